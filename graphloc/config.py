@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`vessel.yaml`: what may stand in it, its defaults, and its validation.
+
+One class per block; each field carries its default, unit and meaning, and `docs/configuration.md`
+is generated from them. Data-sheet units live here only, and become SI in the properties below.
+Which sensor kinds exist is not known here: the caller hands in the table (`kinds`).
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from graphloc.errors import ConfigError
+from graphloc.frames import Array, Geodetic, rotation_from_rpy_deg
+from graphloc.measurements import AXES
+
+STANDARD_GRAVITY_MPS2 = 9.80665
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Triple = tuple[Finite, Finite, Finite]
+
+
+class Block(BaseModel):
+    """A block of the configuration: unknown keys are errors, values are frozen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class DatumConfig(Block):
+    """Origin of the world frame; without this block it is the first good fix, at its height."""
+
+    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
+    """Latitude, deg, WGS 84."""
+    longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)]
+    """Longitude, deg, WGS 84."""
+    height_m: Finite = 0.0
+    """Height above the ellipsoid, m."""
+
+    @property
+    def geodetic(self) -> Geodetic:
+        """The origin as a value."""
+        return Geodetic(self.latitude_deg, self.longitude_deg, self.height_m)
+
+
+class MountConfig(Block):
+    """Pose of the sensor in body (x forward, y port, z up)."""
+
+    xyz_m: Triple = (0.0, 0.0, 0.0)
+    """Sensor origin in body, m."""
+    rpy_deg: Triple = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw of the sensor in body, deg; R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    tf_frame: str | None = None
+    """Take the mount from `/tf_static` instead: name of the sensor's frame there."""
+
+    @property
+    def t_body_sensor_m(self) -> Array:
+        """Sensor origin in body (3,), m."""
+        return np.array(self.xyz_m)
+
+    @property
+    def R_body_sensor(self) -> Array:
+        """Rotation (3, 3) that takes sensor coordinates to body."""
+        return rotation_from_rpy_deg(np.array(self.rpy_deg))
+
+
+class KernelConfig(Block):
+    """Robust loss of a sensor. The last stage of the solver re-weighs by hypotheses where modes exist."""
+
+    kind: Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"] = "cauchy"
+    """Loss. Redescending kinds (geman_mcclure, tukey) are used in the last stage only: before, Cauchy."""
+    scale: Positive = 1.5
+    """Where the loss bends, in standard deviations of the residual."""
+
+
+class SensorConfig(Block):
+    """What every sensor has."""
+
+    kind: str
+    """Which row of the sensor table reads this block."""
+    topic: str = ""
+    """Topic in the bag; empty for a sensor that needs none."""
+    enabled: bool = True
+    """Switch the sensor off without deleting its block."""
+    mount: MountConfig = MountConfig()
+    """Where the sensor sits on the vessel."""
+    time_offset_s: Finite = 0.0
+    """Added to the sensor's stamps, s."""
+    kernel: KernelConfig = KernelConfig()
+    """Robust loss."""
+
+
+class ImuConfig(SensorConfig):
+    """An inertial measurement unit (`sensor_msgs/Imu`)."""
+
+    kind: Literal["imu"] = "imu"
+    """Which row of the sensor table reads this block."""
+    accel_unit: Literal["m/s^2", "g"] = "m/s^2"
+    """Unit of `linear_acceleration` in the bag (REP 103 says m/s^2; some drivers write g)."""
+    gyro_unit: Literal["rad/s", "deg/s"] = "rad/s"
+    """Unit of `angular_velocity` in the bag."""
+    gravity: Literal["included", "removed"] = "included"
+    """Whether `linear_acceleration` holds gravity (+g upwards at rest, the standard) or the driver removed it."""
+    accel_noise_ug_per_sqrt_hz: Positive = 1000.0
+    """Accelerometer white noise, ug/sqrt(Hz). The default allows for hull vibration."""
+    gyro_noise_mdps_per_sqrt_hz: Positive = 10.0
+    """Gyroscope white noise, mdeg/s/sqrt(Hz)."""
+    accel_bias_instability_ug: Positive = 100.0
+    """In-run accelerometer bias instability, ug."""
+    gyro_bias_instability_deg_per_h: Positive = 20.0
+    """In-run gyroscope bias instability, deg/h."""
+    bias_correlation_s: Positive = 300.0
+    """Time over which a bias wanders by its instability, s."""
+    accel_bias_sigma_mg: Positive = 10.0
+    """Turn-on accelerometer bias, 1 sigma, mg."""
+    gyro_bias_sigma_dps: Positive = 2.0
+    """Turn-on gyroscope bias, 1 sigma, deg/s, before the start alignment has measured it."""
+    max_gap_s: Positive = 0.5
+    """A longer hole between samples is an IMU gap: no inertial link is made across it."""
+    kernel: KernelConfig = KernelConfig(kind="none")
+    """Robust loss: not used for inertial data."""
+
+    @property
+    def accel_noise_mps2(self) -> float:
+        """White-noise density, m/s^2/sqrt(Hz)."""
+        return self.accel_noise_ug_per_sqrt_hz * 1e-6 * STANDARD_GRAVITY_MPS2
+
+    @property
+    def gyro_noise_radps(self) -> float:
+        """White-noise density, rad/s/sqrt(Hz)."""
+        return float(np.radians(self.gyro_noise_mdps_per_sqrt_hz * 1e-3))
+
+    @property
+    def accel_bias_walk_mps2(self) -> float:
+        """Random-walk density of the accelerometer bias, m/s^2/sqrt(s)."""
+        return self.accel_bias_instability_ug * 1e-6 * STANDARD_GRAVITY_MPS2 / float(np.sqrt(self.bias_correlation_s))
+
+    @property
+    def gyro_bias_walk_radps(self) -> float:
+        """Random-walk density of the gyroscope bias, rad/s/sqrt(s)."""
+        return float(np.radians(self.gyro_bias_instability_deg_per_h / 3600.0) / np.sqrt(self.bias_correlation_s))
+
+    @property
+    def accel_bias_sigma_mps2(self) -> float:
+        """Turn-on bias, 1 sigma, m/s^2."""
+        return self.accel_bias_sigma_mg * 1e-3 * STANDARD_GRAVITY_MPS2
+
+    @property
+    def gyro_bias_sigma_radps(self) -> float:
+        """Turn-on bias, 1 sigma, rad/s."""
+        return float(np.radians(self.gyro_bias_sigma_dps))
+
+
+class SlowErrorConfig(Block):
+    """The slowly varying part of the GNSS error: a first-order Gauss-Markov process per axis."""
+
+    enabled: bool = True
+    """Off: the GNSS error is taken as white (right for RTK in the open, wrong in a harbour)."""
+    horizontal_sigma_m: Positive = 2.0
+    """Standing size of the slow error, each horizontal axis, 1 sigma, m."""
+    vertical_sigma_m: Positive = 5.0
+    """Standing size of the slow error in height, 1 sigma, m."""
+    time_constant_s: Positive = 200.0
+    """Correlation time, s."""
+    jumps: bool = True
+    """Let the slow error jump (a robust loss on its steps), as multipath does."""
+
+
+class GnssConfig(SensorConfig):
+    """GNSS position (`sensor_msgs/NavSatFix`)."""
+
+    kind: Literal["gnss"] = "gnss"
+    """Which row of the sensor table reads this block."""
+    min_status: Literal["fix", "sbas", "gbas"] = "fix"
+    """Fixes below this `NavSatStatus` are rejected. `STATUS_NO_FIX` never counts as a fix."""
+    sigma_scale: Positive = 1.0
+    """Factor on the reported standard deviations, for the white part of the error."""
+    min_horizontal_sigma_m: Positive = 0.02
+    """Floor of the white horizontal sigma, m."""
+    min_vertical_sigma_m: Positive = 0.04
+    """Floor of the white vertical sigma, m."""
+    default_horizontal_sigma_m: Positive = 1.5
+    """Taken where the message reports no covariance (type unknown, zeros or NaN), m."""
+    default_vertical_sigma_m: Positive = 4.0
+    """The same for height, m."""
+    slow_error: SlowErrorConfig = SlowErrorConfig()
+    """The modelled slow error."""
+
+
+class CompassConfig(SensorConfig):
+    """Heading (`geometry_msgs/QuaternionStamped`, or the orientation of a `sensor_msgs/Imu`)."""
+
+    kind: Literal["compass"] = "compass"
+    """Which row of the sensor table reads this block."""
+    convention: Literal["enu", "ned"] = "enu"
+    """Yaw in the message: `enu` from east, counter-clockwise (REP 103); `ned` from north, clockwise."""
+    sigma_deg: Positive = 1.5
+    """Heading noise, 1 sigma, deg. Used where the message carries no covariance."""
+    use_reported_sigma: bool = True
+    """Take the yaw variance of an `Imu` message where it is positive and finite."""
+    mount_offset_sigma_deg: NonNegative = 1.0
+    """Unknown but constant heading offset of the mount, 1 sigma, deg; 0 holds the mount fixed."""
+
+
+class VelocityConfig(SensorConfig):
+    """GNSS velocity in ENU (`geometry_msgs/TwistWithCovarianceStamped`)."""
+
+    kind: Literal["gnss_velocity"] = "gnss_velocity"
+    """Which row of the sensor table reads this block."""
+    min_sigma_mps: Positive = 0.03
+    """Floor of the velocity sigma, m/s."""
+    default_sigma_mps: Positive = 0.3
+    """Taken where the message reports no covariance, m/s."""
+
+
+class PoseConfig(SensorConfig):
+    """Absolute pose in world (`geometry_msgs/PoseWithCovarianceStamped`, `nav_msgs/Odometry`)."""
+
+    kind: Literal["pose"] = "pose"
+    """Which row of the sensor table reads this block."""
+    axes: tuple[Literal["x", "y", "z", "roll", "pitch", "yaw"], ...] = ("x", "y", "yaw")
+    """Which axes of the pose are used."""
+    false_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
+    """Share of poses that are expected to be false where the front-end does not say."""
+    min_sigma_m: Positive = 0.02
+    """Floor of the position sigma, m."""
+    min_sigma_deg: Positive = 0.1
+    """Floor of the angle sigma, deg."""
+    default_sigma_m: Positive = 0.3
+    """Taken where the message reports no covariance, m."""
+    default_sigma_deg: Positive = 2.0
+    """The same for angles, deg."""
+
+    @field_validator("axes")
+    @classmethod
+    def _ordered(cls, axes: tuple[str, ...]) -> tuple[str, ...]:
+        if not axes:
+            raise ValueError("at least one axis is needed")
+        return tuple(a for a in AXES if a in axes)
+
+
+class HeightConfig(SensorConfig):
+    """Height prior: a vessel floats, so its height is known from waterline and tide."""
+
+    kind: Literal["height"] = "height"
+    """Which row of the sensor table reads this block."""
+    height_m: Finite | None = None
+    """Height of the body origin above the ellipsoid, m; empty: the median of the run's fixes."""
+    sigma_m: Positive = 0.3
+    """Heave and tide around it, 1 sigma, m."""
+    period_s: Positive = 1.0
+    """Time between two priors, s."""
+    kernel: KernelConfig = KernelConfig(kind="none")
+    """Robust loss: not used for the waterline."""
+
+
+class TimelineConfig(Block):
+    """The states of the graph."""
+
+    rate_hz: Annotated[float, Field(gt=0.5, le=200.0)] = 10.0
+    """States a second; a state moves onto a measurement's stamp where one is near."""
+    slow_period_s: Positive = 1.0
+    """Time between two states of the slow quantities (IMU bias, GNSS error), s."""
+
+
+class StartConfig(Block):
+    """How the run is started."""
+
+    window_s: Positive = 20.0
+    """Span that the start alignment may look at, s."""
+    heading_deg: Finite | None = None
+    """Compass heading at the start (from true north, clockwise), where no sensor tells, deg."""
+    heading_sigma_deg: Positive = 10.0
+    """Its 1 sigma, deg."""
+
+
+class OutputConfig(Block):
+    """What is written to the run folder."""
+
+    rate_hz: Positive = 10.0
+    """Rows a second in the solution."""
+    bag: bool = True
+    """Write `solution.mcap` with `nav_msgs/Odometry`."""
+
+
+class VesselConfig(Block):
+    """A whole `vessel.yaml`."""
+
+    vessel: str = "vessel"
+    """Name of the vessel, for the report."""
+    body_frame: str = "base_link"
+    """Name of the body frame in `/tf_static` and in the written bag."""
+    datum: DatumConfig | None = None
+    """Origin of the world frame."""
+    sensors: dict[str, Any] = {}
+    """Sensors by name; `kind` in each block picks the row of the sensor table."""
+    truth_topic: str | None = None
+    """Topic with the true body pose in world (`nav_msgs/Odometry`), for comparisons only; never fused."""
+    check_speed_topic: str | None = None
+    """`nav_msgs/Odometry` whose forward speed is compared with the solution's; never fused."""
+    timeline: TimelineConfig = TimelineConfig()
+    """The states of the graph."""
+    start: StartConfig = StartConfig()
+    """How the run is started."""
+    output: OutputConfig = OutputConfig()
+    """What is written."""
+
+    @model_validator(mode="after")
+    def _one_imu(self) -> VesselConfig:
+        if len(self.of_kind("imu")) > 1:
+            raise ValueError(f"sensors: only one imu can be enabled, found {', '.join(self.of_kind('imu'))}")
+        return self
+
+    def of_kind(self, kind: str) -> dict[str, Any]:
+        """Return the enabled sensors of a kind, by name."""
+        return {n: s for n, s in self.sensors.items() if getattr(s, "kind", None) == kind and s.enabled}
+
+
+def _nearest(key: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
+    return f"; did you mean '{close[0]}'?" if close else f"; known here: {', '.join(sorted(known))}"
+
+
+def _fields_at(model: type[BaseModel], path: list[str]) -> list[str]:
+    """Names of the fields of the block that `path` leads to."""
+    for name in path:
+        field = model.model_fields.get(name)
+        inner = [a for a in (field.annotation, *getattr(field.annotation, "__args__", ())) if field] if field else []
+        blocks = [a for a in inner if isinstance(a, type) and issubclass(a, BaseModel)]
+        if not blocks:
+            return []
+        model = blocks[0]
+    return list(model.model_fields)
+
+
+def _one_line(error: ValidationError, model: type[BaseModel], where: str, prefix: str) -> str:
+    lines = []
+    for item in error.errors():
+        path = [str(p) for p in item["loc"]]
+        name = ".".join([*([prefix] if prefix else []), *path])
+        if item["type"] == "extra_forbidden":
+            lines.append(f"unknown key '{name}'{_nearest(path[-1], _fields_at(model, path[:-1]))}")
+        else:
+            text = item["msg"].removeprefix("Value error, ")
+            lines.append(f"{name + ': ' if name else ''}{text} (got {item['input']!r:.80})")
+    return f"{where}: " + "; ".join(lines)
+
+
+def parse_config(raw: Mapping[str, Any], kinds: Mapping[str, type[SensorConfig]], where: str) -> VesselConfig:
+    """Validate a mapping. `kinds` is the sensor table's kind -> config class; `where` names the file.
+
+    Raises:
+        ConfigError: one line that names each bad key, its nearest known neighbour, and the file.
+    """
+    tree = dict(raw)
+    sensors = tree.get("sensors") or {}
+    if not isinstance(sensors, Mapping):
+        raise ConfigError(f"{where}: 'sensors' must be a mapping of name to block")
+    parsed: dict[str, SensorConfig] = {}
+    for name, block in sensors.items():
+        if not isinstance(block, Mapping):
+            raise ConfigError(f"{where}: sensors.{name} must be a mapping")
+        kind = str(block.get("kind", name))
+        if kind not in kinds:
+            raise ConfigError(f"{where}: sensors.{name}.kind: unknown kind '{kind}'{_nearest(kind, list(kinds))}")
+        try:
+            parsed[str(name)] = kinds[kind].model_validate({**block, "kind": kind})
+        except ValidationError as error:
+            raise ConfigError(_one_line(error, kinds[kind], where, f"sensors.{name}")) from None
+    tree["sensors"] = parsed
+    try:
+        return VesselConfig.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError(_one_line(error, VesselConfig, where, "")) from None
+
+
+def load_config(path: Path, kinds: Mapping[str, type[SensorConfig]]) -> VesselConfig:
+    """Read and validate a `vessel.yaml` (YAML 1.2, no tags)."""
+    try:
+        raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be read ({error.strerror}); `graphloc inspect BAG` writes a first one"
+        ) from None
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())[:200]}") from None
+    if raw is None:
+        raw = {}
+    if not isinstance(raw, Mapping):
+        raise ConfigError(f"{path}: the top level must be a mapping")
+    return parse_config(raw, kinds, str(path))
+
+
+def effective(config: VesselConfig) -> dict[str, Any]:
+    """Return the whole configuration, defaults included, as plain data for `run.json` and YAML."""
+    tree = config.model_dump(mode="json")
+    tree["sensors"] = {name: sensor.model_dump(mode="json") for name, sensor in config.sensors.items()}
+    return tree

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The only list of frames, and the only place where geodetic, NED and compass angles become ENU.
+
+`T_a_b` is the pose of b in a and takes coordinates in b to coordinates in a; in a product equal
+names touch: `T_world_body * T_body_antenna`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import Transformer
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+class Frame(NamedTuple):
+    """A frame: its name, the direction of its axes, and its origin."""
+
+    name: str
+    axes: str
+    origin: str
+
+
+FRAMES: tuple[Frame, ...] = (
+    Frame("world", "x east, y north, z up (ENU, REP 103)", "the run's datum on the WGS 84 ellipsoid"),
+    Frame("body", "x forward, y port (left), z up (FLU, REP 103)", "the vessel's reference point, `base_link`"),
+    Frame("imu", "as the driver reports", "the IMU, `mount` from body"),
+    Frame("antenna", "none: a point", "phase centre of the GNSS antenna, `mount` from body"),
+    Frame("lidar", "x forward, y left, z up", "the scanner, `mount` from body"),
+    Frame("camera", "x right, y down, z forward (optical)", "the projection centre, `mount` from body"),
+    Frame("tag", "x right, y up, z out of the printed face", "the tag's centre"),
+    Frame("image", "u right (column), v down (row)", "centre of the top-left pixel"),
+)
+
+
+class Geodetic(NamedTuple):
+    """A position on WGS 84: latitude and longitude in deg, height above the ellipsoid in m."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Datum:
+    """The origin of the world frame. ENU there is tangent to the ellipsoid (not a map grid)."""
+
+    origin: Geodetic
+
+    def _pipeline(self) -> Transformer:
+        o = self.origin
+        return Transformer.from_pipeline(
+            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+            "+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
+            f"+lat_0={o.latitude_deg!r} +lon_0={o.longitude_deg!r} +h_0={o.height_m!r}"
+        )
+
+    def enu_from_geodetic(self, latitude_deg: Array, longitude_deg: Array, height_m: Array) -> Array:
+        """Return positions (N, 3) in world, m, of N geodetic positions."""
+        e, n, u = self._pipeline().transform(
+            np.atleast_1d(longitude_deg), np.atleast_1d(latitude_deg), np.atleast_1d(height_m)
+        )
+        return np.column_stack([e, n, u])
+
+    def geodetic_from_enu(self, p_world_m: Array) -> Array:
+        """Return (N, 3) latitude deg, longitude deg, height m of positions (N, 3) in world."""
+        p = np.atleast_2d(p_world_m)
+        lon, lat, h = self._pipeline().transform(p[:, 0], p[:, 1], p[:, 2], direction="INVERSE")
+        return np.column_stack([lat, lon, h])
+
+
+def wrap_angle(angle_rad: Array | float) -> Array:
+    """Return angles in (-pi, pi]."""
+    a = np.asarray(angle_rad, dtype=float)
+    return -((-a + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def yaw_from_heading_deg(heading_deg: Array | float) -> Array:
+    """Return yaw (rad, from east, counter-clockwise) of a compass heading (deg, from true north, clockwise)."""
+    return wrap_angle(np.pi / 2.0 - np.radians(heading_deg))
+
+
+def heading_deg_from_yaw(yaw_rad: Array | float) -> Array:
+    """Return the compass heading in [0, 360) deg of a yaw in rad."""
+    return np.asarray((90.0 - np.degrees(yaw_rad)) % 360.0)
+
+
+def rotation_from_rpy_deg(rpy_deg: Array) -> Array:
+    """Return R (3, 3) of roll, pitch, yaw in deg: R = Rz(yaw) Ry(pitch) Rx(roll), as in ROS."""
+    return np.asarray(Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix())
+
+
+def rpy_from_rotation(rotation: Array) -> Array:
+    """Return roll, pitch, yaw in rad, (3,) or (N, 3), of rotation matrices: the inverse of the above."""
+    with np.errstate(all="ignore"):
+        return np.asarray(Rotation.from_matrix(rotation).as_euler("xyz"))

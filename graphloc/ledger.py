@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ledger: every message that arrived ends in exactly one row, and rows add up to the recording."""
+
+from __future__ import annotations
+
+import enum
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+from graphloc.errors import GraphlocError
+
+
+class Outcome(enum.StrEnum):
+    """What became of a message."""
+
+    USED = "used"
+    DOWN_WEIGHTED = "down_weighted"  # final weight below 0.5
+    REJECTED = "rejected"  # well-formed, but not believed; reason says why
+    HELD_OUT = "held_out"  # kept out of the graph to test it
+    LATE = "late"
+    MALFORMED = "malformed"  # reason says file, topic, stamp
+    IGNORED = "ignored"  # no sensor of the configuration asks for this topic or type
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LedgerRow:
+    """One message (or, for ignored topics only, `count` messages).
+
+    Attributes:
+        seq: arrival number; -1 for a row that stands for a whole topic.
+        stamp_ns: sensor stamp (0 if it could not be read).
+        sensor: configured name, '' if none.
+        topic: topic in the bag, or '(simulated)', '(config)'.
+        outcome: what became of it.
+        weight: final weight in [0, 1]; None where it has no meaning.
+        mode: index of the chosen mode; None for sensors without modes.
+        mode_probability: posterior probability of that mode.
+        residual_m, residual_deg: size of the final residual in physical units.
+        nis: squared residual normalised by the measurement's own covariance.
+        dof: number of measured axes.
+        reason: why it was not used fully.
+        count: messages that this row stands for.
+    """
+
+    seq: int
+    stamp_ns: int
+    sensor: str
+    topic: str
+    outcome: Outcome
+    weight: float | None = None
+    mode: int | None = None
+    mode_probability: float | None = None
+    residual_m: float | None = None
+    residual_deg: float | None = None
+    nis: float | None = None
+    dof: int | None = None
+    reason: str = ""
+    count: int = 1
+
+
+class Ledger:
+    """Rows by arrival number. A second row for one arrival is an error in graphloc, not in the data."""
+
+    def __init__(self, rows: Iterable[LedgerRow] = ()) -> None:
+        self._rows: dict[int, LedgerRow] = {}
+        self._topics: list[LedgerRow] = []
+        for row in rows:
+            self.add(row)
+
+    def add(self, row: LedgerRow) -> None:
+        """Add a row; `seq` must be new unless it is -1."""
+        if row.seq < 0:
+            self._topics.append(row)
+            return
+        if row.seq in self._rows:
+            raise GraphlocError(f"ledger: arrival {row.seq} of {row.topic} was entered twice")
+        self._rows[row.seq] = row
+
+    def __iter__(self) -> Iterator[LedgerRow]:
+        yield from (self._rows[seq] for seq in sorted(self._rows))
+        yield from self._topics
+
+    def __len__(self) -> int:
+        return sum(row.count for row in self)
+
+    def __contains__(self, seq: int) -> bool:
+        return seq in self._rows
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Return messages per sensor (or topic, where none) and outcome."""
+        table: dict[str, Counter[str]] = {}
+        for row in self:
+            table.setdefault(row.sensor or row.topic, Counter())[row.outcome.value] += row.count
+        return {name: dict(sorted(counter.items())) for name, counter in sorted(table.items())}
+
+    def reasons(self) -> dict[tuple[str, str, str], int]:
+        """Return messages per (sensor or topic, outcome, reason) for rows that carry a reason."""
+        counter: Counter[tuple[str, str, str]] = Counter()
+        for row in self:
+            if row.reason:
+                counter[(row.sensor or row.topic, row.outcome.value, row.reason)] += row.count
+        return dict(sorted(counter.items()))
+
+    def with_topic(self, seq: int, topic: str) -> None:
+        """Fill in the topic of a row that was entered by a room that knows no topics."""
+        self._rows[seq] = replace(self._rows[seq], topic=topic)

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What sensors say: stamp, value, uncertainty - and nothing about what will be done with it.
+
+Measurements are frozen; their arrays are copied, checked and made read-only. `seq` is the arrival
+number of the message in its recording, unique, and the key of its row in the ledger.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array, Geodetic
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def _frozen(value: object, shape: tuple[int, ...], name: str) -> Array:
+    array = np.array(value, dtype=float)
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} is not finite")
+    array.flags.writeable = False
+    return array
+
+
+def _frozen_covariance(value: object, size: int, name: str) -> Array:
+    cov = _frozen(value, (size, size), name)
+    if not np.allclose(cov, cov.T, rtol=1e-6, atol=1e-12) or np.linalg.eigvalsh(cov).min() <= 0.0:
+        raise ValueError(f"{name} is not symmetric positive definite")
+    return cov
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Measurement:
+    """Base: `stamp_ns` (sensor time), `sensor` (its name under `sensors:` in vessel.yaml), `seq`."""
+
+    stamp_ns: int
+    sensor: str
+    seq: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GnssPosition(Measurement):
+    """A GNSS fix of the antenna.
+
+    Attributes:
+        position: geodetic position of the antenna phase centre (WGS 84).
+        cov_enu_m2: (3, 3) covariance as reported, east-north-up, m^2.
+    """
+
+    position: Geodetic
+    cov_enu_m2: Array
+
+    def __post_init__(self) -> None:
+        lat, lon, height = (float(v) for v in self.position)
+        if not (-90.0 <= lat <= 90.0 and -180.0 <= lon <= 360.0 and np.isfinite(height)):
+            raise ValueError(f"position {lat}, {lon}, {height} is not on Earth")
+        object.__setattr__(self, "position", Geodetic(lat, lon, height))
+        object.__setattr__(self, "cov_enu_m2", _frozen_covariance(self.cov_enu_m2, 3, "cov_enu_m2"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CompassHeading(Measurement):
+    """Yaw of the sensor's x axis in world: rad, from east, counter-clockwise; with its sigma."""
+
+    yaw_rad: float
+    sigma_rad: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.yaw_rad) and np.isfinite(self.sigma_rad) and self.sigma_rad > 0.0):
+            raise ValueError("yaw_rad and sigma_rad must be finite, sigma_rad positive")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GnssVelocity(Measurement):
+    """Velocity of the antenna, (3,) m/s in world (ENU), with covariance (3, 3) in m^2/s^2."""
+
+    v_world_mps: Array
+    cov_m2ps2: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "v_world_mps", _frozen(self.v_world_mps, (3,), "v_world_mps"))
+        object.__setattr__(self, "cov_m2ps2", _frozen_covariance(self.cov_m2ps2, 3, "cov_m2ps2"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseMode:
+    """One hypothesis of a pose measurement, over the measurement's `axes`, in their order.
+
+    Attributes:
+        value: (k,) x, y, z in m (world), roll, pitch, yaw in rad (ZYX), as `axes` select.
+        cov: (k, k) covariance; angles are small rotations about the world's axes (as in ROS).
+        probability: prior probability of this mode.
+    """
+
+    value: Array
+    cov: Array
+    probability: float = 1.0
+
+    def __post_init__(self) -> None:
+        k = len(np.atleast_1d(self.value))
+        object.__setattr__(self, "value", _frozen(self.value, (k,), "value"))
+        object.__setattr__(self, "cov", _frozen_covariance(self.cov, k, "cov"))
+        if not 0.0 < self.probability <= 1.0:
+            raise ValueError("probability must be in (0, 1]")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseFix(Measurement):
+    """An absolute pose of the sensor frame in world, in any subset of `AXES`, with several modes.
+
+    Attributes:
+        axes: which of `AXES` are measured, in the order of `AXES`.
+        modes: at least one; probabilities sum to at most 1, what is missing is 'none of them'.
+    """
+
+    axes: tuple[str, ...]
+    modes: tuple[PoseMode, ...]
+
+    def __post_init__(self) -> None:
+        if not self.axes or tuple(a for a in AXES if a in self.axes) != tuple(self.axes):
+            raise ValueError(f"axes must be a subset of {AXES} in that order, got {self.axes}")
+        if not self.modes or any(len(m.value) != len(self.axes) for m in self.modes):
+            raise ValueError("each mode needs one value per axis")
+        if sum(m.probability for m in self.modes) > 1.0 + 1e-9:
+            raise ValueError("mode probabilities sum to more than 1")
+
+    @property
+    def none_probability(self) -> float:
+        """Prior probability that no mode is right, as the front-end states it (0 if it does not)."""
+        return max(0.0, 1.0 - sum(m.probability for m in self.modes))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class HeightPrior(Measurement):
+    """Height of the body origin above the datum's ellipsoidal height, from waterline and tide: m."""
+
+    z_world_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImuSeries:
+    """All samples of one IMU, as columns, in stamp order, in the sensor's own axes.
+
+    Attributes:
+        sensor: its name under `sensors:`.
+        stamps_ns: (N,) int64, strictly increasing.
+        accel_mps2: (N, 3) specific force (gravity included, +g upwards at rest) unless the
+            configuration declares it removed.
+        gyro_radps: (N, 3) angular rate.
+        seqs: (N,) int64 arrival numbers.
+    """
+
+    sensor: str
+    stamps_ns: NDArray[np.int64]
+    accel_mps2: Array
+    gyro_radps: Array
+    seqs: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        n = len(self.stamps_ns)
+        for name, dtype in (("stamps_ns", np.int64), ("seqs", np.int64)):
+            column = np.array(getattr(self, name), dtype=dtype)
+            column.flags.writeable = False
+            object.__setattr__(self, name, column)
+        if n > 1 and (np.diff(self.stamps_ns) <= 0).any():
+            raise ValueError("IMU stamps must increase strictly")
+        object.__setattr__(self, "accel_mps2", _frozen(self.accel_mps2, (n, 3), "accel_mps2"))
+        object.__setattr__(self, "gyro_radps", _frozen(self.gyro_radps, (n, 3), "gyro_radps"))
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)

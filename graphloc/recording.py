@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run as it was read: measurements, truth where there is one, and an account of every message."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array, Datum
+from graphloc.ledger import LedgerRow
+from graphloc.measurements import ImuSeries, Measurement
+from graphloc.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SpeedSeries:
+    """Forward speed from a sensor that is not fused: stamps (N,) ns and speeds (N,) m/s."""
+
+    topic: str
+    stamps_ns: NDArray[np.int64]
+    speed_mps: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Recording:
+    """What a front-end hands over.
+
+    Attributes:
+        source: the bag's path, or '(simulated)'.
+        imu: the inertial samples, or None where the run has none.
+        measurements: everything else, ordered by stamp, then arrival.
+        rows: ledger rows of messages that gave no measurement (malformed, rejected, ignored). Together
+            with the measurements and the IMU samples they add up to `message_count`.
+        message_count: messages in the recording.
+        topics: topic of each configured sensor.
+        mounts: body -> sensor (t (3,), R (3, 3)) of sensors whose mount came from /tf_static.
+        truth: true body trajectory in `truth_datum`'s world, if known.
+        truth_datum: datum of the truth and of pose measurements; None: that of the configuration.
+        check_speed: forward speed that is compared, not fused.
+        warnings: one line each, for the report.
+    """
+
+    source: str
+    imu: ImuSeries | None
+    measurements: tuple[Measurement, ...]
+    rows: tuple[LedgerRow, ...] = ()
+    message_count: int = 0
+    topics: Mapping[str, str] = field(default_factory=dict)
+    mounts: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+    truth: Trajectory | None = None
+    truth_datum: Datum | None = None
+    check_speed: SpeedSeries | None = None
+    warnings: tuple[str, ...] = ()

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a solver hands over: the trajectory, what was estimated beside it, and how well it went."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array, Datum
+from graphloc.ledger import Ledger
+from graphloc.trajectory import Trajectory
+
+
+class Health(enum.StrEnum):
+    """How far an estimate can be trusted, at one time."""
+
+    GOOD = "good"  # position sigma small, absolute sensors agree
+    DEGRADED = "degraded"  # usable, but one absolute sensor is missing or disagrees, or sigma is large
+    DEAD_RECKONING = "dead_reckoning"  # no absolute position agreed for a while
+    LOST = "lost"  # the covariance, or the solver, says that the pose is not known
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SlowEstimate:
+    """A slow state of one sensor over time, e.g. the GNSS error: what must be subtracted from its fixes.
+
+    Attributes:
+        name: what it is, for axis labels, e.g. 'GNSS error'.
+        unit: 'm' or 'deg'.
+        axes: names of the k columns.
+        stamps_ns: (M,); value, sigma: (M, k).
+    """
+
+    name: str
+    unit: str
+    axes: tuple[str, ...]
+    stamps_ns: NDArray[np.int64]
+    value: Array
+    sigma: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolveStats:
+    """How the solver fared.
+
+    Attributes:
+        passes: outer passes (re-linearised carries, weights, modes) over the whole run.
+        iterations: iterations of the non-linear solver, all passes and windows together.
+        states: poses in the graph; factors: factors in the graph.
+        cost: 2 x final weighted cost (a chi-square if the model holds); expected_cost: its degrees of freedom.
+        converged: whether the last pass moved no state noticeably.
+        warnings: one line each, for the report.
+    """
+
+    passes: int
+    iterations: int
+    states: int
+    factors: int
+    cost: float
+    expected_cost: float
+    converged: bool
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solution:
+    """The estimate of a whole run.
+
+    Attributes:
+        datum: origin of world.
+        trajectory: poses, velocities and pose covariances of the states.
+        v_cov: (N, 3, 3) covariance of velocity, world axes, m^2/s^2.
+        accel_bias_mps2, gyro_bias_radps: (N, 3) in IMU axes.
+        gyro_radps: (N, 3) angular rate of the body, body axes, bias removed.
+        health: N values of `Health`; health_reason: one short text each.
+        since_agreed_s: per absolute sensor, (N,) s since it last agreed (inf: never).
+        slow: slow states by sensor.
+        ledger: every message of the run.
+        stats: how the solver fared.
+    """
+
+    datum: Datum
+    trajectory: Trajectory
+    v_cov: Array
+    accel_bias_mps2: Array
+    gyro_bias_radps: Array
+    gyro_radps: Array
+    health: tuple[Health, ...]
+    health_reason: tuple[str, ...]
+    since_agreed_s: Mapping[str, Array]
+    slow: Mapping[str, SlowEstimate]
+    ledger: Ledger
+    stats: SolveStats

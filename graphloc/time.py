@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time is an integer number of nanoseconds since the Unix epoch; seconds appear only as differences."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import numpy as np
+
+NS_PER_S = 1_000_000_000
+
+
+def seconds_between(start_ns: int, stop_ns: int) -> float:
+    """Return `stop_ns - start_ns` in s; exact before the one conversion to float."""
+    return (stop_ns - start_ns) / NS_PER_S
+
+
+def seconds_since(origin_ns: int, stamps_ns: np.ndarray) -> np.ndarray:
+    """Return stamps (N,) int64 ns as float s since `origin_ns`."""
+    return (np.asarray(stamps_ns, dtype=np.int64) - np.int64(origin_ns)) / NS_PER_S
+
+
+def duration_ns(duration_s: float) -> int:
+    """Return a duration in s as whole ns."""
+    return round(duration_s * NS_PER_S)
+
+
+def utc_text(stamp_ns: int) -> str:
+    """Return a stamp as ISO 8601 UTC with all nine decimals, e.g. `2015-05-21T19:11:37.988949113Z`."""
+    whole, rest = divmod(stamp_ns, NS_PER_S)
+    try:
+        text = datetime.fromtimestamp(whole, UTC).strftime("%Y-%m-%dT%H:%M:%S")
+    except (OverflowError, ValueError, OSError):
+        return f"{whole}.{rest:09d}s"
+    return f"{text}.{rest:09d}Z"

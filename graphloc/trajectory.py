@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories of the body in world, and their interpolation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from graphloc.frames import Array, rpy_from_rotation
+from graphloc.time import seconds_since
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trajectory:
+    """Poses of body in world at increasing stamps.
+
+    Attributes:
+        stamps_ns: (N,) int64, strictly increasing.
+        p_world_m: (N, 3).
+        R_world_body: (N, 3, 3).
+        v_world_mps: (N, 3), or None where velocity is not known (then interpolation is linear).
+        cov: (N, 6, 6) or None: x, y, z (m) and small rotations (rad), all about the world's axes.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    p_world_m: Array
+    R_world_body: Array
+    v_world_mps: Array | None = None
+    cov: Array | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.stamps_ns)
+        if n > 1 and (np.diff(self.stamps_ns) <= 0).any():
+            raise ValueError("trajectory stamps must increase strictly")
+        if self.p_world_m.shape != (n, 3) or self.R_world_body.shape != (n, 3, 3):
+            raise ValueError("trajectory columns disagree in length")
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def rpy_rad(self) -> Array:
+        """Roll, pitch, yaw (N, 3) in rad; yaw from east, counter-clockwise."""
+        return rpy_from_rotation(self.R_world_body)
+
+    @property
+    def yaw_rad(self) -> Array:
+        """Yaw (N,): direction of the body's x axis in the world's horizontal plane."""
+        return np.asarray(np.arctan2(self.R_world_body[:, 1, 0], self.R_world_body[:, 0, 0]))
+
+    def covers(self, stamps_ns: NDArray[np.int64], max_gap_s: float = 1.0) -> NDArray[np.bool_]:
+        """Return (M,) whether each stamp lies inside the span and between poses at most `max_gap_s` apart."""
+        stamps = np.asarray(stamps_ns, dtype=np.int64)
+        right = np.clip(np.searchsorted(self.stamps_ns, stamps, side="left"), 1, len(self) - 1)
+        gap = (self.stamps_ns[right] - self.stamps_ns[right - 1]) / 1e9
+        inside = (stamps >= self.stamps_ns[0]) & (stamps <= self.stamps_ns[-1])
+        return np.asarray(inside & (gap <= max_gap_s))
+
+    def at(self, stamps_ns: NDArray[np.int64]) -> Trajectory:
+        """Return the trajectory at M stamps inside its span (cubic Hermite in position, slerp in attitude).
+
+        Covariances are those of the nearest pose; velocities are the derivative of the position.
+        """
+        stamps = np.asarray(stamps_ns, dtype=np.int64)
+        if len(stamps) and (stamps[0] < self.stamps_ns[0] or stamps[-1] > self.stamps_ns[-1]):
+            raise ValueError("stamps outside the trajectory: select with covers() first")
+        origin = int(self.stamps_ns[0])
+        t, s = seconds_since(origin, self.stamps_ns), seconds_since(origin, stamps)
+        velocity: Array | None = None
+        if self.v_world_mps is None:
+            position = np.column_stack([np.interp(s, t, self.p_world_m[:, i]) for i in range(3)])
+        else:
+            spline = CubicHermiteSpline(t, self.p_world_m, self.v_world_mps)
+            position, velocity = spline(s), spline(s, 1)
+        rotation = Slerp(t, Rotation.from_matrix(self.R_world_body))(s).as_matrix()
+        cov = None
+        if self.cov is not None:
+            right = np.clip(np.searchsorted(t, s), 1, len(t) - 1)
+            nearest = np.where(s - t[right - 1] < t[right] - s, right - 1, right)
+            cov = self.cov[nearest]
+        return Trajectory(stamps_ns=stamps, p_world_m=position, R_world_body=rotation, v_world_mps=velocity, cov=cov)
