@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one function that builds noise models and robust kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphloc.config import KernelConfig
+from graphloc.frames import Array
+from graphloc.graph import Decision
+
+_LOSSES = {
+    "huber": gtsam.noiseModel.mEstimator.Huber,
+    "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
+    "geman_mcclure": gtsam.noiseModel.mEstimator.GemanMcClure,
+    "tukey": gtsam.noiseModel.mEstimator.Tukey,
+}
+
+
+def noise_model(cov: Array, decision: Decision) -> Any:
+    """Return a noise model of covariance (k, k) / weight, under the decision's kernel."""
+    scaled = np.asarray(cov) / decision.weight
+    if np.count_nonzero(scaled - np.diag(np.diagonal(scaled))) == 0:
+        base = gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(np.diagonal(scaled)))
+    else:
+        base = gtsam.noiseModel.Gaussian.Covariance(scaled)
+    return robust(base, decision.kernel)
+
+
+def robust(base: Any, kernel: KernelConfig | None) -> Any:
+    """Put a kernel on a noise model; none, or kind `none`, leaves it as it is."""
+    if kernel is None or kernel.kind == "none":
+        return base
+    return gtsam.noiseModel.Robust.Create(_LOSSES[kernel.kind].Create(kernel.scale), base)

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""GNSS position: lever arm, white noise, and a slow error.
+
+    z = p + R l + d + w,   w ~ N(0, C),   d: first-order Gauss-Markov per axis
+
+z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachment`); C: the reported
+covariance. The slow state holds n = -d, so that only native factors are needed: `A = p + R l` is a
+leaf (`ReferenceFrameFactor`, tied within 5 mm), and `A - N = z` is a `BetweenFactor` under the kernel.
+Without a slow state: `GPSFactorArm`. Not handled: correlation between axes of d.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphloc.config import GnssConfig
+from graphloc.factors._noise import noise_model
+from graphloc.frames import Array, Geodetic
+from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor, SlowProcess
+from graphloc.measurements import GnssPosition
+
+_TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
+_TIE = gtsam.noiseModel.Isotropic.Sigma(3, _TIE_M)
+
+
+def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
+    """Covariance (3, 3) of the white part: reported, scaled, with floors, m^2."""
+    cov = np.array(m.cov_enu_m2) * config.sigma_scale**2
+    floors = np.array([config.min_horizontal_sigma_m] * 2 + [config.min_vertical_sigma_m]) ** 2
+    return cov + np.diag(np.maximum(floors - np.diagonal(cov), 0.0))
+
+
+def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
+    return at.datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0]
+
+
+def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Residual, ...]:
+    """Residual a + d - z (3,) in m, world axes."""
+    lever = at.T_state_sensor.translation()
+    R = at.T_world_body.rotation().matrix()
+    d = np.zeros(3) if at.slow_value is None else -at.slow_value
+    raw = at.T_world_body.transformFrom(lever) + d - _fix_world_m(m, at)
+    jacobian = np.hstack([-R @ _skew(lever), R])
+    size = float(np.hypot(raw[0], raw[1]))
+    return (
+        Residual(raw=raw, cov=white_covariance(m, config), jacobian=jacobian, prior=1.0, size_m=size, size_deg=None),
+    )
+
+
+def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decision) -> GraphUpdate:
+    """Return the factors of one fix."""
+    z = _fix_world_m(m, at)
+    lever = np.asarray(at.T_state_sensor.translation())
+    model = noise_model(white_covariance(m, config), decision)
+    if at.slow_key is None:
+        return GraphUpdate(factors=(gtsam.GPSFactorArm(at.pose_key, z, lever, model),))
+    antenna_key, lever_key = at.leaf_keys
+    return GraphUpdate(
+        factors=(
+            gtsam.PriorFactorPoint3(lever_key, lever, _TIE),
+            gtsam.ReferenceFrameFactorPoint3Pose3(lever_key, at.pose_key, antenna_key, _TIE),
+            gtsam.BetweenFactorPoint3(at.slow_key, antenna_key, z, model),
+        ),
+        guesses=((antenna_key, at.T_world_body.transformFrom(lever)), (lever_key, lever)),
+    )
+
+
+def slow(config: GnssConfig) -> SlowProcess | None:
+    """Return the slow error that the configuration asks for."""
+    s = config.slow_error
+    if not s.enabled:
+        return None
+    return SlowProcess(
+        name="GNSS error",
+        unit="m",
+        scale=-1.0,
+        axes=("east", "north", "up"),
+        sigma=np.array([s.horizontal_sigma_m, s.horizontal_sigma_m, s.vertical_sigma_m]),
+        time_constant_s=s.time_constant_s,
+        jumps=s.jumps,
+    )
+
+
+def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
+    """Return the fix that the attachment's estimate would give."""
+    antenna = at.T_world_body.transformFrom(at.T_state_sensor.translation())
+    d = np.zeros(3) if at.slow_value is None else -at.slow_value
+    lat, lon, height = at.datum.geodetic_from_enu(antenna + d)[0]
+    return GnssPosition(
+        stamp_ns=0, sensor="gnss", seq=0, position=Geodetic(lat, lon, height), cov_enu_m2=np.diag([0.25, 0.25, 1.0])
+    )
+
+
+def _skew(v: Any) -> Array:
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+ROW = Sensor(
+    kind="gnss",
+    measurement=GnssPosition,
+    config=GnssConfig,
+    residuals=residuals,
+    factors=factors,
+    ideal=ideal,
+    slow=slow,
+    absolute=True,
+)

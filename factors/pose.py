@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Absolute pose in any subset of (x, y, z, roll, pitch, yaw), with several modes.
+
+The measured axes replace those of the current estimate of the sensor's pose; the result, moved to the
+body, anchors a native `PriorFactorPose3` whose unmeasured axes are wide:
+
+    Z = T_world_sensor(measured axes) ;  anchor = Z T_state_sensor^-1 ;  e = Log(anchor^-1 T_world_body)
+
+Exact when re-anchored (measured: anchored level it is 11 % wrong at 3 deg of roll and pitch), which
+the solver does every pass. Rotation errors are small rotations about the world's axes, as in ROS.
+Each mode is a hypothesis, and so is 'none of them'; the solver weighs them. Not handled: pitch near
++-90 deg where roll and yaw are measured alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphloc.config import PoseConfig
+from graphloc.factors._noise import noise_model
+from graphloc.frames import Array
+from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor
+from graphloc.measurements import AXES, PoseFix, PoseMode
+
+_WIDE_M, _WIDE_RAD = 1e3, 1e2
+# Where a false pose may lie: BL's search window, +-5 m and +-5 deg around the truth.
+FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(5.0))
+
+
+def _covariance(mode: PoseMode, axes: tuple[str, ...], config: PoseConfig) -> Array:
+    cov = np.array(mode.cov)
+    floors = np.array([config.min_sigma_m if AXES.index(a) < 3 else np.radians(config.min_sigma_deg) for a in axes])
+    return cov + np.diag(np.maximum(floors**2 - np.diagonal(cov), 0.0))
+
+
+def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor: Any) -> Any:
+    """Return T_world_sensor with the measured axes replaced."""
+    values = np.concatenate([T_world_sensor.translation(), T_world_sensor.rotation().rpy()])
+    for axis, value in zip(axes, mode.value, strict=True):
+        values[AXES.index(axis)] = value
+    return gtsam.Pose3(gtsam.Rot3.RzRyRx(values[3:]), values[:3])
+
+
+def residuals(m: PoseFix, config: PoseConfig, at: Attachment) -> tuple[Residual, ...]:
+    """Residuals predicted - measured (k,), m and rad, one for each mode."""
+    T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
+    R = T_world_sensor.rotation().matrix()
+    picked = [AXES.index(a) for a in m.axes]
+    # d(world translation, world rotation) of the sensor by the body tangent.
+    adjoint = np.asarray(at.T_state_sensor.inverse().AdjointMap())
+    world = np.zeros((6, 6))
+    world[:3], world[3:] = R @ adjoint[3:], R @ adjoint[:3]
+    found = []
+    for mode in m.modes:
+        Z = _measured_sensor_pose(mode, m.axes, T_world_sensor)
+        rotation = gtsam.Rot3.Logmap(gtsam.Rot3(R @ Z.rotation().matrix().T))
+        raw = np.concatenate([T_world_sensor.translation() - Z.translation(), rotation])[picked]
+        angles = raw[[i for i, p in enumerate(picked) if p >= 3]]
+        lengths = raw[[i for i, p in enumerate(picked) if p < 2]]
+        found.append(
+            Residual(
+                raw=raw,
+                cov=_covariance(mode, m.axes, config),
+                jacobian=world[picked],
+                prior=mode.probability * (1.0 - _false_probability(m, config)) / _stated(m),
+                size_m=float(np.linalg.norm(lengths)) if len(lengths) else None,
+                size_deg=float(np.degrees(np.linalg.norm(angles))) if len(angles) else None,
+            )
+        )
+    return tuple(found)
+
+
+def _stated(m: PoseFix) -> float:
+    return sum(mode.probability for mode in m.modes)
+
+
+def _false_probability(m: PoseFix, config: PoseConfig) -> float:
+    """The front-end's own 'none of them' where it states one, else the configured fraction."""
+    return float(np.clip(m.none_probability if m.none_probability > 1e-6 else config.false_fraction, 1e-4, 0.99))
+
+
+def false_log_density(m: PoseFix, config: PoseConfig) -> float:
+    """Log of P(false) x uniform density of a false pose over the measured axes."""
+    lengths = sum(AXES.index(a) < 3 for a in m.axes)
+    volume = (2.0 * FALSE_SPREAD_M) ** lengths * (2.0 * FALSE_SPREAD_RAD) ** (len(m.axes) - lengths)
+    return float(np.log(_false_probability(m, config)) - np.log(volume))
+
+
+def factors(m: PoseFix, config: PoseConfig, at: Attachment, decision: Decision) -> GraphUpdate:
+    """Return the factor of the chosen mode."""
+    mode = m.modes[decision.mode]
+    T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
+    Z = _measured_sensor_pose(mode, m.axes, T_world_sensor)
+    picked = [AXES.index(a) for a in m.axes]
+    world = np.diag([_WIDE_M**2] * 3 + [_WIDE_RAD**2] * 3)
+    world[np.ix_(picked, picked)] = _covariance(mode, m.axes, config)
+    # World translation and rotation -> tangent of the sensor at Z -> tangent of the body at the anchor.
+    R = Z.rotation().matrix()
+    to_sensor = np.zeros((6, 6))
+    to_sensor[:3, 3:], to_sensor[3:, :3] = R.T, R.T
+    to_body = np.asarray(at.T_state_sensor.AdjointMap()) @ to_sensor
+    cov = to_body @ world @ to_body.T
+    anchor = Z.compose(at.T_state_sensor.inverse())
+    model = noise_model((cov + cov.T) / 2.0, decision)
+    return GraphUpdate(factors=(gtsam.PriorFactorPose3(at.pose_key, anchor, model),))
+
+
+def ideal(at: Attachment, config: PoseConfig) -> PoseFix:
+    """Return the pose that the attachment's estimate would give."""
+    T = at.T_world_body.compose(at.T_state_sensor)
+    values = np.concatenate([T.translation(), T.rotation().rpy()])
+    sigmas = np.where(np.arange(6) < 3, 0.3, np.radians(2.0))
+    picked = [AXES.index(a) for a in config.axes]
+    mode = PoseMode(value=values[picked], cov=np.diag(sigmas[picked] ** 2))
+    return PoseFix(stamp_ns=0, sensor="pose", seq=0, axes=config.axes, modes=(mode,))
+
+
+ROW = Sensor(
+    kind="pose",
+    measurement=PoseFix,
+    config=PoseConfig,
+    residuals=residuals,
+    factors=factors,
+    ideal=ideal,
+    false_log_density=false_log_density,
+    absolute=True,
+)

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a sensor row promises to the graph builder, and what it gets to see.
+
+A row turns a measurement into residuals (to weigh it, choose its mode, and write its ledger row) and
+into native GTSAM factors. Both functions are pure; what a row returns enters the graph whole or not
+at all. Builder and solvers know rows only through this module, never by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gtsam
+import numpy as np
+
+from graphloc.config import KernelConfig, SensorConfig
+from graphloc.frames import Array, Datum
+from graphloc.measurements import ImuSeries, Measurement
+
+BODY_TANGENT = "rotation first, then translation, both in body axes (GTSAM Pose3)"
+
+
+@dataclass(frozen=True, slots=True)
+class GraphUpdate:
+    """Factors and the guesses of the keys that only these factors introduce."""
+
+    factors: tuple[Any, ...] = ()
+    guesses: tuple[tuple[int, Any], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Attachment:
+    """Where a measurement meets the graph, and what the graph believes there now.
+
+    A measurement between two states is carried to the nearest one with the IMU's own relative motion:
+    `T_state_sensor` is the pose of the sensor at the measurement's stamp, seen from the body at the
+    state. Carrying is thus the same thing as a mount.
+
+    Attributes:
+        pose_key, velocity_key: keys of the state.
+        slow_key: key of the sensor's slow state, or None.
+        leaf_keys: two keys that belong to this measurement alone.
+        T_world_body: estimate of the body at the state. v_world_mps: of its velocity (3,).
+        T_state_sensor: see above (gtsam.Pose3).
+        dv_world_mps: (3,) what velocity gains from the state to the measurement.
+        gyro_radps: (3,) body rate at the measurement, body axes, bias removed.
+        lever_m: (3,) sensor origin in body.
+        slow_value: estimate of the slow state, or None.
+        datum: origin of world.
+    """
+
+    pose_key: int
+    velocity_key: int
+    slow_key: int | None
+    leaf_keys: tuple[int, int]
+    T_world_body: Any
+    v_world_mps: Array
+    T_state_sensor: Any
+    dv_world_mps: Array
+    gyro_radps: Array
+    lever_m: Array
+    slow_value: Array | None
+    datum: Datum
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Residual:
+    """Residual of one hypothesis of a measurement at the current estimate.
+
+    Attributes:
+        raw: (k,) in m, rad or m/s. cov: (k, k) of the measurement.
+        jacobian: (k, 6) d raw / d (body tangent of the state's pose), for the predicted covariance.
+        prior: prior probability of this hypothesis.
+        size_m, size_deg: physical size, for the ledger.
+    """
+
+    raw: Array
+    cov: Array
+    jacobian: Array
+    prior: float
+    size_m: float | None
+    size_deg: float | None
+
+    def nis(self, inflation: Array | None = None) -> float:
+        """Squared residual normalised by `cov` (+ `inflation`)."""
+        s = self.cov if inflation is None else self.cov + inflation
+        return float(self.raw @ np.linalg.solve(s, self.raw))
+
+    def log_density(self, inflation: Array | None = None) -> float:
+        """Log of prior x Gaussian density of the residual, covariance `cov` (+ `inflation`)."""
+        s = self.cov if inflation is None else self.cov + inflation
+        logdet = np.linalg.slogdet(2.0 * np.pi * s)[1]
+        return float(np.log(self.prior) - 0.5 * (self.nis(inflation) + logdet))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Decision:
+    """What the solver has decided about a measurement for this pass.
+
+    Attributes:
+        mode: index of the hypothesis that enters the graph.
+        weight: factor on its information, in (0, 1].
+        kernel: robust loss on top, or None.
+    """
+
+    mode: int = 0
+    weight: float = 1.0
+    kernel: KernelConfig | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlowProcess:
+    """A slow state: per axis a first-order Gauss-Markov process.
+
+    Attributes:
+        name, unit, axes: for outputs. scale: from the state's unit to `unit`.
+        sigma: (k,) standing size. time_constant_s: correlation time; inf for a constant.
+        jumps: put a robust loss on its steps.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    axes: tuple[str, ...]
+    sigma: Array
+    time_constant_s: float
+    jumps: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensor:
+    """One row of the table of sensors.
+
+    Attributes:
+        kind: what `kind:` in vessel.yaml says.
+        measurement, config: their classes.
+        residuals: all hypotheses of a measurement at the current estimate.
+        factors: the factors of the chosen one.
+        ideal: the noise-free measurement that a state would give (used by conformance tests).
+        slow: the slow state that a config asks for.
+        false_log_density: log (probability x density) of a false measurement; None: the sensor has
+            no hypothesis 'false' and is guarded by its kernel alone.
+        synthetic: measurements made from the configuration over the run's stamps (no topic).
+        absolute: whether it says something about position (for health).
+    """
+
+    kind: str
+    measurement: type[Measurement]
+    config: type[SensorConfig]
+    residuals: Callable[[Any, Any, Attachment], tuple[Residual, ...]]
+    factors: Callable[[Any, Any, Attachment, Decision], GraphUpdate]
+    ideal: Callable[[Attachment, Any], Measurement]
+    slow: Callable[[Any], SlowProcess | None] = lambda _config: None
+    false_log_density: Callable[[Any, Any], float] | None = None
+    synthetic: Callable[[str, Any, Sequence[int], float], Sequence[Measurement]] | None = None
+    absolute: bool = False
+
+
+class InertialRow(Protocol):
+    """The row of the inertial sensor: it links states instead of measuring one."""
+
+    kind: str
+    config: type[SensorConfig]
+
+    def link(self, imu: ImuSeries, config: Any, t_body_imu_m: Array, R_body_imu: Array) -> InertialLink:
+        """Return the links that one IMU gives."""
+        ...
+
+
+class InertialLink(Protocol):
+    """Preintegration of one IMU between any two stamps."""
+
+    def integrate(self, start_ns: int, stop_ns: int, bias: Any) -> Any:
+        """Return the preintegrated measurement from `start_ns` to `stop_ns` (start < stop)."""
+        ...
+
+    def factor(self, k: int, j: int, preintegrated: Any) -> Any:
+        """Return the factor between states `k` and `k + 1` with the bias of slow node `j`."""
+        ...
+
+    def gyro_at(self, stamp_ns: int) -> Array:
+        """Return the raw angular rate (3,) in body axes at a stamp."""
+        ...
+
+    def bias_steps(self, dt_s: float) -> Array:
+        """Return the sigmas (6,) of the bias random walk over `dt_s`, accelerometer first."""
+        ...
+
+    def bias_sigmas(self) -> Array:
+        """Return the turn-on sigmas (6,), accelerometer first."""
+        ...
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """Return the holes in the data as (start, stop) stamps in ns."""
+        ...
