@@ -11,6 +11,7 @@ Without a slow state: `GPSFactorArm`. Not handled: correlation between axes of d
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import gtsam
@@ -18,7 +19,7 @@ import numpy as np
 
 from graphloc.config import GnssConfig
 from graphloc.factors._noise import noise_model
-from graphloc.frames import Array, Geodetic
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor, SlowProcess
 from graphloc.measurements import GnssPosition
 
@@ -33,8 +34,13 @@ def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
     return cov + np.diag(np.maximum(floors - np.diagonal(cov), 0.0))
 
 
+@lru_cache(maxsize=1 << 18)
+def _world_m(position: Geodetic, datum: Datum) -> Array:
+    return datum.enu_from_geodetic(*(np.array([v]) for v in position))[0]
+
+
 def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
-    return at.datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0]
+    return _world_m(m.position, at.datum)
 
 
 def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Residual, ...]:

@@ -8,6 +8,7 @@ names touch: `T_world_body * T_body_antenna`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +47,15 @@ class Geodetic(NamedTuple):
     height_m: float
 
 
+@lru_cache(maxsize=8)  # making a transformer takes longer than a thousand transforms
+def _topocentric(latitude_deg: float, longitude_deg: float, height_m: float) -> Transformer:
+    return Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+        "+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
+        f"+lat_0={latitude_deg!r} +lon_0={longitude_deg!r} +h_0={height_m!r}"
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Datum:
     """The origin of the world frame. ENU there is tangent to the ellipsoid (not a map grid)."""
@@ -53,12 +63,7 @@ class Datum:
     origin: Geodetic
 
     def _pipeline(self) -> Transformer:
-        o = self.origin
-        return Transformer.from_pipeline(
-            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
-            "+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
-            f"+lat_0={o.latitude_deg!r} +lon_0={o.longitude_deg!r} +h_0={o.height_m!r}"
-        )
+        return _topocentric(*(float(v) for v in self.origin))
 
     def enu_from_geodetic(self, latitude_deg: Array, longitude_deg: Array, height_m: Array) -> Array:
         """Return positions (N, 3) in world, m, of N geodetic positions."""

@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a recording to the graph of any stretch of it.
+
+A `Problem` holds what does not change while solving: timeline, preintegrated links, and per sensor a
+`Stream` of measurements with the state that each attaches to. `build_graph` turns a stretch of it into
+factors, at the current estimate and with the current decisions. It knows sensors only as rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc import keys
+from graphloc.config import KernelConfig, SensorConfig, VesselConfig
+from graphloc.errors import SolveError
+from graphloc.frames import Array, Datum
+from graphloc.graph import Attachment, Decision, InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import ImuSeries, Measurement
+from graphloc.recording import Recording
+from graphloc.timeline import Timeline, make_timeline
+
+# A step of a slow state is believed to be a jump beyond this many sigmas.
+_JUMP = KernelConfig(kind="cauchy", scale=2.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stream:
+    """The measurements of one sensor and where they attach.
+
+    Attributes:
+        number: of the sensor, for keys. name, row, config: the sensor.
+        slow: its slow state, or None. slow_model: its Jump kernel where steps may jump.
+        mount: T_body_sensor.
+        measurements: M of them by stamp. state: (M,) nearest state. carry: per measurement the
+            preintegrated motion from the state before it, or None where it stands on a state.
+    """
+
+    number: int
+    name: str
+    row: Sensor
+    config: SensorConfig
+    slow: SlowProcess | None
+    mount: Any
+    measurements: tuple[Measurement, ...]
+    state: NDArray[np.int64]
+    carry: tuple[tuple[int, Any] | None, ...]
+
+    def between(self, first: int, last: int) -> range:
+        """Indices of the measurements that attach to states first..last (inclusive)."""
+        lo, hi = np.searchsorted(self.state, [first, last + 1])
+        return range(int(lo), int(hi))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """A run, ready to be solved."""
+
+    config: VesselConfig
+    datum: Datum
+    timeline: Timeline
+    imu: ImuSeries
+    R_body_imu: Array
+    links: InertialLink
+    preintegrated: tuple[Any, ...]
+    streams: tuple[Stream, ...]
+    rejected: tuple[LedgerRow, ...]
+    warnings: tuple[str, ...] = field(default=())
+
+
+def mount_of(name: str, config: SensorConfig, recording: Recording) -> tuple[Array, Array]:
+    """Return (t (3,), R (3, 3)) of a sensor in body: from /tf_static where it was asked for."""
+    if name in recording.mounts:
+        return recording.mounts[name]
+    return config.mount.t_body_sensor_m, config.mount.R_body_sensor
+
+
+def make_problem(
+    recording: Recording, config: VesselConfig, datum: Datum, rows: Sequence[Sensor], inertial: InertialRow
+) -> Problem:
+    """Lay out the timeline, preintegrate, and attach every measurement.
+
+    Raises:
+        SolveError: the recording has no usable IMU data.
+    """
+    imu = recording.imu
+    if imu is None or len(imu) < 10:
+        raise SolveError(f"{recording.source}: no IMU data (need at least 10 samples); check sensors.imu.topic")
+    imu_config = config.sensors[imu.sensor]
+    t, R = mount_of(imu.sensor, imu_config, recording)
+    links = inertial.link(imu, imu_config, t, R)
+    start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
+    inside = [m for m in recording.measurements if start <= m.stamp_ns <= stop]
+    rejected = tuple(
+        LedgerRow(
+            seq=m.seq,
+            stamp_ns=m.stamp_ns,
+            sensor=m.sensor,
+            topic=recording.topics.get(m.sensor, ""),
+            outcome=Outcome.REJECTED,
+            reason="no IMU data at this stamp",
+        )
+        for m in recording.measurements
+        if not start <= m.stamp_ns <= stop
+    )
+    timeline = make_timeline(start, stop, inside, config.timeline)
+    zero = gtsam.imuBias.ConstantBias()
+    stamps = [int(s) for s in timeline.stamps_ns]
+    preintegrated = tuple(links.integrate(a, b, zero) for a, b in zip(stamps[:-1], stamps[1:], strict=True))
+    by_kind = {row.kind: row for row in rows}
+    by_sensor: dict[str, list[Measurement]] = {}
+    for m in inside:
+        by_sensor.setdefault(m.sensor, []).append(m)
+    streams = []
+    for number, (name, sensor) in enumerate(config.sensors.items()):
+        if sensor.kind in by_kind and sensor.enabled and name in by_sensor:
+            row = by_kind[sensor.kind]
+            t, R = mount_of(name, sensor, recording)
+            streams.append(_stream(number, name, row, sensor, (t, R), by_sensor[name], timeline, links))
+    warnings = [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
+    return Problem(config, datum, timeline, imu, R, links, preintegrated, tuple(streams), rejected, tuple(warnings))
+
+
+def _stream(
+    number: int,
+    name: str,
+    row: Sensor,
+    config: SensorConfig,
+    mount: tuple[Array, Array],
+    measurements: list[Measurement],
+    timeline: Timeline,
+    links: InertialLink,
+) -> Stream:
+    zero = gtsam.imuBias.ConstantBias()
+    state, carry = [], []
+    for m in measurements:
+        floor = timeline.floor(m.stamp_ns)
+        state.append(timeline.nearest(m.stamp_ns))
+        at = int(timeline.stamps_ns[floor])
+        carry.append(None if m.stamp_ns <= at else (floor, links.integrate(at, m.stamp_ns, zero)))
+    T_body_sensor = gtsam.Pose3(gtsam.Rot3(mount[1]), mount[0])
+    return Stream(
+        number,
+        name,
+        row,
+        config,
+        row.slow(config),
+        T_body_sensor,
+        tuple(measurements),
+        np.array(state, dtype=np.int64),
+        tuple(carry),
+    )
+
+
+def nav_state(values: gtsam.Values, k: int) -> Any:
+    """Return the NavState of state k."""
+    return gtsam.NavState(values.atPose3(keys.pose(k)), values.atVector(keys.velocity(k)))
+
+
+def attach(problem: Problem, stream: Stream, i: int, values: gtsam.Values) -> Attachment:
+    """Return how measurement `i` of a stream meets the graph at the current estimate."""
+    m = stream.measurements[i]
+    k = int(stream.state[i])
+    j = int(problem.timeline.slow_of[k])
+    T = values.atPose3(keys.pose(k))
+    v = values.atVector(keys.velocity(k))
+    bias = values.atConstantBias(keys.bias(j))
+    T_state_sensor, dv = stream.mount, np.zeros(3)
+    carried = stream.carry[i]
+    if carried is not None:
+        floor, pim = carried
+        there = pim.predict(nav_state(values, floor), bias)
+        T_state_sensor = T.between(there.pose()).compose(stream.mount)
+        dv = np.asarray(there.velocity()) - v
+    slow_key = None if stream.slow is None else keys.slow(stream.number, j)
+    return Attachment(
+        pose_key=keys.pose(k),
+        velocity_key=keys.velocity(k),
+        slow_key=slow_key,
+        leaf_keys=keys.leaves(stream.number * 100_000_000 + i),
+        T_world_body=T,
+        v_world_mps=v,
+        T_state_sensor=T_state_sensor,
+        dv_world_mps=dv,
+        gyro_radps=problem.links.gyro_at(m.stamp_ns) - problem.R_body_imu @ bias.gyroscope(),
+        lever_m=np.asarray(stream.mount.translation()),
+        slow_value=None if slow_key is None else np.atleast_1d(values.atVector(slow_key)),
+        datum=problem.datum,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartPrior:
+    """Gaussian prior on the first state of a stretch (block-diagonal; sigmas or covariances)."""
+
+    pose: Any
+    pose_cov: Array
+    velocity: Array
+    velocity_cov: Array
+    bias: Any
+    bias_cov: Array
+    slow: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
+
+
+Decisions = Mapping[tuple[int, int], Decision | None]
+
+
+def build_graph(
+    problem: Problem,
+    values: gtsam.Values,
+    decisions: Decisions,
+    first: int,
+    last: int,
+    prior: StartPrior,
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Return the graph of states first..last and the values of its keys.
+
+    `decisions` maps (stream number, measurement index) to what was decided; None leaves it out.
+    """
+    graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    timeline, links = problem.timeline, problem.links
+    for k in range(first, last + 1):
+        guess.insert(keys.pose(k), values.atPose3(keys.pose(k)))
+        guess.insert(keys.velocity(k), values.atVector(keys.velocity(k)))
+    for k in range(first, last):
+        graph.add(links.factor(k, int(timeline.slow_of[k]), problem.preintegrated[k]))
+    nodes = range(int(timeline.slow_of[first]), int(timeline.slow_of[last]) + 1)
+    _add_bias_chain(graph, guess, problem, values, nodes)
+    _add_start(graph, prior, first, nodes[0])
+    for stream in problem.streams:
+        if stream.slow is not None:
+            _add_slow_chain(graph, guess, problem, stream, stream.slow, values, nodes, prior)
+        for i in stream.between(first, last):
+            decision = decisions.get((stream.number, i), Decision())
+            if decision is None:
+                continue
+            update = stream.row.factors(
+                stream.measurements[i], stream.config, attach(problem, stream, i, values), decision
+            )
+            for factor in update.factors:
+                graph.add(factor)
+            for key, value in update.guesses:
+                guess.insert(key, value)
+    return graph, guess
+
+
+def _node_dt_s(problem: Problem, j: int) -> float:
+    stamps = problem.timeline.slow_stamps_ns
+    return float((stamps[j + 1] - stamps[j]) * 1e-9)
+
+
+def _add_bias_chain(
+    graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values, problem: Problem, values: gtsam.Values, nodes: range
+) -> None:
+    for j in nodes:
+        guess.insert(keys.bias(j), values.atConstantBias(keys.bias(j)))
+    for j in nodes[:-1]:
+        model = gtsam.noiseModel.Diagonal.Sigmas(problem.links.bias_steps(_node_dt_s(problem, j)))
+        same = gtsam.imuBias.ConstantBias()
+        graph.add(gtsam.BetweenFactorConstantBias(keys.bias(j), keys.bias(j + 1), same, model))
+
+
+def _add_start(graph: gtsam.NonlinearFactorGraph, prior: StartPrior, first: int, node: int) -> None:
+    gaussian = gtsam.noiseModel.Gaussian.Covariance
+    graph.add(gtsam.PriorFactorPose3(keys.pose(first), prior.pose, gaussian(prior.pose_cov)))
+    graph.add(gtsam.PriorFactorVector(keys.velocity(first), prior.velocity, gaussian(prior.velocity_cov)))
+    graph.add(gtsam.PriorFactorConstantBias(keys.bias(node), prior.bias, gaussian(prior.bias_cov)))
+
+
+def _add_slow_chain(
+    graph: gtsam.NonlinearFactorGraph,
+    guess: gtsam.Values,
+    problem: Problem,
+    stream: Stream,
+    slow: SlowProcess,
+    values: gtsam.Values,
+    nodes: range,
+    prior: StartPrior,
+) -> None:
+    """A first-order Gauss-Markov chain from native factors.
+
+    Its path measure, exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both
+    ends, is a random walk with a standing prior at each node: exact as the node period goes to 0, and
+    the steps stay free for a robust loss (a `JacobianFactor` with the decay in it takes none).
+    """
+    key = [keys.slow(stream.number, j) for j in nodes]
+    for j, name in zip(nodes, key, strict=True):
+        guess.insert(name, np.atleast_1d(values.atVector(keys.slow(stream.number, j))))
+    constant = not np.isfinite(slow.time_constant_s)
+    zero = np.zeros(len(slow.sigma))
+    diagonal = gtsam.noiseModel.Diagonal.Sigmas
+    given = prior.slow.get(stream.number)
+    if given is not None:
+        graph.add(gtsam.PriorFactorVector(key[0], given[0], gtsam.noiseModel.Gaussian.Covariance(given[1])))
+    else:
+        graph.add(gtsam.PriorFactorVector(key[0], zero, diagonal(slow.sigma * (1.0 if constant else np.sqrt(2.0)))))
+    for n, j in enumerate(nodes[:-1]):
+        dt = _node_dt_s(problem, j)
+        # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
+        step = slow.sigma * (1e-4 if constant else np.sqrt(2.0 * dt / slow.time_constant_s))
+        model = diagonal(step)
+        if slow.jumps:
+            loss = gtsam.noiseModel.mEstimator.Cauchy.Create(_JUMP.scale)
+            model = gtsam.noiseModel.Robust.Create(loss, model)
+        graph.add(gtsam.BetweenFactorVector(key[n], key[n + 1], zero, model))
+        if not constant:
+            standing = slow.sigma * np.sqrt(2.0 * slow.time_constant_s / dt)
+            graph.add(gtsam.PriorFactorVector(key[n + 1], zero, diagonal(standing)))

@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Start alignment: what the first seconds say about attitude, heading, position, velocity and bias.
+
+It looks at a window, never at one measurement: gyro bias from standstill or from what the headings of
+the window leave over, roll and pitch from the mean specific force in a frame carried along by the
+gyroscope, heading from poses, compass or course. Where headings disagree, or none is known, several
+candidates go out and the solver tries each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from graphloc.build import Problem
+from graphloc.config import STANDARD_GRAVITY_MPS2
+from graphloc.errors import SolveError
+from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
+from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, HeightPrior, PoseFix
+from graphloc.time import duration_ns, utc_text
+
+_STILL_GYRO_RADPS = 0.02  # spread of the rate at standstill, engine running
+_STILL_SPEED_MPS = 0.15
+_MOVED_M = 15.0  # travel from which a heading can be told without a heading sensor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """A start: level attitude without heading, and candidates for the heading.
+
+    Attributes:
+        R_level_body: (3, 3) attitude with yaw 0. tilt_sigma_rad: of roll and pitch.
+        yaws_rad: candidates. yaw_sigma_rad: of each (wide where it is a guess).
+        p_world_m, p_sigma_m, v_world_mps, v_sigma_mps: (3,) each.
+        gyro_bias_radps, gyro_bias_sigma_radps: (3,) in IMU axes.
+        window_s: span over which the candidates have to be told apart.
+        notes: what the alignment went by.
+    """
+
+    R_level_body: Array
+    tilt_sigma_rad: float
+    yaws_rad: tuple[float, ...]
+    yaw_sigma_rad: float
+    p_world_m: Array
+    p_sigma_m: Array
+    v_world_mps: Array
+    v_sigma_mps: Array
+    gyro_bias_radps: Array
+    gyro_bias_sigma_radps: Array
+    window_s: float
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Track:
+    """Positions (antenna taken to body as far as attitude is not needed): t (M,) s, p (M, 3), sigma (M, 3)."""
+
+    t: Array
+    p: Array
+    sigma: Array
+
+
+def align(problem: Problem) -> Start:
+    """Return the start of a run.
+
+    Raises:
+        SolveError: nothing in the run says where it is.
+    """
+    origin = int(problem.imu.stamps_ns[0])
+    window = problem.config.start.window_s
+    track = _positions(problem, origin)
+    if not len(track.t):
+        raise SolveError(
+            f"no position from {utc_text(origin)} on: no GNSS fix and no pose was accepted; "
+            "check the topics, the status and the stamps with `graphloc inspect`"
+        )
+    yaws = _yaw_samples(problem, origin)
+    still = _standstill(problem, origin, window, track, yaws)
+    bias, bias_sigma, notes = _gyro_bias(problem, origin, window, still, yaws)
+    turn = _turns(problem, origin, window, bias)
+    R_level, tilt_sigma, tilt_note = _level(problem, origin, window, still, turn, track)
+    heading = _headings(problem, origin, track, yaws, turn)
+    p0, p_sigma, v0, v_sigma = _position_and_velocity(problem, track, still)
+    return Start(
+        R_level_body=R_level,
+        tilt_sigma_rad=tilt_sigma,
+        yaws_rad=heading[0],
+        yaw_sigma_rad=heading[1],
+        p_world_m=p0,
+        p_sigma_m=p_sigma,
+        v_world_mps=v0,
+        v_sigma_mps=v_sigma,
+        gyro_bias_radps=problem.R_body_imu.T @ bias,
+        gyro_bias_sigma_radps=bias_sigma,
+        window_s=heading[2],
+        notes=(*notes, tilt_note, heading[3]),
+    )
+
+
+def _positions(problem: Problem, origin: int) -> _Track:
+    t, p, s = [], [], []
+    for stream in problem.streams:
+        for m in stream.measurements:
+            if isinstance(m, GnssPosition):
+                point = problem.datum.enu_from_geodetic(*(np.array([c]) for c in m.position))[0]
+                sigma = np.sqrt(np.diagonal(m.cov_enu_m2))
+            elif isinstance(m, PoseFix) and m.axes[:2] == ("x", "y"):
+                best = max(m.modes, key=lambda mode: mode.probability)
+                z = "z" in m.axes
+                point = np.array([*best.value[:2], best.value[2] if z else np.nan])
+                sigma = np.sqrt(np.array([*np.diagonal(best.cov)[:2], best.cov[2, 2] if z else np.nan]))
+            else:
+                continue
+            t.append((m.stamp_ns - origin) * 1e-9)
+            p.append(point)
+            s.append(sigma)
+    order = np.argsort(t, kind="stable")
+    return _Track(np.array(t)[order], np.array(p).reshape(-1, 3)[order], np.array(s).reshape(-1, 3)[order])
+
+
+def _yaw_samples(problem: Problem, origin: int) -> dict[str, Array]:
+    """Per sensor (M, 3): t in s, yaw of the body in rad, sigma in rad."""
+    found: dict[str, Array] = {}
+    for stream in problem.streams:
+        R_sensor = stream.mount.rotation().matrix()
+        mount_yaw = float(np.arctan2(R_sensor[1, 0], R_sensor[0, 0]))
+        rows = []
+        for m in stream.measurements:
+            if isinstance(m, CompassHeading):
+                rows.append(((m.stamp_ns - origin) * 1e-9, m.yaw_rad - mount_yaw, m.sigma_rad))
+            elif isinstance(m, PoseFix) and "yaw" in m.axes:
+                best = max(m.modes, key=lambda mode: mode.probability)
+                i = m.axes.index("yaw")
+                rows.append(((m.stamp_ns - origin) * 1e-9, best.value[i] - mount_yaw, np.sqrt(best.cov[i, i])))
+        if rows:
+            found[stream.name] = np.array(rows)
+    return found
+
+
+def _samples(problem: Problem, start_s: float, stop_s: float) -> tuple[Array, Array, Array]:
+    """Return t (M,) s, specific force and rate (M, 3) in body axes over a span."""
+    origin = problem.imu.stamps_ns[0]
+    lo, hi = np.searchsorted(problem.imu.stamps_ns, [origin + duration_ns(start_s), origin + duration_ns(stop_s)])
+    hi = max(int(hi), int(lo) + 2)
+    t = (problem.imu.stamps_ns[lo:hi] - origin) * 1e-9
+    R = problem.R_body_imu
+    return t, problem.imu.accel_mps2[lo:hi] @ R.T, problem.imu.gyro_radps[lo:hi] @ R.T
+
+
+def _standstill(
+    problem: Problem, origin: int, window: float, track: _Track, yaws: dict[str, Array]
+) -> tuple[float, float] | None:
+    """The longest stretch from the start (at least 2 s) in which nothing turns, moves or shakes."""
+    t, f, w = _samples(problem, 0.0, max(window, 30.0))
+    best = None
+    for stop in np.arange(2.0, min(float(t[-1]), max(window, 30.0)), 1.0):
+        inside = t <= stop
+        if (w[inside].std(axis=0) > _STILL_GYRO_RADPS).any() or (f[inside].std(axis=0) > 0.4).any():
+            break
+        best = (0.0, float(stop))
+    if best is None:
+        return None
+    inside = track.t <= best[1]
+    if inside.sum() >= 4 and np.ptp(track.t[inside]) > 1.5:
+        slope = [_slope(track.t[inside], track.p[inside, i]) for i in range(2)]
+        sigma = 2.0 * np.nanmedian(track.sigma[inside, :2]) / np.ptp(track.t[inside])
+        if np.hypot(*slope) > _STILL_SPEED_MPS + min(sigma, 1.0):
+            return None
+    else:
+        return None  # nothing says that it does not glide along
+    for rows in yaws.values():
+        near = rows[rows[:, 0] <= best[1]]
+        if len(near) >= 4:
+            rate = _slope(near[:, 0], np.unwrap(near[:, 1]))
+            mean_rate = w[t <= best[1]].mean(axis=0)[2]
+            if abs(rate) > 0.01 + 3.0 * near[:, 2].mean() / np.ptp(near[:, 0]) / np.sqrt(len(near)) and abs(mean_rate):
+                return None
+    return best
+
+
+def _slope(t: Array, y: Array) -> float:
+    """Theil-Sen slope: the median over pairs a good way apart."""
+    n = len(t)
+    i = np.arange(n)
+    j = (i + max(n // 2, 1)) % n
+    dt = t[j] - t[i]
+    use = np.abs(dt) > 1e-3
+    return float(np.median((y[j] - y[i])[use] / dt[use])) if use.any() else 0.0
+
+
+def _gyro_bias(
+    problem: Problem, origin: int, window: float, still: tuple[float, float] | None, yaws: dict[str, Array]
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """Bias (3,) in body axes and its sigma (3,), rad/s."""
+    prior = problem.links.bias_sigmas()[3:]
+    if still is not None:
+        _, _, w = _samples(problem, *still)
+        sigma = w.std(axis=0) / np.sqrt(len(w) / 4.0) + 3e-4
+        return w.mean(axis=0), np.minimum(sigma, prior), (f"gyro bias from {still[1]:.0f} s of standstill",)
+    t, _, w = _samples(problem, 0.0, window)
+    span = float(np.ptp(t))
+    mean = w.mean(axis=0)
+    bias, sigma = np.zeros(3), np.array(prior)
+    rate = None
+    for rows in yaws.values():
+        near = rows[rows[:, 0] <= window]
+        if len(near) >= 8 and np.ptp(near[:, 0]) > 0.5 * window:
+            rate = _slope(near[:, 0], np.unwrap(near[:, 1]))
+            # A slope from two halves of the window, outliers and slow errors of the sensor allowed for.
+            sigma[2] = min(sigma[2], 0.002 + 0.1 / np.ptp(near[:, 0]))
+            bias[2] = mean[2] - rate
+            break
+    # Roll and pitch come back to where they were (to 0.1 rad): what is left of their mean rate is bias.
+    turn = abs(rate) if rate is not None else abs(mean[2])
+    around = np.hypot(0.1 / span, 0.1 * turn)
+    bias[:2] = np.where(around < prior[:2], mean[:2], 0.0)
+    sigma[:2] = np.minimum(prior[:2], around)
+    if rate is None:
+        return bias, sigma, ("gyro bias about the vertical unknown at the start",)
+    return bias, sigma, (f"gyro bias from {span:.0f} s of motion and heading",)
+
+
+def _turns(problem: Problem, origin: int, window: float, bias: Array) -> Callable[[float], Array]:
+    """Return a function t -> R_body0_body(t), integrated from the gyroscope over the run's beginning."""
+    span = float((problem.imu.stamps_ns[-1] - problem.imu.stamps_ns[0]) * 1e-9)
+    t, _, w = _samples(problem, 0.0, min(max(window, 180.0), span))
+    R = np.empty((len(t), 3, 3))
+    current = Rotation.identity()
+    R[0] = np.eye(3)
+    steps = Rotation.from_rotvec((0.5 * (w[:-1] + w[1:]) - bias) * np.diff(t)[:, None])
+    for i in range(len(steps)):
+        current = current * steps[i]
+        R[i + 1] = current.as_matrix()
+    return lambda s: np.asarray(R[int(np.clip(np.searchsorted(t, s), 0, len(t) - 1))])
+
+
+def _level(
+    problem: Problem,
+    origin: int,
+    window: float,
+    still: tuple[float, float] | None,
+    turn: Callable[[float], Array],
+    track: _Track,
+) -> tuple[Array, float, str]:
+    """Roll and pitch at the start, as R (3, 3) with yaw 0; their sigma; a note."""
+    if getattr(problem.config.sensors[problem.imu.sensor], "gravity", "included") == "removed":
+        return np.eye(3), 0.1, "roll and pitch unknown (gravity removed by the driver): taken level"
+    stop = still[1] if still else min(window, 10.0)
+    t, f, _ = _samples(problem, 0.0, stop)
+    up = np.mean([turn(s) @ force for s, force in zip(t, f, strict=True)], axis=0)
+    up /= np.linalg.norm(up)
+    pitch, roll = np.arctan2(-up[0], np.hypot(up[1], up[2])), np.arctan2(up[1], up[2])
+    R = Rotation.from_euler("xyz", [roll, pitch, 0.0]).as_matrix()
+    # What a change of speed over the window does to the mean force: 2 m/s over its length.
+    sigma = 0.01 if still else float(np.clip(2.0 / STANDARD_GRAVITY_MPS2 / max(stop, 1.0), 0.02, 0.1))
+    return np.asarray(R), sigma, f"roll and pitch from {stop:.0f} s of specific force"
+
+
+def _headings(
+    problem: Problem, origin: int, track: _Track, yaws: dict[str, Array], turn: Callable[[float], Array]
+) -> tuple[tuple[float, ...], float, float, str]:
+    """Candidates for the yaw at the start, their sigma, the window that tells them apart, a note."""
+    config = problem.config.start
+    candidates: list[float] = []
+    sources = []
+    if config.heading_deg is not None:
+        candidates.append(float(yaw_from_heading_deg(config.heading_deg)))
+        sources.append("start.heading_deg")
+    for name, rows in yaws.items():
+        near = rows[rows[:, 0] <= max(config.window_s, rows[0, 0] + 5.0)]
+        at_start = wrap_angle(near[:, 1] - np.array([_turned(turn(s)) for s in near[:, 0]]))
+        centre = _circular_median(at_start)
+        candidates.append(centre)
+        sources.append(f"{name} ({len(near)} readings)")
+    window = min(config.window_s, 10.0)
+    if candidates:
+        apart = [y for i, y in enumerate(candidates) if all(abs(wrap_angle(y - o)) > 0.1 for o in candidates[:i])]
+        sigma = np.radians(20.0) if yaws else max(np.radians(config.heading_sigma_deg), 0.1)
+        return (
+            tuple(apart),
+            float(sigma),
+            max(window, config.window_s if len(apart) > 1 else 0.0),
+            ("heading from " + ", ".join(sources)),
+        )
+    moved = np.hypot(*(track.p[:, :2] - np.median(track.p[:5, :2], axis=0)).T)
+    noise = 5.0 * float(np.nanmedian(track.sigma[:, :2]))
+    far = np.flatnonzero(moved > max(_MOVED_M, noise))
+    if not len(far):
+        return (0.0,), np.pi, window, "heading unknown: no sensor tells it and the vessel does not move"
+    course = np.arange(8) * np.pi / 4.0
+    until = float(track.t[far[0]]) + 10.0
+    return (
+        tuple(wrap_angle(course)),
+        float(np.radians(60.0)),
+        until,
+        "heading from the motion alone, eight starts tried",
+    )
+
+
+def _turned(R: Array) -> float:
+    return float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def _circular_median(angles: Array) -> float:
+    centre = float(np.arctan2(np.median(np.sin(angles)), np.median(np.cos(angles))))
+    return float(wrap_angle(centre + np.median(wrap_angle(angles - centre))))
+
+
+def _position_and_velocity(
+    problem: Problem, track: _Track, still: tuple[float, float] | None
+) -> tuple[Array, Array, Array, Array]:
+    first = track.t[0]
+    near = track.t <= first + 3.0
+    near[: min(3, len(near))] = True
+    p0 = np.array([np.nanmedian(c) if np.isfinite(c).any() else 0.0 for c in track.p[near].T])
+    heights = [m.z_world_m for s in problem.streams for m in s.measurements if isinstance(m, HeightPrior)]
+    if heights:
+        p0[2] = heights[0]
+    v0 = np.zeros(3)
+    speeds = [m for s in problem.streams for m in s.measurements if isinstance(m, GnssVelocity)]
+    if speeds:
+        v0 = np.median([m.v_world_mps for m in speeds[:5]], axis=0)
+    elif still is None:
+        soon = track.t <= first + 5.0
+        soon[: min(4, len(soon))] = True
+        v0[:2] = [_slope(track.t[soon], track.p[soon, i]) for i in range(2)]
+        p0[:2] -= v0[:2] * float(np.median(track.t[near]))
+    sigma = np.full(3, 10.0) + 3.0 * np.nan_to_num(np.nanmax(track.sigma[near], axis=0), nan=5.0)
+    v_sigma = np.full(3, 0.2 if still else 3.0)
+    v_sigma[2] = 0.2 if still else 1.0
+    return p0, sigma, v0, v_sigma
+
+
+def start_pose(start: Start, yaw_rad: float) -> Any:
+    """Return the pose (gtsam.Pose3) of a candidate."""
+    R = Rotation.from_euler("z", yaw_rad).as_matrix() @ start.R_level_body
+    return gtsam.Pose3(gtsam.Rot3(R), start.p_world_m)

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The offline solver: align, grow, open the graph to everything, then decide.
+
+1. Align over a window; try each candidate heading on it and keep the cheapest.
+2. Grow: 20 s more at a time, solved with the last 5 s and a prior from what was before.
+3. Open passes over the whole run: Cauchy everywhere, so that nothing is locked out.
+4. Mixture passes: modes and weights re-chosen, first with the predicted covariance, then without it.
+5. Covariances of every state from a Bayes tree with QR.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphloc import keys
+from graphloc.build import Problem, StartPrior, build_graph, nav_state
+from graphloc.errors import SolveError
+from graphloc.frames import Array
+from graphloc.solve._align import Start, align, start_pose
+from graphloc.solve._decide import Verdict, decisions, pose_covariance, weigh
+from graphloc.solve._lm import bayes_tree, optimize
+
+_CHUNK_S, _OVERLAP_S = 20.0, 5.0
+_MAX_MIXTURE_PASSES = 6
+_SETTLED_M, _SETTLED_WEIGHT = 0.01, 0.05
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatchResult:
+    """The solved graph, before it is turned into a `Solution`."""
+
+    values: gtsam.Values
+    verdicts: dict[tuple[int, int], Verdict]
+    tree: Any
+    graph: gtsam.NonlinearFactorGraph
+    passes: int
+    iterations: int
+    converged: bool
+    notes: tuple[str, ...]
+
+
+def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> BatchResult:
+    """Solve a whole run.
+
+    Raises:
+        SolveError: it could not be started, or the linear algebra failed.
+    """
+    start = align(problem)
+    last = len(problem.timeline) - 1
+    estimate, prior, iterations = _start_window(problem, start, progress)
+    estimate, grown = _grow(problem, estimate, prior, _index_after(problem, start.window_s), progress)
+    iterations += grown
+    passes, converged = 0, False
+    verdicts: dict[tuple[int, int], Verdict] = {}
+    # Open passes: carries and anchors depend on the estimate, so build anew until it stands still.
+    for _ in range(3):
+        verdicts = weigh(problem, estimate, None, first=0, last=last, stage="open")
+        estimate, used, moved, tree, graph = _pass(problem, estimate, verdicts, prior, tree_wanted=True)
+        passes, iterations = passes + 1, iterations + used
+        progress("open passes", passes, 3)
+        if moved < 10 * _SETTLED_M:
+            break
+    # Mixture passes: the predicted covariance is added in the first only.
+    weights = np.array([v.weight for v in verdicts.values()])
+    for n in range(_MAX_MIXTURE_PASSES):
+        inflation = pose_covariance(tree) if n == 0 else None
+        verdicts = weigh(problem, estimate, inflation, first=0, last=last, stage="mixture")
+        estimate, used, moved, _, graph = _pass(problem, estimate, verdicts, prior, tree_wanted=False)
+        passes, iterations = passes + 1, iterations + used
+        fresh = np.array([v.weight for v in verdicts.values()])
+        changed = float(np.abs(fresh - weights).max(initial=0.0))
+        weights = fresh
+        progress("mixture passes", n + 1, _MAX_MIXTURE_PASSES)
+        if n > 0 and moved < _SETTLED_M and changed < _SETTLED_WEIGHT:
+            converged = True
+            break
+    if moved < 5 * _SETTLED_M:
+        converged = True
+    progress("covariances", 0, 1)
+    verdicts = weigh(problem, estimate, None, first=0, last=last, stage="mixture")
+    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
+    tree = bayes_tree(graph, guess)
+    progress("covariances", 1, 1)
+    return BatchResult(
+        values=guess,
+        verdicts=verdicts,
+        tree=tree,
+        graph=graph,
+        passes=passes,
+        iterations=iterations,
+        converged=converged,
+        notes=start.notes,
+    )
+
+
+def _pass(
+    problem: Problem,
+    estimate: gtsam.Values,
+    verdicts: dict[tuple[int, int], Verdict],
+    prior: StartPrior,
+    *,
+    tree_wanted: bool,
+) -> tuple[gtsam.Values, int, float, Any, gtsam.NonlinearFactorGraph]:
+    last = len(problem.timeline) - 1
+    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
+    solved = optimize(graph, guess, 12)
+    moved = max(
+        float(
+            np.linalg.norm(
+                solved.values.atPose3(keys.pose(k)).translation() - guess.atPose3(keys.pose(k)).translation()
+            )
+        )
+        for k in range(0, last + 1)
+    )
+    tree = bayes_tree(graph, solved.values) if tree_wanted else None
+    return solved.values, solved.iterations, moved, tree, graph
+
+
+def _index_after(problem: Problem, seconds: float) -> int:
+    stamps = problem.timeline.stamps_ns
+    return int(min(np.searchsorted(stamps, stamps[0] + int(seconds * 1e9)), len(stamps) - 1))
+
+
+def _start_prior(problem: Problem, start: Start, yaw: float) -> StartPrior:
+    pose = start_pose(start, yaw)
+    R = pose.rotation().matrix()
+    world_rotation = np.diag([start.tilt_sigma_rad, start.tilt_sigma_rad, start.yaw_sigma_rad]) ** 2
+    cov = np.zeros((6, 6))
+    cov[:3, :3] = R.T @ world_rotation @ R
+    cov[3:, 3:] = R.T @ np.diag(start.p_sigma_m**2) @ R
+    sigmas = problem.links.bias_sigmas()
+    bias_cov = np.diag(np.concatenate([sigmas[:3], start.gyro_bias_sigma_radps]) ** 2)
+    return StartPrior(
+        pose=pose,
+        pose_cov=cov,
+        velocity=start.v_world_mps,
+        velocity_cov=np.diag(start.v_sigma_mps**2),
+        bias=gtsam.imuBias.ConstantBias(np.zeros(3), start.gyro_bias_radps),
+        bias_cov=bias_cov,
+    )
+
+
+def _start_window(problem: Problem, start: Start, progress: Progress) -> tuple[gtsam.Values, StartPrior, int]:
+    """Try each candidate on the first window; keep the cheapest."""
+    until = _index_after(problem, start.window_s)
+    best: tuple[float, gtsam.Values, StartPrior] | None = None
+    iterations = 0
+    failure: SolveError | None = None
+    for n, yaw in enumerate(start.yaws_rad):
+        progress("start", n, len(start.yaws_rad))
+        prior = _start_prior(problem, start, yaw)
+        estimate = gtsam.Values()
+        estimate.insert(keys.pose(0), prior.pose)
+        estimate.insert(keys.velocity(0), prior.velocity)
+        _fill_slow(problem, estimate, 0, prior.bias, {})
+        try:
+            _extend(problem, estimate, 0, until)
+            solved, used, error = _solve_window(problem, estimate, 0, until, prior, 4)
+        except SolveError as caught:
+            failure = caught
+            continue
+        iterations += used
+        if best is None or error < best[0]:
+            best = (error, solved, prior)
+    if best is None:
+        raise failure or SolveError("the start alignment found no heading to try")
+    return best[1], best[2], iterations
+
+
+def _fill_slow(problem: Problem, values: gtsam.Values, j: int, bias: Any, slow: dict[int, Array]) -> None:
+    values.insert(keys.bias(j), bias)
+    for stream in problem.streams:
+        if stream.slow is not None:
+            values.insert(keys.slow(stream.number, j), slow.get(stream.number, np.zeros(len(stream.slow.sigma))))
+
+
+def _extend(problem: Problem, values: gtsam.Values, known: int, until: int) -> None:
+    """Dead-reckon from state `known` to `until`."""
+    for k in range(known, until):
+        j, following = (int(problem.timeline.slow_of[i]) for i in (k, k + 1))
+        bias = values.atConstantBias(keys.bias(j))
+        state = problem.preintegrated[k].predict(nav_state(values, k), bias)
+        values.insert(keys.pose(k + 1), state.pose())
+        values.insert(keys.velocity(k + 1), np.asarray(state.velocity()))
+        if following != j:
+            slow = {
+                s.number: np.atleast_1d(values.atVector(keys.slow(s.number, j)))
+                for s in problem.streams
+                if s.slow is not None
+            }
+            _fill_slow(problem, values, following, bias, slow)
+
+
+def _solve_window(
+    problem: Problem, values: gtsam.Values, first: int, last: int, prior: StartPrior, rounds: int
+) -> tuple[gtsam.Values, int, float]:
+    """Solve states first..last with open kernels; return all values, updated, iterations and error."""
+    iterations, error, merged = 0, 0.0, values
+    for _ in range(rounds):
+        verdicts = weigh(problem, merged, None, first=first, last=last, stage="open")
+        graph, guess = build_graph(problem, merged, decisions(verdicts), first, last, prior)
+        solved = optimize(graph, guess, 15)
+        iterations += solved.iterations
+        merged = _merged(problem, merged, solved.values, first, last)
+        if error and abs(error - solved.error) < 0.01 * error:
+            error = solved.error
+            break
+        error = solved.error
+    return merged, iterations, error
+
+
+def _merged(problem: Problem, old: gtsam.Values, new: gtsam.Values, first: int, last: int) -> gtsam.Values:
+    out = gtsam.Values(old)
+    for k in range(first, last + 1):
+        out.update(keys.pose(k), new.atPose3(keys.pose(k)))
+        out.update(keys.velocity(k), new.atVector(keys.velocity(k)))
+    for j in range(int(problem.timeline.slow_of[first]), int(problem.timeline.slow_of[last]) + 1):
+        out.update(keys.bias(j), new.atConstantBias(keys.bias(j)))
+        for stream in problem.streams:
+            if stream.slow is not None:
+                key = keys.slow(stream.number, j)
+                out.update(key, np.atleast_1d(new.atVector(key)))
+    return out
+
+
+def _grow(
+    problem: Problem, estimate: gtsam.Values, prior: StartPrior, known: int, progress: Progress
+) -> tuple[gtsam.Values, int]:
+    """Take the estimate of states 0..known to the end of the run, a chunk at a time."""
+    stamps, end = problem.timeline.stamps_ns, len(problem.timeline) - 1
+    iterations, first = 0, 0
+    while known < end:
+        until = int(min(np.searchsorted(stamps, stamps[known] + int(_CHUNK_S * 1e9)), end))
+        start_of_window = int(np.searchsorted(stamps, stamps[known] - int(_OVERLAP_S * 1e9)))
+        if start_of_window > first:
+            verdicts = weigh(problem, estimate, None, first=first, last=known, stage="open")
+            graph, guess = build_graph(problem, estimate, decisions(verdicts), first, known, prior)
+            prior = _prior_at(problem, bayes_tree(graph, guess), guess, start_of_window)
+            first = start_of_window
+        _extend(problem, estimate, known, until)
+        estimate, used, _ = _solve_window(problem, estimate, first, until, prior, 2)
+        iterations += used
+        known = until
+        progress("growing", known, end)
+    return estimate, iterations
+
+
+def _prior_at(problem: Problem, tree: Any, values: gtsam.Values, k: int) -> StartPrior:
+    """The marginals at state `k` as a prior; cross terms are left out, which only loosens it."""
+    j = int(problem.timeline.slow_of[k])
+    cov = {key: np.asarray(tree.marginalCovariance(key)) for key in (keys.pose(k), keys.velocity(k), keys.bias(j))}
+    slow = {}
+    for stream in problem.streams:
+        if stream.slow is not None:
+            key = keys.slow(stream.number, j)
+            slow[stream.number] = (np.atleast_1d(values.atVector(key)), np.asarray(tree.marginalCovariance(key)))
+    return StartPrior(
+        pose=values.atPose3(keys.pose(k)),
+        pose_cov=cov[keys.pose(k)],
+        velocity=values.atVector(keys.velocity(k)),
+        velocity_cov=cov[keys.velocity(k)],
+        bias=values.atConstantBias(keys.bias(j)),
+        bias_cov=cov[keys.bias(j)],
+        slow=slow,
+    )

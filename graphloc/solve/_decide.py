@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What to believe of each measurement, given an estimate: modes, weights, kernels.
+
+Sensors without hypotheses keep their kernel. Sensors with modes are weighed as a mixture: each mode has
+a density, and so has 'false'. The weight is the posterior probability that the chosen mode is right.
+While the estimate may be off, its predicted covariance is added to the measurement's, so that a
+state that has drifted through an outage does not lock the truth out; and a first stage uses Cauchy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphloc import keys
+from graphloc.build import Problem, Stream, attach
+from graphloc.config import KernelConfig
+from graphloc.frames import Array
+from graphloc.graph import Decision, Residual
+
+_CAUCHY = KernelConfig(kind="cauchy", scale=1.5)
+_REDESCENDING = ("geman_mcclure", "tukey")
+NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
+
+PoseCovariance = Callable[[int], Array]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A decision, and what it was based on.
+
+    Attributes:
+        decision: None leaves the measurement out.
+        weight: posterior probability that the mode is right (or the kernel's weight).
+        mode_probability: of the chosen mode among the modes.
+        residual: of the chosen mode.
+    """
+
+    decision: Decision | None
+    weight: float
+    mode_probability: float
+    residual: Residual
+
+
+def kernel_weight(residual: Residual, kernel: KernelConfig) -> float:
+    """Return the weight that a loss gives a residual, in [0, 1]."""
+    if kernel.kind == "none":
+        return 1.0
+    u2 = residual.nis() / kernel.scale**2
+    if kernel.kind == "huber":
+        return 1.0 if u2 <= 1.0 else 1.0 / float(np.sqrt(u2))
+    if kernel.kind == "cauchy":
+        return 1.0 / (1.0 + u2)
+    if kernel.kind == "geman_mcclure":
+        return 1.0 / (1.0 + u2) ** 2
+    return (1.0 - u2) ** 2 if u2 < 1.0 else 0.0
+
+
+def weigh(
+    problem: Problem,
+    values: gtsam.Values,
+    covariance: PoseCovariance | None,
+    *,
+    first: int,
+    last: int,
+    stage: str,
+) -> dict[tuple[int, int], Verdict]:
+    """Decide about the measurements of states first..last.
+
+    Args:
+        problem: the run. values: current estimate.
+        covariance: state -> pose covariance (6, 6) in the body tangent, added to the measurement's.
+        first: first state. last: last state, inclusive.
+        stage: 'open' (Cauchy for all; nothing can be locked out) or 'mixture'.
+    """
+    verdicts = {}
+    for stream in problem.streams:
+        for i in stream.between(first, last):
+            at = attach(problem, stream, i, values)
+            found = stream.row.residuals(stream.measurements[i], stream.config, at)
+            P = None if covariance is None else covariance(int(stream.state[i]))
+            verdicts[(stream.number, i)] = _verdict(stream, i, found, P, stage)
+    return verdicts
+
+
+def _verdict(stream: Stream, i: int, found: tuple[Residual, ...], P: Array | None, stage: str) -> Verdict:
+    false = stream.row.false_log_density
+    kernel = stream.config.kernel
+    if false is None:
+        if stage == "open" and kernel.kind in _REDESCENDING:
+            kernel = _CAUCHY
+        residual = found[0]
+        return Verdict(Decision(kernel=kernel), kernel_weight(residual, kernel), 1.0, residual)
+    logs = np.array([r.log_density(None if P is None else r.jacobian @ P @ r.jacobian.T) for r in found])
+    mode = int(np.argmax(logs))
+    among = np.exp(logs - logs.max())
+    mode_probability = float(among[mode] / among.sum())
+    residual = found[mode]
+    if stage == "open":
+        open_kernel = kernel if kernel.kind in ("huber", "cauchy") else _CAUCHY
+        return Verdict(
+            Decision(mode=mode, kernel=open_kernel), kernel_weight(residual, open_kernel), mode_probability, residual
+        )
+    nothing = false(stream.measurements[i], stream.config)
+    top = max(logs.max(), nothing)
+    weight = float(np.exp(logs[mode] - top) / (np.exp(logs - top).sum() + np.exp(nothing - top)))
+    decision = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
+    return Verdict(decision, weight, mode_probability, residual)
+
+
+def decisions(verdicts: dict[tuple[int, int], Verdict]) -> dict[tuple[int, int], Decision | None]:
+    """Return what the graph builder needs of verdicts."""
+    return {key: verdict.decision for key, verdict in verdicts.items()}
+
+
+def pose_covariance(tree: Any) -> PoseCovariance:
+    """Return state -> (6, 6) body-tangent covariance of its pose, from a Bayes tree."""
+    return lambda k: np.asarray(tree.marginalCovariance(keys.pose(k)))
