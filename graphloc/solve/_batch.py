@@ -55,8 +55,7 @@ def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> Batch
     start = align(problem)
     last = len(problem.timeline) - 1
     estimate, prior, iterations = _start_window(problem, start, progress)
-    estimate, grown = _grow(problem, estimate, prior, _index_after(problem, start.window_s), progress)
-    iterations += grown
+    iterations += _grow(problem, estimate, prior, _index_after(problem, start.window_s), progress)
     passes, converged = 0, False
     verdicts: dict[tuple[int, int], Verdict] = {}
     # Open passes: carries and anchors depend on the estimate, so build anew until it stands still.
@@ -162,13 +161,13 @@ def _start_window(problem: Problem, start: Start, progress: Progress) -> tuple[g
         _fill_slow(problem, estimate, 0, prior.bias, {})
         try:
             _extend(problem, estimate, 0, until)
-            solved, used, error = _solve_window(problem, estimate, 0, until, prior, 4)
+            used, error = _solve_window(problem, estimate, 0, until, prior, 4)
         except SolveError as caught:
             failure = caught
             continue
         iterations += used
         if best is None or error < best[0]:
-            best = (error, solved, prior)
+            best = (error, estimate, prior)
     if best is None:
         raise failure or SolveError("the start alignment found no heading to try")
     return best[1], best[2], iterations
@@ -200,40 +199,37 @@ def _extend(problem: Problem, values: gtsam.Values, known: int, until: int) -> N
 
 def _solve_window(
     problem: Problem, values: gtsam.Values, first: int, last: int, prior: StartPrior, rounds: int
-) -> tuple[gtsam.Values, int, float]:
-    """Solve states first..last with open kernels; return all values, updated, iterations and error."""
-    iterations, error, merged = 0, 0.0, values
+) -> tuple[int, float]:
+    """Solve states first..last with open kernels, in place; return iterations and final error."""
+    iterations, error = 0, 0.0
     for _ in range(rounds):
-        verdicts = weigh(problem, merged, None, first=first, last=last, stage="open")
-        graph, guess = build_graph(problem, merged, decisions(verdicts), first, last, prior)
+        verdicts = weigh(problem, values, None, first=first, last=last, stage="open")
+        graph, guess = build_graph(problem, values, decisions(verdicts), first, last, prior)
         solved = optimize(graph, guess, 15)
         iterations += solved.iterations
-        merged = _merged(problem, merged, solved.values, first, last)
-        if error and abs(error - solved.error) < 0.01 * error:
-            error = solved.error
-            break
+        _update(problem, values, solved.values, first, last)
+        settled = abs(error - solved.error) < 0.01 * error
         error = solved.error
-    return merged, iterations, error
+        if settled:
+            break
+    return iterations, error
 
 
-def _merged(problem: Problem, old: gtsam.Values, new: gtsam.Values, first: int, last: int) -> gtsam.Values:
-    out = gtsam.Values(old)
+def _update(problem: Problem, values: gtsam.Values, new: gtsam.Values, first: int, last: int) -> None:
+    """Write the states first..last of `new` into `values` (in place: a copy each would be quadratic)."""
     for k in range(first, last + 1):
-        out.update(keys.pose(k), new.atPose3(keys.pose(k)))
-        out.update(keys.velocity(k), new.atVector(keys.velocity(k)))
+        values.update(keys.pose(k), new.atPose3(keys.pose(k)))
+        values.update(keys.velocity(k), new.atVector(keys.velocity(k)))
     for j in range(int(problem.timeline.slow_of[first]), int(problem.timeline.slow_of[last]) + 1):
-        out.update(keys.bias(j), new.atConstantBias(keys.bias(j)))
+        values.update(keys.bias(j), new.atConstantBias(keys.bias(j)))
         for stream in problem.streams:
             if stream.slow is not None:
                 key = keys.slow(stream.number, j)
-                out.update(key, np.atleast_1d(new.atVector(key)))
-    return out
+                values.update(key, np.atleast_1d(new.atVector(key)))
 
 
-def _grow(
-    problem: Problem, estimate: gtsam.Values, prior: StartPrior, known: int, progress: Progress
-) -> tuple[gtsam.Values, int]:
-    """Take the estimate of states 0..known to the end of the run, a chunk at a time."""
+def _grow(problem: Problem, estimate: gtsam.Values, prior: StartPrior, known: int, progress: Progress) -> int:
+    """Take the estimate of states 0..known to the end of the run, a chunk at a time, in place."""
     stamps, end = problem.timeline.stamps_ns, len(problem.timeline) - 1
     iterations, first = 0, 0
     while known < end:
@@ -245,11 +241,11 @@ def _grow(
             prior = _prior_at(problem, bayes_tree(graph, guess), guess, start_of_window)
             first = start_of_window
         _extend(problem, estimate, known, until)
-        estimate, used, _ = _solve_window(problem, estimate, first, until, prior, 2)
+        used, _ = _solve_window(problem, estimate, first, until, prior, 2)
         iterations += used
         known = until
         progress("growing", known, end)
-    return estimate, iterations
+    return iterations
 
 
 def _prior_at(problem: Problem, tree: Any, values: gtsam.Values, k: int) -> StartPrior:

@@ -34,7 +34,7 @@ class Verdict:
     """A decision, and what it was based on.
 
     Attributes:
-        decision: None leaves the measurement out.
+        decision: None leaves the measurement out. mode: the chosen one, also then.
         weight: posterior probability that the mode is right (or the kernel's weight).
         mode_probability: of the chosen mode among the modes.
         residual: of the chosen mode.
@@ -44,6 +44,7 @@ class Verdict:
     weight: float
     mode_probability: float
     residual: Residual
+    mode: int = 0
 
 
 def kernel_weight(residual: Residual, kernel: KernelConfig) -> float:
@@ -103,13 +104,17 @@ def _verdict(stream: Stream, i: int, found: tuple[Residual, ...], P: Array | Non
     if stage == "open":
         open_kernel = kernel if kernel.kind in ("huber", "cauchy") else _CAUCHY
         return Verdict(
-            Decision(mode=mode, kernel=open_kernel), kernel_weight(residual, open_kernel), mode_probability, residual
+            Decision(mode=mode, kernel=open_kernel),
+            kernel_weight(residual, open_kernel),
+            mode_probability,
+            residual,
+            mode,
         )
     nothing = false(stream.measurements[i], stream.config)
     top = max(logs.max(), nothing)
     weight = float(np.exp(logs[mode] - top) / (np.exp(logs - top).sum() + np.exp(nothing - top)))
     decision = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
-    return Verdict(decision, weight, mode_probability, residual)
+    return Verdict(decision, weight, mode_probability, residual, mode)
 
 
 def decisions(verdicts: dict[tuple[int, int], Verdict]) -> dict[tuple[int, int], Decision | None]:

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a solved graph to a `Solution`: world-axes covariances, ledger, health."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphloc import keys
+from graphloc.build import Problem, Stream
+from graphloc.frames import Array
+from graphloc.ledger import Ledger, LedgerRow, Outcome
+from graphloc.recording import Recording
+from graphloc.solution import Health, SlowEstimate, Solution, SolveStats
+from graphloc.solve._batch import BatchResult
+from graphloc.solve._decide import Verdict
+from graphloc.trajectory import Trajectory
+
+AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
+_FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-weighted
+# Health: DNV asks for 2.5 m at 95 % in port (Digerud); beyond 25 m a pose helps nobody there.
+_GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_RAD = 2.5, 25.0, np.radians(45.0)
+_DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
+
+
+def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
+    """Return what the solver hands over."""
+    n = len(problem.timeline)
+    values, tree, slow_of = result.values, result.tree, problem.timeline.slow_of
+    poses = [values.atPose3(keys.pose(k)) for k in range(n)]
+    R = np.array([p.rotation().matrix() for p in poses])
+    bias = [values.atConstantBias(keys.bias(int(j))) for j in slow_of]
+    gyro_bias = np.array([b.gyroscope() for b in bias])
+    raw = np.array([problem.links.gyro_at(int(s)) for s in problem.timeline.stamps_ns])
+    trajectory = Trajectory(
+        stamps_ns=problem.timeline.stamps_ns,
+        p_world_m=np.array([p.translation() for p in poses]),
+        R_world_body=R,
+        v_world_mps=np.array([values.atVector(keys.velocity(k)) for k in range(n)]),
+        cov=np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k]) for k in range(n)]),
+    )
+    since = {s.name: _since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
+    health, reasons = _health(trajectory, since, result.converged)
+    return Solution(
+        datum=problem.datum,
+        trajectory=trajectory,
+        v_cov=np.array([tree.marginalCovariance(keys.velocity(k)) for k in range(n)]),
+        accel_bias_mps2=np.array([b.accelerometer() for b in bias]),
+        gyro_bias_radps=gyro_bias,
+        gyro_radps=raw - gyro_bias @ problem.R_body_imu.T,
+        health=health,
+        health_reason=reasons,
+        since_agreed_s=since,
+        slow={s.name: _slow(problem, s, result) for s in problem.streams if s.slow is not None},
+        ledger=_ledger(problem, recording, result.verdicts),
+        stats=_stats(problem, result),
+    )
+
+
+def world_covariance(cov_body: Any, R: Array) -> Array:
+    """Turn a body-tangent covariance (rotation first) into x, y, z, rotation, all about the world's axes.
+
+    Only the blocks are rotated: the full adjoint would mix yaw times distance from the datum into position.
+    """
+    turn = np.zeros((6, 6))
+    turn[:3, 3:], turn[3:, :3] = R, R
+    return np.asarray(turn @ np.asarray(cov_body) @ turn.T)
+
+
+def _slow(problem: Problem, stream: Stream, result: BatchResult) -> SlowEstimate:
+    process = stream.slow
+    assert process is not None
+    name = [keys.slow(stream.number, j) for j in range(len(problem.timeline.slow_stamps_ns))]
+    value = np.array([np.atleast_1d(result.values.atVector(key)) for key in name])
+    sigma = np.array([np.sqrt(np.diagonal(np.atleast_2d(result.tree.marginalCovariance(key)))) for key in name])
+    return SlowEstimate(
+        name=process.name,
+        unit=process.unit,
+        axes=process.axes,
+        stamps_ns=problem.timeline.slow_stamps_ns,
+        value=value * process.scale,
+        sigma=sigma * abs(process.scale),
+    )
+
+
+def _since_agreed(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int], Verdict]) -> Array:
+    agreed = np.array(
+        [m.stamp_ns for i, m in enumerate(stream.measurements) if verdicts[(stream.number, i)].weight >= AGREES],
+        dtype=np.int64,
+    )
+    stamps = problem.timeline.stamps_ns
+    if not len(agreed):
+        return np.full(len(stamps), np.inf)
+    left = np.searchsorted(agreed, stamps, side="right") - 1
+    return np.where(left >= 0, (stamps - agreed[np.maximum(left, 0)]) * 1e-9, np.inf)
+
+
+def _health(
+    trajectory: Trajectory, since: dict[str, Array], converged: bool
+) -> tuple[tuple[Health, ...], tuple[str, ...]]:
+    assert trajectory.cov is not None
+    horizontal = trajectory.cov[:, :2, :2]
+    bound = np.sqrt(chi2.ppf(0.95, 2) * np.linalg.eigvalsh(horizontal)[:, -1])
+    heading = 1.96 * np.sqrt(trajectory.cov[:, 5, 5])
+    health, reasons = [], []
+    nearest = np.min(list(since.values()), axis=0) if since else np.full(len(bound), np.inf)
+    for k in range(len(bound)):
+        silent = [name for name, s in since.items() if s[k] > _SILENT_S]
+        if bound[k] > _LOST_BOUND_M or heading[k] > _LOST_HEADING_RAD:
+            state, why = Health.LOST, f"95 % bound {bound[k]:.0f} m, heading {np.degrees(heading[k]):.0f} deg"
+        elif nearest[k] > _DEAD_RECKONING_S:
+            state, why = Health.DEAD_RECKONING, "no absolute position agrees"
+        elif bound[k] > _GOOD_BOUND_M:
+            state, why = Health.DEGRADED, f"95 % bound {bound[k]:.1f} m"
+        elif silent:
+            state, why = Health.DEGRADED, f"{', '.join(silent)} missing or not agreeing"
+        elif not converged:
+            state, why = Health.DEGRADED, "the solver did not converge"
+        else:
+            state, why = Health.GOOD, ""
+        health.append(state)
+        reasons.append(why)
+    return tuple(health), tuple(reasons)
+
+
+def _ledger(problem: Problem, recording: Recording, verdicts: dict[tuple[int, int], Verdict]) -> Ledger:
+    ledger = Ledger(recording.rows)
+    for row in problem.rejected:
+        if row.seq >= 0:
+            ledger.add(row)
+    imu_topic = recording.topics.get(problem.imu.sensor, "")
+    for seq, stamp in zip(problem.imu.seqs.tolist(), problem.imu.stamps_ns.tolist(), strict=True):
+        ledger.add(LedgerRow(seq=seq, stamp_ns=stamp, sensor=problem.imu.sensor, topic=imu_topic, outcome=Outcome.USED))
+    for stream in problem.streams:
+        for i, m in enumerate(stream.measurements):
+            if m.seq >= 0:  # synthetic measurements are configuration, not messages
+                topic = recording.topics.get(stream.name, "")
+                ledger.add(_row(stream, m.seq, m.stamp_ns, topic, verdicts[(stream.number, i)]))
+    return ledger
+
+
+def _row(stream: Stream, seq: int, stamp_ns: int, topic: str, verdict: Verdict) -> LedgerRow:
+    residual, weight = verdict.residual, verdict.weight
+    nis, dof = residual.nis(), len(residual.raw)
+    if weight >= AGREES:
+        outcome, reason = Outcome.USED, ""
+    elif stream.row.false_log_density is not None and weight < _FALSE:
+        outcome, reason = Outcome.REJECTED, "judged false: no mode agrees with the rest"
+    else:
+        outcome, reason = Outcome.DOWN_WEIGHTED, "disagrees with the rest"
+    several = stream.row.false_log_density is not None
+    return LedgerRow(
+        seq=seq,
+        stamp_ns=stamp_ns,
+        sensor=stream.name,
+        topic=topic,
+        outcome=outcome,
+        weight=weight,
+        mode=verdict.mode if several else None,
+        mode_probability=verdict.mode_probability if several else None,
+        residual_m=residual.size_m,
+        residual_deg=residual.size_deg,
+        nis=nis,
+        dof=dof,
+        reason=reason,
+    )
+
+
+def _stats(problem: Problem, result: BatchResult) -> SolveStats:
+    n, m = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
+    measured = sum(len(v.residual.raw) * v.weight for v in result.verdicts.values())
+    expected = measured + 9.0 * (n - 1) + 6.0 * (m - 1) + 15.0 - 9.0 * n - 6.0 * m
+    for stream in problem.streams:
+        if stream.slow is not None:
+            k, constant = len(stream.slow.sigma), not np.isfinite(stream.slow.time_constant_s)
+            expected += k * (m - 1) * (1 if constant else 2) + k - k * m
+    warnings = list(problem.warnings)
+    if not result.converged:
+        warnings.append("the solver did not converge: the last pass still moved states or weights")
+    cost = 2.0 * float(result.graph.error(result.values))
+    if expected > 0 and cost > 3.0 * expected:
+        warnings.append(
+            f"the cost is {cost / expected:.1f} times its expectation: noise is configured too small, or a "
+            "mount, a unit or a time offset is wrong"
+        )
+    for stream in problem.streams:
+        weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
+        share = float((weights < AGREES).mean()) if len(weights) else 0.0
+        if share > 0.5 and len(weights) > 10:
+            warnings.append(f"{stream.name}: {100 * share:.0f} % of its measurements disagree with the rest")
+    return SolveStats(
+        passes=result.passes,
+        iterations=result.iterations,
+        states=n,
+        factors=int(result.graph.size()),
+        cost=cost,
+        expected_cost=expected,
+        converged=result.converged,
+        warnings=tuple(warnings),
+    )
