@@ -31,14 +31,19 @@ _GAP_ACCEL, _GAP_GYRO = 1.0, 0.2
 class Links:
     """Preintegration of one IMU (see `graphloc.graph.InertialLink`)."""
 
-    def __init__(self, imu: ImuSeries, config: ImuConfig, t_body_imu_m: Array, R_body_imu: Array) -> None:
+    def __init__(
+        self, imu: ImuSeries, config: ImuConfig, t_body_imu_m: Array, R_body_imu: Array, noise_scale: float
+    ) -> None:
         self._stamps = imu.stamps_ns
         self._samples = np.hstack([imu.accel_mps2, imu.gyro_radps])
         self._config = config
         self._R_body_imu = R_body_imu
         self._max_gap_ns = int(config.max_gap_s * 1e9)
         mount = gtsam.Pose3(gtsam.Rot3(R_body_imu), t_body_imu_m)
-        self._params = self._make_params(config.accel_noise_mps2, config.gyro_noise_radps, mount)
+        self._noise_scale = noise_scale
+        self._params = self._make_params(
+            config.accel_noise_mps2 * noise_scale, config.gyro_noise_radps * noise_scale, mount
+        )
         self._gap_params = self._make_params(_GAP_ACCEL, _GAP_GYRO, mount)
 
     def _make_params(self, accel: float, gyro: float, mount: Any) -> Any:
@@ -92,7 +97,7 @@ class Links:
     def bias_steps(self, dt_s: float) -> Array:
         """Return sigmas (6,) of the random walk over `dt_s`."""
         c = self._config
-        return np.array([c.accel_bias_walk_mps2] * 3 + [c.gyro_bias_walk_radps] * 3) * np.sqrt(dt_s)
+        return np.array([c.accel_bias_walk_mps2] * 3 + [c.gyro_bias_walk_radps] * 3) * np.sqrt(dt_s) * self._noise_scale
 
     def bias_sigmas(self) -> Array:
         """Return turn-on sigmas (6,)."""
@@ -111,9 +116,11 @@ class ImuRow:
     kind = "imu"
     config = ImuConfig
 
-    def link(self, imu: ImuSeries, config: ImuConfig, t_body_imu_m: Array, R_body_imu: Array) -> Links:
+    def link(
+        self, imu: ImuSeries, config: ImuConfig, t_body_imu_m: Array, R_body_imu: Array, noise_scale: float = 1.0
+    ) -> Links:
         """Return the links of one IMU."""
-        return Links(imu, config, t_body_imu_m, R_body_imu)
+        return Links(imu, config, t_body_imu_m, R_body_imu, noise_scale)
 
 
 ROW = ImuRow()

@@ -164,8 +164,10 @@ class InertialRow(Protocol):
     kind: str
     config: type[SensorConfig]
 
-    def link(self, imu: ImuSeries, config: Any, t_body_imu_m: Array, R_body_imu: Array) -> InertialLink:
-        """Return the links that one IMU gives."""
+    def link(
+        self, imu: ImuSeries, config: Any, t_body_imu_m: Array, R_body_imu: Array, noise_scale: float = 1.0
+    ) -> InertialLink:
+        """Return the links that one IMU gives, its noise densities scaled."""
         ...
 
 

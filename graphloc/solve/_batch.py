@@ -26,8 +26,9 @@ from graphloc.solve._decide import Verdict, decisions, pose_covariance, weigh
 from graphloc.solve._lm import bayes_tree, optimize
 
 _CHUNK_S, _OVERLAP_S = 20.0, 5.0
-_MAX_MIXTURE_PASSES = 6
+_MAX_OPEN_PASSES, _MAX_MIXTURE_PASSES = 4, 6
 _SETTLED_M, _SETTLED_WEIGHT = 0.01, 0.05
+_WINDOW_SETTLED_M, _WINDOW_ROUNDS = 0.3, 8
 
 Progress = Callable[[str, int, int], None]
 
@@ -58,14 +59,16 @@ def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> Batch
     iterations += _grow(problem, estimate, prior, _index_after(problem, start.window_s), progress)
     passes, converged = 0, False
     verdicts: dict[tuple[int, int], Verdict] = {}
-    # Open passes: carries and anchors depend on the estimate, so build anew until it stands still.
-    for _ in range(3):
-        verdicts = weigh(problem, estimate, None, first=0, last=last, stage="open")
-        estimate, used, moved, tree, graph = _pass(problem, estimate, verdicts, prior, tree_wanted=True)
-        passes, iterations = passes + 1, iterations + used
-        progress("open passes", passes, 3)
-        if moved < 10 * _SETTLED_M:
-            break
+    # Carries and anchors depend on the estimate, so build anew until it stands still.
+    for stage in ("far", "open"):
+        for n in range(_MAX_OPEN_PASSES):
+            verdicts = weigh(problem, estimate, None, first=0, last=last, stage=stage)
+            wanted = stage == "open"
+            estimate, used, moved, tree, graph = _pass(problem, estimate, verdicts, prior, tree_wanted=wanted)
+            passes, iterations = passes + 1, iterations + used
+            progress(f"{stage} passes", n + 1, _MAX_OPEN_PASSES)
+            if moved < _WINDOW_SETTLED_M:
+                break
     # Mixture passes: the predicted covariance is added in the first only.
     weights = np.array([v.weight for v in verdicts.values()])
     for n in range(_MAX_MIXTURE_PASSES):
@@ -110,14 +113,7 @@ def _pass(
     last = len(problem.timeline) - 1
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
     solved = optimize(graph, guess, 12)
-    moved = max(
-        float(
-            np.linalg.norm(
-                solved.values.atPose3(keys.pose(k)).translation() - guess.atPose3(keys.pose(k)).translation()
-            )
-        )
-        for k in range(0, last + 1)
-    )
+    moved = _moved(guess, solved.values, 0, last)
     tree = bayes_tree(graph, solved.values) if tree_wanted else None
     return solved.values, solved.iterations, moved, tree, graph
 
@@ -161,7 +157,7 @@ def _start_window(problem: Problem, start: Start, progress: Progress) -> tuple[g
         _fill_slow(problem, estimate, 0, prior.bias, {})
         try:
             _extend(problem, estimate, 0, until)
-            used, error = _solve_window(problem, estimate, 0, until, prior, 4)
+            used, error = _solve_window(problem, estimate, 0, until, prior, _WINDOW_ROUNDS)
         except SolveError as caught:
             failure = caught
             continue
@@ -201,18 +197,24 @@ def _solve_window(
     problem: Problem, values: gtsam.Values, first: int, last: int, prior: StartPrior, rounds: int
 ) -> tuple[int, float]:
     """Solve states first..last with open kernels, in place; return iterations and final error."""
-    iterations, error = 0, 0.0
+    iterations, error, moved = 0, 0.0, np.inf
     for _ in range(rounds):
-        verdicts = weigh(problem, values, None, first=first, last=last, stage="open")
+        verdicts = weigh(problem, values, None, first=first, last=last, stage="far")
         graph, guess = build_graph(problem, values, decisions(verdicts), first, last, prior)
         solved = optimize(graph, guess, 15)
         iterations += solved.iterations
+        moved = _moved(guess, solved.values, first, last)
         _update(problem, values, solved.values, first, last)
-        settled = abs(error - solved.error) < 0.01 * error
         error = solved.error
-        if settled:
+        if moved < _WINDOW_SETTLED_M:
             break
     return iterations, error
+
+
+def _moved(old: gtsam.Values, new: gtsam.Values, first: int, last: int) -> float:
+    """How far any pose moved, m (1 rad counts as 10 m)."""
+    steps = (old.atPose3(keys.pose(k)).localCoordinates(new.atPose3(keys.pose(k))) for k in range(first, last + 1))
+    return max(float(np.linalg.norm(s[3:]) + 10.0 * np.linalg.norm(s[:3])) for s in steps)
 
 
 def _update(problem: Problem, values: gtsam.Values, new: gtsam.Values, first: int, last: int) -> None:
@@ -236,12 +238,12 @@ def _grow(problem: Problem, estimate: gtsam.Values, prior: StartPrior, known: in
         until = int(min(np.searchsorted(stamps, stamps[known] + int(_CHUNK_S * 1e9)), end))
         start_of_window = int(np.searchsorted(stamps, stamps[known] - int(_OVERLAP_S * 1e9)))
         if start_of_window > first:
-            verdicts = weigh(problem, estimate, None, first=first, last=known, stage="open")
+            verdicts = weigh(problem, estimate, None, first=first, last=known, stage="far")
             graph, guess = build_graph(problem, estimate, decisions(verdicts), first, known, prior)
             prior = _prior_at(problem, bayes_tree(graph, guess), guess, start_of_window)
             first = start_of_window
         _extend(problem, estimate, known, until)
-        used, _ = _solve_window(problem, estimate, first, until, prior, 2)
+        used, _ = _solve_window(problem, estimate, first, until, prior, _WINDOW_ROUNDS)
         iterations += used
         known = until
         progress("growing", known, end)
