@@ -8,8 +8,9 @@ factors, at the current estimate and with the current decisions. It knows sensor
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -67,7 +68,9 @@ class Problem:
     timeline: Timeline
     imu: ImuSeries
     R_body_imu: Array
+    relink: Callable[[float], InertialLink]
     links: InertialLink
+    noise_scale: float
     preintegrated: tuple[Any, ...]
     streams: tuple[Stream, ...]
     rejected: tuple[LedgerRow, ...]
@@ -94,7 +97,11 @@ def make_problem(
         raise SolveError(f"{recording.source}: no IMU data (need at least 10 samples); check sensors.imu.topic")
     imu_config = config.sensors[imu.sensor]
     t, R = mount_of(imu.sensor, imu_config, recording)
-    links = inertial.link(imu, imu_config, t, R)
+
+    def relink(noise_scale: float) -> InertialLink:
+        return inertial.link(imu, imu_config, t, R, noise_scale)
+
+    links = relink(1.0)
     start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
     inside = [m for m in recording.measurements if start <= m.stamp_ns <= stop]
     rejected = tuple(
@@ -110,9 +117,6 @@ def make_problem(
         if not start <= m.stamp_ns <= stop
     )
     timeline = make_timeline(start, stop, inside, config.timeline)
-    zero = gtsam.imuBias.ConstantBias()
-    stamps = [int(s) for s in timeline.stamps_ns]
-    preintegrated = tuple(links.integrate(a, b, zero) for a, b in zip(stamps[:-1], stamps[1:], strict=True))
     by_kind = {row.kind: row for row in rows}
     by_sensor: dict[str, list[Measurement]] = {}
     for m in inside:
@@ -121,10 +125,35 @@ def make_problem(
     for number, (name, sensor) in enumerate(config.sensors.items()):
         if sensor.kind in by_kind and sensor.enabled and name in by_sensor:
             row = by_kind[sensor.kind]
-            t, R = mount_of(name, sensor, recording)
-            streams.append(_stream(number, name, row, sensor, (t, R), by_sensor[name], timeline, links))
+            mount = mount_of(name, sensor, recording)
+            streams.append(_stream(number, name, row, sensor, mount, by_sensor[name], timeline, links))
     warnings = [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
-    return Problem(config, datum, timeline, imu, R, links, preintegrated, tuple(streams), rejected, tuple(warnings))
+    return Problem(
+        config=config,
+        datum=datum,
+        timeline=timeline,
+        imu=imu,
+        R_body_imu=R,
+        relink=relink,
+        links=links,
+        noise_scale=1.0,
+        preintegrated=_preintegrate(timeline, links),
+        streams=tuple(streams),
+        rejected=rejected,
+        warnings=tuple(warnings),
+    )
+
+
+def _preintegrate(timeline: Timeline, links: InertialLink) -> tuple[Any, ...]:
+    zero = gtsam.imuBias.ConstantBias()
+    stamps = [int(s) for s in timeline.stamps_ns]
+    return tuple(links.integrate(a, b, zero) for a, b in pairwise(stamps))
+
+
+def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
+    """Return the problem with the IMU's noise densities scaled."""
+    links = problem.relink(noise_scale)
+    return replace(problem, links=links, noise_scale=noise_scale, preintegrated=_preintegrate(problem.timeline, links))
 
 
 def _stream(

@@ -109,9 +109,9 @@ class ImuConfig(SensorConfig):
     """Unit of `angular_velocity` in the bag."""
     gravity: Literal["included", "removed"] = "included"
     """Whether `linear_acceleration` holds gravity (+g upwards at rest, the standard) or the driver removed it."""
-    accel_noise_ug_per_sqrt_hz: Positive = 1000.0
+    accel_noise_ug_per_sqrt_hz: Positive = 3000.0
     """Accelerometer white noise, ug/sqrt(Hz). The default allows for hull vibration."""
-    gyro_noise_mdps_per_sqrt_hz: Positive = 10.0
+    gyro_noise_mdps_per_sqrt_hz: Positive = 20.0
     """Gyroscope white noise, mdeg/s/sqrt(Hz)."""
     accel_bias_instability_ug: Positive = 100.0
     """In-run accelerometer bias instability, ug."""
@@ -123,6 +123,8 @@ class ImuConfig(SensorConfig):
     """Turn-on accelerometer bias, 1 sigma, mg."""
     gyro_bias_sigma_dps: Positive = 2.0
     """Turn-on gyroscope bias, 1 sigma, deg/s, before the start alignment has measured it."""
+    adapt_noise: bool = True
+    """Scale the noise up (never down, and said in the report) where the run contradicts it several times over."""
     max_gap_s: Positive = 0.5
     """A longer hole between samples is an IMU gap: no inertial link is made across it."""
     kernel: KernelConfig = KernelConfig(kind="none")

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from graphloc import keys
-from graphloc.build import Problem, StartPrior, build_graph, nav_state
+from graphloc.build import Problem, StartPrior, build_graph, nav_state, with_noise_scale
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.solve._align import Start, align, start_pose
@@ -26,7 +26,8 @@ from graphloc.solve._decide import Verdict, decisions, pose_covariance, weigh
 from graphloc.solve._lm import bayes_tree, optimize
 
 _CHUNK_S, _OVERLAP_S = 20.0, 5.0
-_MAX_OPEN_PASSES, _MAX_MIXTURE_PASSES = 4, 6
+_MAX_OPEN_PASSES, _MAX_MIXTURE_PASSES, _MAX_NOISE_ROUNDS = 4, 6, 5
+_CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
 _SETTLED_M, _SETTLED_WEIGHT = 0.01, 0.05
 _WINDOW_SETTLED_M, _WINDOW_ROUNDS = 0.3, 8
 
@@ -44,6 +45,7 @@ class BatchResult:
     passes: int
     iterations: int
     converged: bool
+    noise_scale: float
     notes: tuple[str, ...]
 
 
@@ -59,16 +61,15 @@ def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> Batch
     iterations += _grow(problem, estimate, prior, _index_after(problem, start.window_s), progress)
     passes, converged = 0, False
     verdicts: dict[tuple[int, int], Verdict] = {}
-    # Carries and anchors depend on the estimate, so build anew until it stands still.
-    for stage in ("far", "open"):
-        for n in range(_MAX_OPEN_PASSES):
-            verdicts = weigh(problem, estimate, None, first=0, last=last, stage=stage)
-            wanted = stage == "open"
-            estimate, used, moved, tree, graph = _pass(problem, estimate, verdicts, prior, tree_wanted=wanted)
-            passes, iterations = passes + 1, iterations + used
-            progress(f"{stage} passes", n + 1, _MAX_OPEN_PASSES)
-            if moved < _WINDOW_SETTLED_M:
-                break
+    grown = gtsam.Values(estimate)
+    for attempt in range(_MAX_NOISE_ROUNDS):
+        estimate, verdicts, tree, graph, passed, used = _open_passes(problem, grown, prior, progress)
+        passes, iterations = passes + passed, iterations + used
+        ratio = 2.0 * float(graph.error(estimate)) / max(expected_cost(problem, verdicts), 1.0)
+        adapt = getattr(problem.config.sensors[problem.imu.sensor], "adapt_noise", False)
+        if not adapt or ratio < _CONTRADICTION or attempt == _MAX_NOISE_ROUNDS - 1:
+            break
+        problem = with_noise_scale(problem, problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0)))
     # Mixture passes: the predicted covariance is added in the first only.
     weights = np.array([v.weight for v in verdicts.values()])
     for n in range(_MAX_MIXTURE_PASSES):
@@ -98,8 +99,39 @@ def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> Batch
         passes=passes,
         iterations=iterations,
         converged=converged,
+        noise_scale=problem.noise_scale,
         notes=start.notes,
     )
+
+
+def _open_passes(
+    problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress
+) -> tuple[gtsam.Values, dict[tuple[int, int], Verdict], Any, gtsam.NonlinearFactorGraph, int, int]:
+    """Solve the whole run with gentle losses. Carries and anchors depend on the estimate: build anew until it stands."""
+    last = len(problem.timeline) - 1
+    passes = iterations = 0
+    for stage in ("far", "open"):
+        for n in range(_MAX_OPEN_PASSES):
+            verdicts = weigh(problem, estimate, None, first=0, last=last, stage=stage)
+            wanted = stage == "open"
+            estimate, used, moved, tree, graph = _pass(problem, estimate, verdicts, prior, tree_wanted=wanted)
+            passes, iterations = passes + 1, iterations + used
+            progress(f"{stage} passes", n + 1, _MAX_OPEN_PASSES)
+            if moved < _WINDOW_SETTLED_M:
+                break
+    return estimate, verdicts, tree, graph, passes, iterations
+
+
+def expected_cost(problem: Problem, verdicts: dict[tuple[int, int], Verdict]) -> float:
+    """Degrees of freedom of the weighted problem: what 2 x its cost is expected to be."""
+    n, m = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
+    expected = sum(len(v.residual.raw) * v.weight for v in verdicts.values())
+    expected += 9.0 * (n - 1) + 6.0 * (m - 1) + 15.0 - 9.0 * n - 6.0 * m
+    for stream in problem.streams:
+        if stream.slow is not None:
+            k, constant = len(stream.slow.sigma), not np.isfinite(stream.slow.time_constant_s)
+            expected += k * (m - 1) * (1 if constant else 2) + k - k * m
+    return expected
 
 
 def _pass(

@@ -14,7 +14,7 @@ from graphloc.frames import Array
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.recording import Recording
 from graphloc.solution import Health, SlowEstimate, Solution, SolveStats
-from graphloc.solve._batch import BatchResult
+from graphloc.solve._batch import BatchResult, expected_cost
 from graphloc.solve._decide import Verdict
 from graphloc.trajectory import Trajectory
 
@@ -169,16 +169,15 @@ def _row(stream: Stream, seq: int, stamp_ns: int, topic: str, verdict: Verdict) 
 
 
 def _stats(problem: Problem, result: BatchResult) -> SolveStats:
-    n, m = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
-    measured = sum(len(v.residual.raw) * v.weight for v in result.verdicts.values())
-    expected = measured + 9.0 * (n - 1) + 6.0 * (m - 1) + 15.0 - 9.0 * n - 6.0 * m
-    for stream in problem.streams:
-        if stream.slow is not None:
-            k, constant = len(stream.slow.sigma), not np.isfinite(stream.slow.time_constant_s)
-            expected += k * (m - 1) * (1 if constant else 2) + k - k * m
+    expected = expected_cost(problem, result.verdicts)
     warnings = list(problem.warnings)
     if not result.converged:
         warnings.append("the solver did not converge: the last pass still moved states or weights")
+    if result.noise_scale > 1.0:
+        warnings.append(
+            f"IMU noise scaled up {result.noise_scale:.1f} times: as configured, the IMU contradicts the other sensors; "
+            "set accel_noise_ug_per_sqrt_hz and gyro_noise_mdps_per_sqrt_hz accordingly"
+        )
     cost = 2.0 * float(result.graph.error(result.values))
     if expected > 0 and cost > 3.0 * expected:
         warnings.append(
@@ -193,7 +192,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
     return SolveStats(
         passes=result.passes,
         iterations=result.iterations,
-        states=n,
+        states=len(problem.timeline),
         factors=int(result.graph.size()),
         cost=cost,
         expected_cost=expected,
