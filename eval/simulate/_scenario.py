@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenarios, and the run that comes of one with a seed: truth, measurements, and an honest vessel.yaml."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.config import (
+    STANDARD_GRAVITY_MPS2,
+    CompassConfig,
+    DatumConfig,
+    GnssConfig,
+    HeightConfig,
+    ImuConfig,
+    MountConfig,
+    PoseConfig,
+    StartConfig,
+    VesselConfig,
+)
+from graphloc.eval.simulate._truth import Motion, Waves, make_motion
+from graphloc.eval.simulate.noise import GnssNoise, gnss_error_m
+from graphloc.frames import Array, Datum, Geodetic, heading_deg_from_yaw, wrap_angle
+from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix, PoseMode
+from graphloc.recording import Recording
+from graphloc.trajectory import Trajectory
+
+START_NS = 1_700_000_000_000_000_000
+DATUM = Geodetic(57.7, 11.7, 36.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scenario:
+    """What happens in a run. Defaults are BL's sensors and a calm harbour.
+
+    Attributes:
+        path: 'entry' (BL case 1), 'turn' (case 2), 'still' (case 3) or 'loops' (any length).
+        case: BL case whose tables the GNSS noise follows.
+        duration_s: length of the run. noise: kind of GNSS error.
+        outage_s: (start, stop) without fixes and poses, or None.
+        imu_hz, gnss_hz, compass_hz, pose_hz: rates; 0 switches a sensor off.
+        gnss_sigma_m: white noise of each axis, 1 sigma; e / sqrt(2) with BL's e = 0.3 m.
+        pose_sigma_m, pose_sigma_deg: noise of a true match. false_fraction: share of false ones.
+        false_stays: probability that a false match repeats in the next scan.
+        pose_modes: modes of each match; the false ones lie around the right one.
+        gyro_bias_radps: size of the gyro bias (random direction); accel_bias_mps2: same.
+        compass_sigma_deg: white. compass_offset_deg: constant offset of the compass.
+        compass_until_s: the compass falls silent then. start_heading_error_deg: error of the start
+            heading written to the configuration; None writes none.
+        wave_roll_deg, wave_pitch_deg, wave_heave_m: RMS of the waves' motion.
+    """
+
+    path: Literal["entry", "turn", "still", "loops"] = "entry"
+    case: int = 1
+    duration_s: float = 120.0
+    noise: GnssNoise = "drift"
+    outage_s: tuple[float, float] | None = None
+    imu_hz: float = 100.0
+    gnss_hz: float = 10.0
+    compass_hz: float = 10.0
+    pose_hz: float = 1.0
+    gnss_sigma_m: float = 0.3 / float(np.sqrt(2.0))
+    pose_sigma_m: float = 0.2
+    pose_sigma_deg: float = 0.5
+    false_fraction: float = 0.4
+    false_stays: float = 0.5
+    pose_modes: int = 1
+    gyro_noise_mdps_per_sqrt_hz: float = 8.0
+    accel_noise_ug_per_sqrt_hz: float = 300.0
+    gyro_bias_radps: float = 0.003
+    accel_bias_mps2: float = 0.03
+    compass_sigma_deg: float = 1.5 / float(np.sqrt(2.0))
+    compass_offset_deg: float = 0.0
+    compass_until_s: float = float("inf")
+    start_heading_error_deg: float | None = None
+    wave_roll_deg: float = 1.5
+    wave_pitch_deg: float = 1.0
+    wave_heave_m: float = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SimulatedRun:
+    """A run: what the sensors said, the truth, and the vessel.yaml an honest engineer would write."""
+
+    scenario: Scenario
+    seed: int
+    recording: Recording
+    truth: Trajectory
+    config: VesselConfig
+
+
+def bl_scenario(case: int, noise: GnssNoise, *, false_fraction: float = 0.4) -> Scenario:
+    """Return BL's case 1, 2 or 3 with its GNSS noise."""
+    path: Literal["entry", "turn", "still"] = ("entry", "turn", "still")[case - 1]  # type: ignore[assignment]
+    base = Scenario(path=path, case=case, noise=noise, false_fraction=false_fraction)
+    if case == 3:
+        return replace(base, duration_s=60.0, wave_roll_deg=4.0, wave_pitch_deg=2.0, wave_heave_m=0.2)
+    return base
+
+
+def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
+    """Run a scenario. Deterministic for a seed."""
+    rng = np.random.default_rng([seed, 7])
+    motion = _motion(scenario, rng)
+    datum = Datum(DATUM)
+    config, mounts = _config(scenario, motion, rng)
+    t = _times(scenario.duration_s, scenario.imu_hz)
+    imu = _imu(scenario, motion, t, mounts["imu"], rng)
+    drafts: list[Measurement] = []
+    drafts += _gnss(scenario, motion, datum, mounts["gnss"][0], rng)
+    drafts += _compass(scenario, motion, rng)
+    drafts += _poses(scenario, motion, rng)
+    drafts.sort(key=lambda m: (m.stamp_ns, m.sensor))
+    measurements = tuple(replace(m, seq=len(imu) + i) for i, m in enumerate(drafts))
+    p, R, v = motion.pose(t)
+    truth = Trajectory(stamps_ns=_stamps(t), p_world_m=p, R_world_body=R, v_world_mps=v)
+    recording = Recording(
+        source="(simulated)",
+        imu=imu,
+        measurements=measurements,
+        message_count=len(imu) + len(measurements),
+        topics={name: sensor.topic for name, sensor in config.sensors.items()},
+        truth=truth,
+        truth_datum=datum,
+    )
+    return SimulatedRun(scenario=scenario, seed=seed, recording=recording, truth=truth, config=config)
+
+
+def _times(duration_s: float, rate_hz: float) -> Array:
+    return np.arange(round(duration_s * rate_hz)) / rate_hz
+
+
+def _stamps(t: Array) -> NDArray[np.int64]:
+    return START_NS + np.rint(t * 1e9).astype(np.int64)
+
+
+def _ramp(t: Array, at: float, width: float) -> Array:
+    return np.asarray(0.5 * (1.0 + np.tanh((t - at) / width)))
+
+
+def _motion(s: Scenario, rng: np.random.Generator) -> Motion:
+    cruise = rng.uniform(2.0, 3.5)
+    wobble = Waves.jonswap(rng, 0.02, 25.0)
+    turn_at, sign = rng.uniform(0.4, 0.6) * s.duration_s, rng.choice([-1.0, 1.0])
+    zero: Callable[[Array], Array] = np.zeros_like
+    speed: Callable[[Array], Array]
+    rate: Callable[[Array], Array]
+    if s.path == "still":
+        speed, rate = (lambda t: Waves.at(wobble, t)), (lambda t: 0.3 * Waves.at(wobble, t))
+    elif s.path == "turn":
+        total, width = np.radians(rng.uniform(80.0, 110.0)), 4.0
+        speed = lambda t: cruise * (1.0 - 0.4 * _ramp(t, turn_at, 8.0))  # noqa: E731
+        rate = lambda t: total / (2.0 * width) / np.cosh((t - turn_at) / width) ** 2 + Waves.at(wobble, t)  # noqa: E731
+    elif s.path == "entry":
+        speed = lambda t: cruise * (1.0 - 0.6 * _ramp(t, 0.75 * s.duration_s, 10.0))  # noqa: E731
+        bend = np.radians(rng.uniform(15.0, 40.0))
+        rate = lambda t: sign * bend / 16.0 / np.cosh((t - turn_at) / 8.0) ** 2 + Waves.at(wobble, t)  # noqa: E731
+    else:
+        slow = Waves.jonswap(rng, 0.08, 60.0)
+        speed = lambda t: cruise * (0.75 + 0.25 * np.sin(2.0 * np.pi * t / 90.0))  # noqa: E731
+        rate = lambda t: sign * 0.05 + Waves.at(slow, t)  # noqa: E731
+    sway = Waves.jonswap(rng, 0.05, 12.0)
+    waves = (
+        Waves.jonswap(rng, np.radians(s.wave_roll_deg), 4.0),
+        Waves.jonswap(rng, np.radians(s.wave_pitch_deg), 4.5),
+        Waves.jonswap(rng, s.wave_heave_m, 5.0),
+    )
+    still = s.path == "still"
+    return make_motion(
+        s.duration_s, speed, rate, rng.uniform(-np.pi, np.pi), sway.at if not still else zero, waves, 0.03
+    )
+
+
+def _config(
+    s: Scenario, motion: Motion, rng: np.random.Generator
+) -> tuple[VesselConfig, dict[str, tuple[Array, Array]]]:
+    imu_mount = MountConfig(xyz_m=(0.5, -0.2, 1.0), rpy_deg=(2.0, -1.0, 90.0))
+    gnss_mount = MountConfig(xyz_m=(-1.5, 0.3, 2.2789))
+    start = StartConfig()
+    if s.start_heading_error_deg is not None:
+        true = float(heading_deg_from_yaw(motion.yaw(0.0)))
+        start = StartConfig(heading_deg=(true + s.start_heading_error_deg) % 360.0)
+    sensors = {
+        "imu": ImuConfig(
+            topic="/imu/data",
+            mount=imu_mount,
+            gyro_noise_mdps_per_sqrt_hz=s.gyro_noise_mdps_per_sqrt_hz,
+            accel_noise_ug_per_sqrt_hz=s.accel_noise_ug_per_sqrt_hz,
+        ),
+        "gnss": GnssConfig(topic="/gnss/fix", mount=gnss_mount),
+        "compass": CompassConfig(topic="/gnss/heading", sigma_deg=s.compass_sigma_deg),
+        "aerial": PoseConfig(topic="/aerial/pose", axes=("x", "y", "yaw")),
+        "height": HeightConfig(height_m=DATUM.height_m),
+    }
+    config = VesselConfig(
+        vessel="simulated Tiara 48",
+        datum=DatumConfig(latitude_deg=DATUM.latitude_deg, longitude_deg=DATUM.longitude_deg, height_m=DATUM.height_m),
+        sensors=sensors,
+        truth_topic="/truth",
+        start=start,
+    )
+    mounts = {
+        "imu": (imu_mount.t_body_sensor_m, imu_mount.R_body_sensor),
+        "gnss": (gnss_mount.t_body_sensor_m, np.eye(3)),
+    }
+    return config, mounts
+
+
+def _imu(s: Scenario, motion: Motion, t: Array, mount: tuple[Array, Array], rng: np.random.Generator) -> ImuSeries:
+    force, rate = motion.inertial(t, mount[0], STANDARD_GRAVITY_MPS2)
+    defaults = ImuConfig()
+    root = np.sqrt(s.imu_hz)
+
+    def bias(size: float, walk: float) -> Array:
+        direction = rng.normal(size=3)
+        steps = rng.normal(0.0, walk / root, (len(t), 3))
+        return size * direction / np.linalg.norm(direction) + np.cumsum(steps, axis=0)
+
+    gyro_noise = np.radians(s.gyro_noise_mdps_per_sqrt_hz * 1e-3) * root
+    accel_noise = s.accel_noise_ug_per_sqrt_hz * 1e-6 * STANDARD_GRAVITY_MPS2 * root
+    gyro = rate @ mount[1] + bias(s.gyro_bias_radps, defaults.gyro_bias_walk_radps)
+    accel = force @ mount[1] + bias(s.accel_bias_mps2, defaults.accel_bias_walk_mps2)
+    return ImuSeries(
+        sensor="imu",
+        stamps_ns=_stamps(t),
+        accel_mps2=accel + rng.normal(0.0, accel_noise, (len(t), 3)),
+        gyro_radps=gyro + rng.normal(0.0, gyro_noise, (len(t), 3)),
+        seqs=np.arange(len(t)),
+    )
+
+
+def _silent(s: Scenario, t: Array) -> NDArray[np.bool_]:
+    if s.outage_s is None:
+        return np.zeros(len(t), dtype=bool)
+    return np.asarray((t >= s.outage_s[0]) & (t < s.outage_s[1]))
+
+
+def _gnss(s: Scenario, motion: Motion, datum: Datum, lever: Array, rng: np.random.Generator) -> list[Measurement]:
+    if s.gnss_hz == 0.0:
+        return []
+    t = _times(s.duration_s - 0.05, s.gnss_hz) + 0.013  # not in step with the IMU
+    p, R, _ = motion.pose(t)
+    fixes = p + R @ lever + gnss_error_m(rng, t, s.noise, s.case, s.gnss_sigma_m)
+    geodetic = datum.geodetic_from_enu(fixes)
+    cov = np.diag([s.gnss_sigma_m**2, s.gnss_sigma_m**2, (2.0 * s.gnss_sigma_m) ** 2])
+    return [
+        GnssPosition(stamp_ns=int(n), sensor="gnss", seq=0, position=Geodetic(*g), cov_enu_m2=cov)
+        for n, g, silent in zip(_stamps(t), geodetic, _silent(s, t), strict=True)
+        if not silent
+    ]
+
+
+def _compass(s: Scenario, motion: Motion, rng: np.random.Generator) -> list[Measurement]:
+    if s.compass_hz == 0.0:
+        return []
+    t = _times(s.duration_s - 0.05, s.compass_hz) + 0.013
+    sigma = np.radians(s.compass_sigma_deg)
+    _, R, _ = motion.pose(t)
+    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0]) + np.radians(s.compass_offset_deg) + rng.normal(0.0, sigma, len(t))
+    return [
+        CompassHeading(stamp_ns=int(n), sensor="compass", seq=0, yaw_rad=float(wrap_angle(y)), sigma_rad=sigma)
+        for n, y, at in zip(_stamps(t), yaw, t, strict=True)
+        if at < s.compass_until_s
+    ]
+
+
+def _poses(s: Scenario, motion: Motion, rng: np.random.Generator) -> list[Measurement]:
+    """Matches of the body pose; the false ones lie in BL's window, 1.5 to 5 m and up to 5 deg away."""
+    if s.pose_hz == 0.0:
+        return []
+    t = _times(s.duration_s - 0.5, s.pose_hz) + 0.437
+    p, R, _ = motion.pose(t)
+    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    sigmas = np.array([s.pose_sigma_m, s.pose_sigma_m, np.radians(s.pose_sigma_deg)])
+    false = rng.uniform(size=len(t)) < s.false_fraction
+    offset = np.zeros(3)
+    out: list[Measurement] = []
+    for i, (n, silent) in enumerate(zip(_stamps(t), _silent(s, t), strict=True)):
+        repeats = i > 0 and false[i - 1] and rng.uniform() < s.false_stays
+        fresh = _false_offset(rng)
+        offset = offset if repeats else fresh
+        right = np.array([*p[i, :2], yaw[i]]) + rng.normal(0.0, sigmas)
+        around = [_false_offset(rng) for _ in range(s.pose_modes - 1)]
+        centre = right + (offset if false[i] else 0.0)
+        values = [centre, *(right + o for o in around)]
+        order = rng.permutation(len(values))
+        modes = tuple(
+            PoseMode(
+                value=[values[k][0], values[k][1], float(wrap_angle(values[k][2]))],
+                cov=np.diag(sigmas**2),
+                probability=1.0 / len(values),
+            )
+            for k in order
+        )
+        if not silent:
+            out.append(PoseFix(stamp_ns=int(n), sensor="aerial", seq=0, axes=("x", "y", "yaw"), modes=modes))
+    return out
+
+
+def _false_offset(rng: np.random.Generator) -> Array:
+    size, angle = rng.uniform(1.5, 5.0), rng.uniform(0.0, 2.0 * np.pi)
+    return np.array([size * np.cos(angle), size * np.sin(angle), np.radians(rng.uniform(-5.0, 5.0))])

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The true motion: a planar path from speed and yaw-rate profiles, with waves and lean on top.
+
+Velocity is a spline, position its integral and acceleration its derivative; attitude is analytic. So
+truth and inertial data agree to the accuracy of the arithmetic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline, PPoly
+from scipy.spatial.transform import Rotation
+
+from graphloc.frames import Array
+
+_STEP_S = 0.02  # knots of the velocity spline
+
+
+@dataclass(frozen=True, slots=True)
+class Waves:
+    """Sums of sinusoids: amplitude (K,), angular frequency (K,), phase (K,)."""
+
+    amplitude: Array
+    omega: Array
+    phase: Array
+
+    def at(self, t: Array, derivative: int = 0) -> Array:
+        """Return the sum (N,) at t (N,), or its derivative."""
+        angle = np.outer(t, self.omega) + self.phase + derivative * np.pi / 2.0
+        return np.asarray(np.sin(angle) @ (self.amplitude * self.omega**derivative))
+
+    @staticmethod
+    def jonswap(rng: np.random.Generator, rms: float, peak_s: float, count: int = 12) -> Waves:
+        """Draw waves whose sum has a standard deviation `rms`, spectrum JONSWAP (gamma 3.3), peak period in s."""
+        peak = 2.0 * np.pi / peak_s
+        omega = peak * np.sort(rng.uniform(0.6, 2.2, count))
+        width = np.where(omega <= peak, 0.07, 0.09)
+        bump = 3.3 ** np.exp(-((omega / peak - 1.0) ** 2) / (2.0 * width**2))
+        power = omega**-5.0 * np.exp(-1.25 * (peak / omega) ** 4) * bump
+        amplitude = np.sqrt(power / power.sum()) * rms * np.sqrt(2.0)
+        return Waves(amplitude, omega, rng.uniform(0.0, 2.0 * np.pi, count))
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """The true motion as functions of t (s): see `state`."""
+
+    velocity: CubicSpline
+    position: PPoly
+    yaw: PPoly
+    yaw_rate: CubicSpline
+    roll: Waves
+    pitch: Waves
+    heave: Waves
+    lean_per_mps2: float
+    speed: CubicSpline
+
+    def attitude(self, t: Array) -> tuple[Array, Array]:
+        """Return rpy (N, 3) and their rates (N, 3), rad and rad/s."""
+        lean = -self.lean_per_mps2 * self.speed(t) * self.yaw_rate(t)
+        lean_rate = -self.lean_per_mps2 * (self.speed(t, 1) * self.yaw_rate(t) + self.speed(t) * self.yaw_rate(t, 1))
+        rpy = np.column_stack([self.roll.at(t) + lean, self.pitch.at(t), self.yaw(t)])
+        rates = np.column_stack([self.roll.at(t, 1) + lean_rate, self.pitch.at(t, 1), self.yaw_rate(t)])
+        return rpy, rates
+
+    def pose(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return p (N, 3) m, R (N, 3, 3) and v (N, 3) m/s of body in world."""
+        rpy, _ = self.attitude(t)
+        p = np.column_stack([self.position(t), self.heave.at(t)])
+        v = np.column_stack([self.velocity(t), self.heave.at(t, 1)])
+        return p, Rotation.from_euler("xyz", rpy).as_matrix(), v
+
+    def body_rate(self, t: Array) -> Array:
+        """Return the angular rate (N, 3) in body axes, rad/s."""
+        rpy, d = self.attitude(t)
+        sr, cr = np.sin(rpy[:, 0]), np.cos(rpy[:, 0])
+        sp, cp = np.sin(rpy[:, 1]), np.cos(rpy[:, 1])
+        return np.column_stack(
+            [d[:, 0] - d[:, 2] * sp, d[:, 1] * cr + d[:, 2] * sr * cp, -d[:, 1] * sr + d[:, 2] * cr * cp]
+        )
+
+    def inertial(self, t: Array, lever_m: Array, gravity_mps2: float) -> tuple[Array, Array]:
+        """Return specific force at `lever_m` and rate, (N, 3) each, in body axes."""
+        _, R, _ = self.pose(t)
+        a = np.column_stack([self.velocity(t, 1), self.heave.at(t, 2)])
+        a[:, 2] += gravity_mps2
+        w = self.body_rate(t)
+        alpha = (self.body_rate(t + 1e-4) - self.body_rate(t - 1e-4)) / 2e-4
+        at_lever = np.cross(alpha, lever_m) + np.cross(w, np.cross(w, lever_m))
+        return np.einsum("nji,nj->ni", R, a) + at_lever, w
+
+
+def make_motion(
+    duration_s: float,
+    speed_mps: Callable[[Array], Array],
+    yaw_rate_radps: Callable[[Array], Array],
+    yaw0_rad: float,
+    sway_mps: Callable[[Array], Array],
+    waves: tuple[Waves, Waves, Waves],
+    lean_per_mps2: float,
+) -> Motion:
+    """Build the motion from profiles over [0, duration]."""
+    t = np.arange(-1.0, duration_s + 1.0 + _STEP_S, _STEP_S)
+    yaw_rate = CubicSpline(t, yaw_rate_radps(t))
+    whole = yaw_rate.antiderivative()
+    offset = yaw0_rad - float(whole(0.0))
+    yaw = PPoly(whole.c.copy(), whole.x)
+    yaw.c[-1] += offset
+    psi, surge, sway = yaw(t), speed_mps(t), sway_mps(t)
+    v = np.column_stack([surge * np.cos(psi) - sway * np.sin(psi), surge * np.sin(psi) + sway * np.cos(psi)])
+    velocity = CubicSpline(t, v)
+    position = velocity.antiderivative()
+    position.c[-1] -= position(0.0)
+    return Motion(velocity, position, yaw, yaw_rate, waves[0], waves[1], waves[2], lean_per_mps2, CubicSpline(t, surge))

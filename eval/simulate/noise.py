@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""GNSS errors as in BL section 3.1.5: white noise, a gradual drift, a sudden constant jump."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from graphloc.frames import Array
+
+GnssNoise = Literal["clean", "drift", "jump", "drift_jump"]
+
+# BL tables 4.1 and 4.2, per case: RMSE of the drifting signal; RMSE and max of the jumping one, m.
+BL_DRIFT_RMSE_M = {1: 1.3567, 2: 1.3658, 3: 1.2847}
+BL_JUMP_RMSE_M = {1: 2.4596, 2: 2.4428, 3: 3.6406}
+BL_JUMP_MAX_M = {1: 14.5443, 2: 14.5115, 3: 9.9748}
+_QUIET_DRIFT = 0.5  # 'a slight reduction of noise' beside the jump
+
+
+def drift_m(rng: np.random.Generator, t: Array, rmse_m: float) -> Array:
+    """Draw a horizontal drift (N, 2): it grows, levels out near 1.25 x its RMSE, and turns slowly."""
+    span = float(np.ptp(t)) or 1.0
+    size = 1.0 - np.exp(-(t - t[0]) / (span * rng.uniform(0.08, 0.2)))
+    size = size + 0.08 * np.sin(2.0 * np.pi * (t - t[0]) / (span * rng.uniform(0.4, 0.8)) + rng.uniform(0, 6.28))
+    angle = rng.uniform(0.0, 2.0 * np.pi) + rng.uniform(-0.8, 0.8) * (t - t[0]) / span
+    curve = size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(curve * rmse_m / np.sqrt((curve**2).sum(axis=1).mean()))
+
+
+def gnss_error_m(rng: np.random.Generator, t: Array, kind: GnssNoise, case: int, white_sigma_m: float) -> Array:
+    """Return the error (N, 3) of fixes at t (N,), white noise included; height drifts along at 1.5 times."""
+    error = rng.normal(0.0, white_sigma_m, (len(t), 3)) * np.array([1.0, 1.0, 2.0])
+    if kind == "clean":
+        return error
+    white = np.sqrt(2.0) * white_sigma_m
+    scale = _QUIET_DRIFT if kind == "jump" else 1.0
+    size = scale * float(np.sqrt(max(BL_DRIFT_RMSE_M[case] ** 2 - white**2, 0.01)))
+    drift = drift_m(rng, t, size)
+    error[:, :2] += drift
+    error[:, 2] += 1.5 * drift[:, 0]
+    if kind in ("jump", "drift_jump"):
+        base = float((error[:, :2] ** 2).sum(axis=1).mean())
+        height = BL_JUMP_MAX_M[case] - size - 2.0 * white
+        share = (BL_JUMP_RMSE_M[case] ** 2 - base) / height**2
+        if kind == "drift_jump":
+            share = 0.04
+        length = share * float(np.ptp(t))
+        start = t[0] + rng.uniform(0.3, 0.7) * (float(np.ptp(t)) - length)
+        during = (t >= start) & (t < start + length)
+        direction = rng.uniform(0.0, 2.0 * np.pi)
+        error[during, :2] += height * np.array([np.cos(direction), np.sin(direction)])
+    return error
