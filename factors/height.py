@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Height prior: a vessel floats.
 
-    z = (p)_up + w,   w ~ N(0, s^2)
+    z = (p + R l)_up + w,   w ~ N(0, s^2)
 
-p: body in world. A native `GPSFactor` whose horizontal sigmas are 1 km wide.
+p, R: state in world; l: body origin from it. A native `GPSFactorArm` whose horizontal sigmas are 1 km wide.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ _WIDE_M = 1e3
 
 def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual predicted - expected (1,) in m."""
-    raw = np.array([at.T_world_body.translation()[2] - m.z_world_m])
-    jacobian = np.concatenate([np.zeros(3), at.T_world_body.rotation().matrix()[2]])[None, :]
+    lever = np.asarray(at.T_state_sensor.translation())
+    up = at.T_world_body.rotation().matrix()[2]
+    raw = np.array([at.T_world_body.transformFrom(lever)[2] - m.z_world_m])
+    jacobian = np.concatenate([np.cross(lever, up), up])[None, :]
     return (
         Residual(
             raw=raw,
@@ -42,14 +44,15 @@ def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Deci
     """Return the factor of one height."""
     sigmas = np.array([_WIDE_M, _WIDE_M, m.sigma_m / np.sqrt(decision.weight)])
     model = robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas), decision.kernel)
-    target = np.array(at.T_world_body.translation())
+    lever = np.asarray(at.T_state_sensor.translation())
+    target = np.array(at.T_world_body.transformFrom(lever))
     target[2] = m.z_world_m
-    return GraphUpdate(factors=(gtsam.GPSFactor(at.pose_key, target, model),))
+    return GraphUpdate(factors=(gtsam.GPSFactorArm(at.pose_key, target, lever, model),))
 
 
 def ideal(at: Attachment, config: HeightConfig) -> HeightPrior:
     """Return the height that the attachment's estimate would give."""
-    z = float(at.T_world_body.translation()[2])
+    z = float(at.T_world_body.transformFrom(at.T_state_sensor.translation())[2])
     return HeightPrior(stamp_ns=0, sensor="height", seq=0, z_world_m=z, sigma_m=config.sigma_m)
 
 

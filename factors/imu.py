@@ -8,7 +8,9 @@ state of its own at the slow period, held between its nodes, with a random walk 
 (docs/decisions): at 1 s that walk is far below the noise of a sample. Samples are interpolated at
 the interval's ends and averaged between stamps (trapezoid). In a hole of the data the last motion is
 held with noise that lets a vessel do anything a vessel does. Gravity removed by the driver: the same
-integral with g = 0. Not handled: coning faster than the sample rate.
+integral with g = 0. The states stand at the IMU (see `graphloc.build`), so there is no lever arm here:
+`setBodyPSensor` would leave out the Euler term (angular acceleration x lever), 0.07 m/s^2 in harbour
+waves at 1 m, which lost whole runs. Not handled: coning faster than the sample rate.
 """
 
 from __future__ import annotations
@@ -31,15 +33,13 @@ _GAP_ACCEL, _GAP_GYRO = 1.0, 0.2
 class Links:
     """Preintegration of one IMU (see `graphloc.graph.InertialLink`)."""
 
-    def __init__(
-        self, imu: ImuSeries, config: ImuConfig, t_body_imu_m: Array, R_body_imu: Array, noise_scale: float
-    ) -> None:
+    def __init__(self, imu: ImuSeries, config: ImuConfig, R_body_imu: Array, noise_scale: float) -> None:
         self._stamps = imu.stamps_ns
         self._samples = np.hstack([imu.accel_mps2, imu.gyro_radps])
         self._config = config
         self._R_body_imu = R_body_imu
         self._max_gap_ns = int(config.max_gap_s * 1e9)
-        mount = gtsam.Pose3(gtsam.Rot3(R_body_imu), t_body_imu_m)
+        mount = gtsam.Pose3(gtsam.Rot3(R_body_imu), np.zeros(3))
         self._noise_scale = noise_scale
         self._params = self._make_params(
             config.accel_noise_mps2 * noise_scale, config.gyro_noise_radps * noise_scale, mount
@@ -116,11 +116,9 @@ class ImuRow:
     kind = "imu"
     config = ImuConfig
 
-    def link(
-        self, imu: ImuSeries, config: ImuConfig, t_body_imu_m: Array, R_body_imu: Array, noise_scale: float = 1.0
-    ) -> Links:
+    def link(self, imu: ImuSeries, config: ImuConfig, R_body_imu: Array, noise_scale: float = 1.0) -> Links:
         """Return the links of one IMU."""
-        return Links(imu, config, t_body_imu_m, R_body_imu, noise_scale)
+        return Links(imu, config, R_body_imu, noise_scale)
 
 
 ROW = ImuRow()

@@ -4,6 +4,10 @@
 A `Problem` holds what does not change while solving: timeline, preintegrated links, and per sensor a
 `Stream` of measurements with the state that each attaches to. `build_graph` turns a stretch of it into
 factors, at the current estimate and with the current decisions. It knows sensors only as rows.
+
+The states stand where the IMU stands, with the axes of the body: inertial data then need no lever arm,
+whose Euler term GTSAM's preintegration leaves out. Every other mount is taken from there, and the
+solution is moved to the body's origin at the end (`graphloc.solve`).
 """
 
 from __future__ import annotations
@@ -38,7 +42,7 @@ class Stream:
     Attributes:
         number: of the sensor, for keys. name, row, config: the sensor.
         slow: its slow state, or None. slow_model: its Jump kernel where steps may jump.
-        mount: T_body_sensor.
+        mount: pose of the sensor from the IMU's place, body axes.
         measurements: M of them by stamp. state: (M,) nearest state. carry: per measurement the
             preintegrated motion from the state before it, or None where it stands on a state.
     """
@@ -67,6 +71,7 @@ class Problem:
     datum: Datum
     timeline: Timeline
     imu: ImuSeries
+    t_body_imu_m: Array
     R_body_imu: Array
     relink: Callable[[float], InertialLink]
     links: InertialLink
@@ -96,10 +101,10 @@ def make_problem(
     if imu is None or len(imu) < 10:
         raise SolveError(f"{recording.source}: no IMU data (need at least 10 samples); check sensors.imu.topic")
     imu_config = config.sensors[imu.sensor]
-    t, R = mount_of(imu.sensor, imu_config, recording)
+    t_body_imu, R = mount_of(imu.sensor, imu_config, recording)
 
     def relink(noise_scale: float) -> InertialLink:
-        return inertial.link(imu, imu_config, t, R, noise_scale)
+        return inertial.link(imu, imu_config, R, noise_scale)
 
     links = relink(1.0)
     start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
@@ -125,7 +130,8 @@ def make_problem(
     for number, (name, sensor) in enumerate(config.sensors.items()):
         if sensor.kind in by_kind and sensor.enabled and name in by_sensor:
             row = by_kind[sensor.kind]
-            mount = mount_of(name, sensor, recording)
+            t, R_mount = mount_of(name, sensor, recording)
+            mount = (t - t_body_imu, R_mount)
             streams.append(_stream(number, name, row, sensor, mount, by_sensor[name], timeline, links))
     warnings = [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
     return Problem(
@@ -133,6 +139,7 @@ def make_problem(
         datum=datum,
         timeline=timeline,
         imu=imu,
+        t_body_imu_m=t_body_imu,
         R_body_imu=R,
         relink=relink,
         links=links,
@@ -173,14 +180,14 @@ def _stream(
         state.append(timeline.nearest(m.stamp_ns))
         at = int(timeline.stamps_ns[floor])
         carry.append(None if m.stamp_ns <= at else (floor, links.integrate(at, m.stamp_ns, zero)))
-    T_body_sensor = gtsam.Pose3(gtsam.Rot3(mount[1]), mount[0])
+    T_state_sensor = gtsam.Pose3(gtsam.Rot3(mount[1]), mount[0])
     return Stream(
         number,
         name,
         row,
         config,
         row.slow(config),
-        T_body_sensor,
+        T_state_sensor,
         tuple(measurements),
         np.array(state, dtype=np.int64),
         tuple(carry),

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import gtsam
 import numpy as np
 
 from graphloc.config import KernelConfig, SensorConfig
@@ -42,11 +41,11 @@ class Attachment:
         pose_key, velocity_key: keys of the state.
         slow_key: key of the sensor's slow state, or None.
         leaf_keys: two keys that belong to this measurement alone.
-        T_world_body: estimate of the body at the state. v_world_mps: of its velocity (3,).
+        T_world_body: estimate at the state: body axes, origin at the IMU (see `graphloc.build`). v_world_mps: of its velocity (3,).
         T_state_sensor: see above (gtsam.Pose3).
         dv_world_mps: (3,) what velocity gains from the state to the measurement.
         gyro_radps: (3,) body rate at the measurement, body axes, bias removed.
-        lever_m: (3,) sensor origin in body.
+        lever_m: (3,) sensor origin from the IMU, body axes.
         slow_value: estimate of the slow state, or None.
         datum: origin of world.
     """
@@ -164,9 +163,7 @@ class InertialRow(Protocol):
     kind: str
     config: type[SensorConfig]
 
-    def link(
-        self, imu: ImuSeries, config: Any, t_body_imu_m: Array, R_body_imu: Array, noise_scale: float = 1.0
-    ) -> InertialLink:
+    def link(self, imu: ImuSeries, config: Any, R_body_imu: Array, noise_scale: float = 1.0) -> InertialLink:
         """Return the links that one IMU gives, its noise densities scaled."""
         ...
 

@@ -34,12 +34,16 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     bias = [values.atConstantBias(keys.bias(int(j))) for j in slow_of]
     gyro_bias = np.array([b.gyroscope() for b in bias])
     raw = np.array([problem.links.gyro_at(int(s)) for s in problem.timeline.stamps_ns])
+    gyro = raw - gyro_bias @ problem.R_body_imu.T
+    # From the IMU's place to the body's origin.
+    lever = -problem.t_body_imu_m
     trajectory = Trajectory(
         stamps_ns=problem.timeline.stamps_ns,
-        p_world_m=np.array([p.translation() for p in poses]),
+        p_world_m=np.array([p.transformFrom(lever) for p in poses]),
         R_world_body=R,
-        v_world_mps=np.array([values.atVector(keys.velocity(k)) for k in range(n)]),
-        cov=np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k]) for k in range(n)]),
+        v_world_mps=np.array([values.atVector(keys.velocity(k)) for k in range(n)])
+        + np.einsum("nij,nj->ni", R, np.cross(gyro, lever)),
+        cov=np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k], lever) for k in range(n)]),
     )
     since = {s.name: _since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     health, reasons = _health(trajectory, since, result.converged)
@@ -49,7 +53,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         v_cov=np.array([tree.marginalCovariance(keys.velocity(k)) for k in range(n)]),
         accel_bias_mps2=np.array([b.accelerometer() for b in bias]),
         gyro_bias_radps=gyro_bias,
-        gyro_radps=raw - gyro_bias @ problem.R_body_imu.T,
+        gyro_radps=gyro,
         health=health,
         health_reason=reasons,
         since_agreed_s=since,
@@ -59,12 +63,15 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     )
 
 
-def world_covariance(cov_body: Any, R: Array) -> Array:
+def world_covariance(cov_body: Any, R: Array, lever_m: Array) -> Array:
     """Turn a body-tangent covariance (rotation first) into x, y, z, rotation, all about the world's axes.
 
-    Only the blocks are rotated: the full adjoint would mix yaw times distance from the datum into position.
+    For the point `lever_m` (body axes) from the state. Only the blocks are rotated: the full adjoint
+    would mix yaw times distance from the datum into position.
     """
+    x, y, z = lever_m
     turn = np.zeros((6, 6))
+    turn[:3, :3] = -R @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     turn[:3, 3:], turn[3:, :3] = R, R
     return np.asarray(turn @ np.asarray(cov_body) @ turn.T)
 

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded bags as one stream of raw messages: ROS 1, ROS 2 sqlite3 and MCAP, split and compressed.
+
+This stands on the readers of rosbags and not on its `AnyReader`, because that one registers every
+type of the bag (one bad definition on a topic nobody asked for makes the whole bag unreadable), and
+because a folder whose metadata or last file is damaged can still be read file by file.
+"""
+
+from __future__ import annotations
+
+import heapq
+import logging
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+from graphloc.errors import InputError
+from graphloc.frontends._recover import Recovered, recover
+
+log = logging.getLogger(__name__)
+HINTS = {
+    ".bag": "try `rosbag reindex`",
+    ".mcap": "try `mcap recover`",
+    ".db3": "try `sqlite3 FILE .recover` and `ros2 bag reindex`",
+    "": "try `ros2 bag reindex`",
+}
+
+
+class RawMessage(NamedTuple):
+    """A message as recorded: nothing is decoded yet."""
+
+    topic: str
+    msgtype: str
+    file: str
+    log_ns: int
+    data: bytes
+
+
+class TopicSummary(NamedTuple):
+    """What the bag's index says about a topic."""
+
+    topic: str
+    msgtypes: tuple[str, ...]
+    count: int
+
+
+class _Opened(NamedTuple):
+    path: Path
+    reader: Reader1 | Reader2
+
+
+def as_paths(paths: Path | str | Sequence[Path | str]) -> tuple[Path, ...]:
+    """Return one path or several as a tuple."""
+    return (Path(paths),) if isinstance(paths, str | Path) else tuple(Path(p) for p in paths)
+
+
+class Bag:
+    """An open recording. Use as a context manager.
+
+    Attributes:
+        name: its path(s), for messages.
+        warnings: what was wrong with the files; grows while messages are read.
+        ros1: whether messages are in ROS 1 serialisation.
+    """
+
+    def __init__(self, paths: Path | str | Sequence[Path | str]) -> None:
+        self.paths = as_paths(paths)
+        self.name = ", ".join(str(p) for p in self.paths)
+        self.warnings: list[str] = []
+        self._stack = ExitStack()
+        self._opened: list[_Opened] = []
+        self._broken: list[str] = []
+
+    def __enter__(self) -> Bag:
+        if not self.paths:
+            raise InputError("no bag given")
+        try:
+            for path in self.paths:
+                self._open(path)
+        except BaseException:
+            self._stack.close()
+            raise
+        if not self._opened:
+            self._stack.close()
+            raise InputError("; ".join(self._broken))
+        self.warnings.extend(self._broken)
+        self.ros1 = isinstance(self._opened[0].reader, Reader1)
+        if any(isinstance(o.reader, Reader1) != self.ros1 for o in self._opened):
+            self._stack.close()
+            raise InputError(f"{self.name}: ROS 1 and ROS 2 bags cannot be read as one run; give one kind")
+        self._store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.LATEST)
+        self._registered: set[str] = set()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def _open(self, path: Path) -> None:
+        """Open a file, or a folder, or what is readable of it."""
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
+        if path.is_dir():
+            self._open_folder(path)
+        elif path.suffix in (".bag", ".mcap", ".db3"):
+            self._try(path, Reader1 if path.suffix == ".bag" else Reader2)
+        else:
+            raise InputError(f"{path}: not a bag: expected .bag, .mcap, .db3, or the folder of a ROS 2 bag")
+
+    def _open_folder(self, path: Path) -> None:
+        if (path / "metadata.yaml").exists():
+            if self._try(path, Reader2):
+                return
+            reason = self._broken.pop()
+        else:
+            reason = f"{path}: has no metadata.yaml"
+        files = sorted(p for p in path.iterdir() if p.suffix in (".bag", ".mcap", ".db3"))
+        before = len(self._opened)
+        for file in files:
+            self._open(file)
+        if len(self._opened) > before:
+            if files[0].suffix != ".bag":
+                self.warnings.append(f"{reason}; its files were read one by one ({HINTS['']})")
+        else:
+            self._broken.append(f"{reason}; and no readable .bag, .mcap or .db3 file lies in it ({HINTS['']})")
+
+    def _try(self, path: Path, kind: type[Reader1] | type[Reader2]) -> bool:
+        """Open with rosbags; a file that is cut short is opened again as far as it is whole."""
+        try:
+            reader = kind(path)
+            reader.open()
+        except Exception as error:  # rosbags lets struct, assertion, sqlite and codec errors through
+            reason = f"{path}: cannot be read ({_text(error)})"
+            repaired = recover(path) if path.is_file() else None
+            if repaired is None or not self._try_recovered(path, kind, repaired):
+                self._broken.append(f"{reason}; {HINTS.get(path.suffix, HINTS[''])}")
+                return False
+            self.warnings.append(
+                f"{path}: damaged or cut short ({_text(error)}): read up to byte {repaired.whole_bytes} "
+                f"of {repaired.file_bytes}; {HINTS[path.suffix]} to repair it"
+            )
+            return True
+        self._stack.callback(reader.close)
+        self._opened.append(_Opened(path, reader))
+        return True
+
+    def _try_recovered(self, path: Path, kind: type[Reader1] | type[Reader2], repaired: Recovered) -> bool:
+        try:
+            reader = kind(repaired)
+            reader.open()
+        except Exception as error:
+            log.debug("%s: recovery failed: %s", path, error)
+            return False
+        self._stack.callback(reader.close)
+        self._opened.append(_Opened(path, reader))
+        return True
+
+    @property
+    def topics(self) -> dict[str, TopicSummary]:
+        """Topics by name, with their types and the number of messages that the index announces."""
+        found: dict[str, TopicSummary] = {}
+        for opened in self._opened:
+            for c in opened.reader.connections:
+                have = found.get(c.topic, TopicSummary(c.topic, (), 0))
+                types = have.msgtypes if c.msgtype in have.msgtypes else (*have.msgtypes, c.msgtype)
+                found[c.topic] = TopicSummary(c.topic, types, have.count + c.msgcount)
+        return dict(sorted(found.items()))
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Yield the raw messages of some topics in order of arrival; others are never unpacked.
+
+        A file that turns out damaged midway ends there, with a line in `warnings`.
+        """
+        streams = []
+        for opened in self._opened:
+            wanted = [c for c in opened.reader.connections if c.topic in topics]
+            if wanted:
+                streams.append(self._until_damage(opened, wanted))
+        yield from heapq.merge(*streams, key=lambda m: m.log_ns)
+
+    def _until_damage(self, opened: _Opened, wanted: list[Connection]) -> Iterator[RawMessage]:
+        read = 0
+        try:
+            for connection, log_ns, data in opened.reader.messages(wanted):
+                read += 1
+                yield RawMessage(connection.topic, connection.msgtype, opened.path.name, log_ns, data)
+        except Exception as error:
+            self.warnings.append(
+                f"{opened.path}: damaged after {read} messages ({_text(error)}): the rest was not read; "
+                f"{HINTS.get(opened.path.suffix, HINTS[''])}"
+            )
+
+    def decode(self, message: RawMessage) -> object:
+        """Return the deserialised message. Raises whatever rosbags raises on bad bytes."""
+        if message.msgtype not in self._registered:
+            self._register(message.msgtype)
+        decode = self._store.deserialize_ros1 if self.ros1 else self._store.deserialize_cdr
+        return decode(message.data, message.msgtype)
+
+    def _register(self, msgtype: str) -> None:
+        """Take the type's definition from the bag where it carries one; the standard one elsewhere."""
+        self._registered.add(msgtype)
+        for opened in self._opened:
+            for c in opened.reader.connections:
+                if c.msgtype != msgtype or c.msgdef.format == MessageDefinitionFormat.NONE:
+                    continue
+                try:
+                    if c.msgdef.format == MessageDefinitionFormat.MSG:
+                        types = get_types_from_msg(c.msgdef.data, msgtype)
+                    else:
+                        types = get_types_from_idl(c.msgdef.data)
+                    store = get_typestore(Stores.EMPTY)
+                    store.register(types)  # may contradict the standard store: checked apart first
+                    self._store.register({k: v for k, v in types.items() if k not in self._store.fielddefs})
+                except Exception as error:
+                    self.warnings.append(
+                        f"{opened.path}: definition of {msgtype} cannot be read ({_text(error)}); the standard one is used"
+                    )
+                return
+
+
+def _text(error: BaseException) -> str:
+    return " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
