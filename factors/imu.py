@@ -19,6 +19,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
@@ -90,9 +91,9 @@ class Links:
             keys.pose(k), keys.velocity(k), keys.pose(k + 1), keys.velocity(k + 1), keys.bias(j), preintegrated
         )
 
-    def gyro_at(self, stamp_ns: int) -> Array:
-        """Return the raw rate (3,) in body axes."""
-        return np.asarray(self._R_body_imu @ self._at(np.array([stamp_ns]))[0, 3:])
+    def gyro_at(self, stamps_ns: NDArray[np.int64]) -> Array:
+        """Return the raw rates (M, 3) in body axes."""
+        return np.asarray(self._at(stamps_ns)[:, 3:] @ self._R_body_imu.T)
 
     def bias_steps(self, dt_s: float) -> Array:
         """Return sigmas (6,) of the random walk over `dt_s`."""

@@ -17,9 +17,11 @@ from types import TracebackType
 from typing import NamedTuple
 
 from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.interfaces.typing import Typesdict
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from graphloc.errors import InputError
 from graphloc.frontends._recover import Recovered, recover
@@ -77,6 +79,7 @@ class Bag:
         self._stack = ExitStack()
         self._opened: list[_Opened] = []
         self._broken: list[str] = []
+        self._stores: dict[str, Typestore] = {}
 
     def __enter__(self) -> Bag:
         if not self.paths:
@@ -95,8 +98,6 @@ class Bag:
         if any(isinstance(o.reader, Reader1) != self.ros1 for o in self._opened):
             self._stack.close()
             raise InputError(f"{self.name}: ROS 1 and ROS 2 bags cannot be read as one run; give one kind")
-        self._store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.LATEST)
-        self._registered: set[str] = set()
         return self
 
     def __exit__(
@@ -200,31 +201,39 @@ class Bag:
 
     def decode(self, message: RawMessage) -> object:
         """Return the deserialised message. Raises whatever rosbags raises on bad bytes."""
-        if message.msgtype not in self._registered:
-            self._register(message.msgtype)
-        decode = self._store.deserialize_ros1 if self.ros1 else self._store.deserialize_cdr
+        if message.msgtype not in self._stores:
+            self._stores[message.msgtype] = self._store_of(message.msgtype)
+        store = self._stores[message.msgtype]
+        decode = store.deserialize_ros1 if self.ros1 else store.deserialize_cdr
         return decode(message.data, message.msgtype)
 
-    def _register(self, msgtype: str) -> None:
-        """Take the type's definition from the bag where it carries one; the standard one elsewhere."""
-        self._registered.add(msgtype)
-        for opened in self._opened:
-            for c in opened.reader.connections:
-                if c.msgtype != msgtype or c.msgdef.format == MessageDefinitionFormat.NONE:
-                    continue
-                try:
-                    if c.msgdef.format == MessageDefinitionFormat.MSG:
-                        types = get_types_from_msg(c.msgdef.data, msgtype)
-                    else:
-                        types = get_types_from_idl(c.msgdef.data)
-                    store = get_typestore(Stores.EMPTY)
-                    store.register(types)  # may contradict the standard store: checked apart first
-                    self._store.register({k: v for k, v in types.items() if k not in self._store.fielddefs})
-                except Exception as error:
-                    self.warnings.append(
-                        f"{opened.path}: definition of {msgtype} cannot be read ({_text(error)}); the standard one is used"
-                    )
-                return
+    def _store_of(self, msgtype: str) -> Typestore:
+        """Return the type's definition from the bag where it carries one; the standard one elsewhere."""
+        definitions = (c.msgdef for o in self._opened for c in o.reader.connections if c.msgtype == msgtype)
+        for definition in definitions:
+            if definition.format == MessageDefinitionFormat.NONE:
+                continue
+            parse = get_types_from_msg if definition.format == MessageDefinitionFormat.MSG else _types_from_idl
+            store = get_typestore(Stores.EMPTY)
+            try:
+                store.register(parse(definition.data, msgtype))
+                return store
+            except Exception as error:
+                self.warnings.append(
+                    f"{self.name}: its definition of {msgtype} cannot be read ({_text(error)}); the standard one is used"
+                )
+            break
+        return get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.LATEST)
+
+
+def _types_from_idl(text: str, _msgtype: str) -> Typesdict:
+    """Parse the concatenated IDL files of an MCAP schema."""
+    separator = "=" * 80 + "\n"
+    parts = text.split(separator) if text.startswith(f"{separator}IDL: ") else [text]
+    types: Typesdict = {}
+    for part in filter(None, parts):
+        types.update(get_types_from_idl(part.split("\n", 1)[1] if part.startswith("IDL: ") else part))
+    return types
 
 
 def _text(error: BaseException) -> str:

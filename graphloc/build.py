@@ -45,6 +45,7 @@ class Stream:
         mount: pose of the sensor from the IMU's place, body axes.
         measurements: M of them by stamp. state: (M,) nearest state. carry: per measurement the
             preintegrated motion from the state before it, or None where it stands on a state.
+        gyro_radps: (M, 3) raw rate at each measurement, body axes.
     """
 
     number: int
@@ -56,6 +57,7 @@ class Stream:
     measurements: tuple[Measurement, ...]
     state: NDArray[np.int64]
     carry: tuple[tuple[int, Any] | None, ...]
+    gyro_radps: Array
 
     def between(self, first: int, last: int) -> range:
         """Indices of the measurements that attach to states first..last (inclusive)."""
@@ -191,6 +193,7 @@ def _stream(
         tuple(measurements),
         np.array(state, dtype=np.int64),
         tuple(carry),
+        links.gyro_at(np.array([m.stamp_ns for m in measurements])),
     )
 
 
@@ -201,7 +204,6 @@ def nav_state(values: gtsam.Values, k: int) -> Any:
 
 def attach(problem: Problem, stream: Stream, i: int, values: gtsam.Values) -> Attachment:
     """Return how measurement `i` of a stream meets the graph at the current estimate."""
-    m = stream.measurements[i]
     k = int(stream.state[i])
     j = int(problem.timeline.slow_of[k])
     T = values.atPose3(keys.pose(k))
@@ -224,7 +226,7 @@ def attach(problem: Problem, stream: Stream, i: int, values: gtsam.Values) -> At
         v_world_mps=v,
         T_state_sensor=T_state_sensor,
         dv_world_mps=dv,
-        gyro_radps=problem.links.gyro_at(m.stamp_ns) - problem.R_body_imu @ bias.gyroscope(),
+        gyro_radps=stream.gyro_radps[i] - problem.R_body_imu @ bias.gyroscope(),
         lever_m=np.asarray(stream.mount.translation()),
         slow_value=None if slow_key is None else np.atleast_1d(values.atVector(slow_key)),
         datum=problem.datum,
@@ -244,7 +246,8 @@ class StartPrior:
     slow: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
 
 
-Decisions = Mapping[tuple[int, int], Decision | None]
+# What was decided about (stream number, measurement index), and where it attaches; None leaves it out.
+Decisions = Mapping[tuple[int, int], tuple[Decision, Attachment] | None]
 
 
 def build_graph(
@@ -255,10 +258,7 @@ def build_graph(
     last: int,
     prior: StartPrior,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Return the graph of states first..last and the values of its keys.
-
-    `decisions` maps (stream number, measurement index) to what was decided; None leaves it out.
-    """
+    """Return the graph of states first..last and the values of its keys."""
     graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
     timeline, links = problem.timeline, problem.links
     for k in range(first, last + 1):
@@ -273,12 +273,11 @@ def build_graph(
         if stream.slow is not None:
             _add_slow_chain(graph, guess, problem, stream, stream.slow, values, nodes, prior)
         for i in stream.between(first, last):
-            decision = decisions.get((stream.number, i), Decision())
-            if decision is None:
+            decided = decisions[(stream.number, i)]
+            if decided is None:
                 continue
-            update = stream.row.factors(
-                stream.measurements[i], stream.config, attach(problem, stream, i, values), decision
-            )
+            decision, at = decided
+            update = stream.row.factors(stream.measurements[i], stream.config, at, decision)
             for factor in update.factors:
                 graph.add(factor)
             for key, value in update.guesses:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphloc.config import KernelConfig, SensorConfig
 from graphloc.frames import Array, Datum
@@ -179,8 +180,8 @@ class InertialLink(Protocol):
         """Return the factor between states `k` and `k + 1` with the bias of slow node `j`."""
         ...
 
-    def gyro_at(self, stamp_ns: int) -> Array:
-        """Return the raw angular rate (3,) in body axes at a stamp."""
+    def gyro_at(self, stamps_ns: NDArray[np.int64]) -> Array:
+        """Return the raw angular rates (M, 3) in body axes at M stamps."""
         ...
 
     def bias_steps(self, dt_s: float) -> Array:

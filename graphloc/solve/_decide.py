@@ -18,10 +18,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from graphloc import keys
-from graphloc.build import Problem, Stream, attach
+from graphloc.build import Decisions, Problem, Stream, attach
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import Decision, Residual
+from graphloc.graph import Attachment, Decision, Residual
 
 # By stage, for every sensor that has a kernel at all: Huber is convex, so a start that is tens of metres
 # off still pulls in; Cauchy forgets outliers better and still lets the truth back in.
@@ -40,14 +40,15 @@ class Verdict:
         decision: None leaves the measurement out. mode: the chosen one, also then.
         weight: posterior probability that the mode is right (or the kernel's weight).
         mode_probability: of the chosen mode among the modes.
-        residual: of the chosen mode.
+        residual: of the chosen mode. at: where the measurement meets the graph.
     """
 
     decision: Decision | None
     weight: float
     mode_probability: float
     residual: Residual
-    mode: int = 0
+    mode: int
+    at: Attachment
 
 
 def kernel_weight(residual: Residual, kernel: KernelConfig) -> float:
@@ -84,14 +85,15 @@ def weigh(
     verdicts = {}
     for stream in problem.streams:
         indices = stream.between(first, last)
+        attached = [attach(problem, stream, i, values) for i in indices]
         residuals = [
-            stream.row.residuals(stream.measurements[i], stream.config, attach(problem, stream, i, values))
-            for i in indices
+            stream.row.residuals(stream.measurements[i], stream.config, at)
+            for i, at in zip(indices, attached, strict=True)
         ]
         kernel = _stage_kernel(stream.config.kernel, stage, _spread(residuals))
-        for i, found in zip(indices, residuals, strict=True):
+        for i, found, at in zip(indices, residuals, attached, strict=True):
             P = None if covariance is None else covariance(int(stream.state[i]))
-            verdicts[(stream.number, i)] = _verdict(stream, i, found, P, stage, kernel)
+            verdicts[(stream.number, i)] = _verdict(stream, i, found, P, stage, kernel, at)
     return verdicts
 
 
@@ -117,31 +119,36 @@ def _spread(residuals: list[tuple[Residual, ...]]) -> float:
 
 
 def _verdict(
-    stream: Stream, i: int, found: tuple[Residual, ...], P: Array | None, stage: str, kernel: KernelConfig
+    stream: Stream,
+    i: int,
+    found: tuple[Residual, ...],
+    P: Array | None,
+    stage: str,
+    kernel: KernelConfig,
+    at: Attachment,
 ) -> Verdict:
     false = stream.row.false_log_density
     if false is None:
         residual = found[0]
-        return Verdict(Decision(kernel=kernel), kernel_weight(residual, kernel), 1.0, residual)
+        return Verdict(Decision(kernel=kernel), kernel_weight(residual, kernel), 1.0, residual, 0, at)
     logs = np.array([r.log_density(None if P is None else r.jacobian @ P @ r.jacobian.T) for r in found])
     mode = int(np.argmax(logs))
     among = np.exp(logs - logs.max())
     mode_probability = float(among[mode] / among.sum())
     residual = found[mode]
     if stage != "mixture":
-        return Verdict(
-            Decision(mode=mode, kernel=kernel), kernel_weight(residual, kernel), mode_probability, residual, mode
-        )
+        decision = Decision(mode=mode, kernel=kernel)
+        return Verdict(decision, kernel_weight(residual, kernel), mode_probability, residual, mode, at)
     nothing = false(stream.measurements[i], stream.config)
     top = max(logs.max(), nothing)
     weight = float(np.exp(logs[mode] - top) / (np.exp(logs - top).sum() + np.exp(nothing - top)))
-    decision = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
-    return Verdict(decision, weight, mode_probability, residual, mode)
+    kept = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
+    return Verdict(kept, weight, mode_probability, residual, mode, at)
 
 
-def decisions(verdicts: dict[tuple[int, int], Verdict]) -> dict[tuple[int, int], Decision | None]:
+def decisions(verdicts: dict[tuple[int, int], Verdict]) -> Decisions:
     """Return what the graph builder needs of verdicts."""
-    return {key: verdict.decision for key, verdict in verdicts.items()}
+    return {key: None if v.decision is None else (v.decision, v.at) for key, v in verdicts.items()}
 
 
 def pose_covariance(tree: Any) -> PoseCovariance:

@@ -33,7 +33,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     R = np.array([p.rotation().matrix() for p in poses])
     bias = [values.atConstantBias(keys.bias(int(j))) for j in slow_of]
     gyro_bias = np.array([b.gyroscope() for b in bias])
-    raw = np.array([problem.links.gyro_at(int(s)) for s in problem.timeline.stamps_ns])
+    raw = problem.links.gyro_at(problem.timeline.stamps_ns)
     gyro = raw - gyro_bias @ problem.R_body_imu.T
     # From the IMU's place to the body's origin.
     lever = -problem.t_body_imu_m

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mounts from `/tf_static`: the chain of transforms from body to a sensor's frame."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from graphloc.errors import InputError
+from graphloc.frames import Array
+
+Pose = tuple[Array, Array]  # t (3,), R (3, 3): T_parent_child
+
+
+class StaticTree:
+    """Static transforms by frame, walked in both directions."""
+
+    def __init__(self) -> None:
+        self._edges: dict[str, dict[str, Pose]] = {}
+
+    def add(self, msg: Any) -> None:
+        """Take the transforms of a `tf2_msgs/TFMessage`; a later one of the same pair replaces an earlier one."""
+        for stamped in msg.transforms:
+            parent, child = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
+            t, q = stamped.transform.translation, stamped.transform.rotation
+            R = np.asarray(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix())
+            p = np.array([t.x, t.y, t.z])
+            self._edges.setdefault(parent, {})[child] = (p, R)
+            self._edges.setdefault(child, {})[parent] = (-R.T @ p, R.T)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of all frames."""
+        return tuple(sorted(self._edges))
+
+    def resolve(self, body: str, sensor: str) -> Pose | None:
+        """Return T_body_sensor along the shortest chain; None where there is no chain."""
+        body, sensor = body.lstrip("/"), sensor.lstrip("/")
+        found: dict[str, Pose] = {body: (np.zeros(3), np.eye(3))}
+        queue = deque([body])
+        while queue and sensor not in found:
+            frame = queue.popleft()
+            p, R = found[frame]
+            for child, (t, C) in self._edges.get(frame, {}).items():
+                if child not in found:
+                    found[child] = (p + R @ t, R @ C)
+                    queue.append(child)
+        return found.get(sensor)
+
+    def mount(self, body: str, sensor: str, where: str) -> Pose:
+        """Return T_body_sensor.
+
+        Raises:
+            InputError: no chain leads there; the line names the frames that exist.
+        """
+        pose = self.resolve(body, sensor)
+        if pose is None:
+            known = ", ".join(self.frames) or "none"
+            raise InputError(
+                f"{where}: no chain from '{body}' to '{sensor}' in /tf_static (frames there: {known}); "
+                "set body_frame and mount.tf_frame to such names, or give mount.xyz_m and mount.rpy_deg"
+            )
+        return pose
