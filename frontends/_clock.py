@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stamps that cannot be true: clock jumps, repeated and backward stamps, clocks in different epochs."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.time import NS_PER_S, duration_ns
+
+Stamps = NDArray[np.int64]
+JUMP_LIMIT_S = 60.0
+"""A header stamp further than this from its topic's usual latency is a clock jump."""
+HOLE_LIMIT_S = 600.0
+"""Where no sensor says anything for so long, nothing can bridge it: the run falls apart there."""
+EPOCH_LIMIT_S = 1.0
+"""Clocks of two sensors that differ by more are said to disagree."""
+
+
+def usual_latency_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
+    """Return the median of recording time minus header stamp, s."""
+    return float(np.median(logs_ns - stamps_ns)) / NS_PER_S
+
+
+def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps, limit_s: float = JUMP_LIMIT_S) -> NDArray[np.bool_]:
+    """Return (N,) whether a stamp lies further than `limit_s` from its topic's usual latency."""
+    if len(stamps_ns) == 0:
+        return np.zeros(0, dtype=bool)
+    latency_ns = logs_ns - stamps_ns
+    return np.asarray(np.abs(latency_ns - np.int64(np.median(latency_ns))) > duration_ns(limit_s))
+
+
+def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
+    """Return (N,) which readings to keep so that as many as possible remain with strictly increasing stamps.
+
+    Dropping whatever is not later than its forerunner would let one stamp that jumped ahead throw
+    away all readings until the clock has caught up; this drops the one. Patience sorting, N log N.
+    """
+    n = len(stamps_ns)
+    if n < 2 or bool((np.diff(stamps_ns) > 0).all()):
+        return np.ones(n, dtype=bool)
+    tails: list[int] = []  # smallest last stamp of an increasing run of length k + 1
+    last: list[int] = []  # its index
+    before = np.full(n, -1, dtype=np.int64)
+    for i, stamp in enumerate(stamps_ns.tolist()):
+        k = bisect_left(tails, stamp)
+        if k < len(tails) and tails[k] == stamp:
+            continue  # of repeated stamps the first arrival stays
+        before[i] = last[k - 1] if k else -1
+        if k == len(tails):
+            tails.append(stamp)
+            last.append(i)
+        else:
+            tails[k], last[k] = stamp, i
+    keep = np.zeros(n, dtype=bool)
+    i = last[-1]
+    while i >= 0:
+        keep[i] = True
+        i = int(before[i])
+    return keep
+
+
+def busiest_section(stamps_ns: Stamps, hole_s: float = HOLE_LIMIT_S) -> tuple[int, int]:
+    """Return first and last stamp of the section with most readings, sections being parted by holes."""
+    ordered = np.sort(stamps_ns)
+    cuts = np.flatnonzero(np.diff(ordered) > duration_ns(hole_s)) + 1
+    section = max(np.split(ordered, cuts), key=len)
+    return int(section[0]), int(section[-1])

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What looks wrong in a whole run: units, gravity, fixes from elsewhere. Said in a warning, never fixed in silence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.config import ImuConfig, VesselConfig
+from graphloc.frames import Array, Datum, Geodetic
+from graphloc.measurements import GnssPosition
+
+FAR_M = 100e3
+"""A fix this far from the middle of its run is not believed."""
+NEVER_STILL_RADPS = 0.5
+"""Median rate that no vessel keeps up for a whole run (29 deg/s)."""
+
+
+def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> list[str]:
+    """Return lines on units and gravity of samples (N, 3), (N, 3) as the configuration reads them."""
+    if len(accel_mps2) < 10:
+        return []
+    g = float(np.median(np.linalg.norm(accel_mps2, axis=1)))
+    rate = float(np.median(np.linalg.norm(gyro_radps, axis=1)))
+    lines = []
+    said = f"{sensor}: median acceleration is {g:.2f} m/s^2"
+    if config.gravity == "included" and not 8.5 < g < 11.5:
+        if config.accel_unit == "m/s^2" and 0.9 < g < 1.1:
+            lines.append(f"{said}: looks like g; set accel_unit: g")
+        elif config.accel_unit == "g" and 85.0 < g < 115.0:
+            lines.append(f"{said}: looks like m/s^2 already; set accel_unit: m/s^2")
+        elif g < 2.0:
+            lines.append(f"{said}: looks like gravity was removed by the driver; set gravity: removed")
+        else:
+            lines.append(f"{said}, not about 9.8: check accel_unit, and the sensor itself")
+    elif config.gravity == "removed" and g > 8.0:
+        lines.append(f"{said}: looks like gravity is included; set gravity: included")
+    if config.gyro_unit == "rad/s" and rate > NEVER_STILL_RADPS:
+        lines.append(f"{sensor}: median angular rate is {rate:.2f} rad/s: looks like deg/s; set gyro_unit: deg/s")
+    return lines
+
+
+def far_fixes(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
+    """Return (N,) whether a fix lies further than `FAR_M` from the median of all fixes."""
+    if not fixes:
+        return np.zeros(0, dtype=bool)
+    lla = np.array([f.position for f in fixes])
+    # Median longitude about the first one, so that a run across the date line stays together.
+    lon = lla[0, 1] + (lla[:, 1] - lla[0, 1] + 180.0) % 360.0 - 180.0
+    middle = Datum(Geodetic(float(np.median(lla[:, 0])), float(np.median(lon)), float(np.median(lla[:, 2]))))
+    enu = middle.enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])
+    return np.asarray(np.linalg.norm(enu, axis=1) > FAR_M)
+
+
+def gnss_warnings(sensor: str, fixes: Sequence[GnssPosition], config: VesselConfig) -> list[str]:
+    """Return a line where the fixes lie far from the configured datum; says so if swapping explains it."""
+    if config.datum is None or not fixes:
+        return []
+    datum = Datum(config.datum.geodetic)
+    lat, lon, height = (float(v) for v in np.median(np.array([f.position for f in fixes]), axis=0))
+
+    def distance_m(a: float, b: float) -> float:
+        return float(np.linalg.norm(datum.enu_from_geodetic(np.array([a]), np.array([b]), np.array([height]))))
+
+    far = distance_m(lat, lon)
+    if far < FAR_M:
+        return []
+    swapped = abs(lon) <= 90.0 and distance_m(lon, lat) < FAR_M
+    why = "latitude and longitude look swapped" if swapped else "check the datum"
+    return [f"{sensor}: the fixes lie {far / 1e3:.0f} km from the datum: {why}"]
