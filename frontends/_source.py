@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.interfaces.typing import Typesdict
@@ -50,7 +50,7 @@ class TopicSummary(NamedTuple):
 
     topic: str
     msgtypes: tuple[str, ...]
-    count: int
+    messages: int
 
 
 class _Opened(NamedTuple):
@@ -81,7 +81,7 @@ class Bag:
         self._broken: list[str] = []
         self._stores: dict[str, Typestore] = {}
 
-    def __enter__(self) -> Bag:
+    def __enter__(self) -> Self:
         if not self.paths:
             raise InputError("no bag given")
         try:
@@ -133,12 +133,12 @@ class Bag:
         else:
             self._broken.append(f"{reason}; and no readable .bag, .mcap or .db3 file lies in it ({HINTS['']})")
 
-    def _try(self, path: Path, kind: type[Reader1] | type[Reader2]) -> bool:
+    def _try(self, path: Path, kind: type[Reader1 | Reader2]) -> bool:
         """Open with rosbags; a file that is cut short is opened again as far as it is whole."""
         try:
             reader = kind(path)
             reader.open()
-        except Exception as error:  # rosbags lets struct, assertion, sqlite and codec errors through
+        except Exception as error:  # noqa: BLE001 - rosbags lets struct, assertion, sqlite and codec errors through
             reason = f"{path}: cannot be read ({_text(error)})"
             repaired = recover(path) if path.is_file() else None
             if repaired is None or not self._try_recovered(path, kind, repaired):
@@ -153,11 +153,11 @@ class Bag:
         self._opened.append(_Opened(path, reader))
         return True
 
-    def _try_recovered(self, path: Path, kind: type[Reader1] | type[Reader2], repaired: Recovered) -> bool:
+    def _try_recovered(self, path: Path, kind: type[Reader1 | Reader2], repaired: Recovered) -> bool:
         try:
             reader = kind(repaired)
             reader.open()
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - as above
             log.debug("%s: recovery failed: %s", path, error)
             return False
         self._stack.callback(reader.close)
@@ -172,7 +172,7 @@ class Bag:
             for c in opened.reader.connections:
                 have = found.get(c.topic, TopicSummary(c.topic, (), 0))
                 types = have.msgtypes if c.msgtype in have.msgtypes else (*have.msgtypes, c.msgtype)
-                found[c.topic] = TopicSummary(c.topic, types, have.count + c.msgcount)
+                found[c.topic] = TopicSummary(c.topic, types, have.messages + c.msgcount)
         return dict(sorted(found.items()))
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
@@ -193,7 +193,7 @@ class Bag:
             for connection, log_ns, data in opened.reader.messages(wanted):
                 read += 1
                 yield RawMessage(connection.topic, connection.msgtype, opened.path.name, log_ns, data)
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - as above
             self.warnings.append(
                 f"{opened.path}: damaged after {read} messages ({_text(error)}): the rest was not read; "
                 f"{HINTS.get(opened.path.suffix, HINTS[''])}"
@@ -218,7 +218,7 @@ class Bag:
             try:
                 store.register(parse(definition.data, msgtype))
                 return store
-            except Exception as error:
+            except Exception as error:  # noqa: BLE001 - a definition may be any text
                 self.warnings.append(
                     f"{self.name}: its definition of {msgtype} cannot be read ({_text(error)}); the standard one is used"
                 )

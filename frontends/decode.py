@@ -1,160 +1,249 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages -> measurements. One table; each decoder is pure and knows one message type.
+"""One table of decoders: (sensor kind, message type) -> a pure function from message to measurement.
 
-A message that cannot become a measurement raises `Unusable` with the reason; the reader writes it into
-the ledger with file, topic and stamp.
+A decoder says what the message says, in the project's frames and units. It fills in uncertainty only
+where the message carries none; floors, scales and kernels belong to the factors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from graphloc.config import STANDARD_GRAVITY_MPS2, CompassConfig, GnssConfig, ImuConfig, PoseConfig, VelocityConfig
+from graphloc.config import (
+    STANDARD_GRAVITY_MPS2,
+    CompassConfig,
+    GnssConfig,
+    ImuConfig,
+    PoseConfig,
+    VelocityConfig,
+)
 from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.ledger import Outcome
-from graphloc.measurements import (
-    AXES,
-    CompassHeading,
-    GnssPosition,
-    GnssVelocity,
-    Measurement,
-    PoseFix,
-    PoseMode,
-)
+from graphloc.measurements import AXES, CompassHeading, GnssPosition, GnssVelocity, PoseFix, PoseMode
+from graphloc.time import NS_PER_S
 
-_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
+IMU = "sensor_msgs/msg/Imu"
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+QUATERNION = "geometry_msgs/msg/QuaternionStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
+TF = "tf2_msgs/msg/TFMessage"
 
-
-class Unusable(Exception):
-    """A message that gives no measurement, and what the ledger is to say about it."""
-
-    def __init__(self, reason: str, outcome: Outcome = Outcome.MALFORMED) -> None:
-        super().__init__(reason)
-        self.reason = reason
-        self.outcome = outcome
+_MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
+_COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 
 
-def _vector(v: Any) -> Array:
-    return np.array([v.x, v.y, v.z], dtype=float)
+class Rejection(NamedTuple):
+    """A message that gives no measurement, and why."""
+
+    outcome: Outcome
+    reason: str
 
 
-def imu_sample(msg: Any, config: ImuConfig) -> tuple[Array, Array]:
-    """Return specific force (3,) m/s^2 and rate (3,) rad/s in the sensor's axes."""
-    accel, gyro = _vector(msg.linear_acceleration), _vector(msg.angular_velocity)
-    if not (np.isfinite(accel).all() and np.isfinite(gyro).all()):
-        raise Unusable("NaN or infinite acceleration or rate")
-    if config.accel_unit == "g":
-        accel = accel * STANDARD_GRAVITY_MPS2
-    if config.gyro_unit == "deg/s":
-        gyro = np.radians(gyro)
-    return accel, gyro
+class ImuSample(NamedTuple):
+    """One inertial sample in the sensor's axes, SI units."""
+
+    accel_mps2: tuple[float, float, float]
+    gyro_radps: tuple[float, float, float]
 
 
-def _covariance(flat: Any, size: int, fallback: Array) -> Array:
-    """A row-major covariance, or the fallback (sigmas) where it is NaN, zero, negative or not definite."""
-    cov = np.array(flat, dtype=float).reshape(size, size)
-    cov = (cov + cov.T) / 2.0
-    usable = np.isfinite(cov).all() and (np.diagonal(cov) > 0.0).all() and np.linalg.eigvalsh(cov).min() > 0.0
-    return cov if usable else np.diag(np.asarray(fallback) ** 2)
+Decoded = GnssPosition | CompassHeading | GnssVelocity | PoseFix | ImuSample | Rejection
+# The message and the configuration are whatever this row of the table asks for, hence Any.
+Decoder = Callable[[Any, int, int, str, Any], Decoded]
 
 
-def gnss(msg: Any, stamp_ns: int, seq: int, name: str, config: GnssConfig) -> Measurement:
-    """`sensor_msgs/NavSatFix`: status and covariance type are honoured; no fix is no fix."""
+def malformed(reason: str) -> Rejection:
+    """A message whose content cannot be used."""
+    return Rejection(Outcome.MALFORMED, reason)
+
+
+def rejected(reason: str) -> Rejection:
+    """A well-formed message that says itself that it is not to be used, or is not believed."""
+    return Rejection(Outcome.REJECTED, reason)
+
+
+def header_stamp_ns(msg: Any) -> int | None:
+    """Return the header's stamp in ns; None where the message has no stamp or a zero one."""
+    stamp = getattr(getattr(msg, "header", None), "stamp", None)
+    if stamp is None:
+        return None
+    return (int(stamp.sec) * NS_PER_S + int(stamp.nanosec)) or None
+
+
+def covariance_translation_first(values: ArrayLike) -> Array:
+    """Return the 6x6 of ROS (36 values, row-major) in its order: x, y, z, then rotations about x, y, z.
+
+    The rotations are small ones about fixed axes. This is the only door for a ROS 6x6; GTSAM's order
+    (rotation first, body side) is made from it in the factors.
+    """
+    return np.asarray(values, dtype=float).reshape(6, 6)
+
+
+def usable_covariance(cov: Array, default_variances: Array) -> Array:
+    """Return `cov` (k, k) with axes that carry no variance (zero, negative, NaN) set to the default.
+
+    A replaced axis loses its correlations; a matrix that is then still not positive definite keeps
+    its diagonal only.
+    """
+    variance = np.diagonal(cov)
+    good = np.isfinite(variance) & (variance > 0.0)
+    both = np.outer(good, good) & np.isfinite(cov)
+    clean = np.where(both, cov, 0.0)
+    clean = 0.5 * (clean + clean.T)
+    clean[np.diag_indices_from(clean)] = np.where(good, variance, default_variances)
+    if np.linalg.eigvalsh(clean).min() <= 1e-9 * clean.diagonal().min():
+        clean = np.diag(clean.diagonal())
+    return clean
+
+
+def yaw_of_x_axis(x: float, y: float, z: float, w: float) -> float | Rejection:
+    """Return the direction (rad, about the up or down axis of the frame) of the x axis of a quaternion.
+
+    Drivers that know heading only write NaN for x and y; then z and w alone give the yaw.
+    """
+    if np.isfinite(z) and np.isfinite(w) and not (np.isfinite(x) and np.isfinite(y)):
+        x = y = 0.0
+        scale = float(np.hypot(z, w))
+        if scale < 1e-6:
+            return malformed("orientation has no yaw (x, y are NaN; z, w are zero)")
+        z, w = z / scale, w / scale
+    if not np.isfinite([x, y, z, w]).all():
+        return malformed("orientation is NaN")
+    norm = float(np.sqrt(x * x + y * y + z * z + w * w))
+    if abs(norm - 1.0) > 0.1:
+        return malformed("orientation is no unit quaternion (all zero: not filled in by the driver)")
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    forward, left = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)
+    if np.hypot(forward, left) < 0.1:
+        return rejected("the compass's x axis points up or down, so it has no heading")
+    return float(np.arctan2(left, forward))
+
+
+def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -> Decoded:
+    a, w = msg.linear_acceleration, msg.angular_velocity
+    values = np.array([a.x, a.y, a.z, w.x, w.y, w.z])
+    if not np.isfinite(values).all():
+        return malformed("acceleration or angular rate is NaN")
+    for name, part, cov in (
+        ("linear_acceleration", values[:3], msg.linear_acceleration_covariance),
+        ("angular_velocity", values[3:], msg.angular_velocity_covariance),
+    ):
+        if cov[0] == -1.0 and not part.any():
+            return malformed(f"the driver says that {name} is absent ({name}_covariance[0] = -1)")
+    k = STANDARD_GRAVITY_MPS2 if config.accel_unit == "g" else 1.0
+    r = np.pi / 180.0 if config.gyro_unit == "deg/s" else 1.0
+    return ImuSample((k * a.x, k * a.y, k * a.z), (r * w.x, r * w.y, r * w.z))
+
+
+def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:
     status = int(msg.status.status)
     if status < 0:
-        raise Unusable("no fix (STATUS_NO_FIX)", Outcome.REJECTED)
-    if status < _STATUS[config.min_status]:
-        raise Unusable(f"fix of status {status} is below min_status '{config.min_status}'", Outcome.REJECTED)
+        return rejected("no fix (STATUS_NO_FIX)")
+    if status < _MIN_STATUS[config.min_status]:
+        return rejected(f"fix status {status} is below min_status '{config.min_status}'")
     lat, lon, height = float(msg.latitude), float(msg.longitude), float(msg.altitude)
     if not np.isfinite([lat, lon, height]).all():
-        raise Unusable("NaN position")
-    if abs(lat) > 90.0:
-        raise Unusable(f"latitude {lat:.3f} is not on Earth: latitude and longitude look swapped")
+        return malformed("latitude, longitude or height is NaN")
     if lat == 0.0 and lon == 0.0:
-        raise Unusable("position is exactly 0, 0: the receiver had none", Outcome.REJECTED)
-    h, v = config.default_horizontal_sigma_m, config.default_vertical_sigma_m
-    fallback = np.array([h, h, v])
-    known = int(msg.position_covariance_type) != 0
-    cov = _covariance(msg.position_covariance, 3, fallback) if known else np.diag(fallback**2)
-    return GnssPosition(stamp_ns=stamp_ns, sensor=name, seq=seq, position=Geodetic(lat, lon, height), cov_enu_m2=cov)
-
-
-def _yaw(q: Any) -> float:
-    values = np.array([q.x, q.y, q.z, q.w], dtype=float)
-    if not np.isfinite(values).all():
-        # Some compasses fill roll and pitch with NaN, which makes x and y of the quaternion NaN.
-        if np.isfinite(values[2:]).all() and np.hypot(*values[2:]) > 1e-6:
-            return float(2.0 * np.arctan2(values[2], values[3]))
-        raise Unusable("NaN orientation")
-    if not 0.5 < np.linalg.norm(values) < 1.5:
-        raise Unusable(f"orientation is not a unit quaternion (norm {np.linalg.norm(values):.3f})")
-    return float(rpy_from_rotation(Rotation.from_quat(values).as_matrix())[2])
-
-
-def _heading(yaw: float, sigma: float, stamp_ns: int, seq: int, name: str, config: CompassConfig) -> Measurement:
-    if config.convention == "ned":
-        yaw = np.pi / 2.0 - yaw
-    return CompassHeading(stamp_ns=stamp_ns, sensor=name, seq=seq, yaw_rad=float(wrap_angle(yaw)), sigma_rad=sigma)
-
-
-def compass_quaternion(msg: Any, stamp_ns: int, seq: int, name: str, config: CompassConfig) -> Measurement:
-    """`geometry_msgs/QuaternionStamped`."""
-    return _heading(_yaw(msg.quaternion), float(np.radians(config.sigma_deg)), stamp_ns, seq, name, config)
-
-
-def compass_imu(msg: Any, stamp_ns: int, seq: int, name: str, config: CompassConfig) -> Measurement:
-    """The orientation of a `sensor_msgs/Imu`."""
-    if msg.orientation_covariance[0] == -1.0:
-        raise Unusable("the message says that it has no orientation (covariance[0] = -1)", Outcome.REJECTED)
-    variance = float(msg.orientation_covariance[8])
-    sigma = float(np.radians(config.sigma_deg))
-    if config.use_reported_sigma and np.isfinite(variance) and variance > 0.0:
-        sigma = float(np.sqrt(variance))
-    return _heading(_yaw(msg.orientation), sigma, stamp_ns, seq, name, config)
-
-
-def velocity(msg: Any, stamp_ns: int, seq: int, name: str, config: VelocityConfig) -> Measurement:
-    """`geometry_msgs/TwistWithCovarianceStamped`, linear part, ENU."""
-    v = _vector(msg.twist.twist.linear)
-    if not np.isfinite(v).all():
-        raise Unusable("NaN velocity")
-    cov = np.array(msg.twist.covariance, dtype=float).reshape(6, 6)[:3, :3]
-    fallback = np.full(3, config.default_sigma_mps)
-    return GnssVelocity(
-        stamp_ns=stamp_ns, sensor=name, seq=seq, v_world_mps=v, cov_m2ps2=_covariance(cov.ravel(), 3, fallback)
+        return rejected("position 0, 0: the receiver had none")
+    if abs(lat) > 90.0:
+        swapped = abs(lat) <= 360.0 and abs(lon) <= 90.0
+        return malformed("latitude is beyond 90 deg" + (": latitude and longitude look swapped" if swapped else ""))
+    if not -180.0 <= lon <= 360.0:
+        return malformed("longitude is beyond 180 deg")
+    default = np.array([config.default_horizontal_sigma_m] * 2 + [config.default_vertical_sigma_m]) ** 2
+    cov = np.asarray(msg.position_covariance, dtype=float).reshape(3, 3)
+    kind = int(msg.position_covariance_type)
+    if kind == _COVARIANCE_UNKNOWN:
+        cov = np.diag(default)
+    elif kind != _COVARIANCE_KNOWN:
+        cov = np.diag(np.diagonal(cov))  # 'approximated' and 'diagonal known' promise the diagonal only
+    return GnssPosition(
+        stamp_ns=stamp_ns,
+        sensor=sensor,
+        seq=seq,
+        position=Geodetic(lat, lon, height),
+        cov_enu_m2=usable_covariance(cov, default),
     )
 
 
-def pose_translation_first(msg: Any, stamp_ns: int, seq: int, name: str, config: PoseConfig) -> Measurement:
-    """`PoseWithCovarianceStamped` or `Odometry`: ROS covariance, x y z, then rotations about fixed axes."""
-    position, q = _vector(msg.pose.pose.position), msg.pose.pose.orientation
+def _heading(orientation: Any, variance: float, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
+    yaw = yaw_of_x_axis(*(float(v) for v in (orientation.x, orientation.y, orientation.z, orientation.w)))
+    if isinstance(yaw, Rejection):
+        return yaw
+    if config.convention == "ned":  # there yaw is the heading: clockwise from north
+        yaw = float(wrap_angle(np.pi / 2.0 - yaw))
+    reported = config.use_reported_sigma and np.isfinite(variance) and variance > 0.0
+    sigma = float(np.sqrt(variance)) if reported else float(np.radians(config.sigma_deg))
+    return CompassHeading(stamp_ns=stamp_ns, sensor=sensor, seq=seq, yaw_rad=yaw, sigma_rad=sigma)
+
+
+def _compass_quaternion(msg: Any, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
+    return _heading(msg.quaternion, 0.0, stamp_ns, seq, sensor, config)
+
+
+def _compass_imu(msg: Any, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
+    if msg.orientation_covariance[0] == -1.0:
+        return rejected("the driver says that the orientation is absent (orientation_covariance[0] = -1)")
+    return _heading(msg.orientation, float(msg.orientation_covariance[8]), stamp_ns, seq, sensor, config)
+
+
+def _velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
+    v = msg.twist.twist.linear
+    value = np.array([v.x, v.y, v.z], dtype=float)
+    if not np.isfinite(value).all():
+        return malformed("velocity is NaN")
+    cov = covariance_translation_first(msg.twist.covariance)[:3, :3]
+    default = np.full(3, config.default_sigma_mps**2)
+    return GnssVelocity(
+        stamp_ns=stamp_ns, sensor=sensor, seq=seq, v_world_mps=value, cov_m2ps2=usable_covariance(cov, default)
+    )
+
+
+def pose_of(msg: Any) -> tuple[Array, Array | None]:
+    """Return position (3,) and rotation (3, 3) of an Odometry or PoseWithCovarianceStamped message.
+
+    The rotation is None where the quaternion is not one.
+    """
+    p, q = msg.pose.pose.position, msg.pose.pose.orientation
+    position = np.array([p.x, p.y, p.z], dtype=float)
     quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
-    if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
-        raise Unusable("NaN pose")
-    if not 0.5 < np.linalg.norm(quaternion) < 1.5:
-        raise Unusable(f"orientation is not a unit quaternion (norm {np.linalg.norm(quaternion):.3f})")
-    values = np.concatenate([position, rpy_from_rotation(Rotation.from_quat(quaternion).as_matrix())])
+    valid = bool(np.isfinite(quaternion).all()) and abs(float(np.linalg.norm(quaternion)) - 1.0) < 0.1
+    return position, np.asarray(Rotation.from_quat(quaternion).as_matrix()) if valid else None
+
+
+def _pose(msg: Any, stamp_ns: int, seq: int, sensor: str, config: PoseConfig) -> Decoded:
+    position, rotation = pose_of(msg)
     picked = [AXES.index(a) for a in config.axes]
-    sigmas = np.array([config.default_sigma_m] * 3 + [np.radians(config.default_sigma_deg)] * 3)[picked]
-    cov = np.array(msg.pose.covariance, dtype=float).reshape(6, 6)[np.ix_(picked, picked)]
-    mode = PoseMode(value=values[picked], cov=_covariance(cov.ravel(), len(picked), sigmas))
-    return PoseFix(stamp_ns=stamp_ns, sensor=name, seq=seq, axes=config.axes, modes=(mode,))
+    if rotation is None and max(picked) > 2:
+        return malformed("orientation is NaN or no unit quaternion")
+    angles = np.zeros(3) if rotation is None else rpy_from_rotation(rotation)
+    value = np.concatenate([position, angles])[picked]
+    if not np.isfinite(value).all():
+        return malformed("position is NaN")
+    default = np.array([config.default_sigma_m] * 3 + [np.radians(config.default_sigma_deg)] * 3) ** 2
+    cov = covariance_translation_first(msg.pose.covariance)[np.ix_(picked, picked)]
+    mode = PoseMode(value=value, cov=usable_covariance(cov, default[picked]))
+    return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=seq, axes=config.axes, modes=(mode,))
 
 
-Decoder = Callable[[Any, int, int, str, Any], Measurement]
 DECODERS: dict[tuple[str, str], Decoder] = {
-    ("gnss", "sensor_msgs/msg/NavSatFix"): gnss,
-    ("compass", "geometry_msgs/msg/QuaternionStamped"): compass_quaternion,
-    ("compass", "sensor_msgs/msg/Imu"): compass_imu,
-    ("gnss_velocity", "geometry_msgs/msg/TwistWithCovarianceStamped"): velocity,
-    ("pose", "geometry_msgs/msg/PoseWithCovarianceStamped"): pose_translation_first,
-    ("pose", "nav_msgs/msg/Odometry"): pose_translation_first,
+    ("imu", IMU): _imu,
+    ("gnss", NAV_SAT_FIX): _gnss,
+    ("compass", QUATERNION): _compass_quaternion,
+    ("compass", IMU): _compass_imu,
+    ("gnss_velocity", TWIST): _velocity,
+    ("pose", POSE): _pose,
+    ("pose", ODOMETRY): _pose,
 }
-SUPPORTED: dict[str, tuple[str, ...]] = {
-    "imu": ("sensor_msgs/msg/Imu",),
-    **{kind: tuple(t for k, t in DECODERS if k == kind) for kind, _ in DECODERS},
-}
+
+
+def supported_types(kind: str) -> tuple[str, ...]:
+    """Return the message types that a sensor kind can be read from; empty where the kind reads no topic."""
+    return tuple(msgtype for have, msgtype in DECODERS if have == kind)
