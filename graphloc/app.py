@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The application: the one place, beside the CLI, where all rooms meet.
+
+`bag -> frontend -> measurements -> rows -> graph -> solution -> outputs and report`, in that order.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from graphloc import outputs
+from graphloc.build import mount_of
+from graphloc.config import VesselConfig, load_config
+from graphloc.errors import InputError
+from graphloc.eval import ekf, holdout, metrics, report
+from graphloc.eval.simulate import SimulatedRun
+from graphloc.factors import INERTIAL, KINDS, SENSORS
+from graphloc.frames import Datum, Geodetic
+from graphloc.frontends.bag import read_recording
+from graphloc.measurements import GnssPosition, Measurement
+from graphloc.recording import Recording
+from graphloc.solution import Solution
+from graphloc.solve import smooth
+
+Progress = Callable[[str, int, int], None]
+
+
+def _quiet(_stage: str, _done: int, _total: int) -> None:
+    return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Run:
+    """A smoothed run and what it is compared with."""
+
+    recording: Recording
+    config: VesselConfig
+    solution: Solution
+    held: tuple[GnssPosition, ...] = ()
+    filters: tuple[ekf.FilterResult, ...] = ()
+
+
+def load(bags: Sequence[Path], config_path: Path, progress: Progress = _quiet) -> tuple[Recording, VesselConfig]:
+    """Read a vessel.yaml and the bag that it describes."""
+    config = load_config(config_path, KINDS)
+    return read_recording(bags, config, progress), config
+
+
+def smooth_recording(
+    recording: Recording,
+    config: VesselConfig,
+    *,
+    hold_out: holdout.HoldOut | None = None,
+    compare: bool = False,
+    progress: Progress = _quiet,
+) -> Run:
+    """Smooth a recording; hold fixes out and run the filters beside it if asked."""
+    held: tuple[GnssPosition, ...] = ()
+    if hold_out is not None:
+        recording, held = hold_out.split(recording)
+    datum = choose_datum(recording, config)
+    recording = with_synthetic(recording, config, datum)
+    solution = smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress)
+    filters: tuple[ekf.FilterResult, ...] = ()
+    if compare:
+        progress("filters", 0, 1)
+        filters = ekf.run_all(recording, config, datum)
+        progress("filters", 1, 1)
+    return Run(recording=recording, config=config, solution=solution, held=held, filters=filters)
+
+
+def simulated(run: SimulatedRun, *, compare: bool = False, progress: Progress = _quiet) -> Run:
+    """Smooth a simulated run."""
+    return smooth_recording(run.recording, run.config, compare=compare, progress=progress)
+
+
+def choose_datum(recording: Recording, config: VesselConfig) -> Datum:
+    """Return the configured datum, the truth's, or the median of the first fixes.
+
+    Raises:
+        InputError: there is none, and no fix to take one from.
+    """
+    if config.datum is not None:
+        return Datum(config.datum.geodetic)
+    fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)][:5]
+    if not fixes:
+        raise InputError(f"{recording.source}: no GNSS fix to take a datum from; set datum: in vessel.yaml")
+    return Datum(Geodetic(*(float(v) for v in np.median([m.position for m in fixes], axis=0))))
+
+
+def with_synthetic(recording: Recording, config: VesselConfig, datum: Datum) -> Recording:
+    """Add the measurements that the configuration makes itself (the height prior)."""
+    if recording.imu is None or not len(recording.imu):
+        return recording
+    span = (int(recording.imu.stamps_ns[0]), int(recording.imu.stamps_ns[-1]))
+    added: list[Measurement] = []
+    for name, sensor in config.sensors.items():
+        row = next((r for r in SENSORS if r.kind == sensor.kind), None)
+        if row is not None and row.synthetic is not None and sensor.enabled:
+            added.extend(row.synthetic(name, sensor, span, _height_m(recording, config, sensor.height_m, datum)))
+    if not added:
+        return recording
+    every = sorted([*recording.measurements, *added], key=lambda m: (m.stamp_ns, m.seq))
+    return replace(recording, measurements=tuple(every))
+
+
+def _height_m(recording: Recording, config: VesselConfig, height_m: float | None, datum: Datum) -> float:
+    """Height of the body in world: as configured (ellipsoidal), or the median fix less its antenna's height."""
+    if height_m is not None:
+        return height_m - datum.origin.height_m
+    heights = [
+        m.position.height_m - float(mount_of(m.sensor, config.sensors[m.sensor], recording)[0][2])
+        for m in recording.measurements
+        if isinstance(m, GnssPosition)
+    ]
+    return float(np.median(heights)) - datum.origin.height_m if heights else 0.0
+
+
+def tables(run: Run) -> tuple[metrics.Table, ...]:
+    """Return the numbers of a run: against truth, held-out fixes, and the speed check."""
+    found: list[metrics.Table] = []
+    estimates = [("graphloc", run.solution.trajectory), *((f.name, f.trajectory) for f in run.filters)]
+    if run.recording.truth is not None:
+        found.append(metrics.truth_table(estimates, run.recording.truth))
+    if run.held:
+        sensor = run.held[0].sensor
+        lever = mount_of(sensor, run.config.sensors[sensor], run.recording)[0]
+        found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, lever))
+    if run.recording.check_speed is not None:
+        found.append(metrics.speed_table(estimates, run.recording.check_speed))
+    return tuple(found)
+
+
+def truth_statement(run: Run) -> str:
+    """Say plainly what the numbers were measured against."""
+    if run.recording.truth is not None:
+        return "Truth: " + (run.config.truth_topic or "given with the recording") + "; it was not fused."
+    if run.held:
+        return (
+            f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; "
+            "their own noise is part of the error."
+        )
+    return "No truth and no held-out fixes: nothing here measures accuracy. Try --hold-out every:5."
+
+
+def write(run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overwrite: bool) -> Path:
+    """Write the run folder with its report; return the report's path."""
+    found = tables(run)
+    with outputs.fresh_folder(folder, overwrite=overwrite) as fresh:
+        outputs.write_run(
+            fresh,
+            run.solution,
+            run.config,
+            inputs={str(p): sha256(p) for p in inputs},
+            command=command,
+            metrics={t.title: t.as_dict() for t in found},
+        )
+        report.write_report(
+            fresh / "report.html",
+            report.ReportData(
+                title=f"{run.config.vessel}: {Path(run.recording.source).name}",
+                solution=run.solution,
+                recording=run.recording,
+                config=run.config,
+                filters=run.filters,
+                held=run.held,
+                tables=found,
+                truth_statement=truth_statement(run),
+            ),
+        )
+    return folder / "report.html"
+
+
+def sha256(path: Path) -> str:
+    """Return the hash of a file, or of all files of a folder in name order."""
+    digest = hashlib.sha256()
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    for file in files:
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+__all__ = [
+    "Run",
+    "choose_datum",
+    "load",
+    "sha256",
+    "simulated",
+    "smooth_recording",
+    "tables",
+    "truth_statement",
+    "with_synthetic",
+    "write",
+]

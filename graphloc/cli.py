@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line. Known errors are one line and exit 2; heavy imports wait until a command runs."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from graphloc import __version__
+from graphloc.errors import GraphlocError
+
+app = typer.Typer(
+    name="graphloc",
+    help="Factor-graph localisation for vessels where GNSS lies.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+BagArgument = Annotated[list[Path], typer.Argument(help="A ROS 1 or ROS 2 bag; several for the parts of a split one.")]
+ConfigOption = Annotated[Path, typer.Option("--config", "-c", help="The vessel.yaml.")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")]
+HoldOutOption = Annotated[
+    str | None, typer.Option("--hold-out", help="Keep fixes out and predict them: every:N, or gaps:COUNTxSECONDS.")
+]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run folder.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the numbers as JSON.")]
+
+
+def _progress() -> Callable[[str, int, int], None]:
+    """A progress bar on stderr, on a terminal only."""
+    from tqdm import tqdm
+
+    state: dict[str, tqdm[None]] = {}
+
+    def show(stage: str, done: int, total: int) -> None:
+        for name in [n for n in state if n != stage]:
+            state.pop(name).close()
+        if stage not in state:
+            state[stage] = tqdm(total=total, desc=stage, disable=None, file=sys.stderr, leave=False)
+        state[stage].n = done
+        state[stage].refresh()
+        if done >= total:
+            state.pop(stage).close()
+
+    return show
+
+
+@app.command()
+def inspect(
+    bag: BagArgument,
+    config: Annotated[Path, typer.Option("--write", "-w", help="Where to write the first vessel.yaml.")] = Path(
+        "vessel.yaml"
+    ),
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Print what a bag holds and write a first vessel.yaml, every guess marked."""
+    from graphloc.errors import OutputError
+    from graphloc.frontends import inspect as inspection
+
+    found = inspection.inspect_bag(bag)
+    typer.echo(json.dumps(found.as_dict(), indent=2) if as_json else inspection.render(found))
+    if config.exists() and not overwrite:
+        raise OutputError(f"{config}: exists already; give --write another name, or --overwrite")
+    config.write_text(inspection.draft_config(found), encoding="utf-8")
+    typer.echo(f"wrote {config}: look at each line marked 'guess'", err=True)
+
+
+def _smooth(
+    bag: list[Path], config: Path, out: Path, hold_out: str | None, overwrite: bool, as_json: bool, compare: bool
+) -> None:
+    from graphloc import app as application
+    from graphloc.eval.holdout import HoldOut
+
+    held = None if hold_out is None else HoldOut.parse(hold_out)
+    show = _progress()
+    recording, vessel = application.load(bag, config, show)
+    run = application.smooth_recording(recording, vessel, hold_out=held, compare=compare, progress=show)
+    report = application.write(run, out, inputs=bag, command=" ".join(sys.argv[1:]), overwrite=overwrite)
+    _print_run(run, report, as_json)
+
+
+def _print_run(run: object, report: Path, as_json: bool) -> None:
+    from graphloc import app as application
+
+    assert isinstance(run, application.Run)
+    found = application.tables(run)
+    if as_json:
+        typer.echo(json.dumps({t.title: t.as_dict() for t in found}, indent=2))
+    else:
+        for table in found:
+            typer.echo(table.as_text())
+        for name, counts in run.solution.ledger.counts().items():
+            typer.echo(f"  {name}: " + ", ".join(f"{n} {outcome}" for outcome, n in counts.items()))
+        for warning in (*run.recording.warnings, *run.solution.stats.warnings):
+            typer.echo(f"warning: {warning}", err=True)
+    typer.echo(str(report))
+
+
+@app.command()
+def smooth(
+    bag: BagArgument,
+    config: ConfigOption,
+    out: OutOption,
+    hold_out: HoldOutOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Smooth a whole run and write the run folder with its report."""
+    _smooth(bag, config, out, hold_out, overwrite, as_json, compare=False)
+
+
+@app.command()
+def compare(
+    bag: BagArgument,
+    config: ConfigOption,
+    out: OutOption,
+    hold_out: HoldOutOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Smooth a run, run the thesis EKF and an honest EKF on the same measurements, and report all."""
+    _smooth(bag, config, out, hold_out, overwrite, as_json, compare=True)
+
+
+@app.command()
+def simulate(
+    out: OutOption,
+    case: Annotated[int, typer.Option(min=1, max=3, help="Case of Bergman & Lindell.")] = 1,
+    noise: Annotated[str, typer.Option(help="clean, drift, jump or drift_jump.")] = "drift",
+    seed: Annotated[int, typer.Option(help="Same seed, same run.")] = 0,
+    ros: Annotated[int, typer.Option(min=1, max=2, help="ROS version of the bag.")] = 2,
+) -> None:
+    """Write a simulated run as a bag, with its vessel.yaml beside it."""
+    from graphloc.errors import ConfigError
+    from graphloc.eval.simulate import bl_scenario
+    from graphloc.eval.simulate import simulate as run_simulation
+    from graphloc.eval.simulate.bag import write_bag
+
+    if noise not in ("clean", "drift", "jump", "drift_jump"):
+        raise ConfigError(f"--noise {noise}: choose clean, drift, jump or drift_jump")
+    run = run_simulation(bl_scenario(case, noise), seed)  # type: ignore[arg-type]
+    bag, config = write_bag(run, out, ros=ros)
+    typer.echo(f"{bag}\n{config}")
+
+
+@app.command()
+def demo(
+    out: OutOption = Path("runs/demo"), seed: Annotated[int, typer.Option(help="Seed of the simulated run.")] = 0
+) -> None:
+    """Simulate a harbour run with drifting GNSS and 40 % false matches, smooth it from its bag, and compare."""
+    from graphloc.eval.simulate import bl_scenario
+    from graphloc.eval.simulate import simulate as run_simulation
+    from graphloc.eval.simulate.bag import write_bag
+
+    run = run_simulation(bl_scenario(1, "drift"), seed)
+    bag, config = write_bag(run, out.parent / f"{out.name}-bag", ros=2, overwrite=True)
+    _smooth([bag], config, out, None, True, False, compare=True)
+
+
+@app.command()
+def sensors() -> None:
+    """List the kinds of sensors that a vessel.yaml can name."""
+    from graphloc.factors import KINDS
+
+    for kind, config in KINDS.items():
+        typer.echo(f"{kind:15} {(config.__doc__ or '').splitlines()[0]}")
+
+
+@app.command("config")
+def show_config(
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="A vessel.yaml to check.")] = None,
+    docs: Annotated[bool, typer.Option("--docs", help="Print docs/configuration.md.")] = False,
+) -> None:
+    """Print the effective configuration of a vessel.yaml, or the reference of all keys."""
+    from graphloc._config_docs import render
+    from graphloc.config import effective, load_config
+    from graphloc.factors import KINDS
+
+    if docs or config is None:
+        typer.echo(render(KINDS), nl=False)
+    else:
+        typer.echo(json.dumps(effective(load_config(config, KINDS)), indent=2))
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more, on stderr.")] = False,
+) -> None:
+    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, stream=sys.stderr, format="%(message)s")
+    if version:
+        typer.echo(f"graphloc {__version__}")
+        raise typer.Exit
+
+
+def main() -> None:
+    """Run the command line; known errors become one line and exit 2."""
+    try:
+        app()
+    except GraphlocError as error:
+        print(f"graphloc: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("graphloc: interrupted; nothing was left half-written", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()
