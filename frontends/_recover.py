@@ -9,6 +9,7 @@ their own tools (`.recover`) do it.
 from __future__ import annotations
 
 import io
+import os
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,7 +26,16 @@ class Recovered:
         self.path, self.whole_bytes = path, whole_bytes
         self.file_bytes = path.stat().st_size
         self._head, self._tail = head, tail
-        self.name, self.stem, self.suffix = path.name, path.stem, path.suffix
+
+    @property
+    def stem(self) -> str:
+        """As `Path.stem`."""
+        return self.path.stem
+
+    @property
+    def suffix(self) -> str:
+        """As `Path.suffix`."""
+        return self.path.suffix
 
     def __str__(self) -> str:
         return str(self.path)
@@ -37,6 +47,17 @@ class Recovered:
     def is_dir(self) -> bool:
         """As `Path.is_dir`."""
         return False
+
+    def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
+        """As `Path.stat`."""
+        return self.path.stat(follow_symlinks=follow_symlinks)
+
+    def read_text(self, encoding: str | None = None) -> str:
+        """As `Path.read_text`; a bag is no text."""
+        raise OSError(f"{self.path} is not a text file (asked in {encoding})")
+
+    def __truediv__(self, key: object) -> Recovered:
+        raise OSError(f"{self.path} is not a folder, so it holds no {key}")
 
     def open(self, *_args: Any, **_kwargs: Any) -> BinaryIO:
         """As `Path.open('rb')`."""

@@ -8,6 +8,7 @@ where the message carries none; floors, scales and kernels belong to the factors
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import isfinite, pi
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,18 +128,18 @@ def yaw_of_x_axis(x: float, y: float, z: float, w: float) -> float | Rejection:
 
 def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -> Decoded:
     a, w = msg.linear_acceleration, msg.angular_velocity
-    values = np.array([a.x, a.y, a.z, w.x, w.y, w.z])
-    if not np.isfinite(values).all():
+    accel, gyro = (float(a.x), float(a.y), float(a.z)), (float(w.x), float(w.y), float(w.z))
+    if not all(map(isfinite, (*accel, *gyro))):
         return malformed("acceleration or angular rate is NaN")
-    for name, part, cov in (
-        ("linear_acceleration", values[:3], msg.linear_acceleration_covariance),
-        ("angular_velocity", values[3:], msg.angular_velocity_covariance),
+    for name, values, cov in (
+        ("linear_acceleration", accel, msg.linear_acceleration_covariance),
+        ("angular_velocity", gyro, msg.angular_velocity_covariance),
     ):
-        if cov[0] == -1.0 and not part.any():
+        if not any(values) and cov[0] == -1.0:
             return malformed(f"the driver says that {name} is absent ({name}_covariance[0] = -1)")
     k = STANDARD_GRAVITY_MPS2 if config.accel_unit == "g" else 1.0
-    r = np.pi / 180.0 if config.gyro_unit == "deg/s" else 1.0
-    return ImuSample((k * a.x, k * a.y, k * a.z), (r * w.x, r * w.y, r * w.z))
+    r = pi / 180.0 if config.gyro_unit == "deg/s" else 1.0
+    return ImuSample((k * accel[0], k * accel[1], k * accel[2]), (r * gyro[0], r * gyro[1], r * gyro[2]))
 
 
 def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:

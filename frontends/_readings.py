@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one sensor of a recording gave, in order of arrival, and what is thrown out of it afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import compress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.config import ImuConfig, SensorConfig, VesselConfig
+from graphloc.frontends import _clock, _sanity
+from graphloc.frontends.decode import Decoded, ImuSample, Rejection, rejected
+from graphloc.ledger import LedgerRow
+from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
+from graphloc.time import utc_text
+
+
+@dataclass(slots=True)
+class Readings:
+    """Columns of one sensor: arrival number, stamp, recording time, decoded value."""
+
+    sensor: str
+    config: SensorConfig
+    seqs: list[int] = field(default_factory=list)
+    stamps_ns: list[int] = field(default_factory=list)
+    logs_ns: list[int] = field(default_factory=list)
+    values: list[Decoded] = field(default_factory=list)
+
+    def add(self, seq: int, stamp_ns: int, log_ns: int, value: Decoded) -> None:
+        """Append a reading."""
+        self.seqs.append(seq)
+        self.stamps_ns.append(stamp_ns)
+        self.logs_ns.append(log_ns)
+        self.values.append(value)
+
+    def stamps(self) -> NDArray[np.int64]:
+        """Return the stamps as an array."""
+        return np.array(self.stamps_ns, dtype=np.int64)
+
+    def logs(self) -> NDArray[np.int64]:
+        """Return the recording times as an array."""
+        return np.array(self.logs_ns, dtype=np.int64)
+
+    def drop(self, bad: NDArray[np.bool_], rejection: Rejection) -> list[LedgerRow]:
+        """Take readings out; return their rows."""
+        rows = [self.row(self.seqs[i], self.stamps_ns[i], rejection) for i in np.flatnonzero(bad)]
+        columns: tuple[list[Any], ...] = (self.seqs, self.stamps_ns, self.logs_ns, self.values)
+        for column in columns if rows else ():
+            column[:] = list(compress(column, ~bad))
+        return rows
+
+    def row(self, seq: int, stamp_ns: int, rejection: Rejection) -> LedgerRow:
+        """Return the ledger row of a message that gave no measurement."""
+        return LedgerRow(
+            seq=seq,
+            stamp_ns=stamp_ns,
+            sensor=self.sensor,
+            topic=self.config.topic,
+            outcome=rejection.outcome,
+            reason=rejection.reason,
+        )
+
+
+def reject_jumps(sensors: Sequence[Readings], warnings: list[str]) -> list[LedgerRow]:
+    """Drop readings whose stamps left the clock of their topic, or lie in another epoch than the run."""
+    rows: list[LedgerRow] = []
+    jump = rejected(f"clock jump: the stamp is over {_clock.JUMP_LIMIT_S:.0f} s off its topic's usual latency")
+    for readings in sensors:
+        rows += _drop(readings, _clock.clock_jumps(readings.stamps(), readings.logs()), jump, warnings)
+    stamps = np.concatenate([r.stamps() for r in sensors]) if sensors else np.zeros(0, dtype=np.int64)
+    if len(stamps) == 0:
+        return rows
+    first, last = _clock.busiest_section(stamps)
+    apart = rejected(
+        f"outside the busiest part of the run ({utc_text(first)} to {utc_text(last)}): "
+        f"no sensor says anything for over {_clock.HOLE_LIMIT_S:.0f} s between"
+    )
+    for readings in sensors:
+        rows += _drop(readings, (readings.stamps() < first) | (readings.stamps() > last), apart, warnings)
+    return rows
+
+
+def _drop(readings: Readings, bad: NDArray[np.bool_], rejection: Rejection, warnings: list[str]) -> list[LedgerRow]:
+    rows = readings.drop(bad, rejection)
+    if rows:
+        warnings.append(f"{readings.sensor}: {len(rows)} messages {rejection.outcome}: {rejection.reason}")
+    return rows
+
+
+def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
+    """Say which sensor's clock stands apart from that of the IMU (or, without one, of the first sensor)."""
+    latency = {r.sensor: _clock.usual_latency_s(r.stamps(), r.logs()) for r in sensors if r.stamps_ns}
+    if len(latency) < 2:
+        return []
+    reference = next((r.sensor for r in sensors if r.config.kind == "imu" and r.stamps_ns), next(iter(latency)))
+    lines = []
+    for sensor, value in latency.items():
+        behind = value - latency[reference]
+        if abs(behind) > _clock.EPOCH_LIMIT_S:
+            lines.append(
+                f"{sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "
+                f"{reference}, judged by the recording times; if so, add {behind:.3f} to its time_offset_s"
+            )
+    return lines
+
+
+def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | None, list[LedgerRow]]:
+    """Return the samples in strictly increasing time, and rows of those that are not."""
+    assert isinstance(readings.config, ImuConfig)
+    bad = ~_clock.longest_increasing(readings.stamps())
+    rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
+    samples = [v for v in readings.values if isinstance(v, ImuSample)]
+    if not samples:
+        return None, rows
+    series = ImuSeries(
+        sensor=readings.sensor,
+        stamps_ns=readings.stamps(),
+        accel_mps2=np.array([s.accel_mps2 for s in samples]),
+        gyro_radps=np.array([s.gyro_radps for s in samples]),
+        seqs=np.array(readings.seqs, dtype=np.int64),
+    )
+    warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
+    return series, rows
+
+
+def reject_repeats(readings: Readings) -> list[LedgerRow]:
+    """Drop messages that say the same at the same stamp again: they are no new evidence."""
+    seen: set[tuple[int, object]] = set()
+    bad = np.zeros(len(readings.values), dtype=bool)
+    for i, (stamp_ns, value) in enumerate(zip(readings.stamps_ns, readings.values, strict=True)):
+        key = (stamp_ns, _content(value))
+        bad[i] = key in seen
+        seen.add(key)
+    return readings.drop(bad, rejected("repeated message: same stamp, same value"))
+
+
+def _content(value: Decoded) -> object:
+    """What a measurement says, as something hashable."""
+    match value:
+        case GnssPosition():
+            return value.position
+        case CompassHeading():
+            return value.yaw_rad
+        case GnssVelocity():
+            return tuple(value.v_world_mps)
+        case PoseFix():
+            return tuple(value.modes[0].value)
+        case _:
+            return id(value)
+
+
+def reject_far(readings: Readings, config: VesselConfig, warnings: list[str]) -> list[LedgerRow]:
+    """Drop fixes that lie far from all others."""
+    fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
+    if not fixes:
+        return []
+    warnings += _sanity.gnss_warnings(readings.sensor, fixes, config)
+    far = rejected(f"over {_sanity.FAR_M / 1e3:.0f} km from the rest of the run")
+    return _drop(readings, _sanity.far_fixes(fixes), far, warnings)

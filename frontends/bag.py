@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag becomes a `Recording`: measurements, inertial samples, and one ledger row for whatever gave none.
+
+Steps: subscribe to the topics that the configuration names; decode them one message at a time;
+throw out stamps that cannot be true; look at the whole run for wrong units; hand over. Messages of
+other topics are counted from the bag's index and never unpacked, so memory does not grow with them.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphloc.config import VesselConfig
+from graphloc.errors import InputError
+from graphloc.frames import Array
+from graphloc.frontends import _clock
+from graphloc.frontends._readings import (
+    Readings,
+    clock_warnings,
+    imu_series,
+    reject_far,
+    reject_jumps,
+    reject_repeats,
+)
+from graphloc.frontends._source import Bag, RawMessage, TopicSummary
+from graphloc.frontends._tf import StaticTree
+from graphloc.frontends.decode import (
+    DECODERS,
+    ODOMETRY,
+    POSE,
+    TF,
+    Decoded,
+    Rejection,
+    header_stamp_ns,
+    malformed,
+    pose_of,
+    supported_types,
+)
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import ImuSeries, Measurement
+from graphloc.recording import Recording, SpeedSeries
+from graphloc.time import duration_ns, utc_text
+from graphloc.trajectory import Trajectory
+
+Progress = Callable[[int, int], None]
+TF_STATIC = "/tf_static"
+_REPORT_EVERY = 2000  # messages between two calls of `progress`
+
+
+@dataclass(slots=True)
+class _Beside:
+    """A topic that is read beside the sensors: truth or check speed."""
+
+    topic: str
+    reason: str
+    count: int = 0
+    stamps_ns: list[int] = field(default_factory=list)
+    messages: list[Any] = field(default_factory=list)
+
+
+def read_recording(
+    paths: Path | str | Sequence[Path | str], config: VesselConfig, progress: Progress | None = None
+) -> Recording:
+    """Read the topics that the configuration names.
+
+    Args:
+        paths: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, or several of one kind (split bags).
+        config: which topics belong to which sensors, units, mounts.
+        progress: called now and then with messages done and messages in all.
+
+    Returns:
+        The recording. Its measurements, IMU samples and rows add up to its `message_count`, in which
+        a message that several sensors read counts once for each.
+
+    Raises:
+        InputError: no readable bag, a topic that is not there or has another type, a broken mount chain.
+    """
+    with Bag(paths) as bag:
+        topics = bag.topics
+        sensors = _subscriptions(config, topics, bag.name)
+        truth = _beside(config.truth_topic, "truth_topic", "truth, never fused", topics, bag.name)
+        check = _beside(config.check_speed_topic, "check_speed_topic", "check, never fused", topics, bag.name)
+        tree = StaticTree() if any(s.enabled and s.mount.tf_frame for s in config.sensors.values()) else None
+        rows = _Reader(bag, topics, sensors, [b for b in (truth, check) if b], tree).read(progress)
+        warnings = list(bag.warnings)
+
+    rows += reject_jumps(sensors, warnings)
+    warnings += clock_warnings(sensors)
+    imu: ImuSeries | None = None
+    measurements: list[Measurement] = []
+    for readings in sensors:
+        if readings.config.kind == "imu":
+            imu, more = imu_series(readings, warnings)
+            rows += more
+        else:
+            rows += reject_repeats(readings) + reject_far(readings, config, warnings)
+            measurements += [v for v in readings.values if isinstance(v, Measurement)]
+    warnings += _silent(sensors, rows, topics)
+    return Recording(
+        source=bag.name,
+        imu=imu,
+        measurements=tuple(sorted(measurements, key=lambda m: (m.stamp_ns, m.seq))),
+        rows=tuple(sorted(rows, key=lambda r: (r.seq < 0, r.seq, r.topic))),
+        message_count=sum(len(r.values) for r in sensors) + sum(r.count for r in rows),
+        topics={r.sensor: r.config.topic for r in sensors},
+        mounts=_mounts(config, tree, bag.name),
+        truth=_truth(truth, warnings) if truth else None,
+        check_speed=_check_speed(check) if check else None,
+        warnings=tuple(warnings),
+    )
+
+
+class _Reader:
+    """One pass over the bag: each message goes to whoever asked for its topic."""
+
+    def __init__(
+        self,
+        bag: Bag,
+        topics: Mapping[str, TopicSummary],
+        sensors: Sequence[Readings],
+        beside: Sequence[_Beside],
+        tree: StaticTree | None,
+    ) -> None:
+        self._bag, self._topics, self._tree = bag, topics, tree
+        self._sensors: dict[str, list[Readings]] = {}
+        for readings in sensors:
+            self._sensors.setdefault(readings.config.topic, []).append(readings)
+        self._beside: dict[str, list[_Beside]] = {}
+        for item in beside:
+            self._beside.setdefault(item.topic, []).append(item)
+        self._wanted = set(self._sensors) | set(self._beside)
+        if tree is not None and TF_STATIC in topics:
+            self._wanted.add(TF_STATIC)
+        self._rows: list[LedgerRow] = []
+        self._seq = 0
+
+    def read(self, progress: Progress | None) -> list[LedgerRow]:
+        """Fill the sensors' readings; return the rows of all other messages."""
+        total = sum(self._topics[t].messages for t in self._wanted)
+        read: Counter[str] = Counter()
+        for done, raw in enumerate(self._bag.messages(self._wanted), start=1):
+            read[raw.topic] += 1
+            self._take(raw)
+            if progress is not None and done % _REPORT_EVERY == 0:
+                progress(done, max(total, done))
+        if progress is not None:
+            progress(total, total)
+        return self._rows + self._topic_rows(read)
+
+    def _take(self, raw: RawMessage) -> None:
+        msg: Any = None
+        broken = malformed("")
+        try:
+            msg = self._bag.decode(raw)
+        except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
+            broken = malformed(
+                f"{raw.file}: cannot be decoded as {raw.msgtype} ({type(error).__name__}), "
+                f"recorded at {utc_text(raw.log_ns)}"
+            )
+        for readings in self._sensors.get(raw.topic, ()):
+            seq, self._seq = self._seq, self._seq + 1
+            if msg is None:
+                self._rows.append(readings.row(seq, 0, broken))
+            else:
+                self._decode(readings, raw, msg, seq)
+        for item in self._beside.get(raw.topic, ()):
+            item.count += 1
+            stamp_ns = None if msg is None else header_stamp_ns(msg)
+            if stamp_ns is not None:
+                item.stamps_ns.append(stamp_ns)
+                item.messages.append(msg)
+        if raw.topic == TF_STATIC and self._tree is not None and msg is not None and raw.msgtype == TF:
+            self._tree.add(msg)
+
+    def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:
+        """Hand a message to its decoder; what gives no reading gives a row."""
+        stamp_ns = header_stamp_ns(msg)
+        if stamp_ns is None:
+            text = f"{raw.file}: header stamp is zero, recorded at {utc_text(raw.log_ns)}"
+            self._rows.append(readings.row(seq, 0, malformed(text)))
+            return
+        stamp_ns += duration_ns(readings.config.time_offset_s)
+        decoder = DECODERS.get((readings.config.kind, raw.msgtype))
+        value: Decoded = malformed(f"{raw.msgtype} is not read by a {readings.config.kind} sensor")
+        if decoder is not None:
+            try:
+                value = decoder(msg, stamp_ns, seq, readings.sensor, readings.config)
+            except (ValueError, ArithmeticError, AttributeError) as error:
+                value = malformed(" ".join(str(error).split()))
+        if not isinstance(value, Rejection):
+            readings.add(seq, stamp_ns, raw.log_ns, value)
+        elif value.outcome is Outcome.MALFORMED:
+            self._rows.append(readings.row(seq, stamp_ns, malformed(f"{raw.file}: {value.reason}")))
+        else:
+            self._rows.append(readings.row(seq, stamp_ns, value))
+
+    def _topic_rows(self, read: Counter[str]) -> list[LedgerRow]:
+        """Rows that stand for whole topics: not asked for, read beside the sensors, or unreadable."""
+        rows: list[LedgerRow] = []
+
+        def add(topic: str, count: int, outcome: Outcome, reason: str) -> None:
+            row = LedgerRow(seq=-1, stamp_ns=0, sensor="", topic=topic, outcome=outcome, reason=reason, count=count)
+            rows.extend([row] if count > 0 else [])
+
+        for topic, summary in self._topics.items():
+            if topic not in self._wanted:
+                reason = f"no sensor reads this topic ({_or(summary.msgtypes)})"
+                add(topic, summary.messages, Outcome.IGNORED, reason)
+                continue
+            for item in self._beside.get(topic, ()):
+                add(topic, item.count, Outcome.IGNORED, item.reason)
+            if topic == TF_STATIC:
+                add(topic, read[topic], Outcome.IGNORED, "mounts")
+            missing = summary.messages - read[topic]
+            add(topic, missing, Outcome.MALFORMED, "announced by the bag's index, but cannot be read")
+        return rows
+
+
+def _subscriptions(config: VesselConfig, topics: Mapping[str, TopicSummary], bag: str) -> list[Readings]:
+    """One `Readings` per enabled sensor that reads a topic."""
+    found = []
+    for name, sensor in config.sensors.items():
+        types = supported_types(sensor.kind)
+        if sensor.enabled and types:
+            _check_topic(sensor.topic, f"sensors.{name}.topic", types, topics, bag)
+            found.append(Readings(name, sensor))
+    return found
+
+
+def _check_topic(topic: str, key: str, types: tuple[str, ...], topics: Mapping[str, TopicSummary], bag: str) -> None:
+    """Raise an `InputError` where a topic is not in the bag, or holds something else."""
+    fitting = [t.topic for t in topics.values() if set(t.msgtypes) & set(types)]
+    offer = f"topics of a fitting type: {', '.join(fitting)}" if fitting else f"no topic holds {_or(types)}"
+    if topic not in topics:
+        close = difflib.get_close_matches(topic, list(topics), n=3, cutoff=0.3)
+        near = f"nearest: {', '.join(close)}" if close else f"it holds: {', '.join(topics) or 'no topic at all'}"
+        raise InputError(f"{bag}: {key} '{topic}' is not in the bag; {near}; {offer}")
+    have = topics[topic].msgtypes
+    if not set(have) & set(types):
+        raise InputError(f"{bag}: {key} '{topic}' holds {_or(have)}, but must hold {_or(types)}; {offer}")
+
+
+def _or(names: Sequence[str]) -> str:
+    return " or ".join(n.replace("/msg/", "/") for n in names)
+
+
+def _beside(topic: str | None, key: str, reason: str, topics: Mapping[str, TopicSummary], bag: str) -> _Beside | None:
+    if topic is None:
+        return None
+    _check_topic(topic, key, (ODOMETRY, POSE) if key == "truth_topic" else (ODOMETRY,), topics, bag)
+    return _Beside(topic, reason)
+
+
+def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str, tuple[Array, Array]]:
+    """Mounts of all enabled sensors that name a frame of /tf_static, also of those that read no topic."""
+    if tree is None:
+        return {}
+    return {
+        name: tree.mount(config.body_frame, sensor.mount.tf_frame, f"{bag}: sensors.{name}.mount.tf_frame")
+        for name, sensor in config.sensors.items()
+        if sensor.enabled and sensor.mount.tf_frame
+    }
+
+
+def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary]) -> list[str]:
+    """Say which sensors gave nothing at all, and mostly why."""
+    lines = []
+    for readings in (r for r in sensors if not r.values):
+        reasons = Counter(r.reason for r in rows if r.sensor == readings.sensor)
+        why = f", mostly: {reasons.most_common(1)[0][0]}" if reasons else ""
+        count = topics[readings.config.topic].messages
+        lines.append(f"{readings.sensor}: none of the {count} messages on {readings.config.topic} could be used{why}")
+    return lines
+
+
+def _truth(item: _Beside, warnings: list[str]) -> Trajectory | None:
+    """Return the true trajectory; its twist is not used (its frame differs between writers)."""
+    poses = [(s, *pose_of(m)) for s, m in zip(item.stamps_ns, item.messages, strict=True)]
+    good = [(s, p, R) for s, p, R in poses if R is not None and np.isfinite(p).all()]
+    stamps = np.array([s for s, _, _ in good], dtype=np.int64)
+    keep = np.flatnonzero(_clock.longest_increasing(stamps))
+    if len(keep) < item.count:
+        warnings.append(f"{item.topic}: {item.count - len(keep)} truth messages left out (stamp or pose not usable)")
+    if len(keep) < 2:
+        return None
+    return Trajectory(
+        stamps_ns=stamps[keep],
+        p_world_m=np.array([good[i][1] for i in keep]),
+        R_world_body=np.array([good[i][2] for i in keep]),
+    )
+
+
+def _check_speed(item: _Beside) -> SpeedSeries | None:
+    """Return the forward speed of an odometry topic, in stamp order."""
+    stamps = np.array(item.stamps_ns, dtype=np.int64)
+    speed = np.array([float(m.twist.twist.linear.x) for m in item.messages])
+    keep = np.flatnonzero(_clock.longest_increasing(stamps))
+    keep = keep[np.isfinite(speed[keep])]
+    if len(keep) == 0:
+        return None
+    return SpeedSeries(topic=item.topic, stamps_ns=stamps[keep], speed_mps=speed[keep])
