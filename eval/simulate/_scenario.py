@@ -153,16 +153,16 @@ def _motion(s: Scenario, rng: np.random.Generator) -> Motion:
         speed, rate = (lambda t: Waves.at(wobble, t)), (lambda t: 0.3 * Waves.at(wobble, t))
     elif s.path == "turn":
         total, width = np.radians(rng.uniform(80.0, 110.0)), 4.0
-        speed = lambda t: cruise * (1.0 - 0.4 * _ramp(t, turn_at, 8.0))  # noqa: E731
-        rate = lambda t: total / (2.0 * width) / np.cosh((t - turn_at) / width) ** 2 + Waves.at(wobble, t)  # noqa: E731
+        speed = lambda t: cruise * (1.0 - 0.4 * _ramp(t, turn_at, 8.0))
+        rate = lambda t: total / (2.0 * width) / np.cosh((t - turn_at) / width) ** 2 + Waves.at(wobble, t)
     elif s.path == "entry":
-        speed = lambda t: cruise * (1.0 - 0.6 * _ramp(t, 0.75 * s.duration_s, 10.0))  # noqa: E731
+        speed = lambda t: cruise * (1.0 - 0.6 * _ramp(t, 0.75 * s.duration_s, 10.0))
         bend = np.radians(rng.uniform(15.0, 40.0))
-        rate = lambda t: sign * bend / 16.0 / np.cosh((t - turn_at) / 8.0) ** 2 + Waves.at(wobble, t)  # noqa: E731
+        rate = lambda t: sign * bend / 16.0 / np.cosh((t - turn_at) / 8.0) ** 2 + Waves.at(wobble, t)
     else:
         slow = Waves.jonswap(rng, 0.08, 60.0)
-        speed = lambda t: cruise * (0.75 + 0.25 * np.sin(2.0 * np.pi * t / 90.0))  # noqa: E731
-        rate = lambda t: sign * 0.05 + Waves.at(slow, t)  # noqa: E731
+        speed = lambda t: cruise * (0.75 + 0.25 * np.sin(2.0 * np.pi * t / 90.0))
+        rate = lambda t: sign * 0.05 + Waves.at(slow, t)
     sway = Waves.jonswap(rng, 0.05, 12.0)
     waves = (
         Waves.jonswap(rng, np.radians(s.wave_roll_deg), 4.0),

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keep GNSS fixes out of a run, to predict them: every n-th, or gaps of some seconds."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+from graphloc.errors import ConfigError
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import GnssPosition
+from graphloc.recording import Recording
+
+
+@dataclass(frozen=True, slots=True)
+class HoldOut:
+    """`every` n-th fix, or `gaps` gaps of `gap_s` seconds spread evenly over the fixes' span."""
+
+    every: int = 0
+    gaps: int = 0
+    gap_s: float = 0.0
+
+    @staticmethod
+    def parse(text: str) -> HoldOut:
+        """Read `every:N` or `gaps:COUNTxSECONDS`.
+
+        Raises:
+            ConfigError: it is neither.
+        """
+        if match := re.fullmatch(r"every:(\d+)", text):
+            if int(match[1]) >= 2:
+                return HoldOut(every=int(match[1]))
+        elif (match := re.fullmatch(r"gaps:(\d+)x(\d+(?:\.\d+)?)", text)) and int(match[1]) and float(match[2]):
+            return HoldOut(gaps=int(match[1]), gap_s=float(match[2]))
+        raise ConfigError(f"--hold-out {text}: use every:N (N of 2 or more) or gaps:COUNTxSECONDS, e.g. gaps:8x10")
+
+    def split(self, recording: Recording) -> tuple[Recording, tuple[GnssPosition, ...]]:
+        """Return the recording without the held fixes (their ledger rows say so), and the held fixes."""
+        fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)]
+        if len(fixes) < 3:
+            raise ConfigError(f"{recording.source}: --hold-out needs at least 3 fixes, the run has {len(fixes)}")
+        held = tuple(m for i, m in enumerate(fixes) if self._holds(i, m, fixes))
+        gone = {id(m) for m in held}
+        rows = tuple(
+            LedgerRow(
+                seq=m.seq,
+                stamp_ns=m.stamp_ns,
+                sensor=m.sensor,
+                topic=recording.topics.get(m.sensor, ""),
+                outcome=Outcome.HELD_OUT,
+                reason="kept out of the graph to test it",
+            )
+            for m in held
+        )
+        kept = tuple(m for m in recording.measurements if id(m) not in gone)
+        return replace(recording, measurements=kept, rows=recording.rows + rows), held
+
+    def _holds(self, i: int, m: GnssPosition, fixes: list[GnssPosition]) -> bool:
+        if self.every:
+            return i % self.every == self.every - 1
+        span = (fixes[-1].stamp_ns - fixes[0].stamp_ns) * 1e-9
+        at = (m.stamp_ns - fixes[0].stamp_ns) * 1e-9
+        centres = (span * (n + 1.0) / (self.gaps + 1.0) for n in range(self.gaps))
+        return any(abs(at - c) <= self.gap_s / 2.0 for c in centres)

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How good an estimate is: BL eq. 2.29-2.32, percentiles, NEES, coverage, held-out fixes, speed.
+
+The estimate is interpolated to the truth's stamps; nothing is aligned; the matched fraction is always
+given, since a track that covers half a run must not look better for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphloc.frames import Array, Datum, wrap_angle
+from graphloc.measurements import GnssPosition
+from graphloc.recording import SpeedSeries
+from graphloc.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Numbers for people: a title, column names, rows of a name and values, and a note."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, tuple[float | None, ...]], ...]
+    note: str = ""
+
+    def as_dict(self) -> dict[str, dict[str, float | None]]:
+        """Return row name -> column -> value."""
+        return {name: dict(zip(self.columns, values, strict=True)) for name, values in self.rows}
+
+    def as_text(self) -> str:
+        """Return the table as aligned text."""
+        cells = [["", *self.columns]] + [[n, *("-" if v is None else f"{v:.3f}" for v in vs)] for n, vs in self.rows]
+        widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+        lines = [
+            "  ".join(c.rjust(w) if i else c.ljust(w) for i, (c, w) in enumerate(zip(r, widths, strict=True)))
+            for r in cells
+        ]
+        return "\n".join([self.title, *lines, *([self.note] if self.note else [])])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TruthMetrics:
+    """Errors against truth: position horizontal (BL eq. 2.29, 2.30), heading (2.31, 2.32).
+
+    NEES is of the horizontal position, 2 degrees of freedom: 2.0 if the covariance is honest. Coverage:
+    share of times at which the 95 % region holds the truth. None where there is no covariance.
+    """
+
+    position_rmse_m: float
+    position_p50_m: float
+    position_p95_m: float
+    position_max_m: float
+    error_3d_rmse_m: float
+    heading_rmse_deg: float
+    heading_max_deg: float
+    nees: float | None
+    coverage_95: float | None
+    heading_coverage_95: float | None
+    matched: float
+
+
+def errors(estimate: Trajectory, truth: Trajectory) -> tuple[Array, Array, Array, Trajectory, float]:
+    """Return t (M,) ns, position error (M, 3) m, heading error (M,) rad, the estimate there, matched share."""
+    covered = estimate.covers(truth.stamps_ns)
+    stamps = truth.stamps_ns[covered]
+    if not len(stamps):
+        raise ValueError("estimate and truth share no time")
+    there, true = estimate.at(stamps), truth.at(stamps)
+    return (
+        stamps,
+        there.p_world_m - true.p_world_m,
+        wrap_angle(there.yaw_rad - true.yaw_rad),
+        there,
+        float(covered.mean()),
+    )
+
+
+def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
+    """Return the metrics of an estimate against truth."""
+    _, error, heading, there, matched = errors(estimate, truth)
+    horizontal = np.hypot(error[:, 0], error[:, 1])
+    nees = coverage = heading_coverage = None
+    if there.cov is not None:
+        squared = np.einsum("ni,ni->n", error[:, :2], np.linalg.solve(there.cov[:, :2, :2], error[:, :2, None])[..., 0])
+        nees, coverage = float(squared.mean()), float((squared <= chi2.ppf(0.95, 2)).mean())
+        heading_coverage = float((heading**2 <= chi2.ppf(0.95, 1) * there.cov[:, 5, 5]).mean())
+    return TruthMetrics(
+        position_rmse_m=_rms(horizontal),
+        position_p50_m=float(np.percentile(horizontal, 50)),
+        position_p95_m=float(np.percentile(horizontal, 95)),
+        position_max_m=float(horizontal.max()),
+        error_3d_rmse_m=_rms(np.linalg.norm(error, axis=1)),
+        heading_rmse_deg=float(np.degrees(_rms(heading))),
+        heading_max_deg=float(np.degrees(np.abs(heading).max())),
+        nees=nees,
+        coverage_95=coverage,
+        heading_coverage_95=heading_coverage,
+        matched=matched,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldOutMetrics:
+    """Predicted antenna against held-out fixes. `outage_drift_m`: RMS of the largest error of each gap."""
+
+    horizontal_rmse_m: float
+    horizontal_p95_m: float
+    horizontal_max_m: float
+    error_3d_rmse_m: float
+    outage_drift_m: float
+    fixes: int
+    matched: float
+
+
+def held_out_errors(
+    estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, lever_m: Array
+) -> tuple[Array, Array, float]:
+    """Return stamps (M,), error (M, 3) of the predicted antenna, and the matched share."""
+    stamps = np.array([m.stamp_ns for m in held], dtype=np.int64)
+    positions = np.array([m.position for m in held])
+    fixes = datum.enu_from_geodetic(positions[:, 0], positions[:, 1], positions[:, 2])
+    covered = estimate.covers(stamps)
+    if not covered.any():
+        raise ValueError("the estimate covers none of the held-out fixes")
+    there = estimate.at(stamps[covered])
+    return stamps[covered], there.p_world_m + there.R_world_body @ lever_m - fixes[covered], float(covered.mean())
+
+
+def compare_to_held_out(
+    estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, lever_m: Array
+) -> HeldOutMetrics:
+    """Return the metrics of an estimate against held-out fixes."""
+    stamps, error, matched = held_out_errors(estimate, held, datum, lever_m)
+    horizontal = np.hypot(error[:, 0], error[:, 1])
+    usual = np.median(np.diff(stamps)) if len(stamps) > 1 else 1
+    gap = np.cumsum(np.concatenate([[0], np.diff(stamps) > 2.5 * usual]))
+    largest = np.array([horizontal[gap == g].max() for g in range(gap[-1] + 1)])
+    return HeldOutMetrics(
+        horizontal_rmse_m=_rms(horizontal),
+        horizontal_p95_m=float(np.percentile(horizontal, 95)),
+        horizontal_max_m=float(horizontal.max()),
+        error_3d_rmse_m=_rms(np.linalg.norm(error, axis=1)),
+        outage_drift_m=_rms(largest),
+        fixes=len(stamps),
+        matched=matched,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpeedMetrics:
+    """Forward speed of the estimate less that of a sensor that was not fused."""
+
+    mean_mps: float
+    std_mps: float
+    samples: int
+
+
+def compare_speed(estimate: Trajectory, check: SpeedSeries) -> SpeedMetrics:
+    """Return how the forward speed (body x) agrees with an independent one."""
+    covered = estimate.covers(check.stamps_ns)
+    order = np.argsort(check.stamps_ns[covered], kind="stable")
+    there = estimate.at(check.stamps_ns[covered][order])
+    if there.v_world_mps is None:
+        raise ValueError("the estimate has no velocity")
+    forward = np.einsum("ni,ni->n", there.v_world_mps, there.R_world_body[:, :, 0])
+    difference = forward - check.speed_mps[covered][order]
+    return SpeedMetrics(mean_mps=float(difference.mean()), std_mps=float(difference.std()), samples=len(difference))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+_Named = Sequence[tuple[str, Trajectory]]
+
+
+def _table(title: str, rows: Sequence[tuple[str, object]], note: str) -> Table:
+    dicts = [(name, asdict(row)) for name, row in rows]  # type: ignore[call-overload]
+    columns = tuple(dicts[0][1])
+    return Table(title, columns, tuple((n, tuple(d[c] for c in columns)) for n, d in dicts), note)
+
+
+def truth_table(estimates: _Named, truth: Trajectory) -> Table:
+    """Return one row an estimate, against truth."""
+    rows = [(name, compare_to_truth(t, truth)) for name, t in estimates]
+    return _table("Against truth", rows, "position: horizontal; interpolated to the truth's stamps, not aligned")
+
+
+def held_out_table(estimates: _Named, held: Sequence[GnssPosition], datum: Datum, lever_m: Array) -> Table:
+    """Return one row an estimate, against held-out fixes."""
+    rows = [(name, compare_to_held_out(t, held, datum, lever_m)) for name, t in estimates]
+    return _table("Against held-out fixes", rows, "the fixes' own noise is part of the error")
+
+
+def speed_table(estimates: _Named, check: SpeedSeries) -> Table:
+    """Return one row an estimate, against an independent forward speed."""
+    rows = [(name, compare_speed(t, check)) for name, t in estimates if t.v_world_mps is not None]
+    return _table("Forward speed", rows, f"estimate less {check.topic}, which was not fused")
