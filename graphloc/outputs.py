@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The run folder: solution.csv, .tum, .mcap, track.geojson, ledger.csv, slow.csv, run.json, effective config.
+
+Everything is written into a folder beside the wanted one and moved in place when complete, so an
+interrupted run leaves nothing half-written. Columns and units: docs/outputs.md.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.metadata
+import json
+import math
+import platform
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from graphloc.config import VesselConfig, effective
+from graphloc.errors import OutputError
+from graphloc.frames import Array, heading_deg_from_yaw
+from graphloc.ledger import LedgerRow
+from graphloc.solution import Solution
+from graphloc.time import utc_text
+
+MARK = "run.json"  # a folder with this file is ours to replace
+
+
+@contextmanager
+def fresh_folder(folder: Path, *, overwrite: bool) -> Iterator[Path]:
+    """Yield a folder to fill; move it to `folder` when all went well, and drop it when not.
+
+    Raises:
+        OutputError: `folder` exists and may not be replaced, or the disk refuses.
+    """
+    if folder.exists() and not (overwrite and (folder / MARK).exists()) and any(folder.iterdir()):
+        what = "is no graphloc run folder, so it is not replaced" if overwrite else "exists already; give --overwrite"
+        raise OutputError(f"{folder}: {what}")
+    fresh = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        fresh.chmod(0o755)
+        yield fresh
+        if folder.exists():
+            shutil.rmtree(folder)
+        fresh.rename(folder)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error.strerror or error})") from error
+    finally:
+        if fresh is not None and fresh.exists():
+            shutil.rmtree(fresh, ignore_errors=True)
+
+
+def write_run(
+    folder: Path,
+    solution: Solution,
+    config: VesselConfig,
+    *,
+    inputs: Mapping[str, str],
+    command: str,
+    metrics: Mapping[str, Any],
+) -> None:
+    """Write all files of a run but the report into an existing folder.
+
+    Args:
+        folder: where to. solution: what to write. config: its effective form goes along.
+        inputs: SHA-256 of each input. command: the command line. metrics: tables as plain data.
+    """
+    picked = _thinned(solution, config.output.rate_hz)
+    _csv(folder / "solution.csv", _solution_columns(solution), _solution_rows(solution, picked))
+    _tum(folder / "solution.tum", solution, picked)
+    if config.output.bag:
+        _bag(folder / "solution_bag", solution, picked, config.body_frame)
+    _geojson(folder / "track.geojson", solution, picked)
+    _csv(folder / "ledger.csv", _LEDGER_COLUMNS, (_ledger_row(row) for row in solution.ledger))
+    _csv(folder / "slow.csv", ("sensor", "name", "utc", "stamp_ns", "axis", "value", "sigma", "unit"), _slow(solution))
+    with (folder / "vessel.effective.yaml").open("w", encoding="utf-8") as stream:
+        YAML(typ="safe", pure=True).dump(effective(config), stream)
+    _run_json(folder / MARK, solution, config, inputs, command, metrics)
+
+
+def _thinned(solution: Solution, rate_hz: float) -> Array:
+    """Indices of the states to write: at most `rate_hz` a second, the last one included."""
+    stamps = solution.trajectory.stamps_ns
+    slot = np.floor((stamps - stamps[0]) * 1e-9 * rate_hz + 1e-6).astype(np.int64)
+    picked = np.flatnonzero(np.diff(slot, prepend=-1) > 0)
+    return np.unique(np.append(picked, len(stamps) - 1))
+
+
+def _csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _solution_columns(solution: Solution) -> list[str]:
+    fixed = (
+        "utc stamp_ns latitude_deg longitude_deg height_m east_m north_m up_m heading_deg roll_deg pitch_deg "
+        "v_east_mps v_north_mps v_up_mps bound95_horizontal_m bound95_height_m bound95_heading_deg health health_reason"
+    )
+    return [*fixed.split(), *(f"since_agreed_{name}_s" for name in solution.since_agreed_s)]
+
+
+def bounds_95(cov: Array) -> Array:
+    """95 % bounds (N, 3) of covariances (N, 6, 6): horizontal radius m, height m, heading deg.
+
+    The radius is the semi-major axis of the 95 % ellipse; so it holds at least 95 %.
+    """
+    major = np.linalg.eigvalsh(cov[:, :2, :2])[:, -1]
+    one = chi2.ppf(0.95, 1)
+    return np.column_stack(
+        [
+            np.sqrt(chi2.ppf(0.95, 2) * major),
+            np.sqrt(one * cov[:, 2, 2]),
+            np.degrees(np.sqrt(one * cov[:, 5, 5])),
+        ]
+    )
+
+
+def _solution_rows(solution: Solution, picked: Array) -> Iterator[list[object]]:
+    track = solution.trajectory
+    assert track.cov is not None
+    assert track.v_world_mps is not None
+    geodetic = solution.datum.geodetic_from_enu(track.p_world_m[picked])
+    rpy, heading = np.degrees(track.rpy_rad[picked]), heading_deg_from_yaw(track.yaw_rad[picked])
+    bound = bounds_95(track.cov[picked])
+    for i, k in enumerate(picked):
+        stamp = int(track.stamps_ns[k])
+        yield [
+            utc_text(stamp),
+            stamp,
+            *(f"{v:.9f}" for v in geodetic[i, :2]),
+            f"{geodetic[i, 2]:.4f}",
+            *(f"{v:.4f}" for v in track.p_world_m[k]),
+            f"{heading[i]:.4f}",
+            *(f"{v:.4f}" for v in rpy[i, :2]),
+            *(f"{v:.4f}" for v in track.v_world_mps[k]),
+            *(f"{v:.4f}" for v in bound[i]),
+            solution.health[k].value,
+            solution.health_reason[k],
+            *(f"{since[k]:.3f}" for since in solution.since_agreed_s.values()),
+        ]
+
+
+def _tum(path: Path, solution: Solution, picked: Array) -> None:
+    track = solution.trajectory
+    quaternions = Rotation.from_matrix(track.R_world_body[picked]).as_quat()
+    with path.open("w", encoding="ascii") as stream:
+        for k, q in zip(picked, quaternions, strict=True):
+            whole, rest = divmod(int(track.stamps_ns[k]), 1_000_000_000)
+            values = " ".join(f"{v:.9f}" for v in (*track.p_world_m[k], *q))
+            stream.write(f"{whole}.{rest:09d} {values}\n")
+
+
+def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None:
+    """A ROS 2 bag (MCAP): nav_msgs/Odometry, map -> body, and NavSatFix for map panels."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    t = store.types
+    track = solution.trajectory
+    assert track.cov is not None
+    assert track.v_world_mps is not None
+    geodetic = solution.datum.geodetic_from_enu(track.p_world_m[picked])
+    quaternions = Rotation.from_matrix(track.R_world_body[picked]).as_quat()
+    point, vector, quaternion = (t[f"geometry_msgs/msg/{n}"] for n in ("Point", "Vector3", "Quaternion"))
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        odometry = writer.add_connection("/graphloc/odometry", "nav_msgs/msg/Odometry", typestore=store)
+        fix = writer.add_connection("/graphloc/fix", "sensor_msgs/msg/NavSatFix", typestore=store)
+        for i, k in enumerate(picked):
+            stamp = int(track.stamps_ns[k])
+            R = track.R_world_body[k]
+            time = t["builtin_interfaces/msg/Time"](sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000)
+            twist_cov = np.zeros((6, 6))
+            twist_cov[:3, :3] = R.T @ solution.v_cov[k] @ R
+            message = t["nav_msgs/msg/Odometry"](
+                header=t["std_msgs/msg/Header"](stamp=time, frame_id="map"),
+                child_frame_id=body_frame,
+                pose=t["geometry_msgs/msg/PoseWithCovariance"](
+                    pose=t["geometry_msgs/msg/Pose"](
+                        position=point(*map(float, track.p_world_m[k])),
+                        orientation=quaternion(*map(float, quaternions[i])),
+                    ),
+                    covariance=np.ascontiguousarray(track.cov[k]).reshape(36),
+                ),
+                twist=t["geometry_msgs/msg/TwistWithCovariance"](
+                    twist=t["geometry_msgs/msg/Twist"](
+                        linear=vector(*map(float, R.T @ track.v_world_mps[k])),
+                        angular=vector(*map(float, solution.gyro_radps[k])),
+                    ),
+                    covariance=twist_cov.reshape(36),
+                ),
+            )
+            writer.write(odometry, stamp, store.serialize_cdr(message, "nav_msgs/msg/Odometry"))
+            status = t["sensor_msgs/msg/NavSatStatus"](status=0, service=1)
+            position = t["sensor_msgs/msg/NavSatFix"](
+                header=t["std_msgs/msg/Header"](stamp=time, frame_id=body_frame),
+                status=status,
+                latitude=float(geodetic[i, 0]),
+                longitude=float(geodetic[i, 1]),
+                altitude=float(geodetic[i, 2]),
+                position_covariance=np.ascontiguousarray(track.cov[k][:3, :3]).reshape(9),
+                position_covariance_type=3,
+            )
+            writer.write(fix, stamp, store.serialize_cdr(position, "sensor_msgs/msg/NavSatFix"))
+
+
+def _geojson(path: Path, solution: Solution, picked: Array) -> None:
+    """RFC 7946: the track as a line, longitude first."""
+    geodetic = solution.datum.geodetic_from_enu(solution.trajectory.p_world_m[picked])
+    line = [[round(float(lon), 9), round(float(lat), 9), round(float(h), 3)] for lat, lon, h in geodetic]
+    stamps = solution.trajectory.stamps_ns
+    properties = {
+        "name": "graphloc",
+        "start": utc_text(int(stamps[0])),
+        "end": utc_text(int(stamps[-1])),
+        "stroke": "#0072B2",
+    }
+    feature = {
+        "type": "Feature",
+        "geometry": {"type": "LineString", "coordinates": line},
+        "properties": properties,
+    }
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}), encoding="utf-8")
+
+
+_LEDGER_COLUMNS = ["utc", *(f.name for f in fields(LedgerRow))]
+
+
+def _ledger_row(row: LedgerRow) -> list[object]:
+    values = [getattr(row, f.name) for f in fields(LedgerRow)]
+    text = [f"{v:.4f}" if isinstance(v, float) else "" if v is None else v for v in values]
+    return [utc_text(row.stamp_ns) if row.stamp_ns else "", *text]
+
+
+def _slow(solution: Solution) -> Iterator[list[object]]:
+    for sensor, slow in solution.slow.items():
+        for stamp, value, sigma in zip(slow.stamps_ns.tolist(), slow.value, slow.sigma, strict=True):
+            for axis, v, s in zip(slow.axes, value, sigma, strict=True):
+                yield [sensor, slow.name, utc_text(stamp), stamp, axis, f"{v:.4f}", f"{s:.4f}", slow.unit]
+
+
+def _plain(value: Any) -> Any:
+    """JSON knows no NaN and no infinity."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _run_json(
+    path: Path,
+    solution: Solution,
+    config: VesselConfig,
+    inputs: Mapping[str, str],
+    command: str,
+    metrics: Mapping[str, Any],
+) -> None:
+    names = ("graphloc", "gtsam", "numpy", "scipy", "rosbags", "pyproj")
+    run = {
+        "command": command,
+        "inputs_sha256": dict(inputs),
+        "versions": {"python": platform.python_version(), **{n: importlib.metadata.version(n) for n in names}},
+        "datum": solution.datum.origin._asdict(),
+        "stats": asdict(solution.stats),
+        "ledger": solution.ledger.counts(),
+        "ledger_total": len(solution.ledger),
+        "metrics": dict(metrics),
+        "config": effective(config),
+    }
+    path.write_text(json.dumps(_plain(run), indent=2), encoding="utf-8")
