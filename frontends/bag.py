@@ -49,7 +49,7 @@ from graphloc.recording import Recording, SpeedSeries
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 
-Progress = Callable[[int, int], None]
+Progress = Callable[[str, int, int], None]
 TF_STATIC = "/tf_static"
 _REPORT_EVERY = 2000  # messages between two calls of `progress`
 
@@ -73,7 +73,7 @@ def read_recording(
     Args:
         paths: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, or several of one kind (split bags).
         config: which topics belong to which sensors, units, mounts.
-        progress: called now and then with messages done and messages in all.
+        progress: called now and then with the stage, messages done and messages in all.
 
     Returns:
         The recording. Its measurements, IMU samples and rows add up to its `message_count`, in which
@@ -149,9 +149,9 @@ class _Reader:
             read[raw.topic] += 1
             self._take(raw)
             if progress is not None and done % _REPORT_EVERY == 0:
-                progress(done, max(total, done))
+                progress("reading", done, max(total, done))
         if progress is not None:
-            progress(total, total)
+            progress("reading", total, total)
         return self._rows + self._topic_rows(read)
 
     def _take(self, raw: RawMessage) -> None:
