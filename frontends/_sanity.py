@@ -42,16 +42,20 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
     return lines
 
 
-def far_fixes(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
-    """Return (N,) whether a fix lies further than `FAR_M` from the median of all fixes."""
-    if not fixes:
+def far_fixes_of(lla: Array) -> NDArray[np.bool_]:
+    """Return (N,) whether a fix (N, 3), deg, deg, m, lies further than `FAR_M` from the median of all."""
+    if len(lla) == 0:
         return np.zeros(0, dtype=bool)
-    lla = np.array([f.position for f in fixes])
     # Median longitude about the first one, so that a run across the date line stays together.
     lon = lla[0, 1] + (lla[:, 1] - lla[0, 1] + 180.0) % 360.0 - 180.0
     middle = Datum(Geodetic(float(np.median(lla[:, 0])), float(np.median(lon)), float(np.median(lla[:, 2]))))
     enu = middle.enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])
     return np.asarray(np.linalg.norm(enu, axis=1) > FAR_M)
+
+
+def far_fixes(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
+    """Return (N,) whether a fix lies further than `FAR_M` from the median of all fixes."""
+    return far_fixes_of(np.array([f.position for f in fixes]).reshape(-1, 3))
 
 
 def gnss_warnings(sensor: str, fixes: Sequence[GnssPosition], config: VesselConfig) -> list[str]:

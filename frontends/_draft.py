@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A first `vessel.yaml` from an inspection: it works as it stands, and every guess says that it is one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from graphloc.config import ImuConfig, SlowErrorConfig
+from graphloc.frontends._reports import CompassReport, GnssReport, ImuReport, Inspection, OdometryReport
+from graphloc.frontends.decode import IMU
+
+_HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
+
+
+def draft_config(inspection: Inspection) -> str:
+    """Return the YAML text of a configuration for this bag. Lines with `# guess:` want a look."""
+    name = Path(inspection.source.split(", ")[0]).stem or "vessel"
+    lines = [
+        f"# A first configuration for {inspection.source}, written by `graphloc inspect`.",
+        "# Look at each line marked 'guess'. All keys and their defaults: docs/configuration.md.",
+        f"vessel: {json.dumps(name)}",
+        "body_frame: base_link",
+        "# datum: the first good fix",
+        "sensors:",
+    ]
+    blocks = list(_blocks(inspection))
+    lines += [f"  {line}" for block in blocks for line in block]
+    if not blocks:
+        lines[-1] = "sensors: {}  # nothing in this bag can be used"
+    lines += _beside(inspection.odometry)
+    return "\n".join(lines) + "\n"
+
+
+def _blocks(inspection: Inspection) -> Iterator[list[str]]:
+    for k, imu in enumerate(inspection.imus):
+        yield _imu_block(_numbered("imu", k), imu, enabled=k == 0)
+    for k, gnss in enumerate(inspection.gnss):
+        yield _gnss_block(_numbered("gnss", k), gnss, enabled=k == 0)
+    for k, compass in enumerate(c for c in inspection.compasses if c.usable):
+        yield _compass_block(_numbered("compass", k), compass)
+    for compass in (c for c in inspection.compasses if not c.usable):
+        yield [f"# orientation of {compass.topic}: left out as a compass; {compass.why}"]
+    for k, topic in enumerate(inspection.velocities):
+        yield [
+            f"{_numbered('gnss_velocity', k)}:",
+            "  kind: gnss_velocity",
+            f"  topic: {topic}  # guess: taken as a velocity in east, north, up",
+        ]
+    for k, item in enumerate(o for o in inspection.odometry if o.role == "pose"):
+        yield [
+            f"{_numbered('pose', k)}:",
+            "  kind: pose",
+            f"  topic: {item.topic}",
+            f"  enabled: false  # guess: its frame '{item.frame_id}' must be east-north-up at the datum; then true",
+        ]
+    if inspection.gnss:
+        yield ["height:", "  enabled: false  # guess: set to true for a craft that floats"]
+
+
+def _numbered(name: str, k: int) -> str:
+    return name if k == 0 else f"{name}_{k + 1}"
+
+
+def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
+    lines = [f"{name}:", "  kind: imu", f"  topic: {imu.topic}"]
+    if not enabled:
+        lines.append("  enabled: false  # guess: one IMU is used, the one with most samples")
+    reason = "; ".join(imu.why)
+    if imu.accel_unit != "m/s^2":
+        lines.append(f"  accel_unit: {imu.accel_unit}  # guess: {reason}")
+    if imu.gyro_unit != "rad/s":
+        lines.append(f"  gyro_unit: {imu.gyro_unit}  # guess: {reason}")
+    if imu.gravity != "included":
+        lines.append(f"  gravity: {imu.gravity}  # guess: {reason}")
+    mount = imu.mount
+    if mount.tf_frame is not None:
+        lines.append(f"  mount: {{tf_frame: {json.dumps(mount.tf_frame)}}}  # {mount.evidence}")
+    else:
+        rpy = ", ".join(f"{a:.1f}" for a in mount.rpy_deg)
+        lines.append(f"  mount: {{xyz_m: [0.0, 0.0, 0.0], rpy_deg: [{rpy}]}}  # guess: {mount.evidence}; xyz unknown")
+    lines += _noise_lines(imu)
+    return lines
+
+
+def _noise_lines(imu: ImuReport) -> list[str]:
+    """Noise is set only where the bag shows more than the default allows for."""
+    if imu.accel_noise_ug is None or imu.gyro_noise_mdps is None:
+        return ["  # noise: the defaults; no standstill in this bag to measure it at"]
+    default = ImuConfig()
+    lines = [f"  # measured at standstill: {imu.accel_noise_ug:.0f} ug, {imu.gyro_noise_mdps:.1f} mdps per sqrt(Hz)"]
+    if imu.accel_noise_ug > default.accel_noise_ug_per_sqrt_hz:
+        lines.append(f"  accel_noise_ug_per_sqrt_hz: {imu.accel_noise_ug:.0f}  # guess: as measured")
+    if imu.gyro_noise_mdps > default.gyro_noise_mdps_per_sqrt_hz:
+        lines.append(f"  gyro_noise_mdps_per_sqrt_hz: {imu.gyro_noise_mdps:.1f}  # guess: as measured")
+    return lines
+
+
+def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
+    lines = [f"{name}:", "  kind: gnss", f"  topic: {gnss.topic}"]
+    if not enabled:
+        lines.append("  enabled: false  # guess: the receiver with most fixes is used")
+    if gnss.tf_frame is not None:
+        lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # /tf_static knows it")
+    else:
+        lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
+    wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
+    if wanders:
+        lines.append(f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m")
+    if not gnss.slow_error:
+        lines.append(f"  slow_error: {{enabled: false}}  # guess: {gnss.why}")
+    else:
+        vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3) if wanders else None
+        more = f", vertical_sigma_m: {vertical:.1f}" if vertical else ""
+        lines.append(f"  slow_error: {{enabled: true{more}}}  # guess: {gnss.why}")
+    return lines
+
+
+def _compass_block(name: str, compass: CompassReport) -> list[str]:
+    lines = [
+        f"{name}:",
+        "  kind: compass",
+        f"  topic: {compass.topic}",
+        f"  convention: {compass.convention}  # guess: {compass.why}",
+    ]
+    if compass.offset_deg is not None and abs(compass.offset_deg) > 10.0:
+        quarter = 90.0 * round(compass.offset_deg / 90.0)
+        yaw = quarter if abs(compass.offset_deg - quarter) < 15.0 else round(compass.offset_deg)
+        lines.append(f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course")
+    if compass.msgtype == IMU:
+        lines.append("  use_reported_sigma: false  # guess: drivers' orientation covariances are seldom measured")
+    return lines
+
+
+def _beside(odometry: tuple[OdometryReport, ...]) -> list[str]:
+    lines = []
+    for role, key, note in (
+        ("truth", "truth_topic", "for comparison only, never fused"),
+        ("check_speed", "check_speed_topic", "compared, never fused"),
+    ):
+        for k, item in enumerate(o for o in odometry if o.role == role):
+            lines.append(f"{'# ' if k else ''}{key}: {item.topic}  # guess: {item.why}; {note}")
+    return lines

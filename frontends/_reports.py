@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `inspect` finds out about a bag: plain frozen values, ready for JSON."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+Vec = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TopicReport:
+    """A topic. Stamps are header stamps; None where messages of this type are not unpacked.
+
+    Attributes:
+        gaps: intervals longer than 5 usual ones (and 0.1 s); max_gap_s: the longest interval.
+        repeated, backward: stamps equal to, or before, the one before; no_stamp: zero stamps.
+        latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points.
+    """
+
+    topic: str
+    msgtype: str
+    count: int
+    undecodable: int = 0
+    frame_id: str = ""
+    start_ns: int | None = None
+    span_s: float | None = None
+    rate_hz: float | None = None
+    gaps: int | None = None
+    max_gap_s: float | None = None
+    repeated: int | None = None
+    backward: int | None = None
+    no_stamp: int | None = None
+    latency_s: Vec | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MountGuess:
+    """Rotation of a sensor in body, deg, or the frame of /tf_static that knows it; and the evidence."""
+
+    rpy_deg: Vec
+    tf_frame: str | None
+    evidence: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuReport:
+    """An IMU, in its own axes and in the units of the bag.
+
+    Attributes:
+        gravity_size: median size of the acceleration; gravity_axis: its direction, unit vector.
+        accel_unit, gyro_unit, gravity: as `vessel.yaml` has them; why: one line each, where not the standard.
+        still_s: standstill found; gyro_bias_radps and the noise densities are from it (None without).
+        reported_accel_ug, reported_gyro_mdps: densities that the messages' covariances amount to.
+    """
+
+    topic: str
+    gravity_size: float
+    gravity_axis: Vec
+    accel_unit: str
+    gyro_unit: str
+    gravity: str
+    why: tuple[str, ...]
+    still_s: float
+    gyro_bias_radps: Vec | None
+    accel_noise_ug: float | None
+    gyro_noise_mdps: float | None
+    reported_accel_ug: float | None
+    reported_gyro_mdps: float | None
+    mount: MountGuess
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GnssReport:
+    """A GNSS receiver.
+
+    Attributes:
+        statuses: fixes by status name; known_covariance: share of fixes that report one.
+        reported_sigma_m: median sigma east, north, up; scatter_m: the white part seen in the data, the same.
+        height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
+    """
+
+    topic: str
+    fixes: int
+    statuses: dict[str, int]
+    known_covariance: float
+    reported_sigma_m: Vec | None
+    scatter_m: Vec | None
+    height_range_m: float
+    extent_m: tuple[float, float]
+    travelled_m: float
+    first: Vec
+    slow_error: bool
+    why: str
+    tf_frame: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompassReport:
+    """An orientation that may be a compass, judged by the GNSS course in motion.
+
+    Attributes:
+        usable: whether it fits the course; convention: the better one.
+        offset_deg: mean of yaw minus course; scatter_deg: its circular standard deviation.
+        samples: courses compared; why: the judgement in words.
+    """
+
+    topic: str
+    msgtype: str
+    usable: bool
+    convention: str
+    offset_deg: float | None
+    scatter_deg: float | None
+    samples: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryReport:
+    """An odometry or pose topic: role is 'truth', 'check_speed' or 'pose'."""
+
+    topic: str
+    msgtype: str
+    frame_id: str
+    role: str
+    max_speed_mps: float
+    why: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inspection:
+    """All of it."""
+
+    source: str
+    topics: tuple[TopicReport, ...]
+    imus: tuple[ImuReport, ...] = ()
+    gnss: tuple[GnssReport, ...] = ()
+    compasses: tuple[CompassReport, ...] = ()
+    odometry: tuple[OdometryReport, ...] = ()
+    velocities: tuple[str, ...] = ()
+    tf_frames: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain data for JSON; numbers that are not finite become None."""
+        tree = _plain(asdict(self))
+        assert isinstance(tree, dict)
+        return tree
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Columns of every topic that `inspect` understands, read in one pass; other topics are only counted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+from graphloc.frontends._source import Bag
+from graphloc.frontends._tf import StaticTree
+from graphloc.frontends.decode import IMU, NAV_SAT_FIX, ODOMETRY, POSE, QUATERNION, TF, TWIST, header_stamp_ns
+
+
+def _xyz(v: Any) -> tuple[float, float, float]:
+    return (v.x, v.y, v.z)
+
+
+def _xyzw(q: Any) -> tuple[float, float, float, float]:
+    return (q.x, q.y, q.z, q.w)
+
+
+def _imu_row(m: Any) -> tuple[float, ...]:
+    covariances = (m.linear_acceleration_covariance[0], m.angular_velocity_covariance[0], m.orientation_covariance[0])
+    return (*_xyz(m.linear_acceleration), *_xyz(m.angular_velocity), *_xyzw(m.orientation), *covariances)
+
+
+def _fix_row(m: Any) -> tuple[float, ...]:
+    c = m.position_covariance
+    kind = m.position_covariance_type
+    return (m.latitude, m.longitude, m.altitude, m.status.status, kind, c[0], c[4], c[8])
+
+
+def _pose_row(m: Any) -> tuple[float, ...]:
+    return (*_xyz(m.pose.pose.position), *_xyzw(m.pose.pose.orientation), 0.0, 0.0, 0.0)
+
+
+def _odometry_row(m: Any) -> tuple[float, ...]:
+    return (*_pose_row(m)[:7], *_xyz(m.twist.twist.linear))
+
+
+ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
+    IMU: _imu_row,
+    NAV_SAT_FIX: _fix_row,
+    QUATERNION: lambda m: _xyzw(m.quaternion),
+    ODOMETRY: _odometry_row,
+    POSE: _pose_row,
+    TWIST: lambda m: _xyz(m.twist.twist.linear),
+}
+
+
+@dataclass(slots=True)
+class Stream:
+    """One topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`)."""
+
+    topic: str
+    msgtype: str
+    frame_id: str = ""
+    undecodable: int = 0
+    no_stamp: int = 0
+    _stamps: list[int] = field(default_factory=list)
+    _logs: list[int] = field(default_factory=list)
+    _rows: list[tuple[float, ...]] = field(default_factory=list)
+
+    def add(self, stamp_ns: int, log_ns: int, row: tuple[float, ...]) -> None:
+        """Append a message."""
+        self._stamps.append(stamp_ns)
+        self._logs.append(log_ns)
+        self._rows.append(row)
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Header stamps in order of arrival."""
+        return np.array(self._stamps, dtype=np.int64)
+
+    @property
+    def logs_ns(self) -> NDArray[np.int64]:
+        """Recording times in order of arrival."""
+        return np.array(self._logs, dtype=np.int64)
+
+    @property
+    def rows(self) -> Array:
+        """The numbers (N, k)."""
+        return np.array(self._rows, dtype=float)
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+
+def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
+    """Read all topics of the types in `ROWS`, and the static transforms."""
+    streams = {
+        t.topic: Stream(t.topic, t.msgtypes[0])
+        for t in bag.topics.values()
+        if len(t.msgtypes) == 1 and t.msgtypes[0] in ROWS
+    }
+    tree = StaticTree()
+    statics = {"/tf_static"} & set(bag.topics)
+    for raw in bag.messages(set(streams) | statics) if streams or statics else ():
+        stream = streams.get(raw.topic)
+        try:
+            msg: Any = bag.decode(raw)
+            if stream is None:
+                if raw.msgtype == TF:
+                    tree.add(msg)
+                continue
+            row = ROWS[raw.msgtype](msg)
+        except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything; counted
+            if stream is not None:
+                stream.undecodable += 1
+            continue
+        stamp_ns = header_stamp_ns(msg)
+        if stamp_ns is None:
+            stream.no_stamp += 1
+            continue
+        stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
+        stream.add(stamp_ns, raw.log_ns, row)
+    return list(streams.values()), tree

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`graphloc inspect`: what a bag holds, as a value, as text, and as a first `vessel.yaml`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from graphloc.frontends._assess import (
+    Courses,
+    compass_report,
+    courses_of,
+    gnss_report,
+    imu_report,
+    motion_of,
+    sane,
+    topic_report,
+    track,
+)
+from graphloc.frontends._draft import draft_config
+from graphloc.frontends._reports import (
+    CompassReport,
+    GnssReport,
+    ImuReport,
+    Inspection,
+    MountGuess,
+    OdometryReport,
+    TopicReport,
+)
+from graphloc.frontends._source import Bag
+from graphloc.frontends._streams import Stream, read_streams
+from graphloc.frontends._tf import StaticTree
+from graphloc.frontends.decode import IMU, NAV_SAT_FIX, ODOMETRY, POSE, QUATERNION, TWIST
+from graphloc.time import utc_text
+
+__all__ = [
+    "CompassReport",
+    "GnssReport",
+    "ImuReport",
+    "Inspection",
+    "MountGuess",
+    "OdometryReport",
+    "TopicReport",
+    "draft_config",
+    "inspect_bag",
+    "render",
+]
+BODY_FRAME = "base_link"
+
+
+def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
+    """Look at a whole bag.
+
+    Args:
+        paths: as for `read_recording`.
+
+    Raises:
+        InputError: the bag cannot be opened.
+    """
+    with Bag(paths) as bag:
+        topics = bag.topics
+        streams, tree = read_streams(bag)
+        source, warnings = bag.name, tuple(bag.warnings)
+    by_topic = {s.topic: s for s in streams}
+    filled = [s for s in streams if len(s)]
+    fixes = [s for s in filled if s.msgtype == NAV_SAT_FIX]
+    odometry = [_odometry_report(s) for s in filled if s.msgtype in (ODOMETRY, POSE)]
+    wheels = [by_topic[o.topic] for o in odometry if o.role == "check_speed"]
+    motion = motion_of(wheels, fixes)
+    found_gnss = [g for s in fixes if (g := gnss_report(s, _known(s, tree)))]
+    found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, tree, BODY_FRAME))]
+    courses = _courses(by_topic, found_gnss)
+    candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU)]
+    return Inspection(
+        source=source,
+        topics=tuple(
+            topic_report(by_topic[t.topic], t.messages)
+            if t.topic in by_topic
+            else TopicReport(topic=t.topic, msgtype=" or ".join(t.msgtypes), count=t.messages)
+            for t in topics.values()
+        ),
+        imus=tuple(sorted(found_imus, key=lambda i: -len(by_topic[i.topic]))),
+        gnss=tuple(sorted(found_gnss, key=lambda g: -g.fixes)),
+        compasses=tuple(c for s in candidates if (c := compass_report(s, courses))),
+        odometry=tuple(odometry),
+        velocities=tuple(s.topic for s in filled if s.msgtype == TWIST),
+        tf_frames=tree.frames,
+        warnings=warnings,
+    )
+
+
+def _known(stream: Stream, tree: StaticTree) -> str | None:
+    """Return the stream's frame where /tf_static leads to it from the body."""
+    return stream.frame_id if tree.resolve(BODY_FRAME, stream.frame_id) and stream.frame_id in tree.frames else None
+
+
+def _courses(by_topic: dict[str, Stream], gnss: Sequence[GnssReport]) -> Courses | None:
+    """Return the course over ground of the receiver with most fixes."""
+    if not gnss:
+        return None
+    best = max(gnss, key=lambda g: g.fixes)
+    stamps, p, _ = track(by_topic[best.topic])
+    scatter = max(best.scatter_m[:2]) if best.scatter_m else 1.0
+    return courses_of(stamps, p, scatter)
+
+
+def _odometry_report(stream: Stream) -> OdometryReport:
+    """Guess what an odometry or pose topic is, by its name and whether it reports a speed."""
+    rows = stream.rows[sane(stream)]
+    speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
+    name = stream.topic.lower()
+    if any(word in name for word in ("truth", "groundtruth", "/gt")):
+        role, why = "truth", "its name says so"
+    elif stream.msgtype == ODOMETRY and speed > 0.05:
+        role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: looks like wheel odometry"
+    else:
+        role, why = "pose", "it reports poses and no speed"
+    return OdometryReport(
+        topic=stream.topic,
+        msgtype=stream.msgtype,
+        frame_id=stream.frame_id,
+        role=role,
+        max_speed_mps=speed,
+        why=why,
+    )
+
+
+def render(inspection: Inspection) -> str:
+    """Return the inspection as text for a terminal."""
+    lines = [inspection.source, ""]
+    lines += _topic_table(inspection.topics)
+    for imu in inspection.imus:
+        lines += ["", *_imu_lines(imu)]
+    for gnss in inspection.gnss:
+        lines += ["", *_gnss_lines(gnss)]
+    for compass in inspection.compasses:
+        verdict = f"fits as a compass ({compass.convention})" if compass.usable else "not usable as a compass"
+        lines += ["", f"{compass.topic}: {verdict}", f"  {compass.why}"]
+    for item in inspection.odometry:
+        lines += ["", f"{item.topic}: suggested as {item.role}", f"  {item.why}"]
+    if inspection.tf_frames:
+        lines += ["", f"/tf_static knows: {', '.join(inspection.tf_frames)}"]
+    lines += [f"warning: {w}" for w in inspection.warnings]
+    return "\n".join(lines)
+
+
+def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
+    head = ("topic", "type", "count", "Hz", "span s", "gaps", "longest s", "repeated", "backward", "latency s")
+    rows = [head]
+    for t in topics:
+        latency = "-" if t.latency_s is None else f"{t.latency_s[1]:.3f} ({t.latency_s[0]:.3f}..{t.latency_s[2]:.3f})"
+        rows.append(
+            (
+                t.topic,
+                t.msgtype.replace("/msg/", "/"),
+                str(t.count),
+                _number(t.rate_hz, ".1f"),
+                _number(t.span_s, ".1f"),
+                _number(t.gaps, "d"),
+                _number(t.max_gap_s, ".2f"),
+                _number(t.repeated, "d"),
+                _number(t.backward, "d"),
+                latency,
+            )
+        )
+    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
+    lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    starts = [t.start_ns for t in topics if t.start_ns is not None]
+    if starts:
+        lines.append(f"starts {utc_text(min(starts))}")
+    for t in topics:
+        if t.undecodable or t.no_stamp:
+            lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded, {t.no_stamp or 0} have no stamp")
+    return lines
+
+
+def _number(value: float | None, spec: str) -> str:
+    return "-" if value is None else format(value, spec)
+
+
+def _imu_lines(imu: ImuReport) -> list[str]:
+    x, y, z = imu.gravity_axis
+    lines = [
+        f"{imu.topic}: acceleration {imu.gravity_size:.2f} (median), along {x:+.2f} {y:+.2f} {z:+.2f}",
+        *(f"  {why}" for why in imu.why),
+        f"  mount: {imu.mount.rpy_deg} deg; {imu.mount.evidence}",
+    ]
+    if imu.gyro_bias_radps is None:
+        lines.append("  no standstill found, so bias and noise were not measured")
+    else:
+        bias = ", ".join(f"{b:+.5f}" for b in imu.gyro_bias_radps)
+        lines.append(
+            f"  standstill {imu.still_s:.1f} s: gyro bias {bias} rad/s, noise {imu.accel_noise_ug:.0f} ug/sqrt(Hz) "
+            f"and {imu.gyro_noise_mdps:.1f} mdeg/s/sqrt(Hz)"
+        )
+    return lines
+
+
+def _gnss_lines(gnss: GnssReport) -> list[str]:
+    statuses = ", ".join(f"{n} {s}" for s, n in gnss.statuses.items())
+    lat, lon, height = gnss.first
+    east_m, north_m = gnss.extent_m
+    lines = [
+        f"{gnss.topic}: {statuses}; first fix {lat:.7f}, {lon:.7f}, {height:.1f} m",
+        f"  track {gnss.travelled_m:.0f} m in a box of {east_m:.0f} x {north_m:.0f} m, height {gnss.height_range_m:.1f} m",
+    ]
+    if gnss.reported_sigma_m is not None:
+        lines.append(f"  reported sigma east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
+    if gnss.scatter_m is not None:
+        lines.append(f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m)} m")
+    return lines
