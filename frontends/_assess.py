@@ -282,8 +282,8 @@ def imu_report(imu: Stream, motion: Motion | None, tree: StaticTree, body: str) 
     quiet = still.sum() > 20
 
     def density(columns: Array) -> float:
-        steps = np.diff(columns[still], axis=0)
-        return float(1.4826 * np.median(np.abs(steps)) / np.sqrt(2.0)) * root_dt
+        steps = np.diff(columns[still], axis=0)  # of the axis in the middle: one bad axis does not speak for all
+        return float(1.4826 * np.median(np.median(np.abs(steps), axis=0)) / np.sqrt(2.0)) * root_dt
 
     def reported(column: int, unit: float) -> float | None:
         variance = float(np.median(rows[:, column]))
@@ -314,11 +314,11 @@ def _standstill(stamps: NDArray[np.int64], accel: Array, gyro: Array, motion: Mo
     still = np.zeros(len(stamps), dtype=bool)
     for s in np.unique(second):
         part = second == s
-        quiet = float(gyro[part].std(axis=0).max()) < 0.01 and float(accel[part].std(axis=0).max()) < 0.2
+        quiet = float(gyro[part].std(axis=0).max()) < 0.03 and float(accel[part].std(axis=0).max()) < 0.2
         still[part] = quiet and float(np.abs(gyro[part].mean(axis=0)).max()) < 0.02
     if motion is not None:
         t = (stamps - motion.origin_ns) / NS_PER_S
-        still &= np.asarray(np.abs(np.interp(t, motion.t_s, motion.speed_mps)) < 0.05)
+        still[np.abs(np.interp(t, motion.t_s, motion.speed_mps)) > 0.05] = False
     return still
 
 

@@ -90,19 +90,20 @@ def weigh(
             stream.row.residuals(stream.measurements[i], stream.config, at)
             for i, at in zip(indices, attached, strict=True)
         ]
-        kernel = _stage_kernel(stream.config.kernel, stage, _spread(residuals))
+        # The norm of k whitened residuals is about sqrt(k) where all is well: bend that much later.
+        dof = len(residuals[0][0].raw) if residuals else 1
+        kernel = _stage_kernel(stream.config.kernel, stage, _spread(residuals) * float(np.sqrt(dof)))
         for i, found, at in zip(indices, residuals, attached, strict=True):
             P = None if covariance is None else covariance(int(stream.state[i]))
             verdicts[(stream.number, i)] = _verdict(stream, i, found, P, stage, kernel, at)
     return verdicts
 
 
-def _stage_kernel(kernel: KernelConfig, stage: str, spread: float) -> KernelConfig:
-    """The sensor's own kernel, or the stage's where that one is gentler; its bend at `spread` scales."""
+def _stage_kernel(kernel: KernelConfig, stage: str, widening: float) -> KernelConfig:
+    """The sensor's own kernel, or the stage's where that one is gentler; its bend `widening` times later."""
     limit = _STAGE_KERNEL.get(stage, kernel)
     gentle = _CONVEXITY.index(kernel.kind) <= _CONVEXITY.index(limit.kind)
-    far = 2.0 if stage == "far" and spread > 1.5 else 1.0
-    return KernelConfig(kind=kernel.kind if gentle else limit.kind, scale=kernel.scale * spread * far)
+    return KernelConfig(kind=kernel.kind if gentle else limit.kind, scale=kernel.scale * widening)
 
 
 def _spread(residuals: list[tuple[Residual, ...]]) -> float:

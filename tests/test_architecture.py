@@ -1,0 +1,105 @@
+"""The house: which room may import which, and what importing graphloc does not do."""
+
+import ast
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+VOCABULARY = {
+    "errors", "time", "frames", "measurements", "ledger", "trajectory", "config", "recording", "solution", "_config_docs",
+}  # fmt: skip
+GRAPH = {"graph", "keys", "timeline", "build", "solve", "outputs"}
+FORBIDDEN = {
+    "vocabulary": {"graphloc.factors", "graphloc.frontends", "graphloc.eval", "gtsam"},
+    "graph": {"graphloc.factors", "graphloc.frontends", "graphloc.eval"},
+    "factors": {"graphloc.frontends", "graphloc.eval", "graphloc.app", "graphloc.cli", "graphloc.solve"},
+    "frontends": {"graphloc.factors", "graphloc.eval", "graphloc.app", "graphloc.cli", "graphloc.solve", "gtsam"},
+    "eval": {"graphloc.app", "graphloc.cli"},
+    "door": set(),
+}
+
+
+def imports_of(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {a.name for a in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{path}: relative import"
+            found |= {node.module} | {f"{node.module}.{a.name}" for a in node.names}
+    return found
+
+
+def kind_of(path: Path) -> str:
+    first, second = path.relative_to(ROOT).parts[:2]
+    if first != "graphloc":
+        return first
+    name = second.removesuffix(".py")
+    if name in VOCABULARY or name == "__init__":
+        return "vocabulary"
+    return "graph" if name in GRAPH else "door"
+
+
+MODULES = sorted(p for room in ("graphloc", "factors", "frontends", "eval") for p in (ROOT / room).rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_go_one_way(path: Path) -> None:
+    forbidden = FORBIDDEN[kind_of(path)]
+    bad = {i for i in imports_of(path) if any(i == f or i.startswith(f + ".") for f in forbidden)}
+    assert not bad
+
+
+def test_only_the_door_opens_to_all() -> None:
+    assert {p.stem for p in MODULES if kind_of(p) == "door"} == {"app", "cli"}
+
+
+def test_builder_and_solvers_name_no_sensor() -> None:
+    for path in [ROOT / "graphloc/build.py", *(ROOT / "graphloc/solve").glob("*.py")]:
+        if path.stem == "_align":  # alignment reads measurements, as their types
+            continue
+        names = {n.id for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Name)}
+        assert not names & {"GnssPosition", "CompassHeading", "PoseFix", "GnssVelocity", "HeightPrior"}, path
+
+
+def test_import_is_light_and_writes_nothing(tmp_path: Path) -> None:
+    code = (
+        "import sys, graphloc, graphloc.cli; heavy = {'gtsam', 'cv2', 'open3d', 'matplotlib', 'plotly', 'rosbags'}; "
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    env = {**os.environ, "HOME": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", code], env=env, cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
+    assert not list(tmp_path.iterdir())
+
+
+def test_declared_packages_are_those_on_disk() -> None:
+    config = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    found = set()
+    for folder, name in ((".", "graphloc"), (".", "factors"), (".", "frontends"), (".", "eval")):
+        for path in {p.parent for p in (ROOT / folder / name).rglob("*.py")}:
+            assert (path / "__init__.py").exists(), path
+            dotted = ".".join(path.relative_to(ROOT).parts)
+            found.add(dotted if dotted.startswith("graphloc") else f"graphloc.{dotted}")
+    assert found == set(config["packages"])
+
+
+@pytest.mark.parametrize("room", ["factors", "frontends", "eval"])
+def test_links_for_type_checkers_resolve(room: str) -> None:
+    link = ROOT / "typings/graphloc" / room
+    if not link.is_symlink():
+        pytest.skip("this checkout has no symbolic links")
+    assert link.resolve() == ROOT / room
+
+
+@pytest.mark.parametrize("room", ["factors", "frontends", "eval", "tests"])
+def test_rooms_are_no_top_level_modules(room: str, tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", f"import {room}"], cwd=tmp_path, capture_output=True, check=False)
+    assert done.returncode != 0

@@ -1,0 +1,191 @@
+"""Conformance of every row of the sensor table, from the table (style rule 27)."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from graphloc.config import KernelConfig
+from graphloc.factors import KINDS, SENSORS
+from graphloc.frames import Datum, Geodetic
+from graphloc.graph import Attachment, Decision, Sensor
+
+DATUM = Datum(Geodetic(59.3, 18.1, 20.0))
+RNG = np.random.default_rng(3)
+
+
+def attachment(row: Sensor, config: object, *, tilt: float = 0.1, far_m: float = 50.0, slow: bool = True) -> Attachment:
+    process = row.slow(config) if slow else None
+    yaw = RNG.uniform(-3, 3)
+    return Attachment(
+        pose_key=1,
+        velocity_key=2,
+        slow_key=None if process is None else 3,
+        leaf_keys=(4, 5),
+        T_world_body=gtsam.Pose3(
+            gtsam.Rot3.RzRyRx(RNG.uniform(-tilt, tilt), RNG.uniform(-tilt, tilt), yaw), RNG.uniform(-far_m, far_m, 3)
+        ),
+        v_world_mps=RNG.normal(0, 2, 3),
+        T_state_sensor=gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, -0.03, 0.4), np.array([-1.5, 0.4, 2.2])),
+        dv_world_mps=np.array([0.1, -0.05, 0.02]),
+        gyro_radps=np.array([0.02, -0.01, 0.2]),
+        lever_m=np.array([-1.5, 0.4, 2.2]),
+        slow_value=None if process is None else RNG.normal(0, 0.1, len(process.sigma)),
+        datum=DATUM,
+    )
+
+
+def values_of(at: Attachment, guesses: tuple[tuple[int, object], ...]) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(at.pose_key, at.T_world_body)
+    values.insert(at.velocity_key, at.v_world_mps)
+    if at.slow_key is not None:
+        values.insert(at.slow_key, np.array(at.slow_value))
+    for key, value in guesses:
+        values.insert(key, value)
+    return values
+
+
+CASES = [pytest.param(row, slow, id=f"{row.kind}-{'slow' if slow else 'plain'}") for row in SENSORS for slow in (True, False)]
+
+
+@pytest.mark.parametrize(("row", "slow"), CASES)
+def test_zero_at_the_truth(row: Sensor, slow: bool) -> None:
+    config = row.config(kind=row.kind)
+    for _ in range(5):
+        at = attachment(row, config, slow=slow)
+        m = row.ideal(at, config)
+        for residual in row.residuals(m, config, at):
+            assert np.allclose(residual.raw, 0.0, atol=1e-6)
+        update = row.factors(m, config, at, Decision())
+        values = values_of(at, update.guesses)
+        assert sum(f.error(values) for f in update.factors) < 1e-8
+
+
+@pytest.mark.parametrize(("row", "slow"), CASES)
+def test_jacobians_are_numeric_ones(row: Sensor, slow: bool) -> None:
+    """Linearised factors against central differences of their own whitened error, step 1e-5."""
+    config = row.config(kind=row.kind)
+    at = attachment(row, config, slow=slow)
+    m = row.ideal(at, config)
+    update = row.factors(m, config, at, Decision())
+    values = values_of(at, update.guesses)
+    for factor in update.factors:
+        linear = factor.linearize(values)
+        A, _b = linear.jacobian()
+        column = 0
+        for key in factor.keys():
+            size = {1: 6, 2: 3, 3: 0 if at.slow_value is None else len(at.slow_value), 4: 3, 5: 3}[key]
+            for axis in range(size):
+                sides = []
+                for sign in (1.0, -1.0):
+                    delta = gtsam.VectorValues()
+                    for other in values.keys():
+                        width = {1: 6, 2: 3, 3: 0 if at.slow_value is None else len(at.slow_value), 4: 3, 5: 3}[other]
+                        delta.insert(other, np.zeros(width))
+                    step = np.zeros(size)
+                    step[axis] = sign * 1e-5
+                    delta.update(_one(key, step))
+                    moved = values.retract(delta)
+                    sides.append(-np.asarray(factor.linearize(moved).jacobian()[1]))
+                numeric = (sides[0] - sides[1]) / 2e-5
+                assert np.allclose(numeric, A[:, column], rtol=1e-4, atol=1e-3 * max(1.0, np.abs(A).max() * 1e-3)), (
+                    key,
+                    axis,
+                )
+                column += 1
+
+
+def _one(key: int, step: np.ndarray) -> gtsam.VectorValues:
+    values = gtsam.VectorValues()
+    values.insert(key, step)
+    return values
+
+
+@pytest.mark.parametrize("row", [r for r in SENSORS if r.kind in ("gnss", "pose", "height")], ids=lambda r: r.kind)
+def test_residual_jacobian_of_the_pose(row: Sensor) -> None:
+    """`Residual.jacobian`, which scales the gate, against differences of `Residual.raw`."""
+    config = row.config(kind=row.kind)
+    # Level: with tilt, ZYX yaw and the rotation about the world's z differ by the tilt times the other axes.
+    level = gtsam.Pose3(gtsam.Rot3.Yaw(0.4), np.array([-1.5, 0.4, 2.2]))
+    at = replace(attachment(row, config, tilt=0.0), T_state_sensor=level)
+    m = row.ideal(at, config)
+    residual = row.residuals(m, config, at)[0]
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = 1e-5
+        sides = [
+            row.residuals(m, config, replace(at, T_world_body=at.T_world_body.retract(s * step)))[0].raw
+            for s in (1.0, -1.0)
+        ]
+        assert np.allclose((sides[0] - sides[1]) / 2e-5, residual.jacobian[:, axis], atol=1e-4)
+
+
+def test_one_metre_east_of_a_fix_is_one_metre_of_residual() -> None:
+    row = next(r for r in SENSORS if r.kind == "gnss")
+    config = row.config(kind="gnss", mount={"xyz_m": [0, 0, 0]})
+    at = attachment(row, config)
+    m = row.ideal(at, config)
+    east = gtsam.Pose3(at.T_world_body.rotation(), at.T_world_body.translation() + np.array([1.0, 0.0, 0.0]))
+    residual = row.residuals(m, config, replace(at, T_world_body=east))[0]
+    assert np.allclose(residual.raw, [1.0, 0.0, 0.0], atol=1e-6)
+    assert residual.nis() == pytest.approx(1.0 / 0.25, rel=1e-3)  # 0.5 m sigma, by `ideal`
+
+
+def test_compass_sign_and_wrap() -> None:
+    row = next(r for r in SENSORS if r.kind == "compass")
+    config = row.config(kind="compass")
+    at = replace(attachment(row, config, tilt=0.0, slow=False), T_state_sensor=gtsam.Pose3())
+    at = replace(at, T_world_body=gtsam.Pose3(gtsam.Rot3.Yaw(np.pi - 0.01), np.zeros(3)))
+    m = replace(row.ideal(at, config), yaw_rad=-np.pi + 0.01)  # 0.02 rad further, across the wrap
+    assert row.residuals(m, config, at)[0].raw[0] == pytest.approx(-0.02)
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.25])
+def test_weight_scales_the_information(weight: float) -> None:
+    row = next(r for r in SENSORS if r.kind == "pose")
+    config = row.config(kind="pose")
+    at = attachment(row, config, tilt=0.0)
+    m = row.ideal(at, config)
+    factor = row.factors(m, config, at, Decision(weight=weight)).factors[0]
+    values = gtsam.Values()
+    moved = gtsam.Pose3(at.T_world_body.rotation(), at.T_world_body.translation() + np.array([0.3, 0.0, 0.0]))
+    values.insert(1, moved)
+    assert factor.error(values) == pytest.approx(0.5 * weight, rel=1e-3)  # 0.3 m is one sigma, by `ideal`
+
+
+def test_pose_leaves_unmeasured_axes_free() -> None:
+    """A planar match says nothing of z, roll and pitch: 1 m and 3 deg there cost nothing."""
+    row = next(r for r in SENSORS if r.kind == "pose")
+    config = row.config(kind="pose")
+    at = replace(attachment(row, config, tilt=0.0), T_state_sensor=gtsam.Pose3())
+    m = row.ideal(at, config)
+    factor = row.factors(m, config, at, Decision()).factors[0]
+    values = gtsam.Values()
+    turned = at.T_world_body.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(0.05, 0.05, 0.0), np.array([0.0, 0.0, 1.0])))
+    values.insert(1, turned)
+    assert factor.error(values) < 1e-2
+
+
+def test_kernel_bounds_the_error_of_an_outlier() -> None:
+    row = next(r for r in SENSORS if r.kind == "gnss")
+    config = row.config(kind="gnss")
+    at = attachment(row, config, slow=False)
+    m = row.ideal(at, config)
+    far = gtsam.Pose3(at.T_world_body.rotation(), at.T_world_body.translation() + np.array([50.0, 0.0, 0.0]))
+    values = gtsam.Values()
+    values.insert(1, far)
+    plain, cauchy = (
+        row.factors(m, config, at, Decision(kernel=KernelConfig(kind=kind))).factors[0].error(values)
+        for kind in ("none", "cauchy")
+    )
+    assert plain == pytest.approx(0.5 * (50.0 / 0.5) ** 2, rel=1e-3)
+    assert cauchy < 0.01 * plain
+
+
+def test_every_kind_has_its_config() -> None:
+    assert set(KINDS) == {"imu", *(row.kind for row in SENSORS)}
+    for kind, config in KINDS.items():
+        assert config(kind=kind).kind == kind
+        assert config.model_validate(config(kind=kind).model_dump(mode="json")) == config(kind=kind)

@@ -1,0 +1,173 @@
+"""The offline solver on simulated runs, where truth exists; and the whole path through a bag."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.config import VesselConfig
+from graphloc.errors import InputError, SolveError
+from graphloc.eval.holdout import HoldOut
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import Scenario, bl_scenario, simulate
+from graphloc.measurements import ImuSeries, PoseFix
+from graphloc.recording import Recording
+
+SHORT = Scenario(duration_s=40.0, noise="drift")
+
+
+@pytest.fixture(scope="module")
+def short() -> app.Run:
+    return app.simulated(simulate(SHORT, 5), compare=True)
+
+
+def test_smoother_beats_the_filter_and_its_covariance_holds(short: app.Run) -> None:
+    truth = short.recording.truth
+    assert truth is not None
+    ours = compare_to_truth(short.solution.trajectory, truth)
+    filters = {f.name: compare_to_truth(f.trajectory, truth) for f in short.filters}
+    assert ours.position_rmse_m < 0.35
+    assert ours.position_rmse_m < filters["BL EKF"].position_rmse_m / 3.0
+    assert ours.heading_rmse_deg < 0.5
+    assert ours.coverage_95 is not None
+    assert ours.coverage_95 > 0.7
+    assert short.solution.stats.converged
+
+
+def test_ledger_has_one_row_for_each_message(short: app.Run) -> None:
+    ledger = short.solution.ledger
+    assert len(ledger) == short.recording.message_count
+    assert len({row.seq for row in ledger}) == short.recording.message_count
+
+
+def test_false_matches_are_found(short: app.Run) -> None:
+    """A match is false where it lies over 1 m from the truth; the ledger must say the same of nearly all."""
+    truth = short.recording.truth
+    assert truth is not None
+    weights = {row.seq: row.weight or 0.0 for row in short.solution.ledger}
+    right = wrong = 0
+    for m in short.recording.measurements:
+        if isinstance(m, PoseFix):
+            at = truth.at(np.array([m.stamp_ns]))
+            false = np.hypot(*(m.modes[0].value[:2] - at.p_world_m[0, :2])) > 1.0
+            right += (weights[m.seq] < 0.5) == false
+            wrong += (weights[m.seq] < 0.5) != false
+    assert wrong <= 2
+    assert right >= 35
+
+
+def test_modes_are_chosen() -> None:
+    """Three modes a match, one right: the ledger's choice is the right one."""
+    run = simulate(replace(SHORT, pose_modes=3, false_fraction=0.0, noise="clean"), 2)
+    solved = app.simulated(run)
+    rows = {row.seq: row for row in solved.solution.ledger}
+    chosen = []
+    for m in run.recording.measurements:
+        if isinstance(m, PoseFix):
+            true = run.truth.at(np.array([m.stamp_ns])).p_world_m[0, :2]
+            nearest = int(np.argmin([np.hypot(*(mode.value[:2] - true)) for mode in m.modes]))
+            chosen.append(rows[m.seq].mode == nearest)
+    assert np.mean(chosen) >= 0.97
+
+
+def test_bad_start_is_not_lost() -> None:
+    """Gyro bias of 0.05 rad/s and a start heading 15 deg off."""
+    scenario = replace(SHORT, noise="clean", gyro_bias_radps=0.05, start_heading_error_deg=15.0)
+    run = simulate(scenario, 1)
+    ours = compare_to_truth(app.simulated(run).solution.trajectory, run.truth)
+    assert ours.heading_max_deg < 1.5
+    assert ours.position_rmse_m < 0.5
+
+
+def test_comes_back_after_an_outage() -> None:
+    scenario = replace(bl_scenario(1, "clean"), duration_s=80.0, outage_s=(25.0, 55.0))
+    run = simulate(scenario, 3)
+    track = app.simulated(run).solution.trajectory
+    at = np.array([run.truth.stamps_ns[6500]])
+    error = np.hypot(*(track.at(at).p_world_m - run.truth.at(at).p_world_m)[0, :2])
+    assert error < 1.0
+
+
+def test_rotated_world_gives_the_rotated_estimate() -> None:
+    """Turning every measurement about the datum by 90 deg turns the estimate: no axis is special."""
+    run = simulate(replace(SHORT, duration_s=20.0, gnss_hz=0.0, compass_hz=0.0, false_fraction=0.0), 4)
+    plain = app.simulated(run).solution.trajectory
+
+    def turned(m: PoseFix) -> PoseFix:
+        x, y, yaw = m.modes[0].value
+        mode = replace(m.modes[0], value=np.array([-y, x, yaw + np.pi / 2.0]))
+        return replace(m, modes=(mode,))
+
+    measurements = tuple(turned(m) if isinstance(m, PoseFix) else m for m in run.recording.measurements)
+    other = app.smooth_recording(replace(run.recording, measurements=measurements), run.config).solution.trajectory
+    expected = np.column_stack([-plain.p_world_m[:, 1], plain.p_world_m[:, 0], plain.p_world_m[:, 2]])
+    assert np.abs(other.p_world_m - expected).max() < 0.02
+
+
+def test_imu_gap_is_bridged_and_said() -> None:
+    run = simulate(replace(SHORT, noise="clean"), 6)
+    imu = run.recording.imu
+    assert imu is not None
+    t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    keep = (t < 18.0) | (t > 20.0)
+    holed = ImuSeries(
+        sensor="imu",
+        stamps_ns=imu.stamps_ns[keep],
+        accel_mps2=imu.accel_mps2[keep],
+        gyro_radps=imu.gyro_radps[keep],
+        seqs=imu.seqs[keep],
+    )
+    solved = app.smooth_recording(replace(run.recording, imu=holed), run.config)
+    assert any("IMU gap of 2.0 s" in w for w in solved.solution.stats.warnings)
+    assert compare_to_truth(solved.solution.trajectory, run.truth).position_rmse_m < 0.6
+
+
+def test_no_imu_and_no_position_are_one_clear_line() -> None:
+    run = simulate(replace(SHORT, duration_s=10.0), 0)
+    with pytest.raises(SolveError, match="no IMU data"):
+        app.smooth_recording(replace(run.recording, imu=None), run.config)
+    with pytest.raises(SolveError, match="no position"):
+        app.smooth_recording(replace(run.recording, measurements=()), run.config)
+    with pytest.raises(InputError, match="no GNSS fix to take a datum from"):
+        app.choose_datum(Recording(source="x", imu=None, measurements=()), VesselConfig())
+
+
+def test_held_out_fixes_are_counted_and_predicted() -> None:
+    run = simulate(replace(SHORT, noise="clean", duration_s=30.0), 8)
+    solved = app.smooth_recording(run.recording, run.config, hold_out=HoldOut.parse("every:3"))
+    counts = solved.solution.ledger.counts()["gnss"]
+    assert counts["held_out"] == len(solved.held) == 299 // 3
+    assert len(solved.solution.ledger) == run.recording.message_count
+    table = app.tables(solved)[1].as_dict()["graphloc"]
+    assert table["horizontal_rmse_m"] is not None
+    assert table["horizontal_rmse_m"] < 0.5
+
+
+def test_run_folder(short: app.Run, tmp_path: Path) -> None:
+    report = app.write(short, tmp_path / "run", inputs=[], command="test", overwrite=False)
+    folder = report.parent
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "ledger.csv", "report.html", "run.json", "slow.csv", "solution.csv", "solution.tum", "solution_bag",
+        "track.geojson", "vessel.effective.yaml",
+    ]  # fmt: skip
+    with (folder / "ledger.csv").open() as stream:
+        assert sum(int(row["count"]) for row in csv.DictReader(stream)) == short.recording.message_count
+    with (folder / "solution.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    track = short.solution.trajectory
+    k = list(track.stamps_ns).index(int(rows[100]["stamp_ns"]))
+    forward = track.R_world_body[k] @ np.array([1.0, 0.0, 0.0])
+    heading = np.degrees(np.arctan2(forward[0], forward[1])) % 360.0  # from north, clockwise
+    assert float(rows[100]["heading_deg"]) == pytest.approx(heading, abs=1e-3)
+    tum = np.loadtxt(folder / "solution.tum")
+    assert np.allclose(tum[100, 1:4], track.p_world_m[k], atol=1e-8)
+    line = json.loads((folder / "track.geojson").read_text())["features"][0]["geometry"]["coordinates"]
+    assert line[0][0] == pytest.approx(11.7, abs=0.01)  # longitude first
+    html = (folder / "report.html").read_text()
+    assert 'src="http' not in html
+    assert "BL EKF" in html
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
