@@ -43,7 +43,7 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
         Residual(
             raw=raw,
             cov=np.array([[sigma**2]]),
-            jacobian=_yaw_jacobian(R, at.T_state_sensor.rotation().matrix())[None, :],
+            jacobian=lambda: _yaw_jacobian(R, at.T_state_sensor.rotation().matrix())[None, :],
             prior=1.0,
             size_m=None,
             size_deg=float(abs(np.degrees(raw[0]))),
@@ -74,10 +74,10 @@ def factors(m: CompassHeading, config: CompassConfig, at: Attachment, decision: 
     point = gtsam.Values()
     point.insert(at.pose_key, at.T_world_body)
     if at.slow_key is None:
-        linear = gtsam.JacobianFactor(at.pose_key, residual.jacobian, -residual.raw, model)
+        linear = gtsam.JacobianFactor(at.pose_key, residual.jacobian(), -residual.raw, model)
     else:
         point.insert(at.slow_key, np.array(at.slow_value))
-        linear = gtsam.JacobianFactor(at.pose_key, residual.jacobian, at.slow_key, np.eye(1), -residual.raw, model)
+        linear = gtsam.JacobianFactor(at.pose_key, residual.jacobian(), at.slow_key, np.eye(1), -residual.raw, model)
     return GraphUpdate(factors=(gtsam.LinearContainerFactor(linear, point),))
 
 

@@ -46,13 +46,18 @@ def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
 def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual a + d - z (3,) in m, world axes."""
     lever = at.T_state_sensor.translation()
-    R = at.T_world_body.rotation().matrix()
     d = np.zeros(3) if at.slow_value is None else -at.slow_value
     raw = at.T_world_body.transformFrom(lever) + d - _fix_world_m(m, at)
-    jacobian = np.hstack([-R @ _skew(lever), R])
     size = float(np.hypot(raw[0], raw[1]))
     return (
-        Residual(raw=raw, cov=white_covariance(m, config), jacobian=jacobian, prior=1.0, size_m=size, size_deg=None),
+        Residual(
+            raw=raw,
+            cov=white_covariance(m, config),
+            jacobian=lambda: _antenna_jacobian(at),
+            prior=1.0,
+            size_m=size,
+            size_deg=None,
+        ),
     )
 
 
@@ -98,6 +103,12 @@ def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
     return GnssPosition(
         stamp_ns=0, sensor="gnss", seq=0, position=Geodetic(lat, lon, height), cov_enu_m2=np.diag([0.25, 0.25, 1.0])
     )
+
+
+def _antenna_jacobian(at: Attachment) -> Array:
+    """d(p + R l) / d(body tangent), (3, 6)."""
+    R = at.T_world_body.rotation().matrix()
+    return np.hstack([-R @ _skew(at.T_state_sensor.translation()), R])
 
 
 def _skew(v: Any) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 
 from graphloc.config import HeightConfig
 from graphloc.factors._noise import robust
+from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor
 from graphloc.measurements import HeightPrior
 from graphloc.time import duration_ns
@@ -25,9 +26,12 @@ _WIDE_M = 1e3
 def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual predicted - expected (1,) in m."""
     lever = np.asarray(at.T_state_sensor.translation())
-    up = at.T_world_body.rotation().matrix()[2]
     raw = np.array([at.T_world_body.transformFrom(lever)[2] - m.z_world_m])
-    jacobian = np.concatenate([np.cross(lever, up), up])[None, :]
+
+    def jacobian() -> Array:
+        up = at.T_world_body.rotation().matrix()[2]
+        return np.concatenate([np.cross(lever, up), up])[None, :]
+
     return (
         Residual(
             raw=raw,

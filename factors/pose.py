@@ -61,7 +61,7 @@ def residuals(m: PoseFix, config: PoseConfig, at: Attachment) -> tuple[Residual,
             Residual(
                 raw=raw,
                 cov=_covariance(mode, m.axes, config),
-                jacobian=world[picked],
+                jacobian=lambda: world[picked],
                 prior=mode.probability * (1.0 - _false_probability(m, config)) / _stated(m),
                 size_m=float(np.linalg.norm(lengths)) if len(lengths) else None,
                 size_deg=float(np.degrees(np.linalg.norm(angles))) if len(angles) else None,
@@ -100,7 +100,9 @@ def factors(m: PoseFix, config: PoseConfig, at: Attachment, decision: Decision) 
     cov = _covariance(mode, m.axes, config) / decision.weight
     root[np.ix_(picked, picked)] = np.linalg.inv(np.linalg.cholesky(cov))
     anchor = Z.compose(at.T_state_sensor.inverse())
-    base = gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.qr(root @ rows)[1])
+    upper = np.linalg.qr(root @ rows)[1]
+    upper *= np.sign(np.diagonal(upper))[:, None]  # GTSAM takes a diagonal one for sigmas, and these are positive
+    base = gtsam.noiseModel.Gaussian.SqrtInformation(upper)
     return GraphUpdate(factors=(gtsam.PriorFactorPose3(at.pose_key, anchor, robust(base, decision.kernel)),))
 
 

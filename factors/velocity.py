@@ -35,7 +35,14 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
     """Residual predicted - measured (3,) in m/s, world axes."""
     raw = at.v_world_mps + _added_mps(at) - m.v_world_mps
     return (
-        Residual(raw=raw, cov=_covariance(m, config), jacobian=np.zeros((3, 6)), prior=1.0, size_m=None, size_deg=None),
+        Residual(
+            raw=raw,
+            cov=_covariance(m, config),
+            jacobian=lambda: np.zeros((3, 6)),
+            prior=1.0,
+            size_m=None,
+            size_deg=None,
+        ),
     )
 
 

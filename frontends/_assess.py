@@ -255,7 +255,7 @@ def imu_report(imu: Stream, motion: Motion | None, tree: StaticTree, body: str) 
     """Return units, gravity, standstill, noise and mount of an IMU."""
     keep = sane(imu)
     rows = imu.rows[keep] if len(keep) else np.zeros((0, 13))
-    finite = np.isfinite(rows[:, :6]).all(axis=1)
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(rows[:, :6]).all(axis=1))
     if finite.sum() < 20:
         return None
     stamps = imu.stamps_ns[keep]

@@ -71,14 +71,14 @@ class Residual:
 
     Attributes:
         raw: (k,) in m, rad or m/s. cov: (k, k) of the measurement.
-        jacobian: (k, 6) d raw / d (body tangent of the state's pose), for the predicted covariance.
+        jacobian: gives (k, 6) d raw / d (body tangent of the state's pose), for the predicted covariance.
         prior: prior probability of this hypothesis.
         size_m, size_deg: physical size, for the ledger.
     """
 
     raw: Array
     cov: Array
-    jacobian: Array
+    jacobian: Callable[[], Array]
     prior: float
     size_m: float | None
     size_deg: float | None

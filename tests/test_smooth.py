@@ -140,7 +140,7 @@ def test_held_out_fixes_are_counted_and_predicted() -> None:
     run = simulate(replace(SHORT, noise="clean", duration_s=30.0), 8)
     solved = app.smooth_recording(run.recording, run.config, hold_out=HoldOut.parse("every:3"))
     counts = solved.solution.ledger.counts()["gnss"]
-    assert counts["held_out"] == len(solved.held) == 299 // 3
+    assert counts["held_out"] == len(solved.held) == 300 // 3
     assert len(solved.solution.ledger) == run.recording.message_count
     table = app.tables(solved)[1].as_dict()["graphloc"]
     assert table["horizontal_rmse_m"] is not None

@@ -330,7 +330,7 @@ def _position_and_velocity(
         soon[: min(4, len(soon))] = True
         v0[:2] = [_slope(track.t[soon], track.p[soon, i]) for i in range(2)]
         p0[:2] -= v0[:2] * float(np.median(track.t[near]))
-    sigma = np.full(3, 10.0) + 3.0 * np.nan_to_num(np.nanmax(track.sigma[near], axis=0), nan=5.0)
+    sigma = np.full(3, 10.0) + 3.0 * np.nan_to_num(track.sigma[near], nan=5.0).max(axis=0)
     v_sigma = np.full(3, 0.2 if still else 3.0)
     v_sigma[2] = 0.2 if still else 1.0
     return p0, sigma, v0, v_sigma

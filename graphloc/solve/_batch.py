@@ -234,7 +234,7 @@ def _solve_window(
     of gyro bias, 300 m after 20 s of dead reckoning), so each window goes through all the stages.
     """
     iterations, error = 0, 0.0
-    for stage, limit in (("far", rounds), ("open", 2), ("mixture", 3)):
+    for stage, limit in (("far", rounds), ("open", 2), ("mixture", 2)):
         for _ in range(limit):
             verdicts = weigh(problem, values, None, first=first, last=last, stage=stage)
             graph, guess = build_graph(problem, values, decisions(verdicts), first, last, prior)

@@ -51,11 +51,19 @@ class Verdict:
     at: Attachment
 
 
-def kernel_weight(residual: Residual, kernel: KernelConfig) -> float:
-    """Return the weight that a loss gives a residual, in [0, 1]."""
+def _predicted(residual: Residual, P: Array | None) -> Array | None:
+    """Covariance (k, k) of the prediction, from that of the pose."""
+    if P is None:
+        return None
+    J = residual.jacobian()
+    return np.asarray(J @ P @ J.T)
+
+
+def kernel_weight(nis: float, kernel: KernelConfig) -> float:
+    """Return the weight that a loss gives a squared normalised residual, in [0, 1]."""
     if kernel.kind == "none":
         return 1.0
-    u2 = residual.nis() / kernel.scale**2
+    u2 = nis / kernel.scale**2
     if kernel.kind == "huber":
         return 1.0 if u2 <= 1.0 else 1.0 / float(np.sqrt(u2))
     if kernel.kind == "cauchy":
@@ -92,10 +100,11 @@ def weigh(
         ]
         # The norm of k whitened residuals is about sqrt(k) where all is well: bend that much later.
         dof = len(residuals[0][0].raw) if residuals else 1
-        kernel = _stage_kernel(stream.config.kernel, stage, _spread(residuals) * float(np.sqrt(dof)))
-        for i, found, at in zip(indices, residuals, attached, strict=True):
+        nis = [min(r.nis() for r in found) for found in residuals]
+        kernel = _stage_kernel(stream.config.kernel, stage, _spread(nis, dof) * float(np.sqrt(dof)))
+        for i, found, at, best in zip(indices, residuals, attached, nis, strict=True):
             P = None if covariance is None else covariance(int(stream.state[i]))
-            verdicts[(stream.number, i)] = _verdict(stream, i, found, P, stage, kernel, at)
+            verdicts[(stream.number, i)] = _verdict(stream, i, found, P, stage, kernel, at, best)
     return verdicts
 
 
@@ -106,17 +115,14 @@ def _stage_kernel(kernel: KernelConfig, stage: str, widening: float) -> KernelCo
     return KernelConfig(kind=kernel.kind if gentle else limit.kind, scale=kernel.scale * widening)
 
 
-def _spread(residuals: list[tuple[Residual, ...]]) -> float:
+def _spread(nis: list[float], dof: int) -> float:
     """How many times wider than configured the residuals of a sensor are, as a whole; at least 1.
 
     A loss that bends at 1.5 sigmas around an estimate that is 100 sigmas off sees outliers only, and
     re-weighting then creeps; one that bends too early for noise that is configured too small rejects a
     good sensor (measured on KITTI: 97 % of the fixes lost, 23 m off). So the bend follows the median.
     """
-    if not residuals:
-        return 1.0
-    nis = [min(r.nis() for r in found) for found in residuals]
-    return max(1.0, float(np.sqrt(np.median(nis) / chi2.median(len(residuals[0][0].raw)))))
+    return max(1.0, float(np.sqrt(np.median(nis) / chi2.median(dof)))) if nis else 1.0
 
 
 def _verdict(
@@ -127,19 +133,20 @@ def _verdict(
     stage: str,
     kernel: KernelConfig,
     at: Attachment,
+    nis: float,
 ) -> Verdict:
     false = stream.row.false_log_density
     if false is None:
         residual = found[0]
-        return Verdict(Decision(kernel=kernel), kernel_weight(residual, kernel), 1.0, residual, 0, at)
-    logs = np.array([r.log_density(None if P is None else r.jacobian @ P @ r.jacobian.T) for r in found])
+        return Verdict(Decision(kernel=kernel), kernel_weight(nis, kernel), 1.0, residual, 0, at)
+    logs = np.array([r.log_density(_predicted(r, P)) for r in found])
     mode = int(np.argmax(logs))
     among = np.exp(logs - logs.max())
     mode_probability = float(among[mode] / among.sum())
     residual = found[mode]
     if stage != "mixture":
         decision = Decision(mode=mode, kernel=kernel)
-        return Verdict(decision, kernel_weight(residual, kernel), mode_probability, residual, mode, at)
+        return Verdict(decision, kernel_weight(nis, kernel), mode_probability, residual, mode, at)
     nothing = false(stream.measurements[i], stream.config)
     top = max(logs.max(), nothing)
     weight = float(np.exp(logs[mode] - top) / (np.exp(logs - top).sum() + np.exp(nothing - top)))

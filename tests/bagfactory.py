@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small bags for tests: messages of both ROS versions, and files of every kind."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+START_NS = 1_700_000_000_000_000_000
+S = 1_000_000_000
+UP = (0.0, 0.0, 9.81)
+Item = tuple[str, int, Any]  # topic, recording time, message (or (type, raw bytes))
+
+
+class Messages:
+    """Makes messages of one ROS version; the stamp is the header's, ns."""
+
+    def __init__(self, ros: int) -> None:
+        self.ros = ros
+        self.store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+        self.t = self.store.types
+
+    def header(self, stamp_ns: int, frame: str = "sensor") -> Any:
+        stamp = self.t["builtin_interfaces/msg/Time"](sec=stamp_ns // S, nanosec=stamp_ns % S)
+        extra = {"seq": 0} if self.ros == 1 else {}
+        return self.t["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **extra)
+
+    def vector(self, xyz: Sequence[float]) -> Any:
+        return self.t["geometry_msgs/msg/Vector3"](x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
+
+    def quat(self, xyzw: Sequence[float]) -> Any:
+        x, y, z, w = (float(v) for v in xyzw)
+        return self.t["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
+
+    def imu(
+        self,
+        stamp_ns: int,
+        accel: Sequence[float] = UP,
+        gyro: Sequence[float] = (0.0, 0.0, 0.0),
+        orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+        orientation_covariance: Sequence[float] = (-1.0, 0, 0, 0, 0, 0, 0, 0, 0),
+        frame: str = "sensor",
+    ) -> Any:
+        return self.t["sensor_msgs/msg/Imu"](
+            header=self.header(stamp_ns, frame),
+            orientation=self.quat(orientation),
+            orientation_covariance=np.array(orientation_covariance, dtype=float),
+            angular_velocity=self.vector(gyro),
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=self.vector(accel),
+            linear_acceleration_covariance=np.zeros(9),
+        )
+
+    def fix(
+        self,
+        stamp_ns: int,
+        lat: float = 57.7,
+        lon: float = 11.9,
+        height: float = 40.0,
+        status: int = 0,
+        covariance: Sequence[float] = (1.0, 0, 0, 0, 1.0, 0, 0, 0, 4.0),
+        covariance_type: int = 2,
+        frame: str = "gps",
+    ) -> Any:
+        return self.t["sensor_msgs/msg/NavSatFix"](
+            header=self.header(stamp_ns, frame),
+            status=self.t["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
+            latitude=float(lat),
+            longitude=float(lon),
+            altitude=float(height),
+            position_covariance=np.array(covariance, dtype=float),
+            position_covariance_type=covariance_type,
+        )
+
+    def compass(self, stamp_ns: int, xyzw: Sequence[float]) -> Any:
+        return self.t["geometry_msgs/msg/QuaternionStamped"](header=self.header(stamp_ns), quaternion=self.quat(xyzw))
+
+    def _pose(self, xyz: Sequence[float], xyzw: Sequence[float], covariance: Any) -> Any:
+        x, y, z = (float(v) for v in xyz)
+        pose = self.t["geometry_msgs/msg/Pose"](
+            position=self.t["geometry_msgs/msg/Point"](x=x, y=y, z=z), orientation=self.quat(xyzw)
+        )
+        cov = np.zeros(36) if covariance is None else np.array(covariance, dtype=float).ravel()
+        return self.t["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=cov)
+
+    def pose(
+        self, stamp_ns: int, xyz: Sequence[float], xyzw: Sequence[float] = (0, 0, 0, 1), covariance: Any = None
+    ) -> Any:
+        return self.t["geometry_msgs/msg/PoseWithCovarianceStamped"](
+            header=self.header(stamp_ns), pose=self._pose(xyz, xyzw, covariance)
+        )
+
+    def _twist(self, v: Sequence[float], covariance: Any) -> Any:
+        twist = self.t["geometry_msgs/msg/Twist"](linear=self.vector(v), angular=self.vector((0, 0, 0)))
+        cov = np.zeros(36) if covariance is None else np.array(covariance, dtype=float).ravel()
+        return self.t["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=cov)
+
+    def twist(self, stamp_ns: int, v: Sequence[float], covariance: Any = None) -> Any:
+        return self.t["geometry_msgs/msg/TwistWithCovarianceStamped"](
+            header=self.header(stamp_ns), twist=self._twist(v, covariance)
+        )
+
+    def odometry(
+        self,
+        stamp_ns: int,
+        xyz: Sequence[float] = (0, 0, 0),
+        xyzw: Sequence[float] = (0, 0, 0, 1),
+        v: Sequence[float] = (0, 0, 0),
+    ) -> Any:
+        return self.t["nav_msgs/msg/Odometry"](
+            header=self.header(stamp_ns, "odom"),
+            child_frame_id="base_link",
+            pose=self._pose(xyz, xyzw, None),
+            twist=self._twist(v, None),
+        )
+
+    def transforms(self, edges: Iterable[tuple[str, str, Sequence[float], Sequence[float]]]) -> Any:
+        """`tf2_msgs/TFMessage` of (parent, child, xyz, xyzw)."""
+        if "tf2_msgs/msg/TFMessage" not in self.t:
+            definition = get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+            self.store.register(definition)
+        stamped = [
+            self.t["geometry_msgs/msg/TransformStamped"](
+                header=self.header(START_NS, parent),
+                child_frame_id=child,
+                transform=self.t["geometry_msgs/msg/Transform"](translation=self.vector(p), rotation=self.quat(q)),
+            )
+            for parent, child, p, q in edges
+        ]
+        return self.t["tf2_msgs/msg/TFMessage"](transforms=stamped)
+
+    def text(self, words: str) -> Any:
+        return self.t["std_msgs/msg/String"](data=words)
+
+
+def write_bag(path: Path, make: Messages, items: Iterable[Item], kind: str = "sqlite3", compression: str = "") -> Path:
+    """Write a bag; `kind` is 'ros1', 'sqlite3' or 'mcap'; compression as the format knows it."""
+    store = make.store
+    connections: dict[str, Any] = {}
+    writer: Any
+    if kind == "ros1":
+        writer = Writer1(path)
+        if compression:
+            writer.set_compression(Writer1.CompressionFormat[compression.upper()])
+    else:
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer = Writer2(path, version=9, storage_plugin=plugin)
+        if compression:
+            writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    serialize = store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
+    with writer:
+        for topic, log_ns, msg in items:
+            msgtype = msg[0] if isinstance(msg, tuple) else msg.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, msgtype, typestore=store)
+            data = msg[1] if isinstance(msg, tuple) else serialize(msg, msgtype)
+            writer.write(connections[topic], log_ns, data)
+    return path
+
+
+def still_run(make: Messages, seconds: float = 4.0, start_ns: int = START_NS) -> list[Item]:
+    """A craft at rest: /imu at 50 Hz, /fix at 5 Hz, recorded 10 ms after their stamps."""
+    items: list[Item] = []
+    for k in range(round(seconds * 50)):
+        stamp = start_ns + k * S // 50
+        items.append(("/imu", stamp + 10_000_000, make.imu(stamp)))
+        if k % 10 == 0:
+            items.append(("/fix", stamp + 10_000_000, make.fix(stamp)))
+    return items

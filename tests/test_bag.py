@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading bags: every kind of file gives the same run, and every message is accounted for."""
+
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import get_types_from_msg
+from ruamel.yaml import YAML
+
+from graphloc.config import (
+    CompassConfig,
+    GnssConfig,
+    HeightConfig,
+    ImuConfig,
+    PoseConfig,
+    VelocityConfig,
+    VesselConfig,
+    parse_config,
+)
+from graphloc.errors import InputError
+from graphloc.frontends.bag import read_recording
+from graphloc.ledger import Ledger, Outcome
+from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.recording import Recording
+from tests.bagfactory import START_NS, S, Messages, still_run, write_bag
+
+KINDS = {
+    "imu": ImuConfig,
+    "gnss": GnssConfig,
+    "compass": CompassConfig,
+    "gnss_velocity": VelocityConfig,
+    "pose": PoseConfig,
+    "height": HeightConfig,
+}
+HUSKY = Path(__file__).parent.parent.parent / "shared" / "data" / "husky" / "husky_car_park.bag"
+
+
+def vessel(**sensors: Any) -> VesselConfig:
+    """A configuration; `imu` and `gnss` on their usual topics unless said otherwise."""
+    extra = {k: sensors.pop(k) for k in ("truth_topic", "check_speed_topic", "datum", "body_frame") if k in sensors}
+    blocks = {"imu": {"topic": "/imu"}, "gnss": {"topic": "/fix"}, **sensors}
+    return parse_config({"sensors": {k: v for k, v in blocks.items() if v}, **extra}, KINDS, "test")
+
+
+def accounted(recording: Recording) -> int:
+    """Messages that ended somewhere; the ledger refuses an arrival that ended twice."""
+    ledger = Ledger(recording.rows)
+    imu = recording.imu.seqs if recording.imu is not None else []
+    used = [int(s) for s in imu] + [m.seq for m in recording.measurements]
+    assert len(set(used)) == len(used)
+    assert not any(s in ledger for s in used)
+    return len(used) + len(ledger)
+
+
+CASES = [
+    ("ros1", "", "run.bag"),
+    ("ros1", "bz2", "run.bag"),
+    ("ros1", "lz4", "run.bag"),
+    ("sqlite3", "", "run"),
+    ("sqlite3", "file", "run"),
+    ("sqlite3", "message", "run"),
+    ("mcap", "", "run"),
+    ("mcap", "storage", "run"),
+    ("mcap", "message", "run"),
+]
+
+
+@pytest.mark.parametrize(("kind", "compression", "name"), CASES)
+def test_every_kind_of_bag_gives_the_same_run(tmp_path: Path, kind: str, compression: str, name: str) -> None:
+    make = Messages(1 if kind == "ros1" else 2)
+    items = still_run(make)
+    items += [("/note", START_NS + k * S, make.text("hello")) for k in range(3)]
+    path = write_bag(tmp_path / name, make, sorted(items, key=lambda i: i[1]), kind, compression)
+    recording = read_recording(path, vessel())
+    assert recording.imu is not None
+    assert len(recording.imu) == 200
+    assert len(recording.measurements) == 20
+    assert recording.imu.stamps_ns[0] == START_NS
+    assert recording.imu.stamps_ns[-1] == START_NS + 199 * S // 50
+    np.testing.assert_allclose(recording.imu.accel_mps2, np.tile([0.0, 0.0, 9.81], (200, 1)))
+    fix = recording.measurements[3]
+    assert isinstance(fix, GnssPosition)
+    assert fix.stamp_ns == START_NS + 30 * S // 50
+    assert tuple(fix.position) == (57.7, 11.9, 40.0)
+    np.testing.assert_allclose(fix.cov_enu_m2, np.diag([1.0, 1.0, 4.0]))
+    assert recording.message_count == accounted(recording) == 223
+    (ignored,) = recording.rows
+    assert (ignored.outcome, ignored.topic, ignored.count) == (Outcome.IGNORED, "/note", 3)
+    assert recording.warnings == ()
+
+
+@pytest.mark.parametrize(("kind", "suffix"), [("sqlite3", "db3"), ("mcap", "mcap")])
+def test_a_bare_file_and_a_folder_without_metadata_open(tmp_path: Path, kind: str, suffix: str) -> None:
+    folder = write_bag(tmp_path / "run", make := Messages(2), still_run(make), kind)
+    assert len(read_recording(folder / f"run.{suffix}", vessel()).measurements) == 20
+    (folder / "metadata.yaml").unlink()
+    recording = read_recording(folder, vessel())
+    assert len(recording.measurements) == 20
+    assert "no metadata.yaml" in recording.warnings[0]
+
+
+def test_a_bag_without_definitions_is_read_by_the_standard_ones(tmp_path: Path) -> None:
+    folder = write_bag(tmp_path / "run", make := Messages(2), still_run(make))
+    with sqlite3.connect(folder / "run.db3") as db:
+        db.execute("DELETE FROM message_definitions")
+    db.close()
+    assert len(read_recording(folder, vessel()).measurements) == 20
+
+
+def test_split_ros1_bags(tmp_path: Path) -> None:
+    make = Messages(1)
+    parts = [
+        write_bag(tmp_path / f"run_{k}.bag", make, still_run(make, start_ns=START_NS + 4 * k * S), "ros1")
+        for k in range(3)
+    ]
+    for given in (parts, [parts[2], parts[0], parts[1]], tmp_path):
+        recording = read_recording(given, vessel())
+        assert recording.imu is not None
+        assert len(recording.imu) == 600
+        assert (np.diff(recording.imu.stamps_ns) == S // 50).all()
+        assert (np.diff(recording.imu.seqs) > 0).all()
+        assert recording.message_count == accounted(recording) == 660
+        assert recording.warnings == ()
+
+
+@pytest.mark.parametrize(("kind", "suffix"), [("sqlite3", "db3"), ("mcap", "mcap")])
+def test_split_ros2_bag(tmp_path: Path, kind: str, suffix: str) -> None:
+    make = Messages(2)
+    folder = write_bag(tmp_path / "run", make, still_run(make), kind)
+    second = write_bag(tmp_path / "next", make, still_run(make, start_ns=START_NS + 4 * S), kind)
+    (second / f"next.{suffix}").rename(folder / f"next.{suffix}")
+    yaml = YAML(typ="safe")
+    metadata = yaml.load(folder / "metadata.yaml")
+    information = metadata["rosbag2_bagfile_information"]
+    information["relative_file_paths"] = [f"run.{suffix}", f"next.{suffix}"]
+    information["message_count"] *= 2
+    for topic in information["topics_with_message_count"]:
+        topic["message_count"] *= 2
+    yaml.dump(metadata, folder / "metadata.yaml")
+    recording = read_recording(folder, vessel())
+    assert recording.imu is not None
+    assert len(recording.imu) == 400
+    assert recording.message_count == accounted(recording) == 440
+    assert recording.warnings == ()
+
+
+def test_image_topics_are_never_unpacked(tmp_path: Path) -> None:
+    """Bytes that are no image at all do no harm, so nobody looked at them."""
+    make = Messages(2)
+    items = still_run(make)
+    items += [("/camera", START_NS + k * S, ("sensor_msgs/msg/Image", b"\0\1\2")) for k in range(4)]
+    path = write_bag(tmp_path / "run", make, sorted(items, key=lambda i: i[1]), "mcap")
+    recording = read_recording(path, vessel())
+    assert [(r.topic, r.count, r.outcome) for r in recording.rows] == [("/camera", 4, Outcome.IGNORED)]
+
+
+def test_an_unknown_type_on_another_topic_is_counted(tmp_path: Path) -> None:
+    make = Messages(2)
+    make.store.register(get_types_from_msg("float64 depth\n", "boat_msgs/msg/Sonar"))
+    sonar = make.store.types["boat_msgs/msg/Sonar"]
+    items = still_run(make) + [("/sonar", START_NS + 5 * S + k, sonar(depth=3.0)) for k in range(7)]
+    recording = read_recording(write_bag(tmp_path / "run", make, items), vessel())
+    (row,) = recording.rows
+    assert (row.topic, row.count) == ("/sonar", 7)
+    assert "boat_msgs/Sonar" in row.reason
+    assert recording.message_count == accounted(recording)
+
+
+def test_units_offsets_and_disabled_sensors(tmp_path: Path) -> None:
+    make = Messages(2)
+    items = [
+        ("/imu", START_NS + k * S // 50, make.imu(START_NS + k * S // 50, accel=(0, 0, 1.0), gyro=(0, 0, 180.0)))
+        for k in range(100)
+    ]
+    path = write_bag(tmp_path / "run", make, items)
+    block = {"topic": "/imu", "accel_unit": "g", "gyro_unit": "deg/s", "time_offset_s": -0.25}
+    recording = read_recording(path, vessel(imu=block, gnss={"topic": "/not/there", "enabled": False}))
+    assert recording.imu is not None
+    np.testing.assert_allclose(recording.imu.accel_mps2[0], [0.0, 0.0, 9.80665])
+    np.testing.assert_allclose(recording.imu.gyro_radps[0], [0.0, 0.0, np.pi])
+    assert recording.imu.stamps_ns[0] == START_NS - S // 4
+
+
+def test_one_topic_for_two_sensors_counts_for_each(tmp_path: Path) -> None:
+    """The orientation of an IMU as compass: yaw 30 deg, variance 4e-4."""
+    make = Messages(2)
+    half = np.radians(15.0)
+    cov = np.diag([1.0, 1.0, 4e-4]).ravel()
+    stamps = [START_NS + k * S // 50 for k in range(60)]
+    items = [
+        ("/imu", s, make.imu(s, orientation=(0, 0, np.sin(half), np.cos(half)), orientation_covariance=cov))
+        for s in stamps
+    ]
+    path = write_bag(tmp_path / "run", make, items)
+    recording = read_recording(path, vessel(gnss=None, compass={"topic": "/imu"}))
+    assert recording.imu is not None
+    assert len(recording.imu) == len(recording.measurements) == 60
+    heading = recording.measurements[0]
+    assert isinstance(heading, CompassHeading)
+    assert heading.yaw_rad == pytest.approx(np.radians(30.0))
+    assert heading.sigma_rad == pytest.approx(0.02)
+    assert recording.message_count == accounted(recording) == 120
+
+
+def test_truth_and_check_speed_are_read_and_never_fused(tmp_path: Path) -> None:
+    make = Messages(2)
+    items = still_run(make)
+    for k in range(40):
+        t = START_NS + k * S // 10
+        items.append(("/truth", t, make.odometry(t, xyz=(k, 2 * k, 0), xyzw=(0, 0, np.sqrt(0.5), np.sqrt(0.5)))))
+        items.append(("/wheels", t, make.odometry(t, v=(0.1 * k, 0, 0))))
+    path = write_bag(tmp_path / "run", make, sorted(items, key=lambda i: i[1]))
+    recording = read_recording(path, vessel(truth_topic="/truth", check_speed_topic="/wheels"))
+    assert recording.truth is not None
+    assert recording.check_speed is not None
+    np.testing.assert_allclose(recording.truth.p_world_m[7], [7, 14, 0])
+    np.testing.assert_allclose(recording.truth.yaw_rad, np.pi / 2)
+    np.testing.assert_allclose(recording.check_speed.speed_mps, 0.1 * np.arange(40))
+    assert {(r.topic, r.count, r.reason) for r in recording.rows} == {
+        ("/truth", 40, "truth, never fused"),
+        ("/wheels", 40, "check, never fused"),
+    }
+    assert recording.message_count == accounted(recording)
+    assert len(recording.measurements) == 20
+
+
+def test_mounts_follow_the_chain_of_tf_static(tmp_path: Path) -> None:
+    """base_link -> mast (1 m forward, turned 90 deg left) -> gps (2 m along the mast's x): body (1, 2, 0)."""
+    make = Messages(2)
+    turn = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+    edges = [("base_link", "mast", (1, 0, 0), turn), ("mast", "gps", (2, 0, 0), (0, 0, 0, 1))]
+    items = [("/tf_static", START_NS, make.transforms(edges)), *still_run(make)]
+    path = write_bag(tmp_path / "run", make, items)
+    recording = read_recording(path, vessel(gnss={"topic": "/fix", "mount": {"tf_frame": "gps"}}))
+    t, R = recording.mounts["gnss"]
+    np.testing.assert_allclose(t, [1.0, 2.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(R @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)
+    assert recording.message_count == accounted(recording) == 221
+    with pytest.raises(InputError, match=r"gnss\.mount\.tf_frame: no chain from 'base_link' to 'lidar'.*gps, mast"):
+        read_recording(path, vessel(gnss={"topic": "/fix", "mount": {"tf_frame": "lidar"}}))
+
+
+def test_progress_counts_the_messages_that_are_read(tmp_path: Path) -> None:
+    calls: list[tuple[str, int, int]] = []
+    path = write_bag(tmp_path / "run", make := Messages(2), still_run(make))
+    read_recording(path, vessel(), lambda stage, done, total: calls.append((stage, done, total)))
+    assert calls[-1] == ("reading", 220, 220)
+
+
+@pytest.mark.skipif(not HUSKY.exists(), reason="the Husky recording is not here")
+def test_husky() -> None:
+    imu = {"topic": "/imu/data"}
+    config = vessel(imu=imu, gnss={"topic": "/fix"}, check_speed_topic="/husky_velocity_controller/odom")
+    recording = read_recording(HUSKY, config)
+    assert recording.imu is not None
+    assert recording.check_speed is not None
+    assert (len(recording.imu), len(recording.measurements), len(recording.check_speed.stamps_ns)) == (11865, 989, 3952)
+    x, y, z = np.median(recording.imu.accel_mps2, axis=0)
+    assert y == pytest.approx(9.8, abs=0.1)
+    assert abs(x) < 0.5
+    assert abs(z) < 0.5
+    assert recording.message_count == accounted(recording) == 11865 + 989 + 3952
+    assert recording.warnings == ()
