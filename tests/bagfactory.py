@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -43,7 +44,7 @@ class Messages:
         accel: Sequence[float] = UP,
         gyro: Sequence[float] = (0.0, 0.0, 0.0),
         orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
-        orientation_covariance: Sequence[float] = (-1.0, 0, 0, 0, 0, 0, 0, 0, 0),
+        orientation_covariance: ArrayLike = (-1.0, 0, 0, 0, 0, 0, 0, 0, 0),
         frame: str = "sensor",
     ) -> Any:
         return self.t["sensor_msgs/msg/Imu"](
@@ -63,7 +64,7 @@ class Messages:
         lon: float = 11.9,
         height: float = 40.0,
         status: int = 0,
-        covariance: Sequence[float] = (1.0, 0, 0, 0, 1.0, 0, 0, 0, 4.0),
+        covariance: ArrayLike = (1.0, 0, 0, 0, 1.0, 0, 0, 0, 4.0),
         covariance_type: int = 2,
         frame: str = "gps",
     ) -> Any:

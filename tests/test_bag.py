@@ -16,6 +16,7 @@ from graphloc.config import (
     HeightConfig,
     ImuConfig,
     PoseConfig,
+    SensorConfig,
     VelocityConfig,
     VesselConfig,
     parse_config,
@@ -25,9 +26,9 @@ from graphloc.frontends.bag import read_recording
 from graphloc.ledger import Ledger, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
 from graphloc.recording import Recording
-from tests.bagfactory import START_NS, S, Messages, still_run, write_bag
+from tests.bagfactory import START_NS, Messages, S, still_run, write_bag
 
-KINDS = {
+KINDS: dict[str, type[SensorConfig]] = {
     "imu": ImuConfig,
     "gnss": GnssConfig,
     "compass": CompassConfig,
@@ -40,7 +41,9 @@ HUSKY = Path(__file__).parent.parent.parent / "shared" / "data" / "husky" / "hus
 
 def vessel(**sensors: Any) -> VesselConfig:
     """A configuration; `imu` and `gnss` on their usual topics unless said otherwise."""
-    extra = {k: sensors.pop(k) for k in ("truth_topic", "check_speed_topic", "datum", "body_frame") if k in sensors}
+    extra: dict[str, Any] = {
+        k: sensors.pop(k) for k in ("truth_topic", "check_speed_topic", "datum", "body_frame") if k in sensors
+    }
     blocks = {"imu": {"topic": "/imu"}, "gnss": {"topic": "/fix"}, **sensors}
     return parse_config({"sensors": {k: v for k, v in blocks.items() if v}, **extra}, KINDS, "test")
 
@@ -48,8 +51,9 @@ def vessel(**sensors: Any) -> VesselConfig:
 def accounted(recording: Recording) -> int:
     """Messages that ended somewhere; the ledger refuses an arrival that ended twice."""
     ledger = Ledger(recording.rows)
-    imu = recording.imu.seqs if recording.imu is not None else []
-    used = [int(s) for s in imu] + [m.seq for m in recording.measurements]
+    used = [m.seq for m in recording.measurements]
+    if recording.imu is not None:
+        used += [int(s) for s in recording.imu.seqs]
     assert len(set(used)) == len(used)
     assert not any(s in ledger for s in used)
     return len(used) + len(ledger)

@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Issue item A.7 at the reading level: each kind of bad input ends in a ledger row, a warning, or one clear line."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphloc.errors import InputError
+from graphloc.frontends._clock import longest_increasing
+from graphloc.frontends.bag import read_recording
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.recording import Recording
+from tests.bagfactory import START_NS, Item, Messages, S, still_run, write_bag
+from tests.test_bag import accounted, vessel
+
+MAKE = Messages(2)
+LATER_NS = 10_000_000
+
+
+def read(tmp_path: Path, items: list[Item], kind: str = "mcap", **sensors: Any) -> Recording:
+    """Write, read, and hold the sum."""
+    ordered = sorted(items, key=lambda i: i[1])
+    recording = read_recording(write_bag(tmp_path / "run", MAKE, ordered, kind), vessel(**sensors))
+    assert recording.message_count == accounted(recording)
+    return recording
+
+
+def rows_of(recording: Recording, sensor: str) -> list[LedgerRow]:
+    return [r for r in recording.rows if r.sensor == sensor]
+
+
+def one_line(error: pytest.ExceptionInfo[InputError], *words: str) -> None:
+    text = str(error.value)
+    assert "\n" not in text
+    for word in words:
+        assert word in text
+
+
+# truncated bag
+
+
+def test_no_bag(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        read_recording(tmp_path / "nowhere.bag", vessel())
+    one_line(error, "nowhere.bag", "no such file")
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(InputError) as error:
+        read_recording(tmp_path / "notes.txt", vessel())
+    one_line(error, "notes.txt", "not a bag")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError) as error:
+        read_recording(tmp_path / "empty", vessel())
+    one_line(error, "empty", "metadata.yaml")
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"), [("a.bag", "rosbag reindex"), ("a.mcap", "mcap recover"), ("a.db3", "ros2 bag reindex")]
+)
+@pytest.mark.parametrize("content", [b"", b"this is no bag", b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n"])
+def test_nothing_readable_names_the_tool_that_repairs(tmp_path: Path, name: str, hint: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError) as error:
+        read_recording(tmp_path / name, vessel())
+    one_line(error, name, hint)
+
+
+# missing topic, wrong and unknown types
+
+
+def test_missing_topic_names_the_nearest(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "run", MAKE, still_run(MAKE))
+    with pytest.raises(InputError) as error:
+        read_recording(path, vessel(gnss={"topic": "/fixx"}))
+    one_line(error, str(path), "sensors.gnss.topic", "'/fixx'", "nearest: /fix")
+    with pytest.raises(InputError) as error:
+        read_recording(path, vessel(gnss={"topic": ""}))
+    one_line(error, "sensors.gnss.topic", "fitting type: /fix")
+    with pytest.raises(InputError) as error:
+        read_recording(path, vessel(check_speed_topic="/odom"))
+    one_line(error, "check_speed_topic", "/odom", "no topic holds nav_msgs/Odometry")
+
+
+def test_wrong_type_names_both(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "run", MAKE, still_run(MAKE))
+    with pytest.raises(InputError) as error:
+        read_recording(path, vessel(gnss={"topic": "/imu"}))
+    one_line(error, "'/imu' holds sensor_msgs/Imu", "must hold sensor_msgs/NavSatFix", "fitting type: /fix")
+
+
+def test_bytes_that_are_no_message(tmp_path: Path) -> None:
+    items = [*still_run(MAKE), ("/fix", START_NS + S, ("sensor_msgs/msg/NavSatFix", b"\0\1\0\0short"))]
+    recording = read(tmp_path, items)
+    (row,) = rows_of(recording, "gnss")
+    assert row.outcome is Outcome.MALFORMED
+    assert row.topic == "/fix"
+    assert "run" in row.reason
+    assert "2023-11-14T22:13:21" in row.reason  # START_NS + 1 s
+    assert len(recording.measurements) == 20
+
+
+# values
+
+
+def test_nan_and_zero_covariance(tmp_path: Path) -> None:
+    items = still_run(MAKE)
+    stamp = START_NS + 5 * S
+    items.append(("/fix", stamp, MAKE.fix(stamp, covariance=np.full(9, np.nan))))
+    items.append(("/fix", stamp + S, MAKE.fix(stamp + S, covariance=np.zeros(9))))
+    recording = read(tmp_path, items)
+    assert rows_of(recording, "gnss") == []
+    for fix in recording.measurements[-2:]:
+        assert isinstance(fix, GnssPosition)
+        np.testing.assert_allclose(fix.cov_enu_m2, np.diag([1.5**2, 1.5**2, 4.0**2]))
+
+
+def test_nan_values(tmp_path: Path) -> None:
+    items = still_run(MAKE)
+    stamp = START_NS + 5 * S
+    items.append(("/imu", stamp, MAKE.imu(stamp, accel=(0, np.nan, 9.8))))
+    items.append(("/fix", stamp, MAKE.fix(stamp, lat=np.nan)))
+    recording = read(tmp_path, items)
+    for sensor in ("imu", "gnss"):
+        (row,) = rows_of(recording, sensor)
+        assert (row.outcome, row.stamp_ns) == (Outcome.MALFORMED, stamp)
+        assert "NaN" in row.reason
+        assert "run" in row.reason
+
+
+def test_no_fix_is_no_fix(tmp_path: Path) -> None:
+    stamps = [START_NS + k * S // 5 for k in range(10)]
+    items = [("/fix", t, MAKE.fix(t, status=-1 if k < 4 else 0)) for k, t in enumerate(stamps)]
+    recording = read(tmp_path, items, imu=None)
+    assert len(recording.measurements) == 6
+    assert [r.outcome for r in rows_of(recording, "gnss")] == [Outcome.REJECTED] * 4
+
+
+def test_a_sensor_that_gives_nothing_is_said(tmp_path: Path) -> None:
+    items = [("/fix", START_NS + k * S, MAKE.fix(START_NS + k * S, status=-1)) for k in range(5)]
+    recording = read(tmp_path, items, imu=None)
+    assert any("gnss: none of the 5 messages on /fix" in w and "NO_FIX" in w for w in recording.warnings)
+
+
+def test_fixes_at_null_island_and_far_away(tmp_path: Path) -> None:
+    items = still_run(MAKE)
+    for k, (lat, lon) in enumerate([(0.0, 0.0), (59.7, 11.9)]):
+        stamp = START_NS + (5 + k) * S
+        items.append(("/fix", stamp, MAKE.fix(stamp, lat=lat, lon=lon)))
+    recording = read(tmp_path, items)
+    null, far = rows_of(recording, "gnss")
+    assert null.outcome is far.outcome is Outcome.REJECTED
+    assert "0, 0" in null.reason
+    assert "100 km" in far.reason
+    assert len(recording.measurements) == 20
+
+
+def test_compass_with_nan_roll_and_pitch(tmp_path: Path) -> None:
+    nan = float("nan")
+    stamps = [START_NS + k * S for k in range(4)]
+    quats = [(nan, nan, 0.0, 1.0), (nan, nan, nan, nan), (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)), (nan, nan, 1.0, 0.0)]
+    items = [("/heading", t, MAKE.compass(t, q)) for t, q in zip(stamps, quats, strict=True)]
+    recording = read(tmp_path, items, imu=None, gnss=None, compass={"topic": "/heading"})
+    yaws = [m.yaw_rad for m in recording.measurements if isinstance(m, CompassHeading)]
+    np.testing.assert_allclose(np.abs(yaws), [0.0, np.pi / 2, np.pi])
+    (row,) = rows_of(recording, "compass")
+    assert (row.outcome, row.stamp_ns) == (Outcome.MALFORMED, stamps[1])
+
+
+# stamps
+
+
+def test_zero_stamps(tmp_path: Path) -> None:
+    recording = read(tmp_path, [*still_run(MAKE), ("/imu", START_NS + S // 3, MAKE.imu(0))])
+    (row,) = rows_of(recording, "imu")
+    assert (row.outcome, row.stamp_ns) == (Outcome.MALFORMED, 0)
+    assert "header stamp is zero" in row.reason
+
+
+def test_repeated_and_backward_imu_stamps(tmp_path: Path) -> None:
+    items = still_run(MAKE)
+    repeated, backward = START_NS + S, START_NS + 2 * S
+    items.append(("/imu", repeated + LATER_NS + 1, MAKE.imu(repeated)))
+    items.append(("/imu", backward + LATER_NS + 1, MAKE.imu(backward - S // 2)))
+    recording = read(tmp_path, items)
+    assert recording.imu is not None
+    assert len(recording.imu) == 200
+    assert sorted(r.stamp_ns for r in rows_of(recording, "imu")) == [repeated, backward - S // 2]
+    assert all(r.outcome is Outcome.REJECTED and "repeated or backward" in r.reason for r in rows_of(recording, "imu"))
+    assert any("2 messages rejected" in w for w in recording.warnings)
+
+
+def test_one_stamp_that_ran_ahead_costs_one_sample(tmp_path: Path) -> None:
+    """Keeping each sample that is later than the last kept one would lose three seconds here."""
+    items = still_run(MAKE)
+    items.append(("/imu", START_NS + S + LATER_NS + 1, MAKE.imu(START_NS + 4 * S)))
+    recording = read(tmp_path, items)
+    assert recording.imu is not None
+    assert len(recording.imu) == 200
+    assert [r.stamp_ns for r in rows_of(recording, "imu")] == [START_NS + 4 * S]
+
+
+def test_the_longest_increasing_run_is_kept() -> None:
+    """Against all subsets of short random sequences."""
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        stamps = rng.integers(0, 8, size=rng.integers(1, 9))
+        keep = longest_increasing(stamps)
+        assert (np.diff(stamps[keep]) > 0).all()
+        subsets = (np.array([m >> i & 1 for i in range(len(stamps))], dtype=bool) for m in range(1, 2 ** len(stamps)))
+        assert keep.sum() == max(s.sum() for s in subsets if (np.diff(stamps[s]) > 0).all())
+
+
+def test_repeated_fixes_are_no_new_evidence_but_two_at_one_stamp_are(tmp_path: Path) -> None:
+    items = still_run(MAKE)
+    items.append(("/fix", START_NS + LATER_NS + 1, MAKE.fix(START_NS)))  # the same again
+    items.append(("/fix", START_NS + LATER_NS + 2, MAKE.fix(START_NS, lat=57.70001)))  # another one
+    recording = read(tmp_path, items)
+    (row,) = rows_of(recording, "gnss")
+    assert "repeated message" in row.reason
+    assert [m.stamp_ns for m in recording.measurements[:3]] == [START_NS, START_NS, START_NS + S // 5]
+    assert recording.measurements[0].seq < recording.measurements[1].seq
+
+
+@pytest.mark.parametrize("jump_s", [3600, -3600, 400_000_000, -1_600_000_000])
+def test_clock_jump_of_single_stamps(tmp_path: Path, jump_s: int) -> None:
+    items = still_run(MAKE)
+    for topic, make in (("/imu", MAKE.imu), ("/fix", MAKE.fix)):
+        items.append((topic, START_NS + S + 1, make(START_NS + S + jump_s * S)))
+    recording = read(tmp_path, items)
+    for sensor in ("imu", "gnss"):
+        (row,) = rows_of(recording, sensor)
+        assert (row.outcome, row.stamp_ns) == (Outcome.REJECTED, START_NS + S + jump_s * S)
+        assert "clock jump" in row.reason
+    assert recording.imu is not None
+    assert len(recording.imu) == 200
+    assert len(recording.measurements) == 20
+
+
+def test_the_computer_clock_is_set_during_the_run(tmp_path: Path) -> None:
+    """Two seconds in 1970, then four in the present: the longer part is the run, the rest is said."""
+    items = still_run(MAKE, seconds=2.0, start_ns=100 * S) + still_run(MAKE)
+    recording = read(tmp_path, items)
+    assert recording.imu is not None
+    assert (len(recording.imu), len(recording.measurements)) == (200, 20)
+    assert len(rows_of(recording, "imu")) == 100
+    assert all("busiest part" in r.reason for r in recording.rows)
+    assert any("imu: 100 messages rejected" in w for w in recording.warnings)
+
+
+def test_a_sensor_in_another_epoch_is_said_and_not_fixed(tmp_path: Path) -> None:
+    """GPS time without leap seconds: 18 s ahead of UTC."""
+    items = []
+    for topic, log_ns, msg in still_run(MAKE):
+        items.append((topic, log_ns, MAKE.fix(log_ns - LATER_NS + 18 * S) if topic == "/fix" else msg))
+    recording = read(tmp_path, items)
+    assert recording.measurements[0].stamp_ns == START_NS + 18 * S
+    (line,) = recording.warnings
+    assert "gnss: its clock is 18.000 s ahead of that of imu" in line
+    assert "add -18.000 to its time_offset_s" in line
+    path = tmp_path / "run"
+    assert read_recording(path, vessel(gnss={"topic": "/fix", "time_offset_s": -18.0})).warnings == ()
+
+
+# units, gravity, swapped axes
+
+
+@pytest.mark.parametrize(
+    ("accel", "gyro", "block", "words"),
+    [
+        ((0, 0, 1.0), (0, 0, 0), {}, "accel_unit: g"),
+        ((0.01, 0, 0.02), (0, 0, 0), {}, "gravity: removed"),
+        ((0, 0, 9.8), (0, 0, 0), {"accel_unit": "g"}, "accel_unit: m/s^2"),
+        ((0, 0, 9.8), (0, 0, 0), {"gravity": "removed"}, "gravity: included"),
+        ((0, 0, 9.8), (2.0, -3.0, 5.0), {}, "gyro_unit: deg/s"),
+        ((0, 0, 4.0), (0, 0, 0), {}, "not about 9.8"),
+        ((0, 0, 9.8), (0, 0, 0.2), {}, ""),
+        ((0, 0, 1.0), (0, 0, 0), {"accel_unit": "g"}, ""),
+        ((0.01, 0, 0.02), (0, 0, 0), {"gravity": "removed"}, ""),
+    ],
+)
+def test_wrong_units_and_gravity(tmp_path: Path, accel: Any, gyro: Any, block: dict[str, str], words: str) -> None:
+    stamps = [START_NS + k * S // 50 for k in range(100)]
+    items = [("/imu", t, MAKE.imu(t, accel=accel, gyro=gyro)) for t in stamps]
+    recording = read(tmp_path, items, gnss=None, imu={"topic": "/imu", **block})
+    if words:
+        (line,) = recording.warnings
+        assert words in line
+    else:
+        assert recording.warnings == ()
+
+
+def test_swapped_latitude_and_longitude(tmp_path: Path) -> None:
+    """Beyond 90 deg it shows in the message; elsewhere the datum tells."""
+    stamps = [START_NS + k * S for k in range(10)]
+    items = [("/fix", t, MAKE.fix(t, lat=151.2, lon=-33.9)) for t in stamps]
+    recording = read(tmp_path, items, imu=None)
+    assert all(r.outcome is Outcome.MALFORMED and "swapped" in r.reason for r in rows_of(recording, "gnss"))
+    assert len(rows_of(recording, "gnss")) == 10
+    other = tmp_path / "second"
+    items = [("/fix", t, MAKE.fix(t, lat=11.9, lon=57.7)) for t in stamps]
+    datum = {"latitude_deg": 57.7, "longitude_deg": 11.9}
+    warnings = read(other, items, imu=None, datum=datum).warnings
+    assert any("latitude and longitude look swapped" in w for w in warnings)
