@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import io
 import os
+import struct
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
+
+from rosbags.rosbag1.reader import Header, ReaderError, RecordType, decompressors, read_uint32
 
 
 class Recovered:
@@ -105,5 +108,134 @@ class _View(io.RawIOBase):
 
 
 def recover(path: Path) -> Recovered | None:
-    """Return a view of the whole part of a damaged file; None where nothing can be read."""
-    return None
+    """Return a view of the whole part of a damaged file; None where nothing of it can be read."""
+    repair = {".bag": _recover_ros1, ".mcap": _recover_mcap}.get(path.suffix)
+    if repair is None:
+        return None
+    try:
+        return repair(path)
+    except (ReaderError, struct.error, ValueError, KeyError, OSError):
+        return None
+
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_MCAP_FOOTER, _MCAP_DATA_END = 0x02, 0x0F
+
+
+def _recover_mcap(path: Path) -> Recovered | None:
+    """Cut behind the last whole record of the data section; a footer without summary makes rosbags scan."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
+            return None
+        whole = first = file.tell()
+        while len(start := file.read(9)) == 9:
+            op, length = struct.unpack("<BQ", start)
+            if op == _MCAP_DATA_END or file.tell() + length > size:
+                break
+            whole = file.seek(length, io.SEEK_CUR)
+    footer = struct.pack("<BQQQI", _MCAP_FOOTER, 20, 0, 0, 0) + _MCAP_MAGIC
+    return Recovered(path, b"", whole, footer) if whole > first else None
+
+
+class _Chunk(NamedTuple):
+    position: int
+    start_ns: int
+    end_ns: int
+    counts: dict[int, int]
+
+
+def _recover_ros1(path: Path) -> Recovered | None:
+    """Rebuild the index (connections and chunk infos) of the chunks that are whole, as `rosbag reindex` does.
+
+    A chunk counts as whole when its index records, which follow it, are there too.
+    """
+    size = path.stat().st_size
+    connections: dict[int, bytes] = {}
+    chunks: list[_Chunk] = []
+    with path.open("rb") as file:
+        magic = file.readline()
+        Header.read(file, RecordType.BAGHEADER)
+        file.seek(read_uint32(file), io.SEEK_CUR)
+        head_bytes = whole = file.tell()
+        position, needed, counts = 0, set[int](), dict[int, int]()
+        times: list[int] = []
+        while file.tell() < size:
+            at = file.tell()
+            try:
+                header = Header.read(file)
+                length = read_uint32(file)
+            except ReaderError:
+                break
+            if file.tell() + length > size:
+                break
+            op = header.get_uint8("op")
+            if op == RecordType.CHUNK:
+                position, counts, times = at, {}, []
+                data = decompressors[header.get_string("compression")](file.read(length))
+                needed = _read_chunk(data, connections)
+            elif op == RecordType.IDXDATA:
+                conn = header.get_uint32("conn")
+                entries = struct.unpack(f"<{3 * (length // 12)}L", file.read(length))
+                counts[conn] = len(entries) // 3
+                times += [s * 10**9 + ns for s, ns in zip(entries[::3], entries[1::3], strict=True)]
+                if set(counts) == needed:
+                    chunks.append(_Chunk(position, min(times), max(times), counts))
+                    whole = file.tell()
+            else:
+                break  # the index itself: written last, so all chunks are read
+    known = {conn for chunk in chunks for conn in chunk.counts}
+    if not chunks or not known <= set(connections):
+        return None
+    head = _ros1_head(magic, head_bytes, whole, len(known), len(chunks))
+    tail = b"".join(connections[c] for c in sorted(known)) + b"".join(_ros1_chunk_info(c) for c in chunks)
+    return Recovered(path, head, whole, tail)
+
+
+def _read_chunk(data: bytes, connections: dict[int, bytes]) -> set[int]:
+    """Collect the raw connection records of a chunk; return which connections have messages in it."""
+    chunk = io.BytesIO(data)
+    used = set()
+    while (at := chunk.tell()) < len(data):
+        header = Header.read(chunk)
+        stop = chunk.seek(read_uint32(chunk), io.SEEK_CUR)
+        conn = header.get_uint32("conn")
+        if header.get_uint8("op") == RecordType.CONNECTION:
+            connections[conn] = data[at:stop]
+        else:
+            used.add(conn)
+    return used
+
+
+def _ros1_header(**fields: bytes) -> bytes:
+    """A record header with its length in front."""
+    body = b"".join(struct.pack("<L", len(k) + 1 + len(v)) + k.encode() + b"=" + v for k, v in fields.items())
+    return struct.pack("<L", len(body)) + body
+
+
+def _ros1_head(magic: bytes, head_bytes: int, index_pos: int, connections: int, chunks: int) -> bytes:
+    """The file's first bytes, as long as they were, with the bag header pointing to the new index."""
+    head = magic + _ros1_header(
+        op=bytes([RecordType.BAGHEADER]),
+        index_pos=struct.pack("<Q", index_pos),
+        conn_count=struct.pack("<L", connections),
+        chunk_count=struct.pack("<L", chunks),
+    )
+    padding = head_bytes - len(head) - 4
+    return head + struct.pack("<L", padding) + b" " * padding
+
+
+def _ros1_chunk_info(chunk: _Chunk) -> bytes:
+    def time(stamp_ns: int) -> bytes:
+        return struct.pack("<LL", *divmod(stamp_ns, 10**9))
+
+    header = _ros1_header(
+        op=bytes([RecordType.CHUNK_INFO]),
+        ver=struct.pack("<L", 1),
+        chunk_pos=struct.pack("<Q", chunk.position),
+        start_time=time(chunk.start_ns),
+        end_time=time(chunk.end_ns),
+        count=struct.pack("<L", len(chunk.counts)),
+    )
+    data = b"".join(struct.pack("<LL", conn, count) for conn, count in chunk.counts.items())
+    return header + struct.pack("<L", len(data)) + data

@@ -20,6 +20,7 @@ from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.interfaces.typing import Typesdict
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -190,7 +191,7 @@ class Bag:
     def _until_damage(self, opened: _Opened, wanted: list[Connection]) -> Iterator[RawMessage]:
         read = 0
         try:
-            for connection, log_ns, data in opened.reader.messages(wanted):
+            for connection, log_ns, data in _stream(opened, wanted):
                 read += 1
                 yield RawMessage(connection.topic, connection.msgtype, opened.path.name, log_ns, data)
         except Exception as error:  # noqa: BLE001 - as above
@@ -234,6 +235,14 @@ def _types_from_idl(text: str, _msgtype: str) -> Typesdict:
     for part in filter(None, parts):
         types.update(get_types_from_idl(part.split("\n", 1)[1] if part.startswith("IDL: ") else part))
     return types
+
+
+def _stream(opened: _Opened, wanted: list[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
+    """Messages of a file. MCAP without an index is taken in the order of the file, which need not be that of time."""
+    if isinstance(opened.reader, Reader2) and isinstance(opened.reader.storage, McapReader):
+        storage = opened.reader.storage
+        return storage.messages(wanted) if storage.chunks else storage.messages_scan(wanted)
+    return opened.reader.messages(wanted)
 
 
 def _text(error: BaseException) -> str:
