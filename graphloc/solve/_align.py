@@ -82,7 +82,7 @@ def align(problem: Problem) -> Start:
     yaws = _yaw_samples(problem, origin)
     still = _standstill(problem, origin, window, track, yaws)
     bias, bias_sigma, notes = _gyro_bias(problem, origin, window, still, yaws)
-    turn = _turns(problem, origin, window, bias)
+    turn = _turns(problem, window + 10.0 if yaws else 180.0, bias)
     R_level, tilt_sigma, tilt_note = _level(problem, origin, window, still, turn, track)
     heading = _headings(problem, origin, track, yaws, turn)
     p0, p_sigma, v0, v_sigma = _position_and_velocity(problem, track, still)
@@ -225,10 +225,10 @@ def _gyro_bias(
     return bias, sigma, (f"gyro bias from {span:.0f} s of motion and heading",)
 
 
-def _turns(problem: Problem, origin: int, window: float, bias: Array) -> Callable[[float], Array]:
+def _turns(problem: Problem, span_s: float, bias: Array) -> Callable[[float], Array]:
     """Return a function t -> R_body0_body(t), integrated from the gyroscope over the run's beginning."""
     span = float((problem.imu.stamps_ns[-1] - problem.imu.stamps_ns[0]) * 1e-9)
-    t, _, w = _samples(problem, 0.0, min(max(window, 180.0), span))
+    t, _, w = _samples(problem, 0.0, min(span_s, span))
     R = np.empty((len(t), 3, 3))
     current = Rotation.identity()
     R[0] = np.eye(3)

@@ -29,7 +29,11 @@ _CHUNK_S, _OVERLAP_S = 20.0, 10.0
 _MAX_OPEN_PASSES, _MAX_MIXTURE_PASSES, _MAX_NOISE_ROUNDS = 4, 6, 5
 _CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
 _SETTLED_M, _SETTLED_WEIGHT = 0.01, 0.05
-_WINDOW_SETTLED_M, _WINDOW_ROUNDS = 0.5, 8
+_WINDOW_SETTLED_M = 0.5
+# Stages of a window: name, most rounds, motion in m that ends it. A grown window starts near the truth.
+_Stages = tuple[tuple[str, int, float], ...]
+_START_STAGES: _Stages = (("far", 8, 0.5), ("open", 2, 0.5), ("mixture", 2, 0.5))
+_GROW_STAGES: _Stages = (("far", 8, 2.0), ("mixture", 2, 0.5))
 
 Progress = Callable[[str, int, int], None]
 
@@ -189,7 +193,7 @@ def _start_window(problem: Problem, start: Start, progress: Progress) -> tuple[g
         _fill_slow(problem, estimate, 0, prior.bias, {})
         try:
             _extend(problem, estimate, 0, until)
-            used, error = _solve_window(problem, estimate, 0, until, prior, _WINDOW_ROUNDS)
+            used, error = _solve_window(problem, estimate, 0, until, prior, _START_STAGES)
         except SolveError as caught:
             failure = caught
             continue
@@ -226,7 +230,7 @@ def _extend(problem: Problem, values: gtsam.Values, known: int, until: int) -> N
 
 
 def _solve_window(
-    problem: Problem, values: gtsam.Values, first: int, last: int, prior: StartPrior, rounds: int
+    problem: Problem, values: gtsam.Values, first: int, last: int, prior: StartPrior, stages: _Stages
 ) -> tuple[int, float]:
     """Solve states first..last in place; return iterations and final error.
 
@@ -234,7 +238,7 @@ def _solve_window(
     of gyro bias, 300 m after 20 s of dead reckoning), so each window goes through all the stages.
     """
     iterations, error = 0, 0.0
-    for stage, limit in (("far", rounds), ("open", 2), ("mixture", 2)):
+    for stage, limit, settled_m in stages:
         for _ in range(limit):
             verdicts = weigh(problem, values, None, first=first, last=last, stage=stage)
             graph, guess = build_graph(problem, values, decisions(verdicts), first, last, prior)
@@ -243,7 +247,7 @@ def _solve_window(
             moved = _moved(guess, solved.values, first, last)
             _update(problem, values, solved.values, first, last)
             error = solved.error
-            if moved < _WINDOW_SETTLED_M:
+            if moved < settled_m:
                 break
     return iterations, error
 
@@ -280,7 +284,7 @@ def _grow(problem: Problem, estimate: gtsam.Values, prior: StartPrior, known: in
             prior = _prior_at(problem, bayes_tree(graph, guess), guess, start_of_window)
             first = start_of_window
         _extend(problem, estimate, known, until)
-        used, _ = _solve_window(problem, estimate, first, until, prior, _WINDOW_ROUNDS)
+        used, _ = _solve_window(problem, estimate, first, until, prior, _GROW_STAGES)
         iterations += used
         known = until
         progress("growing", known, end)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Render docs/configuration.md from the configuration's own definitions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pydantic import BaseModel
+
+from graphloc.config import (
+    DatumConfig,
+    KernelConfig,
+    MountConfig,
+    OutputConfig,
+    SensorConfig,
+    SlowErrorConfig,
+    StartConfig,
+    TimelineConfig,
+    VesselConfig,
+)
+
+_BLOCKS = (DatumConfig, TimelineConfig, StartConfig, OutputConfig, MountConfig, KernelConfig, SlowErrorConfig)
+
+
+def render(kinds: Mapping[str, type[SensorConfig]]) -> str:
+    """Return the reference of all keys as Markdown."""
+    parts = [
+        "# Configuration: `vessel.yaml`",
+        "",
+        "Made by `graphloc config --docs`. A key that is not listed is an error that names its nearest neighbour.",
+        "",
+        "## Top level",
+        _table(VesselConfig),
+    ]
+    for block in _BLOCKS:
+        parts += [f"## Block `{block.__name__.removesuffix('Config').lower()}`", _doc(block), "", _table(block)]
+    for kind, config in kinds.items():
+        parts += [f"## Sensor kind `{kind}`", _doc(config), "", _table(config)]
+    return "\n".join(parts)
+
+
+def _doc(model: type[BaseModel]) -> str:
+    return (model.__doc__ or "").splitlines()[0]
+
+
+def _table(model: type[BaseModel]) -> str:
+    lines = ["| key | default | meaning |", "|---|---|---|"]
+    for name, field in model.model_fields.items():
+        default = "required" if field.is_required() else _value(field.default)
+        lines.append(f"| `{name}` | {default} | {' '.join((field.description or '').split())} |")
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: object) -> str:
+    if isinstance(value, BaseModel):
+        given = {k: v for k, v in value.model_dump().items() if k in value.model_fields_set}
+        return f"`{given}`" if given else "see its block"
+    return f"`{value}`" if value not in (None, {}, ()) else "none"
