@@ -119,7 +119,7 @@ def recover(path: Path) -> Recovered | None:
 
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
-_MCAP_FOOTER, _MCAP_DATA_END = 0x02, 0x0F
+_MCAP_FOOTER, _MCAP_MESSAGE, _MCAP_CHUNK, _MCAP_DATA_END = 0x02, 0x05, 0x06, 0x0F
 
 
 def _recover_mcap(path: Path) -> Recovered | None:
@@ -128,14 +128,15 @@ def _recover_mcap(path: Path) -> Recovered | None:
     with path.open("rb") as file:
         if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
             return None
-        whole = first = file.tell()
+        whole, filled = file.tell(), False
         while len(start := file.read(9)) == 9:
             op, length = struct.unpack("<BQ", start)
             if op == _MCAP_DATA_END or file.tell() + length > size:
                 break
             whole = file.seek(length, io.SEEK_CUR)
+            filled |= op in (_MCAP_MESSAGE, _MCAP_CHUNK)
     footer = struct.pack("<BQQQI", _MCAP_FOOTER, 20, 0, 0, 0) + _MCAP_MAGIC
-    return Recovered(path, b"", whole, footer) if whole > first else None
+    return Recovered(path, b"", whole, footer) if filled else None
 
 
 class _Chunk(NamedTuple):

@@ -2,6 +2,7 @@
 """Reading bags: every kind of file gives the same run, and every message is accounted for."""
 
 import sqlite3
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,20 @@ def test_image_topics_are_never_unpacked(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "run", make, sorted(items, key=lambda i: i[1]), "mcap")
     recording = read_recording(path, vessel())
     assert [(r.topic, r.count, r.outcome) for r in recording.rows] == [("/camera", 4, Outcome.IGNORED)]
+
+
+def test_memory_does_not_grow_with_image_topics(tmp_path: Path) -> None:
+    make = Messages(2)
+    items: list[Any] = still_run(make)
+    items += [("/camera", START_NS + k * S // 20, ("sensor_msgs/msg/Image", bytes(1_000_000))) for k in range(64)]
+    path = write_bag(tmp_path / "run", make, sorted(items, key=lambda i: i[1]), "mcap")
+    tracemalloc.start()
+    try:
+        read_recording(path, vessel())
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 16_000_000  # 64 MB of images lie in between; a chunk of the file is a few MB
 
 
 def test_an_unknown_type_on_another_topic_is_counted(tmp_path: Path) -> None:

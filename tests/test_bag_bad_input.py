@@ -67,6 +67,87 @@ def test_nothing_readable_names_the_tool_that_repairs(tmp_path: Path, name: str,
     one_line(error, name, hint)
 
 
+@pytest.mark.parametrize(
+    ("kind", "compression"), [("ros1", ""), ("ros1", "lz4"), ("ros1", "bz2"), ("mcap", ""), ("mcap", "storage")]
+)
+@pytest.mark.parametrize("share", [0.45, 0.7, 0.97])
+def test_truncated_bag_gives_what_is_whole(tmp_path: Path, kind: str, compression: str, share: float) -> None:
+    """What is read is the beginning of the run, with every message in it, and a line that says so."""
+    make = Messages(1 if kind == "ros1" else 2)
+    suffix = "bag" if kind == "ros1" else "mcap"
+    path = write_bag(
+        tmp_path / ("run.bag" if kind == "ros1" else "run"), make, still_run(make, 240.0), kind, compression
+    )
+    whole = (path if kind == "ros1" else path / "run.mcap").read_bytes()
+    cut = tmp_path / f"cut.{suffix}"
+    cut.write_bytes(whole[: int(share * len(whole))])
+    recording = read_recording(cut, vessel())
+    assert recording.imu is not None
+    n = len(recording.imu)
+    assert 1000 < n <= 12000
+    np.testing.assert_array_equal(recording.imu.stamps_ns, START_NS + np.arange(n) * (S // 50))
+    assert len(recording.measurements) == pytest.approx(n / 10, abs=1)
+    assert recording.message_count == accounted(recording)
+    (line,) = recording.warnings
+    assert "cut.bag: damaged or cut short" in line or "cut.mcap: damaged or cut short" in line
+    assert f"of {int(share * len(whole))}" in line
+    assert ("rosbag reindex" if kind == "ros1" else "mcap recover") in line
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_truncated_before_the_first_message(tmp_path: Path, kind: str) -> None:
+    make = Messages(1 if kind == "ros1" else 2)
+    name = "run.bag" if kind == "ros1" else "run"
+    path = write_bag(tmp_path / name, make, still_run(make), kind)
+    whole = (path if kind == "ros1" else path / "run.mcap").read_bytes()
+    cut = tmp_path / ("cut.bag" if kind == "ros1" else "cut.mcap")
+    for share in (0.1, 0.5):
+        cut.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(InputError) as error:
+            read_recording(cut, vessel())
+        one_line(error, cut.name, "rosbag reindex" if kind == "ros1" else "mcap recover")
+
+
+def test_truncated_sqlite_is_one_line(tmp_path: Path) -> None:
+    whole = (write_bag(tmp_path / "run", MAKE, still_run(MAKE)) / "run.db3").read_bytes()
+    (tmp_path / "cut.db3").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError) as error:
+        read_recording(tmp_path / "cut.db3", vessel())
+    one_line(error, "cut.db3", "ros2 bag reindex")
+
+
+def test_one_truncated_file_of_a_split_bag(tmp_path: Path) -> None:
+    """The folder's other files are read whole."""
+    make = Messages(2)
+    folder = write_bag(tmp_path / "run", make, still_run(make, 60.0), "mcap")
+    more = write_bag(tmp_path / "more", make, still_run(make, 60.0, START_NS + 60 * S), "mcap")
+    data = (more / "more.mcap").read_bytes()
+    (folder / "run_1.mcap").write_bytes(data[: int(0.97 * len(data))])
+    (folder / "metadata.yaml").unlink()
+    recording = read_recording(folder, vessel())
+    assert recording.imu is not None
+    assert 3000 < len(recording.imu) < 6000
+    assert any("run_1.mcap: damaged or cut short" in w for w in recording.warnings)
+    assert recording.message_count == accounted(recording)
+
+
+def test_damage_in_the_middle_keeps_what_came_before(tmp_path: Path) -> None:
+    """A chunk whose bytes are wrong; the index, at the end, is whole and announces all messages."""
+    make = Messages(1)
+    path = write_bag(tmp_path / "run.bag", make, still_run(make, 120.0), "ros1", "lz4")
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"compression=lz4") + 60
+    data[at : at + 200] = bytes(200)
+    path.write_bytes(bytes(data))
+    recording = read_recording(path, vessel())
+    assert recording.imu is not None
+    assert 100 < len(recording.imu) < 6000
+    assert any("damaged after" in w for w in recording.warnings)
+    lost = {r.topic: r.count for r in recording.rows if r.outcome is Outcome.MALFORMED}
+    assert lost["/imu"] == 6000 - len(recording.imu)
+    assert recording.message_count == accounted(recording) == 6600
+
+
 # missing topic, wrong and unknown types
 
 

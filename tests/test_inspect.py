@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`inspect` on runs whose answer is known: mounts, units, conventions, and a draft that works as it stands."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphloc.config import ImuConfig, VesselConfig, load_config
+from graphloc.frames import Datum, Geodetic
+from graphloc.frontends.bag import read_recording
+from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
+from graphloc.measurements import CompassHeading
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.test_bag import HUSKY, KINDS
+
+DATUM = Datum(Geodetic(57.7, 11.9, 40.0))
+G = 9.81
+
+
+def rotation_z(degrees: float) -> Any:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+ROLL_90 = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # takes the sensor's y to body z
+
+
+def drive(
+    make: Messages,
+    R_body_sensor: Any = None,
+    accel_scale: float = 1.0,
+    gyro_scale: float = 1.0,
+    status: int = 2,
+    sigma_m: float = 0.02,
+    seconds: int = 120,
+) -> list[Item]:
+    """Speed 3 + 1.5 sin(0.4 t) m/s, yaw rate 0.15 sin(0.13 t) + 0.05 rad/s, first 10 s at rest; analytic IMU."""
+    R = np.eye(3) if R_body_sensor is None else R_body_sensor
+    rng = np.random.default_rng(1)
+    dt = 0.02
+    t = np.arange(0.0, seconds, dt)
+    ramp = np.clip((t - 10.0) / 2.0, 0.0, 1.0)
+    speed = ramp * (3.0 + 1.5 * np.sin(0.4 * t))
+    rate = ramp * (0.15 * np.sin(0.13 * t) + 0.05)
+    yaw = 0.3 + np.concatenate([[0.0], np.cumsum(rate[:-1] * dt)])
+    east = np.concatenate([[0.0], np.cumsum((speed * np.cos(yaw))[:-1] * dt)])
+    north = np.concatenate([[0.0], np.cumsum((speed * np.sin(yaw))[:-1] * dt)])
+    accel = np.column_stack([np.gradient(speed, dt), speed * rate, np.full(len(t), G)]) + rng.normal(
+        0, 0.02, (len(t), 3)
+    )
+    gyro = np.column_stack([0 * t, 0 * t, rate]) + rng.normal(0, 1e-3, (len(t), 3)) + [0.0, 0.0, 0.004]
+    lla = DATUM.geodetic_from_enu(np.column_stack([east, north, 0 * t]))
+    items: list[Item] = []
+    for k in range(len(t)):
+        stamp = START_NS + k * S // 50
+        in_sensor = accel_scale * (R.T @ accel[k]), gyro_scale * (R.T @ gyro[k])
+        items.append(("/imu", stamp, make.imu(stamp, *in_sensor, frame="imu_link")))
+        if k % 10 == 0:
+            cov = (sigma_m**2 * np.eye(3)).ravel()
+            items.append(("/fix", stamp, make.fix(stamp, lla[k][0], lla[k][1], lla[k][2], status, cov)))
+            heading = np.pi / 2.0 - yaw[k]
+            half = 0.5 * (heading + np.radians(1.0) * rng.normal())
+            items.append(("/compass", stamp, make.compass(stamp, (0, 0, np.sin(half), np.cos(half)))))
+        if k % 5 == 0:
+            items.append(("/wheel/odom", stamp, make.odometry(stamp, v=(speed[k], 0, 0))))
+    return items
+
+
+def look(tmp_path: Path, items: list[Item], make: Messages) -> tuple[Inspection, VesselConfig, str]:
+    """Inspect; the draft must load, and the text and the JSON must be made."""
+    path = write_bag(tmp_path / "run", make, items, "mcap")
+    found = inspect_bag(path)
+    text = draft_config(found)
+    (tmp_path / "vessel.yaml").write_text(text)
+    config = load_config(tmp_path / "vessel.yaml", KINDS)
+    assert render(found)
+    json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    return found, config, text
+
+
+@pytest.mark.parametrize("upright", [True, False], ids=["upright", "gravity on y"])
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0, -90.0])
+def test_mount_from_gravity_and_motion(tmp_path: Path, yaw_deg: float, upright: bool) -> None:
+    make = Messages(2)
+    R = rotation_z(yaw_deg) @ (np.eye(3) if upright else ROLL_90)
+    found, config, _ = look(tmp_path, drive(make, R, seconds=60), make)
+    np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, R, atol=1e-6)
+    axis = 2 if upright else 1
+    assert found.imus[0].gravity_axis[axis] == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_whole_draft(tmp_path: Path) -> None:
+    make = Messages(2)
+    found, config, text = look(tmp_path, drive(make), make)
+    imu, gnss, compass = found.imus[0], found.gnss[0], found.compasses[0]
+    assert imu.gyro_bias_radps == pytest.approx((0.0, 0.0, 0.004), abs=2e-4)
+    assert imu.still_s == pytest.approx(10.0, abs=1.5)
+    # 0.02 m/s^2 and 1e-3 rad/s per sample at 50 Hz: times sqrt(0.02 s)
+    assert imu.accel_noise_ug == pytest.approx(0.02 * np.sqrt(0.02) / 9.80665e-6, rel=0.1)
+    assert imu.gyro_noise_mdps == pytest.approx(np.degrees(1e-3) * np.sqrt(0.02) * 1e3, rel=0.1)
+    assert gnss.statuses == {"gbas": 600}
+    assert not config.sensors["gnss"].slow_error.enabled
+    assert (compass.usable, compass.convention) == (True, "ned")
+    assert config.sensors["compass"].convention == "ned"
+    assert config.check_speed_topic == "/wheel/odom"
+    assert "pose" not in config.sensors
+    assert text.count("# guess:") >= 5
+    recording = read_recording(tmp_path / "run", config)
+    assert recording.warnings == ()
+    headings = [m for m in recording.measurements if isinstance(m, CompassHeading)]
+    assert np.degrees(headings[0].yaw_rad) == pytest.approx(np.degrees(0.3), abs=4.0)
+
+
+def test_wrong_units_are_found(tmp_path: Path) -> None:
+    make = Messages(2)
+    _, config, text = look(tmp_path, drive(make, accel_scale=1 / 9.80665, gyro_scale=180 / np.pi), make)
+    imu = config.sensors["imu"]
+    assert isinstance(imu, ImuConfig)
+    assert (imu.accel_unit, imu.gyro_unit, imu.gravity) == ("g", "deg/s", "included")
+    assert "looks like g" in text
+    assert read_recording(tmp_path / "run", config).warnings == ()
+
+
+def test_removed_gravity_is_found(tmp_path: Path) -> None:
+    make = Messages(2)
+    items = [
+        (t, at, make.imu(at, (0.05, 0.02, 0.03), (0, 0, 0)) if t == "/imu" else m)
+        for t, at, m in drive(make, seconds=30)
+    ]
+    _, config, _ = look(tmp_path, items, make)
+    assert config.sensors["imu"].gravity == "removed"
+
+
+def test_standard_receiver_gets_a_slow_error(tmp_path: Path) -> None:
+    make = Messages(2)
+    found, config, _ = look(tmp_path, drive(make, status=1, sigma_m=1.2, seconds=60), make)
+    assert config.sensors["gnss"].slow_error.enabled
+    assert found.gnss[0].reported_sigma_m == pytest.approx((1.2, 1.2, 1.2))
+    assert max(found.gnss[0].scatter_m or (1.0,)) < 0.02  # the data are smooth, whatever they claim
+
+
+@pytest.mark.parametrize(("offset_deg", "scatter_deg", "usable"), [(90.0, 2.0, True), (0.0, 60.0, False)])
+def test_imu_orientation_as_compass(tmp_path: Path, offset_deg: float, scatter_deg: float, usable: bool) -> None:
+    """Constant offset to the course: a mount. Wide scatter: only relative, left out, and said."""
+    make = Messages(2)
+    rng = np.random.default_rng(0)
+    items: list[Item] = []
+    for topic, at, m in drive(make):
+        if topic == "/compass":
+            yaw = np.pi / 2.0 - 2.0 * np.arctan2(m.quaternion.z, m.quaternion.w)
+            half = 0.5 * (yaw + np.radians(offset_deg + scatter_deg * rng.normal()))
+            q = (0.0, 0.0, np.sin(half), np.cos(half))
+            items.append(("/ahrs", at, make.imu(at, (0, 0, G), orientation=q, orientation_covariance=np.zeros(9))))
+        else:
+            items.append((topic, at, m))
+    found, config, text = look(tmp_path, items, make)
+    (report,) = found.compasses
+    assert report.usable is usable
+    if usable:
+        assert (report.convention, config.sensors["compass"].mount.rpy_deg) == ("enu", (0.0, 0.0, offset_deg))
+    else:
+        assert "compass" not in config.sensors
+        assert "orientation of /ahrs: left out as a compass" in text
+    assert not config.sensors["imu_2"].enabled
+
+
+def test_stamps_gaps_and_latency(tmp_path: Path) -> None:
+    """10 Hz for 10 s with one hole of 1 s, one repeated, one backward and one zero stamp, 30 ms late."""
+    make = Messages(2)
+    stamps = [START_NS + k * S // 10 for k in range(100) if not 50 <= k < 59]
+    logs = [t + 30_000_000 for t in stamps]
+    stamps[20] = stamps[19]
+    stamps[30] = stamps[29] - 1
+    items = [("/imu", log_ns, make.imu(t)) for t, log_ns in zip(stamps, logs, strict=True)]
+    items.append(("/imu", START_NS + 11 * S, make.imu(0)))
+    items.append(("/camera", START_NS + 12 * S, ("sensor_msgs/msg/Image", b"\0")))
+    found, _, _ = look(tmp_path, items, make)
+    imu = next(t for t in found.topics if t.topic == "/imu")
+    assert (imu.count, imu.repeated, imu.backward, imu.no_stamp, imu.gaps) == (92, 1, 1, 1, 1)
+    assert imu.rate_hz == pytest.approx(10.0)
+    assert imu.max_gap_s == pytest.approx(1.0)
+    assert imu.span_s == pytest.approx(9.9)
+    assert imu.latency_s is not None
+    assert imu.latency_s[1] == pytest.approx(0.030)
+    camera = next(t for t in found.topics if t.topic == "/camera")
+    assert (camera.count, camera.rate_hz) == (1, None)
+
+
+def test_tf_static_beats_guessing(tmp_path: Path) -> None:
+    make = Messages(2)
+    half = np.sqrt(0.5)
+    edges = [("base_link", "imu_link", (0, 0, 1), (0, 0, half, half)), ("base_link", "gps", (1, 2, 3), (0, 0, 0, 1))]
+    items = [("/tf_static", START_NS, make.transforms(edges)), *drive(make, rotation_z(90.0), seconds=30)]
+    found, config, _ = look(tmp_path, items, make)
+    assert found.imus[0].mount.tf_frame == config.sensors["imu"].mount.tf_frame == "imu_link"
+    recording = read_recording(tmp_path / "run", config)
+    np.testing.assert_allclose(recording.mounts["gnss"][0], [1, 2, 3])
+    np.testing.assert_allclose(recording.mounts["imu"][1], rotation_z(90.0), atol=1e-9)
+
+
+def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
+    make = Messages(2)
+    items: list[Item] = []
+    for k in range(30):
+        t = START_NS + k * S // 10
+        items.append(("/ground_truth/odom", t, make.odometry(t, v=(1, 0, 0))))
+        items.append(("/match", t, make.pose(t, (1, 2, 3))))
+    _, config, _ = look(tmp_path, items, make)
+    assert config.truth_topic == "/ground_truth/odom"
+    assert config.check_speed_topic is None
+    assert not config.sensors["pose"].enabled
+    (tmp_path / "b").mkdir()
+    _, config, text = look(tmp_path / "b", [("/note", START_NS, make.text("hello"))], make)
+    assert config.sensors == {}
+    assert "nothing in this bag" in text
+
+
+@pytest.mark.skipif(not HUSKY.exists(), reason="the Husky recording is not here")
+def test_husky(tmp_path: Path) -> None:
+    """The mount that was established by hand: roll 90, pitch 0, yaw -90 deg, gravity on +y."""
+    found = inspect_bag(HUSKY)
+    (tmp_path / "vessel.yaml").write_text(draft_config(found))
+    config = load_config(tmp_path / "vessel.yaml", KINDS)
+    imu = found.imus[0]
+    assert config.sensors["imu"].mount.rpy_deg == (90.0, 0.0, -90.0)
+    assert imu.gravity_axis[1] > 0.99
+    assert imu.still_s == pytest.approx(336 / 30, abs=2.0)
+    assert max(np.abs(imu.gyro_bias_radps or (1.0,))) < 4e-4
+    assert found.gnss[0].statuses == {"sbas": 989}
+    assert found.gnss[0].height_range_m > 30.0
+    assert config.check_speed_topic == "/husky_velocity_controller/odom"
+    assert "compass" not in config.sensors  # its yaw drifts by tens of degrees against the course
+    recording = read_recording(HUSKY, config)
+    assert recording.message_count == 11865 + 989 + 3952
