@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphloc.config import VesselConfig
 from graphloc.errors import InputError
@@ -46,7 +47,7 @@ from graphloc.frontends.decode import (
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.recording import Recording, SpeedSeries
-from graphloc.time import duration_ns, utc_text
+from graphloc.time import duration_ns, seconds_since, utc_text
 from graphloc.trajectory import Trajectory
 
 Progress = Callable[[str, int, int], None]
@@ -281,20 +282,33 @@ def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapp
 
 
 def _truth(item: _Beside, warnings: list[str]) -> Trajectory | None:
-    """Return the true trajectory; its twist is not used (its frame differs between writers)."""
-    poses = [(s, *pose_of(m)) for s, m in zip(item.stamps_ns, item.messages, strict=True)]
-    good = [(s, p, R) for s, p, R in poses if R is not None and np.isfinite(p).all()]
-    stamps = np.array([s for s, _, _ in good], dtype=np.int64)
+    """Return the true trajectory, with velocity."""
+    poses = [(s, *pose_of(m), m) for s, m in zip(item.stamps_ns, item.messages, strict=True)]
+    good = [(s, p, R, m) for s, p, R, m in poses if R is not None and np.isfinite(p).all()]
+    stamps = np.array([s for s, _, _, _ in good], dtype=np.int64)
     keep = np.flatnonzero(_clock.longest_increasing(stamps))
     if len(keep) < item.count:
         warnings.append(f"{item.topic}: {item.count - len(keep)} truth messages left out (stamp or pose not usable)")
     if len(keep) < 2:
         return None
-    return Trajectory(
-        stamps_ns=stamps[keep],
-        p_world_m=np.array([good[i][1] for i in keep]),
-        R_world_body=np.array([good[i][2] for i in keep]),
-    )
+    stamps = stamps[keep]
+    p, R = np.array([good[i][1] for i in keep]), np.array([good[i][2] for i in keep])
+    v = _true_velocity(stamps, p, R, [good[i][3] for i in keep])
+    return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v)
+
+
+def _true_velocity(stamps_ns: NDArray[np.int64], p_m: Array, R: Array, messages: Sequence[Any]) -> Array:
+    """Return velocity (N, 3), m/s, in world: the twist (in the child frame, as nav_msgs has it) where it agrees
+    with the positions, else their derivative - writers differ in the twist's frame, or leave it at zero.
+    """
+    derivative = np.gradient(p_m, seconds_since(int(stamps_ns[0]), stamps_ns), axis=0)
+    if not all(hasattr(m, "twist") for m in messages):
+        return np.asarray(derivative)
+    linear = (m.twist.twist.linear for m in messages)
+    twist = np.einsum("nij,nj->ni", R, np.array([[v.x, v.y, v.z] for v in linear], dtype=float))
+    apart = float(np.median(np.linalg.norm(twist - derivative, axis=1)))
+    speed = float(np.median(np.linalg.norm(derivative, axis=1)))
+    return np.asarray(twist if apart < 0.1 + 0.1 * speed else derivative)
 
 
 def _check_speed(item: _Beside) -> SpeedSeries | None:

@@ -262,6 +262,33 @@ def test_mounts_follow_the_chain_of_tf_static(tmp_path: Path) -> None:
         read_recording(path, vessel(gnss={"topic": "/fix", "mount": {"tf_frame": "lidar"}}))
 
 
+def test_the_body_may_hang_below_another_frame(tmp_path: Path) -> None:
+    """base_link at (2, 0, 0.5) in the footprint, turned 90 deg left; gps at (1, 0, 2): 1 m to port of the body."""
+    make = Messages(2)
+    turn = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+    edges = [("footprint", "base_link", (2, 0, 0.5), turn), ("footprint", "gps", (1, 0, 2), (0, 0, 0, 1))]
+    path = write_bag(tmp_path / "run", make, [("/tf_static", START_NS, make.transforms(edges)), *still_run(make)])
+    t, R = read_recording(path, vessel(gnss={"topic": "/fix", "mount": {"tf_frame": "gps"}})).mounts["gnss"]
+    np.testing.assert_allclose(t, [0.0, 1.0, 1.5], atol=1e-12)
+    np.testing.assert_allclose(R @ [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("twist", [(0.0, -1.0, 0.0), (0.0, 0.0, 0.0)], ids=["in body", "left at zero"])
+def test_velocity_of_the_truth(tmp_path: Path, twist: tuple[float, float, float]) -> None:
+    """East at 1 m/s with the bow north: to starboard, so -y in body."""
+    make = Messages(2)
+    items = [
+        ("/truth", t, make.odometry(t, xyz=(k / 10, 0, 0), xyzw=(0, 0, np.sqrt(0.5), np.sqrt(0.5)), v=twist))
+        for k, t in enumerate(START_NS + k * S // 10 for k in range(30))
+    ]
+    recording = read_recording(
+        write_bag(tmp_path / "run", make, items), vessel(imu=None, gnss=None, truth_topic="/truth")
+    )
+    assert recording.truth is not None
+    assert recording.truth.v_world_mps is not None
+    np.testing.assert_allclose(recording.truth.v_world_mps, np.tile([1.0, 0.0, 0.0], (30, 1)), atol=1e-6)
+
+
 def test_progress_counts_the_messages_that_are_read(tmp_path: Path) -> None:
     calls: list[tuple[str, int, int]] = []
     path = write_bag(tmp_path / "run", make := Messages(2), still_run(make))

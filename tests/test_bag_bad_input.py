@@ -270,6 +270,9 @@ def test_repeated_and_backward_imu_stamps(tmp_path: Path) -> None:
     assert sorted(r.stamp_ns for r in rows_of(recording, "imu")) == [repeated, backward - S // 2]
     assert all(r.outcome is Outcome.REJECTED and "repeated or backward" in r.reason for r in rows_of(recording, "imu"))
     assert any("2 messages rejected" in w for w in recording.warnings)
+    (second,) = (r.seq for r in rows_of(recording, "imu") if r.stamp_ns == repeated)
+    (first,) = recording.imu.seqs[recording.imu.stamps_ns == repeated]
+    assert first < second  # of repeated stamps the first arrival stays
 
 
 def test_one_stamp_that_ran_ahead_costs_one_sample(tmp_path: Path) -> None:
