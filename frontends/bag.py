@@ -11,17 +11,13 @@ from __future__ import annotations
 import difflib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from graphloc.config import VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array
-from graphloc.frontends import _clock
+from graphloc.frontends._beside import Beside, check_speed, true_trajectory
 from graphloc.frontends._readings import (
     Readings,
     clock_warnings,
@@ -41,29 +37,16 @@ from graphloc.frontends.decode import (
     Rejection,
     header_stamp_ns,
     malformed,
-    pose_of,
     supported_types,
 )
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement
-from graphloc.recording import Recording, SpeedSeries
-from graphloc.time import duration_ns, seconds_since, utc_text
-from graphloc.trajectory import Trajectory
+from graphloc.recording import Recording
+from graphloc.time import duration_ns, utc_text
 
 Progress = Callable[[str, int, int], None]
 TF_STATIC = "/tf_static"
 _REPORT_EVERY = 2000  # messages between two calls of `progress`
-
-
-@dataclass(slots=True)
-class _Beside:
-    """A topic that is read beside the sensors: truth or check speed."""
-
-    topic: str
-    reason: str
-    count: int = 0
-    stamps_ns: list[int] = field(default_factory=list)
-    messages: list[Any] = field(default_factory=list)
 
 
 def read_recording(
@@ -112,8 +95,8 @@ def read_recording(
         message_count=sum(len(r.values) for r in sensors) + sum(r.count for r in rows),
         topics={r.sensor: r.config.topic for r in sensors},
         mounts=_mounts(config, tree, bag.name),
-        truth=_truth(truth, warnings) if truth else None,
-        check_speed=_check_speed(check) if check else None,
+        truth=true_trajectory(truth, warnings) if truth else None,
+        check_speed=check_speed(check) if check else None,
         warnings=tuple(warnings),
     )
 
@@ -126,14 +109,14 @@ class _Reader:
         bag: Bag,
         topics: Mapping[str, TopicSummary],
         sensors: Sequence[Readings],
-        beside: Sequence[_Beside],
+        beside: Sequence[Beside],
         tree: StaticTree | None,
     ) -> None:
         self._bag, self._topics, self._tree = bag, topics, tree
         self._sensors: dict[str, list[Readings]] = {}
         for readings in sensors:
             self._sensors.setdefault(readings.config.topic, []).append(readings)
-        self._beside: dict[str, list[_Beside]] = {}
+        self._beside: dict[str, list[Beside]] = {}
         for item in beside:
             self._beside.setdefault(item.topic, []).append(item)
         self._wanted = set(self._sensors) | set(self._beside)
@@ -252,11 +235,11 @@ def _or(names: Sequence[str]) -> str:
     return " or ".join(n.replace("/msg/", "/") for n in names)
 
 
-def _beside(topic: str | None, key: str, reason: str, topics: Mapping[str, TopicSummary], bag: str) -> _Beside | None:
+def _beside(topic: str | None, key: str, reason: str, topics: Mapping[str, TopicSummary], bag: str) -> Beside | None:
     if topic is None:
         return None
     _check_topic(topic, key, (ODOMETRY, POSE) if key == "truth_topic" else (ODOMETRY,), topics, bag)
-    return _Beside(topic, reason)
+    return Beside(topic, reason)
 
 
 def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str, tuple[Array, Array]]:
@@ -279,44 +262,3 @@ def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapp
         count = topics[readings.config.topic].messages
         lines.append(f"{readings.sensor}: none of the {count} messages on {readings.config.topic} could be used{why}")
     return lines
-
-
-def _truth(item: _Beside, warnings: list[str]) -> Trajectory | None:
-    """Return the true trajectory, with velocity."""
-    poses = [(s, *pose_of(m), m) for s, m in zip(item.stamps_ns, item.messages, strict=True)]
-    good = [(s, p, R, m) for s, p, R, m in poses if R is not None and np.isfinite(p).all()]
-    stamps = np.array([s for s, _, _, _ in good], dtype=np.int64)
-    keep = np.flatnonzero(_clock.longest_increasing(stamps))
-    if len(keep) < item.count:
-        warnings.append(f"{item.topic}: {item.count - len(keep)} truth messages left out (stamp or pose not usable)")
-    if len(keep) < 2:
-        return None
-    stamps = stamps[keep]
-    p, R = np.array([good[i][1] for i in keep]), np.array([good[i][2] for i in keep])
-    v = _true_velocity(stamps, p, R, [good[i][3] for i in keep])
-    return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v)
-
-
-def _true_velocity(stamps_ns: NDArray[np.int64], p_m: Array, R: Array, messages: Sequence[Any]) -> Array:
-    """Return velocity (N, 3), m/s, in world: the twist (in the child frame, as nav_msgs has it) where it agrees
-    with the positions, else their derivative - writers differ in the twist's frame, or leave it at zero.
-    """
-    derivative = np.gradient(p_m, seconds_since(int(stamps_ns[0]), stamps_ns), axis=0)
-    if not all(hasattr(m, "twist") for m in messages):
-        return np.asarray(derivative)
-    linear = (m.twist.twist.linear for m in messages)
-    twist = np.einsum("nij,nj->ni", R, np.array([[v.x, v.y, v.z] for v in linear], dtype=float))
-    apart = float(np.median(np.linalg.norm(twist - derivative, axis=1)))
-    speed = float(np.median(np.linalg.norm(derivative, axis=1)))
-    return np.asarray(twist if apart < 0.1 + 0.1 * speed else derivative)
-
-
-def _check_speed(item: _Beside) -> SpeedSeries | None:
-    """Return the forward speed of an odometry topic, in stamp order."""
-    stamps = np.array(item.stamps_ns, dtype=np.int64)
-    speed = np.array([float(m.twist.twist.linear.x) for m in item.messages])
-    keep = np.flatnonzero(_clock.longest_increasing(stamps))
-    keep = keep[np.isfinite(speed[keep])]
-    if len(keep) == 0:
-        return None
-    return SpeedSeries(topic=item.topic, stamps_ns=stamps[keep], speed_mps=speed[keep])

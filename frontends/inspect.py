@@ -13,12 +13,12 @@ from graphloc.frontends._assess import (
     compass_report,
     courses_of,
     gnss_report,
-    imu_report,
     motion_of,
     sane,
     topic_report,
     track,
 )
+from graphloc.frontends._assess_imu import imu_report
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._reports import (
     CompassReport,

@@ -36,6 +36,7 @@ def drive(
     status: int = 2,
     sigma_m: float = 0.02,
     seconds: int = 120,
+    noise_m: float = 0.0,
 ) -> list[Item]:
     """Speed 3 + 1.5 sin(0.4 t) m/s, yaw rate 0.15 sin(0.13 t) + 0.05 rad/s, first 10 s at rest; analytic IMU."""
     R = np.eye(3) if R_body_sensor is None else R_body_sensor
@@ -52,7 +53,7 @@ def drive(
         0, 0.02, (len(t), 3)
     )
     gyro = np.column_stack([0 * t, 0 * t, rate]) + rng.normal(0, 1e-3, (len(t), 3)) + [0.0, 0.0, 0.004]
-    lla = DATUM.geodetic_from_enu(np.column_stack([east, north, 0 * t]))
+    lla = DATUM.geodetic_from_enu(np.column_stack([east, north, 0 * t]) + noise_m * rng.normal(size=(len(t), 3)))
     items: list[Item] = []
     for k in range(len(t)):
         stamp = START_NS + k * S // 50
@@ -112,6 +113,13 @@ def test_a_whole_draft(tmp_path: Path) -> None:
     assert recording.warnings == ()
     headings = [m for m in recording.measurements if isinstance(m, CompassHeading)]
     assert np.degrees(headings[0].yaw_rad) == pytest.approx(np.degrees(0.3), abs=4.0)
+
+
+def test_scatter_of_the_fixes(tmp_path: Path) -> None:
+    """White noise of 0.4 m shows as such, though the craft turns and changes its speed."""
+    make = Messages(2)
+    found, _, _ = look(tmp_path, drive(make, noise_m=0.4), make)
+    assert found.gnss[0].scatter_m == pytest.approx((0.4, 0.4, 0.4), rel=0.15)
 
 
 def test_wrong_units_are_found(tmp_path: Path) -> None:

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Judging an IMU: units, gravity, standstill, noise, and which way it is mounted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from graphloc.config import STANDARD_GRAVITY_MPS2
+from graphloc.frames import Array, rpy_from_rotation, wrap_angle
+from graphloc.frontends._assess import Motion, sane, vec
+from graphloc.frontends._reports import ImuReport, MountGuess
+from graphloc.frontends._sanity import NEVER_STILL_RADPS
+from graphloc.frontends._streams import Stream
+from graphloc.frontends._tf import StaticTree
+from graphloc.time import NS_PER_S
+
+_WINDOW_S = 1.0
+_MIN_COHERENCE = 0.25  # and 4 / sqrt(windows), four times what chance gives
+
+
+def mount_guess(
+    imu: Stream, accel: Array, gyro: Array, motion: Motion | None, tree: StaticTree, body: str
+) -> MountGuess:
+    """Return how an IMU sits in the body: from /tf_static, else levelled by gravity and turned by motion.
+
+    Levelled, with unknown yaw psi, the horizontal acceleration as complex number a = ax + i ay meets that of
+    the craft, m = dv/dt + i v w_z, as m = exp(i psi) a. So psi = arg sum(conj(a) m), and
+    |sum| / sqrt(sum |a|^2 sum |m|^2) says how far the data support it. Snapped to quarter turns.
+
+    Args:
+        accel: (N, 3) m/s^2; gyro: (N, 3) rad/s, of the `sane` samples.
+    """
+    up = np.median(accel, axis=0)
+    size = float(np.linalg.norm(up))
+    pose = tree.resolve(body, imu.frame_id) if imu.frame_id in tree.frames else None
+    if pose is not None:
+        rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
+        tilt = float(np.degrees(np.arccos(np.clip((pose[1] @ up)[2] / max(size, 1e-9), -1.0, 1.0))))
+        note = "" if size < 2.0 or tilt < 20.0 else f", BUT gravity is then {tilt:.0f} deg off body z: check"
+        return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"/tf_static knows it{note}")
+    if size < 0.5 * STANDARD_GRAVITY_MPS2:
+        return MountGuess(rpy_deg=(0.0, 0.0, 0.0), tf_frame=None, evidence="no gravity to level by: taken as aligned")
+    axis = up / size
+    snapped = np.zeros(3)
+    k = int(np.argmax(np.abs(axis)))
+    snapped[k] = np.sign(axis[k])
+    aligned = float(axis @ snapped) > np.cos(np.radians(15.0))
+    level = _level(snapped if aligned else axis)
+    name = f"{'+' if snapped[k] > 0 else '-'}{'xyz'[k]}"
+    said = (
+        f"gravity is on {name} of the sensor" if aligned else f"gravity is {np.round(axis, 2).tolist()} in the sensor"
+    )
+    yaw, evidence = _mount_yaw(imu, accel @ level.T, gyro @ level.T, motion)
+    turn = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
+    rpy = vec(np.round(np.degrees(rpy_from_rotation(turn @ level)), 1) + 0.0)
+    return MountGuess(rpy_deg=rpy, tf_frame=None, evidence=f"{said}; {evidence}")
+
+
+def _level(axis: Array) -> Array:
+    """Return the smallest rotation (3, 3) that takes a unit vector to +z (half a turn about x for -z)."""
+    z = np.array([0.0, 0.0, 1.0])
+    cross = np.cross(axis, z)
+    sine = float(np.linalg.norm(cross))
+    if sine < 1e-9:
+        return np.diag([1.0, 1.0, 1.0]) if axis[2] > 0.0 else np.diag([1.0, -1.0, -1.0])
+    angle = float(np.arctan2(sine, axis[2]))
+    return np.asarray(Rotation.from_rotvec(angle * cross / sine).as_matrix())
+
+
+def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motion: Motion | None) -> tuple[float, str]:
+    """Return the quarter turn (deg) that fits the motion, and the evidence; `accel`, `gyro` are levelled."""
+    if motion is None:
+        return 0.0, "no motion to tell its yaw by: taken as 0"
+    t = (imu.stamps_ns[sane(imu)] - motion.origin_ns) / NS_PER_S
+    edges = np.arange(max(t[0], motion.t_s[0]), min(t[-1], motion.t_s[-1]), _WINDOW_S)
+    if len(edges) < 20:
+        return 0.0, "too little motion to tell its yaw by: taken as 0"
+
+    def mean(columns: Array) -> Array:
+        """Mean over each window, from the running integral."""
+        total = np.concatenate([[0.0], np.cumsum(0.5 * (columns[1:] + columns[:-1]) * np.diff(t))])
+        return np.asarray(np.diff(np.interp(edges, t, total)) / _WINDOW_S)
+
+    v = np.interp(edges, motion.t_s, motion.speed_mps)
+    m = np.diff(v) / _WINDOW_S + 1j * 0.5 * (v[1:] + v[:-1]) * mean(gyro[:, 2])
+    a = mean(accel[:, 0]) + 1j * mean(accel[:, 1])
+    a, m = a - np.median(a.real) - 1j * np.median(a.imag), m - m.mean()
+    power = float(np.sqrt((np.abs(a) ** 2).sum() * (np.abs(m) ** 2).sum()))
+    product = complex((np.conj(a) * m).sum())
+    coherence = abs(product) / power if power > 0.0 else 0.0
+    psi = float(np.degrees(np.angle(product)))
+    if coherence < max(_MIN_COHERENCE, 4.0 / float(np.sqrt(len(a)))):
+        return 0.0, f"motion of {motion.source} does not tell its yaw (coherence {coherence:.2f}): taken as 0"
+    quarter = float(wrap_angle(np.radians(90.0 * round(psi / 90.0))))
+    return float(
+        np.degrees(quarter)
+    ), f"yaw by the motion of {motion.source}: {psi:.0f} deg (coherence {coherence:.2f})"
+
+
+def imu_report(imu: Stream, motion: Motion | None, tree: StaticTree, body: str) -> ImuReport | None:
+    """Return units, gravity, standstill, noise and mount of an IMU."""
+    keep = sane(imu)
+    rows = imu.rows[keep] if len(keep) else np.zeros((0, 13))
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(rows[:, :6]).all(axis=1))
+    if finite.sum() < 20:
+        return None
+    stamps = imu.stamps_ns[keep]
+    accel, gyro = np.where(finite[:, None], rows[:, :3], 0.0), np.where(finite[:, None], rows[:, 3:6], 0.0)
+    size = float(np.median(np.linalg.norm(accel, axis=1)))
+    rate = float(np.median(np.linalg.norm(gyro, axis=1)))
+    why = []
+    accel_unit = "g" if 0.9 < size < 1.1 else "m/s^2"
+    gravity = "removed" if size < 0.5 else "included"
+    gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS else "rad/s"
+    if accel_unit == "g":
+        why.append(f"median acceleration is {size:.2f}: looks like g")
+    if gravity == "removed":
+        why.append(f"median acceleration is {size:.2f}: looks like gravity was removed by the driver")
+    if accel_unit == "m/s^2" and gravity == "included" and not 8.5 < size < 11.5:
+        why.append(f"median acceleration is {size:.2f}: neither m/s^2 nor g with gravity; check the sensor")
+    if gyro_unit == "deg/s":
+        why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")
+    accel = accel * (STANDARD_GRAVITY_MPS2 if accel_unit == "g" else 1.0)
+    gyro = gyro * (np.pi / 180.0 if gyro_unit == "deg/s" else 1.0)
+    up = np.median(accel, axis=0)
+    still = _standstill(stamps, accel, gyro, motion)
+    root_dt = float(np.sqrt(np.median(np.diff(stamps)) / NS_PER_S))
+    quiet = still.sum() > 20
+
+    def density(columns: Array) -> float:
+        steps = np.diff(columns[still], axis=0)  # of the axis in the middle: one bad axis does not speak for all
+        return float(1.4826 * np.median(np.median(np.abs(steps), axis=0)) / np.sqrt(2.0)) * root_dt
+
+    def reported(column: int, unit: float) -> float | None:
+        variance = float(np.median(rows[:, column]))
+        return float(np.sqrt(variance)) * root_dt / unit if np.isfinite(variance) and variance > 0.0 else None
+
+    ug, mdps = 1e-6 * STANDARD_GRAVITY_MPS2, np.radians(1e-3)
+    return ImuReport(
+        topic=imu.topic,
+        gravity_size=size,
+        gravity_axis=vec(up / max(float(np.linalg.norm(up)), 1e-9)),
+        accel_unit=accel_unit,
+        gyro_unit=gyro_unit,
+        gravity=gravity,
+        why=tuple(why),
+        still_s=float(still.sum()) * root_dt**2,
+        gyro_bias_radps=vec(gyro[still].mean(axis=0)) if quiet else None,
+        accel_noise_ug=density(accel) / ug if quiet else None,
+        gyro_noise_mdps=density(gyro) / mdps if quiet else None,
+        reported_accel_ug=reported(10, ug),
+        reported_gyro_mdps=reported(11, mdps),
+        mount=mount_guess(imu, accel, gyro, motion, tree, body),
+    )
+
+
+def _standstill(stamps: NDArray[np.int64], accel: Array, gyro: Array, motion: Motion | None) -> NDArray[np.bool_]:
+    """Return (N,) whether a sample lies in a quiet second (and the speed, where known, is zero)."""
+    second = (stamps - stamps[0]) // NS_PER_S
+    still = np.zeros(len(stamps), dtype=bool)
+    for s in np.unique(second):
+        part = second == s
+        quiet = float(gyro[part].std(axis=0).max()) < 0.03 and float(accel[part].std(axis=0).max()) < 0.2
+        still[part] = quiet and float(np.abs(gyro[part].mean(axis=0)).max()) < 0.02
+    if motion is not None:
+        t = (stamps - motion.origin_ns) / NS_PER_S
+        still[np.abs(np.interp(t, motion.t_s, motion.speed_mps)) > 0.05] = False
+    return still

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Topics that are read beside the sensors and never fused: the truth, and a speed to compare with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+from graphloc.frontends import _clock
+from graphloc.frontends.decode import pose_of
+from graphloc.recording import SpeedSeries
+from graphloc.time import seconds_since
+from graphloc.trajectory import Trajectory
+
+
+@dataclass(slots=True)
+class Beside:
+    """A topic that is read beside the sensors: truth or check speed."""
+
+    topic: str
+    reason: str
+    count: int = 0
+    stamps_ns: list[int] = field(default_factory=list)
+    messages: list[Any] = field(default_factory=list)
+
+
+def true_trajectory(item: Beside, warnings: list[str]) -> Trajectory | None:
+    """Return the true trajectory, with velocity."""
+    poses = [(s, *pose_of(m), m) for s, m in zip(item.stamps_ns, item.messages, strict=True)]
+    good = [(s, p, R, m) for s, p, R, m in poses if R is not None and np.isfinite(p).all()]
+    stamps = np.array([s for s, _, _, _ in good], dtype=np.int64)
+    keep = np.flatnonzero(_clock.longest_increasing(stamps))
+    if len(keep) < item.count:
+        warnings.append(f"{item.topic}: {item.count - len(keep)} truth messages left out (stamp or pose not usable)")
+    if len(keep) < 2:
+        return None
+    stamps = stamps[keep]
+    p, R = np.array([good[i][1] for i in keep]), np.array([good[i][2] for i in keep])
+    v = _true_velocity(stamps, p, R, [good[i][3] for i in keep])
+    return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v)
+
+
+def _true_velocity(stamps_ns: NDArray[np.int64], p_m: Array, R: Array, messages: Sequence[Any]) -> Array:
+    """Return velocity (N, 3), m/s, in world.
+
+    That is the twist (in the child frame, as nav_msgs has it) where it agrees with the positions, else
+    their derivative: writers differ in the twist's frame, or leave it at zero.
+    """
+    derivative = np.gradient(p_m, seconds_since(int(stamps_ns[0]), stamps_ns), axis=0)
+    if not all(hasattr(m, "twist") for m in messages):
+        return np.asarray(derivative)
+    linear = (m.twist.twist.linear for m in messages)
+    twist = np.einsum("nij,nj->ni", R, np.array([[v.x, v.y, v.z] for v in linear], dtype=float))
+    apart = float(np.median(np.linalg.norm(twist - derivative, axis=1)))
+    speed = float(np.median(np.linalg.norm(derivative, axis=1)))
+    return np.asarray(twist if apart < 0.1 + 0.1 * speed else derivative)
+
+
+def check_speed(item: Beside) -> SpeedSeries | None:
+    """Return the forward speed of an odometry topic, in stamp order."""
+    stamps = np.array(item.stamps_ns, dtype=np.int64)
+    speed = np.array([float(m.twist.twist.linear.x) for m in item.messages])
+    keep = np.flatnonzero(_clock.longest_increasing(stamps))
+    keep = keep[np.isfinite(speed[keep])]
+    if len(keep) == 0:
+        return None
+    return SpeedSeries(topic=item.topic, stamps_ns=stamps[keep], speed_mps=speed[keep])
