@@ -82,7 +82,7 @@ def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decis
 def slow(config: GnssConfig) -> SlowProcess | None:
     """Return the slow error that the configuration asks for."""
     s = config.slow_error
-    if not s.enabled:
+    if s.enabled is False:
         return None
     return SlowProcess(
         name="GNSS error",
@@ -92,6 +92,7 @@ def slow(config: GnssConfig) -> SlowProcess | None:
         sigma=np.array([s.horizontal_sigma_m, s.horizontal_sigma_m, s.vertical_sigma_m]),
         time_constant_s=s.time_constant_s,
         jumps=s.jumps,
+        needs_company=s.enabled is None,
     )
 
 

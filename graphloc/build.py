@@ -128,13 +128,19 @@ def make_problem(
     by_sensor: dict[str, list[Measurement]] = {}
     for m in inside:
         by_sensor.setdefault(m.sensor, []).append(m)
+    absolute = sum(
+        bool(s.kind in by_kind and by_kind[s.kind].absolute and n in by_sensor) for n, s in config.sensors.items()
+    )
     streams = []
     for number, (name, sensor) in enumerate(config.sensors.items()):
         if sensor.kind in by_kind and sensor.enabled and name in by_sensor:
             row = by_kind[sensor.kind]
             t, R_mount = mount_of(name, sensor, recording)
             mount = (t - t_body_imu, R_mount)
-            streams.append(_stream(number, name, row, sensor, mount, by_sensor[name], timeline, links))
+            slow = row.slow(sensor)
+            if slow is not None and slow.needs_company and absolute < 2:
+                slow = None
+            streams.append(_stream(number, name, row, sensor, slow, mount, by_sensor[name], timeline, links))
     warnings = [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
     return Problem(
         config=config,
@@ -170,6 +176,7 @@ def _stream(
     name: str,
     row: Sensor,
     config: SensorConfig,
+    slow: SlowProcess | None,
     mount: tuple[Array, Array],
     measurements: list[Measurement],
     timeline: Timeline,
@@ -188,7 +195,7 @@ def _stream(
         name,
         row,
         config,
-        row.slow(config),
+        slow,
         T_state_sensor,
         tuple(measurements),
         np.array(state, dtype=np.int64),
@@ -257,8 +264,14 @@ def build_graph(
     first: int,
     last: int,
     prior: StartPrior,
+    *,
+    jumps: bool = True,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Return the graph of states first..last and the values of its keys."""
+    """Return the graph of states first..last and the values of its keys.
+
+    `jumps` lets slow states jump where their process may. Not while the estimate is far off: a GNSS error
+    that may jump explains a dead-reckoned track that is 300 m off better than the track's own correction.
+    """
     graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
     timeline, links = problem.timeline, problem.links
     for k in range(first, last + 1):
@@ -271,7 +284,7 @@ def build_graph(
     _add_start(graph, prior, first, nodes[0])
     for stream in problem.streams:
         if stream.slow is not None:
-            _add_slow_chain(graph, guess, problem, stream, stream.slow, values, nodes, prior)
+            _add_slow_chain(graph, guess, problem, stream, stream.slow, values, nodes, prior, jumps)
         for i in stream.between(first, last):
             decided = decisions[(stream.number, i)]
             if decided is None:
@@ -317,6 +330,7 @@ def _add_slow_chain(
     values: gtsam.Values,
     nodes: range,
     prior: StartPrior,
+    jumps: bool,
 ) -> None:
     """A first-order Gauss-Markov chain from native factors.
 
@@ -340,7 +354,7 @@ def _add_slow_chain(
         # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
         step = slow.sigma * (1e-4 if constant else np.sqrt(2.0 * dt / slow.time_constant_s))
         model = diagonal(step)
-        if slow.jumps:
+        if slow.jumps and jumps:
             loss = gtsam.noiseModel.mEstimator.Cauchy.Create(_JUMP.scale)
             model = gtsam.noiseModel.Robust.Create(loss, model)
         graph.add(gtsam.BetweenFactorVector(key[n], key[n + 1], zero, model))

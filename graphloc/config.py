@@ -164,8 +164,9 @@ class ImuConfig(SensorConfig):
 class SlowErrorConfig(Block):
     """The slowly varying part of the GNSS error: a first-order Gauss-Markov process per axis."""
 
-    enabled: bool = True
-    """Off: the GNSS error is taken as white (right for RTK in the open, wrong in a harbour)."""
+    enabled: bool | None = None
+    """Off: the GNSS error is taken as white (right for RTK in the open, wrong in a harbour). Empty: on where
+    a second absolute sensor (matches, tags, another receiver) can tell it from motion, off where GNSS is alone."""
     horizontal_sigma_m: Positive = 2.0
     """Standing size of the slow error, each horizontal axis, 1 sigma, m."""
     vertical_sigma_m: Positive = 5.0

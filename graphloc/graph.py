@@ -118,6 +118,7 @@ class SlowProcess:
         name, unit, axes: for outputs. scale: from the state's unit to `unit`.
         sigma: (k,) standing size. time_constant_s: correlation time; inf for a constant.
         jumps: put a robust loss on its steps.
+        needs_company: leave it out where no second absolute sensor can tell it from motion.
     """
 
     name: str
@@ -127,6 +128,7 @@ class SlowProcess:
     sigma: Array
     time_constant_s: float
     jumps: bool = False
+    needs_company: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

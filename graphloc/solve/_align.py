@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -24,7 +25,7 @@ from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, HeightPrior, PoseFix
 from graphloc.time import duration_ns, utc_text
 
-_STILL_GYRO_RADPS = 0.02  # spread of the rate at standstill, engine running
+_STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
 _STILL_SPEED_MPS = 0.15
 _MOVED_M = 15.0  # travel from which a heading can be told without a heading sensor
 
@@ -80,12 +81,13 @@ def align(problem: Problem) -> Start:
             "check the topics, the status and the stamps with `graphloc inspect`"
         )
     yaws = _yaw_samples(problem, origin)
-    still = _standstill(problem, origin, window, track, yaws)
+    still = _standstill(problem, track, yaws)
     bias, bias_sigma, notes = _gyro_bias(problem, origin, window, still, yaws)
     turn = _turns(problem, window + 10.0 if yaws else 180.0, bias)
-    R_level, tilt_sigma, tilt_note = _level(problem, origin, window, still, turn, track)
+    at_start = still if still is not None and still[0] == 0.0 else None
+    R_level, tilt_sigma, tilt_note = _level(problem, origin, window, at_start, turn, track)
     heading = _headings(problem, origin, track, yaws, turn)
-    p0, p_sigma, v0, v_sigma = _position_and_velocity(problem, track, still)
+    p0, p_sigma, v0, v_sigma = _position_and_velocity(problem, track, at_start)
     return Start(
         R_level_body=R_level,
         tilt_sigma_rad=tilt_sigma,
@@ -152,35 +154,42 @@ def _samples(problem: Problem, start_s: float, stop_s: float) -> tuple[Array, Ar
     return t, problem.imu.accel_mps2[lo:hi] @ R.T, problem.imu.gyro_radps[lo:hi] @ R.T
 
 
-def _standstill(
-    problem: Problem, origin: int, window: float, track: _Track, yaws: dict[str, Array]
-) -> tuple[float, float] | None:
-    """The longest stretch from the start (at least 2 s) in which nothing turns, moves or shakes."""
-    t, f, w = _samples(problem, 0.0, max(window, 30.0))
-    best = None
-    for stop in np.arange(2.0, min(float(t[-1]), max(window, 30.0)), 1.0):
-        inside = t <= stop
-        if (w[inside].std(axis=0) > _STILL_GYRO_RADPS).any() or (f[inside].std(axis=0) > 0.4).any():
-            break
-        best = (0.0, float(stop))
-    if best is None:
-        return None
-    inside = track.t <= best[1]
-    if inside.sum() >= 4 and np.ptp(track.t[inside]) > 1.5:
-        slope = [_slope(track.t[inside], track.p[inside, i]) for i in range(2)]
-        sigma = 2.0 * np.nanmedian(track.sigma[inside, :2]) / np.ptp(track.t[inside])
-        if np.hypot(*slope) > _STILL_SPEED_MPS + min(sigma, 1.0):
-            return None
-    else:
-        return None  # nothing says that it does not glide along
-    for rows in yaws.values():
-        near = rows[rows[:, 0] <= best[1]]
-        if len(near) >= 4:
-            rate = _slope(near[:, 0], np.unwrap(near[:, 1]))
-            mean_rate = w[t <= best[1]].mean(axis=0)[2]
-            if abs(rate) > 0.01 + 3.0 * near[:, 2].mean() / np.ptp(near[:, 0]) / np.sqrt(len(near)) and abs(mean_rate):
-                return None
+def _standstill(problem: Problem, track: _Track, yaws: dict[str, Array]) -> tuple[float, float] | None:
+    """The longest stretch of the whole run (at least 3 s) in which nothing turns, moves or shakes."""
+    span = float((problem.imu.stamps_ns[-1] - problem.imu.stamps_ns[0]) * 1e-9)
+    t, f, w = _samples(problem, 0.0, span)
+    block = np.floor(t).astype(np.int64)
+    start = np.searchsorted(block, np.arange(block[-1] + 2))
+    quiet = [
+        b - a > 3
+        and bool((w[a:b].std(axis=0) < _STILL_GYRO_RADPS).all() and (f[a:b].std(axis=0) < _STILL_ACCEL_MPS2).all())
+        for a, b in pairwise(start)
+    ]
+    best: tuple[float, float] | None = None
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.array(quiet, dtype=int), [0]])))
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        longer = best is None or last - first > best[1] - best[0]
+        if last - first >= 3 and longer and _rests(track, yaws, float(first), float(last)):
+            best = (float(first), float(last))
     return best
+
+
+def _rests(track: _Track, yaws: dict[str, Array], first: float, last: float) -> bool:
+    """Whether positions and headings agree that a quiet stretch is no steady glide or turn."""
+    inside = (track.t >= first) & (track.t <= last)
+    if inside.sum() < 4 or np.ptp(track.t[inside]) < 0.5 * (last - first):
+        return False
+    slope = [_slope(track.t[inside], track.p[inside, i]) for i in range(2)]
+    noise = 2.0 * float(np.nanmedian(track.sigma[inside, :2])) / float(np.ptp(track.t[inside]))
+    if np.hypot(*slope) > _STILL_SPEED_MPS + min(noise, 0.3):
+        return False
+    for rows in yaws.values():
+        near = rows[(rows[:, 0] >= first) & (rows[:, 0] <= last)]
+        if len(near) >= 4:
+            noise = 3.0 * float(near[:, 2].mean()) / float(np.ptp(near[:, 0])) / np.sqrt(len(near))
+            if abs(_slope(near[:, 0], np.unwrap(near[:, 1]))) > 0.01 + noise:
+                return False
+    return True
 
 
 def _slope(t: Array, y: Array) -> float:
@@ -201,7 +210,7 @@ def _gyro_bias(
     if still is not None:
         _, _, w = _samples(problem, *still)
         sigma = w.std(axis=0) / np.sqrt(len(w) / 4.0) + 3e-4
-        return w.mean(axis=0), np.minimum(sigma, prior), (f"gyro bias from {still[1]:.0f} s of standstill",)
+        return w.mean(axis=0), np.minimum(sigma, prior), (f"gyro bias from {still[1] - still[0]:.0f} s of standstill",)
     t, _, w = _samples(problem, 0.0, window)
     span = float(np.ptp(t))
     mean = w.mean(axis=0)

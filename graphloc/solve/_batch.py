@@ -20,16 +20,18 @@ import numpy as np
 from graphloc import keys
 from graphloc.build import Problem, StartPrior, build_graph, nav_state, with_noise_scale
 from graphloc.errors import SolveError
-from graphloc.frames import Array
+from graphloc.frames import Array, wrap_angle
 from graphloc.solve._align import Start, align, start_pose
 from graphloc.solve._decide import Verdict, decisions, pose_covariance, weigh
 from graphloc.solve._lm import bayes_tree, optimize
 
-_CHUNK_S, _OVERLAP_S = 20.0, 10.0
+_CHUNK_S, _OVERLAP_S = 8.0, 10.0
 _MAX_OPEN_PASSES, _MAX_MIXTURE_PASSES, _MAX_NOISE_ROUNDS = 4, 6, 5
 _CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
 _SETTLED_M, _SETTLED_WEIGHT = 0.01, 0.05
 _WINDOW_SETTLED_M = 0.5
+# Starts that cost this much more (log-likelihood) are dropped; while others live, the window grows.
+_COST_APART, _LONGEST_START_S = 8.0, 60.0
 # Stages of a window: name, most rounds, motion in m that ends it. A grown window starts near the truth.
 _Stages = tuple[tuple[str, int, float], ...]
 _START_STAGES: _Stages = (("far", 8, 0.5), ("open", 2, 0.5), ("mixture", 2, 0.5))
@@ -61,8 +63,8 @@ def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> Batch
     """
     start = align(problem)
     last = len(problem.timeline) - 1
-    estimate, prior, iterations = _start_window(problem, start, progress)
-    iterations += _grow(problem, estimate, prior, _index_after(problem, start.window_s), progress)
+    estimate, prior, known, iterations = _start_window(problem, start, progress)
+    iterations += _grow(problem, estimate, prior, known, progress)
     passes, converged = 0, False
     verdicts: dict[tuple[int, int], Verdict] = {}
     grown = gtsam.Values(estimate)
@@ -118,7 +120,9 @@ def _open_passes(
         for n in range(_MAX_OPEN_PASSES):
             verdicts = weigh(problem, estimate, None, first=0, last=last, stage=stage)
             wanted = stage == "open"
-            estimate, used, moved, tree, graph = _pass(problem, estimate, verdicts, prior, tree_wanted=wanted)
+            estimate, used, moved, tree, graph = _pass(
+                problem, estimate, verdicts, prior, tree_wanted=wanted, jumps=stage != "far"
+            )
             passes, iterations = passes + 1, iterations + used
             progress(f"{stage} passes", n + 1, _MAX_OPEN_PASSES)
             if moved < _WINDOW_SETTLED_M:
@@ -145,9 +149,10 @@ def _pass(
     prior: StartPrior,
     *,
     tree_wanted: bool,
+    jumps: bool = True,
 ) -> tuple[gtsam.Values, int, float, Any, gtsam.NonlinearFactorGraph]:
     last = len(problem.timeline) - 1
-    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
+    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps)
     solved = optimize(graph, guess, 12)
     moved = _moved(guess, solved.values, 0, last)
     tree = bayes_tree(graph, solved.values) if tree_wanted else None
@@ -178,31 +183,67 @@ def _start_prior(problem: Problem, start: Start, yaw: float) -> StartPrior:
     )
 
 
-def _start_window(problem: Problem, start: Start, progress: Progress) -> tuple[gtsam.Values, StartPrior, int]:
-    """Try each candidate on the first window; keep the cheapest."""
-    until = _index_after(problem, start.window_s)
-    best: tuple[float, gtsam.Values, StartPrior] | None = None
-    iterations = 0
+@dataclass(slots=True)
+class _Candidate:
+    """One start: its estimate, prior and cost so far."""
+
+    values: gtsam.Values
+    prior: StartPrior
+    cost: float = 0.0
+
+
+def _start_window(problem: Problem, start: Start, progress: Progress) -> tuple[gtsam.Values, StartPrior, int, int]:
+    """Try each candidate on the first window; look further while several explain it; keep the cheapest.
+
+    Returns values, prior, the last state solved, and iterations.
+    """
+    seconds, iterations, until = start.window_s, 0, 0
+    candidates = [_candidate(problem, start, yaw) for yaw in start.yaws_rad]
     failure: SolveError | None = None
-    for n, yaw in enumerate(start.yaws_rad):
-        progress("start", n, len(start.yaws_rad))
-        prior = _start_prior(problem, start, yaw)
-        estimate = gtsam.Values()
-        estimate.insert(keys.pose(0), prior.pose)
-        estimate.insert(keys.velocity(0), prior.velocity)
-        _fill_slow(problem, estimate, 0, prior.bias, {})
-        try:
-            _extend(problem, estimate, 0, until)
-            used, error = _solve_window(problem, estimate, 0, until, prior, _START_STAGES)
-        except SolveError as caught:
-            failure = caught
-            continue
-        iterations += used
-        if best is None or error < best[0]:
-            best = (error, estimate, prior)
-    if best is None:
-        raise failure or SolveError("the start alignment found no heading to try")
-    return best[1], best[2], iterations
+    while True:
+        known, until = until, _index_after(problem, seconds)
+        alive = []
+        for n, candidate in enumerate(candidates):
+            progress("start", n, len(candidates))
+            try:
+                _extend(problem, candidate.values, known, until)
+                used, candidate.cost = _solve_window(
+                    problem, candidate.values, 0, until, candidate.prior, _START_STAGES
+                )
+            except SolveError as caught:
+                failure = caught
+                continue
+            iterations += used
+            alive.append(candidate)
+        if not alive:
+            raise failure or SolveError("the start alignment found no heading to try")
+        alive.sort(key=lambda c: c.cost)
+        candidates = _different(alive)
+        if len(candidates) == 1 or seconds >= _LONGEST_START_S or until == len(problem.timeline) - 1:
+            return candidates[0].values, candidates[0].prior, until, iterations
+        seconds *= 1.6
+
+
+def _different(ranked: list[_Candidate]) -> list[_Candidate]:
+    """Drop what is clearly dearer than the cheapest, and what has come to the same heading as a cheaper one."""
+    kept: list[_Candidate] = []
+    for candidate in ranked:
+        yaw = candidate.values.atPose3(keys.pose(0)).rotation().yaw()
+        apart = all(
+            abs(wrap_angle(yaw - other.values.atPose3(keys.pose(0)).rotation().yaw())) > np.radians(15.0)
+            for other in kept
+        )
+        if apart and candidate.cost < ranked[0].cost + _COST_APART + 0.2 * ranked[0].cost:
+            kept.append(candidate)
+    return kept
+
+
+def _candidate(problem: Problem, start: Start, yaw: float) -> _Candidate:
+    prior, values = _start_prior(problem, start, yaw), gtsam.Values()
+    values.insert(keys.pose(0), prior.pose)
+    values.insert(keys.velocity(0), prior.velocity)
+    _fill_slow(problem, values, 0, prior.bias, {})
+    return _Candidate(values, prior)
 
 
 def _fill_slow(problem: Problem, values: gtsam.Values, j: int, bias: Any, slow: dict[int, Array]) -> None:
@@ -241,7 +282,7 @@ def _solve_window(
     for stage, limit, settled_m in stages:
         for _ in range(limit):
             verdicts = weigh(problem, values, None, first=first, last=last, stage=stage)
-            graph, guess = build_graph(problem, values, decisions(verdicts), first, last, prior)
+            graph, guess = build_graph(problem, values, decisions(verdicts), first, last, prior, jumps=stage != "far")
             solved = optimize(graph, guess, 15)
             iterations += solved.iterations
             moved = _moved(guess, solved.values, first, last)
