@@ -209,7 +209,7 @@ def _gyro_bias(
     prior = problem.links.bias_sigmas()[3:]
     if still is not None:
         _, _, w = _samples(problem, *still)
-        sigma = w.std(axis=0) / np.sqrt(len(w) / 4.0) + 3e-4
+        sigma = w.std(axis=0) / np.sqrt(len(w)) + 3e-4
         return w.mean(axis=0), np.minimum(sigma, prior), (f"gyro bias from {still[1] - still[0]:.0f} s of standstill",)
     t, _, w = _samples(problem, 0.0, window)
     span = float(np.ptp(t))
