@@ -112,8 +112,9 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(f"  slow_error: {{enabled: false}}  # guess: {gnss.why}")
     else:
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3) if wanders else None
-        more = f", vertical_sigma_m: {vertical:.1f}" if vertical else ""
-        lines.append(f"  slow_error: {{enabled: true{more}}}  # guess: {gnss.why}")
+        # Left to the default, which is on where a second absolute sensor can tell the error from motion.
+        more = f"vertical_sigma_m: {vertical:.1f}" if vertical else ""
+        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}")
     return lines
 
 

@@ -77,13 +77,13 @@ def test_jacobians_are_numeric_ones(row: Sensor, slow: bool) -> None:
         linear = factor.linearize(values)
         A, _b = linear.jacobian()
         column = 0
-        for key in factor.keys()  # noqa: SIM118:
+        for key in list(factor.keys()):
             size = {1: 6, 2: 3, 3: 0 if at.slow_value is None else len(at.slow_value), 4: 3, 5: 3}[key]
             for axis in range(size):
                 sides = []
                 for sign in (1.0, -1.0):
                     delta = gtsam.VectorValues()
-                    for other in values.keys()  # noqa: SIM118:
+                    for other in list(values.keys()):
                         width = {1: 6, 2: 3, 3: 0 if at.slow_value is None else len(at.slow_value), 4: 3, 5: 3}[other]
                         delta.insert(other, np.zeros(width))
                     step = np.zeros(size)

@@ -103,7 +103,7 @@ def test_a_whole_draft(tmp_path: Path) -> None:
     assert imu.accel_noise_ug == pytest.approx(0.02 * np.sqrt(0.02) / 9.80665e-6, rel=0.1)
     assert imu.gyro_noise_mdps == pytest.approx(np.degrees(1e-3) * np.sqrt(0.02) * 1e3, rel=0.1)
     assert gnss.statuses == {"gbas": 600}
-    assert not config.sensors["gnss"].slow_error.enabled
+    assert config.sensors["gnss"].slow_error.enabled is False
     assert (compass.usable, compass.convention) == (True, "ned")
     assert config.sensors["compass"].convention == "ned"
     assert config.check_speed_topic == "/wheel/odom"
@@ -145,7 +145,7 @@ def test_removed_gravity_is_found(tmp_path: Path) -> None:
 def test_standard_receiver_gets_a_slow_error(tmp_path: Path) -> None:
     make = Messages(2)
     found, config, _ = look(tmp_path, drive(make, status=1, sigma_m=1.2, seconds=60), make)
-    assert config.sensors["gnss"].slow_error.enabled
+    assert config.sensors["gnss"].slow_error.enabled is None  # on where a second absolute sensor is
     assert found.gnss[0].reported_sigma_m == pytest.approx((1.2, 1.2, 1.2))
     assert max(found.gnss[0].scatter_m or (1.0,)) < 0.02  # the data are smooth, whatever they claim
 

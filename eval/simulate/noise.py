@@ -48,6 +48,8 @@ def gnss_error_m(rng: np.random.Generator, t: Array, kind: GnssNoise, case: int,
         length = share * float(np.ptp(t))
         start = t[0] + rng.uniform(0.3, 0.7) * (float(np.ptp(t)) - length)
         during = (t >= start) & (t < start + length)
-        direction = rng.uniform(0.0, 2.0 * np.pi)
+        # Along the drift, give or take, so that the two add up to the table's largest error.
+        along = drift[int(np.argmax(during))]
+        direction = float(np.arctan2(along[1], along[0])) + rng.normal(0.0, 0.3)
         error[during, :2] += height * np.array([np.cos(direction), np.sin(direction)])
     return error
