@@ -22,11 +22,11 @@ import numpy as np
 from graphloc.config import PoseConfig
 from graphloc.factors._noise import robust
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor
+from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Residual, Sensor
 from graphloc.measurements import AXES, PoseFix, PoseMode
 
 _WIDE_M, _WIDE_RAD = 1e3, 1e2
-# Where a false pose may lie: BL's search window, +-5 m and +-5 deg around the truth.
+# Where a false pose may lie: about BL's search window, 5 m and 5 deg around the truth.
 FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(5.0))
 
 
@@ -79,11 +79,12 @@ def _false_probability(m: PoseFix, config: PoseConfig) -> float:
     return float(np.clip(m.none_probability if m.none_probability > 1e-6 else config.false_fraction, 1e-4, 0.99))
 
 
-def false_log_density(m: PoseFix, config: PoseConfig) -> float:
-    """Log of P(false) x uniform density of a false pose over the measured axes."""
-    lengths = sum(AXES.index(a) < 3 for a in m.axes)
-    volume = (2.0 * FALSE_SPREAD_M) ** lengths * (2.0 * FALSE_SPREAD_RAD) ** (len(m.axes) - lengths)
-    return float(np.log(_false_probability(m, config)) - np.log(volume))
+def false(m: PoseFix, config: PoseConfig) -> FalseModel:
+    """Return what is expected of a false pose: anywhere in BL's search window, and likely to stay there."""
+    sigmas = np.array([FALSE_SPREAD_M if AXES.index(a) < 3 else FALSE_SPREAD_RAD for a in m.axes])
+    return FalseModel(
+        probability=_false_probability(m, config), cov=np.diag(sigmas**2), repeats=config.false_repeats
+    )
 
 
 def factors(m: PoseFix, config: PoseConfig, at: Attachment, decision: Decision) -> GraphUpdate:
@@ -129,6 +130,6 @@ ROW = Sensor(
     residuals=residuals,
     factors=factors,
     ideal=ideal,
-    false_log_density=false_log_density,
+    false=false,
     absolute=True,
 )

@@ -46,6 +46,7 @@ class Stream:
         measurements: M of them by stamp. state: (M,) nearest state. carry: per measurement the
             preintegrated motion from the state before it, or None where it stands on a state.
         gyro_radps: (M, 3) raw rate at each measurement, body axes.
+        sparse: (M,) true for the first measurement at each slow node.
     """
 
     number: int
@@ -58,6 +59,7 @@ class Stream:
     state: NDArray[np.int64]
     carry: tuple[tuple[int, Any] | None, ...]
     gyro_radps: Array
+    sparse: NDArray[np.bool_]
 
     def between(self, first: int, last: int) -> range:
         """Indices of the measurements that attach to states first..last (inclusive)."""
@@ -201,6 +203,7 @@ def _stream(
         np.array(state, dtype=np.int64),
         tuple(carry),
         links.gyro_at(np.array([m.stamp_ns for m in measurements])),
+        np.diff(timeline.slow_of[state], prepend=-1) > 0,
     )
 
 
@@ -253,7 +256,7 @@ class StartPrior:
     slow: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
 
 
-# What was decided about (stream number, measurement index), and where it attaches; None leaves it out.
+# What was decided about (stream number, measurement index), and where it attaches; without it, or None: left out.
 Decisions = Mapping[tuple[int, int], tuple[Decision, Attachment] | None]
 
 
@@ -286,7 +289,7 @@ def build_graph(
         if stream.slow is not None:
             _add_slow_chain(graph, guess, problem, stream, stream.slow, values, nodes, prior, jumps)
         for i in stream.between(first, last):
-            decided = decisions[(stream.number, i)]
+            decided = decisions.get((stream.number, i))
             if decided is None:
                 continue
             decision, at = decided

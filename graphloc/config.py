@@ -233,6 +233,8 @@ class PoseConfig(SensorConfig):
     """Which axes of the pose are used."""
     false_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
     """Share of poses that are expected to be false where the front-end does not say."""
+    false_repeats: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
+    """Probability that a false pose after a false pose repeats its error (a moored boat stays)."""
     min_sigma_m: Positive = 0.02
     """Floor of the position sigma, m."""
     min_sigma_deg: Positive = 0.1

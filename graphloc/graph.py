@@ -132,6 +132,21 @@ class SlowProcess:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FalseModel:
+    """What a sensor's false measurements look like.
+
+    Attributes:
+        probability: that a measurement is false. cov: (k, k) of a false residual, around the truth.
+        repeats: probability that a false one that follows a false one repeats its error (a moored boat
+            taken for another one is so again in the next scan).
+    """
+
+    probability: float
+    cov: Array
+    repeats: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sensor:
     """One row of the table of sensors.
 
@@ -142,8 +157,8 @@ class Sensor:
         factors: the factors of the chosen one.
         ideal: the noise-free measurement that a state would give (used by conformance tests).
         slow: the slow state that a config asks for.
-        false_log_density: log (probability x density) of a false measurement; None: the sensor has
-            no hypothesis 'false' and is guarded by its kernel alone.
+        false: the hypothesis that a measurement is false; None: the sensor has no such hypothesis
+            and is guarded by its kernel alone.
         synthetic: measurements made from the configuration over the run's stamps (no topic).
         absolute: whether it says something about position (for health).
     """
@@ -155,7 +170,7 @@ class Sensor:
     factors: Callable[[Any, Any, Attachment, Decision], GraphUpdate]
     ideal: Callable[[Attachment, Any], Measurement]
     slow: Callable[[Any], SlowProcess | None] = lambda _config: None
-    false_log_density: Callable[[Any, Any], float] | None = None
+    false: Callable[[Any, Any], FalseModel] | None = None
     synthetic: Callable[[str, Any, Sequence[int], float], Sequence[Measurement]] | None = None
     absolute: bool = False
 

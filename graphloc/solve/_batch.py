@@ -1,41 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The offline solver: align, grow, open the graph to everything, then decide.
+"""The offline solver: align, grow, then decide about the whole run.
 
 1. Align over a window; try each candidate heading on it and keep the cheapest.
-2. Grow: 20 s more at a time, solved with the last 5 s and a prior from what was before.
-3. Open passes over the whole run: Cauchy everywhere, so that nothing is locked out.
-4. Mixture passes: modes and weights re-chosen, first with the predicted covariance, then without it.
+2. Grow, some seconds at a time, each window solved with a prior from what was before. Hypotheses that
+   are new in a window are judged by the prediction without them, with its covariance.
+3. Judge each stretch's hypotheses once more, by the whole run without that stretch.
+4. Passes over the whole run: modes and weights re-chosen until they stand.
 5. Covariances of every state from a Bayes tree with QR.
+
+An inertial sensor that contradicts the rest gets more noise, and 3 to 4 are done again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 
 from graphloc import keys
-from graphloc.build import Problem, StartPrior, build_graph, nav_state, with_noise_scale
+from graphloc.build import Decisions, Problem, StartPrior, build_graph, nav_state, with_noise_scale
 from graphloc.errors import SolveError
 from graphloc.frames import Array, wrap_angle
 from graphloc.solve._align import Start, align, start_pose
-from graphloc.solve._decide import Verdict, decisions, pose_covariance, weigh
+from graphloc.solve._decide import PoseCovariance, Verdicts, decisions, pose_covariance, weigh
 from graphloc.solve._lm import bayes_tree, optimize
 
 _CHUNK_S, _OVERLAP_S = 8.0, 10.0
-_MAX_OPEN_PASSES, _MAX_MIXTURE_PASSES, _MAX_NOISE_ROUNDS = 4, 6, 5
+_MAX_OPEN_PASSES, _MAX_FINAL_PASSES, _MAX_NOISE_ROUNDS = 4, 6, 5
 _CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
 _SETTLED_M, _SETTLED_WEIGHT = 0.01, 0.05
 _WINDOW_SETTLED_M = 0.5
+_MAX_GROW_ROUNDS, _GROWN_SETTLED_M = 8, 2.0
+# A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
+# short enough to dead-reckon through.
+_STRETCH_S = 8.0
 # Starts that cost this much more (log-likelihood) are dropped; while others live, the window grows.
 _COST_APART, _LONGEST_START_S = 8.0, 60.0
-# Stages of a window: name, most rounds, motion in m that ends it. A grown window starts near the truth.
-_Stages = tuple[tuple[str, int, float], ...]
-_START_STAGES: _Stages = (("far", 8, 0.5), ("open", 2, 0.5), ("mixture", 2, 0.5))
-_GROW_STAGES: _Stages = (("far", 8, 2.0), ("mixture", 2, 0.5))
+# Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
+_START_STAGES = (("far", 8, 0.5, False), ("open", 2, 0.5, False), ("final", 2, 0.5, True))
 
 Progress = Callable[[str, int, int], None]
 
@@ -45,7 +50,7 @@ class BatchResult:
     """The solved graph, before it is turned into a `Solution`."""
 
     values: gtsam.Values
-    verdicts: dict[tuple[int, int], Verdict]
+    verdicts: Verdicts
     tree: Any
     graph: gtsam.NonlinearFactorGraph
     passes: int
@@ -63,37 +68,21 @@ def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> Batch
     """
     start = align(problem)
     last = len(problem.timeline) - 1
-    estimate, prior, known, iterations = _start_window(problem, start, progress)
-    iterations += _grow(problem, estimate, prior, known, progress)
-    passes, converged = 0, False
-    verdicts: dict[tuple[int, int], Verdict] = {}
-    grown = gtsam.Values(estimate)
+    grown, prior, known, iterations = _start_window(problem, start, progress)
+    iterations += _grow(problem, grown, prior, known, progress)
+    passes, estimate, ratio = 0, grown, 1.0
     for attempt in range(_MAX_NOISE_ROUNDS):
-        estimate, verdicts, tree, graph, passed, used = _open_passes(problem, grown, prior, progress)
-        passes, iterations = passes + passed, iterations + used
-        ratio = 2.0 * float(graph.error(estimate)) / max(expected_cost(problem, verdicts), 1.0)
-        adapt = getattr(problem.config.sensors[problem.imu.sensor], "adapt_noise", False)
-        if not adapt or ratio < _CONTRADICTION or attempt == _MAX_NOISE_ROUNDS - 1:
+        if attempt > 0:
+            problem = with_noise_scale(problem, problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0)))
+        estimate, used, passed = _open_passes(problem, estimate, prior, progress)
+        settled = _final_passes(problem, estimate, prior, progress)
+        passes, iterations = passes + passed + settled.passes, iterations + used + settled.iterations
+        estimate = settled.values
+        ratio = 2.0 * float(settled.graph.error(estimate)) / max(expected_cost(problem, settled.verdicts), 1.0)
+        if ratio < _CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
-        problem = with_noise_scale(problem, problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0)))
-    # Mixture passes: the predicted covariance is added in the first only.
-    weights = np.array([v.weight for v in verdicts.values()])
-    for n in range(_MAX_MIXTURE_PASSES):
-        inflation = pose_covariance(tree) if n == 0 else None
-        verdicts = weigh(problem, estimate, inflation, first=0, last=last, stage="mixture")
-        estimate, used, moved, _, graph = _pass(problem, estimate, verdicts, prior, tree_wanted=False)
-        passes, iterations = passes + 1, iterations + used
-        fresh = np.array([v.weight for v in verdicts.values()])
-        changed = float(np.abs(fresh - weights).max(initial=0.0))
-        weights = fresh
-        progress("mixture passes", n + 1, _MAX_MIXTURE_PASSES)
-        if n > 0 and moved < _SETTLED_M and changed < _SETTLED_WEIGHT:
-            converged = True
-            break
-    if moved < 5 * _SETTLED_M:
-        converged = True
     progress("covariances", 0, 1)
-    verdicts = weigh(problem, estimate, None, first=0, last=last, stage="mixture")
+    verdicts = weigh(problem, estimate, first=0, last=last, stage="final")
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
     tree = bayes_tree(graph, guess)
     progress("covariances", 1, 1)
@@ -104,7 +93,7 @@ def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> Batch
         graph=graph,
         passes=passes,
         iterations=iterations,
-        converged=converged,
+        converged=settled.converged,
         noise_scale=problem.noise_scale,
         notes=start.notes,
     )
@@ -112,25 +101,84 @@ def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> Batch
 
 def _open_passes(
     problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress
-) -> tuple[gtsam.Values, dict[tuple[int, int], Verdict], Any, gtsam.NonlinearFactorGraph, int, int]:
+) -> tuple[gtsam.Values, int, int]:
     """Solve the whole run with gentle losses. Carries and anchors depend on the estimate: build anew until it stands."""
     last = len(problem.timeline) - 1
     passes = iterations = 0
     for stage in ("far", "open"):
         for n in range(_MAX_OPEN_PASSES):
-            verdicts = weigh(problem, estimate, None, first=0, last=last, stage=stage)
-            wanted = stage == "open"
-            estimate, used, moved, tree, graph = _pass(
-                problem, estimate, verdicts, prior, tree_wanted=wanted, jumps=stage != "far"
-            )
-            passes, iterations = passes + 1, iterations + used
+            verdicts = weigh(problem, estimate, first=0, last=last, stage=stage)
+            step = _pass(problem, estimate, verdicts, prior, jumps=stage != "far")
+            estimate = step.values
+            passes, iterations = passes + 1, iterations + step.iterations
             progress(f"{stage} passes", n + 1, _MAX_OPEN_PASSES)
-            if moved < _WINDOW_SETTLED_M:
+            if step.moved_m < _WINDOW_SETTLED_M:
                 break
-    return estimate, verdicts, tree, graph, passes, iterations
+    return estimate, iterations, passes
 
 
-def expected_cost(problem: Problem, verdicts: dict[tuple[int, int], Verdict]) -> float:
+@dataclass(frozen=True, slots=True)
+class _Settled:
+    values: gtsam.Values
+    graph: gtsam.NonlinearFactorGraph
+    verdicts: Verdicts
+    passes: int
+    iterations: int
+    converged: bool
+
+
+def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress) -> _Settled:
+    """Re-choose modes and weights over the whole run until they stand."""
+    last = len(problem.timeline) - 1
+    verdicts, iterations = _judged_by_the_rest(problem, estimate, prior)
+    for n in range(_MAX_FINAL_PASSES):
+        step = _pass(problem, estimate, verdicts, prior)
+        estimate, iterations = step.values, iterations + step.iterations
+        used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage="final")
+        changed = max((abs(v.weight - used[key].weight) for key, v in verdicts.items()), default=0.0)
+        progress("final passes", n + 1, _MAX_FINAL_PASSES)
+        if step.moved_m < _SETTLED_M and changed < _SETTLED_WEIGHT:
+            break
+    return _Settled(estimate, step.graph, used, n + 1, iterations, step.moved_m < 5 * _SETTLED_M)
+
+
+def _judged_by_the_rest(problem: Problem, estimate: gtsam.Values, prior: StartPrior) -> tuple[Verdicts, int]:
+    """Weigh each stretch's hypotheses by the solution of the run without that stretch's.
+
+    Hypotheses that took part in the estimate speak for themselves, and a wrong choice confirms itself. Every
+    second stretch is left out at once, so two solutions do for the whole run.
+    """
+    last = len(problem.timeline) - 1
+    verdicts, iterations = weigh(problem, estimate, first=0, last=last, stage="final"), 0
+    stretch = {
+        (s.number, i): int((m.stamp_ns - problem.timeline.stamps_ns[0]) / (_STRETCH_S * 1e9)) % 2
+        for s in problem.streams
+        if s.row.false is not None
+        for i, m in enumerate(s.measurements)
+    }
+    judged = dict(verdicts)
+    for half in sorted(set(stretch.values())):
+        without = {key for key, n in stretch.items() if n == half}
+        if len(without) == len(stretch):
+            return verdicts, iterations  # nothing would be left to judge by
+        step = _pass(problem, estimate, verdicts, prior, without=without)
+        tree = bayes_tree(step.graph, step.values)
+        left_out = {int(s.state[i]) for s in problem.streams for i in range(len(s.state)) if (s.number, i) in without}
+        predicted = pose_covariance(tree)
+        fresh = weigh(
+            problem,
+            step.values,
+            first=0,
+            last=last,
+            stage="final",
+            covariance=lambda k, P=predicted, at=left_out: P(k) if k in at else None,
+        )
+        judged.update({key: fresh[key] for key in without})
+        iterations += step.iterations
+    return judged, iterations
+
+
+def expected_cost(problem: Problem, verdicts: Verdicts) -> float:
     """Degrees of freedom of the weighted problem: what 2 x its cost is expected to be."""
     n, m = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
     expected = sum(len(v.residual.raw) * v.weight for v in verdicts.values())
@@ -142,21 +190,29 @@ def expected_cost(problem: Problem, verdicts: dict[tuple[int, int], Verdict]) ->
     return expected
 
 
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """One optimisation of the whole run: what came out, and how far any pose moved."""
+
+    values: gtsam.Values
+    graph: gtsam.NonlinearFactorGraph
+    iterations: int
+    moved_m: float
+
+
 def _pass(
     problem: Problem,
     estimate: gtsam.Values,
-    verdicts: dict[tuple[int, int], Verdict],
+    verdicts: Verdicts,
     prior: StartPrior,
     *,
-    tree_wanted: bool,
+    without: Container[tuple[int, int]] = (),
     jumps: bool = True,
-) -> tuple[gtsam.Values, int, float, Any, gtsam.NonlinearFactorGraph]:
+) -> _Step:
     last = len(problem.timeline) - 1
-    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps)
+    graph, guess = build_graph(problem, estimate, decisions(verdicts, without), 0, last, prior, jumps=jumps)
     solved = optimize(graph, guess, 12)
-    moved = _moved(guess, solved.values, 0, last)
-    tree = bayes_tree(graph, solved.values) if tree_wanted else None
-    return solved.values, solved.iterations, moved, tree, graph
+    return _Step(solved.values, graph, solved.iterations, _moved(guess, solved.values, 0, last))
 
 
 def _index_after(problem: Problem, seconds: float) -> int:
@@ -207,9 +263,7 @@ def _start_window(problem: Problem, start: Start, progress: Progress) -> tuple[g
             progress("start", n, len(candidates))
             try:
                 _extend(problem, candidate.values, known, until)
-                used, candidate.cost = _solve_window(
-                    problem, candidate.values, 0, until, candidate.prior, _START_STAGES
-                )
+                used, candidate.cost = _solve_start(problem, candidate, until)
             except SolveError as caught:
                 failure = caught
                 continue
@@ -270,27 +324,47 @@ def _extend(problem: Problem, values: gtsam.Values, known: int, until: int) -> N
             _fill_slow(problem, values, following, bias, slow)
 
 
-def _solve_window(
-    problem: Problem, values: gtsam.Values, first: int, last: int, prior: StartPrior, stages: _Stages
-) -> tuple[int, float]:
-    """Solve states first..last in place; return iterations and final error.
-
-    With false matches in it, a window solved under Huber alone is off by many of its own sigmas (0.01 rad/s
-    of gyro bias, 300 m after 20 s of dead reckoning), so each window goes through all the stages.
-    """
+def _solve_start(problem: Problem, candidate: _Candidate, last: int) -> tuple[int, float]:
+    """Solve the first window in place, gently first; return iterations and final error."""
     iterations, error = 0, 0.0
-    for stage, limit, settled_m in stages:
+    for stage, limit, settled_m, hypotheses in _START_STAGES:
         for _ in range(limit):
-            verdicts = weigh(problem, values, None, first=first, last=last, stage=stage)
-            graph, guess = build_graph(problem, values, decisions(verdicts), first, last, prior, jumps=stage != "far")
-            solved = optimize(graph, guess, 15)
-            iterations += solved.iterations
-            moved = _moved(guess, solved.values, first, last)
-            _update(problem, values, solved.values, first, last)
-            error = solved.error
-            if moved < settled_m:
+            verdicts = weigh(
+                problem, candidate.values, first=0, last=last, stage=stage, hypotheses=hypotheses, sparse=True
+            )
+            step = _solve_window(
+                problem, candidate.values, 0, last, candidate.prior, decisions(verdicts), jumps=stage != "far"
+            )
+            iterations, error = iterations + step.iterations, step.error
+            if step.moved_m < settled_m:
                 break
     return iterations, error
+
+
+class _WindowStep(NamedTuple):
+    """One optimisation of a window: iterations, final error, how far any pose moved."""
+
+    iterations: int
+    error: float
+    moved_m: float
+
+
+def _solve_window(
+    problem: Problem,
+    values: gtsam.Values,
+    first: int,
+    last: int,
+    prior: StartPrior,
+    decided: Decisions,
+    *,
+    jumps: bool = True,
+) -> _WindowStep:
+    """Optimise states first..last in place."""
+    graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps)
+    solved = optimize(graph, guess, 15)
+    moved = _moved(guess, solved.values, first, last)
+    _update(problem, values, solved.values, first, last)
+    return _WindowStep(solved.iterations, solved.error, moved)
 
 
 def _moved(old: gtsam.Values, new: gtsam.Values, first: int, last: int) -> float:
@@ -320,15 +394,50 @@ def _grow(problem: Problem, estimate: gtsam.Values, prior: StartPrior, known: in
         until = int(min(np.searchsorted(stamps, stamps[known] + int(_CHUNK_S * 1e9)), end))
         start_of_window = int(np.searchsorted(stamps, stamps[known] - int(_OVERLAP_S * 1e9)))
         if start_of_window > first:
-            verdicts = weigh(problem, estimate, None, first=first, last=known, stage="mixture")
+            verdicts = weigh(problem, estimate, first=first, last=known, stage="final", sparse=True)
             graph, guess = build_graph(problem, estimate, decisions(verdicts), first, known, prior)
             prior = _prior_at(problem, bayes_tree(graph, guess), guess, start_of_window)
             first = start_of_window
         _extend(problem, estimate, known, until)
-        used, _ = _solve_window(problem, estimate, first, until, prior, _GROW_STAGES)
-        iterations += used
+        iterations += _solve_grown(problem, estimate, first, known, until, prior)
         known = until
         progress("growing", known, end)
+    return iterations
+
+
+def _solve_grown(
+    problem: Problem, values: gtsam.Values, first: int, known: int, last: int, prior: StartPrior
+) -> int:
+    """Solve a window whose states after `known` are new, in place; return iterations.
+
+    New hypotheses wait until the rest has said where the vessel is, and how well it knows: with false matches
+    in it, a window solved under Huber alone is off by many of its own sigmas (0.01 rad/s of gyro bias, 300 m
+    after 20 s of dead reckoning).
+    """
+    fresh = {
+        (s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)
+    }
+    iterations = 0
+    for _ in range(_MAX_GROW_ROUNDS):
+        verdicts = weigh(problem, values, first=first, last=last, stage="far", sparse=True)
+        step = _solve_window(problem, values, first, last, prior, decisions(verdicts, fresh), jumps=False)
+        iterations += step.iterations
+        if step.moved_m < _GROWN_SETTLED_M:
+            break
+    covariance: PoseCovariance = lambda _state: None
+    if fresh:
+        graph, guess = build_graph(problem, values, decisions(verdicts, fresh), first, last, prior)
+        predicted = pose_covariance(bayes_tree(graph, guess))
+        covariance = lambda k: predicted(k) if k > known else None
+    for _ in range(2):
+        verdicts = weigh(
+            problem, values, first=first, last=last, stage="final", covariance=covariance, sparse=True
+        )
+        step = _solve_window(problem, values, first, last, prior, decisions(verdicts))
+        iterations += step.iterations
+        covariance = lambda _state: None
+        if step.moved_m < _WINDOW_SETTLED_M:
+            break
     return iterations
 
 

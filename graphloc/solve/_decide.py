@@ -3,13 +3,13 @@
 
 Sensors without hypotheses keep their kernel. Sensors with modes are weighed as a mixture: each mode has
 a density, and so has 'false'. The weight is the posterior probability that the chosen mode is right.
-While the estimate may be off, its predicted covariance is added to the measurement's, so that a
-state that has drifted through an outage does not lock the truth out; and a first stage uses Cauchy.
+Where the prediction stands without the measurement, its covariance is added to the measurement's, so
+that a state that has drifted through an outage does not lock the truth out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from graphloc import keys
 from graphloc.build import Decisions, Problem, Stream, attach
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, Residual
+from graphloc.graph import Attachment, Decision, FalseModel, Residual
 
 # By stage, for every sensor that has a kernel at all: Huber is convex, so a start that is tens of metres
 # off still pulls in; Cauchy forgets outliers better and still lets the truth back in.
@@ -29,7 +29,7 @@ _STAGE_KERNEL = {"far": KernelConfig(kind="huber", scale=1.5), "open": KernelCon
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
 
-PoseCovariance = Callable[[int], Array]
+PoseCovariance = Callable[[int], Array | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +51,15 @@ class Verdict:
     at: Attachment
 
 
-def _predicted(residual: Residual, P: Array | None) -> Array | None:
+# By (stream number, measurement index).
+Verdicts = dict[tuple[int, int], Verdict]
+
+
+def _predicted(found: tuple[Residual, ...], P: Array | None) -> Array | None:
     """Covariance (k, k) of the prediction, from that of the pose."""
     if P is None:
         return None
-    J = residual.jacobian()
+    J = found[0].jacobian()
     return np.asarray(J @ P @ J.T)
 
 
@@ -76,43 +80,62 @@ def kernel_weight(nis: float, kernel: KernelConfig) -> float:
 def weigh(
     problem: Problem,
     values: gtsam.Values,
-    covariance: PoseCovariance | None,
     *,
     first: int,
     last: int,
     stage: str,
-) -> dict[tuple[int, int], Verdict]:
+    covariance: PoseCovariance = lambda _state: None,
+    hypotheses: bool = True,
+    sparse: bool = False,
+) -> Verdicts:
     """Decide about the measurements of states first..last.
 
     Args:
         problem: the run. values: current estimate.
-        covariance: state -> pose covariance (6, 6) in the body tangent, added to the measurement's.
         first: first state. last: last state, inclusive.
-        stage: 'far' (Huber at most), 'open' (Cauchy at most) or 'mixture'.
+        stage: 'far' (Huber at most), 'open' (Cauchy at most) or 'final' (each sensor's own kernel).
+        covariance: state -> covariance (6, 6) of its predicted pose in the body tangent, or None.
+        hypotheses: weigh sensors that can be false by their hypotheses; else by the stage's kernel, on the
+            nearest mode.
+        sparse: thin sensors without hypotheses to one measurement for each slow node.
     """
-    verdicts = {}
+    verdicts: Verdicts = {}
     for stream in problem.streams:
-        indices = stream.between(first, last)
+        several = stream.row.false is not None
+        indices = [i for i in stream.between(first, last) if several or not sparse or stream.sparse[i]]
+        if not indices:
+            continue
         attached = [attach(problem, stream, i, values) for i in indices]
         residuals = [
             stream.row.residuals(stream.measurements[i], stream.config, at)
             for i, at in zip(indices, attached, strict=True)
         ]
-        # The norm of k whitened residuals is about sqrt(k) where all is well: bend that much later.
-        dof = len(residuals[0][0].raw) if residuals else 1
-        nis = [min(r.nis() for r in found) for found in residuals]
-        kernel = _stage_kernel(stream.config.kernel, stage, _spread(nis, dof) * float(np.sqrt(dof)))
-        for i, found, at, best in zip(indices, residuals, attached, nis, strict=True):
-            P = None if covariance is None else covariance(int(stream.state[i]))
-            verdicts[(stream.number, i)] = _verdict(stream, i, found, P, stage, kernel, at, best)
+        if several and hypotheses:
+            predicted = [_predicted(r, covariance(int(stream.state[i]))) for i, r in zip(indices, residuals, strict=True)]
+            found = _by_hypotheses(stream, indices, attached, residuals, predicted)
+        else:
+            found = _by_kernel(stream, attached, residuals, stage)
+        verdicts.update({(stream.number, i): v for i, v in zip(indices, found, strict=True)})
     return verdicts
 
 
-def _stage_kernel(kernel: KernelConfig, stage: str, widening: float) -> KernelConfig:
-    """The sensor's own kernel, or the stage's where that one is gentler; its bend `widening` times later."""
-    limit = _STAGE_KERNEL.get(stage, kernel)
-    gentle = _CONVEXITY.index(kernel.kind) <= _CONVEXITY.index(limit.kind)
-    return KernelConfig(kind=kernel.kind if gentle else limit.kind, scale=kernel.scale * widening)
+def _by_kernel(
+    stream: Stream, attached: list[Attachment], residuals: list[tuple[Residual, ...]], stage: str
+) -> list[Verdict]:
+    """The sensor's own kernel, or the stage's where that one is gentler."""
+    nis = [[r.nis() for r in found] for found in residuals]
+    mode = [int(np.argmin(n)) for n in nis]
+    best = [n[m] for n, m in zip(nis, mode, strict=True)]
+    own, limit = stream.config.kernel, _STAGE_KERNEL.get(stage, stream.config.kernel)
+    gentle = _CONVEXITY.index(own.kind) <= _CONVEXITY.index(limit.kind)
+    # The norm of k whitened residuals is about sqrt(k) where all is well: bend that much later.
+    dof = len(residuals[0][0].raw)
+    widening = _spread(best, dof) * float(np.sqrt(dof))
+    kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=own.scale * widening)
+    return [
+        Verdict(Decision(mode=m, kernel=kernel), kernel_weight(n, kernel), 1.0, found[m], m, at)
+        for m, n, found, at in zip(mode, best, residuals, attached, strict=True)
+    ]
 
 
 def _spread(nis: list[float], dof: int) -> float:
@@ -125,38 +148,102 @@ def _spread(nis: list[float], dof: int) -> float:
     return max(1.0, float(np.sqrt(np.median(nis) / chi2.median(dof)))) if nis else 1.0
 
 
-def _verdict(
+def _by_hypotheses(
     stream: Stream,
-    i: int,
-    found: tuple[Residual, ...],
-    P: Array | None,
-    stage: str,
-    kernel: KernelConfig,
-    at: Attachment,
-    nis: float,
-) -> Verdict:
-    false = stream.row.false_log_density
-    if false is None:
-        residual = found[0]
-        return Verdict(Decision(kernel=kernel), kernel_weight(nis, kernel), 1.0, residual, 0, at)
-    logs = np.array([r.log_density(_predicted(r, P)) for r in found])
-    mode = int(np.argmax(logs))
-    among = np.exp(logs - logs.max())
-    mode_probability = float(among[mode] / among.sum())
-    residual = found[mode]
-    if stage != "mixture":
-        decision = Decision(mode=mode, kernel=kernel)
-        return Verdict(decision, kernel_weight(nis, kernel), mode_probability, residual, mode, at)
-    nothing = false(stream.measurements[i], stream.config)
-    top = max(logs.max(), nothing)
-    weight = float(np.exp(logs[mode] - top) / (np.exp(logs - top).sum() + np.exp(nothing - top)))
-    kept = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
-    return Verdict(kept, weight, mode_probability, residual, mode, at)
+    indices: list[int],
+    attached: list[Attachment],
+    residuals: list[tuple[Residual, ...]],
+    predicted: list[Array | None],
+) -> list[Verdict]:
+    """Posterior of 'right' and 'false' along the sequence of one sensor's measurements.
+
+    A false measurement's error is drawn anew, or repeats that of the false one before it. So right and false
+    form a chain of two states, and forward-backward gives each posterior exactly: without the repeats, six
+    scans that take the same wrong boat for the right one outweigh IMU and GNSS together.
+    """
+    assert stream.row.false is not None
+    modes = [np.array([r.log_density(P) for r in found]) for found, P in zip(residuals, predicted, strict=True)]
+    right = np.array([_log_sum(logs) for logs in modes])
+    models = [stream.row.false(stream.measurements[i], stream.config) for i in indices]
+    fresh = np.array([_log_false(*args) for args in zip(residuals, models, predicted, strict=True)])
+    after_false = np.array(
+        [fresh[0]]
+        + [
+            np.logaddexp(
+                np.log1p(-model.repeats) + fresh[n],
+                np.log(max(model.repeats * model.probability, 1e-12)) + _log_repeat(residuals[n - 1], residuals[n]),
+            )
+            for n, model in enumerate(models)
+            if n > 0
+        ]
+    )
+    posterior = _forward_backward(right, fresh, after_false)
+    verdicts = []
+    for n, logs in enumerate(modes):
+        mode = int(np.argmax(logs))
+        share = float(np.exp(logs[mode] - right[n]))
+        weight = float(posterior[n]) * share
+        kept = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
+        verdicts.append(Verdict(kept, weight, share, residuals[n][mode], mode, attached[n]))
+    return verdicts
 
 
-def decisions(verdicts: dict[tuple[int, int], Verdict]) -> Decisions:
-    """Return what the graph builder needs of verdicts."""
-    return {key: None if v.decision is None else (v.decision, v.at) for key, v in verdicts.items()}
+def _log_sum(logs: Array) -> float:
+    return float(np.logaddexp.reduce(logs))
+
+
+def _log_gauss(raw: Array, cov: Array) -> float:
+    logdet = np.linalg.slogdet(2.0 * np.pi * cov)[1]
+    return float(-0.5 * (raw @ np.linalg.solve(cov, raw) + logdet))
+
+
+def _log_false(found: tuple[Residual, ...], model: FalseModel, P: Array | None) -> float:
+    """Log of P(false) x density, over the modes. The prediction's covariance widens it as it does the right one's."""
+    around = model.cov if P is None else model.cov + P
+    share = np.log([r.prior for r in found]) - np.log(sum(r.prior for r in found))
+    logs = share + np.array([_log_gauss(r.raw, r.cov + around) for r in found])
+    return float(np.log(model.probability)) + _log_sum(logs)
+
+
+def _log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...]) -> float:
+    """Log density of seeing the error of one measurement again in the next, over pairs of modes."""
+    if len(before[0].raw) != len(now[0].raw):
+        return -np.inf
+    total = np.log(sum(r.prior for r in before) * sum(r.prior for r in now))
+    logs = [np.log(a.prior * b.prior) + _log_gauss(a.raw - b.raw, a.cov + b.cov) for a in before for b in now]
+    return float(_log_sum(np.array(logs)) - total)
+
+
+def _forward_backward(right: Array, fresh: Array, after_false: Array) -> Array:
+    """Posterior (N,) of 'right' in a chain of right and false.
+
+    Args:
+        right: (N,) log density x prior of 'right'. fresh, after_false: (N,) of 'false', after a right one and
+            after a false one.
+    """
+    count = len(right)
+    ahead = np.zeros((count, 2))
+    ahead[0] = right[0], fresh[0]
+    for n in range(1, count):
+        r, f = ahead[n - 1] - ahead[n - 1].max()
+        ahead[n] = right[n] + np.logaddexp(r, f), np.logaddexp(r + fresh[n], f + after_false[n])
+    back = np.zeros((count, 2))
+    for n in range(count - 2, -1, -1):
+        r, f = back[n + 1]
+        back[n] = (
+            np.logaddexp(right[n + 1] + r, fresh[n + 1] + f),
+            np.logaddexp(right[n + 1] + r, after_false[n + 1] + f),
+        )
+        back[n] -= back[n].max()
+    both = ahead + back
+    return np.asarray(np.exp(both[:, 0] - np.logaddexp(both[:, 0], both[:, 1])))
+
+
+def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> Decisions:
+    """Return what the graph builder needs of verdicts; what is in `without` is left out."""
+    return {
+        key: None if v.decision is None or key in without else (v.decision, v.at) for key, v in verdicts.items()
+    }
 
 
 def pose_covariance(tree: Any) -> PoseCovariance:

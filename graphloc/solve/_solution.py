@@ -153,11 +153,11 @@ def _row(stream: Stream, seq: int, stamp_ns: int, topic: str, verdict: Verdict) 
     nis, dof = residual.nis(), len(residual.raw)
     if weight >= AGREES:
         outcome, reason = Outcome.USED, ""
-    elif stream.row.false_log_density is not None and weight < _FALSE:
+    elif stream.row.false is not None and weight < _FALSE:
         outcome, reason = Outcome.REJECTED, "judged false: no mode agrees with the rest"
     else:
         outcome, reason = Outcome.DOWN_WEIGHTED, "disagrees with the rest"
-    several = stream.row.false_log_density is not None
+    several = stream.row.false is not None
     return LedgerRow(
         seq=seq,
         stamp_ns=stamp_ns,
