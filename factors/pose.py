@@ -82,9 +82,7 @@ def _false_probability(m: PoseFix, config: PoseConfig) -> float:
 def false(m: PoseFix, config: PoseConfig) -> FalseModel:
     """Return what is expected of a false pose: anywhere in BL's search window, and likely to stay there."""
     sigmas = np.array([FALSE_SPREAD_M if AXES.index(a) < 3 else FALSE_SPREAD_RAD for a in m.axes])
-    return FalseModel(
-        probability=_false_probability(m, config), cov=np.diag(sigmas**2), repeats=config.false_repeats
-    )
+    return FalseModel(probability=_false_probability(m, config), cov=np.diag(sigmas**2), repeats=config.false_repeats)
 
 
 def factors(m: PoseFix, config: PoseConfig, at: Attachment, decision: Decision) -> GraphUpdate:

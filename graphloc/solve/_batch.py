@@ -25,13 +25,13 @@ from graphloc.build import Decisions, Problem, StartPrior, build_graph, nav_stat
 from graphloc.errors import SolveError
 from graphloc.frames import Array, wrap_angle
 from graphloc.solve._align import Start, align, start_pose
-from graphloc.solve._decide import PoseCovariance, Verdicts, decisions, pose_covariance, weigh
-from graphloc.solve._lm import bayes_tree, optimize
+from graphloc.solve._decide import PoseCovariance, Verdicts, decisions, pose_covariance, thinned, weigh
+from graphloc.solve._optimize import bayes_tree, optimize
 
-_CHUNK_S, _OVERLAP_S = 8.0, 10.0
+_CHUNK_S, _OVERLAP_S = 12.0, 6.0
 _MAX_OPEN_PASSES, _MAX_FINAL_PASSES, _MAX_NOISE_ROUNDS = 4, 6, 5
 _CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
-_SETTLED_M, _SETTLED_WEIGHT = 0.01, 0.05
+_SETTLED_M, _SETTLED_WEIGHT = 0.03, 0.1
 _WINDOW_SETTLED_M = 0.5
 _MAX_GROW_ROUNDS, _GROWN_SETTLED_M = 8, 2.0
 # A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
@@ -67,30 +67,27 @@ def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> Batch
         SolveError: it could not be started, or the linear algebra failed.
     """
     start = align(problem)
-    last = len(problem.timeline) - 1
     grown, prior, known, iterations = _start_window(problem, start, progress)
     iterations += _grow(problem, grown, prior, known, progress)
     passes, estimate, ratio = 0, grown, 1.0
     for attempt in range(_MAX_NOISE_ROUNDS):
         if attempt > 0:
             problem = with_noise_scale(problem, problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0)))
-        estimate, used, passed = _open_passes(problem, estimate, prior, progress)
+            estimate, used, passed = _open_passes(problem, estimate, prior, progress)
+            passes, iterations = passes + passed, iterations + used
         settled = _final_passes(problem, estimate, prior, progress)
-        passes, iterations = passes + passed + settled.passes, iterations + used + settled.iterations
-        estimate = settled.values
+        passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
         ratio = 2.0 * float(settled.graph.error(estimate)) / max(expected_cost(problem, settled.verdicts), 1.0)
         if ratio < _CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
     progress("covariances", 0, 1)
-    verdicts = weigh(problem, estimate, first=0, last=last, stage="final")
-    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
-    tree = bayes_tree(graph, guess)
+    tree = bayes_tree(settled.graph, estimate)
     progress("covariances", 1, 1)
     return BatchResult(
-        values=guess,
-        verdicts=verdicts,
+        values=estimate,
+        verdicts=settled.verdicts,
         tree=tree,
-        graph=graph,
+        graph=settled.graph,
         passes=passes,
         iterations=iterations,
         converged=settled.converged,
@@ -139,7 +136,7 @@ def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, p
         progress("final passes", n + 1, _MAX_FINAL_PASSES)
         if step.moved_m < _SETTLED_M and changed < _SETTLED_WEIGHT:
             break
-    return _Settled(estimate, step.graph, used, n + 1, iterations, step.moved_m < 5 * _SETTLED_M)
+    return _Settled(estimate, step.graph, verdicts, n + 1, iterations, step.moved_m < 3 * _SETTLED_M)
 
 
 def _judged_by_the_rest(problem: Problem, estimate: gtsam.Values, prior: StartPrior) -> tuple[Verdicts, int]:
@@ -148,32 +145,30 @@ def _judged_by_the_rest(problem: Problem, estimate: gtsam.Values, prior: StartPr
     Hypotheses that took part in the estimate speak for themselves, and a wrong choice confirms itself. Every
     second stretch is left out at once, so two solutions do for the whole run.
     """
-    last = len(problem.timeline) - 1
-    verdicts, iterations = weigh(problem, estimate, first=0, last=last, stage="final"), 0
-    stretch = {
-        (s.number, i): int((m.stamp_ns - problem.timeline.stamps_ns[0]) / (_STRETCH_S * 1e9)) % 2
-        for s in problem.streams
-        if s.row.false is not None
-        for i, m in enumerate(s.measurements)
-    }
-    judged = dict(verdicts)
-    for half in sorted(set(stretch.values())):
-        without = {key for key, n in stretch.items() if n == half}
-        if len(without) == len(stretch):
-            return verdicts, iterations  # nothing would be left to judge by
-        step = _pass(problem, estimate, verdicts, prior, without=without)
-        tree = bayes_tree(step.graph, step.values)
-        left_out = {int(s.state[i]) for s in problem.streams for i in range(len(s.state)) if (s.number, i) in without}
-        predicted = pose_covariance(tree)
+    last, start_ns = len(problem.timeline) - 1, int(problem.timeline.stamps_ns[0])
+    judged, iterations = weigh(problem, estimate, first=0, last=last, stage="final"), 0
+    halves: tuple[dict[tuple[int, int], int], ...] = ({}, {})  # measurement -> its state
+    for stream in problem.streams:
+        if stream.row.false is not None:
+            for i, m in enumerate(stream.measurements):
+                half = int((m.stamp_ns - start_ns) * 1e-9 / _STRETCH_S) % 2
+                halves[half][(stream.number, i)] = int(stream.state[i])
+    if not all(halves):  # nothing to judge, or nothing to judge it by
+        return judged, iterations
+    everything = thinned(problem, judged)
+    for left_out in halves:
+        step = _pass(problem, estimate, everything, prior, without=left_out)
+        predicted, states = pose_covariance(bayes_tree(step.graph, step.values)), set(left_out.values())
         fresh = weigh(
             problem,
             step.values,
             first=0,
             last=last,
             stage="final",
-            covariance=lambda k, P=predicted, at=left_out: P(k) if k in at else None,
+            covariance=lambda k, P=predicted, states=states: P(k) if k in states else None,  # type: ignore[misc]
+            only_hypotheses=True,
         )
-        judged.update({key: fresh[key] for key in without})
+        judged.update({key: fresh[key] for key in left_out})
         iterations += step.iterations
     return judged, iterations
 
@@ -332,9 +327,8 @@ def _solve_start(problem: Problem, candidate: _Candidate, last: int) -> tuple[in
             verdicts = weigh(
                 problem, candidate.values, first=0, last=last, stage=stage, hypotheses=hypotheses, sparse=True
             )
-            step = _solve_window(
-                problem, candidate.values, 0, last, candidate.prior, decisions(verdicts), jumps=stage != "far"
-            )
+            decided, jumps = decisions(verdicts), stage != "far"
+            step = _solve_window(problem, candidate.values, 0, last, candidate.prior, decided, jumps=jumps, tol=1e-4)
             iterations, error = iterations + step.iterations, step.error
             if step.moved_m < settled_m:
                 break
@@ -342,8 +336,10 @@ def _solve_start(problem: Problem, candidate: _Candidate, last: int) -> tuple[in
 
 
 class _WindowStep(NamedTuple):
-    """One optimisation of a window: iterations, final error, how far any pose moved."""
+    """One optimisation of a window: what came out, iterations, final error, how far any pose moved."""
 
+    values: gtsam.Values
+    graph: gtsam.NonlinearFactorGraph
     iterations: int
     error: float
     moved_m: float
@@ -358,13 +354,14 @@ def _solve_window(
     decided: Decisions,
     *,
     jumps: bool = True,
+    tol: float = 3e-3,
 ) -> _WindowStep:
-    """Optimise states first..last in place."""
+    """Optimise states first..last in place, roughly: what it leaves, the passes over the whole run take up."""
     graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps)
-    solved = optimize(graph, guess, 15)
+    solved = optimize(graph, guess, 15, tol)
     moved = _moved(guess, solved.values, first, last)
     _update(problem, values, solved.values, first, last)
-    return _WindowStep(solved.iterations, solved.error, moved)
+    return _WindowStep(solved.values, graph, solved.iterations, solved.error, moved)
 
 
 def _moved(old: gtsam.Values, new: gtsam.Values, first: int, last: int) -> float:
@@ -389,60 +386,56 @@ def _update(problem: Problem, values: gtsam.Values, new: gtsam.Values, first: in
 def _grow(problem: Problem, estimate: gtsam.Values, prior: StartPrior, known: int, progress: Progress) -> int:
     """Take the estimate of states 0..known to the end of the run, a chunk at a time, in place."""
     stamps, end = problem.timeline.stamps_ns, len(problem.timeline) - 1
-    iterations, first = 0, 0
+    verdicts = weigh(problem, estimate, first=0, last=known, stage="final", sparse=True)
+    step = _solve_window(problem, estimate, 0, known, prior, decisions(verdicts))
+    iterations, first = step.iterations, 0
     while known < end:
         until = int(min(np.searchsorted(stamps, stamps[known] + int(_CHUNK_S * 1e9)), end))
         start_of_window = int(np.searchsorted(stamps, stamps[known] - int(_OVERLAP_S * 1e9)))
         if start_of_window > first:
-            verdicts = weigh(problem, estimate, first=first, last=known, stage="final", sparse=True)
-            graph, guess = build_graph(problem, estimate, decisions(verdicts), first, known, prior)
-            prior = _prior_at(problem, bayes_tree(graph, guess), guess, start_of_window)
+            prior = _prior_at(problem, step, start_of_window)
             first = start_of_window
         _extend(problem, estimate, known, until)
-        iterations += _solve_grown(problem, estimate, first, known, until, prior)
-        known = until
+        used, step = _solve_grown(problem, estimate, first, known, until, prior)
+        iterations, known = iterations + used, until
         progress("growing", known, end)
     return iterations
 
 
 def _solve_grown(
     problem: Problem, values: gtsam.Values, first: int, known: int, last: int, prior: StartPrior
-) -> int:
-    """Solve a window whose states after `known` are new, in place; return iterations.
+) -> tuple[int, _WindowStep]:
+    """Solve a window whose states after `known` are new, in place; return iterations and the last step.
 
     New hypotheses wait until the rest has said where the vessel is, and how well it knows: with false matches
     in it, a window solved under Huber alone is off by many of its own sigmas (0.01 rad/s of gyro bias, 300 m
     after 20 s of dead reckoning).
     """
-    fresh = {
-        (s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)
-    }
+    fresh = {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
     iterations = 0
-    for _ in range(_MAX_GROW_ROUNDS):
-        verdicts = weigh(problem, values, first=first, last=last, stage="far", sparse=True)
-        step = _solve_window(problem, values, first, last, prior, decisions(verdicts, fresh), jumps=False)
+    for stage in ("final", *["far"] * _MAX_GROW_ROUNDS, "final"):
+        verdicts = weigh(problem, values, first=first, last=last, stage=stage, sparse=True)
+        step = _solve_window(problem, values, first, last, prior, decisions(verdicts, fresh), jumps=stage != "far")
         iterations += step.iterations
         if step.moved_m < _GROWN_SETTLED_M:
             break
-    covariance: PoseCovariance = lambda _state: None
-    if fresh:
-        graph, guess = build_graph(problem, values, decisions(verdicts, fresh), first, last, prior)
-        predicted = pose_covariance(bayes_tree(graph, guess))
-        covariance = lambda k: predicted(k) if k > known else None
+    if not fresh:
+        return iterations, step
+    predicted = pose_covariance(bayes_tree(step.graph, step.values))
+    covariance: PoseCovariance = lambda k: predicted(k) if k > known else None
     for _ in range(2):
-        verdicts = weigh(
-            problem, values, first=first, last=last, stage="final", covariance=covariance, sparse=True
-        )
+        verdicts = weigh(problem, values, first=first, last=last, stage="final", covariance=covariance, sparse=True)
         step = _solve_window(problem, values, first, last, prior, decisions(verdicts))
         iterations += step.iterations
         covariance = lambda _state: None
         if step.moved_m < _WINDOW_SETTLED_M:
             break
-    return iterations
+    return iterations, step
 
 
-def _prior_at(problem: Problem, tree: Any, values: gtsam.Values, k: int) -> StartPrior:
+def _prior_at(problem: Problem, step: _WindowStep, k: int) -> StartPrior:
     """The marginals at state `k` as a prior; cross terms are left out, which only loosens it."""
+    tree, values = bayes_tree(step.graph, step.values), step.values
     j = int(problem.timeline.slow_of[k])
     cov = {key: np.asarray(tree.marginalCovariance(key)) for key in (keys.pose(k), keys.velocity(k), keys.bias(j))}
     slow = {}

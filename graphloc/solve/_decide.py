@@ -87,6 +87,7 @@ def weigh(
     covariance: PoseCovariance = lambda _state: None,
     hypotheses: bool = True,
     sparse: bool = False,
+    only_hypotheses: bool = False,
 ) -> Verdicts:
     """Decide about the measurements of states first..last.
 
@@ -98,10 +99,13 @@ def weigh(
         hypotheses: weigh sensors that can be false by their hypotheses; else by the stage's kernel, on the
             nearest mode.
         sparse: thin sensors without hypotheses to one measurement for each slow node.
+        only_hypotheses: leave those sensors out altogether.
     """
     verdicts: Verdicts = {}
     for stream in problem.streams:
         several = stream.row.false is not None
+        if only_hypotheses and not several:
+            continue
         indices = [i for i in stream.between(first, last) if several or not sparse or stream.sparse[i]]
         if not indices:
             continue
@@ -111,7 +115,9 @@ def weigh(
             for i, at in zip(indices, attached, strict=True)
         ]
         if several and hypotheses:
-            predicted = [_predicted(r, covariance(int(stream.state[i]))) for i, r in zip(indices, residuals, strict=True)]
+            predicted = [
+                _predicted(r, covariance(int(stream.state[i]))) for i, r in zip(indices, residuals, strict=True)
+            ]
             found = _by_hypotheses(stream, indices, attached, residuals, predicted)
         else:
             found = _by_kernel(stream, attached, residuals, stage)
@@ -239,11 +245,19 @@ def _forward_backward(right: Array, fresh: Array, after_false: Array) -> Array:
     return np.asarray(np.exp(both[:, 0] - np.logaddexp(both[:, 0], both[:, 1])))
 
 
+def thinned(problem: Problem, verdicts: Verdicts) -> Verdicts:
+    """Return the verdicts of the measurements that `weigh(sparse=True)` would keep."""
+    streams = {s.number: s for s in problem.streams}
+    return {
+        (number, i): v
+        for (number, i), v in verdicts.items()
+        if streams[number].row.false is not None or streams[number].sparse[i]
+    }
+
+
 def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> Decisions:
     """Return what the graph builder needs of verdicts; what is in `without` is left out."""
-    return {
-        key: None if v.decision is None or key in without else (v.decision, v.at) for key, v in verdicts.items()
-    }
+    return {key: None if v.decision is None or key in without else (v.decision, v.at) for key, v in verdicts.items()}
 
 
 def pose_covariance(tree: Any) -> PoseCovariance:
