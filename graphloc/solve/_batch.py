@@ -14,7 +14,7 @@ An inertial sensor that contradicts the rest gets more noise, and 3 to 4 are don
 from __future__ import annotations
 
 from collections.abc import Callable, Container
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import gtsam
@@ -25,7 +25,16 @@ from graphloc.build import Decisions, Problem, StartPrior, build_graph, nav_stat
 from graphloc.errors import SolveError
 from graphloc.frames import Array, wrap_angle
 from graphloc.solve._align import Start, align, start_pose
-from graphloc.solve._decide import PoseCovariance, Verdicts, decisions, pose_covariance, thinned, weigh
+from graphloc.solve._decide import (
+    PoseCovariance,
+    Verdicts,
+    along_best_chains,
+    decisions,
+    log_evidence,
+    pose_covariance,
+    thinned,
+    weigh,
+)
 from graphloc.solve._optimize import bayes_tree, optimize
 
 _CHUNK_S, _OVERLAP_S = 12.0, 6.0
@@ -36,7 +45,7 @@ _WINDOW_SETTLED_M = 0.5
 _MAX_GROW_ROUNDS, _GROWN_SETTLED_M = 8, 2.0
 # A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
 # short enough to dead-reckon through.
-_STRETCH_S = 8.0
+_STRETCH_S, _STRETCH_MARGIN = 8.0, 0.5
 # Starts that cost this much more (log-likelihood) are dropped; while others live, the window grows.
 _COST_APART, _LONGEST_START_S = 8.0, 60.0
 # Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
@@ -125,9 +134,33 @@ class _Settled:
 
 
 def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress) -> _Settled:
-    """Re-choose modes and weights over the whole run until they stand."""
+    """Re-choose modes and weights over the whole run until they stand, and look for better choices.
+
+    Choices confirm themselves: the estimate follows them. So two others are tried: the most probable chain of
+    measurements that agree with each other, and what the run says of each stretch without its own.
+    The more probable solution is kept.
+    """
     last = len(problem.timeline) - 1
-    verdicts, iterations = _judged_by_the_rest(problem, estimate, prior)
+    settled = _settle(problem, estimate, weigh(problem, estimate, first=0, last=last, stage="final"), prior, progress)
+    for other in (_along_best_chains, _judged_by_the_rest):
+        verdicts, iterations = other(problem, settled, prior)
+        settled = replace(settled, iterations=settled.iterations + iterations)
+        if any(abs(verdicts[key].weight - v.weight) > 0.5 for key, v in settled.verdicts.items()):
+            tried = _settle(problem, settled.values, verdicts, prior, progress)
+            used = settled.iterations + tried.iterations
+            better = tried if _cost(problem, tried, prior) < _cost(problem, settled, prior) else settled
+            settled = replace(better, iterations=used, passes=settled.passes + tried.passes)
+    return settled
+
+
+def _along_best_chains(problem: Problem, settled: _Settled, prior: StartPrior) -> tuple[Verdicts, int]:
+    return along_best_chains(problem, settled.values, settled.verdicts), 0
+
+
+def _settle(
+    problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior, progress: Progress
+) -> _Settled:
+    last, iterations = len(problem.timeline) - 1, 0
     for n in range(_MAX_FINAL_PASSES):
         step = _pass(problem, estimate, verdicts, prior)
         estimate, iterations = step.values, iterations + step.iterations
@@ -139,36 +172,48 @@ def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, p
     return _Settled(estimate, step.graph, verdicts, n + 1, iterations, step.moved_m < 3 * _SETTLED_M)
 
 
-def _judged_by_the_rest(problem: Problem, estimate: gtsam.Values, prior: StartPrior) -> tuple[Verdicts, int]:
-    """Weigh each stretch's hypotheses by the solution of the run without that stretch's.
+def _cost(problem: Problem, settled: _Settled, prior: StartPrior) -> float:
+    """-log of the posterior, summed over all hypotheses."""
+    numbers = {s.number for s in problem.streams if s.row.false is not None}
+    hypotheses = {key for key in settled.verdicts if key[0] in numbers}
+    decided = decisions(settled.verdicts, hypotheses)
+    graph, guess = build_graph(problem, settled.values, decided, 0, len(problem.timeline) - 1, prior)
+    return float(graph.error(guess)) - log_evidence(problem, settled.values)
+
+
+def _judged_by_the_rest(problem: Problem, settled: _Settled, prior: StartPrior) -> tuple[Verdicts, int]:
+    """Weigh each stretch's hypotheses by the solution of the run without them and their neighbours.
 
     Hypotheses that took part in the estimate speak for themselves, and a wrong choice confirms itself. Every
-    second stretch is left out at once, so two solutions do for the whole run.
+    third stretch is judged at once, so three solutions do for the whole run.
     """
     last, start_ns = len(problem.timeline) - 1, int(problem.timeline.stamps_ns[0])
-    judged, iterations = weigh(problem, estimate, first=0, last=last, stage="final"), 0
-    halves: tuple[dict[tuple[int, int], int], ...] = ({}, {})  # measurement -> its state
-    for stream in problem.streams:
-        if stream.row.false is not None:
-            for i, m in enumerate(stream.measurements):
-                half = int((m.stamp_ns - start_ns) * 1e-9 / _STRETCH_S) % 2
-                halves[half][(stream.number, i)] = int(stream.state[i])
-    if not all(halves):  # nothing to judge, or nothing to judge it by
-        return judged, iterations
+    judged, iterations = dict(settled.verdicts), 0
+    at_s = {  # time of each hypothesis in the run
+        (s.number, i): (m.stamp_ns - start_ns) * 1e-9
+        for s in problem.streams
+        if s.row.false is not None
+        for i, m in enumerate(s.measurements)
+    }
     everything = thinned(problem, judged)
-    for left_out in halves:
-        step = _pass(problem, estimate, everything, prior, without=left_out)
-        predicted, states = pose_covariance(bayes_tree(step.graph, step.values)), set(left_out.values())
+    for third in range(3):
+        own = {key for key, t in at_s.items() if int(t / _STRETCH_S) % 3 == third}
+        around = {
+            key for key, t in at_s.items() if (t / _STRETCH_S - third + _STRETCH_MARGIN) % 3 < 1 + 2 * _STRETCH_MARGIN
+        }
+        if not own or len(around) == len(at_s):  # nothing to judge, or nothing to judge it by
+            continue
+        step = _pass(problem, settled.values, everything, prior, without=around)
         fresh = weigh(
             problem,
             step.values,
             first=0,
             last=last,
             stage="final",
-            covariance=lambda k, P=predicted, states=states: P(k) if k in states else None,  # type: ignore[misc]
-            only_hypotheses=True,
+            covariance=pose_covariance(bayes_tree(step.graph, step.values)),
+            only=own,
         )
-        judged.update({key: fresh[key] for key in left_out})
+        judged.update(fresh)
         iterations += step.iterations
     return judged, iterations
 

@@ -21,7 +21,8 @@ from graphloc import keys
 from graphloc.build import Decisions, Problem, Stream, attach
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, FalseModel, Residual
+from graphloc.graph import Attachment, Decision, Residual
+from graphloc.solve._hypotheses import best_chain, sequence_of
 
 # By stage, for every sensor that has a kernel at all: Huber is convex, so a start that is tens of metres
 # off still pulls in; Cauchy forgets outliers better and still lets the truth back in.
@@ -87,7 +88,7 @@ def weigh(
     covariance: PoseCovariance = lambda _state: None,
     hypotheses: bool = True,
     sparse: bool = False,
-    only_hypotheses: bool = False,
+    only: Container[tuple[int, int]] | None = None,
 ) -> Verdicts:
     """Decide about the measurements of states first..last.
 
@@ -99,14 +100,16 @@ def weigh(
         hypotheses: weigh sensors that can be false by their hypotheses; else by the stage's kernel, on the
             nearest mode.
         sparse: thin sensors without hypotheses to one measurement for each slow node.
-        only_hypotheses: leave those sensors out altogether.
+        only: decide about these alone, all of sensors that can be false.
     """
     verdicts: Verdicts = {}
     for stream in problem.streams:
         several = stream.row.false is not None
-        if only_hypotheses and not several:
+        if only is not None and not several:
             continue
         indices = [i for i in stream.between(first, last) if several or not sparse or stream.sparse[i]]
+        if only is not None:
+            indices = [i for i in indices if (stream.number, i) in only]
         if not indices:
             continue
         attached = [attach(problem, stream, i, values) for i in indices]
@@ -123,6 +126,13 @@ def weigh(
             found = _by_kernel(stream, attached, residuals, stage)
         verdicts.update({(stream.number, i): v for i, v in zip(indices, found, strict=True)})
     return verdicts
+
+
+def _residuals_at(
+    problem: Problem, stream: Stream, i: int, values: gtsam.Values
+) -> tuple[Attachment, tuple[Residual, ...]]:
+    at = attach(problem, stream, i, values)
+    return at, stream.row.residuals(stream.measurements[i], stream.config, at)
 
 
 def _by_kernel(
@@ -161,88 +171,42 @@ def _by_hypotheses(
     residuals: list[tuple[Residual, ...]],
     predicted: list[Array | None],
 ) -> list[Verdict]:
-    """Posterior of 'right' and 'false' along the sequence of one sensor's measurements.
-
-    A false measurement's error is drawn anew, or repeats that of the false one before it. So right and false
-    form a chain of two states, and forward-backward gives each posterior exactly: without the repeats, six
-    scans that take the same wrong boat for the right one outweigh IMU and GNSS together.
-    """
-    assert stream.row.false is not None
-    modes = [np.array([r.log_density(P) for r in found]) for found, P in zip(residuals, predicted, strict=True)]
-    right = np.array([_log_sum(logs) for logs in modes])
-    models = [stream.row.false(stream.measurements[i], stream.config) for i in indices]
-    fresh = np.array([_log_false(*args) for args in zip(residuals, models, predicted, strict=True)])
-    after_false = np.array(
-        [fresh[0]]
-        + [
-            np.logaddexp(
-                np.log1p(-model.repeats) + fresh[n],
-                np.log(max(model.repeats * model.probability, 1e-12)) + _log_repeat(residuals[n - 1], residuals[n]),
-            )
-            for n, model in enumerate(models)
-            if n > 0
-        ]
-    )
-    posterior = _forward_backward(right, fresh, after_false)
+    posterior = sequence_of(stream, indices, residuals, predicted).posterior()
     verdicts = []
-    for n, logs in enumerate(modes):
+    for n, found in enumerate(residuals):
+        logs = np.array([r.log_density(predicted[n]) for r in found])
         mode = int(np.argmax(logs))
-        share = float(np.exp(logs[mode] - right[n]))
+        share = float(np.exp(logs[mode] - np.logaddexp.reduce(logs)))
         weight = float(posterior[n]) * share
         kept = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
-        verdicts.append(Verdict(kept, weight, share, residuals[n][mode], mode, attached[n]))
+        verdicts.append(Verdict(kept, weight, share, found[mode], mode, attached[n]))
     return verdicts
 
 
-def _log_sum(logs: Array) -> float:
-    return float(np.logaddexp.reduce(logs))
+def log_evidence(problem: Problem, values: gtsam.Values) -> float:
+    """Log probability of all hypotheses together, around an estimate."""
+    total = 0.0
+    for stream in problem.streams:
+        if stream.row.false is not None:
+            indices = range(len(stream.measurements))
+            residuals = [_residuals_at(problem, stream, i, values)[1] for i in indices]
+            total += sequence_of(stream, indices, residuals, [None] * len(indices)).log_evidence()
+    return total
 
 
-def _log_gauss(raw: Array, cov: Array) -> float:
-    logdet = np.linalg.slogdet(2.0 * np.pi * cov)[1]
-    return float(-0.5 * (raw @ np.linalg.solve(cov, raw) + logdet))
-
-
-def _log_false(found: tuple[Residual, ...], model: FalseModel, P: Array | None) -> float:
-    """Log of P(false) x density, over the modes. The prediction's covariance widens it as it does the right one's."""
-    around = model.cov if P is None else model.cov + P
-    share = np.log([r.prior for r in found]) - np.log(sum(r.prior for r in found))
-    logs = share + np.array([_log_gauss(r.raw, r.cov + around) for r in found])
-    return float(np.log(model.probability)) + _log_sum(logs)
-
-
-def _log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...]) -> float:
-    """Log density of seeing the error of one measurement again in the next, over pairs of modes."""
-    if len(before[0].raw) != len(now[0].raw):
-        return -np.inf
-    total = np.log(sum(r.prior for r in before) * sum(r.prior for r in now))
-    logs = [np.log(a.prior * b.prior) + _log_gauss(a.raw - b.raw, a.cov + b.cov) for a in before for b in now]
-    return float(_log_sum(np.array(logs)) - total)
-
-
-def _forward_backward(right: Array, fresh: Array, after_false: Array) -> Array:
-    """Posterior (N,) of 'right' in a chain of right and false.
-
-    Args:
-        right: (N,) log density x prior of 'right'. fresh, after_false: (N,) of 'false', after a right one and
-            after a false one.
-    """
-    count = len(right)
-    ahead = np.zeros((count, 2))
-    ahead[0] = right[0], fresh[0]
-    for n in range(1, count):
-        r, f = ahead[n - 1] - ahead[n - 1].max()
-        ahead[n] = right[n] + np.logaddexp(r, f), np.logaddexp(r + fresh[n], f + after_false[n])
-    back = np.zeros((count, 2))
-    for n in range(count - 2, -1, -1):
-        r, f = back[n + 1]
-        back[n] = (
-            np.logaddexp(right[n + 1] + r, fresh[n + 1] + f),
-            np.logaddexp(right[n + 1] + r, after_false[n + 1] + f),
-        )
-        back[n] -= back[n].max()
-    both = ahead + back
-    return np.asarray(np.exp(both[:, 0] - np.logaddexp(both[:, 0], both[:, 1])))
+def along_best_chains(problem: Problem, values: gtsam.Values, verdicts: Verdicts) -> Verdicts:
+    """Return the verdicts that believe each sensor's most probable chain, wherever it lies."""
+    changed = dict(verdicts)
+    for stream in problem.streams:
+        if stream.row.false is None:
+            continue
+        met = [_residuals_at(problem, stream, i, values) for i in range(len(stream.measurements))]
+        for i, mode in enumerate(best_chain(stream, [residuals for _, residuals in met])):
+            at, residuals = met[i]
+            chosen = 0 if mode is None else mode
+            kept = None if mode is None else Decision(mode=mode)
+            changed[(stream.number, i)] = Verdict(kept, float(mode is not None), 1.0, residuals[chosen], chosen, at)
+    return changed
 
 
 def thinned(problem: Problem, verdicts: Verdicts) -> Verdicts:
