@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
+from graphloc.config import ImuConfig
 from graphloc.frames import Array
 from graphloc.measurements import ImuSeries
 
@@ -34,7 +34,9 @@ _GAP_ACCEL, _GAP_GYRO = 1.0, 0.2
 class Links:
     """Preintegration of one IMU (see `graphloc.graph.InertialLink`)."""
 
-    def __init__(self, imu: ImuSeries, config: ImuConfig, R_body_imu: Array, noise_scale: float) -> None:
+    def __init__(
+        self, imu: ImuSeries, config: ImuConfig, R_body_imu: Array, gravity_mps2: float, noise_scale: float
+    ) -> None:
         self._stamps = imu.stamps_ns
         self._samples = np.hstack([imu.accel_mps2, imu.gyro_radps])
         self._config = config
@@ -42,6 +44,7 @@ class Links:
         self._max_gap_ns = int(config.max_gap_s * 1e9)
         mount = gtsam.Pose3(gtsam.Rot3(R_body_imu), np.zeros(3))
         self._noise_scale = noise_scale
+        self._gravity_mps2 = gravity_mps2 if config.gravity == "included" else 0.0
         self._params = self._make_params(
             config.accel_noise_mps2 * noise_scale, config.gyro_noise_radps * noise_scale, mount
         )
@@ -49,8 +52,7 @@ class Links:
 
     def _make_params(self, accel: float, gyro: float, mount: Any) -> Any:
         # Every covariance of fresh params is 1.0: set them all.
-        gravity = STANDARD_GRAVITY_MPS2 if self._config.gravity == "included" else 0.0
-        params = gtsam.PreintegrationParams.MakeSharedU(gravity)
+        params = gtsam.PreintegrationParams.MakeSharedU(self._gravity_mps2)
         params.setAccelerometerCovariance(np.eye(3) * accel**2)
         params.setGyroscopeCovariance(np.eye(3) * gyro**2)
         params.setIntegrationCovariance(np.eye(3) * _INTEGRATION_SIGMA**2)
@@ -117,9 +119,11 @@ class ImuRow:
     kind = "imu"
     config = ImuConfig
 
-    def link(self, imu: ImuSeries, config: ImuConfig, R_body_imu: Array, noise_scale: float = 1.0) -> Links:
+    def link(
+        self, imu: ImuSeries, config: ImuConfig, R_body_imu: Array, gravity_mps2: float, noise_scale: float = 1.0
+    ) -> Links:
         """Return the links of one IMU."""
-        return Links(imu, config, R_body_imu, noise_scale)
+        return Links(imu, config, R_body_imu, gravity_mps2, noise_scale)
 
 
 ROW = ImuRow()

@@ -108,7 +108,7 @@ def make_problem(
     t_body_imu, R = mount_of(imu.sensor, imu_config, recording)
 
     def relink(noise_scale: float) -> InertialLink:
-        return inertial.link(imu, imu_config, R, noise_scale)
+        return inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale)
 
     links = relink(1.0)
     start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])

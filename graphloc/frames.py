@@ -72,6 +72,13 @@ class Datum:
         )
         return np.column_stack([e, n, u])
 
+    @property
+    def gravity_mps2(self) -> float:
+        """Normal gravity at the origin: Somigliana's formula on GRS 80, less 3.086e-6 /s^2 of height."""
+        sin2 = float(np.sin(np.radians(self.origin.latitude_deg))) ** 2
+        on_ellipsoid = 9.7803267715 * (1.0 + 0.001931851353 * sin2) / float(np.sqrt(1.0 - 0.0066943800229 * sin2))
+        return on_ellipsoid - 3.086e-6 * self.origin.height_m
+
     def geodetic_from_enu(self, p_world_m: Array) -> Array:
         """Return (N, 3) latitude deg, longitude deg, height m of positions (N, 3) in world."""
         p = np.atleast_2d(p_world_m)

@@ -181,7 +181,9 @@ class InertialRow(Protocol):
     kind: str
     config: type[SensorConfig]
 
-    def link(self, imu: ImuSeries, config: Any, R_body_imu: Array, noise_scale: float = 1.0) -> InertialLink:
+    def link(
+        self, imu: ImuSeries, config: Any, R_body_imu: Array, gravity_mps2: float, noise_scale: float = 1.0
+    ) -> InertialLink:
         """Return the links that one IMU gives, its noise densities scaled."""
         ...
 

@@ -211,7 +211,7 @@ def _config(
 
 
 def _imu(s: Scenario, motion: Motion, t: Array, mount: tuple[Array, Array], rng: np.random.Generator) -> ImuSeries:
-    force, rate = motion.inertial(t, mount[0], STANDARD_GRAVITY_MPS2)
+    force, rate = motion.inertial(t, mount[0], Datum(DATUM).gravity_mps2)
     defaults = ImuConfig()
     root = np.sqrt(s.imu_hz)
 

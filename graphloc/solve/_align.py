@@ -239,12 +239,10 @@ def _turns(problem: Problem, span_s: float, bias: Array) -> Callable[[float], Ar
     span = float((problem.imu.stamps_ns[-1] - problem.imu.stamps_ns[0]) * 1e-9)
     t, _, w = _samples(problem, 0.0, min(span_s, span))
     R = np.empty((len(t), 3, 3))
-    current = Rotation.identity()
     R[0] = np.eye(3)
-    steps = Rotation.from_rotvec((0.5 * (w[:-1] + w[1:]) - bias) * np.diff(t)[:, None])
-    for i in range(len(steps)):
-        current = current * steps[i]
-        R[i + 1] = current.as_matrix()
+    steps = Rotation.from_rotvec((0.5 * (w[:-1] + w[1:]) - bias) * np.diff(t)[:, None]).as_matrix()
+    for i, step in enumerate(steps):
+        R[i + 1] = R[i] @ step
     return lambda s: np.asarray(R[int(np.clip(np.searchsorted(t, s), 0, len(t) - 1))])
 
 

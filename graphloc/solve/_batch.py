@@ -46,6 +46,7 @@ _MAX_GROW_ROUNDS, _GROWN_SETTLED_M = 8, 2.0
 # A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
 # short enough to dead-reckon through.
 _STRETCH_S, _STRETCH_MARGIN = 8.0, 0.5
+_FEW = 3  # hypotheses off their best chain are a matter of the last digit, not of another place
 # Starts that cost this much more (log-likelihood) are dropped; while others live, the window grows.
 _COST_APART, _LONGEST_START_S = 8.0, 60.0
 # Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
@@ -142,10 +143,11 @@ def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, p
     """
     last = len(problem.timeline) - 1
     settled = _settle(problem, estimate, weigh(problem, estimate, first=0, last=last, stage="final"), prior, progress)
-    for other in (_along_best_chains, _judged_by_the_rest):
+    for other, few in ((_along_best_chains, _FEW), (_judged_by_the_rest, 0)):
         verdicts, iterations = other(problem, settled, prior)
         settled = replace(settled, iterations=settled.iterations + iterations)
-        if any(abs(verdicts[key].weight - v.weight) > 0.5 for key, v in settled.verdicts.items()):
+        differ = sum(abs(verdicts[key].weight - v.weight) > 0.5 for key, v in settled.verdicts.items())
+        if differ > few:
             tried = _settle(problem, settled.values, verdicts, prior, progress)
             used = settled.iterations + tried.iterations
             better = tried if _cost(problem, tried, prior) < _cost(problem, settled, prior) else settled
@@ -203,7 +205,7 @@ def _judged_by_the_rest(problem: Problem, settled: _Settled, prior: StartPrior) 
         }
         if not own or len(around) == len(at_s):  # nothing to judge, or nothing to judge it by
             continue
-        step = _pass(problem, settled.values, everything, prior, without=around)
+        step = _pass(problem, settled.values, everything, prior, without=around, tol=1e-2)
         fresh = weigh(
             problem,
             step.values,
@@ -248,10 +250,11 @@ def _pass(
     *,
     without: Container[tuple[int, int]] = (),
     jumps: bool = True,
+    tol: float = 1e-4,
 ) -> _Step:
     last = len(problem.timeline) - 1
     graph, guess = build_graph(problem, estimate, decisions(verdicts, without), 0, last, prior, jumps=jumps)
-    solved = optimize(graph, guess, 12)
+    solved = optimize(graph, guess, 12, tol)
     return _Step(solved.values, graph, solved.iterations, _moved(guess, solved.values, 0, last))
 
 

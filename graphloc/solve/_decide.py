@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -139,9 +140,10 @@ def _by_kernel(
     stream: Stream, attached: list[Attachment], residuals: list[tuple[Residual, ...]], stage: str
 ) -> list[Verdict]:
     """The sensor's own kernel, or the stage's where that one is gentler."""
-    nis = [[r.nis() for r in found] for found in residuals]
-    mode = [int(np.argmin(n)) for n in nis]
-    best = [n[m] for n, m in zip(nis, mode, strict=True)]
+    nis = _nis([r for found in residuals for r in found])
+    starts = np.cumsum([0, *(len(found) for found in residuals)])
+    mode = [int(np.argmin(nis[a:b])) for a, b in pairwise(starts)]
+    best = [float(nis[a + m]) for a, m in zip(starts, mode, strict=False)]
     own, limit = stream.config.kernel, _STAGE_KERNEL.get(stage, stream.config.kernel)
     gentle = _CONVEXITY.index(own.kind) <= _CONVEXITY.index(limit.kind)
     # The norm of k whitened residuals is about sqrt(k) where all is well: bend that much later.
@@ -152,6 +154,14 @@ def _by_kernel(
         Verdict(Decision(mode=m, kernel=kernel), kernel_weight(n, kernel), 1.0, found[m], m, at)
         for m, n, found, at in zip(mode, best, residuals, attached, strict=True)
     ]
+
+
+def _nis(residuals: list[Residual]) -> Array:
+    """Squared normalised residuals, in one call where they have the same shape."""
+    if len({len(r.raw) for r in residuals}) > 1:
+        return np.array([r.nis() for r in residuals])
+    raw = np.array([r.raw for r in residuals])
+    return np.asarray(np.einsum("ni,ni->n", raw, np.linalg.solve([r.cov for r in residuals], raw[:, :, None])[:, :, 0]))
 
 
 def _spread(nis: list[float], dof: int) -> float:
