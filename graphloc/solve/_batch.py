@@ -46,7 +46,7 @@ _MAX_GROW_ROUNDS, _GROWN_SETTLED_M = 8, 2.0
 # A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
 # short enough to dead-reckon through.
 _STRETCH_S, _STRETCH_MARGIN = 8.0, 0.5
-_FEW = 3  # hypotheses off their best chain are a matter of the last digit, not of another place
+_FEW = 3  # choices off the best chain are a matter of the last digit, not of another place
 # Starts that cost this much more (log-likelihood) are dropped; while others live, the window grows.
 _COST_APART, _LONGEST_START_S = 8.0, 60.0
 # Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
@@ -146,13 +146,21 @@ def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, p
     for other, few in ((_along_best_chains, _FEW), (_judged_by_the_rest, 0)):
         verdicts, iterations = other(problem, settled, prior)
         settled = replace(settled, iterations=settled.iterations + iterations)
-        differ = sum(abs(verdicts[key].weight - v.weight) > 0.5 for key, v in settled.verdicts.items())
-        if differ > few:
-            tried = _settle(problem, settled.values, verdicts, prior, progress)
-            used = settled.iterations + tried.iterations
-            better = tried if _cost(problem, tried, prior) < _cost(problem, settled, prior) else settled
-            settled = replace(better, iterations=used, passes=settled.passes + tried.passes)
+        if _differ(verdicts, settled.verdicts) <= few:
+            continue
+        tried = _settle(problem, settled.values, verdicts, prior, progress, known=settled.verdicts)
+        used, passes = settled.iterations + tried.iterations, settled.passes + tried.passes
+        if _differ(tried.verdicts, settled.verdicts) > 0 and _cost(problem, tried, prior) < _cost(
+            problem, settled, prior
+        ):
+            settled = tried
+        settled = replace(settled, iterations=used, passes=passes)
     return settled
+
+
+def _differ(some: Verdicts, others: Verdicts) -> int:
+    """How many measurements are believed in the one and not in the other."""
+    return sum(abs(some[key].weight - v.weight) > 0.5 for key, v in others.items())
 
 
 def _along_best_chains(problem: Problem, settled: _Settled, prior: StartPrior) -> tuple[Verdicts, int]:
@@ -160,8 +168,15 @@ def _along_best_chains(problem: Problem, settled: _Settled, prior: StartPrior) -
 
 
 def _settle(
-    problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior, progress: Progress
+    problem: Problem,
+    estimate: gtsam.Values,
+    verdicts: Verdicts,
+    prior: StartPrior,
+    progress: Progress,
+    *,
+    known: Verdicts | None = None,
 ) -> _Settled:
+    """Passes until modes and weights stand, or are those of the `known` solution again."""
     last, iterations = len(problem.timeline) - 1, 0
     for n in range(_MAX_FINAL_PASSES):
         step = _pass(problem, estimate, verdicts, prior)
@@ -169,7 +184,7 @@ def _settle(
         used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage="final")
         changed = max((abs(v.weight - used[key].weight) for key, v in verdicts.items()), default=0.0)
         progress("final passes", n + 1, _MAX_FINAL_PASSES)
-        if step.moved_m < _SETTLED_M and changed < _SETTLED_WEIGHT:
+        if (step.moved_m < _SETTLED_M and changed < _SETTLED_WEIGHT) or (known and not _differ(verdicts, known)):
             break
     return _Settled(estimate, step.graph, verdicts, n + 1, iterations, step.moved_m < 3 * _SETTLED_M)
 
