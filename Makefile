@@ -3,8 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-# `types` is not yet clean, and not yet part of check
-.PHONY: demo test check types bench results clean
+.PHONY: demo test check bench results clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -23,8 +22,6 @@ test: $(STAMP)
 check: $(STAMP)
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
-
-types: $(STAMP)
 	@$(BIN)/mypy
 
 bench: $(STAMP)

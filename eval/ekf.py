@@ -89,7 +89,7 @@ def _inputs(recording: Recording, config: VesselConfig, rate_hz: float) -> _Inpu
     # A planar filter knows no attitude: it removes what tilt leaves of gravity with a slow mean (20 s).
     window = min(int(20.0 * rate_hz), len(mean))
     smooth = np.column_stack([np.convolve(mean[:, i], np.ones(window) / window, "same") for i in range(2)])
-    events = []
+    events: list[tuple[int, Measurement, Array, float]] = []
     for m in recording.measurements:
         if isinstance(m, GnssPosition | CompassHeading | PoseFix):
             t, R_mount = mount_of(m.sensor, config.sensors[m.sensor], recording)
@@ -275,7 +275,8 @@ def _planar(inputs: _Inputs, out: list[tuple[Array, Array]], recording: Recordin
     R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = c, -s, s, c, 1.0
     cov = np.zeros((n, 6, 6))
     index = np.array([0, 1, 4])
-    cov[np.ix_(range(n), [0, 1, 5], [0, 1, 5])] = P[np.ix_(range(n), index, index)]
+    every = np.arange(n)
+    cov[np.ix_(every, np.array([0, 1, 5]), np.array([0, 1, 5]))] = P[np.ix_(every, index, index)]
     cov[:, 2, 2], cov[:, 3, 3], cov[:, 4, 4] = 1.0, 0.01, 0.01
     v = np.column_stack([c * x[:, 2] - s * x[:, 3], s * x[:, 2] + c * x[:, 3], np.zeros(n)])
     return Trajectory(

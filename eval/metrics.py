@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from graphloc.frames import Array, Datum, wrap_angle
@@ -64,7 +65,7 @@ class TruthMetrics:
     matched: float
 
 
-def errors(estimate: Trajectory, truth: Trajectory) -> tuple[Array, Array, Array, Trajectory, float]:
+def errors(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], Array, Array, Trajectory, float]:
     """Return t (M,) ns, position error (M, 3) m, heading error (M,) rad, the estimate there, matched share."""
     covered = estimate.covers(truth.stamps_ns)
     stamps = truth.stamps_ns[covered]
@@ -119,7 +120,7 @@ class HeldOutMetrics:
 
 def held_out_errors(
     estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, lever_m: Array
-) -> tuple[Array, Array, float]:
+) -> tuple[NDArray[np.int64], Array, float]:
     """Return stamps (M,), error (M, 3) of the predicted antenna, and the matched share."""
     stamps = np.array([m.stamp_ns for m in held], dtype=np.int64)
     positions = np.array([m.position for m in held])

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import plotly.graph_objects as go
+from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from graphloc.eval.ekf import FilterResult
@@ -217,7 +218,7 @@ def residuals_over_time(solution: Solution) -> go.Figure:
 
 def slow_over_time(solution: Solution) -> go.Figure:
     """Estimated slow states (GNSS error, compass offset) with 95 % bands, and IMU biases."""
-    panels = [
+    panels: list[tuple[str, NDArray[np.int64], Array, Array | None, tuple[str, ...]]] = [
         (f"{s}: {e.name}, {e.unit}", e.stamps_ns, e.value, 1.96 * e.sigma, e.axes) for s, e in solution.slow.items()
     ]
     stamps, axes = solution.trajectory.stamps_ns, ("x", "y", "z")

@@ -12,7 +12,7 @@ from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Decision
 
-_LOSSES = {
+_LOSSES: dict[str, Any] = {
     "huber": gtsam.noiseModel.mEstimator.Huber,
     "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
     "geman_mcclure": gtsam.noiseModel.mEstimator.GemanMcClure,
@@ -24,7 +24,7 @@ def noise_model(cov: Array, decision: Decision) -> Any:
     """Return a noise model of covariance (k, k) / weight, under the decision's kernel."""
     scaled = np.asarray(cov) / decision.weight
     if np.count_nonzero(scaled - np.diag(np.diagonal(scaled))) == 0:
-        base = gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(np.diagonal(scaled)))
+        base: Any = gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(np.diagonal(scaled)))
     else:
         base = gtsam.noiseModel.Gaussian.Covariance(scaled)
     return robust(base, decision.kernel)

@@ -31,12 +31,12 @@ def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
     """Covariance (3, 3) of the white part: reported, scaled, with floors, m^2."""
     cov = np.array(m.cov_enu_m2) * config.sigma_scale**2
     floors = np.array([config.min_horizontal_sigma_m] * 2 + [config.min_vertical_sigma_m]) ** 2
-    return cov + np.diag(np.maximum(floors - np.diagonal(cov), 0.0))
+    return np.asarray(cov + np.diag(np.maximum(floors - np.diagonal(cov), 0.0)))
 
 
 @lru_cache(maxsize=1 << 18)
 def _world_m(position: Geodetic, datum: Datum) -> Array:
-    return datum.enu_from_geodetic(*(np.array([v]) for v in position))[0]
+    return np.asarray(datum.enu_from_geodetic(*(np.array([v]) for v in position))[0])
 
 
 def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:

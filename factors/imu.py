@@ -75,7 +75,7 @@ class Links:
                 pim.integrateMeasurement(sample[:3], sample[3:], dt)
         return pim
 
-    def _at(self, stamps_ns: Array) -> Array:
+    def _at(self, stamps_ns: NDArray[np.int64]) -> Array:
         """Samples (M, 6) interpolated at stamps; held beyond the ends."""
         right = np.clip(np.searchsorted(self._stamps, stamps_ns), 1, len(self._stamps) - 1)
         a, b = self._stamps[right - 1], self._stamps[right]
@@ -100,7 +100,8 @@ class Links:
     def bias_steps(self, dt_s: float) -> Array:
         """Return sigmas (6,) of the random walk over `dt_s`."""
         c = self._config
-        return np.array([c.accel_bias_walk_mps2] * 3 + [c.gyro_bias_walk_radps] * 3) * np.sqrt(dt_s) * self._noise_scale
+        sigmas = np.array([c.accel_bias_walk_mps2] * 3 + [c.gyro_bias_walk_radps] * 3)
+        return np.asarray(sigmas * np.sqrt(dt_s) * self._noise_scale)
 
     def bias_sigmas(self) -> Array:
         """Return turn-on sigmas (6,)."""

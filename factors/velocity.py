@@ -23,7 +23,7 @@ from graphloc.measurements import GnssVelocity
 
 def _covariance(m: GnssVelocity, config: VelocityConfig) -> Array:
     cov = np.array(m.cov_m2ps2)
-    return cov + np.diag(np.maximum(config.min_sigma_mps**2 - np.diagonal(cov), 0.0))
+    return np.asarray(cov + np.diag(np.maximum(config.min_sigma_mps**2 - np.diagonal(cov), 0.0)))
 
 
 def _added_mps(at: Attachment) -> Array:

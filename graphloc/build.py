@@ -356,7 +356,7 @@ def _add_slow_chain(
         dt = _node_dt_s(problem, j)
         # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
         step = slow.sigma * (1e-4 if constant else np.sqrt(2.0 * dt / slow.time_constant_s))
-        model = diagonal(step)
+        model: Any = diagonal(step)
         if slow.jumps and jumps:
             loss = gtsam.noiseModel.mEstimator.Cauchy.Create(_JUMP.scale)
             model = gtsam.noiseModel.Robust.Create(loss, model)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -77,9 +78,11 @@ def _smooth(
     bag: list[Path], config: Path, out: Path, hold_out: str | None, overwrite: bool, as_json: bool, compare: bool
 ) -> None:
     from graphloc import app as application
+    from graphloc import outputs
     from graphloc.eval.holdout import HoldOut
 
     held = None if hold_out is None else HoldOut.parse(hold_out)
+    outputs.check_folder(out, overwrite=overwrite)
     show = _progress()
     recording, vessel = application.load(bag, config, show)
     run = application.smooth_recording(recording, vessel, hold_out=held, compare=compare, progress=show)
@@ -210,8 +213,8 @@ def main() -> None:
         print(f"graphloc: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        print("graphloc: interrupted; nothing was left half-written", file=sys.stderr)
-        sys.exit(130)
+        print("graphloc: interrupted; nothing was left half-written", file=sys.stderr, flush=True)
+        os._exit(130)  # at once: the solver's thread may be deep in a step that cannot be stopped
 
 
 if __name__ == "__main__":

@@ -179,7 +179,11 @@ class InertialRow(Protocol):
     """The row of the inertial sensor: it links states instead of measuring one."""
 
     kind: str
-    config: type[SensorConfig]
+
+    @property
+    def config(self) -> type[SensorConfig]:
+        """The class of its configuration."""
+        ...
 
     def link(
         self, imu: ImuSeries, config: Any, R_body_imu: Array, gravity_mps2: float, noise_scale: float = 1.0

@@ -332,6 +332,7 @@ def test_kitti_example(tmp_path: Path, flags: list[str]) -> None:
     assert (len(recording.imu), len(recording.measurements), recording.warnings) == (46967, 470, ())
     fixes = [m.position for m in recording.measurements if isinstance(m, GnssPosition)]
     enu = Datum(config.datum.geodetic).enu_from_geodetic(*np.array(fixes).T)
-    expected = np.loadtxt(gtsam.findExampleDataFile("KittiGps_converted.txt"), skiprows=1, delimiter=",")
+    example = gtsam.findExampleDataFile("KittiGps_converted.txt")  # type: ignore[no-untyped-call]
+    expected = np.loadtxt(example, skiprows=1, delimiter=",")
     np.testing.assert_allclose(enu, expected[:, 1:4], atol=1e-3)
     np.testing.assert_allclose(np.diff([m.stamp_ns for m in recording.measurements]) / S, np.diff(expected[:, 0]))

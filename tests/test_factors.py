@@ -1,6 +1,7 @@
 """Conformance of every row of the sensor table, from the table (style rule 27)."""
 
 from dataclasses import replace
+from typing import Any, cast
 
 import gtsam
 import numpy as np
@@ -10,6 +11,7 @@ from graphloc.config import KernelConfig
 from graphloc.factors import KINDS, SENSORS
 from graphloc.frames import Datum, Geodetic
 from graphloc.graph import Attachment, Decision, Sensor
+from graphloc.measurements import CompassHeading
 
 DATUM = Datum(Geodetic(59.3, 18.1, 20.0))
 RNG = np.random.default_rng(3)
@@ -36,7 +38,7 @@ def attachment(row: Sensor, config: object, *, tilt: float = 0.1, far_m: float =
     )
 
 
-def values_of(at: Attachment, guesses: tuple[tuple[int, object], ...]) -> gtsam.Values:
+def values_of(at: Attachment, guesses: tuple[tuple[int, Any], ...]) -> gtsam.Values:
     values = gtsam.Values()
     values.insert(at.pose_key, at.T_world_body)
     values.insert(at.velocity_key, at.v_world_mps)
@@ -126,7 +128,7 @@ def test_residual_jacobian_of_the_pose(row: Sensor) -> None:
 
 def test_one_metre_east_of_a_fix_is_one_metre_of_residual() -> None:
     row = next(r for r in SENSORS if r.kind == "gnss")
-    config = row.config(kind="gnss", mount={"xyz_m": [0, 0, 0]})
+    config = row.config(kind="gnss")
     at = attachment(row, config)
     m = row.ideal(at, config)
     east = gtsam.Pose3(at.T_world_body.rotation(), at.T_world_body.translation() + np.array([1.0, 0.0, 0.0]))
@@ -140,7 +142,7 @@ def test_compass_sign_and_wrap() -> None:
     config = row.config(kind="compass")
     at = replace(attachment(row, config, tilt=0.0, slow=False), T_state_sensor=gtsam.Pose3())
     at = replace(at, T_world_body=gtsam.Pose3(gtsam.Rot3.Yaw(np.pi - 0.01), np.zeros(3)))
-    m = replace(row.ideal(at, config), yaw_rad=-np.pi + 0.01)  # 0.02 rad further, across the wrap
+    m = replace(cast(CompassHeading, row.ideal(at, config)), yaw_rad=-np.pi + 0.01)  # 0.02 rad further, across the wrap
     assert row.residuals(m, config, at)[0].raw[0] == pytest.approx(-0.02)
 
 

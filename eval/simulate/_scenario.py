@@ -95,7 +95,7 @@ class SimulatedRun:
 
 def bl_scenario(case: int, noise: GnssNoise, *, false_fraction: float = 0.4) -> Scenario:
     """Return BL's case 1, 2 or 3 with its GNSS noise."""
-    path: Literal["entry", "turn", "still"] = ("entry", "turn", "still")[case - 1]  # type: ignore[assignment]
+    path: Literal["entry", "turn", "still"] = ("entry", "turn", "still")[case - 1]
     base = Scenario(path=path, case=case, noise=noise, false_fraction=false_fraction)
     if case == 3:
         return replace(base, duration_s=60.0, wave_roll_deg=4.0, wave_pitch_deg=2.0, wave_heave_m=0.2)
@@ -290,7 +290,7 @@ def _poses(s: Scenario, motion: Motion, rng: np.random.Generator) -> list[Measur
         order = rng.permutation(len(values))
         modes = tuple(
             PoseMode(
-                value=[values[k][0], values[k][1], float(wrap_angle(values[k][2]))],
+                value=np.array([values[k][0], values[k][1], float(wrap_angle(values[k][2]))]),
                 cov=np.diag(sigmas**2),
                 probability=1.0 / len(values),
             )

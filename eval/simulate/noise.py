@@ -32,7 +32,7 @@ def gnss_error_m(rng: np.random.Generator, t: Array, kind: GnssNoise, case: int,
     """Return the error (N, 3) of fixes at t (N,), white noise included; height drifts along at 1.5 times."""
     error = rng.normal(0.0, white_sigma_m, (len(t), 3)) * np.array([1.0, 1.0, 2.0])
     if kind == "clean":
-        return error
+        return np.asarray(error)
     white = np.sqrt(2.0) * white_sigma_m
     scale = _QUIET_DRIFT if kind == "jump" else 1.0
     size = scale * float(np.sqrt(max(BL_DRIFT_RMSE_M[case] ** 2 - white**2, 0.01)))
@@ -52,4 +52,4 @@ def gnss_error_m(rng: np.random.Generator, t: Array, kind: GnssNoise, case: int,
         along = drift[int(np.argmax(during))]
         direction = float(np.arctan2(along[1], along[0])) + rng.normal(0.0, 0.3)
         error[during, :2] += height * np.array([np.cos(direction), np.sin(direction)])
-    return error
+    return np.asarray(error)

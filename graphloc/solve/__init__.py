@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from graphloc.build import make_problem
 from graphloc.config import VesselConfig
@@ -15,6 +17,9 @@ from graphloc.solve._batch import solve_batch
 from graphloc.solve._solution import make_solution
 
 __all__ = ["smooth"]
+
+_T = TypeVar("_T")
+_STACK_BYTES = 1 << 29  # address space, not memory: pages are taken when touched
 
 
 def smooth(
@@ -36,5 +41,32 @@ def smooth(
     Raises:
         SolveError: the run cannot be started or solved; the text says why.
     """
-    problem = make_problem(recording, config, datum, rows, inertial)
-    return make_solution(problem, recording, solve_batch(problem, progress))
+
+    def work() -> Solution:
+        problem = make_problem(recording, config, datum, rows, inertial)
+        return make_solution(problem, recording, solve_batch(problem, progress))
+
+    return _on_deep_stack(work)
+
+
+def _on_deep_stack(work: Callable[[], _T]) -> _T:
+    """Call `work` in a thread of its own: GTSAM recurses along the run, and two hours overflow the usual 8 MiB."""
+    done: list[_T] = []
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            done.append(work())
+        except BaseException as error:  # noqa: BLE001 - handed to the caller, whatever it is
+            failed.append(error)
+
+    usual = threading.stack_size(_STACK_BYTES)
+    thread = threading.Thread(target=run, name="graphloc solver", daemon=True)
+    try:
+        thread.start()
+    finally:
+        threading.stack_size(usual)
+    thread.join()
+    if failed:
+        raise failed[0]
+    return done[0]

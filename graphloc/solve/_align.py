@@ -181,7 +181,7 @@ def _rests(track: _Track, yaws: dict[str, Array], first: float, last: float) -> 
         return False
     slope = [_slope(track.t[inside], track.p[inside, i]) for i in range(2)]
     noise = 2.0 * float(np.nanmedian(track.sigma[inside, :2])) / float(np.ptp(track.t[inside]))
-    if np.hypot(*slope) > _STILL_SPEED_MPS + min(noise, 0.3):
+    if np.hypot(slope[0], slope[1]) > _STILL_SPEED_MPS + min(noise, 0.3):
         return False
     for rows in yaws.values():
         near = rows[(rows[:, 0] >= first) & (rows[:, 0] <= last)]
@@ -302,7 +302,7 @@ def _headings(
     course = np.arange(8) * np.pi / 4.0
     until = float(track.t[far[0]]) + 10.0
     return (
-        tuple(wrap_angle(course)),
+        tuple(wrap_angle(np.asarray(course, dtype=np.float64))),
         float(np.radians(60.0)),
         until,
         "heading from the motion alone, eight starts tried",
