@@ -24,9 +24,11 @@ from graphloc import keys
 from graphloc.build import Decisions, Problem, StartPrior, build_graph, nav_state, with_noise_scale
 from graphloc.errors import SolveError
 from graphloc.frames import Array, wrap_angle
+from graphloc.graph import Decision
 from graphloc.solve._align import Start, align, start_pose
 from graphloc.solve._decide import (
     PoseCovariance,
+    Verdict,
     Verdicts,
     along_best_chains,
     decisions,
@@ -46,7 +48,9 @@ _MAX_GROW_ROUNDS, _GROWN_SETTLED_M = 8, 2.0
 # A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
 # short enough to dead-reckon through.
 _STRETCH_S, _STRETCH_MARGIN = 8.0, 0.5
-_FEW = 3  # choices off the best chain are a matter of the last digit, not of another place
+_SURE = 0.7  # a hypothesis judged by the rest alone is believed from here on
+# Surroundings on which another choice of hypotheses is tried.
+_AROUND_S = 10.0
 # Starts that cost this much more (log-likelihood) are dropped; while others live, the window grows.
 _COST_APART, _LONGEST_START_S = 8.0, 60.0
 # Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
@@ -138,29 +142,126 @@ def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, p
     """Re-choose modes and weights over the whole run until they stand, and look for better choices.
 
     Choices confirm themselves: the estimate follows them. So two others are tried: the most probable chain of
-    measurements that agree with each other, and what the run says of each stretch without its own.
-    The more probable solution is kept.
+    measurements that agree with each other, and what the run says of each stretch without its own. Where one
+    of these is more probable, it is taken.
     """
     last = len(problem.timeline) - 1
     settled = _settle(problem, estimate, weigh(problem, estimate, first=0, last=last, stage="final"), prior, progress)
-    for other, few in ((_along_best_chains, _FEW), (_judged_by_the_rest, 0)):
-        verdicts, iterations = other(problem, settled, prior)
+    for other in (_along_best_chains, _judged_by_the_rest):
+        others, iterations = other(problem, settled, prior)
+        better = _where_more_probable(problem, settled, others, prior)
         settled = replace(settled, iterations=settled.iterations + iterations)
-        if _differ(verdicts, settled.verdicts) <= few:
-            continue
-        tried = _settle(problem, settled.values, verdicts, prior, progress, known=settled.verdicts)
-        used, passes = settled.iterations + tried.iterations, settled.passes + tried.passes
-        if _differ(tried.verdicts, settled.verdicts) > 0 and _cost(problem, tried, prior) < _cost(
-            problem, settled, prior
-        ):
-            settled = tried
-        settled = replace(settled, iterations=used, passes=passes)
+        if better is not None:
+            fresh = _settle(problem, settled.values, better, prior, progress)
+            used, passes = settled.iterations + fresh.iterations, settled.passes + fresh.passes
+            settled = replace(fresh, iterations=used, passes=passes)
     return settled
 
 
-def _differ(some: Verdicts, others: Verdicts) -> int:
-    """How many measurements are believed in the one and not in the other."""
-    return sum(abs(some[key].weight - v.weight) > 0.5 for key, v in others.items())
+def _changed(before: Verdicts, after: Verdicts) -> float:
+    """The largest change of any weight."""
+    return max((abs(v.weight - before[key].weight) for key, v in after.items()), default=0.0)
+
+
+def _where_more_probable(problem: Problem, settled: _Settled, others: Verdicts, prior: StartPrior) -> Verdicts | None:
+    """Return the verdicts with those of `others` wherever they are more probable; None: nowhere.
+
+    Verdicts that differ are taken together while they are near in time, and each such group is tried on its
+    own surroundings, so that one bad guess does not cost the good ones, and a long run costs no more.
+    """
+    taken: Verdicts | None = None
+    for keys_ in _groups(problem, settled.verdicts, others):
+        states = [_state_of(problem, key) for key in keys_]
+        first, last = (_index_around(problem, k, s) for k, s in ((min(states), -_AROUND_S), (max(states), _AROUND_S)))
+        start = prior if first == 0 else _weak_prior(problem, settled.values, first)
+        here = _solve_around(problem, settled.values, settled.verdicts, first, last, start)
+        there = _solve_around(problem, settled.values, others, first, last, start)
+        if there.cost < here.cost:
+            taken = taken if taken is not None else dict(settled.verdicts)
+            taken.update(
+                {key: v for key, v in there.verdicts.items() if min(states) <= _state_of(problem, key) <= max(states)}
+            )
+    return taken
+
+
+def _groups(problem: Problem, some: Verdicts, others: Verdicts) -> list[list[tuple[int, int]]]:
+    """Measurements that are believed in the one and not in the other, split where they are far apart in time."""
+    stamps = problem.timeline.stamps_ns
+    differ = sorted(
+        (key for key, v in some.items() if abs(others[key].weight - v.weight) > 0.5),
+        key=lambda key: _state_of(problem, key),
+    )
+    groups: list[list[tuple[int, int]]] = []
+    for key in differ:
+        near = groups and stamps[_state_of(problem, key)] - stamps[_state_of(problem, groups[-1][-1])] < 2e9 * _AROUND_S
+        if near:
+            groups[-1].append(key)
+        else:
+            groups.append([key])
+    return groups
+
+
+def _state_of(problem: Problem, key: tuple[int, int]) -> int:
+    return int(next(s for s in problem.streams if s.number == key[0]).state[key[1]])
+
+
+def _index_around(problem: Problem, k: int, seconds: float) -> int:
+    stamps = problem.timeline.stamps_ns
+    return int(np.clip(np.searchsorted(stamps, stamps[k] + int(seconds * 1e9)), 0, len(stamps) - 1))
+
+
+class _Around(NamedTuple):
+    """A stretch solved on its own: its verdicts, and -log of its probability, all hypotheses summed over."""
+
+    verdicts: Verdicts
+    cost: float
+
+
+def _solve_around(
+    problem: Problem, values: gtsam.Values, verdicts: Verdicts, first: int, last: int, prior: StartPrior
+) -> _Around:
+    local = _copy(problem, values, max(first - 1, 0), min(last + 1, len(problem.timeline) - 1))
+    for _ in range(_MAX_FINAL_PASSES):
+        step = _solve_window(problem, local, first, last, prior, decisions(verdicts), tol=1e-3)
+        used, verdicts = verdicts, weigh(problem, local, first=first, last=last, stage="final")
+        if step.moved_m < _SETTLED_M and _changed(used, verdicts) < _SETTLED_WEIGHT:
+            break
+    numbers = {s.number for s in problem.streams if s.row.false is not None}
+    plain = decisions(verdicts, {key for key in verdicts if key[0] in numbers})
+    graph, guess = build_graph(problem, local, plain, first, last, prior)
+    return _Around(verdicts, float(graph.error(guess)) - log_evidence(problem, local, first, last))
+
+
+def _copy(problem: Problem, values: gtsam.Values, first: int, last: int) -> gtsam.Values:
+    """The states first..last and their slow states."""
+    copy = gtsam.Values()
+    for k in range(first, last + 1):
+        copy.insert(keys.pose(k), values.atPose3(keys.pose(k)))
+        copy.insert(keys.velocity(k), values.atVector(keys.velocity(k)))
+    for j in range(int(problem.timeline.slow_of[first]), int(problem.timeline.slow_of[last]) + 1):
+        _fill_slow(problem, copy, j, values.atConstantBias(keys.bias(j)), _slow_at(problem, values, j))
+    return copy
+
+
+def _slow_at(problem: Problem, values: gtsam.Values, j: int) -> dict[int, Array]:
+    return {
+        s.number: np.atleast_1d(values.atVector(keys.slow(s.number, j))) for s in problem.streams if s.slow is not None
+    }
+
+
+def _weak_prior(problem: Problem, values: gtsam.Values, k: int) -> StartPrior:
+    """A prior on state `k` that only keeps a stretch determined; what the stretch measures outweighs it."""
+    j = int(problem.timeline.slow_of[k])
+    slow = _slow_at(problem, values, j)
+    return StartPrior(
+        pose=values.atPose3(keys.pose(k)),
+        pose_cov=np.diag([0.05**2] * 3 + [1.0] * 3),
+        velocity=values.atVector(keys.velocity(k)),
+        velocity_cov=np.eye(3) * 0.5**2,
+        bias=values.atConstantBias(keys.bias(j)),
+        bias_cov=np.diag([0.05**2] * 3 + [0.002**2] * 3),
+        slow={s.number: (slow[s.number], np.diag(s.slow.sigma**2)) for s in problem.streams if s.slow is not None},
+    )
 
 
 def _along_best_chains(problem: Problem, settled: _Settled, prior: StartPrior) -> tuple[Verdicts, int]:
@@ -173,29 +274,17 @@ def _settle(
     verdicts: Verdicts,
     prior: StartPrior,
     progress: Progress,
-    *,
-    known: Verdicts | None = None,
 ) -> _Settled:
-    """Passes until modes and weights stand, or are those of the `known` solution again."""
+    """Passes until modes and weights stand."""
     last, iterations = len(problem.timeline) - 1, 0
     for n in range(_MAX_FINAL_PASSES):
         step = _pass(problem, estimate, verdicts, prior)
         estimate, iterations = step.values, iterations + step.iterations
         used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage="final")
-        changed = max((abs(v.weight - used[key].weight) for key, v in verdicts.items()), default=0.0)
         progress("final passes", n + 1, _MAX_FINAL_PASSES)
-        if (step.moved_m < _SETTLED_M and changed < _SETTLED_WEIGHT) or (known and not _differ(verdicts, known)):
+        if step.moved_m < _SETTLED_M and _changed(used, verdicts) < _SETTLED_WEIGHT:
             break
     return _Settled(estimate, step.graph, verdicts, n + 1, iterations, step.moved_m < 3 * _SETTLED_M)
-
-
-def _cost(problem: Problem, settled: _Settled, prior: StartPrior) -> float:
-    """-log of the posterior, summed over all hypotheses."""
-    numbers = {s.number for s in problem.streams if s.row.false is not None}
-    hypotheses = {key for key in settled.verdicts if key[0] in numbers}
-    decided = decisions(settled.verdicts, hypotheses)
-    graph, guess = build_graph(problem, settled.values, decided, 0, len(problem.timeline) - 1, prior)
-    return float(graph.error(guess)) - log_evidence(problem, settled.values)
 
 
 def _judged_by_the_rest(problem: Problem, settled: _Settled, prior: StartPrior) -> tuple[Verdicts, int]:
@@ -230,9 +319,15 @@ def _judged_by_the_rest(problem: Problem, settled: _Settled, prior: StartPrior) 
             covariance=pose_covariance(bayes_tree(step.graph, step.values)),
             only=own,
         )
-        judged.update(fresh)
+        judged.update({key: _decisive(v) for key, v in fresh.items()})
         iterations += step.iterations
     return judged, iterations
+
+
+def _decisive(verdict: Verdict) -> Verdict:
+    """All or nothing: half a belief in each of several that repeat each other is enough to bend the estimate to them."""
+    sure = verdict.weight > _SURE
+    return replace(verdict, decision=Decision(mode=verdict.mode) if sure else None, weight=float(sure))
 
 
 def expected_cost(problem: Problem, verdicts: Verdicts) -> float:
@@ -374,12 +469,7 @@ def _extend(problem: Problem, values: gtsam.Values, known: int, until: int) -> N
         values.insert(keys.pose(k + 1), state.pose())
         values.insert(keys.velocity(k + 1), np.asarray(state.velocity()))
         if following != j:
-            slow = {
-                s.number: np.atleast_1d(values.atVector(keys.slow(s.number, j)))
-                for s in problem.streams
-                if s.slow is not None
-            }
-            _fill_slow(problem, values, following, bias, slow)
+            _fill_slow(problem, values, following, bias, _slow_at(problem, values, j))
 
 
 def _solve_start(problem: Problem, candidate: _Candidate, last: int) -> tuple[int, float]:

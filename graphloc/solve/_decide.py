@@ -193,12 +193,12 @@ def _by_hypotheses(
     return verdicts
 
 
-def log_evidence(problem: Problem, values: gtsam.Values) -> float:
-    """Log probability of all hypotheses together, around an estimate."""
+def log_evidence(problem: Problem, values: gtsam.Values, first: int, last: int) -> float:
+    """Log probability of all hypotheses of states first..last together, around an estimate."""
     total = 0.0
     for stream in problem.streams:
         if stream.row.false is not None:
-            indices = range(len(stream.measurements))
+            indices = stream.between(first, last)
             residuals = [_residuals_at(problem, stream, i, values)[1] for i in indices]
             total += sequence_of(stream, indices, residuals, [None] * len(indices)).log_evidence()
     return total
