@@ -20,6 +20,14 @@ _LOSSES: dict[str, Any] = {
 }
 
 
+def with_floors(cov: Array, floors: Array | float) -> Array:
+    """Return a covariance (k, k) whose variances are at least `floors` (k,): sensors are too sure of themselves."""
+    raised = np.array(cov)
+    variances = raised.ravel()[:: len(raised) + 1]
+    np.maximum(variances, floors, out=variances)
+    return raised
+
+
 def noise_model(cov: Array, decision: Decision) -> Any:
     """Return a noise model of covariance (k, k) / weight, under the decision's kernel."""
     scaled = np.asarray(cov) / decision.weight

@@ -12,6 +12,8 @@ as a weight, for the same reason. Not handled: pitch near +-90 deg.
 
 from __future__ import annotations
 
+import math
+
 import gtsam
 import numpy as np
 
@@ -37,7 +39,7 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
     R = at.T_world_body.rotation().matrix()
     x = (R @ at.T_state_sensor.rotation().matrix())[:, 0]
     offset = 0.0 if at.slow_value is None else float(at.slow_value[0])
-    raw = wrap_angle(np.array([np.arctan2(x[1], x[0]) + offset - m.yaw_rad]))
+    raw = np.array([math.remainder(math.atan2(x[1], x[0]) + offset - m.yaw_rad, math.tau)])
     sigma = m.sigma_rad
     return (
         Residual(
@@ -51,25 +53,12 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
     )
 
 
-def kernel_weight(whitened: float, kernel: KernelConfig | None) -> float:
-    """Weight of a whitened residual under a loss, for factors that cannot carry a kernel themselves."""
-    if kernel is None or kernel.kind == "none":
-        return 1.0
-    u = abs(whitened) / kernel.scale
-    if kernel.kind == "huber":
-        return 1.0 if u <= 1.0 else 1.0 / u
-    if kernel.kind == "cauchy":
-        return 1.0 / (1.0 + u * u)
-    if kernel.kind == "geman_mcclure":
-        return 1.0 / (1.0 + u * u) ** 2
-    return (1.0 - u * u) ** 2 if u < 1.0 else 1e-6
-
-
 def factors(m: CompassHeading, config: CompassConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one heading."""
     residual = residuals(m, config, at)[0]
     sigma = float(np.sqrt(residual.cov[0, 0]))
-    weight = decision.weight * max(kernel_weight(float(residual.raw[0]) / sigma, decision.kernel), 1e-6)
+    kernel = decision.kernel or KernelConfig(kind="none")  # a linear factor carries none: its weight stands in
+    weight = decision.weight * max(kernel.weight(residual.nis()), 1e-6)
     model = gtsam.noiseModel.Isotropic.Sigma(1, sigma / np.sqrt(weight))
     point = gtsam.Values()
     point.insert(at.pose_key, at.T_world_body)

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from graphloc.config import GnssConfig
-from graphloc.factors._noise import noise_model
+from graphloc.factors._noise import noise_model, with_floors
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor, SlowProcess
 from graphloc.measurements import GnssPosition
@@ -29,9 +29,8 @@ _TIE = gtsam.noiseModel.Isotropic.Sigma(3, _TIE_M)
 
 def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
     """Covariance (3, 3) of the white part: reported, scaled, with floors, m^2."""
-    cov = np.array(m.cov_enu_m2) * config.sigma_scale**2
-    floors = np.array([config.min_horizontal_sigma_m] * 2 + [config.min_vertical_sigma_m]) ** 2
-    return np.asarray(cov + np.diag(np.maximum(floors - np.diagonal(cov), 0.0)))
+    horizontal, vertical = config.min_horizontal_sigma_m**2, config.min_vertical_sigma_m**2
+    return with_floors(m.cov_enu_m2 * config.sigma_scale**2, np.array([horizontal, horizontal, vertical]))
 
 
 @lru_cache(maxsize=1 << 18)

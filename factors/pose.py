@@ -20,7 +20,7 @@ import gtsam
 import numpy as np
 
 from graphloc.config import PoseConfig
-from graphloc.factors._noise import robust
+from graphloc.factors._noise import robust, with_floors
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Residual, Sensor
 from graphloc.measurements import AXES, PoseFix, PoseMode
@@ -31,9 +31,8 @@ FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(5.0))
 
 
 def _covariance(mode: PoseMode, axes: tuple[str, ...], config: PoseConfig) -> Array:
-    cov = np.array(mode.cov)
     floors = np.array([config.min_sigma_m if AXES.index(a) < 3 else np.radians(config.min_sigma_deg) for a in axes])
-    return cov + np.diag(np.maximum(floors**2 - np.diagonal(cov), 0.0))
+    return with_floors(mode.cov, floors**2)
 
 
 def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor: Any) -> Any:

@@ -15,15 +15,10 @@ import gtsam
 import numpy as np
 
 from graphloc.config import VelocityConfig
-from graphloc.factors._noise import noise_model
+from graphloc.factors._noise import noise_model, with_floors
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor
 from graphloc.measurements import GnssVelocity
-
-
-def _covariance(m: GnssVelocity, config: VelocityConfig) -> Array:
-    cov = np.array(m.cov_m2ps2)
-    return np.asarray(cov + np.diag(np.maximum(config.min_sigma_mps**2 - np.diagonal(cov), 0.0)))
 
 
 def _added_mps(at: Attachment) -> Array:
@@ -37,7 +32,7 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
     return (
         Residual(
             raw=raw,
-            cov=_covariance(m, config),
+            cov=with_floors(m.cov_m2ps2, config.min_sigma_mps**2),
             jacobian=lambda: np.zeros((3, 6)),
             prior=1.0,
             size_m=None,
@@ -48,7 +43,7 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
 
 def factors(m: GnssVelocity, config: VelocityConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one velocity."""
-    model = noise_model(_covariance(m, config), decision)
+    model = noise_model(with_floors(m.cov_m2ps2, config.min_sigma_mps**2), decision)
     return GraphUpdate(factors=(gtsam.PriorFactorVector(at.velocity_key, m.v_world_mps - _added_mps(at), model),))
 
 

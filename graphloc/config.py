@@ -9,6 +9,7 @@ Which sensor kinds exist is not known here: the caller hands in the table (`kind
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -79,6 +80,19 @@ class KernelConfig(Block):
     """Loss. Redescending kinds (geman_mcclure, tukey) are used in the last stage only: before, Cauchy."""
     scale: Positive = 1.5
     """Where the loss bends, in standard deviations of the residual."""
+
+    def weight(self, nis: float) -> float:
+        """Weight in [0, 1] that the loss gives a squared normalised residual."""
+        if self.kind == "none":
+            return 1.0
+        u2 = nis / self.scale**2
+        if self.kind == "huber":
+            return 1.0 if u2 <= 1.0 else 1.0 / math.sqrt(u2)
+        if self.kind == "cauchy":
+            return 1.0 / (1.0 + u2)
+        if self.kind == "geman_mcclure":
+            return 1.0 / (1.0 + u2) ** 2
+        return (1.0 - u2) ** 2 if u2 < 1.0 else 0.0
 
 
 class SensorConfig(Block):

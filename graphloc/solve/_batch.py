@@ -37,9 +37,9 @@ from graphloc.solve._decide import (
     thinned,
     weigh,
 )
-from graphloc.solve._optimize import bayes_tree, optimize
+from graphloc.solve._optimize import bayes_tree, full_step, optimize
 
-_CHUNK_S, _OVERLAP_S = 12.0, 6.0
+_CHUNK_S, _OVERLAP_S = 15.0, 5.0
 _MAX_OPEN_PASSES, _MAX_FINAL_PASSES, _MAX_NOISE_ROUNDS = 4, 6, 5
 _CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
 _SETTLED_M, _SETTLED_WEIGHT = 0.03, 0.1
@@ -94,13 +94,10 @@ def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> Batch
         ratio = 2.0 * float(settled.graph.error(estimate)) / max(expected_cost(problem, settled.verdicts), 1.0)
         if ratio < _CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
-    progress("covariances", 0, 1)
-    tree = bayes_tree(settled.graph, estimate)
-    progress("covariances", 1, 1)
     return BatchResult(
         values=estimate,
         verdicts=settled.verdicts,
-        tree=tree,
+        tree=settled.tree,
         graph=settled.graph,
         passes=passes,
         iterations=iterations,
@@ -119,19 +116,22 @@ def _open_passes(
     for stage in ("far", "open"):
         for n in range(_MAX_OPEN_PASSES):
             verdicts = weigh(problem, estimate, first=0, last=last, stage=stage)
-            step = _pass(problem, estimate, verdicts, prior, jumps=stage != "far")
-            estimate = step.values
-            passes, iterations = passes + 1, iterations + step.iterations
+            done = _pass(problem, estimate, verdicts, prior, jumps=stage != "far")
+            estimate = done.values
+            passes, iterations = passes + 1, iterations + done.iterations
             progress(f"{stage} passes", n + 1, _MAX_OPEN_PASSES)
-            if step.moved_m < _WINDOW_SETTLED_M:
+            if done.moved_m < _WINDOW_SETTLED_M:
                 break
     return estimate, iterations, passes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Settled:
+    """A solution of the whole run; `tree` holds `graph` linearised within the last step of `values`."""
+
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
+    tree: Any
     verdicts: Verdicts
     passes: int
     iterations: int
@@ -147,15 +147,15 @@ def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, p
     """
     last = len(problem.timeline) - 1
     settled = _settle(problem, estimate, weigh(problem, estimate, first=0, last=last, stage="final"), prior, progress)
+    changed, iterations = False, settled.iterations
     for other in (_along_best_chains, _judged_by_the_rest):
-        others, iterations = other(problem, settled, prior)
-        better = _where_more_probable(problem, settled, others, prior)
-        settled = replace(settled, iterations=settled.iterations + iterations)
-        if better is not None:
-            fresh = _settle(problem, settled.values, better, prior, progress)
-            used, passes = settled.iterations + fresh.iterations, settled.passes + fresh.passes
-            settled = replace(fresh, iterations=used, passes=passes)
-    return settled
+        others, used = other(problem, settled, prior)
+        changed = _take_more_probable(problem, settled, others, prior) or changed
+        iterations += used
+    if not changed:
+        return replace(settled, iterations=iterations)
+    again = _settle(problem, settled.values, settled.verdicts, prior, progress)
+    return replace(again, iterations=iterations + again.iterations, passes=settled.passes + again.passes)
 
 
 def _changed(before: Verdicts, after: Verdicts) -> float:
@@ -163,24 +163,24 @@ def _changed(before: Verdicts, after: Verdicts) -> float:
     return max((abs(v.weight - before[key].weight) for key, v in after.items()), default=0.0)
 
 
-def _where_more_probable(problem: Problem, settled: _Settled, others: Verdicts, prior: StartPrior) -> Verdicts | None:
-    """Return the verdicts with those of `others` wherever they are more probable; None: nowhere.
+def _take_more_probable(problem: Problem, settled: _Settled, others: Verdicts, prior: StartPrior) -> bool:
+    """Take the choices of `others` into `settled`, in place, wherever they are more probable; tell whether any were.
 
-    Verdicts that differ are taken together while they are near in time, and each such group is tried on its
+    Choices that differ are taken together while they are near in time, and each such group is tried on its
     own surroundings, so that one bad guess does not cost the good ones, and a long run costs no more.
     """
-    taken: Verdicts | None = None
-    for keys_ in _groups(problem, settled.verdicts, others):
-        states = [_state_of(problem, key) for key in keys_]
-        first, last = (_index_around(problem, k, s) for k, s in ((min(states), -_AROUND_S), (max(states), _AROUND_S)))
+    taken = False
+    for group in _groups(problem, settled.verdicts, others):
+        states = [_state_of(problem, key) for key in group]
+        low, high = min(states), max(states)
+        first, last = _index_around(problem, low, -_AROUND_S), _index_around(problem, high, _AROUND_S)
         start = prior if first == 0 else _weak_prior(problem, settled.values, first)
         here = _solve_around(problem, settled.values, settled.verdicts, first, last, start)
         there = _solve_around(problem, settled.values, others, first, last, start)
         if there.cost < here.cost:
-            taken = taken if taken is not None else dict(settled.verdicts)
-            taken.update(
-                {key: v for key, v in there.verdicts.items() if min(states) <= _state_of(problem, key) <= max(states)}
-            )
+            _update(problem, settled.values, there.values, first, last)
+            settled.verdicts.update(there.verdicts)
+            taken = True
     return taken
 
 
@@ -211,8 +211,9 @@ def _index_around(problem: Problem, k: int, seconds: float) -> int:
 
 
 class _Around(NamedTuple):
-    """A stretch solved on its own: its verdicts, and -log of its probability, all hypotheses summed over."""
+    """A stretch solved on its own: values, verdicts, and -log of its probability, all hypotheses summed over."""
 
+    values: gtsam.Values
     verdicts: Verdicts
     cost: float
 
@@ -229,7 +230,7 @@ def _solve_around(
     numbers = {s.number for s in problem.streams if s.row.false is not None}
     plain = decisions(verdicts, {key for key in verdicts if key[0] in numbers})
     graph, guess = build_graph(problem, local, plain, first, last, prior)
-    return _Around(verdicts, float(graph.error(guess)) - log_evidence(problem, local, first, last))
+    return _Around(local, verdicts, float(graph.error(guess)) - log_evidence(problem, local, first, last))
 
 
 def _copy(problem: Problem, values: gtsam.Values, first: int, last: int) -> gtsam.Values:
@@ -278,13 +279,22 @@ def _settle(
     """Passes until modes and weights stand."""
     last, iterations = len(problem.timeline) - 1, 0
     for n in range(_MAX_FINAL_PASSES):
-        step = _pass(problem, estimate, verdicts, prior)
-        estimate, iterations = step.values, iterations + step.iterations
+        # The first pass takes out the seams of the windows; from then on one step at a time is enough.
+        done = (_pass if n == 0 else _refine)(problem, estimate, verdicts, prior)
+        estimate, iterations = done.values, iterations + done.iterations
         used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage="final")
         progress("final passes", n + 1, _MAX_FINAL_PASSES)
-        if step.moved_m < _SETTLED_M and _changed(used, verdicts) < _SETTLED_WEIGHT:
+        if n > 0 and done.moved_m < _SETTLED_M and _changed(used, verdicts) < _SETTLED_WEIGHT:
             break
-    return _Settled(estimate, step.graph, verdicts, n + 1, iterations, step.moved_m < 3 * _SETTLED_M)
+    return _Settled(
+        values=estimate,
+        graph=done.graph,
+        tree=done.tree,
+        verdicts=verdicts,
+        passes=n + 1,
+        iterations=iterations,
+        converged=done.moved_m < 3 * _SETTLED_M,
+    )
 
 
 def _judged_by_the_rest(problem: Problem, settled: _Settled, prior: StartPrior) -> tuple[Verdicts, int]:
@@ -309,18 +319,18 @@ def _judged_by_the_rest(problem: Problem, settled: _Settled, prior: StartPrior) 
         }
         if not own or len(around) == len(at_s):  # nothing to judge, or nothing to judge it by
             continue
-        step = _pass(problem, settled.values, everything, prior, without=around, tol=1e-2)
+        rest = _refine(problem, settled.values, everything, prior, without=around)
         fresh = weigh(
             problem,
-            step.values,
+            rest.values,
             first=0,
             last=last,
             stage="final",
-            covariance=pose_covariance(bayes_tree(step.graph, step.values)),
+            covariance=pose_covariance(rest.tree),
             only=own,
         )
         judged.update({key: _decisive(v) for key, v in fresh.items()})
-        iterations += step.iterations
+        iterations += rest.iterations
     return judged, iterations
 
 
@@ -350,22 +360,32 @@ class _Step:
     graph: gtsam.NonlinearFactorGraph
     iterations: int
     moved_m: float
+    tree: Any = None
 
 
 def _pass(
+    problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior, *, jumps: bool = True
+) -> _Step:
+    """Optimise the whole run with the given decisions."""
+    last = len(problem.timeline) - 1
+    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps)
+    solved = optimize(graph, guess, 12, 1e-3)
+    return _Step(solved.values, graph, solved.iterations, _moved(guess, solved.values, 0, last))
+
+
+def _refine(
     problem: Problem,
     estimate: gtsam.Values,
     verdicts: Verdicts,
     prior: StartPrior,
     *,
     without: Container[tuple[int, int]] = (),
-    jumps: bool = True,
-    tol: float = 1e-4,
 ) -> _Step:
+    """One step of the whole run, with the tree that gives its covariances; `without` is left out."""
     last = len(problem.timeline) - 1
-    graph, guess = build_graph(problem, estimate, decisions(verdicts, without), 0, last, prior, jumps=jumps)
-    solved = optimize(graph, guess, 12, tol)
-    return _Step(solved.values, graph, solved.iterations, _moved(guess, solved.values, 0, last))
+    graph, guess = build_graph(problem, estimate, decisions(verdicts, without), 0, last, prior)
+    values, tree = full_step(graph, guess)
+    return _Step(values, graph, 1, _moved(guess, values, 0, last), tree)
 
 
 def _index_after(problem: Problem, seconds: float) -> int:

@@ -65,20 +65,6 @@ def _predicted(found: tuple[Residual, ...], P: Array | None) -> Array | None:
     return np.asarray(J @ P @ J.T)
 
 
-def kernel_weight(nis: float, kernel: KernelConfig) -> float:
-    """Return the weight that a loss gives a squared normalised residual, in [0, 1]."""
-    if kernel.kind == "none":
-        return 1.0
-    u2 = nis / kernel.scale**2
-    if kernel.kind == "huber":
-        return 1.0 if u2 <= 1.0 else 1.0 / float(np.sqrt(u2))
-    if kernel.kind == "cauchy":
-        return 1.0 / (1.0 + u2)
-    if kernel.kind == "geman_mcclure":
-        return 1.0 / (1.0 + u2) ** 2
-    return (1.0 - u2) ** 2 if u2 < 1.0 else 0.0
-
-
 def weigh(
     problem: Problem,
     values: gtsam.Values,
@@ -151,7 +137,7 @@ def _by_kernel(
     widening = _spread(best, dof) * float(np.sqrt(dof))
     kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=own.scale * widening)
     return [
-        Verdict(Decision(mode=m, kernel=kernel), kernel_weight(n, kernel), 1.0, found[m], m, at)
+        Verdict(Decision(mode=m, kernel=kernel), kernel.weight(n), 1.0, found[m], m, at)
         for m, n, found, at in zip(mode, best, residuals, attached, strict=True)
     ]
 

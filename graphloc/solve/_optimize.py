@@ -72,6 +72,16 @@ def _levenberg_marquardt(
     return Optimized(values, used + optimizer.iterations(), optimizer.error())
 
 
+def full_step(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> tuple[gtsam.Values, Any]:
+    """Return the result of one full step from near the solution, and the tree that it took, for covariances.
+
+    Raises:
+        SolveError: a state is not determined.
+    """
+    tree = bayes_tree(graph, guess)
+    return gtsam.Values(tree.calculateBestEstimate()), tree
+
+
 def bayes_tree(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Any:
     """Return an ISAM2 that holds the graph linearised at `values`, for covariances (`Marginals` has no QR).
 
