@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import difflib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +41,9 @@ from graphloc.frontends.decode import (
 )
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement
-from graphloc.recording import Recording
+from graphloc.recording import Progress, Recording
 from graphloc.time import duration_ns, utc_text
 
-Progress = Callable[[str, int, int], None]
 TF_STATIC = "/tf_static"
 _REPORT_EVERY = 2000  # messages between two calls of `progress`
 

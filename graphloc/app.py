@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,11 +23,9 @@ from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Datum, Geodetic
 from graphloc.frontends.bag import read_recording
 from graphloc.measurements import GnssPosition, Measurement
-from graphloc.recording import Recording
+from graphloc.recording import Progress, Recording
 from graphloc.solution import Solution
 from graphloc.solve import smooth
-
-Progress = Callable[[str, int, int], None]
 
 
 def _quiet(_stage: str, _done: int, _total: int) -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +13,9 @@ from graphloc.frames import Array, Datum
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.trajectory import Trajectory
+
+Progress = Callable[[str, int, int], None]
+"""Called with stage, done, total."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

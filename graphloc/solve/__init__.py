@@ -11,7 +11,7 @@ from graphloc.build import make_problem
 from graphloc.config import VesselConfig
 from graphloc.frames import Datum
 from graphloc.graph import InertialRow, Sensor
-from graphloc.recording import Recording
+from graphloc.recording import Progress, Recording
 from graphloc.solution import Solution
 from graphloc.solve._batch import solve_batch
 from graphloc.solve._solution import make_solution
@@ -29,7 +29,7 @@ def smooth(
     *,
     rows: Sequence[Sensor],
     inertial: InertialRow,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress = lambda *_: None,
 ) -> Solution:
     """Smooth a whole run offline.
 

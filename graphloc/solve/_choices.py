@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Other choices of modes and weights than those that the estimate confirms.
+
+Choices confirm themselves: the estimate follows them. Two others are made here: along the most probable
+chain of measurements that agree with each other, and by what the run says of each stretch without its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from graphloc.build import Problem, StartPrior, build_graph
+from graphloc.graph import Decision
+from graphloc.solve._decide import (
+    Verdict,
+    Verdicts,
+    along_best_chains,
+    decisions,
+    log_evidence,
+    pose_covariance,
+    thinned,
+    weigh,
+)
+from graphloc.solve._passes import MAX_FINAL_PASSES, SETTLED_M, SETTLED_WEIGHT, Settled, changed, refine_run
+from graphloc.solve._stretch import copy_states, solve_stretch, update_states, weak_prior
+
+# A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
+# short enough to dead-reckon through.
+_STRETCH_S, _STRETCH_MARGIN = 8.0, 0.5
+_SURE = 0.7  # a hypothesis judged by the rest alone is believed from here on
+# Surroundings on which another choice of hypotheses is tried.
+_AROUND_S = 10.0
+
+
+def by_best_chains(problem: Problem, settled: Settled, prior: StartPrior) -> tuple[Verdicts, int]:
+    return along_best_chains(problem, settled.values, settled.verdicts), 0
+
+
+def judged_by_the_rest(problem: Problem, settled: Settled, prior: StartPrior) -> tuple[Verdicts, int]:
+    """Weigh each stretch's hypotheses by the solution of the run without them and their neighbours.
+
+    Hypotheses that took part in the estimate speak for themselves, and a wrong choice confirms itself. Every
+    third stretch is judged at once, so three solutions do for the whole run.
+    """
+    last, start_ns = len(problem.timeline) - 1, int(problem.timeline.stamps_ns[0])
+    judged, iterations = dict(settled.verdicts), 0
+    at_s = {  # time of each hypothesis in the run
+        (s.number, i): (m.stamp_ns - start_ns) * 1e-9
+        for s in problem.streams
+        if s.row.false is not None
+        for i, m in enumerate(s.measurements)
+    }
+    everything = thinned(problem, judged)
+    for third in range(3):
+        own = {key for key, t in at_s.items() if int(t / _STRETCH_S) % 3 == third}
+        around = {
+            key for key, t in at_s.items() if (t / _STRETCH_S - third + _STRETCH_MARGIN) % 3 < 1 + 2 * _STRETCH_MARGIN
+        }
+        if not own or len(around) == len(at_s):  # nothing to judge, or nothing to judge it by
+            continue
+        rest = refine_run(problem, settled.values, everything, prior, without=around)
+        fresh = weigh(
+            problem,
+            rest.values,
+            first=0,
+            last=last,
+            stage="final",
+            covariance=pose_covariance(rest.tree),
+            only=own,
+        )
+        judged.update({key: _decisive(v) for key, v in fresh.items()})
+        iterations += rest.iterations
+    return judged, iterations
+
+
+def _decisive(verdict: Verdict) -> Verdict:
+    """All or nothing: half a belief in each of several that repeat each other is enough to bend the estimate to them."""
+    sure = verdict.weight > _SURE
+    return replace(verdict, decision=Decision(mode=verdict.mode) if sure else None, weight=float(sure))
+
+
+def take_more_probable(problem: Problem, settled: Settled, others: Verdicts, prior: StartPrior) -> bool:
+    """Take the choices of `others` into `settled`, in place, wherever they are more probable; tell whether any were.
+
+    Choices that differ are taken together while they are near in time, and each such group is tried on its
+    own surroundings, so that one bad guess does not cost the good ones, and a long run costs no more.
+    """
+    taken = False
+    for group in _groups(problem, settled.verdicts, others):
+        states = [_state_of(problem, key) for key in group]
+        low, high = min(states), max(states)
+        first, last = _index_around(problem, low, -_AROUND_S), _index_around(problem, high, _AROUND_S)
+        start = prior if first == 0 else weak_prior(problem, settled.values, first)
+        here = _solve_around(problem, settled.values, settled.verdicts, first, last, start)
+        there = _solve_around(problem, settled.values, others, first, last, start)
+        if there.cost < here.cost:
+            update_states(problem, settled.values, there.values, first, last)
+            settled.verdicts.update(there.verdicts)
+            taken = True
+    return taken
+
+
+def _groups(problem: Problem, some: Verdicts, others: Verdicts) -> list[list[tuple[int, int]]]:
+    """Measurements that are believed in the one and not in the other, split where they are far apart in time."""
+    stamps = problem.timeline.stamps_ns
+    differ = sorted(
+        (key for key, v in some.items() if abs(others[key].weight - v.weight) > 0.5),
+        key=lambda key: _state_of(problem, key),
+    )
+    groups: list[list[tuple[int, int]]] = []
+    for key in differ:
+        near = groups and stamps[_state_of(problem, key)] - stamps[_state_of(problem, groups[-1][-1])] < 2e9 * _AROUND_S
+        if near:
+            groups[-1].append(key)
+        else:
+            groups.append([key])
+    return groups
+
+
+def _state_of(problem: Problem, key: tuple[int, int]) -> int:
+    return int(next(s for s in problem.streams if s.number == key[0]).state[key[1]])
+
+
+def _index_around(problem: Problem, k: int, seconds: float) -> int:
+    stamps = problem.timeline.stamps_ns
+    return int(np.clip(np.searchsorted(stamps, stamps[k] + int(seconds * 1e9)), 0, len(stamps) - 1))
+
+
+class _Around(NamedTuple):
+    """A stretch solved on its own: values, verdicts, and -log of its probability, all hypotheses summed over."""
+
+    values: gtsam.Values
+    verdicts: Verdicts
+    cost: float
+
+
+def _solve_around(
+    problem: Problem, values: gtsam.Values, verdicts: Verdicts, first: int, last: int, prior: StartPrior
+) -> _Around:
+    local = copy_states(problem, values, max(first - 1, 0), min(last + 1, len(problem.timeline) - 1))
+    for _ in range(MAX_FINAL_PASSES):
+        step = solve_stretch(problem, local, first, last, prior, decisions(verdicts), tol=1e-3)
+        used, verdicts = verdicts, weigh(problem, local, first=first, last=last, stage="final")
+        if step.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
+            break
+    numbers = {s.number for s in problem.streams if s.row.false is not None}
+    plain = decisions(verdicts, {key for key in verdicts if key[0] in numbers})
+    graph, guess = build_graph(problem, local, plain, first, last, prior)
+    return _Around(local, verdicts, float(graph.error(guess)) - log_evidence(problem, local, first, last))

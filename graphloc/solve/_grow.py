@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the start alignment to an estimate of the whole run, a window at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from graphloc import keys
+from graphloc.build import Problem, StartPrior
+from graphloc.errors import SolveError
+from graphloc.frames import wrap_angle
+from graphloc.recording import Progress
+from graphloc.solve._align import Start, start_pose
+from graphloc.solve._decide import PoseCovariance, decisions, pose_covariance, weigh
+from graphloc.solve._optimize import bayes_tree
+from graphloc.solve._stretch import StretchStep, dead_reckon, fill_slow, prior_at, solve_stretch
+
+_CHUNK_S, _OVERLAP_S = 15.0, 5.0
+_SETTLED_M = 0.5
+_MAX_FAR_ROUNDS, _FAR_SETTLED_M = 8, 2.0
+# Starts that cost this much more (log-likelihood) are dropped; while others live, the window grows.
+_COST_APART, _LONGEST_START_S = 8.0, 60.0
+# Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
+_START_STAGES = (("far", 8, 0.5, False), ("open", 2, 0.5, False), ("final", 2, 0.5, True))
+
+
+def solve_start(problem: Problem, start: Start, progress: Progress) -> tuple[gtsam.Values, StartPrior, int, int]:
+    """Try each candidate on the first window; look further while several explain it; keep the cheapest.
+
+    Returns values, prior, the last state solved, and iterations.
+    """
+    seconds, iterations, until = start.window_s, 0, 0
+    candidates = [_candidate(problem, start, yaw) for yaw in start.yaws_rad]
+    failure: SolveError | None = None
+    while True:
+        known, until = until, _index_after(problem, seconds)
+        alive = []
+        for n, candidate in enumerate(candidates):
+            progress("start", n, len(candidates))
+            try:
+                dead_reckon(problem, candidate.values, known, until)
+                used, candidate.cost = _solve_candidate(problem, candidate, until)
+            except SolveError as caught:
+                failure = caught
+                continue
+            iterations += used
+            alive.append(candidate)
+        if not alive:
+            raise failure or SolveError("the start alignment found no heading to try")
+        alive.sort(key=lambda c: c.cost)
+        candidates = _different(alive)
+        if len(candidates) == 1 or seconds >= _LONGEST_START_S or until == len(problem.timeline) - 1:
+            return candidates[0].values, candidates[0].prior, until, iterations
+        seconds *= 1.6
+
+
+@dataclass(slots=True)
+class _Candidate:
+    """One start: its estimate, prior and cost so far."""
+
+    values: gtsam.Values
+    prior: StartPrior
+    cost: float = 0.0
+
+
+def _candidate(problem: Problem, start: Start, yaw: float) -> _Candidate:
+    prior, values = _start_prior(problem, start, yaw), gtsam.Values()
+    values.insert(keys.pose(0), prior.pose)
+    values.insert(keys.velocity(0), prior.velocity)
+    fill_slow(problem, values, 0, prior.bias, {})
+    return _Candidate(values, prior)
+
+
+def _start_prior(problem: Problem, start: Start, yaw: float) -> StartPrior:
+    pose = start_pose(start, yaw)
+    R = pose.rotation().matrix()
+    world_rotation = np.diag([start.tilt_sigma_rad, start.tilt_sigma_rad, start.yaw_sigma_rad]) ** 2
+    cov = np.zeros((6, 6))
+    cov[:3, :3] = R.T @ world_rotation @ R
+    cov[3:, 3:] = R.T @ np.diag(start.p_sigma_m**2) @ R
+    sigmas = problem.links.bias_sigmas()
+    bias_cov = np.diag(np.concatenate([sigmas[:3], start.gyro_bias_sigma_radps]) ** 2)
+    return StartPrior(
+        pose=pose,
+        pose_cov=cov,
+        velocity=start.v_world_mps,
+        velocity_cov=np.diag(start.v_sigma_mps**2),
+        bias=gtsam.imuBias.ConstantBias(np.zeros(3), start.gyro_bias_radps),
+        bias_cov=bias_cov,
+    )
+
+
+def _different(ranked: list[_Candidate]) -> list[_Candidate]:
+    """Drop what is clearly dearer than the cheapest, and what has come to the same heading as a cheaper one."""
+    kept: list[_Candidate] = []
+    for candidate in ranked:
+        yaw = candidate.values.atPose3(keys.pose(0)).rotation().yaw()
+        apart = all(
+            abs(wrap_angle(yaw - other.values.atPose3(keys.pose(0)).rotation().yaw())) > np.radians(15.0)
+            for other in kept
+        )
+        if apart and candidate.cost < ranked[0].cost + _COST_APART + 0.2 * ranked[0].cost:
+            kept.append(candidate)
+    return kept
+
+
+def _solve_candidate(problem: Problem, candidate: _Candidate, last: int) -> tuple[int, float]:
+    """Solve the first window in place, gently first; return iterations and final error."""
+    iterations, error = 0, 0.0
+    for stage, limit, settled_m, hypotheses in _START_STAGES:
+        for _ in range(limit):
+            verdicts = weigh(
+                problem, candidate.values, first=0, last=last, stage=stage, hypotheses=hypotheses, sparse=True
+            )
+            decided, jumps = decisions(verdicts), stage != "far"
+            step = solve_stretch(problem, candidate.values, 0, last, candidate.prior, decided, jumps=jumps, tol=1e-4)
+            iterations, error = iterations + step.iterations, step.error
+            if step.moved_m < settled_m:
+                break
+    return iterations, error
+
+
+def _index_after(problem: Problem, seconds: float) -> int:
+    stamps = problem.timeline.stamps_ns
+    return int(min(np.searchsorted(stamps, stamps[0] + int(seconds * 1e9)), len(stamps) - 1))
+
+
+def grow(problem: Problem, estimate: gtsam.Values, prior: StartPrior, known: int, progress: Progress) -> int:
+    """Take the estimate of states 0..known to the end of the run, a chunk at a time, in place."""
+    stamps, end = problem.timeline.stamps_ns, len(problem.timeline) - 1
+    verdicts = weigh(problem, estimate, first=0, last=known, stage="final", sparse=True)
+    step = solve_stretch(problem, estimate, 0, known, prior, decisions(verdicts))
+    iterations, first = step.iterations, 0
+    while known < end:
+        until = int(min(np.searchsorted(stamps, stamps[known] + int(_CHUNK_S * 1e9)), end))
+        start_of_window = int(np.searchsorted(stamps, stamps[known] - int(_OVERLAP_S * 1e9)))
+        if start_of_window > first:
+            prior = prior_at(problem, step, start_of_window)
+            first = start_of_window
+        dead_reckon(problem, estimate, known, until)
+        used, step = _solve_grown(problem, estimate, first, known, until, prior)
+        iterations, known = iterations + used, until
+        progress("growing", known, end)
+    return iterations
+
+
+def _solve_grown(
+    problem: Problem, values: gtsam.Values, first: int, known: int, last: int, prior: StartPrior
+) -> tuple[int, StretchStep]:
+    """Solve a window whose states after `known` are new, in place; return iterations and the last step.
+
+    New hypotheses wait until the rest has said where the vessel is, and how well it knows: with false matches
+    in it, a window solved under Huber alone is off by many of its own sigmas (0.01 rad/s of gyro bias, 300 m
+    after 20 s of dead reckoning).
+    """
+    fresh = {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
+    iterations = 0
+    for stage in ("final", *["far"] * _MAX_FAR_ROUNDS, "final"):
+        verdicts = weigh(problem, values, first=first, last=last, stage=stage, sparse=True)
+        step = solve_stretch(problem, values, first, last, prior, decisions(verdicts, fresh), jumps=stage != "far")
+        iterations += step.iterations
+        if step.moved_m < _FAR_SETTLED_M:
+            break
+    if not fresh:
+        return iterations, step
+    predicted = pose_covariance(bayes_tree(step.graph, step.values))
+    covariance: PoseCovariance = lambda k: predicted(k) if k > known else None
+    for _ in range(2):
+        verdicts = weigh(problem, values, first=first, last=last, stage="final", covariance=covariance, sparse=True)
+        step = solve_stretch(problem, values, first, last, prior, decisions(verdicts))
+        iterations += step.iterations
+        covariance = lambda _state: None
+        if step.moved_m < _SETTLED_M:
+            break
+    return iterations, step

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Passes over the whole run, with given decisions or until they stand."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphloc.build import Problem, StartPrior, build_graph
+from graphloc.recording import Progress
+from graphloc.solve._decide import Verdicts, decisions, weigh
+from graphloc.solve._optimize import full_step, optimize
+from graphloc.solve._stretch import moved
+
+SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
+MAX_FINAL_PASSES = 6
+_MAX_OPEN_PASSES, _OPEN_SETTLED_M = 4, 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One optimisation of the whole run: what came out, and how far any pose moved."""
+
+    values: gtsam.Values
+    graph: gtsam.NonlinearFactorGraph
+    iterations: int
+    moved_m: float
+    tree: Any = None
+
+
+def optimise_run(
+    problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior, *, jumps: bool = True
+) -> Step:
+    """Optimise the whole run with the given decisions."""
+    last = len(problem.timeline) - 1
+    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps)
+    solved = optimize(graph, guess, 12, 1e-3)
+    return Step(solved.values, graph, solved.iterations, moved(guess, solved.values, 0, last))
+
+
+def refine_run(
+    problem: Problem,
+    estimate: gtsam.Values,
+    verdicts: Verdicts,
+    prior: StartPrior,
+    *,
+    without: Container[tuple[int, int]] = (),
+) -> Step:
+    """One step of the whole run, with the tree that gives its covariances; `without` is left out."""
+    last = len(problem.timeline) - 1
+    graph, guess = build_graph(problem, estimate, decisions(verdicts, without), 0, last, prior)
+    values, tree = full_step(graph, guess)
+    return Step(values, graph, 1, moved(guess, values, 0, last), tree)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settled:
+    """A solution of the whole run; `tree` holds `graph` linearised within the last step of `values`."""
+
+    values: gtsam.Values
+    graph: gtsam.NonlinearFactorGraph
+    tree: Any
+    verdicts: Verdicts
+    passes: int
+    iterations: int
+    converged: bool
+
+
+def settle(
+    problem: Problem,
+    estimate: gtsam.Values,
+    verdicts: Verdicts,
+    prior: StartPrior,
+    progress: Progress,
+) -> Settled:
+    """Passes until modes and weights stand."""
+    last, iterations = len(problem.timeline) - 1, 0
+    for n in range(MAX_FINAL_PASSES):
+        # The first pass takes out the seams of the windows; from then on one step at a time is enough.
+        done = (optimise_run if n == 0 else refine_run)(problem, estimate, verdicts, prior)
+        estimate, iterations = done.values, iterations + done.iterations
+        used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage="final")
+        progress("final passes", n + 1, MAX_FINAL_PASSES)
+        if n > 0 and done.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
+            break
+    return Settled(
+        values=estimate,
+        graph=done.graph,
+        tree=done.tree,
+        verdicts=verdicts,
+        passes=n + 1,
+        iterations=iterations,
+        converged=done.moved_m < 3 * SETTLED_M,
+    )
+
+
+def changed(before: Verdicts, after: Verdicts) -> float:
+    """The largest change of any weight."""
+    return max((abs(v.weight - before[key].weight) for key, v in after.items()), default=0.0)
+
+
+def open_passes(
+    problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress
+) -> tuple[gtsam.Values, int, int]:
+    """Solve the whole run with gentle losses. Carries and anchors depend on the estimate: build anew until it stands."""
+    last = len(problem.timeline) - 1
+    passes = iterations = 0
+    for stage in ("far", "open"):
+        for n in range(_MAX_OPEN_PASSES):
+            verdicts = weigh(problem, estimate, first=0, last=last, stage=stage)
+            done = optimise_run(problem, estimate, verdicts, prior, jumps=stage != "far")
+            estimate = done.values
+            passes, iterations = passes + 1, iterations + done.iterations
+            progress(f"{stage} passes", n + 1, _MAX_OPEN_PASSES)
+            if done.moved_m < _OPEN_SETTLED_M:
+                break
+    return estimate, iterations, passes
+
+
+def expected_cost(problem: Problem, verdicts: Verdicts) -> float:
+    """Degrees of freedom of the weighted problem: what 2 x its cost is expected to be."""
+    n, m = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
+    expected = sum(len(v.residual.raw) * v.weight for v in verdicts.values())
+    expected += 9.0 * (n - 1) + 6.0 * (m - 1) + 15.0 - 9.0 * n - 6.0 * m
+    for stream in problem.streams:
+        if stream.slow is not None:
+            k, constant = len(stream.slow.sigma), not np.isfinite(stream.slow.time_constant_s)
+            expected += k * (m - 1) * (1 if constant else 2) + k - k * m
+    return expected

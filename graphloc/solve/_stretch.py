@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stretch of the run, solved on its own: states first..last of the estimate, changed in place."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gtsam
+import numpy as np
+
+from graphloc import keys
+from graphloc.build import Decisions, Problem, StartPrior, build_graph, nav_state
+from graphloc.frames import Array
+from graphloc.solve._optimize import bayes_tree, optimize
+
+
+class StretchStep(NamedTuple):
+    """One optimisation of a window: what came out, iterations, final error, how far any pose moved."""
+
+    values: gtsam.Values
+    graph: gtsam.NonlinearFactorGraph
+    iterations: int
+    error: float
+    moved_m: float
+
+
+def solve_stretch(
+    problem: Problem,
+    values: gtsam.Values,
+    first: int,
+    last: int,
+    prior: StartPrior,
+    decided: Decisions,
+    *,
+    jumps: bool = True,
+    tol: float = 3e-3,
+) -> StretchStep:
+    """Optimise states first..last in place, roughly: what it leaves, the passes over the whole run take up."""
+    graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps)
+    solved = optimize(graph, guess, 15, tol)
+    moved_m = moved(guess, solved.values, first, last)
+    update_states(problem, values, solved.values, first, last)
+    return StretchStep(solved.values, graph, solved.iterations, solved.error, moved_m)
+
+
+def moved(old: gtsam.Values, new: gtsam.Values, first: int, last: int) -> float:
+    """How far any pose moved, m (1 rad counts as 10 m)."""
+    steps = (old.atPose3(keys.pose(k)).localCoordinates(new.atPose3(keys.pose(k))) for k in range(first, last + 1))
+    return max(float(np.linalg.norm(s[3:]) + 10.0 * np.linalg.norm(s[:3])) for s in steps)
+
+
+def update_states(problem: Problem, values: gtsam.Values, new: gtsam.Values, first: int, last: int) -> None:
+    """Write the states first..last of `new` into `values` (in place: a copy each would be quadratic)."""
+    for k in range(first, last + 1):
+        values.update(keys.pose(k), new.atPose3(keys.pose(k)))
+        values.update(keys.velocity(k), new.atVector(keys.velocity(k)))
+    for j in range(int(problem.timeline.slow_of[first]), int(problem.timeline.slow_of[last]) + 1):
+        values.update(keys.bias(j), new.atConstantBias(keys.bias(j)))
+        for stream in problem.streams:
+            if stream.slow is not None:
+                key = keys.slow(stream.number, j)
+                values.update(key, np.atleast_1d(new.atVector(key)))
+
+
+def copy_states(problem: Problem, values: gtsam.Values, first: int, last: int) -> gtsam.Values:
+    """The states first..last and their slow states."""
+    copy = gtsam.Values()
+    for k in range(first, last + 1):
+        copy.insert(keys.pose(k), values.atPose3(keys.pose(k)))
+        copy.insert(keys.velocity(k), values.atVector(keys.velocity(k)))
+    for j in range(int(problem.timeline.slow_of[first]), int(problem.timeline.slow_of[last]) + 1):
+        fill_slow(problem, copy, j, values.atConstantBias(keys.bias(j)), slow_at(problem, values, j))
+    return copy
+
+
+def slow_at(problem: Problem, values: gtsam.Values, j: int) -> dict[int, Array]:
+    return {
+        s.number: np.atleast_1d(values.atVector(keys.slow(s.number, j))) for s in problem.streams if s.slow is not None
+    }
+
+
+def fill_slow(problem: Problem, values: gtsam.Values, j: int, bias: Any, slow: dict[int, Array]) -> None:
+    values.insert(keys.bias(j), bias)
+    for stream in problem.streams:
+        if stream.slow is not None:
+            values.insert(keys.slow(stream.number, j), slow.get(stream.number, np.zeros(len(stream.slow.sigma))))
+
+
+def dead_reckon(problem: Problem, values: gtsam.Values, known: int, until: int) -> None:
+    """Dead-reckon from state `known` to `until`."""
+    for k in range(known, until):
+        j, following = (int(problem.timeline.slow_of[i]) for i in (k, k + 1))
+        bias = values.atConstantBias(keys.bias(j))
+        state = problem.preintegrated[k].predict(nav_state(values, k), bias)
+        values.insert(keys.pose(k + 1), state.pose())
+        values.insert(keys.velocity(k + 1), np.asarray(state.velocity()))
+        if following != j:
+            fill_slow(problem, values, following, bias, slow_at(problem, values, j))
+
+
+def weak_prior(problem: Problem, values: gtsam.Values, k: int) -> StartPrior:
+    """A prior on state `k` that only keeps a stretch determined; what the stretch measures outweighs it."""
+    j = int(problem.timeline.slow_of[k])
+    slow = slow_at(problem, values, j)
+    return StartPrior(
+        pose=values.atPose3(keys.pose(k)),
+        pose_cov=np.diag([0.05**2] * 3 + [1.0] * 3),
+        velocity=values.atVector(keys.velocity(k)),
+        velocity_cov=np.eye(3) * 0.5**2,
+        bias=values.atConstantBias(keys.bias(j)),
+        bias_cov=np.diag([0.05**2] * 3 + [0.002**2] * 3),
+        slow={s.number: (slow[s.number], np.diag(s.slow.sigma**2)) for s in problem.streams if s.slow is not None},
+    )
+
+
+def prior_at(problem: Problem, step: StretchStep, k: int) -> StartPrior:
+    """The marginals at state `k` as a prior; cross terms are left out, which only loosens it."""
+    tree, values = bayes_tree(step.graph, step.values), step.values
+    j = int(problem.timeline.slow_of[k])
+    cov = {key: np.asarray(tree.marginalCovariance(key)) for key in (keys.pose(k), keys.velocity(k), keys.bias(j))}
+    slow = {}
+    for stream in problem.streams:
+        if stream.slow is not None:
+            key = keys.slow(stream.number, j)
+            slow[stream.number] = (np.atleast_1d(values.atVector(key)), np.asarray(tree.marginalCovariance(key)))
+    return StartPrior(
+        pose=values.atPose3(keys.pose(k)),
+        pose_cov=cov[keys.pose(k)],
+        velocity=values.atVector(keys.velocity(k)),
+        velocity_cov=cov[keys.velocity(k)],
+        bias=values.atConstantBias(keys.bias(j)),
+        bias_cov=cov[keys.bias(j)],
+        slow=slow,
+    )
