@@ -35,10 +35,20 @@ class HoldOut:
         raise ConfigError(f"--hold-out {text}: use every:N (N of 2 or more) or gaps:COUNTxSECONDS, e.g. gaps:8x10")
 
     def split(self, recording: Recording) -> tuple[Recording, tuple[GnssPosition, ...]]:
-        """Return the recording without the held fixes (their ledger rows say so), and the held fixes."""
+        """Return the recording without the held fixes (their ledger rows say so), and the held fixes.
+
+        Raises:
+            ConfigError: the run has too few fixes, or the gaps would run into each other.
+        """
         fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)]
         if len(fixes) < 3:
             raise ConfigError(f"{recording.source}: --hold-out needs at least 3 fixes, the run has {len(fixes)}")
+        span = (fixes[-1].stamp_ns - fixes[0].stamp_ns) * 1e-9
+        if self.gaps and self.gap_s * (self.gaps + 1) >= span:
+            raise ConfigError(
+                f"{recording.source}: --hold-out gaps:{self.gaps}x{self.gap_s:g}: the gaps do not fit into the "
+                f"{span:.1f} s from the first fix to the last; ask for fewer or shorter ones"
+            )
         held = tuple(m for i, m in enumerate(fixes) if self._holds(i, m, fixes))
         gone = {id(m) for m in held}
         rows = tuple(

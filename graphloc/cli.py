@@ -205,6 +205,9 @@ def _root(
         raise typer.Exit
 
 
+_INTERRUPTED = 130  # what typer makes of Ctrl-C, as shells do
+
+
 def main() -> None:
     """Run the command line; known errors become one line and exit 2."""
     try:
@@ -212,9 +215,11 @@ def main() -> None:
     except GraphlocError as error:
         print(f"graphloc: {error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
+    except SystemExit as end:
+        if end.code != _INTERRUPTED:
+            raise
         print("graphloc: interrupted; nothing was left half-written", file=sys.stderr, flush=True)
-        os._exit(130)  # at once: the solver's thread may be deep in a step that cannot be stopped
+        os._exit(_INTERRUPTED)  # at once: the solver's thread may be deep in a step that cannot be stopped
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from __future__ import annotations
 import enum
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from graphloc.errors import GraphlocError
 
@@ -101,7 +101,3 @@ class Ledger:
             if row.reason:
                 counter[(row.sensor or row.topic, row.outcome.value, row.reason)] += row.count
         return dict(sorted(counter.items()))
-
-    def with_topic(self, seq: int, topic: str) -> None:
-        """Fill in the topic of a row that was entered by a room that knows no topics."""
-        self._rows[seq] = replace(self._rows[seq], topic=topic)

@@ -1,0 +1,220 @@
+"""The command line as its user meets it: whole runs, one clear line for bad input, nothing half-written."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphloc import cli, outputs
+from graphloc.eval import report
+from graphloc.eval.simulate import Scenario, bl_scenario, simulate
+from graphloc.eval.simulate.bag import write_bag
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return write_bag(simulate(Scenario(duration_s=25.0), 3), tmp_path_factory.mktemp("cli") / "bag", ros=2)
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["graphloc", *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def edited(config: Path, folder: Path, old: str, new: str) -> Path:
+    text = config.read_text()
+    assert old in text
+    path = folder / "edited.yaml"
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+def test_smooth_writes_a_run_folder_and_does_not_replace_it_unasked(
+    bag: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out, "--json") == 0
+    printed = capsys.readouterr().out
+    numbers = json.loads(printed[: printed.rindex("}") + 1])
+    assert numbers["Against truth"]["graphloc"]["position_rmse_m"] < 0.5
+    assert printed.rstrip().endswith("report.html")
+    before = (out / "solution.csv").read_bytes()
+
+    monkeypatch.setattr("graphloc.app.load", lambda *_: pytest.fail("refused only after the bag was read"))
+    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert (out / "solution.csv").read_bytes() == before
+
+
+def test_a_draft_from_inspect_gives_a_track(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`inspect` then `smooth`, nothing edited.
+
+    The antenna's place and the IMU's yaw (5 deg here) are in no bag: that much the track is off.
+    """
+    where, _ = write_bag(simulate(bl_scenario(1, "clean"), 1), tmp_path / "bag", ros=1)
+    draft = tmp_path / "vessel.yaml"
+    assert run(monkeypatch, "inspect", where, "--write", draft) == 0
+    assert "guess" in draft.read_text()
+    assert run(monkeypatch, "smooth", where, "-c", draft, "-o", tmp_path / "run", "--json") == 0
+    printed = capsys.readouterr().out
+    truth = json.loads(printed[printed.index('{\n  "Against') : printed.rindex("}") + 1])["Against truth"]["graphloc"]
+    assert truth["position_rmse_m"] < 3.0
+    assert truth["heading_rmse_deg"] < 6.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("kind: gnss", "knid: gnss", "did you mean 'kind'"),
+        ("kind: gnss", "kind: gnsss", "did you mean 'gnss'"),
+        ("sensors:", "sensros:", "did you mean 'sensors'"),
+        ("topic: /gnss/fix", "topic: /gnss/fxi", "/gnss/fix"),
+        ("kind: imu", "kind: imu\n    accel_unit: furlong", "accel_unit"),
+        ("kind: imu", "kind: imu\n    accel_noise_ug_per_sqrt_hz: -3", "accel_noise_ug_per_sqrt_hz"),
+        ("sensors:", "sensors: [", "not valid YAML"),
+        ("sensors:", "vessel: !!python/object/apply:os.system ['touch pwned']\nsensors:", "not valid YAML"),
+    ],
+)
+def test_a_bad_vessel_yaml_is_one_line(
+    bag: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    old: str,
+    new: str,
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = edited(bag[1], tmp_path, old, new)
+    assert run(monkeypatch, "smooth", bag[0], "-c", config, "-o", tmp_path / "run") == 2
+    line = capsys.readouterr().err.strip().splitlines()
+    assert len(line) == 1
+    assert line[0].startswith("graphloc: ")
+    assert said in line[0]
+    assert str(config) in line[0] or str(bag[0]) in line[0]
+    assert not (tmp_path / "run").exists()
+    assert not (tmp_path / "pwned").exists()
+
+
+def test_bad_arguments_are_one_line(
+    bag: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.txt").write_text("precious")
+    file = tmp_path / "file"
+    file.write_text("")
+    good = ["smooth", bag[0], "-c", bag[1], "-o", tmp_path / "run"]
+    for arguments, said in (
+        (["smooth", tmp_path / "none.bag", *good[2:]], "none.bag"),
+        (["smooth", bag[0], "-c", tmp_path / "none.yaml", *good[4:]], "graphloc inspect"),
+        ([*good, "--hold-out", "every:x"], "every:"),
+        ([*good, "--hold-out", "gaps:500x10"], "gaps"),
+        ([*good[:5], mine, "--overwrite"], "no graphloc run folder"),
+        ([*good[:5], file], "is a file"),
+        (["simulate", "-o", tmp_path / "sim", "--noise", "pink"], "pink"),
+    ):
+        assert run(monkeypatch, *arguments) == 2, arguments
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1, lines
+        assert said in lines[0]
+    assert (mine / "thesis.txt").read_text() == "precious"
+
+
+def test_a_full_disk_leaves_nothing(
+    bag: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(outputs, "_tum", full)
+    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", tmp_path / "run") == 2
+    assert "No space left" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupt_while_writing_leaves_nothing_and_keeps_the_old_run(
+    bag: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / outputs.MARK).write_text("{}")
+
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    def end(code: int) -> None:
+        raise SystemExit(code)
+
+    monkeypatch.setattr(report, "write_report", interrupted)
+    monkeypatch.setattr(os, "_exit", end)
+    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out, "--overwrite") == 130
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert (out / outputs.MARK).read_text() == "{}"
+
+
+def test_ctrl_c_in_the_solver_ends_at_once(tmp_path: Path) -> None:
+    where, config = write_bag(simulate(bl_scenario(1, "drift"), 2), tmp_path / "bag", ros=2)
+    command = [sys.executable, "-m", "graphloc.cli", "smooth", where, "-c", config, "-o", tmp_path / "run"]
+    code = (
+        "import sys; from graphloc import cli; from graphloc.solve import _grow; grow = _grow.solve_start\n"
+        "def told(*a): print('solving', flush=True); return grow(*a)\n"
+        "import graphloc.solve._batch as b; b.solve_start = told\n"
+        f"sys.argv = {['graphloc', *map(str, command[3:])]!r}; cli.main()"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    )
+    assert started.stdout is not None
+    assert started.stdout.readline().strip() == "solving"
+    time.sleep(0.3)
+    began = time.monotonic()
+    started.send_signal(signal.SIGINT)
+    _, err = started.communicate(timeout=20)
+    assert started.returncode == 130
+    assert time.monotonic() - began < 5.0
+    assert "interrupted" in err
+    assert "Traceback" not in err
+    assert {p.name for p in tmp_path.iterdir()} == {"bag"}
+
+
+def test_the_written_bag_holds_the_track(
+    bag: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run's own bag is read back as a recording's truth would be, and agrees with solution.csv."""
+    from rosbags.highlevel import AnyReader
+
+    out = tmp_path / "run"
+    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out) == 0
+    table = np.genfromtxt(out / "solution.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    with AnyReader([out / "solution_bag"]) as reader:
+        odometry = [c for c in reader.connections if c.topic == "/graphloc/odometry"]
+        east = [
+            reader.deserialize(raw, c.msgtype).pose.pose.position.x  # type: ignore[attr-defined]
+            for c, _, raw in reader.messages(odometry)
+        ]
+    np.testing.assert_allclose(east, table["east_m"], atol=1e-3)
+
+
+def test_sensors_and_config_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, "sensors") == 0
+    assert {"imu", "gnss", "compass", "pose"} <= {line.split()[0] for line in capsys.readouterr().out.splitlines()}
+    assert run(monkeypatch, "config", "--docs") == 0
+    written = (Path(__file__).parent.parent / "docs/configuration.md").read_text()
+    assert capsys.readouterr().out == written, (
+        "docs/configuration.md: run `graphloc config --docs > docs/configuration.md`"
+    )

@@ -1,0 +1,96 @@
+"""Right or false: the chain of hypotheses against enumeration, and choices that confirm themselves."""
+
+from dataclasses import replace
+from itertools import product
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import bl_scenario, simulate
+from graphloc.frames import Array
+from graphloc.graph import FalseModel, Residual
+from graphloc.solve._hypotheses import FalseSequence, best_chain
+
+SIGMA_M = 0.2
+
+
+@pytest.fixture
+def sequence() -> FalseSequence:
+    rng = np.random.default_rng(2)
+    right, fresh = rng.normal(-1.0, 2.0, 7), rng.normal(-1.5, 1.0, 7)
+    return FalseSequence(right, fresh, np.concatenate([fresh[:1], fresh[1:] + rng.normal(0.0, 2.0, 6)]))
+
+
+def log_joint(s: FalseSequence, false: tuple[bool, ...]) -> float:
+    total = 0.0
+    for n, is_false in enumerate(false):
+        repeated = n > 0 and false[n - 1]
+        total += (s.repeated[n] if repeated else s.fresh[n]) if is_false else s.right[n]
+    return float(total)
+
+
+def test_posterior_is_that_of_all_128_sequences(sequence: FalseSequence) -> None:
+    paths = list(product((False, True), repeat=7))
+    logs = np.array([log_joint(sequence, p) for p in paths])
+    weights = np.exp(logs - logs.max())
+    right = np.array([[not f for f in p] for p in paths])
+    np.testing.assert_allclose(sequence.posterior(), weights @ right / weights.sum(), atol=1e-12)
+    assert sequence.log_evidence() == pytest.approx(np.logaddexp.reduce(logs))
+
+
+def stream_of(offsets: Array, repeats: float = 0.5) -> tuple[Any, list[tuple[Residual, ...]]]:
+    """A stream of matches at 1 Hz whose residuals lie at `offsets` (N, 2), m."""
+    model = FalseModel(probability=0.4, cov=np.eye(2) * 25.0, repeats=repeats)
+    measurements = [SimpleNamespace(stamp_ns=n * 1_000_000_000) for n in range(len(offsets))]
+    stream = SimpleNamespace(row=SimpleNamespace(false=lambda *_: model), config=None, measurements=measurements)
+    cov = np.eye(2) * SIGMA_M**2
+    found = [
+        (Residual(raw=o, cov=cov, jacobian=lambda: np.zeros((2, 6)), prior=0.6, size_m=None, size_deg=None),)
+        for o in offsets
+    ]
+    return stream, found
+
+
+def test_the_longest_slow_offset_is_the_right_one() -> None:
+    """60 % false, five of them in one place: what lies along one slowly moving offset, 4 m away, is right."""
+    rng = np.random.default_rng(4)
+    count = 40
+    drift = np.column_stack([3.0 + 0.02 * np.arange(count), np.full(count, -3.0)])
+    offsets = drift + rng.normal(0.0, SIGMA_M, (count, 2))
+    false = np.sort(rng.choice(count, 24, replace=False))
+    offsets[false] += rng.uniform(-5.0, 5.0, (24, 2)) + np.sign(rng.normal(size=(24, 2)))
+    offsets[10:15] = rng.normal(0.0, 0.05, (5, 2))  # where the estimate is: they confirm each other, and it
+    expected = [n not in {*false.tolist(), *range(10, 15)} for n in range(count)]
+    found = [mode is not None for mode in best_chain(*stream_of(offsets))]
+    assert sum(a != b for a, b in zip(found, expected, strict=True)) <= 1
+
+
+def test_nothing_but_noise_makes_no_long_chain() -> None:
+    offsets = np.random.default_rng(1).uniform(-5.0, 5.0, (30, 2))
+    assert sum(mode is not None for mode in best_chain(*stream_of(offsets))) <= 5
+
+
+@pytest.mark.parametrize(
+    ("noise", "seed", "why"),
+    [
+        ("drift", 4, "five equal false matches at the start, six at the end"),
+        ("drift", 0, "the first two matches are false and agree"),
+    ],
+)
+def test_false_matches_that_repeat_do_not_bend_the_track(noise: Any, seed: int, why: str) -> None:
+    run = simulate(bl_scenario(3, noise), seed)
+    assert compare_to_truth(app.simulated(run).solution.trajectory, run.truth).position_rmse_m < 0.2, why
+
+
+def test_long_outage_does_not_lock_the_matches_out() -> None:
+    """After 40 s without fixes and matches the prediction is metres off: the returning matches are believed."""
+    scenario = replace(bl_scenario(1, "drift"), duration_s=100.0, outage_s=(40.0, 80.0))
+    run = simulate(scenario, 5)
+    solution = app.simulated(run).solution
+    after = run.truth.stamps_ns[(run.truth.stamps_ns - run.truth.stamps_ns[0]) > 90_000_000_000]
+    error = solution.trajectory.at(after[:-200]).p_world_m - run.truth.at(after[:-200]).p_world_m
+    assert float(np.hypot(error[:, 0], error[:, 1]).max()) < 1.0

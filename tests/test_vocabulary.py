@@ -1,0 +1,152 @@
+"""Frames, time, trajectories and the ledger: laws that hold for any input."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyproj import Geod, Transformer
+from scipy.spatial.transform import Rotation
+
+from graphloc.errors import GraphlocError
+from graphloc.frames import (
+    Datum,
+    Geodetic,
+    heading_deg_from_yaw,
+    rotation_from_rpy_deg,
+    rpy_from_rotation,
+    wrap_angle,
+    yaw_from_heading_deg,
+)
+from graphloc.ledger import Ledger, LedgerRow, Outcome
+from graphloc.time import NS_PER_S, seconds_between, seconds_since, utc_text
+from graphloc.trajectory import Trajectory
+
+latitudes, longitudes = st.floats(-80.0, 80.0), st.floats(-180.0, 180.0)
+metres, angles = st.floats(-5000.0, 5000.0), st.floats(-20.0, 20.0)
+
+
+@given(latitudes, longitudes, metres, metres, st.floats(-50.0, 50.0))
+@settings(max_examples=50, deadline=None)
+def test_geodetic_and_back(lat: float, lon: float, e: float, n: float, u: float) -> None:
+    datum = Datum(Geodetic(lat, lon, 12.0))
+    there = datum.geodetic_from_enu(np.array([[e, n, u]]))
+    back = datum.enu_from_geodetic(there[:, 0], there[:, 1], there[:, 2])
+    np.testing.assert_allclose(back, [[e, n, u]], atol=1e-6)
+
+
+@given(latitudes, longitudes, st.floats(0.0, 360.0), st.floats(10.0, 2000.0))
+@settings(max_examples=50, deadline=None)
+def test_enu_agrees_with_the_geodesic(lat: float, lon: float, azimuth: float, distance: float) -> None:
+    """East and north against pyproj's geodesic: within the 1e-7 d^2/R that curvature makes of it."""
+    lon2, lat2, _ = Geod(ellps="WGS84").fwd(lon, lat, azimuth, distance)
+    e, n, _ = Datum(Geodetic(lat, lon, 0.0)).enu_from_geodetic(np.array([lat2]), np.array([lon2]), np.zeros(1))[0]
+    assert np.hypot(e, n) == pytest.approx(distance, abs=1e-3)
+    assert wrap_angle(np.arctan2(e, n) - np.radians(azimuth)) == pytest.approx(0.0, abs=2e-3)
+
+
+def test_enu_agrees_with_earth_centred_axes() -> None:
+    """Up is along the ellipsoid's normal: 100 m higher is 100 m up and nothing else, by ECEF differences."""
+    lat, lon = 59.3, 18.1
+    ecef = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    rise = np.subtract(ecef.transform(lon, lat, 120.0), ecef.transform(lon, lat, 20.0))
+    normal = [np.cos(np.radians(lat)) * np.cos(np.radians(lon)), np.cos(np.radians(lat)) * np.sin(np.radians(lon))]
+    assert rise[:2] / 100.0 == pytest.approx(normal, abs=1e-9)
+    enu = Datum(Geodetic(lat, lon, 20.0)).enu_from_geodetic(np.array([lat]), np.array([lon]), np.array([120.0]))
+    np.testing.assert_allclose(enu, [[0.0, 0.0, 100.0]], atol=1e-6)
+
+
+def test_compass_points() -> None:
+    assert np.degrees(yaw_from_heading_deg(np.array([0.0, 90.0, 180.0, 270.0]))) == pytest.approx([90, 0, -90, 180])
+    assert heading_deg_from_yaw(np.radians([0.0, 90.0, -90.0, 180.0])) == pytest.approx([90, 0, 180, 270])
+
+
+@given(st.floats(0.0, 359.99))
+def test_heading_and_back(heading: float) -> None:
+    back = float(heading_deg_from_yaw(yaw_from_heading_deg(heading)))
+    assert abs(wrap_angle(np.radians(back - heading))) < 1e-9
+
+
+@given(angles)
+def test_wrapping_keeps_the_direction(angle: float) -> None:
+    wrapped = float(wrap_angle(angle))
+    assert -np.pi < wrapped <= np.pi
+    assert np.cos(wrapped) == pytest.approx(np.cos(angle), abs=1e-9)
+    assert np.sin(wrapped) == pytest.approx(np.sin(angle), abs=1e-9)
+
+
+@given(st.floats(-179.0, 179.0), st.floats(-85.0, 85.0), st.floats(-179.0, 179.0))
+def test_roll_pitch_yaw_and_back(roll: float, pitch: float, yaw: float) -> None:
+    R = rotation_from_rpy_deg(np.array([roll, pitch, yaw]))
+    np.testing.assert_allclose(R, Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix(), atol=1e-12)
+    again = np.degrees(rpy_from_rotation(R[None])[0])
+    np.testing.assert_allclose(np.abs(wrap_angle(np.radians(again - [roll, pitch, yaw]))), 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("latitude", "expected"), [(0.0, 9.7803267715), (45.0, 9.806199), (90.0, 9.8321863685)])
+def test_gravity_of_grs80(latitude: float, expected: float) -> None:
+    """Moritz, Geodetic Reference System 1980: at the equator, at 45 deg and at the pole."""
+    assert Datum(Geodetic(latitude, 10.0, 0.0)).gravity_mps2 == pytest.approx(expected, abs=2e-6)
+    assert Datum(Geodetic(latitude, 10.0, 1000.0)).gravity_mps2 == pytest.approx(expected - 3.086e-3, abs=2e-6)
+
+
+@given(st.integers(0, 2**62), st.integers(1, 10**15))
+def test_time_differences_are_exact_to_the_nanosecond(start: int, step: int) -> None:
+    assert seconds_between(start, start + step) == step / NS_PER_S
+    assert seconds_since(start, np.array([start, start + step]))[1] == pytest.approx(step / NS_PER_S, rel=1e-15)
+
+
+def test_utc_text() -> None:
+    assert utc_text(1432235497988949113) == "2015-05-21T19:11:37.988949113Z"
+    assert utc_text(2**63 - 1).startswith("2262-04-11T23:47:16.")
+
+
+def circle(count: int = 50) -> Trajectory:
+    """A circle of 10 m at 0.1 rad/s, 1 s apart."""
+    t = np.arange(count) * 1.0
+    a = 0.1 * t
+    position = np.column_stack([10 * np.cos(a), 10 * np.sin(a), np.zeros(count)])
+    velocity = np.column_stack([-np.sin(a), np.cos(a), np.zeros(count)])
+    rotation = Rotation.from_rotvec(np.column_stack([0 * a, 0 * a, a + np.pi / 2])).as_matrix()
+    return Trajectory(
+        stamps_ns=(t * 1e9).astype(np.int64), p_world_m=position, R_world_body=rotation, v_world_mps=velocity
+    )
+
+
+def test_interpolation_follows_the_circle() -> None:
+    stamps = np.arange(300_000_000, 48_000_000_000, 777_000_000, dtype=np.int64)
+    there = circle().at(stamps)
+    a = 0.1 * stamps * 1e-9
+    np.testing.assert_allclose(there.p_world_m[:, :2], 10 * np.column_stack([np.cos(a), np.sin(a)]), atol=1e-5)
+    np.testing.assert_allclose(wrap_angle(there.yaw_rad - a - np.pi / 2), 0.0, atol=1e-9)
+
+
+def test_a_trajectory_covers_no_gap_and_no_outside() -> None:
+    whole = circle()
+    keep = np.r_[0:10, 20:50]
+    holed = Trajectory(
+        stamps_ns=whole.stamps_ns[keep], p_world_m=whole.p_world_m[keep], R_world_body=whole.R_world_body[keep]
+    )
+    asked = np.array([-1, 0, 5_500_000_000, 15_000_000_000, 25_500_000_000, 49_000_000_000, 49_000_000_001])
+    assert holed.covers(asked).tolist() == [False, True, True, False, True, True, False]
+    with pytest.raises(ValueError, match="outside"):
+        whole.at(np.array([60_000_000_000]))
+
+
+def test_stamps_must_increase() -> None:
+    with pytest.raises(ValueError, match="increase"):
+        Trajectory(stamps_ns=np.array([1, 1]), p_world_m=np.zeros((2, 3)), R_world_body=np.tile(np.eye(3), (2, 1, 1)))
+
+
+def row(seq: int, outcome: Outcome = Outcome.USED, count: int = 1) -> LedgerRow:
+    return LedgerRow(seq=seq, stamp_ns=0, sensor="gnss", topic="/fix", outcome=outcome, count=count)
+
+
+def test_a_message_is_entered_once() -> None:
+    ledger = Ledger([row(0), row(1, Outcome.REJECTED)])
+    with pytest.raises(GraphlocError, match="twice"):
+        ledger.add(row(1))
+    assert ledger.counts() == {"gnss": {"rejected": 1, "used": 1}}
+
+
+def test_rows_of_whole_topics_count_all_their_messages() -> None:
+    assert len(Ledger([row(0), row(-1, Outcome.IGNORED, count=40), row(-1, Outcome.IGNORED, count=2)])) == 43
