@@ -48,7 +48,7 @@ def stream_of(offsets: Array, repeats: float = 0.5) -> tuple[Any, list[tuple[Res
     measurements = [SimpleNamespace(stamp_ns=n * 1_000_000_000) for n in range(len(offsets))]
     stream = SimpleNamespace(row=SimpleNamespace(false=lambda *_: model), config=None, measurements=measurements)
     cov = np.eye(2) * SIGMA_M**2
-    found = [
+    found: list[tuple[Residual, ...]] = [
         (Residual(raw=o, cov=cov, jacobian=lambda: np.zeros((2, 6)), prior=0.6, size_m=None, size_deg=None),)
         for o in offsets
     ]
