@@ -95,5 +95,7 @@ def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, p
         iterations += used
     if not changed:
         return replace(settled, iterations=iterations)
-    again = settle(problem, settled.values, settled.verdicts, prior, progress)
-    return replace(again, iterations=iterations + again.iterations, passes=settled.passes + again.passes)
+    values, verdicts, passes = settled.values, settled.verdicts, settled.passes
+    del settled  # and its tree, before the next one is made
+    again = settle(problem, values, verdicts, prior, progress)
+    return replace(again, iterations=iterations + again.iterations, passes=passes + again.passes)

@@ -74,6 +74,7 @@ def judged_by_the_rest(problem: Problem, settled: Settled, prior: StartPrior) ->
         )
         judged.update({key: _decisive(v) for key, v in fresh.items()})
         iterations += rest.iterations
+        del rest  # and its tree, before the next one is made
     return judged, iterations
 
 

@@ -79,7 +79,9 @@ def settle(
 ) -> Settled:
     """Passes until modes and weights stand."""
     last, iterations = len(problem.timeline) - 1, 0
+    done: Step | None = None
     for n in range(MAX_FINAL_PASSES):
+        done = None  # frees its tree before the next one is made: gigabytes on a run of hours
         # The first pass takes out the seams of the windows; from then on one step at a time is enough.
         done = (optimise_run if n == 0 else refine_run)(problem, estimate, verdicts, prior)
         estimate, iterations = done.values, iterations + done.iterations
@@ -87,6 +89,7 @@ def settle(
         progress("final passes", n + 1, MAX_FINAL_PASSES)
         if n > 0 and done.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
             break
+    assert done is not None
     return Settled(
         values=estimate,
         graph=done.graph,
