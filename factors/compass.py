@@ -5,19 +5,18 @@
 
 yaw(R) = atan2(R10, R00). With R <- R Exp(theta): d yaw / d theta = -(row 2 of R) . (x-hat cross-terms),
 worked out in `_yaw_jacobian`. GTSAM has no native factor with yaw and offset in one, so this one is
-a `JacobianFactor` in a `LinearContainerFactor`, linearised anew at every pass: yaw is nearly linear
-in the correction (0.02 deg at 3 deg of roll and pitch and 5 deg of correction). The kernel enters
-as a weight, for the same reason. Not handled: pitch near +-90 deg.
+linearised anew at every pass (`_linear`): yaw is nearly linear in the correction (0.02 deg at 3 deg
+of roll and pitch and 5 deg of correction). Not handled: pitch near +-90 deg.
 """
 
 from __future__ import annotations
 
 import math
 
-import gtsam
 import numpy as np
 
-from graphloc.config import CompassConfig, KernelConfig
+from graphloc.config import CompassConfig
+from graphloc.factors._linear import linear_update
 from graphloc.frames import Array, wrap_angle
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor, SlowProcess
 from graphloc.measurements import CompassHeading
@@ -56,18 +55,10 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
 def factors(m: CompassHeading, config: CompassConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one heading."""
     residual = residuals(m, config, at)[0]
-    sigma = float(np.sqrt(residual.cov[0, 0]))
-    kernel = decision.kernel or KernelConfig(kind="none")  # a linear factor carries none: its weight stands in
-    weight = decision.weight * max(kernel.weight(residual.nis()), 1e-6)
-    model = gtsam.noiseModel.Isotropic.Sigma(1, sigma / np.sqrt(weight))
-    point = gtsam.Values()
-    point.insert(at.pose_key, at.T_world_body)
-    if at.slow_key is None:
-        linear = gtsam.JacobianFactor(at.pose_key, residual.jacobian(), -residual.raw, model)
-    else:
-        point.insert(at.slow_key, np.array(at.slow_value))
-        linear = gtsam.JacobianFactor(at.pose_key, residual.jacobian(), at.slow_key, np.eye(1), -residual.raw, model)
-    return GraphUpdate(factors=(gtsam.LinearContainerFactor(linear, point),))
+    terms = [(at.pose_key, at.T_world_body, residual.jacobian())]
+    if at.slow_key is not None:
+        terms.append((at.slow_key, np.array(at.slow_value), np.eye(1)))
+    return linear_update(residual, terms, decision)
 
 
 def slow(config: CompassConfig) -> SlowProcess | None:

@@ -4,36 +4,44 @@
     z = v + dv + R (omega x l) + w,   w ~ N(0, C)
 
 v: velocity of body in world at the state; dv: what the IMU says it gains until the measurement; omega:
-body rate from the gyroscope, bias removed; l: antenna in body. R and omega are taken from the current
-estimate (re-anchored every pass), so a native `PriorFactorVector` on v serves: at 15 deg/s and 3 m of
-lever, 1 deg of attitude error costs 14 mm/s.
+body rate from the gyroscope, bias removed; l: antenna in body. d z / d v = I, d z / d theta = -R [omega x l]_x.
+The swing is no nuisance but a measurement: in waves it tells the heading. With R held at the estimate
+instead, passes crept (6 of them, and not there yet). dv and omega are taken from the estimate, anew at
+every pass; dv within half a period of the states turns by 9 mm/s for 1 deg of attitude.
 """
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 
 from graphloc.config import VelocityConfig
-from graphloc.factors._noise import noise_model, with_floors
+from graphloc.factors._linear import linear_update
+from graphloc.factors._noise import with_floors
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor
 from graphloc.measurements import GnssVelocity
 
 
-def _added_mps(at: Attachment) -> Array:
+def _antenna_mps(at: Attachment) -> Array:
     swing = at.T_world_body.rotation().matrix() @ np.cross(at.gyro_radps, at.lever_m)
-    return np.asarray(at.dv_world_mps + swing)
+    return np.asarray(at.v_world_mps + at.dv_world_mps + swing)
+
+
+def _attitude_jacobian(at: Attachment) -> Array:
+    """Derivative (3, 6) of R Exp(theta) (omega x l) by the body tangent (theta, rho)."""
+    x, y, z = np.cross(at.gyro_radps, at.lever_m)
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.hstack([-at.T_world_body.rotation().matrix() @ skew, np.zeros((3, 3))])
 
 
 def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual predicted - measured (3,) in m/s, world axes."""
-    raw = at.v_world_mps + _added_mps(at) - m.v_world_mps
+    raw = _antenna_mps(at) - m.v_world_mps
     return (
         Residual(
             raw=raw,
             cov=with_floors(m.cov_m2ps2, config.min_sigma_mps**2),
-            jacobian=lambda: np.zeros((3, 6)),
+            jacobian=lambda: _attitude_jacobian(at),
             prior=1.0,
             size_m=None,
             size_deg=None,
@@ -43,14 +51,16 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
 
 def factors(m: GnssVelocity, config: VelocityConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one velocity."""
-    model = noise_model(with_floors(m.cov_m2ps2, config.min_sigma_mps**2), decision)
-    return GraphUpdate(factors=(gtsam.PriorFactorVector(at.velocity_key, m.v_world_mps - _added_mps(at), model),))
+    residual = residuals(m, config, at)[0]
+    swing = (at.pose_key, at.T_world_body, residual.jacobian())
+    return linear_update(residual, [swing, (at.velocity_key, at.v_world_mps, np.eye(3))], decision)
 
 
 def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
     """Return the velocity that the attachment's estimate would give."""
-    v = at.v_world_mps + _added_mps(at)
-    return GnssVelocity(stamp_ns=0, sensor="gnss_velocity", seq=0, v_world_mps=v, cov_m2ps2=np.eye(3) * 0.01)
+    return GnssVelocity(
+        stamp_ns=0, sensor="gnss_velocity", seq=0, v_world_mps=_antenna_mps(at), cov_m2ps2=np.eye(3) * 0.01
+    )
 
 
 ROW = Sensor(

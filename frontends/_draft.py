@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from graphloc.config import ImuConfig, SlowErrorConfig
-from graphloc.frontends._reports import CompassReport, GnssReport, ImuReport, Inspection, OdometryReport
+from graphloc.frontends._reports import CompassReport, GnssReport, ImuReport, Inspection, OdometryReport, VelocityReport
 from graphloc.frontends.decode import IMU
 
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
@@ -21,7 +21,8 @@ def draft_config(inspection: Inspection) -> str:
         f"# A first configuration for {inspection.source}, written by `graphloc inspect`.",
         "# Look at each line marked 'guess'. All keys and their defaults: docs/configuration.md.",
         f"vessel: {json.dumps(name)}",
-        "body_frame: base_link",
+        f"body_frame: {inspection.body_frame}"
+        + ("" if inspection.body_frame == "base_link" else "  # guess: by its name in /tf_static"),
         "# datum: the first good fix",
         "sensors:",
     ]
@@ -42,12 +43,8 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         yield _compass_block(_numbered("compass", k), compass)
     for compass in (c for c in inspection.compasses if not c.usable):
         yield [f"# orientation of {compass.topic}: left out as a compass; {compass.why}"]
-    for k, topic in enumerate(inspection.velocities):
-        yield [
-            f"{_numbered('gnss_velocity', k)}:",
-            "  kind: gnss_velocity",
-            f"  topic: {topic}  # guess: taken as a velocity in east, north, up",
-        ]
+    for k, twist in enumerate(inspection.velocities):
+        yield _velocity_block(_numbered("gnss_velocity", k), twist, next(iter(inspection.gnss), None))
     for k, item in enumerate(o for o in inspection.odometry if o.role == "pose"):
         yield [
             f"{_numbered('pose', k)}:",
@@ -115,6 +112,21 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
         more = f"vertical_sigma_m: {vertical:.1f}" if vertical else ""
         lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}")
+    return lines
+
+
+def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None) -> list[str]:
+    lines = [f"{name}:", "  kind: gnss_velocity", f"  topic: {twist.topic}"]
+    if twist.axes not in (None, "east, north, up"):
+        lines.append(f"  enabled: false  # guess: east, north, up is wanted, its axes look {twist.axes}; {twist.why}")
+    else:
+        lines[-1] += f"  # guess: a velocity in east, north, up; {twist.why}"
+    frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
+    evidence = "/tf_static knows it" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
+    if frame is not None:
+        lines.append(f"  mount: {{tf_frame: {json.dumps(frame)}}}  # {evidence}")
+    else:
+        lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
     return lines
 
 

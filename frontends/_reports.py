@@ -118,6 +118,16 @@ class CompassReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class VelocityReport:
+    """A velocity topic: the axes that fit the GNSS track (None: nothing to judge by), and why."""
+
+    topic: str
+    axes: str | None
+    why: str
+    tf_frame: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryReport:
     """An odometry or pose topic: role is 'truth', 'check_speed' or 'pose'."""
 
@@ -139,8 +149,9 @@ class Inspection:
     gnss: tuple[GnssReport, ...] = ()
     compasses: tuple[CompassReport, ...] = ()
     odometry: tuple[OdometryReport, ...] = ()
-    velocities: tuple[str, ...] = ()
+    velocities: tuple[VelocityReport, ...] = ()
     tf_frames: tuple[str, ...] = ()
+    body_frame: str = "base_link"
     warnings: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:

@@ -12,6 +12,9 @@ from scipy.spatial.transform import Rotation
 from graphloc.errors import InputError
 from graphloc.frames import Array
 
+# Names of the body frame, likeliest first.
+_BODY_NAMES = ("base_link", "base_footprint", "body", "base", "vessel", "vehicle", "boat")
+
 Pose = tuple[Array, Array]  # t (3,), R (3, 3): T_parent_child
 
 
@@ -35,6 +38,10 @@ class StaticTree:
     def frames(self) -> tuple[str, ...]:
         """Names of all frames."""
         return tuple(sorted(self._edges))
+
+    def body(self) -> str:
+        """Return the frame that is the craft's body by its usual names; `base_link` where there is none of them."""
+        return next((name for name in _BODY_NAMES if name in self._edges), _BODY_NAMES[0])
 
     def resolve(self, body: str, sensor: str) -> Pose | None:
         """Return T_body_sensor along the shortest chain; None where there is no chain."""

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from graphloc.frames import Array
 from graphloc.frontends._assess import (
-    Courses,
     compass_report,
     courses_of,
     gnss_report,
@@ -19,6 +20,7 @@ from graphloc.frontends._assess import (
     track,
 )
 from graphloc.frontends._assess_imu import imu_report
+from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._reports import (
     CompassReport,
@@ -28,6 +30,7 @@ from graphloc.frontends._reports import (
     MountGuess,
     OdometryReport,
     TopicReport,
+    VelocityReport,
 )
 from graphloc.frontends._source import Bag
 from graphloc.frontends._streams import Stream, read_streams
@@ -43,11 +46,11 @@ __all__ = [
     "MountGuess",
     "OdometryReport",
     "TopicReport",
+    "VelocityReport",
     "draft_config",
     "inspect_bag",
     "render",
 ]
-BODY_FRAME = "base_link"
 
 
 def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
@@ -69,9 +72,11 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     odometry = [_odometry_report(s) for s in filled if s.msgtype in (ODOMETRY, POSE)]
     wheels = [by_topic[o.topic] for o in odometry if o.role == "check_speed"]
     motion = motion_of(wheels, fixes)
-    found_gnss = [g for s in fixes if (g := gnss_report(s, _known(s, tree)))]
-    found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, tree, BODY_FRAME))]
-    courses = _courses(by_topic, found_gnss)
+    body = tree.body()
+    found_gnss = [g for s in fixes if (g := gnss_report(s, _known(s, tree, body)))]
+    found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, tree, body))]
+    stamps, p_m, scatter_m = _best_track(by_topic, found_gnss)
+    courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
     candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU)]
     return Inspection(
         source=source,
@@ -85,25 +90,25 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         gnss=tuple(sorted(found_gnss, key=lambda g: -g.fixes)),
         compasses=tuple(c for s in candidates if (c := compass_report(s, courses))),
         odometry=tuple(odometry),
-        velocities=tuple(s.topic for s in filled if s.msgtype == TWIST),
+        velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in filled if s.msgtype == TWIST),
         tf_frames=tree.frames,
+        body_frame=body,
         warnings=warnings,
     )
 
 
-def _known(stream: Stream, tree: StaticTree) -> str | None:
+def _known(stream: Stream, tree: StaticTree, body: str) -> str | None:
     """Return the stream's frame where /tf_static leads to it from the body."""
-    return stream.frame_id if tree.resolve(BODY_FRAME, stream.frame_id) and stream.frame_id in tree.frames else None
+    return stream.frame_id if tree.resolve(body, stream.frame_id) and stream.frame_id in tree.frames else None
 
 
-def _courses(by_topic: dict[str, Stream], gnss: Sequence[GnssReport]) -> Courses | None:
-    """Return the course over ground of the receiver with most fixes."""
+def _best_track(by_topic: dict[str, Stream], gnss: Sequence[GnssReport]) -> tuple[NDArray[np.int64], Array, float]:
+    """Return stamps, places and scatter (m) of the receiver with most fixes."""
     if not gnss:
-        return None
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0
     best = max(gnss, key=lambda g: g.fixes)
     stamps, p, _ = track(by_topic[best.topic])
-    scatter = max(best.scatter_m[:2]) if best.scatter_m else 1.0
-    return courses_of(stamps, p, scatter)
+    return stamps, p, max(best.scatter_m[:2]) if best.scatter_m else 1.0
 
 
 def _odometry_report(stream: Stream) -> OdometryReport:
@@ -138,6 +143,8 @@ def render(inspection: Inspection) -> str:
     for compass in inspection.compasses:
         verdict = f"fits as a compass ({compass.convention})" if compass.usable else "not usable as a compass"
         lines += ["", f"{compass.topic}: {verdict}", f"  {compass.why}"]
+    for twist in inspection.velocities:
+        lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
         lines += ["", f"{item.topic}: suggested as {item.role}", f"  {item.why}"]
     if inspection.tf_frames:

@@ -101,9 +101,9 @@ class Messages:
         cov = np.zeros(36) if covariance is None else np.array(covariance, dtype=float).ravel()
         return self.t["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=cov)
 
-    def twist(self, stamp_ns: int, v: Sequence[float], covariance: Any = None) -> Any:
+    def twist(self, stamp_ns: int, v: Sequence[float], covariance: Any = None, frame: str = "sensor") -> Any:
         return self.t["geometry_msgs/msg/TwistWithCovarianceStamped"](
-            header=self.header(stamp_ns), twist=self._twist(v, covariance)
+            header=self.header(stamp_ns, frame), twist=self._twist(v, covariance)
         )
 
     def odometry(

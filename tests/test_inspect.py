@@ -209,6 +209,34 @@ def test_tf_static_beats_guessing(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.mounts["imu"][1], rotation_z(90.0), atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("axes", "said", "enabled"),
+    [("enu", "east, north, up", True), ("ned", "north, east, down", False), ("body", "forward, left, up", False)],
+)
+def test_axes_of_a_velocity(axes: str, said: str, enabled: bool, tmp_path: Path) -> None:
+    """A velocity that is not in east, north, up is found out by the track, and left out."""
+    make, items = Messages(2), []
+    fixes = [(topic, at, m) for topic, at, m in drive(make, sigma_m=0.02) if topic == "/fix"]
+    places = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for _, _, m in fixes]).T)
+    stamps = np.array([m.header.stamp.sec * S + m.header.stamp.nanosec for _, _, m in fixes])
+    v = np.gradient(places, (stamps - stamps[0]) * 1e-9, axis=0)
+    for stamp, (east, north, up) in zip(stamps.tolist(), v, strict=True):
+        told = {"enu": (east, north, up), "ned": (north, east, -up), "body": (np.hypot(east, north), 0.0, up)}[axes]
+        items.append(("/vel", stamp + 1_000_000, make.twist(stamp, told)))
+    found, config, _ = look(tmp_path, sorted([*drive(make), *items], key=lambda item: item[1]), make)
+    assert (found.velocities[0].axes or "").startswith(said)
+    assert config.sensors["gnss_velocity"].enabled is enabled
+
+
+def test_body_frame_by_its_name(tmp_path: Path) -> None:
+    make = Messages(2)
+    edges = [("vessel", "imu_link", (0, 0, 1), (0, 0, 0, 1)), ("vessel", "gps", (1, 2, 3), (0, 0, 0, 1))]
+    items = [("/tf_static", START_NS, make.transforms(edges)), *drive(make, seconds=30)]
+    _, config, _ = look(tmp_path, items, make)
+    assert config.body_frame == "vessel"
+    np.testing.assert_allclose(read_recording(tmp_path / "run", config).mounts["gnss"][0], [1, 2, 3])
+
+
 def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
     make = Messages(2)
     items: list[Item] = []

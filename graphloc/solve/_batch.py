@@ -28,6 +28,8 @@ from graphloc.solve._grow import grow, solve_start
 from graphloc.solve._passes import Settled, expected_cost, open_passes, settle
 
 _MAX_NOISE_ROUNDS = 5
+# Before other choices are tried, the passes need not stand: what creeps on is a choice that confirms itself.
+_FIRST_PASSES, _LAST_PASSES = 6, 15
 _CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
 
 
@@ -87,15 +89,17 @@ def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, p
     of these is more probable, it is taken.
     """
     last = len(problem.timeline) - 1
-    settled = settle(problem, estimate, weigh(problem, estimate, first=0, last=last, stage="final"), prior, progress)
+    settled = settle(
+        problem, estimate, weigh(problem, estimate, first=0, last=last, stage="final"), prior, progress, _FIRST_PASSES
+    )
     changed, iterations = False, settled.iterations
     for other in (by_best_chains, judged_by_the_rest):
         others, used = other(problem, settled, prior)
         changed = take_more_probable(problem, settled, others, prior) or changed
         iterations += used
-    if not changed:
+    if settled.converged and not changed:
         return replace(settled, iterations=iterations)
     values, verdicts, passes = settled.values, settled.verdicts, settled.passes
     del settled  # and its tree, before the next one is made
-    again = settle(problem, values, verdicts, prior, progress)
+    again = settle(problem, values, verdicts, prior, progress, _LAST_PASSES)
     return replace(again, iterations=iterations + again.iterations, passes=passes + again.passes)

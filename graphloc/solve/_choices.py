@@ -25,7 +25,7 @@ from graphloc.solve._decide import (
     thinned,
     weigh,
 )
-from graphloc.solve._passes import MAX_FINAL_PASSES, SETTLED_M, SETTLED_WEIGHT, Settled, changed, refine_run
+from graphloc.solve._passes import SETTLED_M, SETTLED_WEIGHT, Settled, changed, refine_run
 from graphloc.solve._stretch import copy_states, solve_stretch, update_states, weak_prior
 
 # A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
@@ -34,6 +34,7 @@ _STRETCH_S, _STRETCH_MARGIN = 8.0, 0.5
 _SURE = 0.7  # a hypothesis judged by the rest alone is believed from here on
 # Surroundings on which another choice of hypotheses is tried.
 _AROUND_S = 10.0
+_AROUND_PASSES = 6
 
 
 def by_best_chains(problem: Problem, settled: Settled, prior: StartPrior) -> tuple[Verdicts, int]:
@@ -143,7 +144,7 @@ def _solve_around(
     problem: Problem, values: gtsam.Values, verdicts: Verdicts, first: int, last: int, prior: StartPrior
 ) -> _Around:
     local = copy_states(problem, values, max(first - 1, 0), min(last + 1, len(problem.timeline) - 1))
-    for _ in range(MAX_FINAL_PASSES):
+    for _ in range(_AROUND_PASSES):
         step = solve_stretch(problem, local, first, last, prior, decisions(verdicts), tol=1e-3)
         used, verdicts = verdicts, weigh(problem, local, first=first, last=last, stage="final")
         if step.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:

@@ -17,7 +17,6 @@ from graphloc.solve._optimize import full_step, optimize
 from graphloc.solve._stretch import moved
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
-MAX_FINAL_PASSES = 6
 _MAX_OPEN_PASSES, _OPEN_SETTLED_M = 4, 0.5
 
 
@@ -76,17 +75,18 @@ def settle(
     verdicts: Verdicts,
     prior: StartPrior,
     progress: Progress,
+    most: int,
 ) -> Settled:
-    """Passes until modes and weights stand."""
+    """Passes until modes and weights stand, `most` of them."""
     last, iterations = len(problem.timeline) - 1, 0
     done: Step | None = None
-    for n in range(MAX_FINAL_PASSES):
+    for n in range(most):
         done = None  # frees its tree before the next one is made: gigabytes on a run of hours
         # The first pass takes out the seams of the windows; from then on one step at a time is enough.
         done = (optimise_run if n == 0 else refine_run)(problem, estimate, verdicts, prior)
         estimate, iterations = done.values, iterations + done.iterations
         used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage="final")
-        progress("final passes", n + 1, MAX_FINAL_PASSES)
+        progress("final passes", n + 1, most)
         if n > 0 and done.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
             break
     assert done is not None
