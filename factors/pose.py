@@ -129,4 +129,5 @@ ROW = Sensor(
     ideal=ideal,
     false=false,
     absolute=True,
+    in_world=True,
 )

@@ -23,7 +23,7 @@ def draft_config(inspection: Inspection) -> str:
         f"vessel: {json.dumps(name)}",
         f"body_frame: {inspection.body_frame}"
         + ("" if inspection.body_frame == "base_link" else "  # guess: by its name in /tf_static"),
-        "# datum: the first good fix",
+        _datum_line(inspection.odometry),
         "sensors:",
     ]
     blocks = list(_blocks(inspection))
@@ -50,7 +50,8 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
             f"{_numbered('pose', k)}:",
             "  kind: pose",
             f"  topic: {item.topic}",
-            f"  enabled: false  # guess: its frame '{item.frame_id}' must be east-north-up at the datum; then true",
+            f"  # its frame '{item.frame_id}': {item.world}",
+            "  enabled: false  # guess: true if its frame is east-north-up at the datum and no fix went into it",
         ]
     if inspection.gnss:
         yield ["height:", "  enabled: false  # guess: set to true for a craft that floats"]
@@ -146,12 +147,23 @@ def _compass_block(name: str, compass: CompassReport) -> list[str]:
     return lines
 
 
+def _datum_line(odometry: tuple[OdometryReport, ...]) -> str:
+    """The datum is where the frame of true or measured poses has its origin; without them any place will do."""
+    for role in ("truth", "pose"):
+        for item in odometry:
+            if item.role == role and item.origin is not None:
+                lat, lon, height = item.origin
+                where = f"latitude_deg: {lat:.8f}, longitude_deg: {lon:.8f}, height_m: {height:.2f}"
+                return f"datum: {{{where}}}  # guess: the origin of {item.topic}; {item.world}"
+    return "# datum: the first good fix"
+
+
 def _beside(odometry: tuple[OdometryReport, ...]) -> list[str]:
     lines = []
-    for role, key, note in (
-        ("truth", "truth_topic", "for comparison only, never fused"),
-        ("check_speed", "check_speed_topic", "compared, never fused"),
-    ):
-        for k, item in enumerate(o for o in odometry if o.role == role):
-            lines.append(f"{'# ' if k else ''}{key}: {item.topic}  # guess: {item.why}; {note}")
+    truths = [o for o in odometry if o.role == "truth"]
+    for k, item in enumerate(sorted(truths, key=lambda o: o.origin is None)):
+        off = "# " if k or item.origin is None else ""
+        lines.append(f"{off}truth_topic: {item.topic}  # guess: {item.why}; {item.world}; for comparison, never fused")
+    for k, item in enumerate(o for o in odometry if o.role == "check_speed"):
+        lines.append(f"{'# ' if k else ''}check_speed_topic: {item.topic}  # guess: {item.why}; compared, never fused")
     return lines

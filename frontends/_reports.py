@@ -129,7 +129,11 @@ class VelocityReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryReport:
-    """An odometry or pose topic: role is 'truth', 'check_speed' or 'pose'."""
+    """An odometry or pose topic: role is 'truth', 'check_speed' or 'pose'.
+
+    `origin`: latitude, longitude (deg) and height (m) of its frame's origin, where the frame is
+    east-north-up by the fixes; `world`: the evidence.
+    """
 
     topic: str
     msgtype: str
@@ -137,6 +141,8 @@ class OdometryReport:
     role: str
     max_speed_mps: float
     why: str
+    origin: Vec | None
+    world: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,6 +21,7 @@ from graphloc.frontends._assess import (
 )
 from graphloc.frontends._assess_imu import imu_report
 from graphloc.frontends._assess_velocity import velocity_report
+from graphloc.frontends._assess_world import origin_of
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._reports import (
     CompassReport,
@@ -30,6 +31,7 @@ from graphloc.frontends._reports import (
     MountGuess,
     OdometryReport,
     TopicReport,
+    Vec,
     VelocityReport,
 )
 from graphloc.frontends._source import Bag
@@ -69,13 +71,13 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     by_topic = {s.topic: s for s in streams}
     filled = [s for s in streams if len(s)]
     fixes = [s for s in filled if s.msgtype == NAV_SAT_FIX]
-    odometry = [_odometry_report(s) for s in filled if s.msgtype in (ODOMETRY, POSE)]
-    wheels = [by_topic[o.topic] for o in odometry if o.role == "check_speed"]
+    poses = [s for s in filled if s.msgtype in (ODOMETRY, POSE)]
+    wheels = [s for s in poses if _role(s)[0] == "check_speed"]
     motion = motion_of(wheels, fixes)
     body = tree.body()
     found_gnss = [g for s in fixes if (g := gnss_report(s, _known(s, tree, body)))]
     found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, tree, body))]
-    stamps, p_m, scatter_m = _best_track(by_topic, found_gnss)
+    stamps, p_m, scatter_m, first = _best_track(by_topic, found_gnss)
     courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
     candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU)]
     return Inspection(
@@ -89,7 +91,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         imus=tuple(sorted(found_imus, key=lambda i: -len(by_topic[i.topic]))),
         gnss=tuple(sorted(found_gnss, key=lambda g: -g.fixes)),
         compasses=tuple(c for s in candidates if (c := compass_report(s, courses))),
-        odometry=tuple(odometry),
+        odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first)) for s in poses),
         velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in filled if s.msgtype == TWIST),
         tf_frames=tree.frames,
         body_frame=body,
@@ -102,26 +104,31 @@ def _known(stream: Stream, tree: StaticTree, body: str) -> str | None:
     return stream.frame_id if tree.resolve(body, stream.frame_id) and stream.frame_id in tree.frames else None
 
 
-def _best_track(by_topic: dict[str, Stream], gnss: Sequence[GnssReport]) -> tuple[NDArray[np.int64], Array, float]:
-    """Return stamps, places and scatter (m) of the receiver with most fixes."""
+def _best_track(
+    by_topic: dict[str, Stream], gnss: Sequence[GnssReport]
+) -> tuple[NDArray[np.int64], Array, float, Vec | None]:
+    """Return stamps, places about the first fix, scatter (m) and first fix of the receiver with most fixes."""
     if not gnss:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None
     best = max(gnss, key=lambda g: g.fixes)
     stamps, p, _ = track(by_topic[best.topic])
-    return stamps, p, max(best.scatter_m[:2]) if best.scatter_m else 1.0
+    return stamps, p, max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first
 
 
-def _odometry_report(stream: Stream) -> OdometryReport:
-    """Guess what an odometry or pose topic is, by its name and whether it reports a speed."""
+def _role(stream: Stream) -> tuple[str, float, str]:
+    """Guess what an odometry or pose topic is, by its name and whether it reports a speed; say the speed and why."""
     rows = stream.rows[sane(stream)]
     speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
     name = stream.topic.lower()
     if any(word in name for word in ("truth", "groundtruth", "/gt")):
-        role, why = "truth", "its name says so"
-    elif stream.msgtype == ODOMETRY and speed > 0.05:
-        role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: looks like wheel odometry"
-    else:
-        role, why = "pose", "it reports poses and no speed"
+        return "truth", speed, "its name says so"
+    if stream.msgtype == ODOMETRY and speed > 0.05:
+        return "check_speed", speed, f"it reports forward speeds up to {speed:.1f} m/s: looks like wheel odometry"
+    return "pose", speed, "it reports poses and no speed"
+
+
+def _odometry_report(stream: Stream, origin: Vec | None, world: str) -> OdometryReport:
+    role, speed, why = _role(stream)
     return OdometryReport(
         topic=stream.topic,
         msgtype=stream.msgtype,
@@ -129,6 +136,8 @@ def _odometry_report(stream: Stream) -> OdometryReport:
         role=role,
         max_speed_mps=speed,
         why=why,
+        origin=origin,
+        world=world,
     )
 
 
@@ -146,7 +155,7 @@ def render(inspection: Inspection) -> str:
     for twist in inspection.velocities:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
-        lines += ["", f"{item.topic}: suggested as {item.role}", f"  {item.why}"]
+        lines += ["", f"{item.topic}: suggested as {item.role}", f"  {item.why}; {item.world}"]
     if inspection.tf_frames:
         lines += ["", f"/tf_static knows: {', '.join(inspection.tf_frames)}"]
     lines += [f"warning: {w}" for w in inspection.warnings]

@@ -46,6 +46,7 @@ class Run:
 def load(bags: Sequence[Path], config_path: Path, progress: Progress = _quiet) -> tuple[Recording, VesselConfig]:
     """Read a vessel.yaml and the bag that it describes."""
     config = load_config(config_path, KINDS)
+    _refuse_world_without_datum(config, str(config_path))
     return read_recording(bags, config, progress), config
 
 
@@ -78,17 +79,28 @@ def simulated(run: SimulatedRun, *, compare: bool = False, progress: Progress = 
 
 
 def choose_datum(recording: Recording, config: VesselConfig) -> Datum:
-    """Return the configured datum, the truth's, or the median of the first fixes.
+    """Return the configured datum, or the median of the first fixes.
 
     Raises:
-        InputError: there is none, and no fix to take one from.
+        InputError: none is configured, and there is no fix to take one from, or something is given in world.
     """
     if config.datum is not None:
         return Datum(config.datum.geodetic)
+    _refuse_world_without_datum(config, recording.source)
     fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)][:5]
     if not fixes:
         raise InputError(f"{recording.source}: no GNSS fix to take a datum from; set datum: in vessel.yaml")
     return Datum(Geodetic(*(float(v) for v in np.median([m.position for m in fixes], axis=0))))
+
+
+def _refuse_world_without_datum(config: VesselConfig, where: str) -> None:
+    in_world = [f"sensors.{name}" for row in SENSORS if row.in_world for name in config.of_kind(row.kind)]
+    in_world += ["truth_topic"] if config.truth_topic else []
+    if in_world and config.datum is None:
+        raise InputError(
+            f"{where}: {', '.join(in_world)}: places in world, but nothing says where world's origin is; "
+            "set datum: (`graphloc inspect` guesses it)"
+        )
 
 
 def with_synthetic(recording: Recording, config: VesselConfig, datum: Datum) -> Recording:

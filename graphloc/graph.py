@@ -161,6 +161,7 @@ class Sensor:
             and is guarded by its kernel alone.
         synthetic: measurements made from the configuration over the run's stamps (no topic).
         absolute: whether it says something about position (for health).
+        in_world: whether it is given in world coordinates, so that the datum must be known.
     """
 
     kind: str
@@ -173,6 +174,7 @@ class Sensor:
     false: Callable[[Any, Any], FalseModel] | None = None
     synthetic: Callable[[str, Any, Sequence[int], float], Sequence[Measurement]] | None = None
     absolute: bool = False
+    in_world: bool = False
 
 
 class InertialRow(Protocol):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.frames import Array, Datum
+from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.trajectory import Trajectory
@@ -40,8 +40,7 @@ class Recording:
         message_count: messages in the recording.
         topics: topic of each configured sensor.
         mounts: body -> sensor (t (3,), R (3, 3)) of sensors whose mount came from /tf_static.
-        truth: true body trajectory in `truth_datum`'s world, if known.
-        truth_datum: datum of the truth and of pose measurements; None: that of the configuration.
+        truth: true body trajectory in world, if known.
         check_speed: forward speed that is compared, not fused.
         warnings: one line each, for the report.
     """
@@ -54,6 +53,5 @@ class Recording:
     topics: Mapping[str, str] = field(default_factory=dict)
     mounts: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
     truth: Trajectory | None = None
-    truth_datum: Datum | None = None
     check_speed: SpeedSeries | None = None
     warnings: tuple[str, ...] = ()

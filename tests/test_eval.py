@@ -6,6 +6,7 @@ from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
+from graphloc import app
 from graphloc.errors import ConfigError
 from graphloc.eval import ekf, metrics
 from graphloc.eval.holdout import HoldOut
@@ -42,8 +43,7 @@ def test_gnss_errors_are_those_of_the_thesis(case: int, noise: str, rmse: float,
     """BL tables 4.1 and 4.2; the maximum is that of a signal without our white noise, so looser."""
     run = simulate(bl_scenario(case, noise), 3)  # type: ignore[arg-type]
     fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
-    datum = run.recording.truth_datum
-    assert datum is not None
+    datum = app.choose_datum(run.recording, run.config)
     at = run.truth.at(np.array([m.stamp_ns for m in fixes]))
     antenna = at.p_world_m + at.R_world_body @ np.array([-1.5, 0.3, 2.2789])
     error = np.hypot(*(datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - antenna)[:, :2].T)
@@ -119,8 +119,7 @@ def test_gaps_are_where_they_should_be() -> None:
 def test_the_gate_of_the_thesis_drops_what_is_2_m_away() -> None:
     """A filter started 5 m off by a first bad fix rejects true matches; without a gate it takes them."""
     run = simulate(Scenario(duration_s=30.0, noise="clean", false_fraction=0.0), 2)
-    datum = run.recording.truth_datum
-    assert datum is not None
+    datum = app.choose_datum(run.recording, run.config)
     gated = ekf.run_bl(run.recording, run.config, datum, ekf.BlConfig(gate_m=0.05))
     free = ekf.run_bl(run.recording, run.config, datum, ekf.BlConfig(gate_m=1e9))
     count = [sum(r.outcome.value == "rejected" for r in f.ledger) for f in (gated, free)]

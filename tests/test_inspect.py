@@ -237,6 +237,32 @@ def test_body_frame_by_its_name(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_recording(tmp_path / "run", config).mounts["gnss"][0], [1, 2, 3])
 
 
+@pytest.mark.parametrize(
+    ("turned_deg", "moved_m", "found"), [(0.0, (700.0, -300.0, -20.0), True), (90.0, (0.0, 0.0, 0.0), False)]
+)
+def test_where_the_frame_of_the_truth_lies(
+    turned_deg: float, moved_m: tuple[float, float, float], found: bool, tmp_path: Path
+) -> None:
+    """Truth in a frame whose origin is not the first fix: the draft's datum is that origin, by geodesy done here."""
+    make, items = Messages(2), drive(Messages(2))
+    for _, log_ns, fix in [item for item in items if item[0] == "/fix"]:
+        enu = DATUM.enu_from_geodetic(*np.array([[fix.latitude], [fix.longitude], [fix.altitude]]))[0]
+        stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
+        items.append(("/truth", log_ns, make.odometry(stamp, rotation_z(turned_deg) @ (enu - moved_m))))
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert (config.truth_topic == "/truth") is found
+    assert (config.datum is not None) is found
+    if config.datum is not None:
+        metres_a_degree = np.pi / 180.0 * 6_371_000.0
+        at = config.datum.geodetic
+        assert (at.latitude_deg - 57.7) * metres_a_degree == pytest.approx(moved_m[1], abs=3.0)
+        east = (at.longitude_deg - 11.9) * metres_a_degree * np.cos(np.radians(57.7))
+        assert east == pytest.approx(moved_m[0], rel=0.01)
+        assert at.height_m == pytest.approx(20.0, abs=0.5)
+    else:
+        assert "not east-north-up" in text
+
+
 def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
     make = Messages(2)
     items: list[Item] = []
@@ -245,7 +271,7 @@ def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
         items.append(("/ground_truth/odom", t, make.odometry(t, v=(1, 0, 0))))
         items.append(("/match", t, make.pose(t, (1, 2, 3))))
     _, config, _ = look(tmp_path, items, make)
-    assert config.truth_topic == "/ground_truth/odom"
+    assert config.truth_topic is None  # no fix says where its frame lies
     assert config.check_speed_topic is None
     assert not config.sensors["pose"].enabled
     (tmp_path / "b").mkdir()

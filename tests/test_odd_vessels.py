@@ -71,8 +71,7 @@ def messages(run: SimulatedRun, make: Messages, *, compass: bool, velocity: bool
 
 def world_of(solved: app.Run, run: SimulatedRun) -> Trajectory:
     """The truth in the world of the solution, whose datum is the first fixes'."""
-    here, there = run.recording.truth_datum, solved.solution.datum
-    assert here is not None
+    here, there = app.choose_datum(run.recording, run.config), solved.solution.datum
     latitude, longitude, height = np.transpose(here.geodetic_from_enu(run.truth.p_world_m))
     return Trajectory(
         stamps_ns=run.truth.stamps_ns,

@@ -125,7 +125,6 @@ def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
         message_count=len(imu) + len(measurements),
         topics={name: sensor.topic for name, sensor in config.sensors.items()},
         truth=truth,
-        truth_datum=datum,
     )
     return SimulatedRun(scenario=scenario, seed=seed, recording=recording, truth=truth, config=config)
 
