@@ -17,8 +17,8 @@ import numpy as np
 
 from graphloc.config import CompassConfig
 from graphloc.factors._linear import linear_update
-from graphloc.frames import Array, wrap_angle
-from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor, SlowProcess
+from graphloc.frames import Array, Datum, wrap_angle
+from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import CompassHeading
 
 
@@ -83,6 +83,11 @@ def ideal(at: Attachment, config: CompassConfig) -> CompassHeading:
     return CompassHeading(stamp_ns=0, sensor="compass", seq=0, yaw_rad=yaw, sigma_rad=np.radians(config.sigma_deg))
 
 
+def hint(m: CompassHeading, mount_yaw_rad: float, datum: Datum) -> Hint:
+    """Return the body's heading."""
+    return Hint(yaw_rad=m.yaw_rad - mount_yaw_rad, yaw_sigma_rad=m.sigma_rad)
+
+
 ROW = Sensor(
     kind="compass",
     measurement=CompassHeading,
@@ -90,5 +95,6 @@ ROW = Sensor(
     residuals=residuals,
     factors=factors,
     ideal=ideal,
+    hint=hint,
     slow=slow,
 )

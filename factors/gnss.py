@@ -20,7 +20,7 @@ import numpy as np
 from graphloc.config import GnssConfig
 from graphloc.factors._noise import noise_model, with_floors
 from graphloc.frames import Array, Datum, Geodetic
-from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor, SlowProcess
+from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import GnssPosition
 
 _TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
@@ -116,6 +116,11 @@ def _skew(v: Any) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def hint(m: GnssPosition, mount_yaw_rad: float, datum: Datum) -> Hint:
+    """Return the antenna's place."""
+    return Hint(p_world_m=_world_m(m.position, datum), p_sigma_m=np.sqrt(np.diagonal(m.cov_enu_m2)))
+
+
 ROW = Sensor(
     kind="gnss",
     measurement=GnssPosition,
@@ -123,6 +128,7 @@ ROW = Sensor(
     residuals=residuals,
     factors=factors,
     ideal=ideal,
+    hint=hint,
     slow=slow,
     absolute=True,
 )

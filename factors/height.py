@@ -15,8 +15,8 @@ import numpy as np
 
 from graphloc.config import HeightConfig
 from graphloc.factors._noise import robust
-from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor
+from graphloc.frames import Array, Datum
+from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor
 from graphloc.measurements import HeightPrior
 from graphloc.time import duration_ns
 
@@ -66,6 +66,11 @@ def synthetic(name: str, config: HeightConfig, span_ns: Sequence[int], z_world_m
     return [HeightPrior(stamp_ns=s, sensor=name, seq=-1, z_world_m=z_world_m, sigma_m=config.sigma_m) for s in stamps]
 
 
+def hint(m: HeightPrior, mount_yaw_rad: float, datum: Datum) -> Hint:
+    """Return the height."""
+    return Hint(p_world_m=np.array([np.nan, np.nan, m.z_world_m]), p_sigma_m=np.array([np.nan, np.nan, m.sigma_m]))
+
+
 ROW = Sensor(
     kind="height",
     measurement=HeightPrior,
@@ -73,5 +78,6 @@ ROW = Sensor(
     residuals=residuals,
     factors=factors,
     ideal=ideal,
+    hint=hint,
     synthetic=synthetic,
 )

@@ -21,8 +21,8 @@ import numpy as np
 
 from graphloc.config import PoseConfig
 from graphloc.factors._noise import robust, with_floors
-from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Residual, Sensor
+from graphloc.frames import Array, Datum
+from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor
 from graphloc.measurements import AXES, PoseFix, PoseMode
 
 _WIDE_M, _WIDE_RAD = 1e3, 1e2
@@ -120,6 +120,17 @@ def ideal(at: Attachment, config: PoseConfig) -> PoseFix:
     return PoseFix(stamp_ns=0, sensor="pose", seq=0, axes=config.axes, modes=(mode,))
 
 
+def hint(m: PoseFix, mount_yaw_rad: float, datum: Datum) -> Hint:
+    """Return the likeliest mode's place and heading, as far as it has them."""
+    best = max(m.modes, key=lambda mode: mode.probability)
+    value, sigma = np.full(6, np.nan), np.full(6, np.nan)
+    picked = [AXES.index(a) for a in m.axes]
+    value[picked], sigma[picked] = best.value, np.sqrt(np.diagonal(best.cov))
+    return Hint(
+        p_world_m=value[:3], p_sigma_m=sigma[:3], yaw_rad=float(value[5]) - mount_yaw_rad, yaw_sigma_rad=float(sigma[5])
+    )
+
+
 ROW = Sensor(
     kind="pose",
     measurement=PoseFix,
@@ -127,6 +138,7 @@ ROW = Sensor(
     residuals=residuals,
     factors=factors,
     ideal=ideal,
+    hint=hint,
     false=false,
     absolute=True,
     in_world=True,

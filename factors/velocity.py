@@ -17,8 +17,8 @@ import numpy as np
 from graphloc.config import VelocityConfig
 from graphloc.factors._linear import linear_update
 from graphloc.factors._noise import with_floors
-from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor
+from graphloc.frames import Array, Datum
+from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor
 from graphloc.measurements import GnssVelocity
 
 
@@ -63,6 +63,11 @@ def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
     )
 
 
+def hint(m: GnssVelocity, mount_yaw_rad: float, datum: Datum) -> Hint:
+    """Return the antenna's velocity."""
+    return Hint(v_world_mps=m.v_world_mps)
+
+
 ROW = Sensor(
     kind="gnss_velocity",
     measurement=GnssVelocity,
@@ -70,4 +75,5 @@ ROW = Sensor(
     residuals=residuals,
     factors=factors,
     ideal=ideal,
+    hint=hint,
 )

@@ -8,8 +8,9 @@ at all. Builder and solvers know rows only through this module, never by name.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -146,6 +147,26 @@ class FalseModel:
     repeats: float
 
 
+def _unknown() -> Array:
+    return np.full(3, np.nan)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hint:
+    """What a measurement says of the body by itself, before there is an estimate. NaN: nothing.
+
+    Attributes:
+        p_world_m, p_sigma_m: (3,) place, lever arms aside. v_world_mps: (3,) velocity.
+        yaw_rad, yaw_sigma_rad: heading, from east, counter-clockwise.
+    """
+
+    p_world_m: Array = field(default_factory=_unknown)
+    p_sigma_m: Array = field(default_factory=_unknown)
+    v_world_mps: Array = field(default_factory=_unknown)
+    yaw_rad: float = math.nan
+    yaw_sigma_rad: float = math.nan
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensor:
     """One row of the table of sensors.
@@ -156,6 +177,7 @@ class Sensor:
         residuals: all hypotheses of a measurement at the current estimate.
         factors: the factors of the chosen one.
         ideal: the noise-free measurement that a state would give (used by conformance tests).
+        hint: what a measurement says at the start; takes it, the mount's yaw (rad) and the datum.
         slow: the slow state that a config asks for.
         false: the hypothesis that a measurement is false; None: the sensor has no such hypothesis
             and is guarded by its kernel alone.
@@ -170,6 +192,7 @@ class Sensor:
     residuals: Callable[[Any, Any, Attachment], tuple[Residual, ...]]
     factors: Callable[[Any, Any, Attachment, Decision], GraphUpdate]
     ideal: Callable[[Attachment, Any], Measurement]
+    hint: Callable[[Any, float, Datum], Hint]
     slow: Callable[[Any], SlowProcess | None] = lambda _config: None
     false: Callable[[Any, Any], FalseModel] | None = None
     synthetic: Callable[[str, Any, Sequence[int], float], Sequence[Measurement]] | None = None

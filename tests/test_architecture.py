@@ -103,3 +103,10 @@ def test_links_for_type_checkers_resolve(room: str) -> None:
 def test_rooms_are_no_top_level_modules(room: str, tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", f"import {room}"], cwd=tmp_path, capture_output=True, check=False)
     assert done.returncode != 0
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if kind_of(p) == "graph"], ids=lambda p: p.name)
+def test_graph_and_solvers_name_no_sensor(path: Path) -> None:
+    """They know the one inertial series and measurements as such; what a measurement says, its row says."""
+    named = {i for i in imports_of(path) if i.startswith("graphloc.measurements.")}
+    assert named <= {"graphloc.measurements.Measurement", "graphloc.measurements.ImuSeries"}

@@ -193,3 +193,24 @@ def test_every_kind_has_its_config() -> None:
     for kind, config in KINDS.items():
         assert config(kind=kind).kind == kind
         assert config.model_validate(config(kind=kind).model_dump(mode="json")) == config(kind=kind)
+
+
+@pytest.mark.parametrize("row", SENSORS, ids=lambda r: r.kind)
+def test_hints_say_what_the_state_says(row: Sensor) -> None:
+    """A noise-free measurement's hint is the state's own, as far as it tells; lever arms aside."""
+    config = row.config(kind=row.kind)
+    at = attachment(row, config, tilt=0.0, slow=False)
+    at = replace(
+        at, T_state_sensor=gtsam.Pose3(gtsam.Rot3.Yaw(0.4), np.zeros(3)), lever_m=np.zeros(3), dv_world_mps=np.zeros(3)
+    )
+    hint = row.hint(row.ideal(at, config), 0.4, DATUM)
+    truth = at.T_world_body.translation()
+    told = np.isfinite(hint.p_world_m)
+    np.testing.assert_allclose(hint.p_world_m[told], truth[told], atol=1e-6)
+    assert np.isfinite(hint.p_sigma_m[told]).all()
+    if np.isfinite(hint.yaw_rad):
+        assert np.isclose(np.exp(1j * hint.yaw_rad), np.exp(1j * at.T_world_body.rotation().yaw()))
+    if np.isfinite(hint.v_world_mps).all():
+        np.testing.assert_allclose(hint.v_world_mps, at.v_world_mps, atol=1e-9)
+    says = {"gnss": told.all(), "pose": np.isfinite(hint.yaw_rad), "compass": np.isfinite(hint.yaw_rad)}
+    assert says.get(row.kind, True)

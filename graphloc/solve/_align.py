@@ -22,7 +22,7 @@ from graphloc.build import Problem
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.errors import SolveError
 from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
-from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, HeightPrior, PoseFix
+from graphloc.graph import Hint
 from graphloc.time import duration_ns, utc_text
 
 _STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
@@ -74,20 +74,20 @@ def align(problem: Problem) -> Start:
     """
     origin = int(problem.imu.stamps_ns[0])
     window = problem.config.start.window_s
-    track = _positions(problem, origin)
+    hints = _hints(problem, origin)
+    track, yaws = _track(hints), _yaws(hints)
     if not len(track.t):
         raise SolveError(
             f"no position from {utc_text(origin)} on: no GNSS fix and no pose was accepted; "
             "check the topics, the status and the stamps with `graphloc inspect`"
         )
-    yaws = _yaw_samples(problem, origin)
     still = _standstill(problem, track, yaws)
     bias, bias_sigma, notes = _gyro_bias(problem, origin, window, still, yaws)
     turn = _turns(problem, window + 10.0 if yaws else 180.0, bias)
     at_start = still if still is not None and still[0] == 0.0 else None
     R_level, tilt_sigma, tilt_note = _level(problem, origin, window, at_start, turn, track)
     heading = _headings(problem, origin, track, yaws, turn)
-    p0, p_sigma, v0, v_sigma = _position_and_velocity(problem, track, at_start)
+    p0, p_sigma, v0, v_sigma = _position_and_velocity(hints, track, at_start)
     return Start(
         R_level_body=R_level,
         tilt_sigma_rad=tilt_sigma,
@@ -104,44 +104,35 @@ def align(problem: Problem) -> Start:
     )
 
 
-def _positions(problem: Problem, origin: int) -> _Track:
-    t, p, s = [], [], []
-    for stream in problem.streams:
-        for m in stream.measurements:
-            if isinstance(m, GnssPosition):
-                point = problem.datum.enu_from_geodetic(*(np.array([c]) for c in m.position))[0]
-                sigma = np.sqrt(np.diagonal(m.cov_enu_m2))
-            elif isinstance(m, PoseFix) and m.axes[:2] == ("x", "y"):
-                best = max(m.modes, key=lambda mode: mode.probability)
-                z = "z" in m.axes
-                point = np.array([*best.value[:2], best.value[2] if z else np.nan])
-                sigma = np.sqrt(np.array([*np.diagonal(best.cov)[:2], best.cov[2, 2] if z else np.nan]))
-            else:
-                continue
-            t.append((m.stamp_ns - origin) * 1e-9)
-            p.append(point)
-            s.append(sigma)
-    order = np.argsort(t, kind="stable")
-    return _Track(np.array(t)[order], np.array(p).reshape(-1, 3)[order], np.array(s).reshape(-1, 3)[order])
-
-
-def _yaw_samples(problem: Problem, origin: int) -> dict[str, Array]:
-    """Per sensor (M, 3): t in s, yaw of the body in rad, sigma in rad."""
-    found: dict[str, Array] = {}
+def _hints(problem: Problem, origin: int) -> dict[str, list[tuple[float, Hint]]]:
+    """Per sensor what its measurements say by themselves, with their times, s."""
+    found = {}
     for stream in problem.streams:
         R_sensor = stream.mount.rotation().matrix()
         mount_yaw = float(np.arctan2(R_sensor[1, 0], R_sensor[0, 0]))
-        rows = []
-        for m in stream.measurements:
-            if isinstance(m, CompassHeading):
-                rows.append(((m.stamp_ns - origin) * 1e-9, m.yaw_rad - mount_yaw, m.sigma_rad))
-            elif isinstance(m, PoseFix) and "yaw" in m.axes:
-                best = max(m.modes, key=lambda mode: mode.probability)
-                i = m.axes.index("yaw")
-                rows.append(((m.stamp_ns - origin) * 1e-9, best.value[i] - mount_yaw, np.sqrt(best.cov[i, i])))
-        if rows:
-            found[stream.name] = np.array(rows)
+        found[stream.name] = [
+            ((m.stamp_ns - origin) * 1e-9, stream.row.hint(m, mount_yaw, problem.datum)) for m in stream.measurements
+        ]
     return found
+
+
+def _track(hints: dict[str, list[tuple[float, Hint]]]) -> _Track:
+    rows = [(t, h) for found in hints.values() for t, h in found if np.isfinite(h.p_world_m[:2]).all()]
+    rows.sort(key=lambda row: row[0])
+    return _Track(
+        np.array([t for t, _ in rows]),
+        np.array([h.p_world_m for _, h in rows]).reshape(-1, 3),
+        np.array([h.p_sigma_m for _, h in rows]).reshape(-1, 3),
+    )
+
+
+def _yaws(hints: dict[str, list[tuple[float, Hint]]]) -> dict[str, Array]:
+    """Per sensor (M, 3): t in s, yaw of the body in rad, sigma in rad."""
+    rows = {
+        name: [(t, h.yaw_rad, h.yaw_sigma_rad) for t, h in found if np.isfinite(h.yaw_rad)]
+        for name, found in hints.items()
+    }
+    return {name: np.array(found) for name, found in rows.items() if found}
 
 
 def _samples(problem: Problem, start_s: float, stop_s: float) -> tuple[Array, Array, Array]:
@@ -319,19 +310,20 @@ def _circular_median(angles: Array) -> float:
 
 
 def _position_and_velocity(
-    problem: Problem, track: _Track, still: tuple[float, float] | None
+    hints: dict[str, list[tuple[float, Hint]]], track: _Track, still: tuple[float, float] | None
 ) -> tuple[Array, Array, Array, Array]:
     first = track.t[0]
     near = track.t <= first + 3.0
     near[: min(3, len(near))] = True
     p0 = np.array([np.nanmedian(c) if np.isfinite(c).any() else 0.0 for c in track.p[near].T])
-    heights = [m.z_world_m for s in problem.streams for m in s.measurements if isinstance(m, HeightPrior)]
-    if heights:
+    every = [h for found in hints.values() for _, h in found]
+    heights = [h.p_world_m[2] for h in every if np.isnan(h.p_world_m[0]) and np.isfinite(h.p_world_m[2])]
+    if heights:  # of sensors that tell nothing else: the waterline is surer than GNSS
         p0[2] = heights[0]
     v0 = np.zeros(3)
-    speeds = [m for s in problem.streams for m in s.measurements if isinstance(m, GnssVelocity)]
+    speeds = [h.v_world_mps for h in every if np.isfinite(h.v_world_mps).all()]
     if speeds:
-        v0 = np.median([m.v_world_mps for m in speeds[:5]], axis=0)
+        v0 = np.median(speeds[:5], axis=0)
     elif still is None:
         soon = track.t <= first + 5.0
         soon[: min(4, len(soon))] = True
