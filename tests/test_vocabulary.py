@@ -1,5 +1,7 @@
 """Frames, time, trajectories and the ledger: laws that hold for any input."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.errors import GraphlocError
 from graphloc.frames import (
+    FRAMES,
     Datum,
     Geodetic,
     heading_deg_from_yaw,
@@ -150,3 +153,9 @@ def test_a_message_is_entered_once() -> None:
 
 def test_rows_of_whole_topics_count_all_their_messages() -> None:
     assert len(Ledger([row(0), row(-1, Outcome.IGNORED, count=40), row(-1, Outcome.IGNORED, count=2)])) == 43
+
+
+def test_the_drawn_frames_are_the_ones_in_the_code() -> None:
+    rows = (Path(__file__).parent.parent / "docs/frames.md").read_text().splitlines()
+    for frame in FRAMES:
+        assert f"| {frame.name} | {frame.axes} | {frame.origin} |" in rows
