@@ -18,7 +18,7 @@ from graphloc.config import VesselConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.ledger import Ledger, LedgerRow, Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, Measurement, PoseFix
+from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, Measurement, PoseFix
 from graphloc.recording import Recording
 from graphloc.trajectory import Trajectory
 
@@ -91,7 +91,7 @@ def _inputs(recording: Recording, config: VesselConfig, rate_hz: float) -> _Inpu
     smooth = np.column_stack([np.convolve(mean[:, i], np.ones(window) / window, "same") for i in range(2)])
     events: list[tuple[int, Measurement, Array, float]] = []
     for m in recording.measurements:
-        if isinstance(m, GnssPosition | CompassHeading | PoseFix):
+        if isinstance(m, GnssPosition | GnssVelocity | CompassHeading | PoseFix):
             t, R_mount = mount_of(m.sensor, config.sensors[m.sensor], recording)
             events.append((m.stamp_ns, m, t, float(np.arctan2(R_mount[1, 0], R_mount[0, 0]))))
     return _Inputs(edges, mean[:, :2] - smooth, mean[:, 5], events)
@@ -122,21 +122,33 @@ def _start(inputs: _Inputs, recording: Recording, datum: Datum) -> Array:
 
 
 def _measurement(
-    m: Measurement, psi: float, lever: Array, mount_yaw: float, datum: Datum
+    m: Measurement, x: Array, rate: float, lever: Array, mount_yaw: float, datum: Datum
 ) -> tuple[Array, Array, Array]:
-    """Return z, the picked state indices, and R of a measurement, its lever arm taken off with psi."""
-    turn = np.array([[np.cos(psi), -np.sin(psi)], [np.sin(psi), np.cos(psi)]])
+    """Return innovation (k,), H (k, 5) and R of a measurement, its lever arm taken off with psi."""
+    c, s = np.cos(x[4]), np.sin(x[4])
+    turn = np.array([[c, -s], [s, c]])
+    if isinstance(m, GnssVelocity):
+        swing = rate * np.array([-lever[1], lever[0]])
+        H = np.zeros((2, 5))
+        H[:, 2:4], H[:, 4] = turn, np.array([[-s, -c], [c, -s]]) @ (x[2:4] + swing)
+        return m.v_world_mps[:2] - turn @ (x[2:4] + swing), H, np.array(m.cov_m2ps2[:2, :2])
     if isinstance(m, GnssPosition):
-        z = datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0, :2] - turn @ lever[:2]
-        return z, np.array([0, 1]), np.array(m.cov_enu_m2[:2, :2])
-    if isinstance(m, CompassHeading):
-        return np.array([m.yaw_rad - mount_yaw]), np.array([4]), np.array([[m.sigma_rad**2]])
-    assert isinstance(m, PoseFix)
-    best = max(m.modes, key=lambda mode: mode.probability)
-    index = {"x": 0, "y": 1, "yaw": 4}
-    picked = [i for i, a in enumerate(m.axes) if a in index]
-    z = np.array(best.value[picked])
-    return z, np.array([index[m.axes[i]] for i in picked]), np.array(best.cov[np.ix_(picked, picked)])
+        z = datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0, :2]
+        values, cov, index = {0: z[0], 1: z[1]}, m.cov_enu_m2[:2, :2], [0, 1]
+    elif isinstance(m, CompassHeading):
+        values, cov, index = {4: m.yaw_rad}, np.array([[m.sigma_rad**2]]), [4]
+    else:
+        assert isinstance(m, PoseFix)
+        best = max(m.modes, key=lambda mode: mode.probability)
+        states = {"x": 0, "y": 1, "yaw": 4}
+        picked = [i for i, a in enumerate(m.axes) if a in states]
+        index = [states[m.axes[i]] for i in picked]
+        values = dict(zip(index, best.value[picked], strict=True))
+        cov = best.cov[np.ix_(picked, picked)]
+    off = {0: (turn @ lever[:2])[0], 1: (turn @ lever[:2])[1], 4: mount_yaw}
+    r = np.array([values[i] - off[i] - x[i] for i in index])
+    r = np.where(np.array(index) == 4, wrap_angle(r), r)
+    return r, np.eye(5)[index], np.array(cov)
 
 
 def _row(m: Measurement, recording: Recording, outcome: Outcome, nis: float, reason: str) -> LedgerRow:
@@ -170,7 +182,9 @@ def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: Bl
         while k_event < len(inputs.events) and inputs.events[k_event][0] <= stamp:
             _, m, lever, mount_yaw = inputs.events[k_event]
             k_event += 1
-            z, index, R = _measurement(m, x[4], lever, mount_yaw, datum)
+            if isinstance(m, GnssVelocity):  # BL has none
+                continue
+            r, H, R = _measurement(m, x, rate, lever, mount_yaw, datum)
             if isinstance(m, GnssPosition):
                 e2 = (o.gnss_rmse_m**2 / 2.0) if o.gnss_rmse_m else float(np.trace(R)) / 2.0
                 R = o.a2 * np.eye(2) * e2
@@ -178,12 +192,11 @@ def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: Bl
                 R = o.a2 * np.array([[np.radians(o.heading_rmse_deg) ** 2 / 2.0]])
             else:
                 R = o.a3 * R
-            r = _innovation(z, x, index)
             if isinstance(m, PoseFix) and np.hypot(*r[:2]) >= o.gate_m:
                 if m.seq >= 0:
                     ledger.add(_row(m, recording, Outcome.REJECTED, 0.0, f"outside the {o.gate_m:g} m gate"))
                 continue
-            x, P, nis = _update(x, P, r, index, R)
+            x, P, nis = _update(x, P, r, H, R)
             if m.seq >= 0:
                 ledger.add(_row(m, recording, Outcome.USED, nis, ""))
         out.append((x.copy(), P.copy()))
@@ -210,13 +223,7 @@ def _advance(x: Array, accel: Array, rate: float, dt: float) -> Array:
     return new
 
 
-def _innovation(z: Array, x: Array, index: Array) -> Array:
-    r = z - x[index]
-    return np.where(index == 4, wrap_angle(r), r)
-
-
-def _update(x: Array, P: Array, r: Array, index: Array, R: Array) -> tuple[Array, Array, float]:
-    H = np.eye(len(x))[index]
+def _update(x: Array, P: Array, r: Array, H: Array, R: Array) -> tuple[Array, Array, float]:
     S = H @ P @ H.T + R
     K = np.linalg.solve(S, H @ P).T
     x = x + K @ r
@@ -249,17 +256,16 @@ def run_honest(recording: Recording, config: VesselConfig, datum: Datum) -> Filt
         while k_event < len(inputs.events) and inputs.events[k_event][0] <= stamp:
             _, m, lever, mount_yaw = inputs.events[k_event]
             k_event += 1
-            z, index, R = _measurement(m, x[4], lever, mount_yaw, datum)
+            r, planar, R = _measurement(m, x[:5], rate - x[5], lever, mount_yaw, datum)
+            H = np.hstack([planar, np.zeros((len(r), 1))])
             if isinstance(m, GnssPosition):
                 R = R + np.eye(2) * 1.0**2 * 10.0  # a slow error of 1 m, shared by about 10 fixes
-            r = _innovation(z, x, index)
-            H = np.eye(6)[index]
             nis = float(r @ np.linalg.solve(H @ P @ H.T + R, r))
             if nis > chi2.ppf(0.999, len(r)):
                 if m.seq >= 0:
                     ledger.add(_row(m, recording, Outcome.REJECTED, nis, "outside the 99.9 % gate"))
                 continue
-            x, P, _ = _update(x, P, r, index, R)
+            x, P, _ = _update(x, P, r, H, R)
             if m.seq >= 0:
                 ledger.add(_row(m, recording, Outcome.USED, nis, ""))
         out.append((x.copy(), P.copy()))
