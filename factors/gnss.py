@@ -131,4 +131,5 @@ ROW = Sensor(
     hint=hint,
     slow=slow,
     absolute=True,
+    company=True,
 )

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Height prior: a vessel floats.
 
-    z = (p + R l)_up + w,   w ~ N(0, s^2)
+    z = (p + R l)_up + d^2 / 2 R_earth + w,   w ~ N(0, s^2)
 
-p, R: state in world; l: body origin from it. A native `GPSFactorArm` whose horizontal sigmas are 1 km wide.
+p, R: state in world; l: body origin from it; d: horizontal distance from the datum, below whose tangent
+plane the sea falls off (2 m at 5 km), taken from the estimate at every pass. A native `GPSFactorArm`
+whose horizontal sigmas are 1 km wide.
 """
 
 from __future__ import annotations
@@ -21,12 +23,19 @@ from graphloc.measurements import HeightPrior
 from graphloc.time import duration_ns
 
 _WIDE_M = 1e3
+_EARTH_M = 6_371_000.0
+
+
+def _fall_m(p_world_m: Array) -> float:
+    """How far the ellipsoid lies below the datum's tangent plane."""
+    return float(p_world_m[0] ** 2 + p_world_m[1] ** 2) / (2.0 * _EARTH_M)
 
 
 def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual predicted - expected (1,) in m."""
     lever = np.asarray(at.T_state_sensor.translation())
-    raw = np.array([at.T_world_body.transformFrom(lever)[2] - m.z_world_m])
+    point = at.T_world_body.transformFrom(lever)
+    raw = np.array([point[2] + _fall_m(point) - m.height_m])
 
     def jacobian() -> Array:
         up = at.T_world_body.rotation().matrix()[2]
@@ -50,25 +59,26 @@ def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Deci
     model = robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas), decision.kernel)
     lever = np.asarray(at.T_state_sensor.translation())
     target = np.array(at.T_world_body.transformFrom(lever))
-    target[2] = m.z_world_m
+    target[2] = m.height_m - _fall_m(target)
     return GraphUpdate(factors=(gtsam.GPSFactorArm(at.pose_key, target, lever, model),))
 
 
 def ideal(at: Attachment, config: HeightConfig) -> HeightPrior:
     """Return the height that the attachment's estimate would give."""
-    z = float(at.T_world_body.transformFrom(at.T_state_sensor.translation())[2])
-    return HeightPrior(stamp_ns=0, sensor="height", seq=0, z_world_m=z, sigma_m=config.sigma_m)
+    point = at.T_world_body.transformFrom(at.T_state_sensor.translation())
+    height_m = float(point[2]) + _fall_m(point)
+    return HeightPrior(stamp_ns=0, sensor="height", seq=0, height_m=height_m, sigma_m=config.sigma_m)
 
 
-def synthetic(name: str, config: HeightConfig, span_ns: Sequence[int], z_world_m: float) -> list[HeightPrior]:
-    """Return one prior every `period_s` over the span (start, stop), at height `z_world_m`."""
+def synthetic(name: str, config: HeightConfig, span_ns: Sequence[int], height_m: float) -> list[HeightPrior]:
+    """Return one prior every `period_s` over the span (start, stop), at `height_m` over the datum's."""
     stamps = range(span_ns[0], span_ns[1], duration_ns(config.period_s))
-    return [HeightPrior(stamp_ns=s, sensor=name, seq=-1, z_world_m=z_world_m, sigma_m=config.sigma_m) for s in stamps]
+    return [HeightPrior(stamp_ns=s, sensor=name, seq=-1, height_m=height_m, sigma_m=config.sigma_m) for s in stamps]
 
 
 def hint(m: HeightPrior, mount_yaw_rad: float, datum: Datum) -> Hint:
     """Return the height."""
-    return Hint(p_world_m=np.array([np.nan, np.nan, m.z_world_m]), p_sigma_m=np.array([np.nan, np.nan, m.sigma_m]))
+    return Hint(p_world_m=np.array([np.nan, np.nan, m.height_m]), p_sigma_m=np.array([np.nan, np.nan, m.sigma_m]))
 
 
 ROW = Sensor(

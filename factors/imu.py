@@ -6,8 +6,8 @@
 Forster et al., TRO 2017, as in GTSAM's `PreintegratedImuMeasurements` and `ImuFactor`. The bias is a
 state of its own at the slow period, held between its nodes, with a random walk from node to node
 (docs/decisions): at 1 s that walk is far below the noise of a sample. Samples are interpolated at
-the interval's ends and averaged between stamps (trapezoid). In a hole of the data the last motion is
-held with noise that lets a vessel do anything a vessel does. Gravity removed by the driver: the same
+the interval's ends and averaged between stamps (trapezoid). A hole of the data is interpolated
+across, with noise that lets a vessel do anything a vessel does. Gravity removed by the driver: the same
 integral with g = 0. The states stand at the IMU (see `graphloc.build`), so there is no lever arm here:
 `setBodyPSensor` would leave out the Euler term (angular acceleration x lever), 0.07 m/s^2 in harbour
 waves at 1 m, which lost whole runs. Not handled: coning faster than the sample rate.

@@ -141,5 +141,6 @@ ROW = Sensor(
     hint=hint,
     false=false,
     absolute=True,
+    company=True,
     in_world=True,
 )

@@ -76,4 +76,5 @@ ROW = Sensor(
     factors=factors,
     ideal=ideal,
     hint=hint,
+    company=True,
 )

@@ -84,10 +84,9 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
 
 def _noise_lines(imu: ImuReport) -> list[str]:
     """Noise is set only where the bag shows more than the default allows for."""
-    if imu.accel_noise_ug is None or imu.gyro_noise_mdps is None:
-        return ["  # noise: the defaults; no standstill in this bag to measure it at"]
     default = ImuConfig()
-    lines = [f"  # measured at standstill: {imu.accel_noise_ug:.0f} ug, {imu.gyro_noise_mdps:.1f} mdps per sqrt(Hz)"]
+    noise = f"{imu.accel_noise_ug:.0f} ug, {imu.gyro_noise_mdps:.1f} mdps per sqrt(Hz)"
+    lines = [f"  # measured, worst axis, vibration included: {noise}"]
     if imu.accel_noise_ug > default.accel_noise_ug_per_sqrt_hz:
         lines.append(f"  accel_noise_ug_per_sqrt_hz: {imu.accel_noise_ug:.0f}  # guess: as measured")
     if imu.gyro_noise_mdps > default.gyro_noise_mdps_per_sqrt_hz:
@@ -155,7 +154,7 @@ def _datum_line(odometry: tuple[OdometryReport, ...]) -> str:
                 lat, lon, height = item.origin
                 where = f"latitude_deg: {lat:.8f}, longitude_deg: {lon:.8f}, height_m: {height:.2f}"
                 return f"datum: {{{where}}}  # guess: the origin of {item.topic}; {item.world}"
-    return "# datum: the first good fix"
+    return "# datum: the median of the first five fixes"
 
 
 def _beside(odometry: tuple[OdometryReport, ...]) -> list[str]:

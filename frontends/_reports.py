@@ -52,7 +52,8 @@ class ImuReport:
     Attributes:
         gravity_size: median size of the acceleration; gravity_axis: its direction, unit vector.
         accel_unit, gyro_unit, gravity: as `vessel.yaml` has them; why: one line each, where not the standard.
-        still_s: standstill found; gyro_bias_radps and the noise densities are from it (None without).
+        still_s: standstill found; gyro_bias_radps is from it (None without).
+        accel_noise_ug, gyro_noise_mdps: noise densities, of the worst axis, at rest or in motion.
         reported_accel_ug, reported_gyro_mdps: densities that the messages' covariances amount to.
     """
 
@@ -65,8 +66,8 @@ class ImuReport:
     why: tuple[str, ...]
     still_s: float
     gyro_bias_radps: Vec | None
-    accel_noise_ug: float | None
-    gyro_noise_mdps: float | None
+    accel_noise_ug: float
+    gyro_noise_mdps: float
     reported_accel_ug: float | None
     reported_gyro_mdps: float | None
     mount: MountGuess

@@ -204,14 +204,12 @@ def _imu_lines(imu: ImuReport) -> list[str]:
         f"  mount: {imu.mount.rpy_deg} deg; {imu.mount.evidence}",
     ]
     if imu.gyro_bias_radps is None:
-        lines.append("  no standstill found, so bias and noise were not measured")
+        lines.append("  no standstill found, so the gyro bias was not measured")
     else:
         bias = ", ".join(f"{b:+.5f}" for b in imu.gyro_bias_radps)
-        lines.append(
-            f"  standstill {imu.still_s:.1f} s: gyro bias {bias} rad/s, noise {imu.accel_noise_ug:.0f} ug/sqrt(Hz) "
-            f"and {imu.gyro_noise_mdps:.1f} mdeg/s/sqrt(Hz)"
-        )
-    return lines
+        lines.append(f"  standstill {imu.still_s:.1f} s: gyro bias {bias} rad/s")
+    noise = f"{imu.accel_noise_ug:.0f} ug/sqrt(Hz) and {imu.gyro_noise_mdps:.1f} mdeg/s/sqrt(Hz)"
+    return [*lines, f"  noise of the worst axis, vibration included: {noise}"]
 
 
 def _gnss_lines(gnss: GnssReport) -> list[str]:

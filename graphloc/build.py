@@ -12,7 +12,8 @@ solution is moved to the body's origin at the end (`graphloc.solve`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -29,6 +30,7 @@ from graphloc.graph import Attachment, Decision, InertialLink, InertialRow, Sens
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.recording import Recording
+from graphloc.time import utc_text
 from graphloc.timeline import Timeline, make_timeline
 
 # A step of a slow state is believed to be a jump beyond this many sigmas.
@@ -41,7 +43,7 @@ class Stream:
 
     Attributes:
         number: of the sensor, for keys. name, row, config: the sensor.
-        slow: its slow state, or None. slow_model: its Jump kernel where steps may jump.
+        slow: its slow state, or None. left_out: the slow state that it would have in company.
         mount: pose of the sensor from the IMU's place, body axes.
         measurements: M of them by stamp. state: (M,) nearest state. carry: per measurement the
             preintegrated motion from the state before it, or None where it stands on a state.
@@ -54,6 +56,7 @@ class Stream:
     row: Sensor
     config: SensorConfig
     slow: SlowProcess | None
+    left_out: SlowProcess | None
     mount: Any
     measurements: tuple[Measurement, ...]
     state: NDArray[np.int64]
@@ -102,8 +105,12 @@ def make_problem(
         SolveError: the recording has no usable IMU data.
     """
     imu = recording.imu
+    if not any(sensor.kind == inertial.kind and sensor.enabled for sensor in config.sensors.values()):
+        raise SolveError(
+            f"{recording.source}: no enabled sensor of kind {inertial.kind} in vessel.yaml, and it needs one"
+        )
     if imu is None or len(imu) < 10:
-        raise SolveError(f"{recording.source}: no IMU data (need at least 10 samples); check sensors.imu.topic")
+        raise SolveError(f"{recording.source}: no IMU data (need at least 10 samples); check its topic and stamps")
     imu_config = config.sensors[imu.sensor]
     t_body_imu, R = mount_of(imu.sensor, imu_config, recording)
 
@@ -111,39 +118,27 @@ def make_problem(
         return inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale)
 
     links = relink(1.0)
-    start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
-    inside = [m for m in recording.measurements if start <= m.stamp_ns <= stop]
-    rejected = tuple(
-        LedgerRow(
-            seq=m.seq,
-            stamp_ns=m.stamp_ns,
-            sensor=m.sensor,
-            topic=recording.topics.get(m.sensor, ""),
-            outcome=Outcome.REJECTED,
-            reason="no IMU data at this stamp",
-        )
-        for m in recording.measurements
-        if not start <= m.stamp_ns <= stop
-    )
-    timeline = make_timeline(start, stop, inside, config.timeline)
     by_kind = {row.kind: row for row in rows}
+    inside, rejected, warnings = _sorted_out(recording, config, set(by_kind), imu)
+    start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
+    timeline = make_timeline(start, stop, inside, config.timeline)
     by_sensor: dict[str, list[Measurement]] = {}
     for m in inside:
         by_sensor.setdefault(m.sensor, []).append(m)
-    absolute = sum(
-        bool(s.kind in by_kind and by_kind[s.kind].absolute and n in by_sensor) for n, s in config.sensors.items()
+    company = sum(
+        bool(s.kind in by_kind and by_kind[s.kind].company and n in by_sensor) for n, s in config.sensors.items()
     )
     streams = []
     for number, (name, sensor) in enumerate(config.sensors.items()):
-        if sensor.kind in by_kind and sensor.enabled and name in by_sensor:
+        if name in by_sensor:
             row = by_kind[sensor.kind]
             t, R_mount = mount_of(name, sensor, recording)
             mount = (t - t_body_imu, R_mount)
             slow = row.slow(sensor)
-            if slow is not None and slow.needs_company and absolute < 2:
-                slow = None
-            streams.append(_stream(number, name, row, sensor, slow, mount, by_sensor[name], timeline, links))
-    warnings = [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
+            left_out = slow if slow is not None and slow.needs_company and company < 2 else None
+            slow = slow if left_out is None else None
+            streams.append(_stream(number, name, row, sensor, slow, left_out, mount, by_sensor[name], timeline, links))
+    warnings += [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
     return Problem(
         config=config,
         datum=datum,
@@ -156,9 +151,40 @@ def make_problem(
         noise_scale=1.0,
         preintegrated=_preintegrate(timeline, links),
         streams=tuple(streams),
-        rejected=rejected,
+        rejected=tuple(rejected),
         warnings=tuple(warnings),
     )
+
+
+def _sorted_out(
+    recording: Recording, config: VesselConfig, kinds: Container[str], imu: ImuSeries
+) -> tuple[list[Measurement], list[LedgerRow], list[str]]:
+    """Return the measurements that the graph can take, rows for the others, and warnings."""
+    start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
+    asked_for = {name for name, sensor in config.sensors.items() if sensor.kind in kinds and sensor.enabled}
+    inside, rows = [], []
+    outside, every = Counter[str](), Counter[str]()
+    for m in recording.measurements:
+        every[m.sensor] += 1
+        outcome, reason = Outcome.REJECTED, "no IMU data at this stamp"
+        if m.sensor not in asked_for:
+            outcome, reason = Outcome.IGNORED, "its sensor is switched off or not in the configuration"
+        elif start <= m.stamp_ns <= stop:
+            inside.append(m)
+            continue
+        else:
+            outside[m.sensor] += 1
+        topic = recording.topics.get(m.sensor, "")
+        rows.append(
+            LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason)
+        )
+    span = f"{utc_text(start)} to {utc_text(stop)}"
+    warnings = [
+        f"{name}: {n} of {every[name]} measurements lie outside the IMU's span ({span}): no track there"
+        for name, n in outside.items()
+        if n > 0.02 * every[name] and n > 5
+    ]
+    return inside, rows, warnings
 
 
 def _preintegrate(timeline: Timeline, links: InertialLink) -> tuple[Any, ...]:
@@ -179,6 +205,7 @@ def _stream(
     row: Sensor,
     config: SensorConfig,
     slow: SlowProcess | None,
+    left_out: SlowProcess | None,
     mount: tuple[Array, Array],
     measurements: list[Measurement],
     timeline: Timeline,
@@ -198,6 +225,7 @@ def _stream(
         row,
         config,
         slow,
+        left_out,
         T_state_sensor,
         tuple(measurements),
         np.array(state, dtype=np.int64),
@@ -364,3 +392,5 @@ def _add_slow_chain(
         if not constant:
             standing = slow.sigma * np.sqrt(2.0 * slow.time_constant_s / dt)
             graph.add(gtsam.PriorFactorVector(key[n + 1], zero, diagonal(standing)))
+    if not constant:
+        graph.add(gtsam.PriorFactorVector(key[-1], zero, diagonal(slow.sigma * np.sqrt(2.0))))

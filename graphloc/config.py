@@ -37,7 +37,7 @@ class Block(BaseModel):
 
 
 class DatumConfig(Block):
-    """Origin of the world frame; without this block it is the first good fix, at its height."""
+    """Origin of the world frame; without this block it is the median of the first five fixes."""
 
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     """Latitude, deg, WGS 84."""
@@ -140,7 +140,9 @@ class ImuConfig(SensorConfig):
     adapt_noise: bool = True
     """Scale the noise up (never down, and said in the report) where the run contradicts it several times over."""
     max_gap_s: Positive = 0.5
-    """A longer hole between samples is an IMU gap: no inertial link is made across it."""
+    """A longer hole between samples is an IMU gap: bridged by a link with noise that lets a vessel do anything."""
+    max_bridge_s: Positive = 20.0
+    """A longer gap is not bridged: the run is cut there, and its parts are solved one by one."""
     kernel: KernelConfig = KernelConfig(kind="none")
     """Robust loss: not used for inertial data."""
 
@@ -263,6 +265,10 @@ class PoseConfig(SensorConfig):
     def _ordered(cls, axes: tuple[str, ...]) -> tuple[str, ...]:
         if not axes:
             raise ValueError("at least one axis is needed")
+        if ("roll" in axes) != ("pitch" in axes):
+            raise ValueError(
+                "roll and pitch go together: which of the world's axes one of them is, the heading decides"
+            )
         return tuple(a for a in AXES if a in axes)
 
 

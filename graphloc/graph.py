@@ -119,7 +119,8 @@ class SlowProcess:
         name, unit, axes: for outputs. scale: from the state's unit to `unit`.
         sigma: (k,) standing size. time_constant_s: correlation time; inf for a constant.
         jumps: put a robust loss on its steps.
-        needs_company: leave it out where no second absolute sensor can tell it from motion.
+        needs_company: leave it out where no second sensor can tell it from motion; its size is then
+            added to the bounds.
     """
 
     name: str
@@ -183,6 +184,7 @@ class Sensor:
             and is guarded by its kernel alone.
         synthetic: measurements made from the configuration over the run's stamps (no topic).
         absolute: whether it says something about position (for health).
+        company: whether it can tell another sensor's slow error from motion.
         in_world: whether it is given in world coordinates, so that the datum must be known.
     """
 
@@ -197,6 +199,7 @@ class Sensor:
     false: Callable[[Any, Any], FalseModel] | None = None
     synthetic: Callable[[str, Any, Sequence[int], float], Sequence[Measurement]] | None = None
     absolute: bool = False
+    company: bool = False
     in_world: bool = False
 
 

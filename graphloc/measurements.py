@@ -137,9 +137,9 @@ class PoseFix(Measurement):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HeightPrior(Measurement):
-    """Height of the body origin above the datum's ellipsoidal height, from waterline and tide: m."""
+    """Height of the body origin over the ellipsoid less that of the datum, from waterline and tide: m."""
 
-    z_world_m: float
+    height_m: float
     sigma_m: float
 
 

@@ -206,7 +206,7 @@ def test_hints_say_what_the_state_says(row: Sensor) -> None:
     hint = row.hint(row.ideal(at, config), 0.4, DATUM)
     truth = at.T_world_body.translation()
     told = np.isfinite(hint.p_world_m)
-    np.testing.assert_allclose(hint.p_world_m[told], truth[told], atol=1e-6)
+    np.testing.assert_allclose(hint.p_world_m[told], truth[told], atol=1e-3)  # the sea falls 0.4 mm off at 70 m
     assert np.isfinite(hint.p_sigma_m[told]).all()
     if np.isfinite(hint.yaw_rad):
         assert np.isclose(np.exp(1j * hint.yaw_rad), np.exp(1j * at.T_world_body.rotation().yaw()))

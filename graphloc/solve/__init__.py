@@ -7,6 +7,8 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+import numpy as np
+
 from graphloc.build import make_problem
 from graphloc.config import VesselConfig
 from graphloc.frames import Datum
@@ -14,6 +16,7 @@ from graphloc.graph import InertialRow, Sensor
 from graphloc.recording import Progress, Recording
 from graphloc.solution import Solution
 from graphloc.solve._batch import solve_batch
+from graphloc.solve._parts import solve_parts
 from graphloc.solve._solution import make_solution
 
 __all__ = ["smooth"]
@@ -42,11 +45,13 @@ def smooth(
         SolveError: the run cannot be started or solved; the text says why.
     """
 
-    def work() -> Solution:
-        problem = make_problem(recording, config, datum, rows, inertial)
-        return make_solution(problem, recording, solve_batch(problem, progress))
+    def solve(part: Recording) -> Solution:
+        problem = make_problem(part, config, datum, rows, inertial)
+        return make_solution(problem, part, solve_batch(problem, progress))
 
-    return _on_deep_stack(work)
+    imu = config.of_kind(inertial.kind).values()
+    bridge_s = min((sensor.max_bridge_s for sensor in imu), default=np.inf)
+    return _on_deep_stack(lambda: solve_parts(recording, bridge_s, solve))
 
 
 def _on_deep_stack(work: Callable[[], _T]) -> _T:

@@ -328,11 +328,13 @@ def _position_and_velocity(
         soon = track.t <= first + 5.0
         soon[: min(4, len(soon))] = True
         v0[:2] = [_slope(track.t[soon], track.p[soon, i]) for i in range(2)]
-        p0[:2] -= v0[:2] * float(np.median(track.t[near]))
-    sigma = np.full(3, 10.0) + 3.0 * np.nan_to_num(track.sigma[near], nan=5.0).max(axis=0)
     v_sigma = np.full(3, 0.2 if still else 3.0)
     v_sigma[2] = 0.2 if still else 1.0
-    return p0, sigma, v0, v_sigma
+    # Carried back to the first state, straight: what the vessel did before the first position is unknown.
+    back_s = max(float(np.median(track.t[near])), 0.0)
+    p0[:2] -= v0[:2] * back_s
+    sigma = np.full(3, 10.0) + 3.0 * np.nan_to_num(track.sigma[near], nan=5.0).max(axis=0)
+    return p0, np.hypot(sigma, v_sigma * back_s), v0, np.hypot(v_sigma, min(back_s, 20.0) * 0.1)
 
 
 def start_pose(start: Start, yaw_rad: float) -> Any:

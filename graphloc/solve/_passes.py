@@ -132,5 +132,5 @@ def expected_cost(problem: Problem, verdicts: Verdicts) -> float:
     for stream in problem.streams:
         if stream.slow is not None:
             k, constant = len(stream.slow.sigma), not np.isfinite(stream.slow.time_constant_s)
-            expected += k * (m - 1) * (1 if constant else 2) + k - k * m
+            expected += k * (m - 1) * (1 if constant else 2) + k * (1 if constant else 2) - k * m
     return expected

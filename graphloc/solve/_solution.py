@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from graphloc import keys
@@ -23,6 +24,7 @@ _FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-
 # Health: DNV asks for 2.5 m at 95 % in port (Digerud); beyond 25 m a pose helps nobody there.
 _GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_RAD = 2.5, 25.0, np.radians(45.0)
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
+_NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
 
 
 def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
@@ -45,8 +47,12 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         + np.einsum("nij,nj->ni", R, np.cross(gyro, lever)),
         cov=np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k], lever) for k in range(n)]),
     )
+    assert trajectory.cov is not None
+    trajectory.cov[:, :3, :3] += _left_out(problem)
     since = {s.name: _since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
-    health, reasons = _health(trajectory, since, result.converged)
+    stats = _stats(problem, result)
+    health, reasons = _health(trajectory, since, _misfit(stats, result))
+    ledger = _ledger(problem, recording, result.verdicts)
     return Solution(
         datum=problem.datum,
         trajectory=trajectory,
@@ -58,9 +64,29 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         health_reason=reasons,
         since_agreed_s=since,
         slow={s.name: _slow(problem, s, result) for s in problem.streams if s.slow is not None},
-        ledger=_ledger(problem, recording, result.verdicts),
-        stats=_stats(problem, result),
+        ledger=ledger,
+        stats=stats,
     )
+
+
+def _left_out(problem: Problem) -> Array:
+    """Covariance (3, 3) of slow errors that nothing could tell from motion: the position is off by as much."""
+    total = np.zeros((3, 3))
+    for stream in problem.streams:
+        if stream.left_out is not None:
+            total += np.diag(stream.left_out.sigma**2)
+    if any(s.row.synthetic is not None for s in problem.streams):  # the height is known otherwise
+        total[2, 2] = 0.0
+    return total
+
+
+def _misfit(stats: SolveStats, result: BatchResult) -> str:
+    """Why no part of the run can be called good; empty where nothing speaks against it."""
+    if not result.converged:
+        return "the solver did not converge"
+    if result.noise_scale > _NO_NOISE or stats.cost > _NO_FIT * max(stats.expected_cost, 1.0):
+        return "the measurements contradict each other"
+    return ""
 
 
 def world_covariance(cov_body: Any, R: Array, lever_m: Array) -> Array:
@@ -104,17 +130,25 @@ def _since_agreed(problem: Problem, stream: Stream, verdicts: dict[tuple[int, in
     return np.where(left >= 0, (stamps - agreed[np.maximum(left, 0)]) * 1e-9, np.inf)
 
 
-def _health(
-    trajectory: Trajectory, since: dict[str, Array], converged: bool
-) -> tuple[tuple[Health, ...], tuple[str, ...]]:
+def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
+    """Seconds since a sensor agreed, or until it first does: a smoother knows what comes."""
+    known = np.flatnonzero(np.isfinite(since))
+    if not len(known):
+        return since
+    first = stamps_ns[known[0]] - int(since[known[0]] * 1e9)
+    return np.where(np.isfinite(since), since, (first - stamps_ns) * 1e-9)
+
+
+def _health(trajectory: Trajectory, since: dict[str, Array], misfit: str) -> tuple[tuple[Health, ...], tuple[str, ...]]:
     assert trajectory.cov is not None
     horizontal = trajectory.cov[:, :2, :2]
     bound = np.sqrt(chi2.ppf(0.95, 2) * np.linalg.eigvalsh(horizontal)[:, -1])
     heading = 1.96 * np.sqrt(trajectory.cov[:, 5, 5])
     health, reasons = [], []
-    nearest = np.min(list(since.values()), axis=0) if since else np.full(len(bound), np.inf)
+    away = {name: _or_until(s, trajectory.stamps_ns) for name, s in since.items()}
+    nearest = np.min(list(away.values()), axis=0) if away else np.full(len(bound), np.inf)
     for k in range(len(bound)):
-        silent = [name for name, s in since.items() if s[k] > _SILENT_S]
+        silent = [name for name, s in away.items() if s[k] > _SILENT_S]
         if bound[k] > _LOST_BOUND_M or heading[k] > _LOST_HEADING_RAD:
             state, why = Health.LOST, f"95 % bound {bound[k]:.0f} m, heading {np.degrees(heading[k]):.0f} deg"
         elif nearest[k] > _DEAD_RECKONING_S:
@@ -123,8 +157,8 @@ def _health(
             state, why = Health.DEGRADED, f"95 % bound {bound[k]:.1f} m"
         elif silent:
             state, why = Health.DEGRADED, f"{', '.join(silent)} missing or not agreeing"
-        elif not converged:
-            state, why = Health.DEGRADED, "the solver did not converge"
+        elif misfit:
+            state, why = Health.DEGRADED, misfit
         else:
             state, why = Health.GOOD, ""
         health.append(state)
@@ -181,17 +215,28 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
     if not result.converged:
         warnings.append("the solver did not converge: the last pass still moved states or weights")
     if result.noise_scale > 1.0:
-        warnings.append(
-            f"IMU noise scaled up {result.noise_scale:.1f} times: as configured, the IMU contradicts the other sensors; "
-            "set accel_noise_ug_per_sqrt_hz and gyro_noise_mdps_per_sqrt_hz accordingly"
+        said = (
+            f"IMU noise scaled up {result.noise_scale:.1f} times: as configured, the IMU contradicts the other sensors"
         )
+        if result.noise_scale > _NO_NOISE:
+            cure = "no IMU is that noisy: look for a wrong mount, unit, axis convention, time offset or sensor"
+        else:
+            cure = (
+                "set accel_noise_ug_per_sqrt_hz and gyro_noise_mdps_per_sqrt_hz accordingly, or look for a wrong mount"
+            )
+        warnings.append(f"{said}; {cure}")
     cost = 2.0 * float(result.graph.error(result.values))
-    if expected > 0 and cost > 3.0 * expected:
+    if expected > 0 and cost > _NO_FIT * expected:
         warnings.append(
             f"the cost is {cost / expected:.1f} times its expectation: noise is configured too small, or a "
             "mount, a unit or a time offset is wrong"
         )
     for stream in problem.streams:
+        if stream.left_out is not None:
+            warnings.append(
+                f"{stream.name}: no second sensor can tell its slow error (multipath) from motion; the bounds allow "
+                f"{stream.left_out.sigma[0]:.1f} m (1 sigma) for it; slow_error.enabled: false where there is none"
+            )
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
         share = float((weights < AGREES).mean()) if len(weights) else 0.0
         if share > 0.5 and len(weights) > 10:

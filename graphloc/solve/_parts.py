@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run whose IMU fell silent for long is several runs: cut there, each solved for itself, joined again.
+
+Over a hole of minutes nothing links the two sides: as one graph, both sides were bent by the link that
+has to stand for it (120 s: 4.6 m and 30 deg off beside the hole, where 0.1 m is usual).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.errors import SolveError
+from graphloc.ledger import Ledger, LedgerRow, Outcome
+from graphloc.recording import Recording
+from graphloc.solution import SlowEstimate, Solution, SolveStats
+from graphloc.time import utc_text
+from graphloc.trajectory import Trajectory
+
+
+def solve_parts(recording: Recording, bridge_s: float, solve: Callable[[Recording], Solution]) -> Solution:
+    """Cut the recording at holes of the IMU longer than `bridge_s`; solve the parts and join them.
+
+    Raises:
+        SolveError: no part could be solved; it is the first part's.
+    """
+    parts = _cut(recording, bridge_s)
+    if len(parts) == 1:
+        return solve(recording)
+    solutions, rows, warnings, failure = [], list(recording.rows), [], None
+    for part in parts:
+        assert part.imu is not None
+        start, stop = (utc_text(int(part.imu.stamps_ns[k])) for k in (0, -1))
+        try:
+            solutions.append(solve(part))
+            warnings.append(f"the IMU is silent for long before or after {start} to {stop}: solved as a part by itself")
+        except SolveError as error:
+            failure = failure or error
+            warnings.append(f"the part from {start} to {stop} is left out: {error}")
+            rows += _refused(part, str(error))
+    if not solutions:
+        assert failure is not None
+        raise failure
+    return _join(solutions, rows, warnings)
+
+
+def _cut(recording: Recording, bridge_s: float) -> list[Recording]:
+    """Parts in turn; each has the measurements from its own first sample up to the next part's."""
+    imu = recording.imu
+    if imu is None or len(imu) < 2:
+        return [recording]
+    first = [0, *(np.flatnonzero(np.diff(imu.stamps_ns) > bridge_s * 1e9) + 1).tolist()]
+    if len(first) == 1:
+        return [recording]
+    starts = imu.stamps_ns[first]
+    part_of = np.maximum(np.searchsorted(starts, [m.stamp_ns for m in recording.measurements], side="right") - 1, 0)
+    parts = []
+    for k, (a, b) in enumerate(zip(first, [*first[1:], len(imu)], strict=True)):
+        own = replace(
+            imu,
+            stamps_ns=imu.stamps_ns[a:b],
+            accel_mps2=imu.accel_mps2[a:b],
+            gyro_radps=imu.gyro_radps[a:b],
+            seqs=imu.seqs[a:b],
+        )
+        kept = tuple(m for m, part in zip(recording.measurements, part_of, strict=True) if part == k)
+        parts.append(replace(recording, imu=own, measurements=kept, rows=()))
+    return parts
+
+
+def _refused(part: Recording, why: str) -> list[LedgerRow]:
+    assert part.imu is not None
+    imu = ((seq, stamp, part.imu.sensor) for seq, stamp in zip(part.imu.seqs, part.imu.stamps_ns, strict=True))
+    others = ((m.seq, m.stamp_ns, m.sensor) for m in part.measurements if m.seq >= 0)
+    return [
+        LedgerRow(
+            seq=int(seq),
+            stamp_ns=int(stamp),
+            sensor=sensor,
+            topic=part.topics.get(sensor, ""),
+            outcome=Outcome.REJECTED,
+            reason=f"its part of the run could not be solved: {why}",
+        )
+        for seq, stamp, sensor in (*imu, *others)
+    ]
+
+
+def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Sequence[str]) -> Solution:
+    tracks = [s.trajectory for s in solutions]
+    trajectory = Trajectory(
+        stamps_ns=np.concatenate([t.stamps_ns for t in tracks]),
+        p_world_m=np.concatenate([t.p_world_m for t in tracks]),
+        R_world_body=np.concatenate([t.R_world_body for t in tracks]),
+        v_world_mps=np.concatenate([t.v_world_mps for t in tracks if t.v_world_mps is not None]),
+        cov=np.concatenate([t.cov for t in tracks if t.cov is not None]),
+    )
+    names = dict.fromkeys(name for s in solutions for name in s.since_agreed_s)
+    since = {
+        name: np.concatenate([s.since_agreed_s.get(name, np.full(len(s.trajectory), np.inf)) for s in solutions])
+        for name in names
+    }
+    slow = {
+        name: _join_slow([s.slow[name] for s in solutions if name in s.slow])
+        for name in dict.fromkeys(n for s in solutions for n in s.slow)
+    }
+    return Solution(
+        datum=solutions[0].datum,
+        trajectory=trajectory,
+        v_cov=np.concatenate([s.v_cov for s in solutions]),
+        accel_bias_mps2=np.concatenate([s.accel_bias_mps2 for s in solutions]),
+        gyro_bias_radps=np.concatenate([s.gyro_bias_radps for s in solutions]),
+        gyro_radps=np.concatenate([s.gyro_radps for s in solutions]),
+        health=tuple(h for s in solutions for h in s.health),
+        health_reason=tuple(r for s in solutions for r in s.health_reason),
+        since_agreed_s=since,
+        slow=slow,
+        ledger=Ledger([*rows, *(row for s in solutions for row in s.ledger)]),
+        stats=_join_stats([s.stats for s in solutions], warnings),
+    )
+
+
+def _join_slow(parts: Sequence[SlowEstimate]) -> SlowEstimate:
+    def together(name: str) -> NDArray[np.float64]:
+        return np.concatenate([getattr(p, name) for p in parts])
+
+    return replace(
+        parts[0],
+        stamps_ns=np.concatenate([p.stamps_ns for p in parts]),
+        value=together("value"),
+        sigma=together("sigma"),
+    )
+
+
+def _join_stats(parts: Sequence[SolveStats], warnings: Sequence[str]) -> SolveStats:
+    return SolveStats(
+        passes=sum(p.passes for p in parts),
+        iterations=sum(p.iterations for p in parts),
+        states=sum(p.states for p in parts),
+        factors=sum(p.factors for p in parts),
+        cost=sum(p.cost for p in parts),
+        expected_cost=sum(p.expected_cost for p in parts),
+        converged=all(p.converged for p in parts),
+        warnings=(*warnings, *dict.fromkeys(w for p in parts for w in p.warnings)),
+    )
