@@ -33,7 +33,7 @@ from graphloc.solve._stretch import copy_states, solve_stretch, update_states, w
 _STRETCH_S, _STRETCH_MARGIN = 8.0, 0.5
 _SURE = 0.7  # a hypothesis judged by the rest alone is believed from here on
 # Surroundings on which another choice of hypotheses is tried.
-_AROUND_S = 10.0
+_AROUND_S = 20.0
 _AROUND_PASSES = 6
 
 
