@@ -26,9 +26,11 @@ from typing import Any
 import numpy as np
 
 from graphloc import app
+from graphloc.eval import ekf
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import compare_to_held_out, compare_to_truth
-from graphloc.eval.simulate import Scenario, bl_scenario, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
+from graphloc.measurements import GnssPosition
 
 ROOT = Path(__file__).parent.parent
 HUSKY = ROOT.parent / "shared/data/husky/husky_car_park.bag"
@@ -79,16 +81,28 @@ def kitti(_pool: ProcessPoolExecutor) -> list[Row]:
     rows = []
     for name, text, bound in (("every 2nd fix", "every:2", 0.2), ("ten gaps of 10 s", "gaps:10x10", 0.6)):
         run = app.smooth_recording(recording, config, hold_out=HoldOut.parse(text))
-        held = compare_to_held_out(run.solution.trajectory, run.held, run.solution.datum, np.zeros(3))
+        held = compare_to_held_out(run.solution.trajectory, run.held, run.solution.datum, {"gnss": np.zeros(3)})
         rows.append(row("A.2", f"KITTI, {name} held out: 3D RMSE", held.error_3d_rmse_m, "m", bound, "<="))
     return rows
 
 
+def _loss_ns(run: SimulatedRun) -> tuple[int, int] | None:
+    """Stamps of the simulated signal loss: BL raised a2 by hand while it lasted, so their filter is told."""
+    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    stamps = np.array([m.stamp_ns for m in fixes])
+    datum = app.choose_datum(run.recording, run.config)
+    away = datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - run.truth.at(stamps).p_world_m
+    lost = stamps[np.hypot(away[:, 0], away[:, 1]) > 6.0]
+    return (int(lost[0]), int(lost[-1]) + 1) if len(lost) else None
+
+
 def _bl(job: tuple[int, str, int]) -> tuple[tuple[int, str, int], dict[str, float | None], dict[str, float]]:
     run = simulate(bl_scenario(job[0], job[1]), job[2])  # type: ignore[arg-type]
-    solved = app.simulated(run, compare=True)
+    solved = app.simulated(run)
     ours = compare_to_truth(solved.solution.trajectory, run.truth)
-    filters = {f.name: compare_to_truth(f.trajectory, run.truth).position_rmse_m for f in solved.filters}
+    datum = app.choose_datum(run.recording, run.config)
+    beside = ekf.run_all(run.recording, run.config, datum, ekf.BlConfig(loss_ns=_loss_ns(run)))
+    filters = {f.name: compare_to_truth(f.trajectory, run.truth).position_rmse_m for f in beside}
     return job, {"rmse": ours.position_rmse_m, "heading": ours.heading_rmse_deg, "coverage": ours.coverage_95}, filters
 
 
@@ -102,13 +116,14 @@ def bl_cases(pool: ProcessPoolExecutor, seeds: int = 10) -> list[Row]:
             label = f"BL case {case}, {noise}, {seeds} seeds"
             rmse = float(np.mean([d[1]["rmse"] for d in mine]))
             worst = float(np.max([d[1]["rmse"] for d in mine]))
-            ekf, honest = (float(np.mean([d[2][n] for d in mine])) for n in ("BL EKF", "honest EKF"))
+            bl, honest = (float(np.mean([d[2][n] for d in mine])) for n in ("BL EKF", "honest EKF"))
             heading = float(np.mean([d[1]["heading"] for d in mine]))
             coverage = 100.0 * float(np.mean([d[1]["coverage"] for d in mine]))
             rows += [
                 row("A.3", f"{label}: position RMSE, mean", rmse, "m", 0.2, "<="),
                 row("A.3", f"{label}: position RMSE, worst seed", worst, "m"),
-                row("A.3", f"{label}: RMSE / that of the BL EKF", rmse / ekf, "ratio", 0.2, "<="),
+                row("A.3", f"{label}: position RMSE of the BL EKF (told of a signal loss)", bl, "m"),
+                row("A.3", f"{label}: RMSE / that of the BL EKF", rmse / bl, "ratio", 0.2, "<="),
                 row("A.3", f"{label}: RMSE / that of the honest EKF", rmse / honest, "ratio"),
                 row("A.3", f"{label}: heading RMSE", heading, "deg", 0.3, "<="),
                 row("A.3", f"{label}: 95 % coverage", coverage, "%", 90.0, ">="),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass, replace
 
 from graphloc.errors import ConfigError
@@ -49,7 +50,10 @@ class HoldOut:
                 f"{recording.source}: --hold-out gaps:{self.gaps}x{self.gap_s:g}: the gaps do not fit into the "
                 f"{span:.1f} s from the first fix to the last; ask for fewer or shorter ones"
             )
-        held = tuple(m for i, m in enumerate(fixes) if self._holds(i, m, fixes))
+        number: Counter[str] = Counter()  # counted for each receiver: every 2nd of two in turn would be all of one
+        held = tuple(m for m in fixes if self._holds(_next(number, m.sensor), m, fixes))
+        if not held:
+            raise ConfigError(f"{recording.source}: --hold-out every:{self.every} holds nothing of {len(fixes)} fixes")
         gone = {id(m) for m in held}
         rows = tuple(
             LedgerRow(
@@ -72,3 +76,8 @@ class HoldOut:
         at = (m.stamp_ns - fixes[0].stamp_ns) * 1e-9
         centres = (span * (n + 1.0) / (self.gaps + 1.0) for n in range(self.gaps))
         return any(abs(at - c) <= self.gap_s / 2.0 for c in centres)
+
+
+def _next(number: Counter[str], name: str) -> int:
+    number[name] += 1
+    return number[name] - 1

@@ -7,17 +7,24 @@ given, since a track that covers half a run must not look better for it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from graphloc.errors import InputError
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.measurements import GnssPosition
 from graphloc.recording import SpeedSeries
 from graphloc.trajectory import Trajectory
+
+Levers = Mapping[str, Array]
+
+
+class NoCommonTimeError(InputError):
+    """An estimate and what it is to be compared with share no time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +77,7 @@ def errors(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], 
     covered = estimate.covers(truth.stamps_ns)
     stamps = truth.stamps_ns[covered]
     if not len(stamps):
-        raise ValueError("estimate and truth share no time")
+        raise NoCommonTimeError("the track and the truth share no time: check the stamps of truth_topic")
     there, true = estimate.at(stamps), truth.at(stamps)
     return (
         stamps,
@@ -107,46 +114,58 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOutMetrics:
-    """Predicted antenna against held-out fixes. `outage_drift_m`: RMS of the largest error of each gap."""
+    """Predicted antenna against held-out fixes.
+
+    `outage_drift_m`: RMS of the largest error of each gap; None where the fixes form no several gaps.
+    """
 
     horizontal_rmse_m: float
     horizontal_p95_m: float
     horizontal_max_m: float
     error_3d_rmse_m: float
-    outage_drift_m: float
+    outage_drift_m: float | None
     fixes: int
     matched: float
 
 
 def held_out_errors(
-    estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, lever_m: Array
+    estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers
 ) -> tuple[NDArray[np.int64], Array, float]:
-    """Return stamps (M,), error (M, 3) of the predicted antenna, and the matched share."""
+    """Return stamps (M,), error (M, 3) of the predicted antenna, and the matched share.
+
+    Args:
+        levers_m: by receiver, its antenna in body.
+
+    Raises:
+        NoCommonTimeError: the estimate covers none of them.
+    """
     stamps = np.array([m.stamp_ns for m in held], dtype=np.int64)
     positions = np.array([m.position for m in held])
     fixes = datum.enu_from_geodetic(positions[:, 0], positions[:, 1], positions[:, 2])
     covered = estimate.covers(stamps)
     if not covered.any():
-        raise ValueError("the estimate covers none of the held-out fixes")
+        raise NoCommonTimeError("the track covers none of the held-out fixes")
     there = estimate.at(stamps[covered])
-    return stamps[covered], there.p_world_m + there.R_world_body @ lever_m - fixes[covered], float(covered.mean())
+    levers = np.array([levers_m[m.sensor] for m in held])[covered]
+    antenna = there.p_world_m + np.einsum("nij,nj->ni", there.R_world_body, levers)
+    return stamps[covered], antenna - fixes[covered], float(covered.mean())
 
 
 def compare_to_held_out(
-    estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, lever_m: Array
+    estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers
 ) -> HeldOutMetrics:
     """Return the metrics of an estimate against held-out fixes."""
-    stamps, error, matched = held_out_errors(estimate, held, datum, lever_m)
+    stamps, error, matched = held_out_errors(estimate, held, datum, levers_m)
     horizontal = np.hypot(error[:, 0], error[:, 1])
     usual = np.median(np.diff(stamps)) if len(stamps) > 1 else 1
-    gap = np.cumsum(np.concatenate([[0], np.diff(stamps) > 2.5 * usual]))
+    gap = np.cumsum(np.concatenate([[0], np.diff(stamps) > 2.5 * max(usual, 1)]))
     largest = np.array([horizontal[gap == g].max() for g in range(gap[-1] + 1)])
     return HeldOutMetrics(
         horizontal_rmse_m=_rms(horizontal),
         horizontal_p95_m=float(np.percentile(horizontal, 95)),
         horizontal_max_m=float(horizontal.max()),
         error_3d_rmse_m=_rms(np.linalg.norm(error, axis=1)),
-        outage_drift_m=_rms(largest),
+        outage_drift_m=_rms(largest) if len(largest) > 1 else None,
         fixes=len(stamps),
         matched=matched,
     )
@@ -164,6 +183,8 @@ class SpeedMetrics:
 def compare_speed(estimate: Trajectory, check: SpeedSeries) -> SpeedMetrics:
     """Return how the forward speed (body x) agrees with an independent one."""
     covered = estimate.covers(check.stamps_ns)
+    if not covered.any():
+        raise NoCommonTimeError(f"the track and {check.topic} share no time: check its stamps")
     order = np.argsort(check.stamps_ns[covered], kind="stable")
     there = estimate.at(check.stamps_ns[covered][order])
     if there.v_world_mps is None:
@@ -192,9 +213,9 @@ def truth_table(estimates: _Named, truth: Trajectory) -> Table:
     return _table("Against truth", rows, "position: horizontal; interpolated to the truth's stamps, not aligned")
 
 
-def held_out_table(estimates: _Named, held: Sequence[GnssPosition], datum: Datum, lever_m: Array) -> Table:
+def held_out_table(estimates: _Named, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers) -> Table:
     """Return one row an estimate, against held-out fixes."""
-    rows = [(name, compare_to_held_out(t, held, datum, lever_m)) for name, t in estimates]
+    rows = [(name, compare_to_held_out(t, held, datum, levers_m)) for name, t in estimates]
     return _table("Against held-out fixes", rows, "the fixes' own noise is part of the error")
 
 

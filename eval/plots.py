@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from graphloc.eval.ekf import FilterResult
-from graphloc.eval.metrics import errors, held_out_errors
+from graphloc.eval.metrics import Levers, errors, held_out_errors
 from graphloc.frames import Array, Datum
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import GnssPosition, Measurement, PoseFix
@@ -114,7 +114,7 @@ def error_over_time(
     solution: Solution,
     filters: Sequence[FilterResult],
     held: Sequence[GnssPosition],
-    lever: Array,
+    levers_m: Levers,
 ) -> go.Figure:
     """Position and heading error over time where truth or held-out fixes exist, and the 95 % bounds."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
@@ -131,7 +131,7 @@ def error_over_time(
             shown = np.degrees(np.abs(heading[step]))
             figure.add_scatter(x=t, y=shown, line=line, name=name, legendgroup=name, showlegend=False, row=2, col=1)
         elif held:
-            stamps, error, _ = held_out_errors(track, held, solution.datum, lever)
+            stamps, error, _ = held_out_errors(track, held, solution.datum, levers_m)
             t = (stamps - start) * 1e-9
             size = np.hypot(error[:, 0], error[:, 1])
             marker = {"color": COLOURS[i], "size": 5}

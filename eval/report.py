@@ -14,12 +14,11 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
-from graphloc.build import mount_of
 from graphloc.config import VesselConfig, effective
 from graphloc.errors import OutputError
 from graphloc.eval import plots
 from graphloc.eval.ekf import FilterResult
-from graphloc.eval.metrics import Table
+from graphloc.eval.metrics import Levers, Table
 from graphloc.measurements import GnssPosition
 from graphloc.outputs import bounds_95
 from graphloc.recording import Recording
@@ -36,6 +35,7 @@ class ReportData:
     config: VesselConfig
     filters: Sequence[FilterResult]
     held: Sequence[GnssPosition]
+    levers_m: Levers
     tables: Sequence[Table]
     truth_statement: str
 
@@ -86,7 +86,9 @@ def write_report(path: Path, data: ReportData) -> None:
         warnings=_warnings(data),
         tables="".join(f"<h2>{escape(t.title)}</h2>{_table(t)}" for t in data.tables),
         map=_figure(plots.track_map(data.recording, data.solution, data.filters), "map"),
-        errors=_figure(_errors(data), "errors"),
+        errors=_figure(
+            plots.error_over_time(data.recording, data.solution, data.filters, data.held, data.levers_m), "errors"
+        ),
         ledger=_ledger(data.solution),
         residuals=_figure(plots.residuals_over_time(data.solution), "residuals"),
         slow=_figure(plots.slow_over_time(data.solution), "slow"),
@@ -97,14 +99,6 @@ def write_report(path: Path, data: ReportData) -> None:
         path.write_text(page, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
-
-
-def _errors(data: ReportData) -> go.Figure:
-    lever = np.zeros(3)
-    if data.held:
-        name = data.held[0].sensor
-        lever = mount_of(name, data.config.sensors[name], data.recording)[0]
-    return plots.error_over_time(data.recording, data.solution, data.filters, data.held, lever)
 
 
 def _figure(figure: go.Figure, name: str) -> str:

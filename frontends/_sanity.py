@@ -42,13 +42,17 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
     return lines
 
 
+def _together(longitude_deg: Array) -> Array:
+    """Return longitudes about the first one, so that a run across the date line stays together."""
+    return np.asarray(longitude_deg[0] + (longitude_deg - longitude_deg[0] + 180.0) % 360.0 - 180.0)
+
+
 def far_fixes_of(lla: Array) -> NDArray[np.bool_]:
     """Return (N,) whether a fix (N, 3), deg, deg, m, lies further than `FAR_M` from the median of all."""
     if len(lla) == 0:
         return np.zeros(0, dtype=bool)
-    # Median longitude about the first one, so that a run across the date line stays together.
-    lon = lla[0, 1] + (lla[:, 1] - lla[0, 1] + 180.0) % 360.0 - 180.0
-    middle = Datum(Geodetic(float(np.median(lla[:, 0])), float(np.median(lon)), float(np.median(lla[:, 2]))))
+    lon = float(np.median(_together(lla[:, 1])))
+    middle = Datum(Geodetic(float(np.median(lla[:, 0])), lon, float(np.median(lla[:, 2]))))
     enu = middle.enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])
     return np.asarray(np.linalg.norm(enu, axis=1) > FAR_M)
 
@@ -63,7 +67,9 @@ def gnss_warnings(sensor: str, fixes: Sequence[GnssPosition], config: VesselConf
     if config.datum is None or not fixes:
         return []
     datum = Datum(config.datum.geodetic)
-    lat, lon, height = (float(v) for v in np.median(np.array([f.position for f in fixes]), axis=0))
+    lla = np.array([f.position for f in fixes])
+    lla[:, 1] = _together(lla[:, 1])
+    lat, lon, height = (float(v) for v in np.median(lla, axis=0))
 
     def distance_m(a: float, b: float) -> float:
         return float(np.linalg.norm(datum.enu_from_geodetic(np.array([a]), np.array([b]), np.array([height]))))

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from graphloc.errors import InputError
 from graphloc.eval import ekf, holdout, metrics, report
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.factors import INERTIAL, KINDS, SENSORS
-from graphloc.frames import Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.bag import read_recording
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Progress, Recording
@@ -70,7 +71,39 @@ def smooth_recording(
         progress("filters", 0, 1)
         filters = ekf.run_all(recording, config, datum)
         progress("filters", 1, 1)
-    return Run(recording=recording, config=config, solution=solution, held=held, filters=filters)
+    run = Run(recording=recording, config=config, solution=solution, held=held, filters=filters)
+    return _comparable(run)
+
+
+def _comparable(run: Run) -> Run:
+    """Drop what shares no time with the track, and say so."""
+    recording, track, held = run.recording, run.solution.trajectory, run.held
+    said = []
+    try:
+        if recording.truth is not None:
+            metrics.errors(track, recording.truth)
+    except metrics.NoCommonTimeError as error:
+        said.append(str(error))
+        recording = replace(recording, truth=None)
+    try:
+        if recording.check_speed is not None:
+            metrics.compare_speed(track, recording.check_speed)
+    except metrics.NoCommonTimeError as error:
+        said.append(str(error))
+        recording = replace(recording, check_speed=None)
+    try:
+        if held:
+            metrics.held_out_errors(track, held, run.solution.datum, levers_m(run))
+    except metrics.NoCommonTimeError as error:
+        said.append(str(error))
+        held = ()
+    return replace(run, recording=replace(recording, warnings=(*recording.warnings, *said)), held=held)
+
+
+def levers_m(run: Run) -> dict[str, Array]:
+    """Return the antenna of each receiver that fixes were held out of, in body."""
+    names = dict.fromkeys(m.sensor for m in run.held)
+    return {name: mount_of(name, run.config.sensors[name], run.recording)[0] for name in names}
 
 
 def simulated(run: SimulatedRun, *, compare: bool = False, progress: Progress = _quiet) -> Run:
@@ -87,10 +120,23 @@ def choose_datum(recording: Recording, config: VesselConfig) -> Datum:
     if config.datum is not None:
         return Datum(config.datum.geodetic)
     _refuse_world_without_datum(config, recording.source)
-    fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)][:5]
-    if not fixes:
-        raise InputError(f"{recording.source}: no GNSS fix to take a datum from; set datum: in vessel.yaml")
-    return Datum(Geodetic(*(float(v) for v in np.median([m.position for m in fixes], axis=0))))
+    fixes = np.array([m.position for m in recording.measurements if isinstance(m, GnssPosition)][:5])
+    if not len(fixes):
+        raise InputError(f"{recording.source}: {_why_no_fix(recording, config)}")
+    # Longitudes about the first one, so that fixes on both sides of the date line stay together.
+    fixes[:, 1] = fixes[0, 1] + (fixes[:, 1] - fixes[0, 1] + 180.0) % 360.0 - 180.0
+    return Datum(Geodetic(*(float(v) for v in np.median(fixes, axis=0))))
+
+
+def _why_no_fix(recording: Recording, config: VesselConfig) -> str:
+    receivers = config.of_kind("gnss")
+    if not receivers:
+        return "no GNSS sensor to take a datum from; set datum: in vessel.yaml"
+    reasons = Counter(f"{row.sensor}: {row.reason}" for row in recording.rows if row.sensor in receivers)
+    if not reasons:
+        return f"no GNSS fix from {', '.join(receivers)}: the topic holds no message"
+    (reason, count), *_ = reasons.most_common(1)
+    return f"no usable GNSS fix: {count} messages of {reason}"
 
 
 def _refuse_world_without_datum(config: VesselConfig, where: str) -> None:
@@ -138,9 +184,7 @@ def tables(run: Run) -> tuple[metrics.Table, ...]:
     if run.recording.truth is not None:
         found.append(metrics.truth_table(estimates, run.recording.truth))
     if run.held:
-        sensor = run.held[0].sensor
-        lever = mount_of(sensor, run.config.sensors[sensor], run.recording)[0]
-        found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, lever))
+        found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, levers_m(run)))
     if run.recording.check_speed is not None:
         found.append(metrics.speed_table(estimates, run.recording.check_speed))
     return tuple(found)
@@ -179,6 +223,7 @@ def write(run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overw
                 config=run.config,
                 filters=run.filters,
                 held=run.held,
+                levers_m=levers_m(run),
                 tables=found,
                 truth_statement=truth_statement(run),
             ),

@@ -132,7 +132,7 @@ def test_no_imu_and_no_position_are_one_clear_line() -> None:
         app.smooth_recording(replace(run.recording, imu=None), run.config)
     with pytest.raises(SolveError, match="no position"):
         app.smooth_recording(replace(run.recording, measurements=()), run.config)
-    with pytest.raises(InputError, match="no GNSS fix to take a datum from"):
+    with pytest.raises(InputError, match="no GNSS sensor to take a datum from"):
         app.choose_datum(Recording(source="x", imu=None, measurements=()), VesselConfig())
 
 
