@@ -147,8 +147,8 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
     )
 
 
-def motion_of(odometry: list[Stream], fixes: list[Stream]) -> Motion | None:
-    """Return the speed of the craft from wheels, or else from fixes that are precise enough."""
+def motion_of(odometry: list[Stream], twists: list[Stream], fixes: list[Stream]) -> Motion | None:
+    """Return the speed of the craft from wheels, or a velocity, or else from fixes that are precise enough."""
     for stream in odometry:
         keep = sane(stream)
         if stream.msgtype == ODOMETRY and len(keep) > 20:
@@ -156,6 +156,12 @@ def motion_of(odometry: list[Stream], fixes: list[Stream]) -> Motion | None:
             if np.isfinite(speed).all() and float(np.ptp(speed)) > 0.2:
                 t = (stream.stamps_ns[keep] - stream.stamps_ns[keep[0]]) / NS_PER_S
                 return Motion(stream.topic, int(stream.stamps_ns[keep[0]]), t, speed)
+    for stream in twists:
+        keep = sane(stream)
+        speed = np.hypot(stream.rows[keep, 0], stream.rows[keep, 1]) if len(keep) > 20 else np.zeros(0)
+        if len(speed) and np.isfinite(speed).all() and float(np.percentile(speed, 90)) > 0.5:
+            t = (stream.stamps_ns[keep] - stream.stamps_ns[keep[0]]) / NS_PER_S
+            return Motion(stream.topic, int(stream.stamps_ns[keep[0]]), t, speed)
     for stream in fixes:
         stamps, p, _ = track(stream)
         if len(stamps) > 20:

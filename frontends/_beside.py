@@ -25,6 +25,7 @@ class Beside:
     topic: str
     reason: str
     count: int = 0
+    broken: int = 0
     stamps_ns: list[int] = field(default_factory=list)
     messages: list[Any] = field(default_factory=list)
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from graphloc.config import ImuConfig, SlowErrorConfig
+from graphloc.frontends._clock import EPOCH_LIMIT_S
 from graphloc.frontends._reports import CompassReport, GnssReport, ImuReport, Inspection, OdometryReport, VelocityReport
 from graphloc.frontends.decode import IMU
 
@@ -22,11 +23,11 @@ def draft_config(inspection: Inspection) -> str:
         "# Look at each line marked 'guess'. All keys and their defaults: docs/configuration.md.",
         f"vessel: {json.dumps(name)}",
         f"body_frame: {inspection.body_frame}"
-        + ("" if inspection.body_frame == "base_link" else "  # guess: by its name in /tf_static"),
+        + ("" if inspection.body_frame == "base_link" else "  # guess: the body, by /tf_static"),
         _datum_line(inspection.odometry),
         "sensors:",
     ]
-    blocks = list(_blocks(inspection))
+    blocks = [_with_offset(block, inspection) for block in _blocks(inspection)]
     lines += [f"  {line}" for block in blocks for line in block]
     if not blocks:
         lines[-1] = "sensors: {}  # nothing in this bag can be used"
@@ -55,6 +56,21 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         ]
     if inspection.gnss:
         yield ["height:", "  enabled: false  # guess: set to true for a craft that floats"]
+
+
+def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
+    """Add a time offset where the recording times say that a receiver's clock is off; poses may take their time."""
+    latency = {t.topic: t.latency_s[1] for t in inspection.topics if t.latency_s is not None}
+    reference = next((latency[i.topic] for i in inspection.imus if i.topic in latency), None)
+    kind = next((line.split()[1] for line in block if line.startswith("  kind:")), "")
+    topic = next((line.split()[1] for line in block if line.startswith("  topic:")), "")
+    if reference is None or kind not in ("gnss", "gnss_velocity", "compass") or topic not in latency:
+        return block
+    behind = latency[topic] - reference
+    if abs(behind) <= EPOCH_LIMIT_S:
+        return block
+    side = "behind" if behind > 0 else "ahead of"
+    return [*block, f"  time_offset_s: {behind:.3f}  # guess: its clock is {side} the IMU's, by the recording times"]
 
 
 def _numbered(name: str, k: int) -> str:

@@ -13,7 +13,17 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.frontends._source import Bag
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends.decode import IMU, NAV_SAT_FIX, ODOMETRY, POSE, QUATERNION, TF, TWIST, header_stamp_ns
+from graphloc.frontends.decode import (
+    IMU,
+    NAV_SAT_FIX,
+    ODOMETRY,
+    PLAIN_TWIST,
+    POSE,
+    QUATERNION,
+    TF,
+    TWIST,
+    header_stamp_ns,
+)
 
 
 def _xyz(v: Any) -> tuple[float, float, float]:
@@ -50,6 +60,7 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
     ODOMETRY: _odometry_row,
     POSE: _pose_row,
     TWIST: lambda m: _xyz(m.twist.twist.linear),
+    PLAIN_TWIST: lambda m: _xyz(m.twist.linear),
 }
 
 

@@ -13,6 +13,7 @@ from graphloc.errors import InputError
 from graphloc.frames import Array
 
 # Names of the body frame, likeliest first.
+_WORLD_NAMES = ("map", "odom", "world", "earth", "utm")
 _BODY_NAMES = ("base_link", "base_footprint", "body", "base", "vessel", "vehicle", "boat")
 
 Pose = tuple[Array, Array]  # t (3,), R (3, 3): T_parent_child
@@ -23,6 +24,7 @@ class StaticTree:
 
     def __init__(self) -> None:
         self._edges: dict[str, dict[str, Pose]] = {}
+        self._children: set[str] = set()
 
     def add(self, msg: Any) -> None:
         """Take the transforms of a `tf2_msgs/TFMessage`; a later one of the same pair replaces an earlier one."""
@@ -31,6 +33,7 @@ class StaticTree:
             t, q = stamped.transform.translation, stamped.transform.rotation
             R = np.asarray(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix())
             p = np.array([t.x, t.y, t.z])
+            self._children.add(child)
             self._edges.setdefault(parent, {})[child] = (p, R)
             self._edges.setdefault(child, {})[parent] = (-R.T @ p, R.T)
 
@@ -40,8 +43,10 @@ class StaticTree:
         return tuple(sorted(self._edges))
 
     def body(self) -> str:
-        """Return the frame that is the craft's body by its usual names; `base_link` where there is none of them."""
-        return next((name for name in _BODY_NAMES if name in self._edges), _BODY_NAMES[0])
+        """Return the frame that is the craft's body: by its usual names, else the root of most frames, else `base_link`."""
+        roots = [f for f in self._edges if f not in self._children and f not in _WORLD_NAMES]
+        roots.sort(key=lambda root: -sum(self.resolve(root, frame) is not None for frame in self._edges))
+        return next((name for name in (*_BODY_NAMES, *roots) if name in self._edges), _BODY_NAMES[0])
 
     def resolve(self, body: str, sensor: str) -> Pose | None:
         """Return T_body_sensor along the shortest chain; None where there is no chain."""

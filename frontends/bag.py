@@ -123,6 +123,7 @@ class _Reader:
             self._wanted.add(TF_STATIC)
         self._rows: list[LedgerRow] = []
         self._seq = 0
+        self._broken_mounts = 0
 
     def read(self, progress: Progress | None) -> list[LedgerRow]:
         """Fill the sensors' readings; return the rows of all other messages."""
@@ -154,13 +155,15 @@ class _Reader:
             else:
                 self._decode(readings, raw, msg, seq)
         for item in self._beside.get(raw.topic, ()):
-            item.count += 1
+            item.count, item.broken = item.count + 1, item.broken + (msg is None)
             stamp_ns = None if msg is None else header_stamp_ns(msg)
             if stamp_ns is not None:
                 item.stamps_ns.append(stamp_ns)
                 item.messages.append(msg)
-        if raw.topic == TF_STATIC and self._tree is not None and msg is not None and raw.msgtype == TF:
-            self._tree.add(msg)
+        if raw.topic == TF_STATIC and self._tree is not None:
+            if msg is not None and raw.msgtype == TF:
+                self._tree.add(msg)
+            self._broken_mounts += msg is None
 
     def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:
         """Hand a message to its decoder; what gives no reading gives a row."""
@@ -198,9 +201,11 @@ class _Reader:
                 add(topic, summary.messages, Outcome.IGNORED, reason)
                 continue
             for item in self._beside.get(topic, ()):
-                add(topic, item.count, Outcome.IGNORED, item.reason)
+                add(topic, item.count - item.broken, Outcome.IGNORED, item.reason)
+                add(topic, item.broken, Outcome.MALFORMED, "cannot be decoded")
             if topic == TF_STATIC:
-                add(topic, read[topic], Outcome.IGNORED, "mounts")
+                add(topic, read[topic] - self._broken_mounts, Outcome.IGNORED, "read for mounts")
+                add(topic, self._broken_mounts, Outcome.MALFORMED, "cannot be decoded")
             missing = summary.messages - read[topic]
             add(topic, missing, Outcome.MALFORMED, "announced by the bag's index, but cannot be read")
         return rows

@@ -34,6 +34,7 @@ QUATERNION = "geometry_msgs/msg/QuaternionStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
+PLAIN_TWIST = "geometry_msgs/msg/TwistStamped"
 TF = "tf2_msgs/msg/TFMessage"
 
 _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
@@ -196,11 +197,12 @@ def _compass_imu(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Compass
 
 
 def _velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
-    v = msg.twist.twist.linear
+    with_covariance = hasattr(msg.twist, "covariance")
+    v = msg.twist.twist.linear if with_covariance else msg.twist.linear
     value = np.array([v.x, v.y, v.z], dtype=float)
     if not np.isfinite(value).all():
         return malformed("velocity is NaN")
-    cov = covariance_translation_first(msg.twist.covariance)[:3, :3]
+    cov = covariance_translation_first(msg.twist.covariance)[:3, :3] if with_covariance else np.zeros((3, 3))
     default = np.full(3, config.default_sigma_mps**2)
     return GnssVelocity(
         stamp_ns=stamp_ns, sensor=sensor, seq=seq, v_world_mps=value, cov_m2ps2=usable_covariance(cov, default)
@@ -240,6 +242,7 @@ DECODERS: dict[tuple[str, str], Decoder] = {
     ("compass", QUATERNION): _compass_quaternion,
     ("compass", IMU): _compass_imu,
     ("gnss_velocity", TWIST): _velocity,
+    ("gnss_velocity", PLAIN_TWIST): _velocity,
     ("pose", POSE): _pose,
     ("pose", ODOMETRY): _pose,
 }

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +37,7 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._source import Bag
 from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends.decode import IMU, NAV_SAT_FIX, ODOMETRY, POSE, QUATERNION, TWIST
+from graphloc.frontends.decode import IMU, NAV_SAT_FIX, ODOMETRY, PLAIN_TWIST, POSE, QUATERNION, TWIST
 from graphloc.time import utc_text
 
 __all__ = [
@@ -73,7 +73,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     fixes = [s for s in filled if s.msgtype == NAV_SAT_FIX]
     poses = [s for s in filled if s.msgtype in (ODOMETRY, POSE)]
     wheels = [s for s in poses if _role(s)[0] == "check_speed"]
-    motion = motion_of(wheels, fixes)
+    twists = [s for s in filled if s.msgtype in (TWIST, PLAIN_TWIST)]
+    motion = motion_of(wheels, twists, fixes)
     body = tree.body()
     found_gnss = [g for s in fixes if (g := gnss_report(s, _known(s, tree, body)))]
     found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, tree, body))]
@@ -92,11 +93,32 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         gnss=tuple(sorted(found_gnss, key=lambda g: -g.fixes)),
         compasses=tuple(c for s in candidates if (c := compass_report(s, courses))),
         odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first)) for s in poses),
-        velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in filled if s.msgtype == TWIST),
+        velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
         tf_frames=tree.frames,
         body_frame=body,
-        warnings=warnings,
+        warnings=(*warnings, *_useless(streams, {g.topic for g in found_gnss} | {i.topic for i in found_imus})),
     )
+
+
+def _useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
+    """Say which IMU and GNSS topics gave nothing, and why: silence would read as if they were not there."""
+    lines = (
+        []
+        if any(len(s) or s.undecodable or s.no_stamp for s in streams)
+        else ["the bag holds no message of a known type"]
+    )
+    for stream in streams:
+        if stream.topic in used or stream.msgtype not in (IMU, NAV_SAT_FIX):
+            continue
+        plausible = len(sane(stream)) if len(stream) else 0
+        why = f"{stream.undecodable} cannot be decoded, {stream.no_stamp} have no stamp"
+        if plausible < len(stream):
+            why += f", {len(stream) - plausible} have a stamp that repeats, runs backwards or is far from the recording time"
+        elif stream.msgtype == NAV_SAT_FIX:
+            why += f", {int((stream.rows[:, 3] < 0).sum()) if len(stream) else 0} say 'no fix', the others lie at 0, 0 or are NaN"
+        total = len(stream) + stream.undecodable + stream.no_stamp
+        lines.append(f"{stream.topic}: nothing of its {total} messages can be used: {why}")
+    return lines
 
 
 def _known(stream: Stream, tree: StaticTree, body: str) -> str | None:

@@ -230,7 +230,7 @@ class CompassConfig(SensorConfig):
 
 
 class VelocityConfig(SensorConfig):
-    """GNSS velocity in ENU (`geometry_msgs/TwistWithCovarianceStamped`)."""
+    """GNSS velocity in ENU (`geometry_msgs/TwistWithCovarianceStamped` or `TwistStamped`)."""
 
     kind: Literal["gnss_velocity"] = "gnss_velocity"
     """Which row of the sensor table reads this block."""
