@@ -145,9 +145,10 @@ def held_out_errors(
     covered = estimate.covers(stamps)
     if not covered.any():
         raise NoCommonTimeError("the track covers none of the held-out fixes")
-    there = estimate.at(stamps[covered])
+    moments, index = np.unique(stamps[covered], return_inverse=True)  # receivers share stamps
+    there = estimate.at(moments)
     levers = np.array([levers_m[m.sensor] for m in held])[covered]
-    antenna = there.p_world_m + np.einsum("nij,nj->ni", there.R_world_body, levers)
+    antenna = there.p_world_m[index] + np.einsum("nij,nj->ni", there.R_world_body[index], levers)
     return stamps[covered], antenna - fixes[covered], float(covered.mean())
 
 
@@ -157,7 +158,8 @@ def compare_to_held_out(
     """Return the metrics of an estimate against held-out fixes."""
     stamps, error, matched = held_out_errors(estimate, held, datum, levers_m)
     horizontal = np.hypot(error[:, 0], error[:, 1])
-    usual = np.median(np.diff(stamps)) if len(stamps) > 1 else 1
+    steps = np.diff(np.unique(stamps))
+    usual = np.median(steps) if len(steps) else 1
     gap = np.cumsum(np.concatenate([[0], np.diff(stamps) > 2.5 * max(usual, 1)]))
     largest = np.array([horizontal[gap == g].max() for g in range(gap[-1] + 1)])
     return HeldOutMetrics(

@@ -223,7 +223,7 @@ def _imu_lines(imu: ImuReport) -> list[str]:
     lines = [
         f"{imu.topic}: acceleration {imu.gravity_size:.2f} (median), along {x:+.2f} {y:+.2f} {z:+.2f}",
         *(f"  {why}" for why in imu.why),
-        f"  mount: {imu.mount.rpy_deg} deg; {imu.mount.evidence}",
+        f"  mount: rpy {', '.join(f'{a:.1f}' for a in imu.mount.rpy_deg)} deg; {imu.mount.evidence}",
     ]
     if imu.gyro_bias_radps is None:
         lines.append("  no standstill found, so the gyro bias was not measured")

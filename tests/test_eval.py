@@ -1,5 +1,8 @@
 """Simulator, metrics and filters, each against something derived here."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from evo.core import metrics as evo_metrics
@@ -7,12 +10,15 @@ from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
 from graphloc import app
+from graphloc.config import MountConfig, VelocityConfig, VesselConfig
 from graphloc.errors import ConfigError
 from graphloc.eval import ekf, metrics
 from graphloc.eval.holdout import HoldOut
-from graphloc.eval.simulate import Scenario, bl_scenario, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.eval.simulate._scenario import _motion
-from graphloc.measurements import GnssPosition
+from graphloc.frames import Datum, Geodetic
+from graphloc.measurements import GnssPosition, GnssVelocity, PoseFix
+from graphloc.recording import SpeedSeries
 from graphloc.trajectory import Trajectory
 
 
@@ -116,6 +122,68 @@ def test_gaps_are_where_they_should_be() -> None:
     assert abs(inside[1].sum() - 100) <= 2
 
 
+def test_every_nth_is_the_nth() -> None:
+    run = simulate(Scenario(duration_s=10.0, imu_hz=10.0, noise="clean", pose_hz=0.0), 0)
+    fixes = [m.seq for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    _, held = HoldOut.parse("every:4").split(run.recording)
+    assert [m.seq for m in held] == fixes[3::4]
+
+
+def test_hold_out_that_holds_nothing_is_refused() -> None:
+    run = simulate(Scenario(duration_s=10.0, imu_hz=10.0), 0)
+    with pytest.raises(ConfigError, match="holds nothing of 100 fixes"):
+        HoldOut.parse("every:1000").split(run.recording)
+
+
+def test_held_out_numbers_by_hand() -> None:
+    """A track 1 m east of the fixes in the first gap, 1 and 3 m in the second: RMS of the largest is sqrt(5)."""
+    stamps = np.arange(0, 60 * 10**9, 10**9, dtype=np.int64)
+    datum = Datum(Geodetic(57.7, 11.9, 40.0))
+    off = np.where(np.arange(60) > 45, 3.0, 1.0)
+    track = Trajectory(
+        stamps_ns=stamps,
+        p_world_m=np.column_stack([off, 0 * off, 0 * off]),
+        R_world_body=np.tile(np.eye(3), (60, 1, 1)),
+    )
+    lever = np.array([2.0, 0.0, 0.0])
+    place = Geodetic(*datum.geodetic_from_enu(lever)[0])
+    held = tuple(
+        GnssPosition(stamp_ns=int(stamps[k]), sensor="gnss", seq=k, position=place, cov_enu_m2=np.eye(3))
+        for k in (*range(10, 15), *range(44, 50))
+    )
+    numbers = metrics.compare_to_held_out(track, held, datum, {"gnss": lever})
+    assert numbers.outage_drift_m == pytest.approx(np.sqrt((1.0 + 9.0) / 2.0), abs=1e-6)
+    assert numbers.horizontal_rmse_m == pytest.approx(np.sqrt((7 * 1.0 + 4 * 9.0) / 11.0), abs=1e-6)
+    assert numbers.horizontal_max_m == pytest.approx(3.0, abs=1e-6)
+
+
+def test_forward_speed_by_hand() -> None:
+    """Heading north at 2 m/s, drifting east at 1 m/s; the wheels say 1.5 m/s."""
+    stamps = np.arange(0, 10 * 10**9, 10**8, dtype=np.int64)
+    t = stamps * 1e-9
+    north = Rotation.from_euler("z", np.full((len(t), 1), np.pi / 2.0)).as_matrix()
+    track = Trajectory(
+        stamps_ns=stamps,
+        p_world_m=np.column_stack([t, 2.0 * t, 0 * t]),
+        R_world_body=north,
+        v_world_mps=np.tile([1.0, 2.0, 0.0], (len(t), 1)),
+    )
+    check = SpeedSeries(topic="/wheels", stamps_ns=stamps[5:50], speed_mps=np.full(45, 1.5))
+    numbers = metrics.compare_speed(track, check)
+    assert (numbers.mean_mps, numbers.std_mps, numbers.samples) == pytest.approx((0.5, 0.0, 45))
+
+
+def test_coverage_of_the_heading_is_by_its_own_variance() -> None:
+    estimate, truth = _pair()  # 0.02 rad off everywhere
+    assert estimate.cov is not None
+    for sigma, expected in ((0.015, 1.0), (0.009, 0.0)):  # 1.96 sigma is 0.029 or 0.018 rad
+        cov = estimate.cov.copy()
+        cov[:, 3, 3], cov[:, 4, 4], cov[:, 5, 5] = 1e-8, 1e-2, sigma**2
+        cov[:, 4, 4] = 1e-8 if expected else 1e-2
+        numbers = metrics.compare_to_truth(replace(estimate, cov=cov), truth)
+        assert numbers.heading_coverage_95 == expected
+
+
 def test_the_gate_of_the_thesis_drops_what_is_2_m_away() -> None:
     """A filter started 5 m off by a first bad fix rejects true matches; without a gate it takes them."""
     run = simulate(Scenario(duration_s=30.0, noise="clean", false_fraction=0.0), 2)
@@ -127,3 +195,92 @@ def test_the_gate_of_the_thesis_drops_what_is_2_m_away() -> None:
     assert count[1] == 0
     track = metrics.compare_to_truth(free.trajectory, run.truth)
     assert track.position_rmse_m < 1.0
+
+
+def filters(run: SimulatedRun, config: VesselConfig | None = None, **options: Any) -> dict[str, metrics.TruthMetrics]:
+    config = config or run.config
+    found = ekf.run_all(run.recording, config, app.choose_datum(run.recording, config), ekf.BlConfig(**options))
+    return {f.name: metrics.compare_to_truth(f.trajectory, run.truth) for f in found}
+
+
+def test_clean_runs_leave_the_filters_good() -> None:
+    """White fixes (0.3 m) and right matches. The honest one doubts all fixes, so it lives by a match a second."""
+    clean = Scenario(duration_s=60.0, noise="clean", false_fraction=0.0)
+    found = filters(simulate(clean, 3))
+    assert found["BL EKF"].position_rmse_m < 0.3
+    assert found["honest EKF"].position_rmse_m < 0.5
+    turning = filters(simulate(replace(clean, gyro_bias_radps=0.0175), 3))["honest EKF"]
+    assert turning.heading_rmse_deg < 0.6  # 1 deg/s of bias, taken the wrong way, leaves over 1
+
+
+def test_a_turned_compass_is_turned_back() -> None:
+    run = simulate(Scenario(duration_s=30.0, noise="clean", pose_hz=0.0, compass_offset_deg=90.0), 3)
+    mount = MountConfig(rpy_deg=(0.0, 0.0, 90.0))
+    compass = run.config.sensors["compass"].model_copy(update={"mount": mount})
+    config = run.config.model_copy(update={"sensors": {**run.config.sensors, "compass": compass}})
+    for numbers in filters(run, config).values():
+        assert numbers.heading_rmse_deg < 6.0
+        assert numbers.position_rmse_m < 1.0
+
+
+def test_a_filter_that_is_told_of_the_signal_loss_stays() -> None:
+    """BL section 4: a2 = 1000 while the signal is lost; without it the jump of 14 m pulls the track along."""
+    run = simulate(bl_scenario(1, "jump"), 3)
+    datum = app.choose_datum(run.recording, run.config)
+    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    stamps = np.array([m.stamp_ns for m in fixes])
+    away = datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - run.truth.at(stamps).p_world_m
+    lost = stamps[np.hypot(away[:, 0], away[:, 1]) > 6.0]
+    told = filters(run, loss_ns=(int(lost[0]), int(lost[-1]) + 1))["BL EKF"]
+    assert told.position_max_m < 0.5 * filters(run)["BL EKF"].position_max_m
+
+
+def test_filters_take_a_slow_imu_and_a_hole_in_it() -> None:
+    run = simulate(Scenario(duration_s=60.0, noise="clean", imu_hz=10.0, false_fraction=0.0), 3)
+    assert all(f.heading_rmse_deg < 3.0 for f in filters(run).values())
+    imu = run.recording.imu
+    assert imu is not None
+    t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    keep = (t < 20.0) | (t > 35.0)
+    holed = replace(
+        imu,
+        stamps_ns=imu.stamps_ns[keep],
+        accel_mps2=imu.accel_mps2[keep],
+        gyro_radps=imu.gyro_radps[keep],
+        seqs=imu.seqs[keep],
+    )
+    run = replace(run, recording=replace(run.recording, imu=holed))
+    assert filters(run)["honest EKF"].position_rmse_m < 1.5
+    assert filters(run)["honest EKF"].heading_max_deg < 15.0
+
+
+def test_only_the_honest_filter_takes_a_velocity() -> None:
+    run = simulate(Scenario(duration_s=40.0, noise="clean", gnss_hz=0.2, pose_hz=0.0), 5)
+    antenna = run.truth.p_world_m + run.truth.R_world_body @ np.array([-1.5, 0.3, 2.2789])
+    v = np.gradient(antenna, (run.truth.stamps_ns - run.truth.stamps_ns[0]) * 1e-9, axis=0)
+    more = [
+        GnssVelocity(stamp_ns=int(n), sensor="vel", seq=10**6 + k, v_world_mps=v[100 * k], cov_m2ps2=np.eye(3) * 0.01)
+        for k, n in enumerate(run.truth.stamps_ns[::100].tolist())
+    ]
+    with_it = tuple(sorted([*run.recording.measurements, *more], key=lambda m: (m.stamp_ns, m.seq)))
+    vel = VelocityConfig(topic="/v", mount=MountConfig(xyz_m=(-1.5, 0.3, 2.2789)))
+    config = run.config.model_copy(update={"sensors": {**run.config.sensors, "vel": vel}})
+    without = filters(run)["honest EKF"].position_rmse_m
+    there = filters(replace(run, recording=replace(run.recording, measurements=with_it)), config)
+    assert there["honest EKF"].position_rmse_m < 0.7 * without
+
+
+@pytest.mark.parametrize("axes", [("yaw",), ("x",)])
+def test_a_pose_of_one_axis_goes_through_the_gate(axes: tuple[str, ...]) -> None:
+    run = simulate(Scenario(duration_s=10.0, noise="clean", false_fraction=0.0), 1)
+    index = [("x", "y", "yaw").index(a) for a in axes]
+
+    def one(m: PoseFix) -> PoseFix:
+        mode = m.modes[0]
+        return replace(
+            m, axes=axes, modes=(replace(mode, value=mode.value[index], cov=mode.cov[np.ix_(index, index)]),)
+        )
+
+    fewer = tuple(one(m) if isinstance(m, PoseFix) else m for m in run.recording.measurements)
+    run = replace(run, recording=replace(run.recording, measurements=fewer))
+    assert all(f.position_rmse_m < 1.5 for f in filters(run).values())

@@ -12,7 +12,7 @@ from graphloc.config import ImuConfig, VesselConfig, load_config
 from graphloc.frames import Datum, Geodetic
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
-from graphloc.measurements import CompassHeading
+from graphloc.measurements import CompassHeading, GnssVelocity
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag import HUSKY, KINDS
 
@@ -228,12 +228,16 @@ def test_axes_of_a_velocity(axes: str, said: str, enabled: bool, tmp_path: Path)
     assert config.sensors["gnss_velocity"].enabled is enabled
 
 
-def test_body_frame_by_its_name(tmp_path: Path) -> None:
+@pytest.mark.parametrize("body", ["vessel", "hull"])
+def test_body_frame_by_its_name_or_as_the_root(body: str, tmp_path: Path) -> None:
     make = Messages(2)
-    edges = [("vessel", "imu_link", (0, 0, 1), (0, 0, 0, 1)), ("vessel", "gps", (1, 2, 3), (0, 0, 0, 1))]
+    edges = [("map", body, (9, 9, 9), (0, 0, 0, 1)), (body, "imu_link", (0, 0, 1), (0, 0, 0, 1))]
+    edges += [(body, "gps", (1, 2, 3), (0, 0, 0, 1))]
+    if body == "hull":
+        edges = edges[1:]
     items = [("/tf_static", START_NS, make.transforms(edges)), *drive(make, seconds=30)]
     _, config, _ = look(tmp_path, items, make)
-    assert config.body_frame == "vessel"
+    assert config.body_frame == body
     np.testing.assert_allclose(read_recording(tmp_path / "run", config).mounts["gnss"][0], [1, 2, 3])
 
 
@@ -263,6 +267,49 @@ def test_where_the_frame_of_the_truth_lies(
         assert "not east-north-up" in text
 
 
+def test_a_plain_velocity_tells_the_yaw_of_the_imu(tmp_path: Path) -> None:
+    """`TwistStamped`, as NMEA drivers write it, and no wheels: the mount is found by it."""
+    make = Messages(2)
+    items = [item for item in drive(make, rotation_z(90.0)) if item[0] != "/wheel/odom"]
+    fixes = [m for topic, _, m in items if topic == "/fix"]
+    places = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for m in fixes]).T)
+    stamps = np.array([m.header.stamp.sec * S + m.header.stamp.nanosec for m in fixes])
+    v = np.gradient(places, (stamps - stamps[0]) * 1e-9, axis=0)
+    plain = make.t["geometry_msgs/msg/TwistStamped"]
+    for stamp, speed in zip(stamps.tolist(), v, strict=True):
+        twist = make.t["geometry_msgs/msg/Twist"](linear=make.vector(speed), angular=make.vector((0, 0, 0)))
+        items.append(("/vel", stamp + 1_000_000, plain(header=make.header(stamp), twist=twist)))
+    found, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
+    assert config.sensors["gnss_velocity"].enabled
+    recording = read_recording(tmp_path / "run", config)
+    told = [m.v_world_mps for m in recording.measurements if isinstance(m, GnssVelocity)]
+    np.testing.assert_allclose(told, v)
+
+
+def test_a_clock_ahead_gets_an_offset(tmp_path: Path) -> None:
+    """GPS time in the header, 37 s ahead, recorded at the right time."""
+    make, items = Messages(2), []
+    for topic, log_ns, message in drive(make, seconds=30):
+        if topic == "/fix":
+            message.header.stamp.sec += 37
+        items.append((topic, log_ns, message))
+    _, config, _ = look(tmp_path, items, make)
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(-37.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("status", "said"), [(-1, "say 'no fix'"), (0, "lie at 0, 0")])
+def test_topics_that_give_nothing_are_said(status: int, said: str, tmp_path: Path) -> None:
+    make = Messages(2)
+    items: list[Item] = [
+        ("/fix", START_NS + k * S, make.fix(START_NS + k * S, 0.0, 0.0, status=status)) for k in range(20)
+    ]
+    found, config, _ = look(tmp_path, items, make)
+    assert "gnss" not in config.sensors
+    assert any("/fix" in w and said in w for w in found.warnings)
+    assert "nothing of its 20 messages" in render(found)
+
+
 def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
     make = Messages(2)
     items: list[Item] = []
@@ -278,6 +325,7 @@ def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
     _, config, text = look(tmp_path / "b", [("/note", START_NS, make.text("hello"))], make)
     assert config.sensors == {}
     assert "nothing in this bag" in text
+    assert any("no message of a known type" in w for w in inspect_bag(tmp_path / "b" / "run").warnings)
 
 
 @pytest.mark.skipif(not HUSKY.exists(), reason="the Husky recording is not here")

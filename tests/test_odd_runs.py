@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs that are not like the others: what the covariance, the health and the ledger then say."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.config import DatumConfig, GnssConfig, HeightConfig, MountConfig, PoseConfig, VesselConfig
+from graphloc.errors import InputError
+from graphloc.eval.holdout import HoldOut
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.frames import Datum, Geodetic
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import GnssPosition, HeightPrior, ImuSeries, Measurement
+from graphloc.outputs import bounds_95
+from graphloc.recording import Recording
+from graphloc.trajectory import Trajectory
+
+BASE = Scenario(path="loops", duration_s=40.0, noise="clean", pose_hz=0.0)
+
+
+def only(recording: Recording, keep: tuple[Measurement, ...]) -> Recording:
+    imu = recording.imu
+    assert imu is not None
+    return replace(recording, measurements=keep, message_count=len(imu) + len(keep))
+
+
+def cut(imu: ImuSeries, keep: np.ndarray) -> ImuSeries:
+    return replace(
+        imu,
+        stamps_ns=imu.stamps_ns[keep],
+        accel_mps2=imu.accel_mps2[keep],
+        gyro_radps=imu.gyro_radps[keep],
+        seqs=imu.seqs[keep],
+    )
+
+
+def with_sensors(run: SimulatedRun, **sensors: object) -> VesselConfig:
+    kept = {name: sensor for name, sensor in {**run.config.sensors, **sensors}.items() if sensor is not None}
+    return run.config.model_copy(update={"sensors": kept})
+
+
+def test_gnss_alone_owns_up_to_its_slow_error() -> None:
+    """Fixes that drift by a metre, and nothing beside them: the estimate drifts along, and its bound says so."""
+    run = simulate(replace(BASE, noise="drift", duration_s=60.0), 2)
+    solved = app.simulated(run).solution
+    ours = compare_to_truth(solved.trajectory, run.truth)
+    assert ours.position_rmse_m > 0.7
+    assert ours.coverage_95 is not None
+    assert ours.coverage_95 > 0.95
+    assert any("slow error" in w for w in solved.stats.warnings)
+    told = app.smooth_recording(
+        run.recording, with_sensors(run, gnss=GnssConfig.model_validate({
+            "topic": "/gnss/fix", "mount": {"xyz_m": (-1.5, 0.3, 2.2789)}, "slow_error": {"enabled": False},
+        })),
+    ).solution  # fmt: skip
+    assert told.trajectory.cov is not None
+    assert bounds_95(told.trajectory.cov)[:, 0].max() < 1.0
+    assert not any("slow error" in w for w in told.stats.warnings)
+
+
+def test_the_sea_is_round() -> None:
+    """A datum 10 km off: the waterline lies 7.8 m below its tangent plane."""
+    run = simulate(BASE, 1)
+    away = Geodetic(57.7 + 10.0 / 111.4, 11.7, 36.0)
+    config = run.config.model_copy(
+        update={"datum": DatumConfig(latitude_deg=away.latitude_deg, longitude_deg=11.7, height_m=36.0)}
+    )
+    solved = app.smooth_recording(replace(run.recording, truth=None), config).solution
+    here = app.choose_datum(run.recording, run.config)
+    at = run.truth.at(solved.trajectory.stamps_ns[1:-1])
+    true = here.geodetic_from_enu(at.p_world_m)
+    ours = Datum(away).geodetic_from_enu(solved.trajectory.p_world_m[1:-1])
+    assert np.abs(ours[:, 2] - true[:, 2]).mean() < 0.15
+    assert 0.5 < solved.stats.cost / solved.stats.expected_cost < 1.6
+    assert all("slow error" in w for w in solved.stats.warnings)  # no noise scaled, nothing contradicted
+
+
+def test_a_late_first_position_is_no_confident_prior() -> None:
+    run = simulate(replace(BASE, duration_s=80.0), 4)
+    start = run.recording.measurements[0].stamp_ns
+    late = tuple(
+        m for m in run.recording.measurements if not isinstance(m, GnssPosition) or m.stamp_ns > start + 40 * 10**9
+    )
+    solved = app.smooth_recording(only(run.recording, late), run.config).solution
+    ours = compare_to_truth(solved.trajectory, run.truth)
+    assert ours.coverage_95 is not None
+    assert ours.coverage_95 > 0.85
+    assert ours.position_rmse_m < 15.0
+
+
+def test_a_recorder_pause_cuts_the_run() -> None:
+    """Nothing at all for 60 s: each side is as good as a run of its own, and every message has its row."""
+    run = simulate(replace(BASE, duration_s=140.0), 1)
+    imu = run.recording.imu
+    assert imu is not None
+    t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    silent = (int(imu.stamps_ns[0]) + 40 * 10**9, int(imu.stamps_ns[0]) + 100 * 10**9)
+    kept = tuple(m for m in run.recording.measurements if not silent[0] < m.stamp_ns < silent[1])
+    paused = replace(only(run.recording, kept), imu=cut(imu, (t < 40.0) | (t > 100.0)))
+    paused = replace(paused, message_count=len(paused.imu or ()) + len(kept))
+    solved = app.smooth_recording(paused, run.config).solution
+    track = solved.trajectory
+    seconds = (track.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    assert not ((seconds > 41.0) & (seconds < 99.0)).any()
+    ours = compare_to_truth(track, run.truth)
+    assert ours.position_rmse_m < 0.3
+    assert ours.heading_max_deg < 2.0
+    assert ours.matched == pytest.approx(80.0 / 140.0, abs=0.02)
+    assert len(solved.ledger) == paused.message_count
+    assert sum("solved as a part by itself" in w for w in solved.stats.warnings) == 2
+
+
+def test_a_part_that_cannot_be_solved_is_left_out() -> None:
+    """No position after the pause: the first part stands, the second one's messages are rejected with the reason."""
+    run = simulate(replace(BASE, duration_s=100.0), 1)
+    imu = run.recording.imu
+    assert imu is not None
+    t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    kept = tuple(m for m in run.recording.measurements if m.stamp_ns < imu.stamps_ns[0] + 30 * 10**9)
+    paused = replace(only(run.recording, kept), imu=cut(imu, (t < 40.0) | (t > 80.0)))
+    solved = app.smooth_recording(paused, run.config).solution
+    assert (solved.trajectory.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 < 41.0
+    assert any("left out" in w and "no position" in w for w in solved.stats.warnings)
+    assert solved.ledger.counts()["imu"]["rejected"] == (t > 80.0).sum()
+
+
+def test_an_imu_that_ends_early_is_said() -> None:
+    run = simulate(BASE, 1)
+    imu = run.recording.imu
+    assert imu is not None
+    early = replace(run.recording, imu=cut(imu, imu.stamps_ns < imu.stamps_ns[0] + 10 * 10**9))
+    warnings = app.smooth_recording(early, run.config).solution.stats.warnings
+    assert any(w.startswith("gnss: 300 of 400 measurements lie outside the IMU's span") for w in warnings)
+
+
+def test_a_sensor_that_is_switched_off_keeps_its_rows() -> None:
+    run = simulate(replace(BASE, duration_s=15.0, pose_hz=1.0), 1)
+    off = run.config.sensors["aerial"].model_copy(update={"enabled": False})
+    for config in (with_sensors(run, aerial=off), with_sensors(run, aerial=None)):
+        solved = app.smooth_recording(run.recording, config, compare=True)
+        assert len(solved.solution.ledger) == run.recording.message_count
+        assert solved.solution.ledger.counts()["aerial"] == {"ignored": 14}
+        assert all(row.sensor != "aerial" for f in solved.filters for row in f.ledger)
+
+
+def test_held_out_fixes_of_two_receivers_keep_their_antennas() -> None:
+    """Receivers 7.5 m apart, held out in turn: each fix is predicted at its own antenna."""
+    run = simulate(replace(BASE, gnss_hz=5.0), 1)
+    second = MountConfig(xyz_m=(6.0, -1.0, 2.0))
+    datum, rng = app.choose_datum(run.recording, run.config), np.random.default_rng(1)
+    imu = run.recording.imu
+    assert imu is not None
+    more: list[Measurement] = []
+    for k, m in enumerate(m for m in run.recording.measurements if isinstance(m, GnssPosition)):
+        at = run.truth.at(np.array([m.stamp_ns]))
+        place = at.p_world_m[0] + at.R_world_body[0] @ np.array(second.xyz_m) + rng.normal(0.0, 0.2, 3)
+        position = Geodetic(*datum.geodetic_from_enu(place)[0])
+        more.append(replace(m, sensor="gnss_b", seq=10**6 + k, position=position))
+    both = tuple(sorted([*run.recording.measurements, *more], key=lambda m: (m.stamp_ns, m.seq)))
+    config = with_sensors(run, gnss_b=GnssConfig(topic="/b", mount=second))
+    solved = app.smooth_recording(only(run.recording, both), config, hold_out=HoldOut.parse("every:2"))
+    assert Counter(m.sensor for m in solved.held) == {"gnss": 100, "gnss_b": 100}
+    numbers = next(t for t in app.tables(solved) if "held-out" in t.title).as_dict()["graphloc"]
+    assert numbers["horizontal_rmse_m"] is not None
+    assert numbers["horizontal_rmse_m"] < 0.5
+    assert numbers["outage_drift_m"] is None  # every second one is no outage
+
+
+def test_places_in_world_need_a_datum() -> None:
+    run = simulate(replace(BASE, duration_s=10.0, pose_hz=1.0), 1)
+    with pytest.raises(InputError, match=r"sensors\.aerial, truth_topic.*set datum"):
+        app.smooth_recording(run.recording, run.config.model_copy(update={"datum": None}))
+
+
+def test_a_datum_across_the_date_line() -> None:
+    fixes = tuple(
+        GnssPosition(stamp_ns=k, sensor="gnss", seq=k, position=Geodetic(10.0, lon, 0.0), cov_enu_m2=np.eye(3))
+        for k, lon in enumerate((179.99999, -179.99999, 179.99999, -179.99999))
+    )
+    recording = Recording(source="x", imu=None, measurements=fixes)
+    lon = app.choose_datum(recording, VesselConfig()).origin.longitude_deg
+    assert abs(lon) == pytest.approx(180.0, abs=1e-4)
+
+
+def test_no_usable_fix_says_why() -> None:
+    rows = tuple(
+        LedgerRow(seq=k, stamp_ns=k, sensor="gnss", topic="/fix", outcome=Outcome.REJECTED, reason="no fix (STATUS_NO_FIX)")
+        for k in range(30)
+    )  # fmt: skip
+    recording = Recording(source="my.bag", imu=None, measurements=(), rows=rows)
+    with pytest.raises(InputError, match=r"my\.bag: no usable GNSS fix: 30 messages of gnss: no fix"):
+        app.choose_datum(recording, VesselConfig(sensors={"gnss": GnssConfig(topic="/fix")}))
+
+
+def test_truth_on_another_clock_is_said_and_left_out() -> None:
+    run = simulate(replace(BASE, duration_s=12.0), 1)
+    truth = run.truth
+    shifted = Trajectory(stamps_ns=truth.stamps_ns + 10**12, p_world_m=truth.p_world_m, R_world_body=truth.R_world_body)
+    solved = app.smooth_recording(replace(run.recording, truth=shifted), run.config, compare=True)
+    assert solved.recording.truth is None
+    assert any("share no time" in w for w in solved.recording.warnings)
+    assert app.tables(solved) == ()
+
+
+def test_health_follows_what_agrees() -> None:
+    """Position sensors silent from 15 to 30 s: dead reckoning from 5 s after, and good again at once."""
+    run = simulate(replace(BASE, duration_s=45.0, pose_hz=1.0, false_fraction=0.0, outage_s=(15.0, 30.0)), 3)
+    solved = app.simulated(run).solution
+    t = (solved.trajectory.stamps_ns - solved.trajectory.stamps_ns[0]) * 1e-9
+    health = np.array([h.value for h in solved.health])
+    assert (health[(t > 21.0) & (t < 29.5)] == "dead_reckoning").all()
+    assert (health[t < 14.0] == "good").all()
+    assert (health[t > 31.5] == "good").all()
+    since = solved.since_agreed_s["gnss"]
+    k = int(np.searchsorted(t, 28.0))
+    assert since[k] == pytest.approx(t[k] - 15.0, abs=0.2)
+
+
+def test_antenna_height_is_taken_off_the_waterline() -> None:
+    """Without a configured height the body is at the median fix less the antenna's 2.28 m."""
+    run = simulate(replace(BASE, duration_s=10.0, wave_roll_deg=0.1, wave_pitch_deg=0.1), 1)
+    config = with_sensors(run, height=HeightConfig(topic=""))
+    made = app.with_synthetic(run.recording, config, app.choose_datum(run.recording, config))
+    heights = {m.height_m for m in made.measurements if isinstance(m, HeightPrior)}
+    assert len(heights) == 1
+    assert heights.pop() == pytest.approx(float(run.truth.p_world_m[:, 2].mean()), abs=0.15)
+
+
+def test_output_velocity_is_that_of_the_body_origin() -> None:
+    """The states stand 5 m ahead of the origin, at the IMU: in a turn its velocity differs by w x l."""
+    run = simulate(replace(BASE, duration_s=20.0, pose_hz=2.0, false_fraction=0.0), 6)
+    track = app.simulated(run).solution.trajectory
+    inner = track.stamps_ns[20:-20]
+    true = run.truth.at(inner)
+    assert true.v_world_mps is not None
+    assert track.v_world_mps is not None
+    error = track.v_world_mps[20:-20] - true.v_world_mps
+    assert np.sqrt((error[:, :2] ** 2).mean()) < 0.03  # the IMU's lever of 1.14 m swings by 0.05 m/s in these waves
+
+
+@pytest.mark.parametrize("axes", [("roll",), ("x", "y", "pitch")])
+def test_roll_or_pitch_alone_is_refused(axes: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match="roll and pitch go together"):
+        PoseConfig.model_validate({"topic": "/p", "axes": axes})
