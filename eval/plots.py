@@ -216,6 +216,11 @@ def residuals_over_time(solution: Solution) -> go.Figure:
     return _layout(figure, 120 + 170 * max(len(by_sensor), 1))
 
 
+def _keyed(names: Sequence[str]) -> str:
+    """Names in the colours of their lines."""
+    return ", ".join(f'<span style="color:{COLOURS[k]}">{name}</span>' for k, name in enumerate(names))
+
+
 def slow_over_time(solution: Solution) -> go.Figure:
     """Estimated slow states (GNSS error, compass offset) with 95 % bands, and IMU biases."""
     panels: list[tuple[str, NDArray[np.int64], Array, Array | None, tuple[str, ...]]] = [
@@ -225,9 +230,8 @@ def slow_over_time(solution: Solution) -> go.Figure:
     panels.append(("gyro bias, deg/s", stamps, np.degrees(solution.gyro_bias_radps), None, axes))
     panels.append(("accelerometer bias, m/s^2", stamps, solution.accel_bias_mps2, None, axes))
     start = int(stamps[0])
-    figure = make_subplots(
-        rows=len(panels), cols=1, shared_xaxes=True, vertical_spacing=0.05, subplot_titles=[p[0] for p in panels]
-    )
+    titles = [f"{p[0]} ({_keyed(p[4])})" for p in panels]
+    figure = make_subplots(rows=len(panels), cols=1, shared_xaxes=True, vertical_spacing=0.05, subplot_titles=titles)
     for i, (title, at, value, band, names) in enumerate(panels):
         step = _every(len(at))
         t = (at[step] - start) * 1e-9

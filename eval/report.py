@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import enum
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,6 +24,9 @@ from graphloc.measurements import GnssPosition
 from graphloc.outputs import bounds_95
 from graphloc.recording import Recording
 from graphloc.solution import Solution
+
+# Shares of the run: called good, and covered by the 95 % bounds, below which a reader has to look closer.
+_MOSTLY, _COVERED, _NOT_COVERED = 0.5, 0.85, 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,7 +60,7 @@ li.warning{color:#8a3b00}@media print{.figure{break-inside:avoid}details{display
 <h1>$title</h1><p class="verdict">$verdict</p><p>$truth</p>
 $warnings
 $tables
-<h2>Map</h2><p class="note">East and north of the datum, m. Points: measurements, coloured by final weight; hover for the ledger row.</p>
+<h2>Map</h2><p class="note">East and north of the datum, m. Points: measurements, coloured by final weight; hover for the ledger row. Drag to zoom, double-click to go back.</p>
 $map
 <h2>Errors and 95 % bounds</h2><p class="note">Blue band: the bound that the estimate states. Orange: degraded; red: dead reckoning or lost.</p>
 $errors
@@ -77,11 +81,12 @@ def write_report(path: Path, data: ReportData) -> None:
     Raises:
         OutputError: the disk refuses.
     """
+    trust, text = verdict(data)
     page = _PAGE.substitute(
         title=escape(data.title),
         plotly=get_plotlyjs(),
-        verdict=escape(_verdict(data)),
-        colour="#009E73" if data.solution.stats.converged else "#D55E00",
+        verdict=escape(text),
+        colour=trust.value,
         truth=escape(data.truth_statement),
         warnings=_warnings(data),
         tables="".join(f"<h2>{escape(t.title)}</h2>{_table(t)}" for t in data.tables),
@@ -103,30 +108,58 @@ def write_report(path: Path, data: ReportData) -> None:
 
 def _figure(figure: go.Figure, name: str) -> str:
     html: str = figure.to_html(
-        full_html=False, include_plotlyjs=False, div_id=name, config={"displaylogo": False, "responsive": True}
+        full_html=False,
+        include_plotlyjs=False,
+        div_id=name,
+        config={"displaylogo": False, "responsive": True, "displayModeBar": False},
     )
     return f'<div class="figure">{html}</div>'
 
 
-def _verdict(data: ReportData) -> str:
-    """How good, compared with the filters, and can it be trusted: in two sentences."""
+class Trust(enum.StrEnum):
+    """How far the report says that a run can be relied on; the value is its colour."""
+
+    YES = "#009E73"
+    WITH_CARE = "#E69F00"
+    NO = "#D55E00"
+
+
+def verdict(data: ReportData) -> tuple[Trust, str]:
+    """Say how good a run is, compared with the filters, and whether it can be trusted, in a few sentences."""
     solution = data.solution
     assert solution.trajectory.cov is not None
     bound = float(np.percentile(bounds_95(solution.trajectory.cov)[:, 0], 95))
-    good = np.mean([h.value == "good" for h in solution.health])
-    text = f"The estimate states a 95 % bound of {bound:.2f} m or better for 95 % of the run, and calls itself good for {good:.0%}."
-    for table in data.tables:
-        values = table.as_dict()
-        key = next((k for k in ("position_rmse_m", "horizontal_rmse_m") if k in table.columns), None)
-        if key is None:
-            continue
-        ours = values["graphloc"][key]
-        others = ", ".join(f"{n} {v[key]:.2f} m" for n, v in values.items() if n != "graphloc" and v[key] is not None)
-        text = f"Horizontal RMSE {ours:.2f} m" + (f" (beside it: {others})" if others else "") + ". " + text
-        break
+    good = float(np.mean([h.value == "good" for h in solution.health]))
+    said = [_accuracy(data.tables)] if data.tables else []
+    said.append(
+        f"It states a 95 % bound of {bound:.2f} m or better for 95 % of the run, and calls itself good for {good:.0%}."
+    )
+    covered = next((t.as_dict()["graphloc"]["coverage_95"] for t in data.tables if "coverage_95" in t.columns), None)
+    trust = Trust.YES
+    if covered is not None:
+        said.append(f"Its 95 % bounds held the truth for {covered:.0%} of the time.")
+    warnings = len(data.recording.warnings) + len(solution.stats.warnings)
+    if warnings:
+        said.append(f"Read the {warnings} warning{'s' if warnings > 1 else ''} below.")
+    if warnings or good < _MOSTLY or (covered is not None and covered < _COVERED):
+        trust = Trust.WITH_CARE
+    if covered is not None and covered < _NOT_COVERED:
+        trust, said = Trust.NO, [*said, "The bounds are far too small: a mount, the datum or a noise is wrong."]
     if not solution.stats.converged:
-        text += " THE SOLVER DID NOT CONVERGE: do not rely on this run."
-    return text
+        trust, said = Trust.NO, [*said, "THE SOLVER DID NOT CONVERGE: do not rely on this run."]
+    return trust, " ".join(said)
+
+
+def _accuracy(tables: Sequence[Table]) -> str:
+    for table in tables:
+        key = next((k for k in ("position_rmse_m", "horizontal_rmse_m") if k in table.columns), None)
+        if key is not None:
+            values = table.as_dict()
+            others = ", ".join(
+                f"{n} {v[key]:.2f} m" for n, v in values.items() if n != "graphloc" and v[key] is not None
+            )
+            return f"Horizontal RMSE {values['graphloc'][key]:.2f} m" + (f" (beside it: {others})." if others else ".")
+    return ""
 
 
 def _warnings(data: ReportData) -> str:
@@ -135,13 +168,16 @@ def _warnings(data: ReportData) -> str:
 
 
 def _table(table: Table) -> str:
-    head = "".join(f"<th>{escape(c)}</th>" for c in ("", *table.columns))
+    """Estimates as columns, numbers as rows: it fits a phone."""
+    head = "".join(f"<th>{escape(name)}</th>" for name, _ in table.rows)
     rows = "".join(
-        f"<tr><td>{escape(n)}</td>" + "".join(f"<td>{'-' if v is None else f'{v:.3f}'}</td>" for v in vs) + "</tr>"
-        for n, vs in table.rows
+        f"<tr><td>{escape(column)}</td>"
+        + "".join(f"<td>{'-' if values[k] is None else f'{values[k]:.3f}'}</td>" for _, values in table.rows)
+        + "</tr>"
+        for k, column in enumerate(table.columns)
     )
     note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
-    return f'<div class="scroll"><table><tr>{head}</tr>{rows}</table></div>{note}'
+    return f'<div class="scroll"><table><tr><th></th>{head}</tr>{rows}</table></div>{note}'
 
 
 def _ledger(solution: Solution) -> str:

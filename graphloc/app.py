@@ -196,8 +196,8 @@ def truth_statement(run: Run) -> str:
         return "Truth: " + (run.config.truth_topic or "given with the recording") + "; it was not fused."
     if run.held:
         return (
-            f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; "
-            "their own noise is part of the error."
+            f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
+            "of the error. The track in this folder lacks them: for the best track run again without --hold-out."
         )
     return "No truth and no held-out fixes: nothing here measures accuracy. Try --hold-out every:5."
 

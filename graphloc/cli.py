@@ -95,14 +95,19 @@ def _print_run(run: object, report: Path, as_json: bool) -> None:
 
     assert isinstance(run, application.Run)
     found = application.tables(run)
+    warnings = (*run.recording.warnings, *run.solution.stats.warnings)
     if as_json:
-        typer.echo(json.dumps({t.title: t.as_dict() for t in found}, indent=2))
+        numbers = {t.title: t.as_dict() for t in found}
+        told = {"ledger": run.solution.ledger.counts(), "converged": run.solution.stats.converged, "warnings": warnings}
+        typer.echo(json.dumps({**numbers, **told}, indent=2))
     else:
+        if not found:
+            typer.echo(application.truth_statement(run))
         for table in found:
             typer.echo(table.as_text())
         for name, counts in run.solution.ledger.counts().items():
             typer.echo(f"  {name}: " + ", ".join(f"{n} {outcome}" for outcome, n in counts.items()))
-        for warning in (*run.recording.warnings, *run.solution.stats.warnings):
+        for warning in warnings:
             typer.echo(f"warning: {warning}", err=True)
     typer.echo(str(report))
 

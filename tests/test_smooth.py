@@ -14,7 +14,7 @@ from graphloc.errors import InputError, SolveError
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, bl_scenario, simulate
-from graphloc.measurements import ImuSeries, PoseFix
+from graphloc.measurements import GnssPosition, ImuSeries, PoseFix
 from graphloc.recording import Recording
 
 SHORT = Scenario(duration_s=40.0, noise="drift")
@@ -44,6 +44,14 @@ def test_ledger_has_one_row_for_each_message(short: app.Run) -> None:
     assert len({row.seq for row in ledger}) == short.recording.message_count
 
 
+def test_a_row_is_used_from_half_a_weight_on(short: app.Run) -> None:
+    weighed = [row for row in short.solution.ledger if row.weight is not None]
+    assert {row.outcome.value for row in weighed} == {"used", "down_weighted", "rejected"}
+    for row in weighed:
+        assert row.weight is not None
+        assert (row.outcome.value == "used") == (row.weight >= 0.5)
+
+
 def test_false_matches_are_found(short: app.Run) -> None:
     """A match is false where it lies over 1 m from the truth; the ledger must say the same of nearly all."""
     truth = short.recording.truth
@@ -58,6 +66,20 @@ def test_false_matches_are_found(short: app.Run) -> None:
             wrong += (weights[m.seq] < 0.5) != false
     assert wrong <= 2
     assert right >= 35
+
+
+def test_the_gnss_error_is_found_with_its_sign(short: app.Run) -> None:
+    """The slow state, as written, is what must be subtracted from the fixes: metres of drift, known to decimetres."""
+    truth, datum = short.recording.truth, short.solution.datum
+    assert truth is not None
+    fixes = [m for m in short.recording.measurements if isinstance(m, GnssPosition)]
+    at = truth.at(np.array([m.stamp_ns for m in fixes]))
+    antenna = at.p_world_m + at.R_world_body @ np.array([-1.5, 0.3, 2.2789])
+    error = datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - antenna
+    slow = short.solution.slow["gnss"]
+    estimated = np.column_stack([np.interp(at.stamps_ns, slow.stamps_ns, slow.value[:, k]) for k in range(2)])
+    assert np.sqrt((error[:, :2] ** 2).mean()) > 0.5
+    assert np.sqrt(((estimated - error[:, :2]) ** 2).mean()) < 0.35  # 0.21 m of it is each fix's white noise
 
 
 def test_modes_are_chosen() -> None:
