@@ -17,7 +17,7 @@ import numpy as np
 
 from graphloc.config import CompassConfig
 from graphloc.factors._linear import linear_update
-from graphloc.frames import Array, Datum, wrap_angle
+from graphloc.frames import Array, Datum, skew, wrap_angle
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import CompassHeading
 
@@ -27,8 +27,7 @@ def _yaw_jacobian(R: Array, R_state_sensor: Array) -> Array:
     x_body = R_state_sensor[:, 0]  # the sensor's x axis in body
     x_world = R @ x_body
     # d(R Exp(theta) x)/d theta = -R [x]_x ; yaw = atan2(y, x)
-    skew = np.array([[0.0, -x_body[2], x_body[1]], [x_body[2], 0.0, -x_body[0]], [-x_body[1], x_body[0], 0.0]])
-    d_world = -R @ skew
+    d_world = -R @ skew(x_body)
     horizontal = x_world[0] ** 2 + x_world[1] ** 2
     return np.concatenate([(x_world[0] * d_world[1] - x_world[1] * d_world[0]) / horizontal, np.zeros(3)])
 

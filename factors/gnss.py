@@ -12,14 +12,13 @@ Without a slow state: `GPSFactorArm`. Not handled: correlation between axes of d
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import gtsam
 import numpy as np
 
 from graphloc.config import GnssConfig
 from graphloc.factors._noise import noise_model, with_floors
-from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import GnssPosition
 
@@ -108,12 +107,7 @@ def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
 def _antenna_jacobian(at: Attachment) -> Array:
     """d(p + R l) / d(body tangent), (3, 6)."""
     R = at.T_world_body.rotation().matrix()
-    return np.hstack([-R @ _skew(at.T_state_sensor.translation()), R])
-
-
-def _skew(v: Any) -> Array:
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.hstack([-R @ skew(at.T_state_sensor.translation()), R])
 
 
 def hint(m: GnssPosition, mount_yaw_rad: float, datum: Datum) -> Hint:

@@ -17,7 +17,7 @@ import numpy as np
 from graphloc.config import VelocityConfig
 from graphloc.factors._linear import linear_update
 from graphloc.factors._noise import with_floors
-from graphloc.frames import Array, Datum
+from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor
 from graphloc.measurements import GnssVelocity
 
@@ -29,9 +29,8 @@ def _antenna_mps(at: Attachment) -> Array:
 
 def _attitude_jacobian(at: Attachment) -> Array:
     """Derivative (3, 6) of R Exp(theta) (omega x l) by the body tangent (theta, rho)."""
-    x, y, z = np.cross(at.gyro_radps, at.lever_m)
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.hstack([-at.T_world_body.rotation().matrix() @ skew, np.zeros((3, 3))])
+    swing = skew(np.cross(at.gyro_radps, at.lever_m))
+    return np.hstack([-at.T_world_body.rotation().matrix() @ swing, np.zeros((3, 3))])
 
 
 def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[Residual, ...]:

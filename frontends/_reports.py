@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from typing import Any
+
+from graphloc.plain import plain
 
 Vec = tuple[float, float, float]
 
@@ -163,16 +164,6 @@ class Inspection:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain data for JSON; numbers that are not finite become None."""
-        tree = _plain(asdict(self))
+        tree = plain(asdict(self))
         assert isinstance(tree, dict)
         return tree
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -313,7 +313,7 @@ class OutputConfig(Block):
     rate_hz: Positive = 10.0
     """Rows a second in the solution."""
     bag: bool = True
-    """Write `solution.mcap` with `nav_msgs/Odometry`."""
+    """Write `solution_bag/`, a bag with `nav_msgs/Odometry`."""
 
 
 class VesselConfig(Block):
@@ -351,7 +351,8 @@ class VesselConfig(Block):
 
 def _nearest(key: str, known: list[str]) -> str:
     close = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
-    return f"; did you mean '{close[0]}'?" if close else f"; known here: {', '.join(sorted(known))}"
+    near = f"; did you mean '{close[0]}'?" if close else ""
+    return near + (f"; known here: {', '.join(sorted(known))}" if not close or len(known) <= 10 else "")
 
 
 def _fields_at(model: type[BaseModel], path: list[str]) -> list[str]:

@@ -86,6 +86,12 @@ class Datum:
         return np.column_stack([lat, lon, h])
 
 
+def skew(v: Array) -> Array:
+    """Return the matrix (3, 3) that takes b to the cross product v x b."""
+    x, y, z = (float(c) for c in v)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
 def wrap_angle(angle_rad: Array | float) -> Array:
     """Return angles in (-pi, pi]."""
     a = np.asarray(angle_rad, dtype=float)

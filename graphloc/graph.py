@@ -20,8 +20,6 @@ from graphloc.config import KernelConfig, SensorConfig
 from graphloc.frames import Array, Datum
 from graphloc.measurements import ImuSeries, Measurement
 
-BODY_TANGENT = "rotation first, then translation, both in body axes (GTSAM Pose3)"
-
 
 @dataclass(frozen=True, slots=True)
 class GraphUpdate:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import importlib.metadata
 import json
-import math
 import platform
 import shutil
 import tempfile
@@ -31,6 +30,7 @@ from graphloc.config import VesselConfig, effective
 from graphloc.errors import OutputError
 from graphloc.frames import Array, heading_deg_from_yaw
 from graphloc.ledger import LedgerRow
+from graphloc.plain import plain
 from graphloc.solution import Solution
 from graphloc.time import utc_text
 
@@ -262,17 +262,6 @@ def _slow(solution: Solution) -> Iterator[list[object]]:
                 yield [sensor, slow.name, utc_text(stamp), stamp, axis, f"{v:.4f}", f"{s:.4f}", slow.unit]
 
 
-def _plain(value: Any) -> Any:
-    """JSON knows no NaN and no infinity."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
 def _run_json(
     path: Path,
     solution: Solution,
@@ -293,4 +282,4 @@ def _run_json(
         "metrics": dict(metrics),
         "config": effective(config),
     }
-    path.write_text(json.dumps(_plain(run), indent=2), encoding="utf-8")
+    path.write_text(json.dumps(plain(run), indent=2), encoding="utf-8")

@@ -37,11 +37,12 @@ def covered(share: float) -> tuple[Table, ...]:
 
 
 def test_verdict_names_the_numbers(data: ReportData) -> None:
-    """A bound of 1 m for 19 of 20 states, and of 9 m for the rest: '1.00 m for 95 %' it is."""
+    """Bounds of 0.5 m for a tenth of the states, of 9 m for one in 25, else of 1 m: '1.00 m for 95 %' it is."""
     cov = data.solution.trajectory.cov
     assert cov is not None
     made = np.tile(np.eye(6) * (1.0 / 5.991), (len(cov), 1, 1))
     made[: len(cov) // 25] *= 81.0
+    made[-len(cov) // 10 :] *= 0.25
     solution = replace(data.solution, trajectory=replace(data.solution.trajectory, cov=made))
     trust, text = verdict(replace(data, solution=solution, tables=covered(0.95)))
     assert "95 % bound of 1.00 m" in text

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from graphloc import keys
 from graphloc.build import Problem, Stream
-from graphloc.frames import Array
+from graphloc.frames import Array, skew
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.recording import Recording
 from graphloc.solution import Health, SlowEstimate, Solution, SolveStats
@@ -95,9 +95,8 @@ def world_covariance(cov_body: Any, R: Array, lever_m: Array) -> Array:
     For the point `lever_m` (body axes) from the state. Only the blocks are rotated: the full adjoint
     would mix yaw times distance from the datum into position.
     """
-    x, y, z = lever_m
     turn = np.zeros((6, 6))
-    turn[:3, :3] = -R @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turn[:3, :3] = -R @ skew(lever_m)
     turn[:3, 3:], turn[3:, :3] = R, R
     return np.asarray(turn @ np.asarray(cov_body) @ turn.T)
 
@@ -213,7 +212,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
     expected = expected_cost(problem, result.verdicts)
     warnings = list(problem.warnings)
     if not result.converged:
-        warnings.append("the solver did not converge: the last pass still moved states or weights")
+        warnings.append("the solver did not converge: the last pass still moved the track by centimetres or more")
     if result.noise_scale > 1.0:
         said = (
             f"IMU noise scaled up {result.noise_scale:.1f} times: as configured, the IMU contradicts the other sensors"
