@@ -10,7 +10,8 @@ $(STAMP): pyproject.toml constraints.txt
 		{ echo "graphloc needs Python 3.11 or newer; $$($(PYTHON) --version) is on PATH: call make PYTHON=python3.11"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@echo "setting up .venv (once)"
-	@PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]' \
+		> .venv/setup.log 2>&1 || { cat .venv/setup.log; exit 1; }
 	@touch $@
 
 demo: $(STAMP)
