@@ -41,8 +41,10 @@ class Table:
         return {name: dict(zip(self.columns, values, strict=True)) for name, values in self.rows}
 
     def as_text(self) -> str:
-        """Return the table as aligned text."""
-        cells = [["", *self.columns]] + [[n, *("-" if v is None else f"{v:.3f}" for v in vs)] for n, vs in self.rows]
+        """Return the table as aligned text, estimates as columns: it fits a terminal."""
+        numbers = [["-" if vs[k] is None else f"{vs[k]:.3f}" for _, vs in self.rows] for k in range(len(self.columns))]
+        cells = [["", *(name for name, _ in self.rows)]]
+        cells += [[column, *values] for column, values in zip(self.columns, numbers, strict=True)]
         widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
         lines = [
             "  ".join(c.rjust(w) if i else c.ljust(w) for i, (c, w) in enumerate(zip(r, widths, strict=True)))
