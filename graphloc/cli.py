@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -140,22 +141,30 @@ def compare(
 
 @app.command()
 def simulate(
+    scenario: Annotated[str, typer.Argument(help="bl1-drift, bl2-jump, ...: a wrong name lists them.")],
     out: OutOption,
-    case: Annotated[int, typer.Option(min=1, max=3, help="Case of Bergman & Lindell.")] = 1,
-    noise: Annotated[str, typer.Option(help="clean, drift, jump or drift_jump.")] = "drift",
     seed: Annotated[int, typer.Option(help="Same seed, same run.")] = 0,
     ros: Annotated[int, typer.Option(min=1, max=2, help="ROS version of the bag.")] = 2,
+    storage: Annotated[str, typer.Option(help="mcap or sqlite3, of a ROS 2 bag.")] = "mcap",
+    harbour: Annotated[str, typer.Option(help="Another harbour than the scenario's: a name or a file.")] = "",
+    lidar: Annotated[bool, typer.Option(help="Cast the LiDARs' scans.")] = True,
+    overwrite: OverwriteOption = False,
 ) -> None:
-    """Write a simulated run as a bag, with its vessel.yaml beside it."""
+    """Write a simulated harbour run: bag, vessel.yaml, aerial image, and what only a simulator knows."""
     from graphloc.errors import ConfigError
-    from graphloc.eval.simulate import bl_scenario
+    from graphloc.eval.simulate import harbour_scenarios
     from graphloc.eval.simulate import simulate as run_simulation
     from graphloc.eval.simulate.bag import write_bag
 
-    if noise not in ("clean", "drift", "jump", "drift_jump"):
-        raise ConfigError(f"--noise {noise}: choose clean, drift, jump or drift_jump")
-    run = run_simulation(bl_scenario(case, noise), seed)  # type: ignore[arg-type]
-    bag, config = write_bag(run, out, ros=ros)
+    known = harbour_scenarios()
+    if scenario not in known:
+        raise ConfigError(f"scenario '{scenario}': unknown; there are: {', '.join(known)}")
+    if storage not in ("mcap", "sqlite3"):
+        raise ConfigError(f"--storage {storage}: choose mcap or sqlite3")
+    chosen = known[scenario]
+    chosen = replace(chosen, harbour=harbour or chosen.harbour, lidar_hz=chosen.lidar_hz if lidar else 0.0)
+    run = run_simulation(chosen, seed)
+    bag, config = write_bag(run, out, ros=ros, storage=storage, overwrite=overwrite, progress=_progress())
     typer.echo(f"{bag}\n{config}")
 
 

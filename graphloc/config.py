@@ -367,7 +367,8 @@ def _fields_at(model: type[BaseModel], path: list[str]) -> list[str]:
     return list(model.model_fields)
 
 
-def _one_line(error: ValidationError, model: type[BaseModel], where: str, prefix: str) -> str:
+def one_line(error: ValidationError, model: type[BaseModel], where: str, prefix: str) -> str:
+    """Return what is wrong with a block, in one line: bad keys with their nearest neighbours, bad values."""
     lines = []
     for item in error.errors():
         path = [str(p) for p in item["loc"]]
@@ -400,12 +401,12 @@ def parse_config(raw: Mapping[str, Any], kinds: Mapping[str, type[SensorConfig]]
         try:
             parsed[str(name)] = kinds[kind].model_validate({**block, "kind": kind})
         except ValidationError as error:
-            raise ConfigError(_one_line(error, kinds[kind], where, f"sensors.{name}")) from None
+            raise ConfigError(one_line(error, kinds[kind], where, f"sensors.{name}")) from None
     tree["sensors"] = parsed
     try:
         return VesselConfig.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(_one_line(error, VesselConfig, where, "")) from None
+        raise ConfigError(one_line(error, VesselConfig, where, "")) from None
 
 
 def load_config(path: Path, kinds: Mapping[str, type[SensorConfig]]) -> VesselConfig:

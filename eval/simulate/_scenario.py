@@ -22,7 +22,8 @@ from graphloc.config import (
     StartConfig,
     VesselConfig,
 )
-from graphloc.eval.simulate._truth import Motion, Waves, make_motion
+from graphloc.eval.simulate._truth import Motion, Waves, Way, make_motion, make_way_motion
+from graphloc.eval.simulate.harbour import Harbour, load_harbour
 from graphloc.eval.simulate.noise import GnssNoise, gnss_error_m
 from graphloc.frames import Array, Datum, Geodetic, heading_deg_from_yaw, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix, PoseMode
@@ -31,6 +32,7 @@ from graphloc.trajectory import Trajectory
 
 START_NS = 1_700_000_000_000_000_000
 DATUM = Geodetic(57.7, 11.7, 36.0)
+_CLEAR_M = 2.5  # from the middle of the vessel to anything solid: its half beam, and a hand
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +54,8 @@ class Scenario:
         compass_until_s: the compass falls silent then. start_heading_error_deg: error of the start
             heading written to the configuration; None writes none.
         wave_roll_deg, wave_pitch_deg, wave_heave_m: RMS of the waves' motion.
+        harbour: name or file of the harbour that the run lies in; empty: open water, `path` alone counts.
+        route: of the harbour. tide_m: water over its mean. lidar_hz: scans a second of each LiDAR in the bag.
     """
 
     path: Literal["entry", "turn", "still", "loops"] = "entry"
@@ -80,6 +84,10 @@ class Scenario:
     wave_roll_deg: float = 1.5
     wave_pitch_deg: float = 1.0
     wave_heave_m: float = 0.1
+    harbour: str = ""
+    route: str = "entry"
+    tide_m: float = 0.0
+    lidar_hz: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,6 +99,8 @@ class SimulatedRun:
     recording: Recording
     truth: Trajectory
     config: VesselConfig
+    motion: Motion
+    harbour: Harbour | None
 
 
 def bl_scenario(case: int, noise: GnssNoise, *, false_fraction: float = 0.4) -> Scenario:
@@ -102,14 +112,28 @@ def bl_scenario(case: int, noise: GnssNoise, *, false_fraction: float = 0.4) -> 
     return base
 
 
+def harbour_scenarios() -> dict[str, Scenario]:
+    """Return the scenarios that lie in a harbour, by name: BL's three cases under each kind of GNSS trouble."""
+    found = {}
+    for case, (harbour, route) in {1: ("marina", "entry"), 2: ("basin", "turn"), 3: ("marina", "still")}.items():
+        for name, noise in (("clean", "clean"), ("drift", "drift"), ("jump", "jump"), ("outage", "drift")):
+            base = bl_scenario(case, noise)  # type: ignore[arg-type]
+            outage = (0.4 * base.duration_s, 0.6 * base.duration_s) if name == "outage" else None
+            found[f"bl{case}-{name}"] = replace(
+                base, harbour=harbour, route=route, lidar_hz=1.0, tide_m=0.2, outage_s=outage
+            )
+    return found
+
+
 def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
     """Run a scenario. Deterministic for a seed."""
     rng = np.random.default_rng([seed, 7])
-    motion = _motion(scenario, rng)
-    datum = Datum(DATUM)
-    config, mounts = _config(scenario, motion, rng)
+    harbour = load_harbour(scenario.harbour) if scenario.harbour else None
+    motion = _motion(scenario, rng) if harbour is None else _harbour_motion(scenario, harbour, rng)
+    datum = Datum(DATUM) if harbour is None else harbour.datum
+    config, mounts = _config(scenario, motion, datum, rng)
     t = _times(scenario.duration_s, scenario.imu_hz)
-    imu = _imu(scenario, motion, t, mounts["imu"], rng)
+    imu = _imu(scenario, motion, datum, t, mounts["imu"], rng)
     drafts: list[Measurement] = []
     drafts += _gnss(scenario, motion, datum, mounts["gnss"][0], rng)
     drafts += _compass(scenario, motion, rng)
@@ -126,7 +150,9 @@ def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
         topics={name: sensor.topic for name, sensor in config.sensors.items()},
         truth=truth,
     )
-    return SimulatedRun(scenario=scenario, seed=seed, recording=recording, truth=truth, config=config)
+    return SimulatedRun(
+        scenario=scenario, seed=seed, recording=recording, truth=truth, config=config, motion=motion, harbour=harbour
+    )
 
 
 def _times(duration_s: float, rate_hz: float) -> Array:
@@ -162,20 +188,46 @@ def _motion(s: Scenario, rng: np.random.Generator) -> Motion:
         slow = Waves.jonswap(rng, 0.08, 60.0)
         speed = lambda t: cruise * (0.75 + 0.25 * np.sin(2.0 * np.pi * t / 90.0))
         rate = lambda t: sign * 0.05 + Waves.at(slow, t)
-    sway = Waves.jonswap(rng, 0.05, 12.0)
-    waves = (
-        Waves.jonswap(rng, np.radians(s.wave_roll_deg), 4.0),
-        Waves.jonswap(rng, np.radians(s.wave_pitch_deg), 4.5),
-        Waves.jonswap(rng, s.wave_heave_m, 5.0),
-    )
+    sway, waves = _waves(s, rng)
     still = s.path == "still"
     return make_motion(
         s.duration_s, speed, rate, rng.uniform(-np.pi, np.pi), sway.at if not still else zero, waves, 0.03
     )
 
 
+def _waves(s: Scenario, rng: np.random.Generator) -> tuple[Waves, tuple[Waves, Waves, Waves]]:
+    """Draw the sway, and the waves' roll, pitch and heave."""
+    sway = Waves.jonswap(rng, 0.05, 12.0)
+    return sway, (
+        Waves.jonswap(rng, np.radians(s.wave_roll_deg), 4.0),
+        Waves.jonswap(rng, np.radians(s.wave_pitch_deg), 4.5),
+        Waves.jonswap(rng, s.wave_heave_m, 5.0),
+    )
+
+
+def _harbour_motion(s: Scenario, harbour: Harbour, rng: np.random.Generator) -> Motion:
+    """Along the route from end to end, slower towards its end; or swaying about its only waypoint.
+
+    Raises:
+        ConfigError: the route runs into something.
+    """
+    points = harbour.waypoints(s.route)
+    sway, waves = _waves(s, rng)
+    if len(points) == 1:
+        harbour.refuse_collision(points, _CLEAR_M, s.route)
+        wobble, yaw0 = Waves.jonswap(rng, 0.02, 25.0), float(rng.uniform(-np.pi, np.pi))
+        start = (float(points[0, 0]), float(points[0, 1]))
+        return make_motion(
+            s.duration_s, wobble.at, lambda t: 0.3 * wobble.at(t), yaw0, np.zeros_like, waves, 0.03, start, s.tide_m
+        )
+    way = Way.through(points)
+    harbour.refuse_collision(way.track_m, _CLEAR_M, s.route)
+    slowing: Callable[[Array], Array] = lambda t: 1.0 - 0.5 * _ramp(t, 0.8 * s.duration_s, 8.0)
+    return make_way_motion(s.duration_s, way, slowing, sway.at, waves, 0.03, s.tide_m)
+
+
 def _config(
-    s: Scenario, motion: Motion, rng: np.random.Generator
+    s: Scenario, motion: Motion, datum: Datum, rng: np.random.Generator
 ) -> tuple[VesselConfig, dict[str, tuple[Array, Array]]]:
     imu_mount = MountConfig(xyz_m=(0.5, -0.2, 1.0), rpy_deg=(2.0, -1.0, 90.0))
     gnss_mount = MountConfig(xyz_m=(-1.5, 0.3, 2.2789))
@@ -193,11 +245,15 @@ def _config(
         "gnss": GnssConfig(topic="/gnss/fix", mount=gnss_mount),
         "compass": CompassConfig(topic="/gnss/heading", sigma_deg=s.compass_sigma_deg),
         "aerial": PoseConfig(topic="/aerial/pose", axes=("x", "y", "yaw")),
-        "height": HeightConfig(height_m=DATUM.height_m),
+        "height": HeightConfig(height_m=datum.origin.height_m),
     }
     config = VesselConfig(
         vessel="simulated Tiara 48",
-        datum=DatumConfig(latitude_deg=DATUM.latitude_deg, longitude_deg=DATUM.longitude_deg, height_m=DATUM.height_m),
+        datum=DatumConfig(
+            latitude_deg=datum.origin.latitude_deg,
+            longitude_deg=datum.origin.longitude_deg,
+            height_m=datum.origin.height_m,
+        ),
         sensors=sensors,
         truth_topic="/truth",
         start=start,
@@ -209,8 +265,10 @@ def _config(
     return config, mounts
 
 
-def _imu(s: Scenario, motion: Motion, t: Array, mount: tuple[Array, Array], rng: np.random.Generator) -> ImuSeries:
-    force, rate = motion.inertial(t, mount[0], Datum(DATUM).gravity_mps2)
+def _imu(
+    s: Scenario, motion: Motion, datum: Datum, t: Array, mount: tuple[Array, Array], rng: np.random.Generator
+) -> ImuSeries:
+    force, rate = motion.inertial(t, mount[0], datum.gravity_mps2)
     defaults = ImuConfig()
     root = np.sqrt(s.imu_hz)
 

@@ -57,6 +57,7 @@ class Motion:
     heave: Waves
     lean_per_mps2: float
     speed: CubicSpline
+    tide_m: float
 
     def attitude(self, t: Array) -> tuple[Array, Array]:
         """Return rpy (N, 3) and their rates (N, 3), rad and rad/s."""
@@ -69,7 +70,7 @@ class Motion:
     def pose(self, t: Array) -> tuple[Array, Array, Array]:
         """Return p (N, 3) m, R (N, 3, 3) and v (N, 3) m/s of body in world."""
         rpy, _ = self.attitude(t)
-        p = np.column_stack([self.position(t), self.heave.at(t)])
+        p = np.column_stack([self.position(t), self.heave.at(t) + self.tide_m])
         v = np.column_stack([self.velocity(t), self.heave.at(t, 1)])
         return p, Rotation.from_euler("xyz", rpy).as_matrix(), v
 
@@ -101,6 +102,8 @@ def make_motion(
     sway_mps: Callable[[Array], Array],
     waves: tuple[Waves, Waves, Waves],
     lean_per_mps2: float,
+    start_m: tuple[float, float] = (0.0, 0.0),
+    tide_m: float = 0.0,
 ) -> Motion:
     """Build the motion from profiles over [0, duration]."""
     t = np.arange(-1.0, duration_s + 1.0 + _STEP_S, _STEP_S)
@@ -113,5 +116,59 @@ def make_motion(
     v = np.column_stack([surge * np.cos(psi) - sway * np.sin(psi), surge * np.sin(psi) + sway * np.cos(psi)])
     velocity = CubicSpline(t, v)
     position = velocity.antiderivative()
-    position.c[-1] -= position(0.0)
-    return Motion(velocity, position, yaw, yaw_rate, waves[0], waves[1], waves[2], lean_per_mps2, CubicSpline(t, surge))
+    position.c[-1] += np.array(start_m) - position(0.0)
+    return Motion(
+        velocity, position, yaw, yaw_rate, waves[0], waves[1], waves[2], lean_per_mps2, CubicSpline(t, surge), tide_m
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Way:
+    """A smooth way through waypoints, by its length (m): place (N, 2), heading (rad) and its change (rad/m)."""
+
+    length_m: float
+    heading: CubicSpline
+    start_m: tuple[float, float]
+    track_m: Array
+
+    @staticmethod
+    def through(waypoints_m: Array) -> Way:
+        """Return the way through two waypoints (N, 2) or more."""
+        chord = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(waypoints_m, axis=0).T))])
+        curve = CubicSpline(chord, waypoints_m, bc_type="natural")
+        along = np.linspace(0.0, chord[-1], max(20, int(chord[-1] / 0.25)))
+        track = curve(along)
+        length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(track, axis=0).T))])
+        tangent = curve(along, 1)
+        heading = CubicSpline(length, np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])))
+        return Way(float(length[-1]), heading, (float(track[0, 0]), float(track[0, 1])), track)
+
+
+def make_way_motion(
+    duration_s: float,
+    way: Way,
+    slowing: Callable[[Array], Array],
+    sway_mps: Callable[[Array], Array],
+    waves: tuple[Waves, Waves, Waves],
+    lean_per_mps2: float,
+    tide_m: float,
+) -> Motion:
+    """Build the motion along a way, from end to end in the given time; `slowing` (N,) is the speed's shape."""
+    t = np.arange(-1.0, duration_s + 1.0 + _STEP_S, _STEP_S)
+    shape = slowing(t)
+    travelled = np.concatenate([[0.0], np.cumsum(0.5 * (shape[1:] + shape[:-1]) * np.diff(t))])
+    scale = way.length_m / travelled[-1]
+    speed, at = CubicSpline(t, scale * shape), CubicSpline(t, scale * travelled)
+    before = float(at(0.0))
+    first = float(way.heading(0.0))
+    return make_motion(
+        duration_s,
+        speed,
+        lambda s: way.heading(at(s), 1) * speed(s),
+        float(way.heading(before)),
+        sway_mps,
+        waves,
+        lean_per_mps2,
+        (way.start_m[0] + before * float(np.cos(first)), way.start_m[1] + before * float(np.sin(first))),
+        tide_m,
+    )

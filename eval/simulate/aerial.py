@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An aerial image of a harbour, as cluttered as a real one, written as GeoTIFF in UTM.
+
+Grid north of UTM differs from true north by the meridian convergence, so what reads the image has to
+handle it. The image is taken on another day than the run: other boats, its own sun; and it is
+misregistered: what it shows lies `shift_m` off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+import shapely
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.database import query_utm_crs_info
+
+from graphloc.errors import OutputError
+from graphloc.eval.simulate.harbour import Boat, Harbour
+from graphloc.frames import Array, Datum
+
+Image = NDArray[np.uint8]
+Canvas = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+_FINE = 2  # drawn this much finer, then averaged: edges of a real image are not steps
+# Red, green, blue and how mottled each is.
+_SURFACES = {
+    "concrete": ((168, 165, 158), 9.0), "asphalt": ((92, 94, 97), 7.0), "wood": ((139, 115, 88), 10.0),
+    "grass": ((96, 116, 70), 14.0), "roof": ((126, 78, 66), 8.0), "stone": ((150, 147, 140), 16.0),
+}  # fmt: skip
+_WATER, _WATER_NOISE = (38, 62, 72), 6.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AerialImage:
+    """An image and where it lies.
+
+    Attributes:
+        pixels: (rows, columns, 3) uint8, red, green, blue. epsg: of its grid.
+        left_m, top_m: grid coordinates of the outer corner of the top-left pixel. pixel_m: size of a pixel.
+        shift_m: (2,) east, north: the image shows things this far from where they are.
+    """
+
+    pixels: Image
+    epsg: int
+    left_m: float
+    top_m: float
+    pixel_m: float
+    shift_m: Array
+
+    def write(self, path: Path) -> None:
+        """Write a GeoTIFF; the shift stays unsaid, as in life.
+
+        Raises:
+            OutputError: the disk refuses.
+        """
+        rows, columns, _ = self.pixels.shape
+        profile = {
+            "driver": "GTiff", "width": columns, "height": rows, "count": 3, "dtype": "uint8", "photometric": "RGB",
+            "crs": rasterio.crs.CRS.from_epsg(self.epsg), "compress": "deflate",
+            "transform": rasterio.Affine(self.pixel_m, 0.0, self.left_m, 0.0, -self.pixel_m, self.top_m),
+        }  # fmt: skip
+        try:
+            with rasterio.open(path, "w", **profile) as target:
+                target.write(np.moveaxis(self.pixels, 2, 0))
+        except (OSError, rasterio.errors.RasterioError) as error:
+            raise OutputError(f"{path}: cannot be written ({error})") from error
+
+
+def utm_epsg(datum: Datum) -> int:
+    """Return the EPSG code of the UTM zone that a datum lies in."""
+    lat, lon, _ = datum.origin
+    (found, *_) = query_utm_crs_info(datum_name="WGS 84", area_of_interest=AreaOfInterest(lon, lat, lon, lat))
+    return int(found.code)
+
+
+def grid_from_enu(datum: Datum, epsg: int, p_m: Array) -> Array:
+    """Return grid coordinates (N, 2) of points (N, 2) on the datum's plane, m."""
+    geodetic = datum.geodetic_from_enu(np.column_stack([p_m, np.zeros(len(p_m))]))
+    to_grid = Transformer.from_crs(CRS.from_epsg(4326), CRS.from_epsg(epsg), always_xy=True)
+    return np.column_stack(to_grid.transform(geodetic[:, 1], geodetic[:, 0]))
+
+
+def render(harbour: Harbour, seed: int, pixel_m: float = 0.16, shift_sigma_m: float = 0.3) -> AerialImage:
+    """Take the image of a harbour: its own day, sun, boats and misregistration, from `seed`."""
+    rng = np.random.default_rng([seed, 11])
+    west, south, east, north = harbour.config.image_m
+    epsg = utm_epsg(harbour.datum)
+    corners = grid_from_enu(harbour.datum, epsg, np.array([(west, south), (west, north), (east, south), (east, north)]))
+    left, top = float(np.floor(corners[:, 0].min())), float(np.ceil(corners[:, 1].max()))
+    columns, rows = (int(np.ceil(v / pixel_m)) for v in (corners[:, 0].max() - left, top - corners[:, 1].min()))
+    shift = rng.normal(0.0, shift_sigma_m, 2)
+    pen = _Pen(rng, harbour.datum, epsg, left, top, pixel_m / _FINE, (rows * _FINE, columns * _FINE), shift)
+    _draw(pen, harbour, rng)
+    fine = pen.canvas.reshape(rows, _FINE, columns, _FINE, 3).mean(axis=(1, 3))
+    soft = cv2.GaussianBlur(fine, (0, 0), rng.uniform(0.5, 0.9))
+    noisy = soft * rng.uniform(0.9, 1.08) + rng.normal(0.0, 3.0, soft.shape)
+    coded = cv2.imencode(".jpg", np.clip(noisy, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 82])[1]
+    pixels = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), dtype=np.uint8)
+    return AerialImage(pixels, epsg, left, top, pixel_m, shift)
+
+
+class _Pen:
+    """Draws world outlines on a canvas (rows, columns, 3) of floats."""
+
+    def __init__(
+        self, rng: np.random.Generator, datum: Datum, epsg: int, left: float, top: float, pixel_m: float,
+        shape: tuple[int, int], shift_m: Array,
+    ) -> None:  # fmt: skip
+        self._rng, self._datum, self._epsg = rng, datum, epsg
+        self._left, self._top, self.pixel_m, self._shift = left, top, pixel_m, shift_m
+        self.canvas: Canvas = np.empty((*shape, 3), dtype=np.float32)
+        self.canvas[:] = _WATER
+        self.mottle(self.canvas, np.ones(shape, dtype=bool), _WATER_NOISE, (0.4, 2.0, 9.0))
+
+    def pixels(self, p_m: Array) -> NDArray[np.int32]:
+        """Return canvas pixels (N, 2) of points (N, 2) in world."""
+        grid = grid_from_enu(self._datum, self._epsg, np.asarray(p_m, dtype=float) + self._shift)
+        return np.rint(np.column_stack([grid[:, 0] - self._left, self._top - grid[:, 1]]) / self.pixel_m - 0.5).astype(
+            np.int32
+        )
+
+    def window(self, outlines_m: Array) -> tuple[Canvas, Mask]:
+        """Return the part of the canvas around outlines (K, N, 2), a view, and which of its pixels lie inside one."""
+        corners = [self.pixels(outline) for outline in outlines_m]
+        low = np.clip(np.min([c.min(axis=0) for c in corners], axis=0) - 1, 0, None)
+        high = np.max([c.max(axis=0) for c in corners], axis=0) + 2
+        part = self.canvas[low[1] : max(high[1], 0), low[0] : max(high[0], 0)]
+        filled = np.zeros(part.shape[:2], dtype=np.uint8)
+        for corner in corners if filled.size else []:
+            cv2.fillPoly(filled, [corner - low.astype(np.int32)], 1)
+        return part, np.asarray(filled, dtype=np.bool_)
+
+    def fill(self, outline_m: Array, colour: tuple[float, float, float], noise: float) -> tuple[Canvas, Mask]:
+        """Paint an outline; return its part of the canvas and which pixels of it were painted."""
+        part, inside = self.window(np.asarray(outline_m)[None])
+        part[inside] = np.array(colour) + self._rng.normal(0.0, 4.0)
+        self.mottle(part, inside, noise, (0.3, 1.5, 6.0))
+        return part, inside
+
+    def line(self, a: Array, b: Array, colour: tuple[float, float, float], width_m: float) -> None:
+        """Paint a line."""
+        p, q = self.pixels(np.array([a, b]))
+        cv2.line(self.canvas, p.tolist(), q.tolist(), colour, max(1, round(width_m / self.pixel_m)), cv2.LINE_AA)
+
+    def disc(self, at: Array, radius_m: float, colour: tuple[float, float, float]) -> None:
+        """Paint a disc."""
+        (p,) = self.pixels(np.array([at]))
+        cv2.circle(self.canvas, p.tolist(), max(1, round(radius_m / self.pixel_m)), colour, -1, cv2.LINE_AA)
+
+    def shade(self, outline_m: Array, by: Array, depth: float) -> None:
+        """Darken what lies in the shadow of an outline whose top is moved by `by` (2,) m."""
+        part, dark = self.window(np.asarray(outline_m) + np.linspace(0.0, 1.0, 12)[:, None, None] * by)
+        part[dark] *= depth
+
+    def mottle(self, part: Canvas, inside: Mask, noise: float, sizes_m: tuple[float, ...]) -> None:
+        """Lay grain of several sizes over some pixels of a part of the canvas, in place."""
+        rows, columns = part.shape[:2]
+        for size in sizes_m if inside.any() else ():
+            step = max(1, round(size / self.pixel_m / 2))
+            coarse = self._rng.normal(0.0, noise, (rows // step + 2, columns // step + 2)).astype(np.float32)
+            grain = cv2.resize(coarse, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
+            part[inside] += grain[inside, None] / len(sizes_m)
+
+
+def _draw(pen: _Pen, harbour: Harbour, rng: np.random.Generator) -> None:
+    azimuth, slant = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.5, 1.4)
+    sun = slant * np.array([np.cos(azimuth), np.sin(azimuth)])  # a shadow's tip, per metre of height
+    depth = float(rng.uniform(0.45, 0.65))
+    ground = [*harbour.quays, *harbour.pontoons]
+    for polygon, solid in ground:
+        pen.shade(np.array(polygon.exterior.coords), sun * solid.top_m, depth)
+    for polygon, solid in ground:
+        outline = np.array(polygon.exterior.coords)
+        part, inside = pen.fill(outline, *_SURFACES[solid.surface])
+        around = part[~inside].copy()
+        _joints_and_cars(pen, polygon, solid.surface, rng)
+        part[~inside] = around  # they end where it does
+        for a, b in pairwise(outline):
+            pen.line(a, b, (196, 193, 184), 0.35)  # its kerb
+    for boat in harbour.boats(rng):
+        _boat(pen, boat, sun, depth, rng)
+    for polygon, solid in harbour.buildings:
+        outline = np.array(polygon.exterior.coords)
+        pen.shade(outline, sun * solid.top_m * 0.6, depth)
+        pen.fill(outline, *_SURFACES[solid.surface])
+        middle = outline[:-1].mean(axis=0)
+        pen.line(0.5 * (outline[0] + outline[1]), middle, (90, 60, 52), 0.3)  # the ridge
+        pen.line(middle, 0.5 * (outline[2] + outline[3]), (90, 60, 52), 0.3)
+    for at, pole in harbour.poles:
+        pen.line(at, at + sun * pole.top_m * 0.6, (60, 66, 70), 2.0 * pole.radius_m)
+        pen.disc(at, max(pole.radius_m, 0.2), (190, 185, 170))
+
+
+def _joints_and_cars(pen: _Pen, polygon: shapely.Polygon, surface: str, rng: np.random.Generator) -> None:
+    """Joints of slabs, planks, cars: the clutter that an edge detector meets."""
+    low, high = np.array(polygon.bounds[:2]), np.array(polygon.bounds[2:])
+    size, inner = high - low, polygon.buffer(-2.6)
+    if surface == "wood":
+        along = int(np.argmax(size))
+        for s in np.arange(low[along], high[along], 0.6):
+            a, b = low.copy(), high.copy()
+            a[along] = b[along] = s
+            pen.line(a, b, (112, 92, 70), 0.08)
+    elif surface != "grass":
+        for s in np.arange(low[0] + 4.0, high[0] - 1.0, rng.uniform(5.0, 8.0)):
+            pen.line(np.array([s, low[1]]), np.array([s, high[1]]), (138, 136, 130), 0.1)
+        for _ in range(int(size.prod() / 260.0)):  # cars and crates
+            at, turned = low + rng.uniform(size=2) * size, rng.choice([0.0, np.pi / 2.0]) + rng.normal(0.0, 0.05)
+            if not inner.contains(shapely.Point(at)):
+                continue
+            c, s = np.cos(turned), np.sin(turned)
+            car = np.array([(-2.2, -0.9), (2.2, -0.9), (2.2, 0.9), (-2.2, 0.9)]) @ np.array([[c, s], [-s, c]]) + at
+            grey = float(rng.uniform(30.0, 235.0))
+            pen.fill(car, (grey, grey * rng.uniform(0.85, 1.0), grey * rng.uniform(0.8, 1.0)), 3.0)
+
+
+def _boat(pen: _Pen, boat: Boat, sun: Array, depth: float, rng: np.random.Generator) -> None:
+    outline = boat.outline
+    pen.shade(outline, sun * 1.0, depth)
+    white = float(rng.uniform(200.0, 242.0))
+    pen.fill(outline, (white, white, white * 0.97), 3.0)
+    inner = boat.at + 0.55 * (outline - boat.at)
+    pen.fill(inner, tuple(rng.uniform(60.0, 190.0, 3)), 4.0)
+    for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        pen.line(a, b, (110, 110, 112), 0.1)

@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated harbour: its file, its image, its LiDARs, and the recording that comes of them."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from numpy.typing import NDArray
+from pyproj import Transformer
+from rosbags.highlevel import AnyReader
+from scipy.spatial import cKDTree
+
+from graphloc import app, cli
+from graphloc.errors import ConfigError
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import SimulatedRun, harbour_scenarios, simulate
+from graphloc.eval.simulate.aerial import grid_from_enu, render, utm_epsg
+from graphloc.eval.simulate.bag import write_bag
+from graphloc.eval.simulate.harbour import Harbour, load_harbour, make_harbour, shipped
+from graphloc.eval.simulate.lidar import BPEARL, Lidar, Scene, bl_lidars, extrude, orthonormal, scan, world_points
+from graphloc.frames import Array, Datum, Geodetic
+
+SHORT = replace(harbour_scenarios()["bl1-drift"], duration_s=60.0)
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    return simulate(SHORT, 4)
+
+
+def block(**changes: Any) -> dict[str, Any]:
+    square = [[0, 0], [20, 0], [20, 10], [0, 10]]
+    base = {
+        "name": "small", "datum": {"latitude_deg": 57.7, "longitude_deg": 11.7}, "image_m": [-30, -30, 50, 40],
+        "quays": [{"outline": square, "top_m": 2.0}], "routes": {"by": [[-20, -10], [30, -10]]},
+    }  # fmt: skip
+    return {**base, **changes}
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_shipped_harbours_and_their_routes_are_sound(name: str) -> None:
+    harbour = load_harbour(name)
+    for route in harbour.config.routes:
+        chosen = replace(SHORT, harbour=name, route=route, duration_s=120.0)
+        truth = simulate(chosen, 1).truth
+        points = harbour.waypoints(route)
+        assert np.hypot(*(truth.p_world_m[0, :2] - points[0])) < 5.0
+        assert np.hypot(*(truth.p_world_m[-1, :2] - points[-1])) < 15.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"quays": [{"outline": [[0, 0], [10, 10], [10, 0], [0, 10]], "top_m": 2.0}]}, r"quays\.0\.outline.*Self-intersection"),
+        ({"quays": [{"outline": [[0, 0], [10, 10]], "top_m": 2.0}]}, r"quays\.0\.outline"),
+        ({"quay": []}, "did you mean 'quays'"),
+        ({"image_m": [50, 0, -50, 10]}, "the image has no area"),
+    ],
+)  # fmt: skip
+def test_a_bad_harbour_is_one_line(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as caught:
+        make_harbour(block(**changes), "my.yaml")
+    assert str(caught.value).startswith("my.yaml: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["bl9-drift"], "bl1-clean, bl1-drift"),
+        (["bl1-drift", "--harbour", "nowhere"], "none of the shipped ones: basin, marina"),
+        (["bl1-drift", "--harbour", "crash.yaml"], "route 'entry' comes within 0.0 m of a quay, near (0.0, 5.0)"),
+        (["bl2-drift", "--harbour", "crash.yaml"], "no route 'turn'; it has: entry"),
+    ],
+)
+def test_bad_scenarios_are_one_line(
+    arguments: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("crash.yaml").write_text(json.dumps(block(routes={"entry": [[-20, 5], [40, 5]]})))
+    monkeypatch.setattr(sys, "argv", ["graphloc", "simulate", *arguments, "-o", "out"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1
+    assert not Path("out").exists()
+
+
+def test_the_vessel_rides_its_route_on_the_tide(run: SimulatedRun) -> None:
+    """From one end to the other, bow along the way, at the tide's height."""
+    assert run.truth.v_world_mps is not None
+    middle = slice(200, -200)
+    course = np.arctan2(run.truth.v_world_mps[middle, 1], run.truth.v_world_mps[middle, 0])
+    assert np.degrees(np.abs(np.angle(np.exp(1j * (course - run.truth.yaw_rad[middle]))))).max() < 6.0
+    assert run.truth.p_world_m[:, 2].mean() == pytest.approx(SHORT.tide_m, abs=0.05)
+
+
+def test_the_image_lies_where_its_georeference_says(tmp_path: Path) -> None:
+    """A white square of 10 m, found by its centre; the grid's north is not true north."""
+    raw = block(
+        datum={"latitude_deg": 57.7, "longitude_deg": 14.5}, buildings=[], quays=[
+            {"outline": [[95, 55], [105, 55], [105, 65], [95, 65]], "top_m": 0.1, "surface": "concrete"}
+        ], image_m=[-20, -20, 140, 90],
+    )  # fmt: skip
+    harbour = make_harbour(raw, "square")
+    image = render(harbour, 3)
+    image.write(tmp_path / "a.tif")
+    with rasterio.open(tmp_path / "a.tif") as source:
+        bright = source.read().mean(axis=0) > 120.0
+        rows, columns = np.nonzero(bright)
+        a, _, left, _, e, top = source.transform[:6]
+        easting, northing = left + a * (columns.mean() + 0.5), top + e * (rows.mean() + 0.5)
+        lon, lat = Transformer.from_crs(source.crs, 4326, always_xy=True).transform(easting, northing)
+        assert source.res == (0.16, 0.16)
+        assert source.crs.to_epsg() == 32633  # 14.5 deg east is in zone 33
+    found = harbour.datum.enu_from_geodetic(np.array([lat]), np.array([lon]), np.zeros(1))[0, :2]
+    np.testing.assert_allclose(found, np.array([100.0, 60.0]) + image.shift_m, atol=0.15)
+    north = np.diff(grid_from_enu(harbour.datum, image.epsg, np.array([[0.0, 0.0], [0.0, 100.0]])), axis=0)[0]
+    # Meridian convergence: (lon - 15 deg) sin(lat) = -0.42 deg.
+    assert np.degrees(np.arctan2(north[0], north[1])) == pytest.approx(0.5 * np.sin(np.radians(57.7)), abs=0.01)
+
+
+def test_southern_grids() -> None:
+    assert utm_epsg(Datum(Geodetic(-33.855, 151.21, 0.0))) == 32756
+
+
+def test_boats_of_the_image_are_not_those_of_the_run() -> None:
+    harbour = load_harbour("marina")
+    days = [harbour.boats(np.random.default_rng(seed)) for seed in (1, 2, 1)]
+    assert len(days[0]) > 10
+    assert [b.length_m for b in days[0]] == [b.length_m for b in days[2]]
+    assert {round(b.length_m, 6) for b in days[0]}.isdisjoint(round(b.length_m, 6) for b in days[1])
+
+
+def test_a_prism_has_its_walls_and_top() -> None:
+    vertices, triangles = extrude(load_harbour("marina").quays[0][0], -1.0, 2.0)
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    normal = 0.5 * np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1)
+    flat = np.abs(normal[:, 2]) > 0.5 * area
+    polygon = load_harbour("marina").quays[0][0]
+    assert area[flat].sum() == pytest.approx(polygon.area)
+    assert area[~flat].sum() == pytest.approx(polygon.length * 3.0)
+
+
+def test_mounts_of_the_thesis_are_rotations() -> None:
+    for lidar in bl_lidars():
+        R = lidar.T_body_lidar[:3, :3]
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1.0)
+    rounded = np.array([[0.2202, -0.9699, 0.1039], [-0.8345, -0.2425, -0.4948], [0.5051, 0.0222, -0.8628]])
+    np.testing.assert_allclose(orthonormal(rounded), rounded, atol=2e-4)
+    assert bl_lidars()[3].T_body_lidar[2, 3] == pytest.approx(2.391)  # on the roof
+
+
+def scans(run: SimulatedRun, at_s: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (N, 3) in world of all LiDARs, and which of them hit the own hull."""
+    assert run.harbour is not None
+    rng = np.random.default_rng(5)
+    scene = Scene(run.harbour, run.harbour.boats(rng), run.scenario.tide_m)
+    points = []
+    for lidar in bl_lidars():
+        found = scan(lidar, scene, run.motion, at_s, rng)
+        points.append(world_points(found, lidar, run.motion))
+    p, _, _ = run.motion.pose(np.array([at_s]))
+    together = np.vstack(points)
+    return together, np.asarray(np.hypot(*(together[:, :2] - p[0, :2]).T) < 8.0)
+
+
+def edges_m(harbour: Harbour) -> Array:
+    """Points (M, 2) every 5 cm along quays and pontoons."""
+    solids = [polygon for group in (harbour.quays, harbour.pontoons) for polygon, _ in group]
+    rings = [
+        np.array([solid.exterior.interpolate(s).coords[0] for s in np.arange(0, solid.length, 0.05)])
+        for solid in solids
+    ]
+    return np.vstack(rings)
+
+
+def test_walls_are_hit_where_they_stand(run: SimulatedRun) -> None:
+    """Points below the kerb of the south quay lie on its wall to the range noise, in a rocking vessel."""
+    assert run.harbour is not None
+    points, own = scans(run, 27.0)
+    kerb = (
+        (points[:, 2] > 0.5) & (points[:, 2] < 1.8) & ~own & (np.abs(points[:, 1] + 20.0) < 3.0) & (points[:, 0] < 60.0)
+    )
+    assert kerb.sum() > 200
+    assert np.abs(points[kerb, 1] + 20.0).mean() < 0.02
+    water = points[(points[:, 2] < 0.3) & ~own]
+    assert np.abs(water[:, 2] - run.scenario.tide_m).mean() < 0.03
+
+
+def test_clouds_lie_on_the_edges_of_the_image(run: SimulatedRun) -> None:
+    """B.2: mean distance from wall points to the nearest Canny edge (a kerb has two, 0.35 m apart), and 3 m off."""
+    assert run.harbour is not None
+    points, own = scans(run, 27.0)
+    near_edge, _ = cKDTree(edges_m(run.harbour)).query(points[:, :2])
+    walls = points[(points[:, 2] > 0.4) & ~own & (near_edge < 0.05)][:, :2]
+    image = render(run.harbour, run.seed)
+    edges = cv2.Canny(cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY), 60, 160)
+    away = cv2.distanceTransform(255 - edges, cv2.DIST_L2, 5) * image.pixel_m
+
+    def mean_m(p: Array) -> float:
+        grid = grid_from_enu(run.harbour.datum, image.epsg, p) if run.harbour else p
+        column = np.rint((grid[:, 0] - image.left_m) / image.pixel_m - 0.5).astype(int)
+        row = np.rint((image.top_m - grid[:, 1]) / image.pixel_m - 0.5).astype(int)
+        inside = (row >= 0) & (row < away.shape[0]) & (column >= 0) & (column < away.shape[1])
+        return float(away[row[inside], column[inside]].mean())
+
+    assert len(walls) > 500
+    assert mean_m(walls + image.shift_m) < 0.25
+    assert mean_m(walls + image.shift_m + np.array([0.0, 3.0])) > 1.0
+
+
+def test_motion_within_a_scan_is_in_it(run: SimulatedRun) -> None:
+    """Taken as of one moment, the points of a turn are smeared by what the vessel moved: 0.1 s at 10 m/s or so."""
+    assert run.harbour is not None
+    lidar = Lidar("one", BPEARL, bl_lidars()[1].T_body_lidar)
+    scene = Scene(run.harbour, (), 0.0)
+    found = scan(lidar, scene, run.motion, 27.0, np.random.default_rng(0))
+    assert 0.09 < found.dt_s.max() < 0.1
+    right = world_points(found, lidar, run.motion)
+    frozen = world_points(replace(found, dt_s=np.zeros_like(found.dt_s)), lidar, run.motion)
+    late = found.dt_s > 0.09
+    assert run.truth.v_world_mps is not None
+    speed = float(np.linalg.norm(run.truth.v_world_mps[2700]))
+    assert np.linalg.norm((right - frozen)[late], axis=1).mean() > 0.5 * 0.09 * speed
+
+
+def test_the_recording_is_whole_and_smooths(run: SimulatedRun, tmp_path: Path) -> None:
+    bag, config = write_bag(run, tmp_path / "sim", ros=2)
+    assert {p.name for p in (tmp_path / "sim").iterdir()} == {"run", "vessel.yaml", "aerial.tif", "truth.json"}
+    with AnyReader([bag]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+        connection = next(c for c in reader.connections if c.topic == "/lidar_4/points")
+        _, log_ns, raw = next(iter(reader.messages([connection])))
+        cloud: Any = reader.deserialize(raw, connection.msgtype)
+    assert counts["/lidar_1/points"] == counts["/lidar_5/points"] == 59
+    assert cloud.header.frame_id == "lidar_4"
+    assert len(cloud.data) == cloud.width * cloud.point_step
+    names = [f.name for f in cloud.fields]
+    layout = np.dtype({
+        "names": names, "offsets": [f.offset for f in cloud.fields],
+        "formats": [{7: "<f4", 4: "<u2"}[f.datatype] for f in cloud.fields], "itemsize": cloud.point_step,
+    })  # fmt: skip
+    points = np.frombuffer(cloud.data.tobytes(), layout)
+    assert names[:3] == ["x", "y", "z"]
+    distance = np.sqrt(points["x"] ** 2 + points["y"] ** 2 + points["z"] ** 2)
+    assert 0.2 < distance.min()
+    assert distance.max() < 151.0
+    assert points["time"].max() < 0.1
+    assert log_ns > cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec
+    recording, vessel = app.load([bag], config)
+    solved = app.smooth_recording(recording, vessel)
+    assert recording.truth is not None
+    assert compare_to_truth(solved.solution.trajectory, recording.truth).position_rmse_m < 0.4
+    assert len(solved.solution.ledger) == recording.message_count
+    assert solved.solution.ledger.counts()["/lidar_1/points"] == {"ignored": 59}
