@@ -14,7 +14,7 @@ from graphloc.eval import ekf
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, bl_scenario, simulate
 
-CHOICES = list(product((0.05, 0.1, 0.2, 0.3), (0.95, 0.99, 0.999), (5.0, 10.0, 1e9)))
+CHOICES = list(product((0.1, 0.2, 0.3, 0.5), (0.9, 0.95, 0.99), (5.0, 10.0, 1e9)))
 SEEDS = range(100, 105)
 
 

@@ -65,7 +65,7 @@ class TruthMetrics:
     position_p50_m: float
     position_p95_m: float
     position_max_m: float
-    error_3d_rmse_m: float
+    error_3d_rmse_m: float | None
     heading_rmse_deg: float
     heading_max_deg: float
     nees: float | None
@@ -104,7 +104,7 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
         position_p50_m=float(np.percentile(horizontal, 50)),
         position_p95_m=float(np.percentile(horizontal, 95)),
         position_max_m=float(horizontal.max()),
-        error_3d_rmse_m=_rms(np.linalg.norm(error, axis=1)),
+        error_3d_rmse_m=None if estimate.planar else _rms(np.linalg.norm(error, axis=1)),
         heading_rmse_deg=float(np.degrees(_rms(heading))),
         heading_max_deg=float(np.degrees(np.abs(heading).max())),
         nees=nees,
@@ -124,7 +124,7 @@ class HeldOutMetrics:
     horizontal_rmse_m: float
     horizontal_p95_m: float
     horizontal_max_m: float
-    error_3d_rmse_m: float
+    error_3d_rmse_m: float | None
     outage_drift_m: float | None
     fixes: int
     matched: float
@@ -168,7 +168,7 @@ def compare_to_held_out(
         horizontal_rmse_m=_rms(horizontal),
         horizontal_p95_m=float(np.percentile(horizontal, 95)),
         horizontal_max_m=float(horizontal.max()),
-        error_3d_rmse_m=_rms(np.linalg.norm(error, axis=1)),
+        error_3d_rmse_m=None if estimate.planar else _rms(np.linalg.norm(error, axis=1)),
         outage_drift_m=_rms(largest) if len(largest) > 1 else None,
         fixes=len(stamps),
         matched=matched,

@@ -25,8 +25,8 @@ from graphloc.outputs import bounds_95
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 
-# Shares of the run: called good, and covered by the 95 % bounds, below which a reader has to look closer.
-_MOSTLY, _COVERED, _NOT_COVERED = 0.5, 0.85, 0.5
+# Shares of the run: called good, covered by the 95 % bounds, compared at all; below, a reader has to look closer.
+_MOSTLY, _COVERED, _NOT_COVERED, _MATCHED = 0.5, 0.85, 0.5, 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -138,6 +138,14 @@ def verdict(data: ReportData) -> tuple[Trust, str]:
     trust = Trust.YES
     if covered is not None:
         said.append(f"Its 95 % bounds held the truth for {covered:.0%} of the time.")
+    matched = next((t.as_dict()["graphloc"]["matched"] for t in data.tables if "matched" in t.columns), None)
+    if matched is not None and matched < _MATCHED:
+        trust = Trust.WITH_CARE
+        said.append(f"IT COVERS ONLY {matched:.0%} of what it is compared with; the filters may cover more.")
+    headed = next((t.as_dict()["graphloc"].get("heading_coverage_95") for t in data.tables), None)
+    if headed is not None and headed < _COVERED:
+        trust = Trust.WITH_CARE
+        said.append(f"Its heading bounds held the truth for {headed:.0%} of the time.")
     warnings = len(data.recording.warnings) + len(solution.stats.warnings)
     if warnings:
         said.append(f"Read the {warnings} warning{'s' if warnings > 1 else ''} below.")

@@ -174,7 +174,33 @@ def motion_of(odometry: list[Stream], twists: list[Stream], fixes: list[Stream])
     return None
 
 
-def compass_report(stream: Stream, courses: Courses | None) -> CompassReport | None:
+@dataclass(frozen=True, slots=True, eq=False)
+class Turning:
+    """How the craft turned: times (N,) s since `origin_ns`, and the integral (N,) of its rate about up, rad."""
+
+    origin_ns: int
+    t_s: Array
+    turned_rad: Array
+
+
+def _against_turning(turning: Turning | None, at_ns: NDArray[np.int64], angle: Array) -> int:
+    """Return +1 where an angle grows as the craft turns to port, -1 where it falls, 0 where nothing tells."""
+    if turning is None:
+        return 0
+    at = (at_ns - turning.origin_ns) / NS_PER_S
+    inside = (at > turning.t_s[0]) & (at < turning.t_s[-1])
+    if inside.sum() < 20:
+        return 0
+    # Changes over 2 s: a gyro's bias is small beside them, a compass's noise averages out.
+    step = max(1, round(2.0 / max(float(np.median(np.diff(at[inside]))), 1e-3)))
+    turned = np.interp(at[inside], turning.t_s, turning.turned_rad)
+    a, b = (v[step:] - v[:-step] for v in (angle[inside], turned))
+    power = float(np.sqrt((a**2).sum() * (b**2).sum()))
+    together = float((a * b).sum()) / power if power > 0.0 else 0.0
+    return int(np.sign(together)) if abs(together) > 0.5 else 0
+
+
+def compass_report(stream: Stream, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
     """Return whether an orientation is a heading, and in which convention; None where there is none."""
     keep = sane(stream)
     if len(keep) < 10:
@@ -193,10 +219,12 @@ def compass_report(stream: Stream, courses: Courses | None) -> CompassReport | N
         )
     angle = np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
     named = stream.msgtype != IMU  # a topic of bare headings is meant as a compass
+    sense = _against_turning(turning, stream.stamps_ns[keep][good], angle)
+    by_gyro = {1: "enu", -1: "ned"}.get(sense)
     if courses is None or len(courses.stamps_ns) < 20:
-        why = "no GNSS course in motion to check it by"
+        why = "no GNSS course in motion to check it by" + (", the convention by the gyro" if by_gyro else "")
         return CompassReport(
-            **plain, usable=named, convention="enu", offset_deg=None, scatter_deg=None, samples=0, why=why
+            **plain, usable=named, convention=by_gyro or "enu", offset_deg=None, scatter_deg=None, samples=0, why=why
         )
     origin = int(stream.stamps_ns[keep[0]])
     measured = np.interp(
@@ -208,7 +236,9 @@ def compass_report(stream: Stream, courses: Courses | None) -> CompassReport | N
         scatter = float(np.degrees(np.sqrt(-2.0 * np.log(max(abs(mean), 1e-9)))))
         fits[convention] = (float(np.degrees(np.angle(mean))), scatter)
     turned = float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(max(abs(np.exp(1j * courses.course_rad).mean()), 1e-9))))))
-    if turned < 20.0:  # on a straight both conventions fit with some offset: the smaller offset is likelier
+    if by_gyro:
+        convention = by_gyro
+    elif turned < 20.0:  # on a straight both conventions fit with some offset: the smaller offset is likelier
         convention = min(fits, key=lambda c: abs(fits[c][0]))
     else:
         convention = min(fits, key=lambda c: fits[c][1])
@@ -217,6 +247,8 @@ def compass_report(stream: Stream, courses: Courses | None) -> CompassReport | N
     why = f"yaw minus GNSS course: {offset:+.0f} deg, scatter {scatter:.0f} deg over {len(measured)} courses"
     if not usable:
         why += ": only relative, or disturbed"
+    elif by_gyro:
+        why += "; the convention by the gyro"
     elif turned < 20.0:
         why += ", on a nearly straight track: the convention is not certain"
     return CompassReport(

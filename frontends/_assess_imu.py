@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
-from graphloc.frontends._assess import Motion, sane, vec
+from graphloc.frontends._assess import Motion, Turning, sane, vec
 from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import NEVER_STILL_RADPS
 from graphloc.frontends._streams import Stream
@@ -97,6 +97,22 @@ def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motion: Motion | None) ->
     return float(
         np.degrees(quarter)
     ), f"yaw by the motion of {motion.source}: {psi:.0f} deg (coherence {coherence:.2f})"
+
+
+def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Turning | None:
+    """Return how the craft turned, by an IMU whose mount is known or guessed; its gyro bias taken off where found."""
+    keep = sane(imu)
+    keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)] if len(keep) else keep
+    if len(keep) < 20:
+        return None
+    known = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
+    R = known[1] if known else Rotation.from_euler("xyz", report.mount.rpy_deg, degrees=True).as_matrix()
+    gyro = imu.rows[keep, 3:6] * (np.pi / 180.0 if report.gyro_unit == "deg/s" else 1.0)
+    rate = ((gyro - (report.gyro_bias_radps or (0.0, 0.0, 0.0))) @ R.T)[:, 2]
+    origin = int(imu.stamps_ns[keep[0]])
+    t = (imu.stamps_ns[keep] - origin) / NS_PER_S
+    turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
+    return Turning(origin, t, turned)
 
 
 def imu_report(imu: Stream, motion: Motion | None, tree: StaticTree, body: str) -> ImuReport | None:

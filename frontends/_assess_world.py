@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._assess import sane, vec
@@ -13,23 +14,29 @@ from graphloc.frontends._streams import Stream
 from graphloc.time import NS_PER_S
 
 _EXTENT_M = 20.0  # a shorter way does not tell directions
-_TURNED_DEG = 3.0
+_SLACK_M = 3.0  # sideways, of an antenna that may be anywhere on the craft
+_FAR_M = 50e3
 _APART_M, _APART = 5.0, 0.02  # largest distance that still fits: metres, share of the extent
 
 
-def origin_of(poses: Stream, stamps_ns: NDArray[np.int64], p_m: Array, first_fix: Vec | None) -> tuple[Vec | None, str]:
+def origin_of(
+    poses: Stream, stamps_ns: NDArray[np.int64], p_m: Array, first_fix: Vec | None, antenna_m: Array | None
+) -> tuple[Vec | None, str]:
     """Return latitude, longitude, height of the origin of the poses' frame, and the evidence in words.
 
     None where the frame is not east-north-up, or nothing tells.
 
     Args:
         poses: odometry or poses. stamps_ns: (N,) of the fixes. p_m: (N, 3) m about `first_fix`, ENU.
+        antenna_m: (3,) in body, where /tf_static knows it.
     """
     keep = sane(poses)
     keep = keep[np.isfinite(poses.rows[keep, :3]).all(axis=1)] if len(keep) else keep
     if first_fix is None or len(keep) < 10 or len(stamps_ns) < 10:
         return None, "no GNSS track to place its frame by"
     at, q = poses.stamps_ns[keep], poses.rows[keep, :3]
+    if antenna_m is not None:  # the antenna by the poses' own attitude
+        q = q + Rotation.from_quat(_quaternions(poses.rows[keep, 3:7])).apply(antenna_m)
     inside = (stamps_ns >= at[0]) & (stamps_ns <= at[-1])
     t, there = (at - at[0]) / NS_PER_S, (stamps_ns[inside] - at[0]) / NS_PER_S
     p, q = p_m[inside], np.column_stack([np.interp(there, t, q[:, k]) for k in range(3)])
@@ -41,7 +48,23 @@ def origin_of(poses: Stream, stamps_ns: NDArray[np.int64], p_m: Array, first_fix
     turned = float(np.degrees(np.angle(np.vdot(a, b))))
     offset = np.median(p - q, axis=0)
     apart = float(np.median(np.hypot(*(p - q - offset)[:, :2].T)))
-    if abs(turned) > _TURNED_DEG or apart > max(_APART_M, _APART * extent):
-        return None, f"its frame is not east-north-up: turned by {turned:+.0f} deg, {apart:.1f} m apart from the fixes"
+    away = float(np.linalg.norm(offset))
+    if away > _FAR_M:
+        return (
+            None,
+            f"its origin is {away / 1e3:.0f} km from the fixes: looks like a map grid (UTM), which is not east-north-up",
+        )
+    # What the fixes' scatter, and an antenna whose place is not known, can turn a track of this extent by.
+    tolerance = np.degrees((_SLACK_M if antenna_m is None else 1.0) / extent) + 0.2
+    if abs(turned) > tolerance or apart > max(_APART_M, _APART * extent):
+        return None, f"its frame is not east-north-up: turned by {turned:+.1f} deg, {apart:.1f} m apart from the fixes"
     place = Datum(Geodetic(*first_fix)).geodetic_from_enu(offset[None, :])[0]
-    return vec(place), f"fits the fixes to {apart:.1f} m; the antenna's place on the craft is still in it"
+    still = "" if antenna_m is not None else "the antenna's place on the craft, and "
+    return vec(place), f"fits the fixes to {apart:.1f} m; {still}their slow error is in it, and so in every latitude"
+
+
+def _quaternions(rows: Array) -> Array:
+    """Quaternions (N, 4) that rotate; those that cannot are taken level."""
+    size = np.linalg.norm(rows, axis=1)
+    good = np.isfinite(size) & (np.abs(size - 1.0) < 0.1)
+    return np.where(good[:, None], rows, [0.0, 0.0, 0.0, 1.0])

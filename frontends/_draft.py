@@ -80,7 +80,7 @@ def _numbered(name: str, k: int) -> str:
 def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
     lines = [f"{name}:", "  kind: imu", f"  topic: {imu.topic}"]
     if not enabled:
-        lines.append("  enabled: false  # guess: one IMU is used, the one with most samples")
+        lines.append("  enabled: false  # guess: one IMU is used, the one with least gyro noise")
     reason = "; ".join(imu.why)
     if imu.accel_unit != "m/s^2":
         lines.append(f"  accel_unit: {imu.accel_unit}  # guess: {reason}")
@@ -157,6 +157,10 @@ def _compass_block(name: str, compass: CompassReport) -> list[str]:
         quarter = 90.0 * round(compass.offset_deg / 90.0)
         yaw = quarter if abs(compass.offset_deg - quarter) < 15.0 else round(compass.offset_deg)
         lines.append(f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course")
+    elif compass.offset_deg is not None and abs(compass.offset_deg) > 2.0:
+        lines.append(
+            f"  mount_offset_sigma_deg: {abs(compass.offset_deg):.1f}  # guess: as far as it is off the GNSS course"
+        )
     if compass.msgtype == IMU:
         lines.append("  use_reported_sigma: false  # guess: drivers' orientation covariances are seldom measured")
     return lines

@@ -19,7 +19,7 @@ from graphloc.frontends._assess import (
     topic_report,
     track,
 )
-from graphloc.frontends._assess_imu import imu_report
+from graphloc.frontends._assess_imu import imu_report, turning_of
 from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._assess_world import origin_of
 from graphloc.frontends._draft import draft_config
@@ -79,7 +79,12 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     found_gnss = [g for s in fixes if (g := gnss_report(s, _known(s, tree, body)))]
     found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, tree, body))]
     stamps, p_m, scatter_m, first = _best_track(by_topic, found_gnss)
+    best = max(found_gnss, key=lambda g: g.fixes, default=None)
+    mount = tree.resolve(body, best.tf_frame) if best is not None and best.tf_frame else None
+    antenna = None if mount is None else mount[0]
     courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
+    by_imu = next(iter(sorted(found_imus, key=lambda i: i.gyro_noise_mdps)), None)
+    turning = turning_of(by_topic[by_imu.topic], by_imu, tree, body) if by_imu else None
     candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU)]
     return Inspection(
         source=source,
@@ -89,10 +94,10 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             else TopicReport(topic=t.topic, msgtype=" or ".join(t.msgtypes), count=t.messages)
             for t in topics.values()
         ),
-        imus=tuple(sorted(found_imus, key=lambda i: -len(by_topic[i.topic]))),
+        imus=tuple(sorted(found_imus, key=lambda i: i.gyro_noise_mdps)),
         gnss=tuple(sorted(found_gnss, key=lambda g: -g.fixes)),
-        compasses=tuple(c for s in candidates if (c := compass_report(s, courses))),
-        odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first)) for s in poses),
+        compasses=tuple(c for s in candidates if (c := compass_report(s, courses, turning))),
+        odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first, antenna)) for s in poses),
         velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
         tf_frames=tree.frames,
         body_frame=body,

@@ -174,6 +174,9 @@ def _sorted_out(
             continue
         else:
             outside[m.sensor] += 1
+        if m.seq < 0:  # configuration, not a message
+            outside[m.sensor] = 0
+            continue
         topic = recording.topics.get(m.sensor, "")
         rows.append(
             LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason)

@@ -31,7 +31,7 @@ OutOption = Annotated[Path, typer.Option("--out", "-o", help="Run folder to writ
 HoldOutOption = Annotated[
     str | None, typer.Option("--hold-out", help="Keep fixes out and predict them: every:N, or gaps:COUNTxSECONDS.")
 ]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run folder.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there already.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the numbers as JSON.")]
 
 
@@ -71,7 +71,10 @@ def inspect(
     typer.echo(json.dumps(found.as_dict(), indent=2) if as_json else inspection.render(found))
     if config.exists() and not overwrite:
         raise OutputError(f"{config}: exists already; give --write another name, or --overwrite")
-    config.write_text(inspection.draft_config(found), encoding="utf-8")
+    try:
+        config.write_text(inspection.draft_config(found), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{config}: cannot be written ({error.strerror})") from None
     typer.echo(f"wrote {config}: look at each line marked 'guess'", err=True)
 
 

@@ -105,7 +105,7 @@ def write_run(
 def _thinned(solution: Solution, rate_hz: float) -> Array:
     """Indices of the states to write: at most `rate_hz` a second, the last one included."""
     stamps = solution.trajectory.stamps_ns
-    slot = np.floor((stamps - stamps[0]) * 1e-9 * rate_hz + 1e-6).astype(np.int64)
+    slot = np.rint((stamps - stamps[0]) * 1e-9 * rate_hz).astype(np.int64)  # states move onto stamps, by under half
     picked = np.flatnonzero(np.diff(slot, prepend=-1) > 0)
     return np.unique(np.append(picked, len(stamps) - 1))
 

@@ -24,6 +24,7 @@ class Trajectory:
         R_world_body: (N, 3, 3).
         v_world_mps: (N, 3), or None where velocity is not known (then interpolation is linear).
         cov: (N, 6, 6) or None: x, y, z (m) and small rotations (rad), all about the world's axes.
+        planar: height, roll and pitch are not estimated.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -31,6 +32,7 @@ class Trajectory:
     R_world_body: Array
     v_world_mps: Array | None = None
     cov: Array | None = None
+    planar: bool = False
 
     def __post_init__(self) -> None:
         n = len(self.stamps_ns)
@@ -82,4 +84,11 @@ class Trajectory:
             right = np.clip(np.searchsorted(t, s), 1, len(t) - 1)
             nearest = np.where(s - t[right - 1] < t[right] - s, right - 1, right)
             cov = self.cov[nearest]
-        return Trajectory(stamps_ns=stamps, p_world_m=position, R_world_body=rotation, v_world_mps=velocity, cov=cov)
+        return Trajectory(
+            stamps_ns=stamps,
+            p_world_m=position,
+            R_world_body=rotation,
+            v_world_mps=velocity,
+            cov=cov,
+            planar=self.planar,
+        )

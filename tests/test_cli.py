@@ -126,7 +126,8 @@ def test_bad_arguments_are_one_line(
         ([*good, "--hold-out", "gaps:500x10"], "gaps"),
         ([*good[:5], mine, "--overwrite"], "no graphloc run folder"),
         ([*good[:5], file], "is a file"),
-        (["simulate", "-o", tmp_path / "sim", "--noise", "pink"], "pink"),
+        (["simulate", "bl1-pink", "-o", tmp_path / "sim"], "bl1-pink"),
+        (["inspect", bag[0], "-w", tmp_path / "nowhere/x.yaml"], "nowhere/x.yaml"),
     ):
         assert run(monkeypatch, *arguments) == 2, arguments
         lines = capsys.readouterr().err.strip().splitlines()

@@ -24,6 +24,7 @@ _FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-
 # Health: DNV asks for 2.5 m at 95 % in port (Digerud); beyond 25 m a pose helps nobody there.
 _GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_RAD = 2.5, 25.0, np.radians(45.0)
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
+_FAR_OFF = 3.0
 _NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
 
 
@@ -75,9 +76,17 @@ def _left_out(problem: Problem) -> Array:
     for stream in problem.streams:
         if stream.left_out is not None:
             total += np.diag(stream.left_out.sigma**2)
-    if any(s.row.synthetic is not None for s in problem.streams):  # the height is known otherwise
-        total[2, 2] = 0.0
+    if any(s.row.synthetic is not None and getattr(s.config, "height_m", None) is not None for s in problem.streams):
+        total[2, 2] = 0.0  # the height is known otherwise; taken from the fixes, it is as far off as they are
     return total
+
+
+def _far_from_prior(stream: Stream, result: BatchResult) -> float:
+    """How many of its sigmas a constant slow state (a mount's offset) lies from zero; 0 where there is none."""
+    if stream.slow is None or np.isfinite(stream.slow.time_constant_s):
+        return 0.0
+    value = np.atleast_1d(result.values.atVector(keys.slow(stream.number, 0)))
+    return float(np.abs(value / stream.slow.sigma).max())
 
 
 def _misfit(stats: SolveStats, result: BatchResult) -> str:
@@ -231,6 +240,12 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
             "mount, a unit or a time offset is wrong"
         )
     for stream in problem.streams:
+        far = _far_from_prior(stream, result)
+        if far > _FAR_OFF:
+            warnings.append(
+                f"{stream.name}: its {stream.slow.name if stream.slow else 'offset'} is estimated {far:.1f} sigmas from "
+                "what the configuration allows for: check its mount, or raise that sigma"
+            )
         if stream.left_out is not None:
             warnings.append(
                 f"{stream.name}: no second sensor can tell its slow error (multipath) from motion; the bounds allow "
