@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
@@ -89,7 +90,7 @@ def write_run(
         folder: where to. solution: what to write. config: its effective form goes along.
         inputs: SHA-256 of each input. command: the command line. metrics: tables as plain data.
     """
-    picked = _thinned(solution, config.output.rate_hz)
+    picked = thinned(solution.trajectory.stamps_ns, config.output.rate_hz)
     _csv(folder / "solution.csv", _solution_columns(solution), _solution_rows(solution, picked))
     _tum(folder / "solution.tum", solution, picked)
     if config.output.bag:
@@ -102,9 +103,8 @@ def write_run(
     _run_json(folder / MARK, solution, config, inputs, command, metrics)
 
 
-def _thinned(solution: Solution, rate_hz: float) -> Array:
+def thinned(stamps: NDArray[np.int64], rate_hz: float) -> Array:
     """Indices of the states to write: at most `rate_hz` a second, the last one included."""
-    stamps = solution.trajectory.stamps_ns
     slot = np.rint((stamps - stamps[0]) * 1e-9 * rate_hz).astype(np.int64)  # states move onto stamps, by under half
     picked = np.flatnonzero(np.diff(slot, prepend=-1) > 0)
     return np.unique(np.append(picked, len(stamps) - 1))

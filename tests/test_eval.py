@@ -284,3 +284,33 @@ def test_a_pose_of_one_axis_goes_through_the_gate(axes: tuple[str, ...]) -> None
     fewer = tuple(one(m) if isinstance(m, PoseFix) else m for m in run.recording.measurements)
     run = replace(run, recording=replace(run.recording, measurements=fewer))
     assert all(f.position_rmse_m < 1.5 for f in filters(run).values())
+
+
+def test_the_honest_filter_turns_with_its_axes() -> None:
+    """Fast loops with 1 Hz fixes and a 20 s outage: without w x v it is tens of metres off at the end of it."""
+    scenario = Scenario(path="loops", duration_s=100.0, noise="clean", gnss_hz=1.0, pose_hz=0.0, outage_s=(60.0, 70.0))
+    worst = [filters(simulate(scenario, seed))["honest EKF"].position_max_m for seed in (1, 2, 3)]
+    assert float(np.median(worst)) < 6.0
+
+
+def test_filters_start_moving_where_no_truth_says_so() -> None:
+    """No truth to start from: the first fixes give the velocity, and nothing is gated out."""
+    run = simulate(Scenario(path="loops", duration_s=40.0, noise="clean", gnss_hz=1.0, pose_hz=0.0), 3)
+    blind = replace(run.recording, truth=None)
+    datum = app.choose_datum(blind, run.config)
+    for found in ekf.run_all(blind, run.config, datum):
+        assert metrics.compare_to_truth(found.trajectory, run.truth).position_rmse_m < 1.5
+        assert found.ledger.counts()["gnss"].get("rejected", 0) < 6
+
+
+def test_false_matches_repeat_as_often_as_asked() -> None:
+    """Half of the false matches that follow a false one keep its error."""
+    run = simulate(Scenario(duration_s=600.0, path="loops", imu_hz=10.0, gnss_hz=0.0, compass_hz=0.0, noise="clean"), 1)
+    poses = [m for m in run.recording.measurements if isinstance(m, PoseFix)]
+    at = run.truth.at(np.array([m.stamp_ns for m in poses]))
+    off = np.array([m.modes[0].value[:2] for m in poses]) - at.p_world_m[:, :2]
+    false = np.hypot(off[:, 0], off[:, 1]) > 1.2
+    assert false.mean() == pytest.approx(0.4, abs=0.06)
+    pairs = false[1:] & false[:-1]
+    same = np.hypot(*(off[1:] - off[:-1]).T)[pairs] < 1.2
+    assert same.mean() == pytest.approx(0.5, abs=0.15)

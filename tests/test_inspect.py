@@ -267,6 +267,54 @@ def test_where_the_frame_of_the_truth_lies(
         assert "not east-north-up" in text
 
 
+@pytest.mark.parametrize("convention", ["enu", "ned"])
+def test_a_moored_compass_is_judged_by_the_gyro(convention: str, tmp_path: Path) -> None:
+    """No course to compare with: the heading swings with the gyro, or against it."""
+    make, items = Messages(2), []
+    for k in range(3000):
+        stamp, t = START_NS + k * S // 50, k / 50.0
+        yaw, rate = 0.3 + 0.15 * np.sin(0.4 * t), 0.06 * np.cos(0.4 * t)
+        items.append(("/imu", stamp, make.imu(stamp, (0.0, 0.0, G), (0.0, 0.0, rate + 0.004))))
+        if k % 5 == 0:
+            angle = 0.5 * (yaw if convention == "enu" else np.pi / 2.0 - yaw)
+            items.append(("/compass", stamp, make.compass(stamp, (0, 0, np.sin(angle), np.cos(angle)))))
+    _, config, text = look(tmp_path, items, make)
+    assert config.sensors["compass"].convention == convention
+    assert "by the gyro" in text
+
+
+def test_a_map_grid_is_no_world(tmp_path: Path) -> None:
+    """Truth in UTM, 6400 km north of the equator: no datum is guessed from it."""
+    make, items = Messages(2), drive(Messages(2))
+    for _, log_ns, fix in [item for item in items if item[0] == "/fix"]:
+        enu = DATUM.enu_from_geodetic(*np.array([[fix.latitude], [fix.longitude], [fix.altitude]]))[0]
+        stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
+        items.append(("/truth", log_ns, make.odometry(stamp, (enu[0] + 674_000.0, enu[1] + 6_399_000.0, 40.0))))
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.datum is None
+    assert config.truth_topic is None
+    assert "looks like a map grid (UTM)" in text
+
+
+def test_the_antenna_is_taken_off_the_datum(tmp_path: Path) -> None:
+    """An antenna 30 m aft, known to /tf_static, on a craft that heads one way: the datum must not lie 30 m off."""
+    make, aft = Messages(2), (-30.0, 2.0, 8.0)
+    half = np.sqrt(0.5)  # heading north: a quarter turn to port from east
+    items: list[Item] = [("/tf_static", START_NS, make.transforms([("base_link", "gps", aft, (0, 0, 0, 1))]))]
+    R = rotation_z(90.0)
+    for k in range(600):
+        stamp = START_NS + k * S // 10
+        p = (0.0, 0.5 * k, 0.0)
+        lla = DATUM.geodetic_from_enu(np.array(p) + R @ np.array(aft))[0]
+        cov = (0.0004, 0, 0, 0, 0.0004, 0, 0, 0, 0.001)
+        items.append(("/fix", stamp, make.fix(stamp, lla[0], lla[1], lla[2], status=2, covariance=cov)))
+        items.append(("/truth", stamp, make.odometry(stamp, p, (0, 0, half, half))))
+    _, config, _ = look(tmp_path, items, make)
+    assert config.datum is not None
+    away = DATUM.enu_from_geodetic(*np.array(config.datum.geodetic)[:, None])[0]
+    assert np.linalg.norm(away) < 0.3
+
+
 def test_a_plain_velocity_tells_the_yaw_of_the_imu(tmp_path: Path) -> None:
     """`TwistStamped`, as NMEA drivers write it, and no wheels: the mount is found by it."""
     make = Messages(2)

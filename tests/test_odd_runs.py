@@ -6,18 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from graphloc import app
+from graphloc.build import make_problem
 from graphloc.config import DatumConfig, GnssConfig, HeightConfig, MountConfig, PoseConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum, Geodetic
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import GnssPosition, HeightPrior, ImuSeries, Measurement
 from graphloc.outputs import bounds_95
 from graphloc.recording import Recording
+from graphloc.solve._align import align
+from graphloc.solve._parts import _join_stats
 from graphloc.trajectory import Trajectory
 
 BASE = Scenario(path="loops", duration_s=40.0, noise="clean", pose_hz=0.0)
@@ -241,6 +246,92 @@ def test_output_velocity_is_that_of_the_body_origin() -> None:
     assert track.v_world_mps is not None
     error = track.v_world_mps[20:-20] - true.v_world_mps
     assert np.sqrt((error[:, :2] ** 2).mean()) < 0.03  # the IMU's lever of 1.14 m swings by 0.05 m/s in these waves
+
+
+def test_a_height_from_biased_fixes_is_not_known() -> None:
+    """Fixes 7 m too high, and a waterline taken from them: the bound on the height has to hold 7 m."""
+    run = simulate(replace(BASE, duration_s=20.0), 2)
+    high = tuple(
+        replace(m, position=m.position._replace(height_m=m.position.height_m + 7.0))
+        if isinstance(m, GnssPosition)
+        else m
+        for m in run.recording.measurements
+    )
+    config = with_sensors(run, height=HeightConfig(topic=""))
+    cov = app.smooth_recording(replace(run.recording, measurements=high), config).solution.trajectory.cov
+    known = app.simulated(run).solution.trajectory.cov
+    assert cov is not None
+    assert known is not None
+    assert bounds_95(cov)[:, 1].min() > 7.0
+    assert bounds_95(known)[:, 1].max() < 1.0
+
+
+def test_a_compass_far_off_its_mount_is_said() -> None:
+    run = simulate(replace(BASE, compass_offset_deg=8.0), 2)
+    warnings = app.simulated(run).solution.stats.warnings
+    assert any(w.startswith("compass: its compass offset is estimated") for w in warnings)
+    assert not any("compass offset" in w for w in app.simulated(simulate(BASE, 2)).solution.stats.warnings)
+
+
+def test_an_imu_noisier_than_configured_is_scaled_up() -> None:
+    """Noise of 20 times what vessel.yaml says: scaled up and said; with `adapt_noise: false` left alone."""
+    run = simulate(
+        replace(BASE, gnss_sigma_m=0.02, accel_noise_ug_per_sqrt_hz=30_000.0, gyro_noise_mdps_per_sqrt_hz=300.0), 2
+    )
+    imu = run.config.sensors["imu"].model_copy(
+        update={"accel_noise_ug_per_sqrt_hz": 300.0, "gyro_noise_mdps_per_sqrt_hz": 3.0}
+    )
+    said = app.smooth_recording(run.recording, with_sensors(run, imu=imu)).solution.stats.warnings
+    assert any("IMU noise scaled up" in w for w in said)
+    held = with_sensors(run, imu=imu.model_copy(update={"adapt_noise": False}))
+    assert not any(
+        "IMU noise scaled up" in w for w in app.smooth_recording(run.recording, held).solution.stats.warnings
+    )
+
+
+def test_parts_that_lack_a_sensor_and_do_not_converge() -> None:
+    """Joined: never since a part's missing sensor agreed; converged only where every part is."""
+    run = simulate(replace(BASE, duration_s=80.0, pose_hz=1.0, false_fraction=0.0), 1)
+    imu = run.recording.imu
+    assert imu is not None
+    t0 = int(imu.stamps_ns[0])
+    t = (imu.stamps_ns - t0) * 1e-9
+    kept = tuple(
+        m
+        for m in run.recording.measurements
+        if not 25 * 10**9 < m.stamp_ns - t0 < 55 * 10**9 and not (m.sensor == "aerial" and m.stamp_ns > t0 + 40 * 10**9)
+    )
+    paused = replace(only(run.recording, kept), imu=cut(imu, (t < 25.0) | (t > 55.0)))
+    solved = app.smooth_recording(paused, run.config).solution
+    seconds = (solved.trajectory.stamps_ns - t0) * 1e-9
+    assert np.isinf(solved.since_agreed_s["aerial"][seconds > 50.0]).all()
+    assert solved.stats.converged
+    one, other = (replace(solved.stats, converged=c) for c in (True, False))
+    assert not _join_stats([one, other], ()).converged
+
+
+def test_level_and_bias_at_a_tilted_start() -> None:
+    """At rest, rolled 5 and pitched 8 deg, with an IMU turned by 90 deg: attitude and gyro bias come out in its axes."""
+    run = simulate(
+        replace(BASE, duration_s=30.0, path="still", wave_roll_deg=0.01, wave_pitch_deg=0.01, wave_heave_m=0.001), 5
+    )
+    imu = run.recording.imu
+    assert imu is not None
+    bias = np.array([0.02, -0.01, 0.03])
+    tilt = Rotation.from_euler("ZYX", (0.0, 8.0, 5.0), degrees=True).as_matrix()
+    R_body_imu = Rotation.from_euler("xyz", (2.0, -1.0, 90.0), degrees=True).as_matrix()  # the simulator's
+    force = tilt.T @ np.array([0.0, 0.0, 9.82])
+    rng = np.random.default_rng(1)
+    still = replace(
+        imu,
+        accel_mps2=force @ R_body_imu + rng.normal(0.0, 0.02, (len(imu), 3)),
+        gyro_radps=bias + rng.normal(0.0, 0.001, (len(imu), 3)),
+    )
+    recording = replace(run.recording, imu=still)
+    problem = make_problem(recording, run.config, app.choose_datum(recording, run.config), SENSORS, INERTIAL)
+    start = align(problem)
+    np.testing.assert_allclose(start.gyro_bias_radps, bias, atol=1e-3)
+    np.testing.assert_allclose(start.R_level_body[2], tilt[2], atol=0.01)
 
 
 @pytest.mark.parametrize("axes", [("roll",), ("x", "y", "pitch")])

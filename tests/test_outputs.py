@@ -98,6 +98,14 @@ def test_solution_csv(folder: Path) -> None:
     assert (row["health"], rows_of(folder / "solution.csv")[20]["health_reason"]) == ("good", "gnss missing")
 
 
+def test_ten_rows_a_second_though_states_move_onto_stamps(folder: Path) -> None:
+    """21 states 0.1 s apart give 21 rows; `floor` would drop one where a state moved 1 ns early."""
+    assert len(rows_of(folder / "solution.csv")) == 21
+    moved = START_NS + np.array([0, 130, 170, 310, 420, 480, 610], dtype=np.int64) * 1_000_000
+    picked = outputs.thinned(moved, 10.0)
+    assert picked.tolist() == [0, 1, 2, 3, 4, 5, 6]
+
+
 def test_tum_keeps_nanoseconds_and_zeros(folder: Path) -> None:
     stamp, *values = (folder / "solution.tum").read_text().splitlines()[0].split()
     assert stamp == "1700000000.000000005"
