@@ -267,7 +267,7 @@ def test_a_height_from_biased_fixes_is_not_known() -> None:
 
 
 def test_a_compass_far_off_its_mount_is_said() -> None:
-    run = simulate(replace(BASE, compass_offset_deg=8.0), 2)
+    run = simulate(replace(BASE, compass_offset_deg=8.0, gnss_sigma_m=0.02, duration_s=60.0), 2)
     warnings = app.simulated(run).solution.stats.warnings
     assert any(w.startswith("compass: its compass offset is estimated") for w in warnings)
     assert not any("compass offset" in w for w in app.simulated(simulate(BASE, 2)).solution.stats.warnings)
