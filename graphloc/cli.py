@@ -176,11 +176,11 @@ def demo(
     out: OutOption = Path("runs/demo"), seed: Annotated[int, typer.Option(help="Seed of the simulated run.")] = 0
 ) -> None:
     """Simulate a harbour run with drifting GNSS and 40 % false matches, smooth it from its bag, and compare."""
-    from graphloc.eval.simulate import bl_scenario
+    from graphloc.eval.simulate import harbour_scenarios
     from graphloc.eval.simulate import simulate as run_simulation
     from graphloc.eval.simulate.bag import write_bag
 
-    run = run_simulation(bl_scenario(1, "drift"), seed)
+    run = run_simulation(replace(harbour_scenarios()["bl1-drift"], lidar_hz=0.0), seed)  # nothing reads scans yet
     bag, config = write_bag(run, out.parent / f"{out.name}-bag", ros=2, overwrite=True)
     _smooth([bag], config, out, None, True, False, compare=True)
 

@@ -25,6 +25,7 @@ from graphloc.eval.simulate.bag import write_bag
 from graphloc.eval.simulate.harbour import Harbour, load_harbour, make_harbour, shipped
 from graphloc.eval.simulate.lidar import BPEARL, Lidar, Scene, bl_lidars, extrude, orthonormal, scan, world_points
 from graphloc.frames import Array, Datum, Geodetic
+from graphloc.measurements import GnssPosition
 
 SHORT = replace(harbour_scenarios()["bl1-drift"], duration_s=60.0)
 
@@ -233,6 +234,38 @@ def test_motion_within_a_scan_is_in_it(run: SimulatedRun) -> None:
     assert run.truth.v_world_mps is not None
     speed = float(np.linalg.norm(run.truth.v_world_mps[2700]))
     assert np.linalg.norm((right - frozen)[late], axis=1).mean() > 0.5 * 0.09 * speed
+
+
+def test_the_harbour_of_the_docs_works(tmp_path: Path) -> None:
+    page = (Path(__file__).parent.parent / "docs/simulator.md").read_text()
+    (tmp_path / "mine.yaml").write_text(page.split("```yaml\n")[1].split("```")[0])
+    run = simulate(replace(SHORT, harbour=str(tmp_path / "mine.yaml")), 1)
+    assert run.harbour is not None
+    assert len(run.harbour.pontoons) == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "rmse_m", "largest_m"),
+    [
+        ("bl1-drift", 1.3567, 1.7044), ("bl1-jump", 2.4596, 14.5443), ("bl2-drift", 1.3658, 1.7044),
+        ("bl2-jump", 2.4428, 14.5115), ("bl3-drift", 1.2847, 1.5985), ("bl3-jump", 3.6406, 9.9748),
+    ],
+)  # fmt: skip
+def test_gnss_errors_are_those_of_the_thesis(name: str, rmse_m: float, largest_m: float) -> None:
+    """B.1: BL tables 4.1 and 4.2 to 10 %, the mean of five seeds."""
+    found = []
+    for seed in range(5):
+        run = simulate(harbour_scenarios()[name], seed)
+        fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+        at = run.truth.at(np.array([m.stamp_ns for m in fixes]))
+        antenna = at.p_world_m + at.R_world_body @ np.array([-1.5, 0.3, 2.2789])
+        assert run.harbour is not None
+        there = run.harbour.datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T)
+        error = np.hypot(*(there - antenna)[:, :2].T)
+        found.append((np.sqrt((error**2).mean()), error.max()))
+    rmse, largest = np.mean(found, axis=0)
+    assert rmse == pytest.approx(rmse_m, rel=0.1)
+    assert largest == pytest.approx(largest_m, rel=0.1)
 
 
 def test_the_recording_is_whole_and_smooths(run: SimulatedRun, tmp_path: Path) -> None:
