@@ -301,7 +301,7 @@ def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: Bl
     return _run("BL EKF", recording, config, datum, o.rate_hz, start, predict, judge)
 
 
-_HONEST_ACCEL, _HONEST_GATE, _HONEST_PATIENCE_S = 0.2, 0.9, 10.0
+_HONEST_ACCEL, _HONEST_GATE, _HONEST_PATIENCE_S = 0.3, 0.9, 10.0
 
 
 def run_honest(recording: Recording, config: VesselConfig, datum: Datum) -> FilterResult:
