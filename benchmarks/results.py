@@ -29,7 +29,7 @@ from graphloc import app
 from graphloc.eval import ekf
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import compare_to_held_out, compare_to_truth
-from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, harbour_scenarios, simulate
 from graphloc.measurements import GnssPosition
 
 ROOT = Path(__file__).parent.parent
@@ -211,6 +211,52 @@ def speed(_pool: ProcessPoolExecutor) -> list[Row]:
     return rows
 
 
+# BL tables 4.1 and 4.2: RMSE and largest error of the GNSS signal, m.
+_BL_SIGNALS = {
+    "bl1-drift": (1.3567, 1.7044), "bl1-jump": (2.4596, 14.5443), "bl2-drift": (1.3658, 1.7044),
+    "bl2-jump": (2.4428, 14.5115), "bl3-drift": (1.2847, 1.5985), "bl3-jump": (3.6406, 9.9748),
+}  # fmt: skip
+
+
+def _signal(job: tuple[str, int]) -> tuple[float, float]:
+    run = simulate(harbour_scenarios()[job[0]], job[1])
+    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    at = run.truth.at(np.array([m.stamp_ns for m in fixes]))
+    antenna = at.p_world_m + at.R_world_body @ run.config.sensors["gnss"].mount.t_body_sensor_m
+    datum = app.choose_datum(run.recording, run.config)
+    error = np.hypot(*(datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - antenna)[:, :2].T)
+    return float(np.sqrt((error**2).mean())), float(error.max())
+
+
+def signals(pool: ProcessPoolExecutor, seeds: int = 10) -> list[Row]:
+    rows = []
+    for name, (rmse_m, largest_m) in _BL_SIGNALS.items():
+        rmse, largest = np.mean(list(pool.map(_signal, [(name, seed) for seed in range(seeds)])), axis=0)
+        label = f"{name}, {seeds} seeds: GNSS signal against BL's table"
+        rows.append(row("B.1", f"{label}: RMSE off by", 100.0 * abs(rmse / rmse_m - 1.0), "%", 10.0, "<="))
+        rows.append(
+            row("B.1", f"{label}: largest error off by", 100.0 * abs(largest / largest_m - 1.0), "%", 10.0, "<=")
+        )
+    return rows
+
+
+def making(_pool: ProcessPoolExecutor) -> list[Row]:
+    """A whole recording, as a user makes it, on two cores."""
+    os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:2]))
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "graphloc.cli", "simulate", "bl1-drift", "-o", f"{folder}/sim"]
+        begin = time.perf_counter()
+        subprocess.run(command, check=True, capture_output=True)
+        took = time.perf_counter() - begin
+        size = sum(p.stat().st_size for p in Path(folder).rglob("*") if p.is_file())
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0**2
+    return [
+        row("B.4", "2 min run, five LiDARs at 1 Hz, no camera yet: time to make", took, "s", 90.0, "<="),
+        row("B.4", "2 min run, five LiDARs at 1 Hz, no camera yet: largest memory", peak, "GiB", 2.0, "<="),
+        row("B.4", "2 min run, five LiDARs at 1 Hz, no camera yet: size of the recording", size / 2**20, "MiB"),
+    ]
+
+
 FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "A.1": husky,
     "A.2": kitti,
@@ -218,6 +264,8 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "A.4": starts,
     "A.5": outages,
     "A.6": speed,
+    "B.1": signals,
+    "B.4": making,
 }
 
 
