@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filters that the graph is compared with, on the same measurements.
 
-`run_bl` is BL alg. 6 as printed, 2 m gate included; each erratum is a switch. `run_honest` is the planar
+`run_bl` is BL alg. 6 as printed, 2 m gate included; its missing Jacobian is a switch. `run_honest` is the planar
 filter that one would honestly compare with: exact Jacobian, gyro bias, GNSS velocity, chi-square gates
 that open as the covariance grows. State of both: x, y (m, world), surge, sway (m/s, body), heading psi
 (rad); then the gyro bias.
@@ -40,8 +40,8 @@ class BlConfig:
         accel_noise_mg: printed 37 mg; gyro_noise_dps: 0.008 deg/s; both over the root of the rate (eq. 3.1, 3.2).
         gnss_rmse_m: receiver's own e; 0 takes it from the fix. heading_rmse_deg: of the GNSS compass.
         exact_jacobian: d/dpsi terms in F, which the print lacks.
-        pose_covariance: use the pose's own covariance, since a3 diag((Nm / (10 Nk + 1))^2) needs the
-            point count of BL's matcher.
+
+    R_lidar is a3 times the pose's own covariance, since diag((Nm / (10 Nk + 1))^2) needs the point count of BL's matcher.
     """
 
     rate_hz: float = 20.0

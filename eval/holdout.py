@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass, replace
+from itertools import count
 
 from graphloc.errors import ConfigError
 from graphloc.ledger import LedgerRow, Outcome
@@ -50,8 +51,10 @@ class HoldOut:
                 f"{recording.source}: --hold-out gaps:{self.gaps}x{self.gap_s:g}: the gaps do not fit into the "
                 f"{span:.1f} s from the first fix to the last; ask for fewer or shorter ones"
             )
-        number: Counter[str] = Counter()  # counted for each receiver: every 2nd of two in turn would be all of one
-        held = tuple(m for m in fixes if self._holds(_next(number, m.sensor), m, fixes))
+        number: defaultdict[str, count[int]] = defaultdict(
+            count
+        )  # counted for each receiver: every 2nd of two in turn would be all of one
+        held = tuple(m for m in fixes if self._holds(next(number[m.sensor]), m, fixes))
         if not held:
             raise ConfigError(f"{recording.source}: --hold-out every:{self.every} holds nothing of {len(fixes)} fixes")
         gone = {id(m) for m in held}
@@ -76,8 +79,3 @@ class HoldOut:
         at = (m.stamp_ns - fixes[0].stamp_ns) * 1e-9
         centres = (span * (n + 1.0) / (self.gaps + 1.0) for n in range(self.gaps))
         return any(abs(at - c) <= self.gap_s / 2.0 for c in centres)
-
-
-def _next(number: Counter[str], name: str) -> int:
-    number[name] += 1
-    return number[name] - 1

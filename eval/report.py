@@ -134,15 +134,13 @@ def verdict(data: ReportData) -> tuple[Trust, str]:
     said.append(
         f"It states a 95 % bound of {bound:.2f} m or better for 95 % of the run, and calls itself good for {good:.0%}."
     )
-    covered = next((t.as_dict()["graphloc"]["coverage_95"] for t in data.tables if "coverage_95" in t.columns), None)
+    covered, matched, headed = (_ours(data.tables, c) for c in ("coverage_95", "matched", "heading_coverage_95"))
     trust = Trust.YES
     if covered is not None:
         said.append(f"Its 95 % bounds held the truth for {covered:.0%} of the time.")
-    matched = next((t.as_dict()["graphloc"]["matched"] for t in data.tables if "matched" in t.columns), None)
     if matched is not None and matched < _MATCHED:
         trust = Trust.WITH_CARE
         said.append(f"IT COVERS ONLY {matched:.0%} of what it is compared with; the filters may cover more.")
-    headed = next((t.as_dict()["graphloc"].get("heading_coverage_95") for t in data.tables), None)
     if headed is not None and headed < _COVERED:
         trust = Trust.WITH_CARE
         said.append(f"Its heading bounds held the truth for {headed:.0%} of the time.")
@@ -156,6 +154,11 @@ def verdict(data: ReportData) -> tuple[Trust, str]:
     if not solution.stats.converged:
         trust, said = Trust.NO, [*said, "THE SOLVER DID NOT CONVERGE: do not rely on this run."]
     return trust, " ".join(said)
+
+
+def _ours(tables: Sequence[Table], column: str) -> float | None:
+    """The graph's number in the first table that has such a column."""
+    return next((t.as_dict()["graphloc"][column] for t in tables if column in t.columns), None)
 
 
 def _accuracy(tables: Sequence[Table]) -> str:

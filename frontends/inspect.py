@@ -76,15 +76,17 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     twists = [s for s in filled if s.msgtype in (TWIST, PLAIN_TWIST)]
     motion = motion_of(wheels, twists, fixes)
     body = tree.body()
+    # The best first: what they say is what the others are judged by.
     found_gnss = [g for s in fixes if (g := gnss_report(s, _known(s, tree, body)))]
+    found_gnss.sort(key=lambda g: -g.fixes)
     found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, tree, body))]
+    found_imus.sort(key=lambda i: i.gyro_noise_mdps)
     stamps, p_m, scatter_m, first = _best_track(by_topic, found_gnss)
-    best = max(found_gnss, key=lambda g: g.fixes, default=None)
-    mount = tree.resolve(body, best.tf_frame) if best is not None and best.tf_frame else None
+    frame = found_gnss[0].tf_frame if found_gnss else None
+    mount = tree.resolve(body, frame) if frame else None
     antenna = None if mount is None else mount[0]
     courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
-    by_imu = next(iter(sorted(found_imus, key=lambda i: i.gyro_noise_mdps)), None)
-    turning = turning_of(by_topic[by_imu.topic], by_imu, tree, body) if by_imu else None
+    turning = turning_of(by_topic[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
     candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU)]
     return Inspection(
         source=source,
@@ -94,8 +96,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             else TopicReport(topic=t.topic, msgtype=" or ".join(t.msgtypes), count=t.messages)
             for t in topics.values()
         ),
-        imus=tuple(sorted(found_imus, key=lambda i: i.gyro_noise_mdps)),
-        gnss=tuple(sorted(found_gnss, key=lambda g: -g.fixes)),
+        imus=tuple(found_imus),
+        gnss=tuple(found_gnss),
         compasses=tuple(c for s in candidates if (c := compass_report(s, courses, turning))),
         odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first, antenna)) for s in poses),
         velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
@@ -137,7 +139,7 @@ def _best_track(
     """Return stamps, places about the first fix, scatter (m) and first fix of the receiver with most fixes."""
     if not gnss:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None
-    best = max(gnss, key=lambda g: g.fixes)
+    best = gnss[0]
     stamps, p, _ = track(by_topic[best.topic])
     return stamps, p, max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -77,27 +77,25 @@ def smooth_recording(
 
 def _comparable(run: Run) -> Run:
     """Drop what shares no time with the track, and say so."""
-    recording, track, held = run.recording, run.solution.trajectory, run.held
-    said = []
-    try:
-        if recording.truth is not None:
-            metrics.errors(track, recording.truth)
-    except metrics.NoCommonTimeError as error:
-        said.append(str(error))
-        recording = replace(recording, truth=None)
-    try:
-        if recording.check_speed is not None:
-            metrics.compare_speed(track, recording.check_speed)
-    except metrics.NoCommonTimeError as error:
-        said.append(str(error))
-        recording = replace(recording, check_speed=None)
-    try:
-        if held:
-            metrics.held_out_errors(track, held, run.solution.datum, levers_m(run))
-    except metrics.NoCommonTimeError as error:
-        said.append(str(error))
+    truth, speed, held, track = run.recording.truth, run.recording.check_speed, run.held, run.solution.trajectory
+    said: list[str] = []
+
+    def comparable(compare: Callable[..., object], *arguments: object) -> bool:
+        try:
+            compare(*arguments)
+        except metrics.NoCommonTimeError as error:
+            said.append(str(error))
+            return False
+        return True
+
+    if truth is not None and not comparable(metrics.errors, track, truth):
+        truth = None
+    if speed is not None and not comparable(metrics.compare_speed, track, speed):
+        speed = None
+    if held and not comparable(metrics.held_out_errors, track, held, run.solution.datum, levers_m(run)):
         held = ()
-    return replace(run, recording=replace(recording, warnings=(*recording.warnings, *said)), held=held)
+    warnings = (*run.recording.warnings, *said)
+    return replace(run, recording=replace(run.recording, truth=truth, check_speed=speed, warnings=warnings), held=held)
 
 
 def levers_m(run: Run) -> dict[str, Array]:

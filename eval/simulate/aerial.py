@@ -9,6 +9,7 @@ misregistered: what it shows lies `shift_m` off.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -83,8 +84,12 @@ def utm_epsg(datum: Datum) -> int:
 def grid_from_enu(datum: Datum, epsg: int, p_m: Array) -> Array:
     """Return grid coordinates (N, 2) of points (N, 2) on the datum's plane, m."""
     geodetic = datum.geodetic_from_enu(np.column_stack([p_m, np.zeros(len(p_m))]))
-    to_grid = Transformer.from_crs(CRS.from_epsg(4326), CRS.from_epsg(epsg), always_xy=True)
-    return np.column_stack(to_grid.transform(geodetic[:, 1], geodetic[:, 0]))
+    return np.column_stack(_to_grid(epsg).transform(geodetic[:, 1], geodetic[:, 0]))
+
+
+@lru_cache(maxsize=8)  # making a transformer takes longer than a thousand transforms
+def _to_grid(epsg: int) -> Transformer:
+    return Transformer.from_crs(CRS.from_epsg(4326), CRS.from_epsg(epsg), always_xy=True)
 
 
 def render(harbour: Harbour, seed: int, pixel_m: float = 0.16, shift_sigma_m: float = 0.3) -> AerialImage:
