@@ -142,31 +142,40 @@ def compare(
     _smooth(bag, config, out, hold_out, overwrite, as_json, compare=True)
 
 
+def _pairs(changes: list[str]) -> dict[str, str]:
+    from graphloc.errors import ConfigError
+
+    pairs = [change.partition("=") for change in changes]
+    for change, (key, equals, value) in zip(changes, pairs, strict=True):
+        if not (key and equals and value):
+            raise ConfigError(f"--set {change}: write KEY=VALUE, as in --set camera_hz=15")
+    return {key: value for key, _, value in pairs}
+
+
 @app.command()
 def simulate(
-    scenario: Annotated[str, typer.Argument(help="bl1-drift, bl2-jump, ...: a wrong name lists them.")],
+    scenario: Annotated[str, typer.Argument(help="bl1-drift, dock-fixed-fog, ...: a wrong name lists them.")],
     out: OutOption,
     seed: Annotated[int, typer.Option(help="Same seed, same run.")] = 0,
     ros: Annotated[int, typer.Option(min=1, max=2, help="ROS version of the bag.")] = 2,
     storage: Annotated[str, typer.Option(help="mcap or sqlite3, of a ROS 2 bag.")] = "mcap",
     harbour: Annotated[str, typer.Option(help="Another harbour than the scenario's: a name or a file.")] = "",
-    lidar: Annotated[bool, typer.Option(help="Cast the LiDARs' scans.")] = True,
+    rig: Annotated[str, typer.Option(help="Other sensors than the scenario's: a name or a file.")] = "",
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", help="Change the scenario, as in --set camera_hz=15 --set lidar_hz=0.")
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Write a simulated harbour run: bag, vessel.yaml, aerial image, and what only a simulator knows."""
+    """Write a simulated harbour run: bag, vessel.yaml, aerial image, tag survey, and what only a simulator knows."""
     from graphloc.errors import ConfigError
-    from graphloc.eval.simulate import harbour_scenarios
+    from graphloc.eval.simulate import find_scenario
     from graphloc.eval.simulate import simulate as run_simulation
     from graphloc.eval.simulate.bag import write_bag
 
-    known = harbour_scenarios()
-    if scenario not in known:
-        raise ConfigError(f"scenario '{scenario}': unknown; there are: {', '.join(known)}")
     if storage not in ("mcap", "sqlite3"):
         raise ConfigError(f"--storage {storage}: choose mcap or sqlite3")
-    chosen = known[scenario]
-    chosen = replace(chosen, harbour=harbour or chosen.harbour, lidar_hz=chosen.lidar_hz if lidar else 0.0)
-    run = run_simulation(chosen, seed)
+    named = {key: value for key, value in (("harbour", harbour), ("rig", rig)) if value}
+    run = run_simulation(find_scenario(scenario, {**named, **_pairs(changes or [])}), seed)
     bag, config = write_bag(run, out, ros=ros, storage=storage, overwrite=overwrite, progress=_progress())
     typer.echo(f"{bag}\n{config}")
 

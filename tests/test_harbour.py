@@ -23,7 +23,9 @@ from graphloc.eval.simulate import SimulatedRun, harbour_scenarios, simulate
 from graphloc.eval.simulate.aerial import grid_from_enu, render, utm_epsg
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.eval.simulate.harbour import Harbour, load_harbour, make_harbour, shipped
-from graphloc.eval.simulate.lidar import BPEARL, Lidar, Scene, bl_lidars, extrude, orthonormal, scan, world_points
+from graphloc.eval.simulate.lidar import scan, world_points
+from graphloc.eval.simulate.rig import load_rig
+from graphloc.eval.simulate.scene import Scene, extrude, scene_of
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition
 
@@ -48,7 +50,7 @@ def block(**changes: Any) -> dict[str, Any]:
 def test_shipped_harbours_and_their_routes_are_sound(name: str) -> None:
     harbour = load_harbour(name)
     for route in harbour.config.routes:
-        chosen = replace(SHORT, harbour=name, route=route, duration_s=120.0)
+        chosen = replace(SHORT, harbour=name, route=route, duration_s=900.0 if route == "long" else 120.0)
         truth = simulate(chosen, 1).truth
         points = harbour.waypoints(route)
         assert np.hypot(*(truth.p_world_m[0, :2] - points[0])) < 5.0
@@ -62,6 +64,9 @@ def test_shipped_harbours_and_their_routes_are_sound(name: str) -> None:
         ({"quays": [{"outline": [[0, 0], [10, 10]], "top_m": 2.0}]}, r"quays\.0\.outline"),
         ({"quay": []}, "did you mean 'quays'"),
         ({"image_m": [50, 0, -50, 10]}, "the image has no area"),
+        ({"tags": [{"number": 1, "at": [0, 0], "height_m": 1, "facing_deg": 0, "dock": "d"}]}, "there is no dock 'd'"),
+        ({"tags": [{"number": 1, "at": [0, 0], "height_m": 1, "facing_deg": 0}] * 2}, r"tags\.1\.number: 1 is there twice"),
+        ({"docks": [{"name": "d", "outline": [[0, 0], [5, 5], [5, 0], [0, 5]], "top_m": 1}]}, r"docks\.0\.outline"),
     ],
 )  # fmt: skip
 def test_a_bad_harbour_is_one_line(changes: dict[str, Any], said: str) -> None:
@@ -78,6 +83,14 @@ def test_a_bad_harbour_is_one_line(changes: dict[str, Any], said: str) -> None:
         (["bl1-drift", "--harbour", "nowhere"], "none of the shipped ones: basin, marina"),
         (["bl1-drift", "--harbour", "crash.yaml"], "route 'entry' comes within 0.0 m of a quay, near (0.0, 5.0)"),
         (["bl2-drift", "--harbour", "crash.yaml"], "no route 'turn'; it has: entry"),
+        (["bl1-drift", "--set", "camera=5"], "no such field; did you mean camera_hz?"),
+        (["bl1-drift", "--set", "camera_hz"], "write KEY=VALUE"),
+        (["bl1-drift", "--set", "camera_hz=often"], "--set camera_hz=often: Input should be a valid number"),
+        (["bl1-drift", "--set", "condition=snow"], "'optimal', 'fog'"),
+        (["bl1-drift", "--set", "duration_s=-1"], "it must be positive"),
+        (["bl1-drift", "--set", "gnss_hz=-1"], "it cannot be negative"),
+        (["bl1-drift", "--rig", "nowhere"], "none of the shipped ones: launch, tiara"),
+        (["bl1-drift", "--rig", "crash.yaml"], "unknown key 'name'"),
     ],
 )
 def test_bad_scenarios_are_one_line(
@@ -152,25 +165,31 @@ def test_a_prism_has_its_walls_and_top() -> None:
     assert area[~flat].sum() == pytest.approx(polygon.length * 3.0)
 
 
-def test_mounts_of_the_thesis_are_rotations() -> None:
-    for lidar in bl_lidars():
-        R = lidar.T_body_lidar[:3, :3]
-        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(R) == pytest.approx(1.0)
-    rounded = np.array([[0.2202, -0.9699, 0.1039], [-0.8345, -0.2425, -0.4948], [0.5051, 0.0222, -0.8628]])
-    np.testing.assert_allclose(orthonormal(rounded), rounded, atol=2e-4)
-    assert bl_lidars()[3].T_body_lidar[2, 3] == pytest.approx(2.391)  # on the roof
+# BL appendix A: rows of T_body_lidar, rounded there to four digits.
+_BL_MOUNTS = (
+    ((0.0008, -0.0002, -1.0, -7.17), (-0.001, -1.0, 0.0002, 0.48), (-1.0, 0.001, -0.0008, 0.396)),
+    ((0.2202, -0.9699, 0.1039, 3.7887), (-0.8345, -0.2425, -0.4948, -1.8122), (0.5051, 0.0222, -0.8628, 1.0779)),
+    ((0.2393, 0.9662, 0.0957, 3.5665), (0.7856, -0.2506, 0.5657, 1.8901), (0.5706, -0.0602, -0.819, 1.0172)),
+    ((-0.022, -0.9977, 0.0648, -3.2191), (0.9727, -0.0064, 0.232, 1.4394), (-0.231, 0.0681, 0.9706, 2.391)),
+    ((0.0004, 0.9995, 0.0311, -3.1667), (-0.9838, 0.006, -0.1791, -1.4083), (-0.1792, -0.0305, 0.9833, 2.3929)),
+)
+
+
+def test_mounts_are_those_of_the_thesis() -> None:
+    lidars = load_rig("tiara").lidars
+    assert list(lidars) == [f"lidar_{k}" for k in range(1, 6)]
+    for lidar, rows in zip(lidars.values(), _BL_MOUNTS, strict=True):
+        np.testing.assert_allclose(lidar.T_body_lidar[:3], rows, atol=2e-4)
+    assert [lidar.make for lidar in lidars.values()] == ["bpearl"] * 3 + ["helios"] * 2
 
 
 def scans(run: SimulatedRun, at_s: float) -> tuple[Array, NDArray[np.bool_]]:
     """Points (N, 3) in world of all LiDARs, and which of them hit the own hull."""
-    assert run.harbour is not None
-    rng = np.random.default_rng(5)
-    scene = Scene(run.harbour, run.harbour.boats(rng), run.scenario.tide_m)
-    points = []
-    for lidar in bl_lidars():
-        found = scan(lidar, scene, run.motion, at_s, rng)
-        points.append(world_points(found, lidar, run.motion))
+    rng, scene = np.random.default_rng(5), scene_of(run)
+    points = [
+        world_points(scan(name, lidar, scene, run.motion, at_s, rng), lidar, run.motion)
+        for name, lidar in run.rig.lidars.items()
+    ]
     p, _, _ = run.motion.pose(np.array([at_s]))
     together = np.vstack(points)
     return together, np.asarray(np.hypot(*(together[:, :2] - p[0, :2]).T) < 8.0)
@@ -224,9 +243,9 @@ def test_clouds_lie_on_the_edges_of_the_image(run: SimulatedRun) -> None:
 def test_motion_within_a_scan_is_in_it(run: SimulatedRun) -> None:
     """Taken as of one moment, the points of a turn are smeared by what the vessel moved: 0.1 s at 10 m/s or so."""
     assert run.harbour is not None
-    lidar = Lidar("one", BPEARL, bl_lidars()[1].T_body_lidar)
-    scene = Scene(run.harbour, (), 0.0)
-    found = scan(lidar, scene, run.motion, 27.0, np.random.default_rng(0))
+    lidar = run.rig.lidars["lidar_2"]
+    scene = Scene(run.harbour, (), 0.0, run.docks, run.rig.hull)
+    found = scan("one", lidar, scene, run.motion, 27.0, np.random.default_rng(0))
     assert 0.09 < found.dt_s.max() < 0.1
     right = world_points(found, lidar, run.motion)
     frozen = world_points(replace(found, dt_s=np.zeros_like(found.dt_s)), lidar, run.motion)
@@ -270,7 +289,9 @@ def test_gnss_errors_are_those_of_the_thesis(name: str, rmse_m: float, largest_m
 
 def test_the_recording_is_whole_and_smooths(run: SimulatedRun, tmp_path: Path) -> None:
     bag, config = write_bag(run, tmp_path / "sim", ros=2)
-    assert {p.name for p in (tmp_path / "sim").iterdir()} == {"run", "vessel.yaml", "aerial.tif", "truth.json"}
+    assert {p.name for p in (tmp_path / "sim").iterdir()} == {
+        "run", "vessel.yaml", "aerial.tif", "tags.yaml", "truth.json"
+    }  # fmt: skip
     with AnyReader([bag]) as reader:
         counts = {c.topic: c.msgcount for c in reader.connections}
         connection = next(c for c in reader.connections if c.topic == "/lidar_4/points")

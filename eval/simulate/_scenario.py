@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+import difflib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
 from graphloc.config import (
     STANDARD_GRAVITY_MPS2,
@@ -17,14 +20,18 @@ from graphloc.config import (
     GnssConfig,
     HeightConfig,
     ImuConfig,
-    MountConfig,
     PoseConfig,
+    SensorConfig,
     StartConfig,
     VesselConfig,
 )
+from graphloc.errors import ConfigError
 from graphloc.eval.simulate._truth import Motion, Waves, Way, make_motion, make_way_motion
+from graphloc.eval.simulate.docks import MovingDock, moving_docks
 from graphloc.eval.simulate.harbour import Harbour, load_harbour
-from graphloc.eval.simulate.noise import GnssNoise, gnss_error_m
+from graphloc.eval.simulate.noise import GnssNoise, gnss_error_m, reported_sigma_m
+from graphloc.eval.simulate.rig import RigConfig, load_rig
+from graphloc.eval.simulate.weather import WEATHER, Condition
 from graphloc.frames import Array, Datum, Geodetic, heading_deg_from_yaw, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix, PoseMode
 from graphloc.recording import Recording
@@ -40,13 +47,15 @@ class Scenario:
     """What happens in a run. Defaults are BL's sensors and a calm harbour.
 
     Attributes:
-        path: 'entry' (BL case 1), 'turn' (case 2), 'still' (case 3) or 'loops' (any length).
+        path: in open water 'entry' (BL case 1), 'turn' (case 2), 'still' (case 3) or 'loops' (any length); in a
+            harbour how the vessel goes along its route: 'dock' comes to rest before its end, 'tour' halts on its way.
         case: BL case whose tables the GNSS noise follows.
         duration_s: length of the run. noise: kind of GNSS error.
         outage_s: (start, stop) without fixes and poses, or None.
         imu_hz, gnss_hz, compass_hz, pose_hz: rates; 0 switches a sensor off.
         gnss_sigma_m: white noise of each axis, 1 sigma; e / sqrt(2) with BL's e = 0.3 m.
-        gnss_reported_sigma_m: what the fixes claim for it; 0: the truth.
+        gnss_reported_sigma_m: what the fixes claim for it, on average; 0: the truth.
+        gnss_reported_spread: how far the claims wander about that: 1 sigma of their logarithm.
         pose_sigma_m, pose_sigma_deg: noise of a true match. false_fraction: share of false ones.
         false_stays: probability that a false match repeats in the next scan.
         pose_modes: modes of each match; the false ones lie around the right one.
@@ -56,10 +65,12 @@ class Scenario:
             heading written to the configuration; None writes none.
         wave_roll_deg, wave_pitch_deg, wave_heave_m: RMS of the waves' motion.
         harbour: name or file of the harbour that the run lies in; empty: open water, `path` alone counts.
-        route: of the harbour. tide_m: water over its mean. lidar_hz: scans a second of each LiDAR in the bag.
+        route: of the harbour. tide_m: water over its mean. lidar_hz, camera_hz: scans of each LiDAR, images of each
+            camera a second in the bag. rig: name or file of what the vessel carries. condition: for cameras.
+        camera_raw: images as `sensor_msgs/Image`, ten times as large, not as JPEG.
     """
 
-    path: Literal["entry", "turn", "still", "loops"] = "entry"
+    path: Literal["entry", "turn", "still", "loops", "dock", "tour"] = "entry"
     case: int = 1
     duration_s: float = 120.0
     noise: GnssNoise = "drift"
@@ -70,6 +81,7 @@ class Scenario:
     pose_hz: float = 1.0
     gnss_sigma_m: float = 0.3 / float(np.sqrt(2.0))
     gnss_reported_sigma_m: float = 0.0
+    gnss_reported_spread: float = 0.0
     pose_sigma_m: float = 0.2
     pose_sigma_deg: float = 0.5
     false_fraction: float = 0.4
@@ -89,7 +101,11 @@ class Scenario:
     harbour: str = ""
     route: str = "entry"
     tide_m: float = 0.0
+    rig: str = "tiara"
     lidar_hz: float = 0.0
+    camera_hz: float = 0.0
+    camera_raw: bool = False
+    condition: Condition = "optimal"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -102,7 +118,9 @@ class SimulatedRun:
     truth: Trajectory
     config: VesselConfig
     motion: Motion
+    rig: RigConfig
     harbour: Harbour | None
+    docks: tuple[MovingDock, ...]
 
 
 def bl_scenario(case: int, noise: GnssNoise, *, false_fraction: float = 0.4) -> Scenario:
@@ -115,40 +133,82 @@ def bl_scenario(case: int, noise: GnssNoise, *, false_fraction: float = 0.4) -> 
 
 
 def harbour_scenarios() -> dict[str, Scenario]:
-    """Return the scenarios that lie in a harbour, by name: BL's three cases under each kind of GNSS trouble.
+    """Return the scenarios that lie in a harbour, by name.
 
-    From fix to fix the receiver scatters by 5 cm; what it claims is BL's 0.3 m. So the largest error of a drifting
-    signal is that of BL table 4.1, whose truth was the receiver itself.
+    BL's three cases under each kind of GNSS trouble; docking at a quay and at a floating dock in each of Digerud's
+    conditions while GNSS drifts; and half an hour through all of it.
     """
     found = {}
     for case, (harbour, route) in {1: ("marina", "entry"), 2: ("basin", "turn"), 3: ("marina", "still")}.items():
         for name, noise in (("clean", "clean"), ("drift", "drift"), ("jump", "jump"), ("outage", "drift")):
             base = bl_scenario(case, noise)  # type: ignore[arg-type]
             outage = (0.4 * base.duration_s, 0.6 * base.duration_s) if name == "outage" else None
-            found[f"bl{case}-{name}"] = replace(
-                base,
-                harbour=harbour,
-                route=route,
-                lidar_hz=1.0,
-                tide_m=0.2,
-                outage_s=outage,
-                gnss_sigma_m=0.05,
-                gnss_reported_sigma_m=base.gnss_sigma_m,
+            found[f"bl{case}-{name}"] = _in_harbour(base, harbour=harbour, route=route, outage_s=outage)
+    docking = replace(bl_scenario(1, "drift"), path="dock", pose_hz=0.0, camera_hz=5.0, wave_heave_m=0.05)
+    for kind in ("fixed", "floating"):
+        for condition in WEATHER:
+            found[f"dock-{kind}-{condition}"] = _in_harbour(
+                docking, harbour="marina", route=f"dock_{kind}", condition=condition
             )
+    long = replace(bl_scenario(1, "varied"), path="tour", duration_s=1800.0, camera_hz=1.0)
+    found["long"] = _in_harbour(long, harbour="marina", route="long", outage_s=(990.0, 1050.0), condition="fog")
     return found
+
+
+def find_scenario(name: str, changes: Mapping[str, str]) -> Scenario:
+    """Return a scenario by name, with some of its fields changed.
+
+    Raises:
+        ConfigError: there is none of that name, no such field, or a value that it cannot have.
+    """
+    known = harbour_scenarios()
+    if name not in known:
+        raise ConfigError(f"scenario '{name}': unknown; there are: {', '.join(known)}")
+    fields = {f.name: getattr(known[name], f.name) for f in dataclasses.fields(Scenario)}
+    for key in changes:
+        if key not in fields:
+            near = difflib.get_close_matches(key, fields, 1)
+            raise ConfigError(
+                f"--set {key}: a scenario has no such field" + (f"; did you mean {near[0]}?" if near else "")
+            )
+    try:
+        changed = TypeAdapter(Scenario).validate_python({**fields, **changes})
+    except ValidationError as error:
+        (first, *_) = error.errors()
+        raise ConfigError(f"--set {first['loc'][0]}={changes.get(str(first['loc'][0]), '')}: {first['msg']}") from None
+    for key in ("duration_s", "imu_hz"):
+        if not 0.0 < getattr(changed, key) < np.inf:
+            raise ConfigError(f"--set {key}={getattr(changed, key):g}: it must be positive")
+    for key in (k for k in fields if k.endswith(("_hz", "_sigma_m", "_fraction"))):
+        if not 0.0 <= getattr(changed, key) < np.inf:
+            raise ConfigError(f"--set {key}={getattr(changed, key):g}: it cannot be negative")
+    return changed
+
+
+def _in_harbour(base: Scenario, **changes: object) -> Scenario:
+    """A scenario with LiDARs, on the tide, its fixes as a receiver reports them.
+
+    Where GNSS errs, the receiver scatters by 5 cm from fix to fix and claims BL's 0.3 m. So the largest error of a
+    drifting signal is that of BL table 4.1, whose truth was the receiver itself.
+    """
+    placed = replace(base, lidar_hz=1.0, tide_m=0.2, gnss_reported_spread=0.3, **changes)  # type: ignore[arg-type]
+    if placed.noise == "clean":
+        return placed
+    return replace(placed, gnss_sigma_m=0.05, gnss_reported_sigma_m=base.gnss_sigma_m)
 
 
 def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
     """Run a scenario. Deterministic for a seed."""
     rng = np.random.default_rng([seed, 7])
     harbour = load_harbour(scenario.harbour) if scenario.harbour else None
+    rig = load_rig(scenario.rig)
     motion = _motion(scenario, rng) if harbour is None else _harbour_motion(scenario, harbour, rng)
     datum = Datum(DATUM) if harbour is None else harbour.datum
-    config, mounts = _config(scenario, motion, datum, rng)
+    config = _config(scenario, rig, motion, datum)
     t = _times(scenario.duration_s, scenario.imu_hz)
-    imu = _imu(scenario, motion, datum, t, mounts["imu"], rng)
+    imu = _imu(scenario, motion, datum, t, (rig.imu.t_body_sensor_m, rig.imu.R_body_sensor), rng)
     drafts: list[Measurement] = []
-    drafts += _gnss(scenario, motion, datum, mounts["gnss"][0], rng)
+    drafts += _gnss(scenario, motion, datum, rig.gnss.t_body_sensor_m, rng)
     drafts += _compass(scenario, motion, rng)
     drafts += _poses(scenario, motion, rng)
     drafts.sort(key=lambda m: (m.stamp_ns, m.sensor))
@@ -163,9 +223,15 @@ def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
         topics={name: sensor.topic for name, sensor in config.sensors.items()},
         truth=truth,
     )
-    return SimulatedRun(
-        scenario=scenario, seed=seed, recording=recording, truth=truth, config=config, motion=motion, harbour=harbour
+    docks = (
+        ()
+        if harbour is None
+        else moving_docks(harbour, scenario.tide_m, scenario.duration_s, np.random.default_rng([seed, 19]))
     )
+    return SimulatedRun(
+        scenario=scenario, seed=seed, recording=recording, truth=truth, config=config, motion=motion, rig=rig,
+        harbour=harbour, docks=docks,
+    )  # fmt: skip
 
 
 def _times(duration_s: float, rate_hz: float) -> Array:
@@ -235,47 +301,63 @@ def _harbour_motion(s: Scenario, harbour: Harbour, rng: np.random.Generator) -> 
         )
     way = Way.through(points)
     harbour.refuse_collision(way.track_m, _CLEAR_M, s.route)
+    if s.path in ("dock", "tour"):
+        swing = Waves.jonswap(rng, np.radians(1.0), 15.0)  # no helmsman holds a course to a hair
+        shape = _docking if s.path == "dock" else _touring
+        return make_way_motion(
+            s.duration_s,
+            way,
+            lambda t: shape(t / s.duration_s),
+            sway.at,
+            waves,
+            0.03,
+            s.tide_m,
+            swing,
+        )
     slowing: Callable[[Array], Array] = lambda t: 1.0 - 0.5 * _ramp(t, 0.8 * s.duration_s, 8.0)
     return make_way_motion(s.duration_s, way, slowing, sway.at, waves, 0.03, s.tide_m)
 
 
-def _config(
-    s: Scenario, motion: Motion, datum: Datum, rng: np.random.Generator
-) -> tuple[VesselConfig, dict[str, tuple[Array, Array]]]:
-    imu_mount = MountConfig(xyz_m=(0.5, -0.2, 1.0), rpy_deg=(2.0, -1.0, 90.0))
-    gnss_mount = MountConfig(xyz_m=(-1.5, 0.3, 2.2789))
+def _docking(share: Array) -> Array:
+    """Speed's shape of a vessel that slows steadily and lies still for the last sixth of its time."""
+    left = 1.0 - share / 0.83
+    return 0.5 * (left + np.sqrt(left**2 + 0.001))
+
+
+def _touring(share: Array) -> Array:
+    """Speed's shape of a tour: a halt of a twentieth of its time amid it, and docking at its end."""
+    halt = _ramp(share, 0.62, 0.004) - _ramp(share, 0.67, 0.004)
+    return (1.0 - halt) * _docking(np.clip((share - 0.85) / 0.15, 0.0, None))
+
+
+def _config(s: Scenario, rig: RigConfig, motion: Motion, datum: Datum) -> VesselConfig:
     start = StartConfig()
     if s.start_heading_error_deg is not None:
         true = float(heading_deg_from_yaw(motion.yaw(0.0)))
         start = StartConfig(heading_deg=(true + s.start_heading_error_deg) % 360.0)
-    sensors = {
+    sensors: dict[str, SensorConfig] = {
         "imu": ImuConfig(
             topic="/imu/data",
-            mount=imu_mount,
+            mount=rig.imu,
             gyro_noise_mdps_per_sqrt_hz=s.gyro_noise_mdps_per_sqrt_hz,
             accel_noise_ug_per_sqrt_hz=s.accel_noise_ug_per_sqrt_hz,
         ),
-        "gnss": GnssConfig(topic="/gnss/fix", mount=gnss_mount),
+        "gnss": GnssConfig(topic="/gnss/fix", mount=rig.gnss),
         "compass": CompassConfig(topic="/gnss/heading", sigma_deg=s.compass_sigma_deg),
         "aerial": PoseConfig(topic="/aerial/pose", axes=("x", "y", "yaw")),
         "height": HeightConfig(height_m=datum.origin.height_m),
     }
-    config = VesselConfig(
-        vessel="simulated Tiara 48",
+    return VesselConfig(
+        vessel=rig.vessel,
         datum=DatumConfig(
             latitude_deg=datum.origin.latitude_deg,
             longitude_deg=datum.origin.longitude_deg,
             height_m=datum.origin.height_m,
         ),
-        sensors=sensors,
+        sensors={name: sensor for name, sensor in sensors.items() if name != "aerial" or s.pose_hz > 0.0},
         truth_topic="/truth",
         start=start,
     )
-    mounts = {
-        "imu": (imu_mount.t_body_sensor_m, imu_mount.R_body_sensor),
-        "gnss": (gnss_mount.t_body_sensor_m, np.eye(3)),
-    }
-    return config, mounts
 
 
 def _imu(
@@ -317,10 +399,13 @@ def _gnss(s: Scenario, motion: Motion, datum: Datum, lever: Array, rng: np.rando
     fixes = p + R @ lever + gnss_error_m(rng, t, s.noise, s.case, s.gnss_sigma_m)
     geodetic = datum.geodetic_from_enu(fixes)
     claimed = s.gnss_reported_sigma_m or s.gnss_sigma_m
-    cov = np.diag([claimed**2, claimed**2, (2.0 * claimed) ** 2])
+    told = np.full(len(t), claimed)
+    if s.gnss_reported_spread > 0.0:
+        told = reported_sigma_m(rng, t, claimed, s.gnss_reported_spread)
+    shape = np.diag([1.0, 1.0, 4.0])
     return [
-        GnssPosition(stamp_ns=int(n), sensor="gnss", seq=0, position=Geodetic(*g), cov_enu_m2=cov)
-        for n, g, silent in zip(_stamps(t), geodetic, _silent(s, t), strict=True)
+        GnssPosition(stamp_ns=int(n), sensor="gnss", seq=0, position=Geodetic(*g), cov_enu_m2=sigma**2 * shape)
+        for n, g, sigma, silent in zip(_stamps(t), geodetic, told, _silent(s, t), strict=True)
         if not silent
     ]
 

@@ -152,8 +152,12 @@ def make_way_motion(
     waves: tuple[Waves, Waves, Waves],
     lean_per_mps2: float,
     tide_m: float,
+    swing: Waves | None = None,
 ) -> Motion:
-    """Build the motion along a way, from end to end in the given time; `slowing` (N,) is the speed's shape."""
+    """Build the motion along a way, from end to end in the given time; `slowing` (N,) is the speed's shape.
+
+    The bow swings about the way's direction by `swing`, rad.
+    """
     t = np.arange(-1.0, duration_s + 1.0 + _STEP_S, _STEP_S)
     shape = slowing(t)
     travelled = np.concatenate([[0.0], np.cumsum(0.5 * (shape[1:] + shape[:-1]) * np.diff(t))])
@@ -161,11 +165,12 @@ def make_way_motion(
     speed, at = CubicSpline(t, scale * shape), CubicSpline(t, scale * travelled)
     before = float(at(0.0))
     first = float(way.heading(0.0))
+    swing = Waves(*np.zeros((3, 1))) if swing is None else swing
     return make_motion(
         duration_s,
         speed,
-        lambda s: way.heading(at(s), 1) * speed(s),
-        float(way.heading(before)),
+        lambda s: way.heading(at(s), 1) * speed(s) + swing.at(s, 1),
+        float(way.heading(before) + swing.at(np.zeros(1))[0]),
         sway_mps,
         waves,
         lean_per_mps2,

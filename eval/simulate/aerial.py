@@ -2,7 +2,7 @@
 """An aerial image of a harbour, as cluttered as a real one, written as GeoTIFF in UTM.
 
 Grid north of UTM differs from true north by the meridian convergence, so what reads the image has to
-handle it. The image is taken on another day than the run: other boats, its own sun; and it is
+handle it. The image is taken on another day than the run: other boats, its own season and sun; and it is
 misregistered: what it shows lies `shift_m` off.
 """
 
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,7 +24,7 @@ from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
 
 from graphloc.errors import OutputError
-from graphloc.eval.simulate.harbour import Boat, Harbour
+from graphloc.eval.simulate.harbour import Boat, Dock, Harbour, Solid
 from graphloc.frames import Array, Datum
 
 Image = NDArray[np.uint8]
@@ -36,6 +37,23 @@ _SURFACES = {
     "grass": ((96, 116, 70), 14.0), "roof": ((126, 78, 66), 8.0), "stone": ((150, 147, 140), 16.0),
 }  # fmt: skip
 _WATER, _WATER_NOISE = (38, 62, 72), 6.0
+
+
+class _Season(NamedTuple):
+    """Colour of grass and water, share of the boats that lie there, brightness, and how bare its light is."""
+
+    grass: tuple[int, int, int]
+    water: tuple[int, int, int]
+    boats: float
+    light: float
+
+
+_SEASONS = (
+    _Season((96, 116, 70), _WATER, 1.0, 1.0),  # summer
+    _Season((128, 118, 76), (46, 60, 62), 0.8, 0.95),  # autumn
+    _Season((150, 146, 138), (52, 58, 62), 0.4, 0.85),  # winter: boats ashore, grass under frost
+    _Season((104, 122, 60), (34, 66, 70), 0.9, 1.03),  # spring
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,11 +119,14 @@ def render(harbour: Harbour, seed: int, pixel_m: float = 0.16, shift_sigma_m: fl
     left, top = float(np.floor(corners[:, 0].min())), float(np.ceil(corners[:, 1].max()))
     columns, rows = (int(np.ceil(v / pixel_m)) for v in (corners[:, 0].max() - left, top - corners[:, 1].min()))
     shift = rng.normal(0.0, shift_sigma_m, 2)
-    pen = _Pen(rng, harbour.datum, epsg, left, top, pixel_m / _FINE, (rows * _FINE, columns * _FINE), shift)
-    _draw(pen, harbour, rng)
+    season = _SEASONS[rng.integers(len(_SEASONS))]
+    pen = _Pen(
+        rng, harbour.datum, epsg, left, top, pixel_m / _FINE, (rows * _FINE, columns * _FINE), shift, season.water
+    )  # fmt: skip
+    _draw(pen, harbour, season, rng)
     fine = pen.canvas.reshape(rows, _FINE, columns, _FINE, 3).mean(axis=(1, 3))
     soft = cv2.GaussianBlur(fine, (0, 0), rng.uniform(0.5, 0.9))
-    noisy = soft * rng.uniform(0.9, 1.08) + rng.normal(0.0, 3.0, soft.shape)
+    noisy = soft * season.light * rng.uniform(0.9, 1.08) + rng.normal(0.0, 3.0, soft.shape)
     coded = cv2.imencode(".jpg", np.clip(noisy, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 82])[1]
     pixels = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), dtype=np.uint8)
     return AerialImage(pixels, epsg, left, top, pixel_m, shift)
@@ -116,12 +137,12 @@ class _Pen:
 
     def __init__(
         self, rng: np.random.Generator, datum: Datum, epsg: int, left: float, top: float, pixel_m: float,
-        shape: tuple[int, int], shift_m: Array,
+        shape: tuple[int, int], shift_m: Array, water: tuple[int, int, int],
     ) -> None:  # fmt: skip
         self._rng, self._datum, self._epsg = rng, datum, epsg
         self._left, self._top, self.pixel_m, self._shift = left, top, pixel_m, shift_m
         self.canvas: Canvas = np.empty((*shape, 3), dtype=np.float32)
-        self.canvas[:] = _WATER
+        self.canvas[:] = water
         self.mottle(self.canvas, np.ones(shape, dtype=bool), _WATER_NOISE, (0.4, 2.0, 9.0))
 
     def pixels(self, p_m: Array) -> NDArray[np.int32]:
@@ -174,23 +195,28 @@ class _Pen:
             part[inside] += grain[inside, None] / len(sizes_m)
 
 
-def _draw(pen: _Pen, harbour: Harbour, rng: np.random.Generator) -> None:
+def _draw(pen: _Pen, harbour: Harbour, season: _Season, rng: np.random.Generator) -> None:
     azimuth, slant = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.5, 1.4)
     sun = slant * np.array([np.cos(azimuth), np.sin(azimuth)])  # a shadow's tip, per metre of height
     depth = float(rng.uniform(0.45, 0.65))
-    ground = [*harbour.quays, *harbour.pontoons]
+    ground: list[tuple[shapely.Polygon, Solid | Dock]] = [*harbour.quays, *harbour.pontoons]
+    for polygon, dock in harbour.docks:  # wherever it lay that day
+        moved = shapely.affinity.rotate(polygon, rng.uniform(-dock.moves_deg, dock.moves_deg))
+        ground.append((shapely.affinity.translate(moved, *rng.uniform(-dock.moves_m, dock.moves_m, 2)), dock))
     for polygon, solid in ground:
         pen.shade(np.array(polygon.exterior.coords), sun * solid.top_m, depth)
     for polygon, solid in ground:
         outline = np.array(polygon.exterior.coords)
-        part, inside = pen.fill(outline, *_SURFACES[solid.surface])
+        colour, noise = _SURFACES[solid.surface]
+        part, inside = pen.fill(outline, season.grass if solid.surface == "grass" else colour, noise)
         around = part[~inside].copy()
         _joints_and_cars(pen, polygon, solid.surface, rng)
         part[~inside] = around  # they end where it does
         for a, b in pairwise(outline):
             pen.line(a, b, (196, 193, 184), 0.35)  # its kerb
     for boat in harbour.boats(rng):
-        _boat(pen, boat, sun, depth, rng)
+        if rng.uniform() < season.boats:
+            _boat(pen, boat, sun, depth, rng)
     for polygon, solid in harbour.buildings:
         outline = np.array(polygon.exterior.coords)
         pen.shade(outline, sun * solid.top_m * 0.6, depth)

@@ -1,32 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a simulated run as a recording: a bag of standard messages, its vessel.yaml, and the aerial image."""
+"""Write a simulated run as a recording: a bag of standard messages, its vessel.yaml, image and survey."""
 
 from __future__ import annotations
 
 import heapq
 import json
+import os
 import shutil
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from ruamel.yaml import YAML
-from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
 
 from graphloc.config import effective
 from graphloc.errors import OutputError
+from graphloc.eval.simulate._messages import TF, Messages
 from graphloc.eval.simulate._scenario import SimulatedRun
-from graphloc.frames import Array
-from graphloc.measurements import AXES, CompassHeading, GnssPosition, PoseFix
+from graphloc.eval.simulate.aerial import render
+from graphloc.eval.simulate.camera import Camera
+from graphloc.eval.simulate.docks import survey, tag_pose
+from graphloc.eval.simulate.lidar import scan
+from graphloc.eval.simulate.scene import Scene, scene_of
+from graphloc.measurements import CompassHeading, GnssPosition, PoseFix
 from graphloc.recording import Progress
-
-if TYPE_CHECKING:
-    from graphloc.eval.simulate.lidar import Scan
 
 _LATENCY_NS = {
     "/imu/data": 2_000_000,
@@ -35,8 +39,9 @@ _LATENCY_NS = {
     "/aerial/pose": 400_000_000,
 }
 _CLOUD_LATENCY_NS = 130_000_000  # a turn, and the driver
-_TF = "tf2_msgs/msg/TFMessage"
-_IMAGE, _TRUTH = "aerial.tif", "truth.json"
+_IMAGE_LATENCY_NS = 80_000_000
+_TRUTH_HZ = 20.0
+_CONFIG, _AERIAL, _TAGS, _TRUTH = "vessel.yaml", "aerial.tif", "tags.yaml", "truth.json"
 
 
 class _Item(NamedTuple):
@@ -60,76 +65,123 @@ def write_bag(
     """Write `run` into `folder`; return the paths of the bag and of its vessel.yaml.
 
     Header stamps are the sensors'; log stamps come later by each sensor's latency. A pose message holds
-    one mode: the first. A run in a harbour gets its aerial image, and LiDAR scans where the scenario has
-    them; they are cast while the bag is written, one at a time, so memory does not grow with the run.
+    one mode: the first. A run in a harbour gets its aerial image and the survey of its tags, and scans and images
+    where the scenario has them; they are made while the bag is written, a few at a time, so memory does not grow
+    with the run.
 
     Raises:
         OutputError: the folder exists, or the disk refuses.
     """
-    bag, config = folder / ("run.bag" if ros == 1 else "run"), folder / "vessel.yaml"
+    bag, config = folder / ("run.bag" if ros == 1 else "run"), folder / _CONFIG
     if folder.exists():
         if not (overwrite and config.exists()):
             raise OutputError(f"{folder}: exists already")
         shutil.rmtree(folder)
     folder.mkdir(parents=True)
-    make = _Messages(ros)
+    with config.open("w", encoding="utf-8") as stream:
+        YAML(typ="safe", pure=True).dump(effective(run.config), stream)
+    if run.harbour is not None:
+        _beside(run, folder)
+    make = Messages(ros)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     serialize = make.store.serialize_ros1 if ros == 1 else make.store.serialize_cdr
-    start, whole_s = int(run.truth.stamps_ns[0]), round(run.scenario.duration_s)
-    with Writer1(bag) if ros == 1 else Writer2(bag, version=9, storage_plugin=plugin) as writer:
+    start, whole_s = _start_ns(run), round(run.scenario.duration_s)
+    writing = Writer1(bag) if ros == 1 else Writer2(bag, version=9, storage_plugin=plugin)
+    # BLAS's own threads spin on our thin products: without them images cost half.
+    with threadpool_limits(1, user_api="blas"), writing as writer:
         connections: dict[str, Any] = {}
         done_s = 0
-        for item in heapq.merge(_small(run, make), _clouds(run, make), key=lambda item: item.log_ns):
+        for item in heapq.merge(_small(run, make), *_seen(run, make), key=lambda item: item.log_ns):
             if item.topic not in connections:
                 connections[item.topic] = writer.add_connection(item.topic, item.kind, typestore=make.store)
             writer.write(connections[item.topic], item.log_ns, serialize(item.message, item.kind))
             if (item.log_ns - start) // 10**9 > done_s:
                 done_s = min((item.log_ns - start) // 10**9, whole_s)
                 progress("writing the bag", done_s, whole_s)
-    with config.open("w", encoding="utf-8") as stream:
-        YAML(typ="safe", pure=True).dump(effective(run.config), stream)
-    if run.harbour is not None:
-        _image(run, folder)
     return bag, config
 
 
-def _image(run: SimulatedRun, folder: Path) -> None:
-    """The aerial image, and beside it what only a simulator knows."""
-    from graphloc.eval.simulate.aerial import render
+def _start_ns(run: SimulatedRun) -> int:
+    return int(run.truth.stamps_ns[0])
 
+
+def _beside(run: SimulatedRun, folder: Path) -> None:
+    """The aerial image, the survey of the tags, and what only a simulator knows."""
     assert run.harbour is not None
     image = render(run.harbour, run.seed)
-    image.write(folder / _IMAGE)
+    image.write(folder / _AERIAL)
+    tags = run.harbour.config.tags
+    if tags:
+        with (folder / _TAGS).open("w", encoding="utf-8") as stream:
+            YAML(typ="safe", pure=True).dump(survey(run.harbour, np.random.default_rng([run.seed, 23])), stream)
     secret = {
+        "scenario": run.scenario.condition,
         "harbour": run.harbour.config.name,
         "seed": run.seed,
         "tide_m": run.scenario.tide_m,
         "image_shows_things_east_north_m": [round(float(v), 4) for v in image.shift_m],
+        "tags": {
+            tag.number: {"frame": tag.dock or "world", "xyz_m": p.tolist(), "R": R.round(12).tolist()}
+            for tag in tags
+            for p, R in [tag_pose(tag, run.harbour)]
+        },
     }
     (folder / _TRUTH).write_text(json.dumps(secret, indent=1) + "\n", encoding="utf-8")
 
 
-def _clouds(run: SimulatedRun, make: _Messages) -> Iterator[_Item]:
-    """LiDAR scans in turn; all LiDARs turn together."""
-    if run.harbour is None or run.scenario.lidar_hz <= 0.0:
-        return
-    from graphloc.eval.simulate.lidar import Scene, bl_lidars, scan
+def _seen(run: SimulatedRun, make: Messages) -> list[Iterator[_Item]]:
+    """Scans and images, if the run has any."""
+    s = run.scenario
+    with_lidars, with_cameras = s.lidar_hz > 0.0 and bool(run.rig.lidars), s.camera_hz > 0.0 and bool(run.rig.cameras)
+    if run.harbour is None or not (with_lidars or with_cameras):
+        return []
+    scene = scene_of(run)
+    found = [_images(run, make, scene, name) for name in run.rig.cameras] if with_cameras else []
+    return [_clouds(run, make, scene), *found] if with_lidars else found
 
-    rng = np.random.default_rng([run.seed, 13])
-    scene, lidars = Scene(run.harbour, run.harbour.boats(rng), run.scenario.tide_m), bl_lidars()
-    start = int(run.truth.stamps_ns[0])
+
+def _clouds(run: SimulatedRun, make: Messages, scene: Scene) -> Iterator[_Item]:
+    """LiDAR scans in turn; all LiDARs turn together."""
+    rng = np.random.default_rng([run.seed, 14])
     for k in range(int((run.scenario.duration_s - 0.2) * run.scenario.lidar_hz)):
         t = k / run.scenario.lidar_hz
-        for lidar in lidars:
-            found = scan(lidar, scene, run.motion, t, rng)
-            stamp = start + round(t * 1e9)
-            log_ns = stamp + _CLOUD_LATENCY_NS
-            yield _Item(log_ns, f"/{lidar.name}/points", "sensor_msgs/msg/PointCloud2", make.cloud(stamp, found))
+        stamp = _start_ns(run) + round(t * 1e9)
+        for name, lidar in run.rig.lidars.items():
+            cloud = make.cloud(stamp, scan(name, lidar, scene, run.motion, t, rng))
+            yield _Item(stamp + _CLOUD_LATENCY_NS, f"/{name}/points", "sensor_msgs/msg/PointCloud2", cloud)
 
 
-def _small(run: SimulatedRun, make: _Messages) -> list[_Item]:
+def _images(run: SimulatedRun, make: Messages, scene: Scene, name: str) -> Iterator[_Item]:
+    """A camera's images in turn, each with its `CameraInfo`; some are made ahead, one on each core."""
+    s, config, frame = run.scenario, run.rig.cameras[name], f"{name}_optical_frame"
+    camera = Camera(config, scene, run)
+
+    def take(k: int) -> list[_Item]:
+        t = (k + 0.3) / s.camera_hz
+        stamp = _start_ns(run) + round(t * 1e9)
+        log_ns = stamp + _IMAGE_LATENCY_NS
+        kind, image = make.image(stamp, frame, camera.take(t, k).pixels, s.camera_raw)
+        topic = f"/{name}/image_raw" if s.camera_raw else f"/{name}/image_raw/compressed"
+        info = make.camera_info(stamp, frame, config)
+        return [
+            _Item(log_ns, topic, kind, image),
+            _Item(log_ns, f"/{name}/camera_info", "sensor_msgs/msg/CameraInfo", info),
+        ]
+
+    workers = len(os.sched_getaffinity(0))
+    with ThreadPoolExecutor(workers) as pool:
+        ahead: deque[Future[list[_Item]]] = deque()
+        for k in range(int((s.duration_s - 0.2) * s.camera_hz)):
+            ahead.append(pool.submit(take, k))
+            if len(ahead) > 2 * workers:
+                yield from ahead.popleft().result()
+        while ahead:
+            yield from ahead.popleft().result()
+
+
+def _small(run: SimulatedRun, make: Messages) -> list[_Item]:
     """All other messages, by the time of their recording."""
-    items: list[_Item] = [_Item(int(run.truth.stamps_ns[0]), "/tf_static", _TF, make.mounts(run))]
+    items: list[_Item] = [_Item(_start_ns(run), "/tf_static", TF, make.mounts(_start_ns(run), _mounts(run)))]
 
     def add(stamp: int, topic: str, kind: str, message: Any) -> None:
         items.append(_Item(stamp + _LATENCY_NS.get(topic, 0), topic, kind, message))
@@ -145,130 +197,24 @@ def _small(run: SimulatedRun, make: _Messages) -> list[_Item]:
             add(m.stamp_ns, "/gnss/heading", "geometry_msgs/msg/QuaternionStamped", make.heading(m))
         elif isinstance(m, PoseFix):
             add(m.stamp_ns, "/aerial/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", make.pose(m))
-    truth = run.truth
-    assert truth.v_world_mps is not None
-    every = slice(None, None, 5)
-    columns = (
-        truth.stamps_ns[every].tolist(),
-        truth.p_world_m[every],
-        truth.R_world_body[every],
-        truth.v_world_mps[every],
-    )
-    for stamp, p, R, v in zip(*columns, strict=True):
+    t = np.arange(round(run.scenario.duration_s * _TRUTH_HZ)) / _TRUTH_HZ
+    stamps = (_start_ns(run) + np.rint(t * 1e9).astype(np.int64)).tolist()
+    for stamp, p, R, v in zip(stamps, *run.motion.pose(t), strict=True):
         add(stamp, "/truth", "nav_msgs/msg/Odometry", make.odometry(stamp, p, R, v))
+    for dock in run.docks:
+        at, turned = dock.pose(t)
+        for stamp, p, R, v in zip(stamps, at, turned, np.gradient(at, 1.0 / _TRUTH_HZ, axis=0), strict=True):
+            message = make.odometry(stamp, p, R, v, child=dock.dock.name)
+            add(stamp, f"/truth/{dock.dock.name}", "nav_msgs/msg/Odometry", message)
     return sorted(items, key=lambda item: item.log_ns)
 
 
-class _Messages:
-    """Makes messages of one ROS version."""
-
-    def __init__(self, ros: int) -> None:
-        self._ros = ros
-        self.store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
-        if _TF not in self.store.types:
-            self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TF))
-        self._t = self.store.types
-
-    def _header(self, stamp_ns: int, frame: str) -> Any:
-        time = self._t["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-        extra = {"seq": 0} if self._ros == 1 else {}
-        return self._t["std_msgs/msg/Header"](**extra, stamp=time, frame_id=frame)
-
-    def _vector(self, v: Array) -> Any:
-        return self._t["geometry_msgs/msg/Vector3"](*map(float, v))
-
-    def _quaternion(self, R: Rotation) -> Any:
-        return self._t["geometry_msgs/msg/Quaternion"](*map(float, R.as_quat()))
-
-    def _pose(self, p: Array, R: Rotation, cov: Array) -> Any:
-        place = self._t["geometry_msgs/msg/Point"](*map(float, p))
-        inner = self._t["geometry_msgs/msg/Pose"](position=place, orientation=self._quaternion(R))
-        return self._t["geometry_msgs/msg/PoseWithCovariance"](pose=inner, covariance=cov.reshape(36))
-
-    def imu(self, stamp_ns: int, accel: Array, gyro: Array) -> Any:
-        return self._t["sensor_msgs/msg/Imu"](
-            header=self._header(stamp_ns, "imu_link"),
-            orientation=self._t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-            orientation_covariance=np.array([-1.0] + [0.0] * 8),
-            angular_velocity=self._vector(gyro),
-            angular_velocity_covariance=np.zeros(9),
-            linear_acceleration=self._vector(accel),
-            linear_acceleration_covariance=np.zeros(9),
-        )
-
-    def fix(self, m: GnssPosition) -> Any:
-        return self._t["sensor_msgs/msg/NavSatFix"](
-            header=self._header(m.stamp_ns, "gnss"),
-            status=self._t["sensor_msgs/msg/NavSatStatus"](status=1, service=1),
-            latitude=m.position.latitude_deg,
-            longitude=m.position.longitude_deg,
-            altitude=m.position.height_m,
-            position_covariance=np.array(m.cov_enu_m2).reshape(9),
-            position_covariance_type=2,
-        )
-
-    def heading(self, m: CompassHeading) -> Any:
-        quaternion = self._quaternion(Rotation.from_euler("z", m.yaw_rad))
-        return self._t["geometry_msgs/msg/QuaternionStamped"](
-            header=self._header(m.stamp_ns, "gnss"), quaternion=quaternion
-        )
-
-    def pose(self, m: PoseFix) -> Any:
-        mode, cov, values = m.modes[0], np.zeros((6, 6)), np.zeros(6)
-        picked = [AXES.index(a) for a in m.axes]
-        cov[np.ix_(picked, picked)], values[picked] = mode.cov, mode.value
-        pose = self._pose(values[:3], Rotation.from_euler("xyz", values[3:]), cov)
-        return self._t["geometry_msgs/msg/PoseWithCovarianceStamped"](header=self._header(m.stamp_ns, "map"), pose=pose)
-
-    def odometry(self, stamp_ns: int, p: Array, R: Array, v: Array) -> Any:
-        none = np.zeros((6, 6))
-        twist = self._t["geometry_msgs/msg/Twist"](linear=self._vector(R.T @ v), angular=self._vector(np.zeros(3)))
-        return self._t["nav_msgs/msg/Odometry"](
-            header=self._header(stamp_ns, "map"),
-            child_frame_id="base_link",
-            pose=self._pose(p, Rotation.from_matrix(R), none),
-            twist=self._t["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=none.reshape(36)),
-        )
-
-    def cloud(self, stamp_ns: int, scan: Scan) -> Any:
-        """A `PointCloud2`: x, y, z (m), intensity, ring, and time since the header's stamp (s)."""
-        layout = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u2"), ("time", "f4")]
-        points = np.zeros(len(scan.points_m), dtype=np.dtype([(n, f"<{k}") for n, k in layout]))
-        for k, name in enumerate("xyz"):
-            points[name] = scan.points_m[:, k]
-        points["intensity"], points["ring"], points["time"] = scan.intensity, scan.ring, scan.dt_s
-        field = self._t["sensor_msgs/msg/PointField"]
-        kinds = {"f4": 7, "u2": 4}  # PointField.FLOAT32, UINT16
-        offsets = {name: points.dtype.fields[name][1] for name, _ in layout} if points.dtype.fields else {}
-        return self._t["sensor_msgs/msg/PointCloud2"](
-            header=self._header(stamp_ns, scan.lidar),
-            height=1,
-            width=len(points),
-            fields=[field(name=n, offset=offsets[n], datatype=kinds[k], count=1) for n, k in layout],
-            is_bigendian=False,
-            point_step=points.dtype.itemsize,
-            row_step=points.nbytes,
-            data=points.view(np.uint8).reshape(-1),
-            is_dense=True,
-        )
-
-    def mounts(self, run: SimulatedRun) -> Any:
-        """`/tf_static`: where every sensor sits."""
-        frames = {"imu_link": run.config.sensors["imu"].mount, "gnss": run.config.sensors["gnss"].mount}
-        poses = {name: (mount.t_body_sensor_m, mount.R_body_sensor) for name, mount in frames.items()}
-        if run.harbour is not None and run.scenario.lidar_hz > 0.0:
-            from graphloc.eval.simulate.lidar import bl_lidars
-
-            poses |= {lidar.name: (lidar.T_body_lidar[:3, 3], lidar.T_body_lidar[:3, :3]) for lidar in bl_lidars()}
-        stamp = int(run.truth.stamps_ns[0])
-        stamped = [
-            self._t["geometry_msgs/msg/TransformStamped"](
-                header=self._header(stamp, "base_link"),
-                child_frame_id=name,
-                transform=self._t["geometry_msgs/msg/Transform"](
-                    translation=self._vector(t), rotation=self._quaternion(Rotation.from_matrix(R))
-                ),
-            )
-            for name, (t, R) in poses.items()
-        ]
-        return self._t[_TF](transforms=stamped)
+def _mounts(run: SimulatedRun) -> dict[str, Any]:
+    """Where each sensor whose messages are in the bag sits in body, by frame."""
+    rig, s = run.rig, run.scenario
+    found = {"imu_link": rig.imu, "gnss": rig.gnss}
+    if run.harbour is not None and s.lidar_hz > 0.0:
+        found |= {name: lidar.mount for name, lidar in rig.lidars.items()}
+    if run.harbour is not None and s.camera_hz > 0.0:
+        found |= {f"{name}_optical_frame": camera.mount for name, camera in rig.cameras.items()}
+    return {frame: (mount.t_body_sensor_m, mount.R_body_sensor) for frame, mount in found.items()}

@@ -10,23 +10,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 import shapely
-from pydantic import Field, ValidationError
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from pydantic import Field
 from shapely import affinity, ops
 from shapely.validation import explain_validity
 
-from graphloc.config import Block, DatumConfig, Finite, Positive, one_line
+from graphloc.config import Block, DatumConfig, Finite, NonNegative, Positive
 from graphloc.errors import ConfigError
+from graphloc.eval.simulate._files import load_block, shipped_names, validated
 from graphloc.frames import Array, Datum, yaw_from_heading_deg
 
 Point = tuple[Finite, Finite]
 Outline = Annotated[tuple[Point, ...], Field(min_length=3)]
+Surface = Literal["concrete", "asphalt", "wood", "grass", "roof", "stone"]
 _SHIPPED = resources.files("graphloc.eval.simulate") / "harbours"
 
 
@@ -46,8 +45,8 @@ class Solid(Block):
     """Corners, east and north, m; the last one is joined to the first."""
     top_m: Finite
     """Height of the top over mean water (a pontoon: over the water), m."""
-    surface: Literal["concrete", "asphalt", "wood", "grass", "roof", "stone"] = "concrete"
-    """What it looks like from above."""
+    surface: Surface = "concrete"
+    """What it looks like."""
     repeat: Repeat | None = None
     """Copies of it."""
 
@@ -80,6 +79,42 @@ class Berth(Block):
     """Copies of it."""
 
 
+class Dock(Block):
+    """A floating dock on slack chains: it rises with the tide and wanders about its place at rest."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    """For tags, topics and routes."""
+    outline: Outline
+    """Corners at rest, east and north, m."""
+    top_m: Finite
+    """Height of its deck over the water, m."""
+    surface: Surface = "concrete"
+    """What it looks like."""
+    moves_m: NonNegative = 0.3
+    """How far it wanders east and north, m."""
+    moves_deg: NonNegative = 1.5
+    """How far it turns, deg."""
+    period_s: Positive = 25.0
+    """Period of its wandering, s."""
+
+
+class Tag(Block):
+    """An AprilTag of the family 36h11 on a plate, 1.21 times as wide as the tag (D 3.2.2)."""
+
+    number: Annotated[int, Field(ge=0, le=586)]
+    """Its id."""
+    at: Point
+    """Its middle, east and north, m; of one on a dock: with the dock at rest."""
+    height_m: Finite
+    """Of its middle over mean water; of one on a dock: over the water, m."""
+    facing_deg: Finite
+    """Where its printed face looks, from true north, clockwise, deg."""
+    size_m: Positive = 0.412
+    """Between the outer corners of the black square, m."""
+    dock: str = ""
+    """The dock it rides on; empty: it stands still."""
+
+
 class HarbourConfig(Block):
     """A whole harbour file."""
 
@@ -94,7 +129,11 @@ class HarbourConfig(Block):
     buildings: tuple[Solid, ...] = ()
     """Houses and sheds on the quays."""
     pontoons: tuple[Solid, ...] = ()
-    """Floating docks: they rise with the tide."""
+    """Pontoons between piles: they rise with the tide."""
+    docks: tuple[Dock, ...] = ()
+    """Floating docks: they rise with the tide and wander."""
+    tags: tuple[Tag, ...] = ()
+    """AprilTags."""
     poles: tuple[Pole, ...] = ()
     """Poles."""
     berths: tuple[Berth, ...] = ()
@@ -128,7 +167,7 @@ class Harbour:
     """A harbour that was checked, its copies spelt out.
 
     Attributes:
-        config: the file. datum: its datum. quays, buildings, pontoons: (polygon, block) each. poles: (at, block).
+        config: the file. datum: its datum. quays, buildings, pontoons, docks: (polygon, block) each. poles: (at, block).
     """
 
     config: HarbourConfig
@@ -136,6 +175,7 @@ class Harbour:
     quays: tuple[tuple[shapely.Polygon, Solid], ...]
     buildings: tuple[tuple[shapely.Polygon, Solid], ...]
     pontoons: tuple[tuple[shapely.Polygon, Solid], ...]
+    docks: tuple[tuple[shapely.Polygon, Dock], ...]
     poles: tuple[tuple[Array, Pole], ...]
 
     def boats(self, rng: np.random.Generator) -> tuple[Boat, ...]:
@@ -174,6 +214,7 @@ class Harbour:
         solids = [("quay", polygon) for polygon, _ in self.quays] + [
             ("pontoon", polygon) for polygon, _ in self.pontoons
         ]
+        solids += [(f"dock '{dock.name}'", polygon.buffer(dock.moves_m)) for polygon, dock in self.docks]
         solids += [("pole", shapely.Point(at)) for at, _ in self.poles]
         for kind, solid in solids:
             away = way.distance(solid)
@@ -190,16 +231,21 @@ def _shifts(repeat: Repeat | None) -> Iterator[Array]:
         yield k * np.array(repeat.step_m if repeat else (0.0, 0.0))
 
 
+def _polygon(outline: Outline, where: str) -> shapely.Polygon:
+    polygon = shapely.Polygon(outline)
+    if not polygon.is_valid or polygon.area < 1e-3:
+        why = explain_validity(polygon) if not polygon.is_valid else "it has no area"
+        raise ConfigError(f"{where}.outline: not a polygon that can be built ({why})")
+    return polygon
+
+
 def _polygons(kind: str, solids: Sequence[Solid], where: str) -> tuple[tuple[shapely.Polygon, Solid], ...]:
-    found = []
-    for k, solid in enumerate(solids):
-        polygon = shapely.Polygon(solid.outline)
-        if not polygon.is_valid or polygon.area < 1e-3:
-            why = explain_validity(polygon) if not polygon.is_valid else "it has no area"
-            raise ConfigError(f"{where}: {kind}.{k}.outline: not a polygon that can be built ({why})")
-        for shift in _shifts(solid.repeat):
-            found.append((affinity.translate(polygon, *shift), solid))
-    return tuple(found)
+    return tuple(
+        (affinity.translate(polygon, *shift), solid)
+        for k, solid in enumerate(solids)
+        for polygon in [_polygon(solid.outline, f"{where}: {kind}.{k}")]
+        for shift in _shifts(solid.repeat)
+    )
 
 
 def make_harbour(raw: Mapping[str, object], where: str) -> Harbour:
@@ -208,28 +254,38 @@ def make_harbour(raw: Mapping[str, object], where: str) -> Harbour:
     Raises:
         ConfigError: one line that names the file, the block and what is wrong with it.
     """
-    try:
-        config = HarbourConfig.model_validate(raw)
-    except ValidationError as error:
-        raise ConfigError(one_line(error, HarbourConfig, where, "")) from None
+    return _built(validated(raw, where, HarbourConfig), where)
+
+
+def _built(config: HarbourConfig, where: str) -> Harbour:
     west, south, east, north = config.image_m
     if not (west < east and south < north):
         raise ConfigError(f"{where}: image_m: west, south, east, north; the image has no area")
+    _refuse_doubles("docks", "name", [d.name for d in config.docks], where)
+    _refuse_doubles("tags", "number", [t.number for t in config.tags], where)
+    for k, tag in enumerate(config.tags):
+        if tag.dock and tag.dock not in {d.name for d in config.docks}:
+            raise ConfigError(f"{where}: tags.{k}.dock: there is no dock '{tag.dock}'")
     return Harbour(
         config=config,
         datum=Datum(config.datum.geodetic),
         quays=_polygons("quays", config.quays, where),
         buildings=_polygons("buildings", config.buildings, where),
         pontoons=_polygons("pontoons", config.pontoons, where),
+        docks=tuple((_polygon(d.outline, f"{where}: docks.{k}"), d) for k, d in enumerate(config.docks)),
         poles=tuple((np.array(p.at) + shift, p) for p in config.poles for shift in _shifts(p.repeat)),
     )
 
 
+def _refuse_doubles(kind: str, key: str, values: Sequence[object], where: str) -> None:
+    for k, value in enumerate(values):
+        if value in values[:k]:
+            raise ConfigError(f"{where}: {kind}.{k}.{key}: {value} is there twice")
+
+
 def shipped() -> tuple[str, ...]:
     """Names of the harbours that come with graphloc."""
-    return tuple(
-        sorted(entry.name.removesuffix(".yaml") for entry in _SHIPPED.iterdir() if entry.name.endswith(".yaml"))
-    )
+    return shipped_names(_SHIPPED)
 
 
 def load_harbour(name_or_path: str) -> Harbour:
@@ -238,19 +294,4 @@ def load_harbour(name_or_path: str) -> Harbour:
     Raises:
         ConfigError: there is none, or it cannot be used.
     """
-    if name_or_path in shipped():
-        text, where = (_SHIPPED / f"{name_or_path}.yaml").read_text(encoding="utf-8"), f"{name_or_path}.yaml"
-    else:
-        path = Path(name_or_path)
-        if not path.exists():
-            raise ConfigError(
-                f"harbour '{name_or_path}': no such file, and none of the shipped ones: {', '.join(shipped())}"
-            )
-        text, where = path.read_text(encoding="utf-8"), str(path)
-    try:
-        raw = YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
-        raise ConfigError(f"{where}: not valid YAML: {' '.join(str(error).split())[:200]}") from None
-    if not isinstance(raw, Mapping):
-        raise ConfigError(f"{where}: the top level must be a mapping")
-    return make_harbour(raw, where)
+    return _built(*load_block("harbour", name_or_path, _SHIPPED, HarbourConfig))

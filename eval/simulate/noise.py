@@ -9,7 +9,7 @@ import numpy as np
 
 from graphloc.frames import Array
 
-GnssNoise = Literal["clean", "drift", "jump", "drift_jump"]
+GnssNoise = Literal["clean", "drift", "jump", "drift_jump", "varied"]
 
 # BL tables 4.1 and 4.2, per case: RMSE of the drifting signal; RMSE and max of the jumping one, m.
 BL_DRIFT_RMSE_M = {1: 1.3567, 2: 1.3658, 3: 1.2847}
@@ -28,10 +28,40 @@ def drift_m(rng: np.random.Generator, t: Array, rmse_m: float) -> Array:
     return np.asarray(curve * rmse_m / np.sqrt((curve**2).sum(axis=1).mean()))
 
 
+def _varied_m(rng: np.random.Generator, t: Array, case: int) -> Array:
+    """Errors (N, 2) of a long run: clear sky, a drift that comes and goes, a jump, and a drift to the end."""
+    share, out = (t - t[0]) / (float(np.ptp(t)) or 1.0), np.zeros((len(t), 2))
+    for begin, end, fades in ((0.2, 0.4, True), (0.6, 1.0, False)):
+        (k,) = np.nonzero((share >= begin) & (share <= end))
+        if len(k):
+            out[k] += drift_m(rng, t[k], BL_DRIFT_RMSE_M[case])
+            if fades:
+                out[k] *= np.clip((end - share[k]) / 0.03, 0.0, 1.0)[:, None]
+    at, angle = rng.uniform(0.44, 0.5), rng.uniform(0.0, 2.0 * np.pi)
+    out[(share >= at) & (share < at + 0.015)] += 10.0 * np.array([np.cos(angle), np.sin(angle)])
+    return out
+
+
+def reported_sigma_m(rng: np.random.Generator, t: Array, sigma_m: float, spread: float) -> Array:
+    """Draw what fixes claim (N,), m: right on average (its mean square is `sigma_m` squared), wandering over 20 s."""
+    log = np.zeros(len(t))
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
+    keep = np.exp(-step / 20.0)
+    kicks = rng.normal(0.0, spread, len(t))
+    log[0] = kicks[0]
+    for k in range(1, len(t)):
+        log[k] = keep * log[k - 1] + np.sqrt(1.0 - keep**2) * kicks[k]
+    claimed = np.exp(log)
+    return np.asarray(sigma_m * claimed / np.sqrt((claimed**2).mean()))
+
+
 def gnss_error_m(rng: np.random.Generator, t: Array, kind: GnssNoise, case: int, white_sigma_m: float) -> Array:
     """Return the error (N, 3) of fixes at t (N,), white noise included; height drifts along at 1.5 times."""
     error = rng.normal(0.0, white_sigma_m, (len(t), 3)) * np.array([1.0, 1.0, 2.0])
     if kind == "clean":
+        return np.asarray(error)
+    if kind == "varied":
+        error[:, :2] += _varied_m(rng, t, case)
         return np.asarray(error)
     white = np.sqrt(2.0) * white_sigma_m
     scale = _QUIET_DRIFT if kind == "jump" else 1.0

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text files of the simulator: shipped ones by name, a user's own by path."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from graphloc.config import Block, one_line
+from graphloc.errors import ConfigError
+
+_Block = TypeVar("_Block", bound=Block)
+
+
+def shipped_names(folder: Traversable) -> tuple[str, ...]:
+    """Names of the YAML files of a folder."""
+    return tuple(sorted(e.name.removesuffix(".yaml") for e in folder.iterdir() if e.name.endswith(".yaml")))
+
+
+def load_block(what: str, name_or_path: str, folder: Traversable, model: type[_Block]) -> tuple[_Block, str]:
+    """Read and validate a file: one of a folder, by name, or a path; return it, and its name for messages.
+
+    Raises:
+        ConfigError: one line that names the file, the block and what is wrong with it.
+    """
+    shipped = shipped_names(folder)
+    if name_or_path in shipped:
+        where = f"{name_or_path}.yaml"
+        text = (folder / where).read_text(encoding="utf-8")
+    else:
+        where, path = name_or_path, Path(name_or_path)
+        if not path.is_file():
+            raise ConfigError(
+                f"{what} '{name_or_path}': no such file, and none of the shipped ones: {', '.join(shipped)}"
+            )
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{where}: cannot be read ({error})") from None
+    try:
+        raw = YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        raise ConfigError(f"{where}: not valid YAML: {' '.join(str(error).split())[:200]}") from None
+    if not isinstance(raw, Mapping):
+        raise ConfigError(f"{where}: the top level must be a mapping")
+    return validated(raw, where, model), where
+
+
+def validated(raw: Mapping[str, object], where: str, model: type[_Block]) -> _Block:
+    """Validate a mapping.
+
+    Raises:
+        ConfigError: one line that names `where`, the block and what is wrong with it.
+    """
+    try:
+        return model.model_validate(dict(raw))
+    except ValidationError as error:
+        raise ConfigError(one_line(error, model, where, "")) from None

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a vessel carries, from a text file: its hull, where IMU and antenna sit, its LiDARs and cameras.
+
+Shipped: `rigs/*.yaml`; docs/simulator.md explains the file.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib import resources
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from graphloc.config import Block, Finite, MountConfig, NonNegative, Positive
+from graphloc.eval.simulate._files import load_block, shipped_names
+from graphloc.eval.simulate.harbour import Outline
+from graphloc.frames import Array
+
+_SHIPPED = resources.files("graphloc.eval.simulate") / "rigs"
+
+LIDAR_MAKES: dict[str, dict[str, float]] = {  # BL table 3.1
+    "bpearl": {"range_m": 100.0, "lowest_deg": 0.0, "highest_deg": 87.19},
+    "helios": {"range_m": 150.0, "lowest_deg": -55.0, "highest_deg": 15.0},
+}
+
+
+class HullConfig(Block):
+    """What of the vessel its own sensors see; metres in body, heights over the waterline."""
+
+    outline: Outline
+    """Corners of the hull, forward and port, m."""
+    top_m: Finite
+    """Height of its deck, m."""
+    cabin: Outline
+    """Corners of the cabin, m."""
+    cabin_top_m: Finite
+    """Height of its roof, m."""
+
+
+class LidarConfig(Block):
+    """A turning LiDAR. With a `make`, only what differs from it is written."""
+
+    make: Literal["bpearl", "helios"] | None = None
+    """A known make, whose figures are the defaults."""
+    mount: MountConfig
+    """Pose of the sensor in body; it turns about its own z axis."""
+    range_m: Positive
+    """Largest range, m."""
+    lowest_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
+    """Elevation of the lowest beam from its x-y plane, deg."""
+    highest_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
+    """Elevation of the highest beam, deg."""
+    beams: Annotated[int, Field(ge=1, le=512)] = 32
+    """Beams between them."""
+    step_deg: Annotated[float, Field(ge=0.02, le=30.0)] = 0.2
+    """Between columns, deg."""
+    sigma_m: NonNegative = 0.01
+    """Noise of a range, m."""
+    scan_s: Positive = 0.1
+    """Time of a turn, s."""
+    drop: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
+    """Share of returns that are lost."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _figures_of_the_make(cls, raw: Any) -> Any:
+        return {**LIDAR_MAKES.get(str(raw.get("make")), {}), **raw} if isinstance(raw, dict) else raw
+
+    @property
+    def T_body_lidar(self) -> Array:
+        """Pose of the sensor in body (4, 4)."""
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = self.mount.R_body_sensor, self.mount.t_body_sensor_m
+        return T
+
+
+class CameraConfig(Block):
+    """A grey camera that exposes its whole image at once. Defaults are Digerud's ZED 2i (D eq. 3.1)."""
+
+    mount: MountConfig
+    """Pose of the optical frame (x right, y down, z forward) in body: looking ahead is rpy_deg: [-90, 0, -90]."""
+    width_px: Annotated[int, Field(ge=64, le=8192)] = 2208
+    """Columns."""
+    height_px: Annotated[int, Field(ge=64, le=8192)] = 1242
+    """Rows."""
+    focal_px: tuple[Positive, Positive] = (1069.38, 1069.38)
+    """Focal lengths fx, fy, px."""
+    centre_px: tuple[Finite, Finite] = (1103.67, 664.69)
+    """Principal point cx, cy, px; (0, 0) is the centre of the top-left pixel."""
+    model: Literal["plumb_bob", "rational_polynomial", "equidistant"] = "plumb_bob"
+    """Distortion model, as in `sensor_msgs/CameraInfo`."""
+    distortion: tuple[Finite, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """Its coefficients: 5, 8 or 4."""
+    blur_px: NonNegative = 0.75
+    """Standard deviation of the lens's blur, px."""
+    electrons_per_ms: Positive = 2000.0
+    """What a white surface in daylight gives a pixel in a millisecond."""
+    full_well: Positive = 10000.0
+    """Electrons that make a pixel white at gain 1."""
+    read_noise: NonNegative = 6.0
+    """Noise of reading a pixel, electrons."""
+    longest_ms: Positive = 30.0
+    """Longest exposure, ms."""
+    highest_gain: Annotated[float, Field(ge=1.0)] = 16.0
+    """Highest gain."""
+
+    @model_validator(mode="after")
+    def _as_many_as_the_model_has(self) -> CameraConfig:
+        needed = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}[self.model]
+        if len(self.distortion) != needed:
+            raise ValueError(f"distortion: {self.model} has {needed} coefficients, not {len(self.distortion)}")
+        return self
+
+    @property
+    def K(self) -> Array:
+        """Camera matrix (3, 3)."""
+        (fx, fy), (cx, cy) = self.focal_px, self.centre_px
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+class RigConfig(Block):
+    """A whole rig file."""
+
+    vessel: str
+    """Name of the vessel."""
+    hull: HullConfig
+    """What its own sensors see of it."""
+    imu: MountConfig
+    """Where the IMU sits."""
+    gnss: MountConfig
+    """Where the antenna sits."""
+    lidars: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")], LidarConfig] = Field(default_factory=dict)
+    """LiDARs by name; all turn together."""
+    cameras: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")], CameraConfig] = Field(default_factory=dict)
+    """Cameras by name."""
+
+
+@lru_cache(maxsize=8)
+def load_rig(name_or_path: str) -> RigConfig:
+    """Read a rig: one that is shipped, by name, or a file.
+
+    Raises:
+        ConfigError: there is none, or it cannot be used.
+    """
+    rig, _ = load_block("rig", name_or_path, _SHIPPED, RigConfig)
+    return rig
+
+
+def shipped_rigs() -> tuple[str, ...]:
+    """Names of the rigs that come with graphloc."""
+    return shipped_names(_SHIPPED)
