@@ -46,23 +46,25 @@ def tag_table(figures: list[Row]) -> list[str]:
         "## Tags: seen, flipped, and off, by range and condition (B.3)",
         "",
         "Share of views in which a 0.412 m tag is found / share of these whose better-fitting pose is the flipped one /",
-        "95 % error of the other pose, m. Simulated approaches to a quay, detector AprilTag 3, poses by IPPE, each tag on its",
-        "own. Digerud's columns are his table 4.13; he counts no flips.",
+        "95 % error of the other pose, m. Simulated approaches to a quay, each tag on its own, poses by IPPE. Detector:",
+        "AprilTag 3, with its *defaults* on the image as it comes (as Digerud), or *full*: every pixel, in linear light.",
+        "Digerud's columns are his table 4.13; he counts no flips.",
         "",
-        "| condition | " + " | ".join(bands) + " | farthest | D: farthest | D: flips |",
-        "|---|" + "---|" * (len(bands) + 3),
+        "| condition | detector | " + " | ".join(bands) + " | farthest | D: farthest | D: flips |",
+        "|---|---|" + "---|" * (len(bands) + 3),
     ]
     for condition, (range_said, flips_said) in simulator.DIGERUD.items():
-        cells = []
-        for band in bands:
-            seen, flipped, off = (
-                values.get(f"tags, {condition}, {band}: {what}")
-                for what in ("seen", "flipped", "error of the right pose, 95 %")
-            )
-            cells.append(f"{seen:.2f} / {flipped:.2f} / {off:.2f}" if off is not None else "-")
-        farthest = values[f"tags, {condition}: farthest sighting (D: {range_said}; flips: {flips_said})"]
-        said = f"{farthest:.0f} m" if farthest else "none"
-        lines.append(f"| {condition} | " + " | ".join(cells) + f" | {said} | {range_said} | {flips_said} |")
+        for way in simulator.WAYS:
+            label, cells = f"tags, {condition}, {way}", []
+            for band in bands:
+                seen, flipped, off = (
+                    values.get(f"{label}, {band}: {what}")
+                    for what in ("seen", "flipped", "error of the right pose, 95 %")
+                )
+                cells.append(f"{seen:.2f} / {flipped:.2f} / {off:.2f}" if off is not None else "-")
+            farthest = values[f"{label}: farthest sighting"]
+            said = f"{farthest:.0f} m" if farthest else "none"
+            lines.append(f"| {condition} | {way} | " + " | ".join([*cells, said, range_said, flips_said]) + " |")
     return lines
 
 

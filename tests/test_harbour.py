@@ -255,12 +255,18 @@ def test_motion_within_a_scan_is_in_it(run: SimulatedRun) -> None:
     assert np.linalg.norm((right - frozen)[late], axis=1).mean() > 0.5 * 0.09 * speed
 
 
-def test_the_harbour_of_the_docs_works(tmp_path: Path) -> None:
+def test_harbour_and_rig_of_the_docs_work(tmp_path: Path) -> None:
     page = (Path(__file__).parent.parent / "docs/simulator.md").read_text()
-    (tmp_path / "mine.yaml").write_text(page.split("```yaml\n")[1].split("```")[0])
-    run = simulate(replace(SHORT, harbour=str(tmp_path / "mine.yaml")), 1)
+    for k, name in ((1, "harbour.yaml"), (2, "rig.yaml")):
+        (tmp_path / name).write_text(page.split("```yaml\n")[k].split("```")[0])
+    run = simulate(replace(SHORT, harbour=str(tmp_path / "harbour.yaml"), rig=str(tmp_path / "rig.yaml")), 1)
     assert run.harbour is not None
     assert len(run.harbour.pontoons) == 5
+    assert [(t.number, t.dock) for t in run.harbour.config.tags] == [(7, ""), (8, "ferry")]
+    assert [d.dock.name for d in run.docks] == ["ferry"]
+    assert run.rig.lidars["mast"].beams == 16
+    assert run.rig.lidars["mast"].range_m == 150.0
+    assert run.rig.cameras["bow"].width_px == 1440
 
 
 @pytest.mark.parametrize(
