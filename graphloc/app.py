@@ -22,7 +22,9 @@ from graphloc.eval import ekf, holdout, metrics, report
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frontends.aerial import match_bag
 from graphloc.frontends.bag import read_recording
+from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Progress, Recording
 from graphloc.solution import Solution
@@ -57,15 +59,22 @@ def smooth_recording(
     *,
     hold_out: holdout.HoldOut | None = None,
     compare: bool = False,
+    scans: Scans | None = None,
     progress: Progress = _quiet,
 ) -> Run:
-    """Smooth a recording; hold fixes out and run the filters beside it if asked."""
+    """Smooth a recording; hold fixes out and run the filters beside it if asked.
+
+    With `scans` and an aerial sensor the run is smoothed, its scans are matched around that, and it is smoothed again.
+    """
     held: tuple[GnssPosition, ...] = ()
     if hold_out is not None:
         recording, held = hold_out.split(recording)
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
     solution = smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress)
+    if scans is not None and config.of_kind("aerial"):
+        recording = with_matches(recording, config, datum, solution, scans, progress)
+        solution = smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress)
     filters: tuple[ekf.FilterResult, ...] = ()
     if compare:
         progress("filters", 0, 1)
@@ -73,6 +82,60 @@ def smooth_recording(
         progress("filters", 1, 1)
     run = Run(recording=recording, config=config, solution=solution, held=held, filters=filters)
     return _comparable(run)
+
+
+@dataclass(frozen=True, slots=True)
+class Scans:
+    """Where scans are matched from: the bags, and the folder that relative image paths count from."""
+
+    bags: tuple[Path, ...]
+    folder: Path
+
+
+def with_matches(
+    recording: Recording,
+    config: VesselConfig,
+    datum: Datum,
+    solution: Solution,
+    scans: Scans,
+    progress: Progress = _quiet,
+) -> Recording:
+    """Add the matches of every aerial sensor, made around a solution; a scan that gave none is a row of the ledger.
+
+    Raises:
+        InputError: an image or LiDAR that cannot be used.
+    """
+    measurements, rows, topics = list(recording.measurements), list(recording.rows), dict(recording.topics)
+    track, seq = solution.trajectory, recording.message_count
+    span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
+    for name, sensor in config.of_kind("aerial").items():
+        topics[name] = f"({name})"
+        read = {lidar.topic for lidar in sensor.lidars.values()}
+        rows = [
+            replace(r, reason=f"read by {name}") if r.topic in read and r.outcome is Outcome.IGNORED else r
+            for r in rows
+        ]
+        found = match_bag(scans.bags, sensor, scans.folder / sensor.image, config.body_frame, track, datum)
+        for item in found:
+            if item.match is not None and item.match.modes:
+                measurements.append(replace(item.match.fix(item.stamp_ns, name), seq=seq))
+            else:
+                rows.append(
+                    LedgerRow(
+                        seq=seq, stamp_ns=item.stamp_ns, sensor=name, topic=topics[name], outcome=Outcome.REJECTED,
+                        reason=item.why_not,
+                    )
+                )  # fmt: skip
+            seq += 1
+            progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)
+        progress("matching", span_s, span_s)
+    return replace(
+        recording,
+        measurements=tuple(sorted(measurements, key=lambda m: (m.stamp_ns, m.seq))),
+        rows=tuple(rows),
+        topics=topics,
+        message_count=seq,
+    )
 
 
 def _comparable(run: Run) -> Run:
@@ -242,6 +305,7 @@ def sha256(path: Path) -> str:
 
 __all__ = [
     "Run",
+    "Scans",
     "choose_datum",
     "load",
     "sha256",
@@ -249,6 +313,7 @@ __all__ = [
     "smooth_recording",
     "tables",
     "truth_statement",
+    "with_matches",
     "with_synthetic",
     "write",
 ]

@@ -89,7 +89,8 @@ def _smooth(
     outputs.check_folder(out, overwrite=overwrite)
     show = _progress()
     recording, vessel = application.load(bag, config, show)
-    run = application.smooth_recording(recording, vessel, hold_out=held, compare=compare, progress=show)
+    scans = application.Scans(tuple(bag), config.parent)
+    run = application.smooth_recording(recording, vessel, hold_out=held, compare=compare, scans=scans, progress=show)
     report = application.write(run, out, inputs=bag, command=" ".join(sys.argv[1:]), overwrite=overwrite)
     _print_run(run, report, as_json)
 

@@ -272,6 +272,38 @@ class PoseConfig(SensorConfig):
         return tuple(a for a in AXES if a in axes)
 
 
+class LidarConfig(Block):
+    """A LiDAR whose scans are matched."""
+
+    topic: str
+    """Its `sensor_msgs/PointCloud2` topic."""
+    mount: MountConfig = MountConfig()
+    """Where it sits on the vessel."""
+
+
+class AerialConfig(PoseConfig):
+    """LiDAR scans laid on an aerial image (`sensor_msgs/PointCloud2` and a GeoTIFF)."""
+
+    kind: Literal["aerial"] = "aerial"
+    """Which row of the sensor table reads this block."""
+    image: str = ""
+    """A georeferenced image that GDAL reads; a relative path counts from the folder of vessel.yaml."""
+    lidars: dict[str, LidarConfig] = Field(default_factory=dict)
+    """The LiDARs by name."""
+    hull_m: tuple[tuple[Finite, Finite], ...] = ()
+    """Corners of the vessel's outline in body, forward and port, m: points within are its own."""
+    waterline_m: Finite = 0.0
+    """Height of the waterline in body, m."""
+    every_s: Positive = 1.0
+    """Time between two matches, s."""
+    window_m: Positive = 6.5
+    """Largest half side of the search, m; less where the estimate is surer (3 sigma)."""
+    window_deg: Positive = 5.0
+    """The same for the heading, deg."""
+    reach_m: Positive = 100.0
+    """Points farther off are not used, m."""
+
+
 class HeightConfig(SensorConfig):
     """Height prior: a vessel floats, so its height is known from waterline and tide."""
 

@@ -37,6 +37,7 @@ _SURFACES = {
     "grass": ((96, 116, 70), 14.0), "roof": ((126, 78, 66), 8.0), "stone": ((150, 147, 140), 16.0),
 }  # fmt: skip
 _WATER, _WATER_NOISE = (38, 62, 72), 6.0
+_KERB_M = 0.35
 
 
 class _Season(NamedTuple):
@@ -212,8 +213,10 @@ def _draw(pen: _Pen, harbour: Harbour, season: _Season, rng: np.random.Generator
         around = part[~inside].copy()
         _joints_and_cars(pen, polygon, solid.surface, rng)
         part[~inside] = around  # they end where it does
-        for a, b in pairwise(outline):
-            pen.line(a, b, (196, 193, 184), 0.35)  # its kerb
+        kerb = polygon.buffer(-0.5 * _KERB_M, join_style="mitre")  # its outer side is the wall's face
+        for part_of_it in shapely.get_parts(kerb):
+            for a, b in pairwise(np.array(part_of_it.exterior.coords)):
+                pen.line(a, b, (196, 193, 184), _KERB_M)
     for boat in harbour.boats(rng):
         if rng.uniform() < season.boats:
             _boat(pen, boat, sun, depth, rng)

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lay a scan's outline on an image's layers: the posterior of the pose over a window, and its modes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from graphloc.frames import Array
+from graphloc.frontends.aerial.layers import Layer, Layers
+from graphloc.frontends.aerial.scan import Outline
+
+STEP_DEG = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """Poses that are tried: yaw (H,) rad, north (R,) m and east (C,) m, in world."""
+
+    yaw_rad: Array
+    north_m: Array
+    east_m: Array
+
+
+def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) -> Grid:
+    """Return the grid of cells of the layers around a pose (3,): east, north, yaw."""
+    patch = layers.patch
+    column, row = np.rint(patch.cells(prior[None, :2])[0]).astype(int)
+    k = np.arange(-int(np.ceil(half_m / patch.cell_m)), int(np.ceil(half_m / patch.cell_m)) + 1)
+    h = np.arange(-int(np.ceil(half_deg / STEP_DEG)), int(np.ceil(half_deg / STEP_DEG)) + 1)
+    return Grid(
+        prior[2] + np.radians(STEP_DEG) * h,
+        patch.north_m - (row + k) * patch.cell_m,
+        patch.west_m + (column + k) * patch.cell_m,
+    )
+
+
+@numba.njit(parallel=True, cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, columns):  # type: ignore[no-untyped-def]
+    """Sum over points of weight x layer, for each yaw, row and column of the grid: (F, H, rows, columns)."""
+    bins, height, width = layer.shape
+    features = weight.shape[1]
+    out = np.zeros((features, len(yaw), rows, columns), dtype=np.float32)
+    for h in numba.prange(len(yaw)):
+        c, s = np.cos(yaw[h]), np.sin(yaw[h])
+        for i in range(len(p_m)):
+            x, y = c * p_m[i, 0] - s * p_m[i, 1], s * p_m[i, 0] + c * p_m[i, 1]
+            u, v = col0 + int(np.rint(x / cell_m)), row0 - int(np.rint(y / cell_m))
+            if u < 0 or v < 0 or u + columns > width or v + rows > height:
+                continue
+            k = int(np.rint((angle[i] + yaw[h]) % turn / turn * bins)) % bins
+            for f in range(features):
+                w = weight[i, f]
+                if w == 0.0:
+                    continue
+                for r in range(rows):
+                    for q in range(columns):
+                        out[f, h, r, q] += w * layer[k, v + r, u + q]
+    return out
+
+
+def volumes(found: Outline, layers: Layers, grid: Grid, thin: NDArray[np.float64] | None = None) -> Layer:
+    """Return the score of each feature at each pose of the grid: (F, H, R, C)."""
+    patch = layers.patch
+    col0, row0 = np.rint(patch.cells(np.array([[grid.east_m[0], grid.north_m[0]]]))[0]).astype(int)
+
+    def lay(layer: Layer, p_m: Array, angle: Array, weight: Array, turn: float) -> Layer:
+        return np.asarray(
+            _laid(layer, p_m, angle, weight.astype(np.float32), grid.yaw_rad, col0, row0, patch.cell_m, turn,
+                  len(grid.north_m), len(grid.east_m))
+        )  # fmt: skip
+
+    parts = [lay(layers.edges, found.faces_m, found.line_rad, found.kind, np.pi)]
+    if layers.shores is not None:
+        ones = np.ones((len(found.shore_m), 1))
+        parts.append(lay(layers.shores, found.shore_m, found.to_land_rad, ones, 2.0 * np.pi))
+    return np.concatenate(parts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mode:
+    """A pose (3,): east, north, yaw; its covariance (3, 3) in m and rad; and its probability."""
+
+    pose: Array
+    cov: Array
+    probability: float
+
+
+def modes_of(
+    log_likelihood: NDArray[np.float32], grid: Grid, none_log: float, most: int = 5
+) -> tuple[list[Mode], float]:
+    """Return the modes of a posterior (H, R, C), best first, and the probability that none is right."""
+    top = float(log_likelihood.max())
+    mass = np.exp(log_likelihood.astype(float) - top)
+    none = float(np.exp(none_log - top)) * mass.size
+    total = mass.sum() + none
+    peaks = (ndimage.maximum_filter(log_likelihood, 3) == log_likelihood) & (log_likelihood > top - 9.0)
+    free = np.ones(mass.shape, dtype=bool)
+    found: list[Mode] = []
+    spots = np.argwhere(peaks)
+    for spot in spots[np.argsort(-log_likelihood[tuple(spots.T)])]:
+        if not free[tuple(spot)] or len(found) == most:
+            continue
+        height = log_likelihood[tuple(spot)]
+        labels, _ = ndimage.label(free & (log_likelihood > height - 4.5))
+        part = labels == labels[tuple(spot)]
+        free &= ~part
+        share = float(mass[part].sum() / total)
+        if share < 0.01:
+            continue
+        h, r, c = np.nonzero(part)
+        values = np.column_stack([grid.east_m[c], grid.north_m[r], grid.yaw_rad[h]])
+        w = mass[part] / mass[part].sum()
+        mean = w @ values
+        cell = abs(grid.east_m[1] - grid.east_m[0])
+        floor = np.diag([cell**2, cell**2, np.radians(STEP_DEG) ** 2]) / 12.0
+        found.append(Mode(mean, (values - mean).T @ (w[:, None] * (values - mean)) + floor, share))
+    return sorted(found, key=lambda m: -m.probability), float(none / total)

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a scan says about edges: vertical faces with their direction, and where water ends.
+
+Points come in the frame `level`: origin and yaw of body, its x-y plane horizontal, heights over the waterline.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from graphloc.frames import Array
+
+_CELL_M = 0.25
+_DRY_M = 0.3  # BL: what is lower is water
+_NEAR_M = 1.25  # neighbours that make a line
+_SECTORS = 360
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LevelCloud:
+    """Points of one or more scans in `level`.
+
+    Attributes:
+        points_m: (N, 3). origin_m: (N, 2) where the ray of each began. column: (N,) ids of rays of one beam turn,
+            unused where unknown.
+    """
+
+    points_m: Array
+    origin_m: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outline:
+    """A scan as the matcher compares it.
+
+    Attributes:
+        faces_m: (M, 2) cells of faces. line_rad: (M,) direction of the line through each. kind: (M, F) features that
+            weights are for, 0 to 1. shore_m: (K, 2) first things behind water. to_land_rad: (K,) away from the sensor.
+        water_m: (L, 2) places that were seen to be free water.
+    """
+
+    faces_m: Array
+    line_rad: Array
+    kind: Array
+    shore_m: Array
+    to_land_rad: Array
+    water_m: Array
+
+
+FEATURES = ("all", "straight", "tall", "long")
+
+
+def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float = 100.0) -> Outline:
+    """Return the outline of a cloud; what lies within `hull` (K, 2) in body, closed, is the vessel itself."""
+    p, away = cloud.points_m, np.hypot(*cloud.points_m[:, :2].T)
+    keep = (away < reach_m) & np.isfinite(p).all(axis=1)
+    if hull is not None:
+        keep &= ~inside(hull, p[:, :2])
+    p, origin = p[keep], cloud.origin_m[keep]
+    dry = p[:, 2] > _DRY_M
+    cells, low, high, count = _columns(p[dry])
+    # A face is hit at several heights; a roof or a quay's deck, seen at a grazing angle, is not.
+    face = (high - low > 0.25) & (count >= 3)
+    at, top = cells[face], high[face]
+    direction, straight, long = _lines(at)
+    kind = np.column_stack([np.ones(len(at)), straight, np.clip((top - 0.8) / 0.8, 0.0, 1.0), long])
+    shore, to_land = _first_returns(p[dry], origin[dry], low_limit=2.5)
+    return Outline(at, direction, kind, shore, to_land, _free_water(shore, to_land, p[~dry]))
+
+
+def inside(polygon: NDArray[np.float64], points_m: Array) -> NDArray[np.bool_]:
+    """Which points (N, 2) lie within a polygon (K, 2)."""
+    a, b = polygon, np.roll(polygon, -1, axis=0)
+    x, y = points_m[:, :1], points_m[:, 1:]
+    spans = (a[:, 1] > y) != (b[:, 1] > y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = (b[:, 0] - a[:, 0]) * (y - a[:, 1]) / (b[:, 1] - a[:, 1]) + a[:, 0]
+    return np.asarray((spans & (x < crossing)).sum(axis=1) % 2 == 1)
+
+
+def _columns(p: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """Stack points into columns: mean place (M, 2), lowest and highest (M,), count (M,)."""
+    key = np.floor(p[:, :2] / _CELL_M).astype(np.int64)
+    _, group, count = np.unique(key[:, 0] * 1_000_003 + key[:, 1], return_inverse=True, return_counts=True)
+    order = np.argsort(group, kind="stable")
+    begin = np.concatenate([[0], np.cumsum(count)[:-1]])
+    if not len(p):
+        return np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64)
+    total = np.add.reduceat(p[order, :2], begin, axis=0)
+    z = p[order, 2]
+    return total / count[:, None], np.minimum.reduceat(z, begin), np.maximum.reduceat(z, begin), count
+
+
+def _lines(at: Array) -> tuple[Array, Array, Array]:
+    """Direction (M,) of the line through each place, how straight it is and how long, 0 to 1."""
+    if len(at) < 3:
+        return np.zeros(len(at)), np.zeros(len(at)), np.zeros(len(at))
+    tree = cKDTree(at)
+    pairs = tree.query_pairs(_NEAR_M, output_type="ndarray")
+    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+    d = at[j] - at[i]
+    xx, xy, yy = (np.bincount(i, v, len(at)) for v in (d[:, 0] ** 2, d[:, 0] * d[:, 1], d[:, 1] ** 2))
+    direction = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    root = np.hypot(xx - yy, 2.0 * xy)
+    straight = np.clip(root / np.maximum(xx + yy, 1e-9), 0.0, 1.0) ** 4
+    # How far the line goes on: neighbours up to 6 m off that lie on it.
+    far = tree.query_pairs(6.0, output_type="ndarray")
+    i, j = np.concatenate([far, far[:, ::-1]]).T
+    d = at[j] - at[i]
+    aside = np.abs(-d[:, 0] * np.sin(direction[i]) + d[:, 1] * np.cos(direction[i]))
+    along = np.abs(d[:, 0] * np.cos(direction[i]) + d[:, 1] * np.sin(direction[i]))
+    on_it = np.bincount(i, (aside < 0.2) & (along > 1.0), len(at))
+    return direction, straight, np.clip(on_it / 30.0, 0.0, 1.0)
+
+
+def _first_returns(p: Array, origin: Array, low_limit: float) -> tuple[Array, Array]:
+    """The nearest thing in each direction, and its direction (rad), where it rises out of the water."""
+    near = p[:, 2] < low_limit
+    d = p[near, :2]
+    away, angle = np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0])
+    sector = np.floor((angle + np.pi) / (2.0 * np.pi) * _SECTORS).astype(int) % _SECTORS
+    order = np.lexsort((away, sector))
+    first = order[np.unique(sector[order], return_index=True)[1]] if len(order) else order
+    ray = d[first] - origin[near][first]
+    return d[first], np.arctan2(ray[:, 1], ray[:, 0])
+
+
+def _free_water(shore: Array, to_land: Array, wet: Array) -> Array:
+    """Places that are water: returns from it, and what lies between the vessel and the first thing."""
+    between = [shore * s for s in (0.3, 0.5, 0.7)]
+    return np.vstack([wet[:, :2], *[b[np.hypot(*b.T) > 8.0] for b in between]])
