@@ -1,9 +1,79 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matches of LiDAR scans to an aerial image: poses in the plane, with several modes, of the body itself."""
+"""Matches of LiDAR scans to an aerial image, with several modes; the image itself is off by some decimetres.
+
+    z = (x, y, yaw)(T_world_body) + (d, 0) + w,   w ~ N(0, C) of the mode,   d (2,): the image's misregistration
+
+d is constant over the run. The modes are those of `pose`; with d in it the factor has two states, and is
+linearised anew at every pass (`_linear`).
+"""
+
+from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 from graphloc.config import AerialConfig
 from graphloc.factors import pose
+from graphloc.factors._linear import linear_update
+from graphloc.frames import Array
+from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
+from graphloc.measurements import PoseFix, PoseMode
 
-ROW = replace(pose.ROW, kind="aerial", config=AerialConfig)
+
+def _shown_off(axes: tuple[str, ...]) -> Array:
+    """Return d residual / d misregistration (k, 2)."""
+    return np.array([[float(a == "x"), float(a == "y")] for a in axes])
+
+
+def residuals(m: PoseFix, config: AerialConfig, at: Attachment) -> tuple[Residual, ...]:
+    """Residuals predicted - measured (k,), m and rad, one for each mode."""
+    plain = pose.residuals(m, config, at)
+    if at.slow_value is None:
+        return plain
+    moved = _shown_off(m.axes) @ at.slow_value
+    flat = [k for k, a in enumerate(m.axes) if a in ("x", "y")]
+    return tuple(
+        replace(r, raw=r.raw + moved, size_m=float(np.linalg.norm((r.raw + moved)[flat])) if flat else None)
+        for r in plain
+    )
+
+
+def factors(m: PoseFix, config: AerialConfig, at: Attachment, decision: Decision) -> GraphUpdate:
+    """Return the factor of the chosen mode."""
+    if at.slow_key is None:
+        return pose.factors(m, config, at, decision)
+    residual = residuals(m, config, at)[decision.mode]
+    terms: list[tuple[int, Any, Array]] = [
+        (at.pose_key, at.T_world_body, residual.jacobian()),
+        (at.slow_key, np.array(at.slow_value), _shown_off(m.axes)),
+    ]
+    return linear_update(residual, terms, decision)
+
+
+def slow(config: AerialConfig) -> SlowProcess | None:
+    """Return the image's misregistration."""
+    if config.image_sigma_m == 0.0:
+        return None
+    return SlowProcess(
+        name="image offset",
+        unit="m",
+        scale=1.0,
+        axes=("east", "north"),
+        sigma=np.full(2, config.image_sigma_m),
+        time_constant_s=float("inf"),
+    )
+
+
+def ideal(at: Attachment, config: AerialConfig) -> PoseFix:
+    """Return the match that the attachment's estimate would give."""
+    found = pose.ideal(at, config)
+    moved = np.zeros(len(config.axes)) if at.slow_value is None else _shown_off(config.axes) @ at.slow_value
+    mode = PoseMode(value=found.modes[0].value + moved, cov=found.modes[0].cov)
+    return replace(found, sensor="aerial", modes=(mode,))
+
+
+ROW = replace(
+    pose.ROW, kind="aerial", config=AerialConfig, residuals=residuals, factors=factors, ideal=ideal, slow=slow
+)

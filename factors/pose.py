@@ -19,7 +19,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from graphloc.config import PoseConfig
+from graphloc.config import AnyPoseConfig, PoseConfig
 from graphloc.factors._noise import robust, with_floors
 from graphloc.frames import Array, Datum
 from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor
@@ -30,7 +30,7 @@ _WIDE_M, _WIDE_RAD = 1e3, 1e2
 FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(5.0))
 
 
-def _covariance(mode: PoseMode, axes: tuple[str, ...], config: PoseConfig) -> Array:
+def _covariance(mode: PoseMode, axes: tuple[str, ...], config: AnyPoseConfig) -> Array:
     floors = np.array([config.min_sigma_m if AXES.index(a) < 3 else np.radians(config.min_sigma_deg) for a in axes])
     return with_floors(mode.cov, floors**2)
 
@@ -43,7 +43,7 @@ def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor:
     return gtsam.Pose3(gtsam.Rot3.RzRyRx(values[3:]), values[:3])
 
 
-def residuals(m: PoseFix, config: PoseConfig, at: Attachment) -> tuple[Residual, ...]:
+def residuals(m: PoseFix, config: AnyPoseConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residuals predicted - measured (k,), m and rad, one for each mode."""
     T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
     R = T_world_sensor.rotation().matrix()
@@ -73,18 +73,18 @@ def _stated(m: PoseFix) -> float:
     return sum(mode.probability for mode in m.modes)
 
 
-def _false_probability(m: PoseFix, config: PoseConfig) -> float:
+def _false_probability(m: PoseFix, config: AnyPoseConfig) -> float:
     """The front-end's own 'none of them' where it states one, else the configured fraction."""
     return float(np.clip(m.none_probability if m.none_probability > 1e-6 else config.false_fraction, 1e-4, 0.99))
 
 
-def false(m: PoseFix, config: PoseConfig) -> FalseModel:
+def false(m: PoseFix, config: AnyPoseConfig) -> FalseModel:
     """Return what is expected of a false pose: anywhere in BL's search window, and likely to stay there."""
     sigmas = np.array([FALSE_SPREAD_M if AXES.index(a) < 3 else FALSE_SPREAD_RAD for a in m.axes])
     return FalseModel(probability=_false_probability(m, config), cov=np.diag(sigmas**2), repeats=config.false_repeats)
 
 
-def factors(m: PoseFix, config: PoseConfig, at: Attachment, decision: Decision) -> GraphUpdate:
+def factors(m: PoseFix, config: AnyPoseConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of the chosen mode."""
     mode = m.modes[decision.mode]
     T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
@@ -110,7 +110,7 @@ def _world_jacobian(R_world_sensor: Array, T_state_sensor: Any) -> Array:
     return np.vstack([R_world_sensor @ adjoint[3:], R_world_sensor @ adjoint[:3]])
 
 
-def ideal(at: Attachment, config: PoseConfig) -> PoseFix:
+def ideal(at: Attachment, config: AnyPoseConfig) -> PoseFix:
     """Return the pose that the attachment's estimate would give."""
     T = at.T_world_body.compose(at.T_state_sensor)
     values = np.concatenate([T.translation(), T.rotation().rpy()])

@@ -240,11 +240,9 @@ class VelocityConfig(SensorConfig):
     """Taken where the message reports no covariance, m/s."""
 
 
-class PoseConfig(SensorConfig):
-    """Absolute pose in world (`geometry_msgs/PoseWithCovarianceStamped`, `nav_msgs/Odometry`)."""
+class AnyPoseConfig(SensorConfig):
+    """What every sensor has that gives poses in world, with modes or false ones among them."""
 
-    kind: Literal["pose"] = "pose"
-    """Which row of the sensor table reads this block."""
     axes: tuple[Literal["x", "y", "z", "roll", "pitch", "yaw"], ...] = ("x", "y", "yaw")
     """Which axes of the pose are used."""
     false_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
@@ -272,6 +270,13 @@ class PoseConfig(SensorConfig):
         return tuple(a for a in AXES if a in axes)
 
 
+class PoseConfig(AnyPoseConfig):
+    """Absolute pose in world (`geometry_msgs/PoseWithCovarianceStamped`, `nav_msgs/Odometry`)."""
+
+    kind: Literal["pose"] = "pose"
+    """Which row of the sensor table reads this block."""
+
+
 class LidarConfig(Block):
     """A LiDAR whose scans are matched."""
 
@@ -281,13 +286,15 @@ class LidarConfig(Block):
     """Where it sits on the vessel."""
 
 
-class AerialConfig(PoseConfig):
+class AerialConfig(AnyPoseConfig):
     """LiDAR scans laid on an aerial image (`sensor_msgs/PointCloud2` and a GeoTIFF)."""
 
     kind: Literal["aerial"] = "aerial"
     """Which row of the sensor table reads this block."""
     image: str = ""
     """A georeferenced image that GDAL reads; a relative path counts from the folder of vessel.yaml."""
+    image_sigma_m: NonNegative = 0.3
+    """How far the image as a whole shows things from where they are, east and north, 1 sigma, m."""
     lidars: dict[str, LidarConfig] = Field(default_factory=dict)
     """The LiDARs by name."""
     hull_m: tuple[tuple[Finite, Finite], ...] = ()

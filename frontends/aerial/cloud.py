@@ -71,12 +71,12 @@ def _since_stamp_ns(time: Any, stamp_ns: int) -> NDArray[np.int64]:
     if size > 1e17:  # absolute, ns
         return np.asarray(time.astype(np.int64) - stamp_ns)
     if size > 1e8 and not whole:  # absolute, s
-        return np.rint((value - stamp_ns * 1e-9) * 1e9).astype(np.int64)
+        return np.asarray(np.rint((value - stamp_ns * 1e-9) * 1e9), dtype=np.int64)
     for unit_ns in (1, 1000) if whole else (10**9, 10**6, 1000, 1):
         if size * unit_ns <= _LONGEST_TURN_S * 1e9:
             if whole and size * unit_ns < 1e6 and unit_ns == 1:
                 continue  # a turn of less than a millisecond: these are microseconds
-            return np.nan_to_num(value * unit_ns).astype(np.int64)
+            return np.asarray(np.nan_to_num(value * unit_ns), dtype=np.int64)
     return np.zeros(len(value), dtype=np.int64)
 
 

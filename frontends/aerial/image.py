@@ -104,8 +104,8 @@ class AerialImage:
         window = rasterio.windows.Window(low[0], low[1], *(high - low))
         bands = self._source.read(window=window, masked=True)
         colours = bands[:3] if len(bands) >= 3 else np.ma.repeat(bands[:1], 3, axis=0)
-        image = np.ascontiguousarray(np.moveaxis(colours.filled(0), 0, 2)).astype(np.uint8)
-        has = (~np.ma.getmaskarray(colours).any(axis=0)).astype(np.uint8)
+        image: Any = np.ascontiguousarray(np.moveaxis(colours.filled(0), 0, 2)).astype(np.uint8)
+        has: Any = (~np.ma.getmaskarray(colours).any(axis=0)).astype(np.uint8)
         finer = cell_m / abs(self._source.transform.a * _metres(self._source.crs))
         if finer > 1.5:  # the grid is coarser than the image: average, do not pick
             image = cv2.GaussianBlur(image, (0, 0), 0.4 * finer)

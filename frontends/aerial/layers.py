@@ -37,7 +37,7 @@ def _near(where: Mask, sigma_m: float, cell_m: float) -> Layer:
     if not where.any():
         return np.zeros(where.shape, dtype=np.float32)
     away = cv2.distanceTransform((~where).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
-    return np.exp(-0.5 * (away / sigma_m) ** 2).astype(np.float32)
+    return np.asarray(np.exp(-0.5 * (away / sigma_m) ** 2), dtype=np.float32)
 
 
 def edge_layer(patch: Patch) -> Layer:
@@ -55,7 +55,7 @@ def shore_layer(patch: Patch, water: Mask) -> Layer:
     """Return shores by the direction from water to land, bin k around k * 360 / SHORE_BINS deg."""
     soft = cv2.GaussianBlur(water.astype(np.float32), (0, 0), 2.0)
     dx, dy = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
-    shore = water & (cv2.erode(water.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    shore = ~water & (cv2.dilate(water.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)  # the watershed's own line
     shore &= cv2.erode(patch.inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     to_land = np.mod(np.arctan2(dy, -dx), 2.0 * np.pi)
     return _by_direction(shore, to_land, 2.0 * np.pi, SHORE_BINS, _SHORE_SIGMA_M, patch.cell_m)
@@ -77,8 +77,8 @@ def segment_water(patch: Patch, free: Mask, limit: float = 3.0) -> Mask:
 
     Colour statistics in LAB, robust; darker counts a fifth, so that shadowed water stays water.
     """
-    lab = cv2.cvtColor(patch.pixels, cv2.COLOR_RGB2LAB).astype(np.float32)
-    lab = cv2.GaussianBlur(lab, (0, 0), 1.5)
+    lab: NDArray[np.float32] = cv2.cvtColor(patch.pixels, cv2.COLOR_RGB2LAB).astype(np.float32)
+    lab = np.asarray(cv2.GaussianBlur(lab, (0, 0), 1.5), dtype=np.float32)
     seed = free & patch.inside
     if seed.sum() < 50:
         return np.zeros(seed.shape, dtype=bool)
@@ -109,13 +109,13 @@ def _snapped(patch: Patch, water: Mask) -> Mask:
     markers = np.zeros(water.shape, dtype=np.int32)
     markers[sure], markers[other] = 1, 2
     cv2.watershed(patch.pixels, markers)
-    return (markers == 1) & patch.inside
+    return np.asarray((markers == 1) & patch.inside)
 
 
 def _thin(water: Mask) -> Mask:
     """Land that is narrower than 2 m or so: all of it is near the rim."""
     land = (~water).astype(np.uint8)
-    return (land > 0) & (cv2.morphologyEx(land, cv2.MORPH_OPEN, _disc(6)) == 0)
+    return np.asarray((land > 0) & (cv2.morphologyEx(land, cv2.MORPH_OPEN, _disc(6)) == 0))
 
 
 def _disc(radius: int) -> Pixels:

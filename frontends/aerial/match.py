@@ -39,7 +39,7 @@ def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) ->
     )
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@numba.njit(parallel=True, cache=True, fastmath=True)
 def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, columns):  # type: ignore[no-untyped-def]
     """Sum over points of weight x layer, for each yaw, row and column of the grid: (F, H, rows, columns)."""
     bins, height, width = layer.shape

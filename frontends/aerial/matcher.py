@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphloc.config import AerialConfig
 from graphloc.frames import Array, Datum, wrap_angle
@@ -19,7 +20,7 @@ from graphloc.measurements import PoseFix, PoseMode
 _CELL_M = 0.25
 _TILE_M = 40.0  # a patch serves all priors of one tile
 # Log-likelihood of a face on an edge, and of a first return on a shore; fitted by benchmarks/matcher.py.
-_WEIGHTS = np.array([0.066, 0.0, 0.0, 0.0, 0.138])
+_WEIGHTS = np.array([0.057, 0.0, 0.0, 0.0, 0.166])
 _NONE_LOG = -2.0  # that of a pose of which nothing is known
 _LEAST_FACES = 30
 _MODES = 5
@@ -76,7 +77,6 @@ class Matcher:
         self._config, self._image = config, AerialImage(image, datum)
         self._hull = np.array(config.hull_m, dtype=float) if config.hull_m else None
         self._tile: tuple[int, int] | None = None
-        self._patch: Patch | None = None
         self._layers: Layers | None = None
 
     def match(self, cloud: LevelCloud, prior: Prior) -> Match:
@@ -99,22 +99,22 @@ class Matcher:
         return Match(prior, found, layers, grid, score, tuple(modes), none, why_not)
 
     def _layers_around(self, prior: Prior, found: Outline) -> Layers:
-        tile = tuple(np.floor(prior.pose[:2] / _TILE_M).astype(int).tolist())
+        tile = (int(prior.pose[0] // _TILE_M), int(prior.pose[1] // _TILE_M))
         if self._layers is None or tile != self._tile:
             middle = (np.array(tile) + 0.5) * _TILE_M
             patch = self._image.patch(middle, self._config.reach_m + _TILE_M + self._config.window_m, _CELL_M)
             water = segment_water(patch, _seen_water(patch, prior, found))
             shores = shore_layer(patch, water) if water.any() else None
-            self._tile, self._layers = (tile[0], tile[1]), Layers(patch, edge_layer(patch), shores)
+            self._tile, self._layers = tile, Layers(patch, edge_layer(patch), shores)
         return self._layers
 
 
-def _seen_water(patch: Patch, prior: Prior, found: Outline) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _seen_water(patch: Patch, prior: Prior, found: Outline) -> NDArray[np.bool_]:
     """Cells that the scan saw to be water, were the prior right."""
     c, s = np.cos(prior.pose[2]), np.sin(prior.pose[2])
     at = found.water_m @ np.array([[c, s], [-s, c]]) + prior.pose[:2]
     cells = np.rint(patch.cells(at)).astype(int)
     free = np.zeros(patch.inside.shape, dtype=bool)
-    cells = cells[((cells >= 0) & (cells < [free.shape[1], free.shape[0]])).all(axis=1)]
+    cells = cells[((cells >= 0) & (cells < np.array(free.shape)[::-1])).all(axis=1)]
     free[cells[:, 1], cells[:, 0]] = True
     return free

@@ -107,14 +107,25 @@ def _lines(at: Array) -> tuple[Array, Array, Array]:
     direction = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     root = np.hypot(xx - yy, 2.0 * xy)
     straight = np.clip(root / np.maximum(xx + yy, 1e-9), 0.0, 1.0) ** 4
-    # How far the line goes on: neighbours up to 6 m off that lie on it.
-    far = tree.query_pairs(6.0, output_type="ndarray")
-    i, j = np.concatenate([far, far[:, ::-1]]).T
+    return direction, straight, np.clip((_extent_m(tree, at, direction) - 7.0) / 7.0, 0.0, 1.0)
+
+
+def _extent_m(tree: cKDTree, at: Array, direction: Array) -> Array:
+    """How long the line through each place is (M,), as far as places follow each other on it, up to 15 m each way."""
+    pairs = tree.query_pairs(15.0, output_type="ndarray")
+    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
     d = at[j] - at[i]
     aside = np.abs(-d[:, 0] * np.sin(direction[i]) + d[:, 1] * np.cos(direction[i]))
-    along = np.abs(d[:, 0] * np.cos(direction[i]) + d[:, 1] * np.sin(direction[i]))
-    on_it = np.bincount(i, (aside < 0.2) & (along > 1.0), len(at))
-    return direction, straight, np.clip(on_it / 30.0, 0.0, 1.0)
+    along = d[:, 0] * np.cos(direction[i]) + d[:, 1] * np.sin(direction[i])
+    on_it = aside < 0.15 + 0.02 * np.abs(along)
+    i, along = i[on_it], along[on_it]
+    bins = np.zeros((len(at), 31), dtype=bool)  # a metre each; a gap of more than two ends the line
+    bins[i, np.clip(np.rint(along).astype(int) + 15, 0, 30)] = True
+    bins[:, 15] = True
+    filled = bins | np.roll(bins, 1, axis=1) | np.roll(bins, -1, axis=1)
+    ahead = np.minimum.accumulate(filled[:, 15:], axis=1).sum(axis=1)
+    behind = np.minimum.accumulate(filled[:, 15::-1], axis=1).sum(axis=1)
+    return np.asarray(ahead + behind - 2, dtype=float)
 
 
 def _first_returns(p: Array, origin: Array, low_limit: float) -> tuple[Array, Array]:
