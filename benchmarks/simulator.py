@@ -138,7 +138,7 @@ def _sightings(job: tuple[str, int]) -> dict[str, list[Sighting]]:
                 in_view[number] = (p, R)
         for way, (decimate, linearise) in WAYS.items():
             detections = _detector(decimate).detect(linear[pixels] if linearise else pixels)
-            seen = {d.tag_id: np.roll(d.corners[::-1] - 0.5, 2, axis=0) for d in detections}
+            seen = {d.tag_id: d.corners[::-1] - 0.5 for d in detections}
             for number, (p, R) in in_view.items():
                 away = float(np.linalg.norm(p))
                 if number not in seen:

@@ -157,9 +157,9 @@ def _pairs(changes: list[str]) -> dict[str, str]:
 def simulate(
     scenario: Annotated[str, typer.Argument(help="bl1-drift, dock-fixed-fog, ...: a wrong name lists them.")],
     out: OutOption,
-    seed: Annotated[int, typer.Option(help="Same seed, same run.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same run.")] = 0,
     ros: Annotated[int, typer.Option(min=1, max=2, help="ROS version of the bag.")] = 2,
-    storage: Annotated[str, typer.Option(help="mcap or sqlite3, of a ROS 2 bag.")] = "mcap",
+    storage: Annotated[str, typer.Option(help="mcap or sqlite3, of a ROS 2 bag.")] = "",
     harbour: Annotated[str, typer.Option(help="Another harbour than the scenario's: a name or a file.")] = "",
     rig: Annotated[str, typer.Option(help="Other sensors than the scenario's: a name or a file.")] = "",
     changes: Annotated[
@@ -168,22 +168,24 @@ def simulate(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write a simulated harbour run: bag, vessel.yaml, aerial image, tag survey, and what only a simulator knows."""
+    from graphloc import outputs
     from graphloc.errors import ConfigError
     from graphloc.eval.simulate import find_scenario
     from graphloc.eval.simulate import simulate as run_simulation
-    from graphloc.eval.simulate.bag import write_bag
+    from graphloc.eval.simulate.bag import TRUTH, write_bag
 
-    if storage not in ("mcap", "sqlite3"):
-        raise ConfigError(f"--storage {storage}: choose mcap or sqlite3")
+    if storage not in ("", "mcap", "sqlite3") or (storage and ros == 1):
+        raise ConfigError(f"--storage {storage}: choose mcap or sqlite3, and ROS 2")
+    outputs.check_folder(out, overwrite=overwrite, mark=TRUTH)
     named = {key: value for key, value in (("harbour", harbour), ("rig", rig)) if value}
     run = run_simulation(find_scenario(scenario, {**named, **_pairs(changes or [])}), seed)
-    bag, config = write_bag(run, out, ros=ros, storage=storage, overwrite=overwrite, progress=_progress())
+    bag, config = write_bag(run, out, ros=ros, storage=storage or "mcap", overwrite=overwrite, progress=_progress())
     typer.echo(f"{bag}\n{config}")
 
 
 @app.command()
 def demo(
-    out: OutOption = Path("runs/demo"), seed: Annotated[int, typer.Option(help="Seed of the simulated run.")] = 0
+    out: OutOption = Path("runs/demo"), seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated run.")] = 0
 ) -> None:
     """Simulate a harbour run with drifting GNSS and 40 % false matches, smooth it from its bag, and compare."""
     from graphloc.eval.simulate import harbour_scenarios

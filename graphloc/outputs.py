@@ -38,27 +38,33 @@ from graphloc.time import utc_text
 MARK = "run.json"  # a folder with this file is ours to replace
 
 
-def check_folder(folder: Path, *, overwrite: bool) -> None:
+def check_folder(folder: Path, *, overwrite: bool, mark: str = MARK) -> None:
     """Refuse early what `fresh_folder` would refuse after the work.
+
+    A folder is replaced only if it holds the file `mark`, so that nobody's own work is.
 
     Raises:
         OutputError: `folder` exists and may not be replaced, or there is a file in its place.
     """
     if folder.is_file():
         raise OutputError(f"{folder}: is a file, and a folder is wanted")
-    if folder.exists() and not (overwrite and (folder / MARK).exists()) and any(folder.iterdir()):
-        what = "is no graphloc run folder, so it is not replaced" if overwrite else "exists already; give --overwrite"
+    if folder.exists() and not (overwrite and (folder / mark).exists()) and any(folder.iterdir()):
+        what = (
+            f"holds no {mark}, so graphloc did not make it: it is not replaced"
+            if overwrite
+            else "exists already; give --overwrite"
+        )
         raise OutputError(f"{folder}: {what}")
 
 
 @contextmanager
-def fresh_folder(folder: Path, *, overwrite: bool) -> Iterator[Path]:
+def fresh_folder(folder: Path, *, overwrite: bool, mark: str = MARK) -> Iterator[Path]:
     """Yield a folder to fill; move it to `folder` when all went well, and drop it when not.
 
     Raises:
         OutputError: `folder` exists and may not be replaced, or the disk refuses.
     """
-    check_folder(folder, overwrite=overwrite)
+    check_folder(folder, overwrite=overwrite, mark=mark)
     fresh = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

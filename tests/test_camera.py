@@ -54,10 +54,9 @@ def detector() -> Detector:
 def detected(detector: Detector, pixels: NDArray[np.uint8]) -> dict[int, Array]:
     """Corners (4, 2) by id, in `CORNERS`' order; (0, 0) is the middle of the top-left pixel.
 
-    pupil_apriltags counts from the pixel's outer corner, and from the tag's bottom left, counter-clockwise in the
-    image as it prints it: measured below by the test that the tag stands upright.
+    AprilTag 3 counts pixels from their outer corner, and corners from the tag's bottom left, counter-clockwise.
     """
-    return {d.tag_id: np.roll(d.corners[::-1] - 0.5, 2, axis=0) for d in detector.detect(pixels)}
+    return {d.tag_id: d.corners[::-1] - 0.5 for d in detector.detect(pixels)}
 
 
 def seen_from(p: Array, R: Array, K: Array) -> Array:
@@ -149,9 +148,9 @@ def test_a_tag_stands_upright_and_not_mirrored(detector: Detector) -> None:
             cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
         ).detectMarkers(pixels)
         assert ids.ravel().tolist() == [5]
-        # OpenCV starts at the printed top left and goes clockwise; unrefined, its corners are whole pixels.
+        # OpenCV starts at the bottom right of AprilTag's own print, clockwise; unrefined, its corners are whole pixels.
         expected = np.array([(0.5, -1.5), (1.5, -1.5), (1.5, -0.5), (0.5, -0.5)]) / 20.0 * f + (cx, cy)
-        np.testing.assert_allclose(corners[0][0], expected, atol=3.0)
+        np.testing.assert_allclose(np.roll(corners[0][0], 2, axis=0), expected, atol=3.0)
         np.testing.assert_allclose(detected(detector, LINEAR[pixels])[5], expected, atol=0.2)
 
 
@@ -266,6 +265,23 @@ def test_motion_smears_by_its_length() -> None:
         assert (smeared * v).sum() == pytest.approx(0.0, abs=0.02)
         length2 = float(motion @ motion)
         assert (smeared * ahead**2).sum() == pytest.approx(length2 / 12.0, abs=0.3)
+
+
+@pytest.mark.parametrize("rig", ["tiara", "launch"])
+def test_what_is_beside_the_view_neither_smears_nor_shows(rig: str) -> None:
+    """A tag abeam, level with the lens: its projection is nonsense, and with distortion anything at all."""
+    run = simulate(find_scenario("bl1-drift", {"rig": rig, "camera_hz": "1"}), 3)
+    (config,) = run.rig.cameras.values()
+    camera = Camera(config, scene_of(run), run)
+    abeam = [
+        t
+        for t in np.arange(2.0, 110.0, 0.5)
+        for p, _ in camera.tag_poses(float(t)).values()
+        if 0.2 < p[2] < 0.1 * abs(p[0])
+    ]
+    assert abeam
+    for t in abeam[::4]:
+        assert camera.take(float(t), 0).blur_px < 3.0
 
 
 def test_an_image_depends_on_its_time_alone() -> None:
@@ -429,7 +445,9 @@ def test_another_rig_sees_with_its_own_eyes(
     assert "/aerial/pose" not in counts
     vessel = YAML(typ="safe").load((tmp_path / "out/vessel.yaml").read_text())
     assert vessel["sensors"]["imu"]["mount"]["rpy_deg"] == [180.0, 0.0, 0.0]
-    assert "aerial" not in vessel["sensors"]
+    matcher = vessel["sensors"]["aerial"]
+    assert (matcher["kind"], matcher["enabled"], matcher["image"]) == ("aerial", False, "aerial.tif")
+    assert matcher["lidars"]["mast"]["topic"] == "/mast/points"
 
 
 @pytest.mark.parametrize(
@@ -438,6 +456,7 @@ def test_another_rig_sees_with_its_own_eyes(
         ({"cameras": {"c": {"mount": {}, "model": "equidistant"}}}, "equidistant has 4 coefficients, not 5"),
         ({"cameras": {"c": {"mount": {}, "focal": 1}}}, "unknown key 'cameras.c.focal'"),
         ({"lidars": {"l": {"mount": {}}}}, "lidars.l.range_m: Field required"),
+        ({"lidars": {"gnss": {"make": "helios", "mount": {}}}}, "'gnss' cannot name a sensor"),
         ({"lidars": {"l": {"make": "velodyne", "mount": {}}}}, "'bpearl' or 'helios'"),
         ({"lidars": {"Top Lidar": {"make": "helios", "mount": {}}}}, "lidars.Top Lidar"),
     ],

@@ -124,7 +124,7 @@ def test_bad_arguments_are_one_line(
         (["smooth", bag[0], "-c", tmp_path / "none.yaml", *good[4:]], "graphloc inspect"),
         ([*good, "--hold-out", "every:x"], "every:"),
         ([*good, "--hold-out", "gaps:500x10"], "gaps"),
-        ([*good[:5], mine, "--overwrite"], "no graphloc run folder"),
+        ([*good[:5], mine, "--overwrite"], "holds no run.json"),
         ([*good[:5], file], "is a file"),
         (["simulate", "bl1-pink", "-o", tmp_path / "sim"], "bl1-pink"),
         (["inspect", bag[0], "-w", tmp_path / "nowhere/x.yaml"], "nowhere/x.yaml"),

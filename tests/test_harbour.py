@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 import rasterio
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from pyproj import Transformer
 from rosbags.highlevel import AnyReader
+from ruamel.yaml import YAML
 from scipy.spatial import cKDTree
 
 from graphloc import app, cli
-from graphloc.errors import ConfigError
+from graphloc.errors import ConfigError, OutputError
 from graphloc.eval.metrics import compare_to_truth
-from graphloc.eval.simulate import SimulatedRun, harbour_scenarios, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun, find_scenario, harbour_scenarios, simulate
 from graphloc.eval.simulate.aerial import grid_from_enu, render, utm_epsg
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.eval.simulate.harbour import Harbour, load_harbour, make_harbour, shipped
@@ -50,7 +52,8 @@ def block(**changes: Any) -> dict[str, Any]:
 def test_shipped_harbours_and_their_routes_are_sound(name: str) -> None:
     harbour = load_harbour(name)
     for route in harbour.config.routes:
-        chosen = replace(SHORT, harbour=name, route=route, duration_s=900.0 if route == "long" else 120.0)
+        whole_s = 900.0 if route == "long" else 120.0
+        chosen = replace(SHORT, harbour=name, route=route, duration_s=whole_s, route_s=whole_s)
         truth = simulate(chosen, 1).truth
         points = harbour.waypoints(route)
         assert np.hypot(*(truth.p_world_m[0, :2] - points[0])) < 5.0
@@ -64,6 +67,9 @@ def test_shipped_harbours_and_their_routes_are_sound(name: str) -> None:
         ({"quays": [{"outline": [[0, 0], [10, 10]], "top_m": 2.0}]}, r"quays\.0\.outline"),
         ({"quay": []}, "did you mean 'quays'"),
         ({"image_m": [50, 0, -50, 10]}, "the image has no area"),
+        ({"image_m": [-90000, 0, 90000, 10]}, "more than 4000 m across"),
+        ({"datum": {"latitude_deg": 89, "longitude_deg": 0}}, "no UTM zone"),
+        ({"docks": [{"name": "world", "outline": [[0, 0], [5, 0], [5, 5]], "top_m": 1}]}, "'world' names another frame already"),
         ({"tags": [{"number": 1, "at": [0, 0], "height_m": 1, "facing_deg": 0, "dock": "d"}]}, "there is no dock 'd'"),
         ({"tags": [{"number": 1, "at": [0, 0], "height_m": 1, "facing_deg": 0}] * 2}, r"tags\.1\.number: 1 is there twice"),
         ({"docks": [{"name": "d", "outline": [[0, 0], [5, 5], [5, 0], [0, 5]], "top_m": 1}]}, r"docks\.0\.outline"),
@@ -80,15 +86,24 @@ def test_a_bad_harbour_is_one_line(changes: dict[str, Any], said: str) -> None:
     ("arguments", "said"),
     [
         (["bl9-drift"], "bl1-clean, bl1-drift"),
-        (["bl1-drift", "--harbour", "nowhere"], "none of the shipped ones: basin, marina"),
-        (["bl1-drift", "--harbour", "crash.yaml"], "route 'entry' comes within 0.0 m of a quay, near (0.0, 5.0)"),
+        (["bl1-drift", "--harbour", "nowhere"], "none of the shipped ones: basin, crowded, marina"),
+        (["bl1-drift", "--harbour", "crash.yaml"], "on route 'entry' the hull comes within 0.0 m of a quay, near ("),
         (["bl2-drift", "--harbour", "crash.yaml"], "no route 'turn'; it has: entry"),
         (["bl1-drift", "--set", "camera=5"], "no such field; did you mean camera_hz?"),
         (["bl1-drift", "--set", "camera_hz"], "write KEY=VALUE"),
         (["bl1-drift", "--set", "camera_hz=often"], "--set camera_hz=often: Input should be a valid number"),
         (["bl1-drift", "--set", "condition=snow"], "'optimal', 'fog'"),
-        (["bl1-drift", "--set", "duration_s=-1"], "it must be positive"),
-        (["bl1-drift", "--set", "gnss_hz=-1"], "it cannot be negative"),
+        (["bl1-drift", "--set", "duration_s=-1"], "--set duration_s=-1: must be from 2 to 14400"),
+        (["bl1-drift", "--set", "gnss_hz=-1"], "--set gnss_hz=-1: must be from 0 to 200"),
+        (["bl1-drift", "--set", "gnss_hz=nan"], "--set gnss_hz=nan: must be from 0 to 200"),
+        (["bl1-drift", "--set", "case=9"], "--set case=9: must be from 1 to 3"),
+        (["bl1-drift", "--set", "outage_s=soon"], "write its begin and end, as in outage_s=30,50"),
+        (["bl1-drift", "--set", "duration_s=200"], "is at the end of route 'entry' after route_s=120"),
+        (["long", "--set", "duration_s=60", "--set", "route_s=60"], "the vessel would do"),
+        (["dock-fixed-optimal", "--harbour", "berth.yaml"], "the hull comes within 0.0 m of a quay"),
+        (["bl1-drfit"], "unknown; did you mean bl1-drift?"),
+        (["bl1-drift", "--seed", "-1"], "Invalid value"),
+        (["bl1-drift", "--ros", "1", "--storage", "sqlite3"], "--storage sqlite3: choose mcap or sqlite3, and ROS 2"),
         (["bl1-drift", "--rig", "nowhere"], "none of the shipped ones: launch, tiara"),
         (["bl1-drift", "--rig", "crash.yaml"], "unknown key 'name'"),
     ],
@@ -97,6 +112,8 @@ def test_bad_scenarios_are_one_line(
     arguments: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    # Its reference point ends 4 m before the quay: the bow does not.
+    Path("berth.yaml").write_text(json.dumps(block(routes={"dock_fixed": [[-60, 5], [-4, 5]]})))
     Path("crash.yaml").write_text(json.dumps(block(routes={"entry": [[-20, 5], [40, 5]]})))
     monkeypatch.setattr(sys, "argv", ["graphloc", "simulate", *arguments, "-o", "out"])
     with pytest.raises(SystemExit) as end:
@@ -104,8 +121,50 @@ def test_bad_scenarios_are_one_line(
     assert end.value.code == 2
     err = capsys.readouterr().err
     assert said in err
-    assert err.count("\n") == 1
+    assert err.count("\n") == 1 or "Usage" in err
     assert not Path("out").exists()
+
+
+def test_folders_are_made_whole_or_not_at_all(
+    run: SimulatedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = replace(run, harbour=None, docks=())
+    (tmp_path / "empty").mkdir()
+    write_bag(small, tmp_path / "empty", ros=2)  # an empty folder is in nobody's way
+    write_bag(small, tmp_path / "empty", ros=2, overwrite=True)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/vessel.yaml").write_text("mine")
+    with pytest.raises(OutputError, match=r"holds no truth\.json"):
+        write_bag(small, tmp_path / "mine", ros=2, overwrite=True)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_bag(small, tmp_path / "file/below", ros=2)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("graphloc.eval.simulate.bag.Writer2.write", full)
+    with pytest.raises(OutputError, match="No space left on device"):
+        write_bag(small, tmp_path / "full", ros=2)
+    assert {p.name for p in tmp_path.iterdir()} == {"empty", "mine", "file"}
+
+
+def test_a_recording_tells_how_it_was_made(run: SimulatedRun, tmp_path: Path) -> None:
+    chosen = find_scenario("bl1-outage", {"outage_s": "3,5", "duration_s": "8", "lidar_hz": "0", "compass_hz": "0"})
+    _, config = write_bag(simulate(chosen, 6), tmp_path / "out", ros=2)
+    told = json.loads((tmp_path / "out/truth.json").read_text())
+    assert told["seed"] == 6
+    assert TypeAdapter(Scenario).validate_python(told["scenario"]) == chosen
+    assert chosen.outage_s == (3.0, 5.0)
+    sensors = YAML(typ="safe").load(config.read_text())["sensors"]
+    assert set(sensors) == {"imu", "gnss", "aerial", "height"}  # what is off is not asked for
+
+
+def test_a_shorter_run_ends_on_the_way() -> None:
+    whole = simulate(find_scenario("bl1-clean", {}), 2).motion
+    part = simulate(find_scenario("bl1-clean", {"duration_s": "20"}), 2).motion
+    t = np.arange(0.0, 20.0)
+    np.testing.assert_allclose(whole.pose(t)[0], part.pose(t)[0])
 
 
 def test_the_vessel_rides_its_route_on_the_tide(run: SimulatedRun) -> None:

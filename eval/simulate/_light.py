@@ -35,6 +35,7 @@ _ALBEDO = {
 _WALL = 0.6  # of the sky's light, what a wall gets
 _SKY, _SUN = 1.2, 3000.0
 _ASTRAY_PX = 0.05  # a ray that its lens takes elsewhere
+_NEAREST_M = 0.1
 _STEP = 3  # pixels between rays of the background
 _GRAIN = 512  # pixels of the tile that surfaces take their grain from
 
@@ -66,9 +67,12 @@ def project(camera: CameraConfig, points_m: Array) -> Array:
 
 @lru_cache(maxsize=1024)
 def cells(number: int) -> NDArray[np.uint8]:
-    """Return the cells (8, 8) of a tag, first row on top; 1 is white."""
+    """Return the cells (8, 8) of a tag, first row on top, as AprilTag's own images have them; 1 is white.
+
+    OpenCV draws them upside down.
+    """
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    return np.asarray(cv2.aruco.generateImageMarker(family, number, 8) > 127, dtype=np.uint8)
+    return np.asarray(np.rot90(cv2.aruco.generateImageMarker(family, number, 8), 2) > 127, dtype=np.uint8)
 
 
 @lru_cache(maxsize=1)
@@ -122,6 +126,7 @@ class Light:
                 "pixels; calibrate it over the whole image, or give a smaller one"
             )
         self._length = np.linalg.norm(self._rays, axis=1)
+        self._low, self._high = self._rays[:, :2].min(axis=0), self._rays[:, :2].max(axis=0)
         in_body = self._rays @ camera.mount.R_body_sensor.T.astype(np.float32)
         own = scene.own_range_m(camera.mount.t_body_sensor_m.astype(np.float32), in_body)
         self._own = np.isfinite(own)
@@ -136,6 +141,13 @@ class Light:
         for tag in self._harbour.config.tags:
             self._tag(picture, tag, view)
         return picture
+
+    def sees(self, p_m: Array) -> bool:
+        """Whether a point (3,) in camera lies in its view: a lens's formulae mean nothing outside of it."""
+        if p_m[2] < _NEAREST_M:
+            return False
+        flat = p_m[:2] / p_m[2]
+        return bool(((flat > self._low) & (flat < self._high)).all())
 
     def _through_air(self, radiance: Rays, away_m: Rays) -> Rays:
         if self._weather.fog_per_m == 0.0:
@@ -223,9 +235,13 @@ class Light:
             t_camera_tag
             + np.array([(-half, -half), (half, -half), (half, half), (-half, half)]) @ R_camera_tag[:, :2].T
         )
-        if corners[:, 2].min() < 0.1 or R_camera_tag[:, 2] @ t_camera_tag >= 0.0:
+        if corners[:, 2].min() < _NEAREST_M or R_camera_tag[:, 2] @ t_camera_tag >= 0.0:
             return  # behind the camera, or seen from behind
-        seen = project(self._camera, corners)
+        flat = corners[:, :2] / corners[:, 2:]
+        if (flat.max(axis=0) < self._low).any() or (flat.min(axis=0) > self._high).any():
+            return  # beside its view
+        within = np.column_stack([np.clip(flat, self._low, self._high), np.ones(4)])
+        seen = project(self._camera, within)
         low = np.maximum(np.floor(seen.min(axis=0)).astype(int) - 1, 0)
         high = np.minimum(np.ceil(seen.max(axis=0)).astype(int) + 2, self.size[::-1])
         if (high <= low).any() or (low + 1 >= self.size[::-1]).any():

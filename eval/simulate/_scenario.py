@@ -5,21 +5,25 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from graphloc.config import (
     STANDARD_GRAVITY_MPS2,
+    AerialConfig,
     CompassConfig,
     DatumConfig,
     GnssConfig,
     HeightConfig,
     ImuConfig,
+    LidarConfig,
     PoseConfig,
     SensorConfig,
     StartConfig,
@@ -39,7 +43,9 @@ from graphloc.trajectory import Trajectory
 
 START_NS = 1_700_000_000_000_000_000
 DATUM = Geodetic(57.7, 11.7, 36.0)
-_CLEAR_M = 2.5  # from the middle of the vessel to anything solid: its half beam, and a hand
+_CLEAR_M = 0.4  # from the hull to anything solid
+_FASTEST_MPS = 15.0
+_LONGEST_S = 4.0 * 3600.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +71,7 @@ class Scenario:
             heading written to the configuration; None writes none.
         wave_roll_deg, wave_pitch_deg, wave_heave_m: RMS of the waves' motion.
         harbour: name or file of the harbour that the run lies in; empty: open water, `path` alone counts.
-        route: of the harbour. tide_m: water over its mean. lidar_hz, camera_hz: scans of each LiDAR, images of each
+        route: of the harbour. route_s: time that the vessel takes for all of it; a shorter run ends on the way. tide_m: water over its mean. lidar_hz, camera_hz: scans of each LiDAR, images of each
             camera a second in the bag. rig: name or file of what the vessel carries. condition: for cameras.
         camera_raw: images as `sensor_msgs/Image`, ten times as large, not as JPEG.
     """
@@ -100,6 +106,7 @@ class Scenario:
     wave_heave_m: float = 0.1
     harbour: str = ""
     route: str = "entry"
+    route_s: float = 120.0
     tide_m: float = 0.0
     rig: str = "tiara"
     lidar_hz: float = 0.0
@@ -150,7 +157,7 @@ def harbour_scenarios() -> dict[str, Scenario]:
             found[f"dock-{kind}-{condition}"] = _in_harbour(
                 docking, harbour="marina", route=f"dock_{kind}", condition=condition
             )
-    long = replace(bl_scenario(1, "varied"), path="tour", duration_s=1800.0, camera_hz=1.0)
+    long = replace(bl_scenario(1, "varied"), path="tour", duration_s=1800.0, route_s=1800.0, camera_hz=1.0)
     found["long"] = _in_harbour(long, harbour="marina", route="long", outage_s=(990.0, 1050.0), condition="fog")
     return found
 
@@ -163,26 +170,58 @@ def find_scenario(name: str, changes: Mapping[str, str]) -> Scenario:
     """
     known = harbour_scenarios()
     if name not in known:
-        raise ConfigError(f"scenario '{name}': unknown; there are: {', '.join(known)}")
+        raise ConfigError(f"scenario '{name}': unknown{_near(name, known)}; there are: {', '.join(known)}")
     fields = {f.name: getattr(known[name], f.name) for f in dataclasses.fields(Scenario)}
     for key in changes:
         if key not in fields:
-            near = difflib.get_close_matches(key, fields, 1)
-            raise ConfigError(
-                f"--set {key}: a scenario has no such field" + (f"; did you mean {near[0]}?" if near else "")
-            )
+            raise ConfigError(f"--set {key}: a scenario has no such field{_near(key, fields)}")
+    spans = {key: f"[{value.strip('[]()')}]" for key, value in changes.items() if key == "outage_s"}
     try:
-        changed = TypeAdapter(Scenario).validate_python({**fields, **changes})
+        given = {**changes, **{key: json.loads(value) for key, value in spans.items()}}
+        changed = TypeAdapter(Scenario).validate_python({**fields, **given})
+    except json.JSONDecodeError:
+        raise ConfigError(
+            f"--set outage_s={changes['outage_s']}: write its begin and end, as in outage_s=30,50"
+        ) from None
     except ValidationError as error:
         (first, *_) = error.errors()
         raise ConfigError(f"--set {first['loc'][0]}={changes.get(str(first['loc'][0]), '')}: {first['msg']}") from None
-    for key in ("duration_s", "imu_hz"):
-        if not 0.0 < getattr(changed, key) < np.inf:
-            raise ConfigError(f"--set {key}={getattr(changed, key):g}: it must be positive")
-    for key in (k for k in fields if k.endswith(("_hz", "_sigma_m", "_fraction"))):
-        if not 0.0 <= getattr(changed, key) < np.inf:
-            raise ConfigError(f"--set {key}={getattr(changed, key):g}: it cannot be negative")
+    _refuse_nonsense(changed)
     return changed
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _refuse_nonsense(s: Scenario) -> None:
+    """Refuse numbers that no harbour has.
+
+    Raises:
+        ConfigError: the first of them.
+    """
+    limits = {key: (0.0, 200.0) for key in _fields(s) if key.endswith("_hz") and not key.endswith("per_sqrt_hz")}
+    limits |= {
+        key: (0.0, 1e6) for key in _fields(s) if key.startswith(("wave_", "gnss_", "pose_sigma", "gyro_", "accel_"))
+    }
+    limits |= {
+        "gnss_hz": (0.0, 200.0),
+        "false_fraction": (0.0, 1.0),
+        "false_stays": (0.0, 1.0),
+        "tide_m": (-10.0, 10.0),
+    }
+    limits |= {"imu_hz": (10.0, 2000.0), "duration_s": (2.0, _LONGEST_S), "route_s": (2.0, _LONGEST_S), "case": (1, 3)}
+    limits |= {"pose_modes": (1, 20), "compass_sigma_deg": (1e-3, 90.0), "compass_offset_deg": (-180.0, 180.0)}
+    for key, (low, high) in limits.items():
+        value = getattr(s, key)
+        if not low <= value <= high:
+            raise ConfigError(f"--set {key}={value:g}: must be from {low:g} to {high:g}")
+
+
+def _fields(s: Scenario) -> tuple[str, ...]:
+    """Names of a scenario's fields."""
+    return tuple(f.name for f in dataclasses.fields(s))
 
 
 def _in_harbour(base: Scenario, **changes: object) -> Scenario:
@@ -202,7 +241,7 @@ def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
     rng = np.random.default_rng([seed, 7])
     harbour = load_harbour(scenario.harbour) if scenario.harbour else None
     rig = load_rig(scenario.rig)
-    motion = _motion(scenario, rng) if harbour is None else _harbour_motion(scenario, harbour, rng)
+    motion = _motion(scenario, rng) if harbour is None else _harbour_motion(scenario, harbour, rig, rng)
     datum = Datum(DATUM) if harbour is None else harbour.datum
     config = _config(scenario, rig, motion, datum)
     t = _times(scenario.duration_s, scenario.imu_hz)
@@ -284,7 +323,7 @@ def _waves(s: Scenario, rng: np.random.Generator) -> tuple[Waves, tuple[Waves, W
     )
 
 
-def _harbour_motion(s: Scenario, harbour: Harbour, rng: np.random.Generator) -> Motion:
+def _harbour_motion(s: Scenario, harbour: Harbour, rig: RigConfig, rng: np.random.Generator) -> Motion:
     """Along the route from end to end, slower towards its end; or swaying about its only waypoint.
 
     Raises:
@@ -293,29 +332,46 @@ def _harbour_motion(s: Scenario, harbour: Harbour, rng: np.random.Generator) -> 
     points = harbour.waypoints(s.route)
     sway, waves = _waves(s, rng)
     if len(points) == 1:
-        harbour.refuse_collision(points, _CLEAR_M, s.route)
         wobble, yaw0 = Waves.jonswap(rng, 0.02, 25.0), float(rng.uniform(-np.pi, np.pi))
         start = (float(points[0, 0]), float(points[0, 1]))
-        return make_motion(
+        motion = make_motion(
             s.duration_s, wobble.at, lambda t: 0.3 * wobble.at(t), yaw0, np.zeros_like, waves, 0.03, start, s.tide_m
         )
-    way = Way.through(points)
-    harbour.refuse_collision(way.track_m, _CLEAR_M, s.route)
+    elif s.duration_s > s.route_s:
+        raise ConfigError(
+            f"duration_s={s.duration_s:g}: the vessel is at the end of route '{s.route}' after route_s={s.route_s:g}: "
+            "set both, to go slower"
+        )
+    else:
+        motion = _way_motion(s, Way.through(points), sway, waves, rng)
+    _refuse_collision(s, harbour, rig, motion)
+    return motion
+
+
+def _way_motion(
+    s: Scenario, way: Way, sway: Waves, waves: tuple[Waves, Waves, Waves], rng: np.random.Generator
+) -> Motion:
+    slowing: Callable[[Array], Array] = lambda t: 1.0 - 0.5 * _ramp(t, 0.8 * s.route_s, 8.0)
+    swing = None
     if s.path in ("dock", "tour"):
         swing = Waves.jonswap(rng, np.radians(1.0), 15.0)  # no helmsman holds a course to a hair
         shape = _docking if s.path == "dock" else _touring
-        return make_way_motion(
-            s.duration_s,
-            way,
-            lambda t: shape(t / s.duration_s),
-            sway.at,
-            waves,
-            0.03,
-            s.tide_m,
-            swing,
+        slowing = lambda t: shape(t / s.route_s)
+    motion = make_way_motion(s.route_s, way, slowing, sway.at, waves, 0.03, s.tide_m, swing)
+    fastest = float(np.abs(motion.speed(np.arange(0.0, s.duration_s, 0.5))).max())
+    if fastest > _FASTEST_MPS:
+        raise ConfigError(
+            f"route_s={s.route_s:g}: the vessel would do {fastest:.0f} m/s on route '{s.route}', {way.length_m:.0f} m long; "
+            "to see only its beginning, set duration_s alone"
         )
-    slowing: Callable[[Array], Array] = lambda t: 1.0 - 0.5 * _ramp(t, 0.8 * s.duration_s, 8.0)
-    return make_way_motion(s.duration_s, way, slowing, sway.at, waves, 0.03, s.tide_m)
+    return motion
+
+
+def _refuse_collision(s: Scenario, harbour: Harbour, rig: RigConfig, motion: Motion) -> None:
+    p, R, _ = motion.pose(np.arange(0.0, s.duration_s, 0.5))
+    hull = np.array(rig.hull.outline)
+    hulls = shapely.polygons(p[:, None, :2] + np.einsum("nij,kj->nki", R[:, :2, :2], hull))
+    harbour.refuse_collision(hulls, _CLEAR_M, s.route)
 
 
 def _docking(share: Array) -> Array:
@@ -342,11 +398,16 @@ def _config(s: Scenario, rig: RigConfig, motion: Motion, datum: Datum) -> Vessel
             gyro_noise_mdps_per_sqrt_hz=s.gyro_noise_mdps_per_sqrt_hz,
             accel_noise_ug_per_sqrt_hz=s.accel_noise_ug_per_sqrt_hz,
         ),
-        "gnss": GnssConfig(topic="/gnss/fix", mount=rig.gnss),
-        "compass": CompassConfig(topic="/gnss/heading", sigma_deg=s.compass_sigma_deg),
-        "aerial": PoseConfig(topic="/aerial/pose", axes=("x", "y", "yaw")),
         "height": HeightConfig(height_m=datum.origin.height_m),
     }
+    if s.gnss_hz > 0.0:
+        sensors["gnss"] = GnssConfig(topic="/gnss/fix", mount=rig.gnss)
+    if s.compass_hz > 0.0:
+        sensors["compass"] = CompassConfig(topic="/gnss/heading", sigma_deg=s.compass_sigma_deg)
+    if s.pose_hz > 0.0:
+        sensors["aerial"] = PoseConfig(topic="/aerial/pose", axes=("x", "y", "yaw"))
+    elif s.harbour and s.lidar_hz > 0.0 and rig.lidars:
+        sensors["aerial"] = _matcher(rig)
     return VesselConfig(
         vessel=rig.vessel,
         datum=DatumConfig(
@@ -354,9 +415,20 @@ def _config(s: Scenario, rig: RigConfig, motion: Motion, datum: Datum) -> Vessel
             longitude_deg=datum.origin.longitude_deg,
             height_m=datum.origin.height_m,
         ),
-        sensors={name: sensor for name, sensor in sensors.items() if name != "aerial" or s.pose_hz > 0.0},
+        sensors=sensors,
         truth_topic="/truth",
         start=start,
+    )
+
+
+def _matcher(rig: RigConfig) -> AerialConfig:
+    """What matches the rig's scans to the image; the hull with a hand's breadth around it."""
+    hull = shapely.Polygon(rig.hull.outline).buffer(0.3, join_style="mitre")
+    return AerialConfig(
+        enabled=False,  # still worse than none between moored boats
+        image="aerial.tif",
+        hull_m=tuple((round(x, 2), round(y, 2)) for x, y in hull.exterior.coords[:-1]),
+        lidars={name: LidarConfig(topic=f"/{name}/points", mount=lidar.mount) for name, lidar in rig.lidars.items()},
     )
 
 

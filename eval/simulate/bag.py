@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 import json
 import os
-import shutil
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,7 +21,6 @@ from ruamel.yaml import YAML
 from threadpoolctl import threadpool_limits
 
 from graphloc.config import effective
-from graphloc.errors import OutputError
 from graphloc.eval.simulate._messages import TF, Messages
 from graphloc.eval.simulate._scenario import SimulatedRun
 from graphloc.eval.simulate.aerial import render
@@ -30,6 +29,7 @@ from graphloc.eval.simulate.docks import survey, tag_pose
 from graphloc.eval.simulate.lidar import scan
 from graphloc.eval.simulate.scene import Scene, scene_of
 from graphloc.measurements import CompassHeading, GnssPosition, PoseFix
+from graphloc.outputs import fresh_folder
 from graphloc.recording import Progress
 
 _LATENCY_NS = {
@@ -41,7 +41,7 @@ _LATENCY_NS = {
 _CLOUD_LATENCY_NS = 130_000_000  # a turn, and the driver
 _IMAGE_LATENCY_NS = 80_000_000
 _TRUTH_HZ = 20.0
-_CONFIG, _AERIAL, _TAGS, _TRUTH = "vessel.yaml", "aerial.tif", "tags.yaml", "truth.json"
+_CONFIG, _AERIAL, _TAGS, TRUTH = "vessel.yaml", "aerial.tif", "tags.yaml", "truth.json"
 
 
 class _Item(NamedTuple):
@@ -72,20 +72,21 @@ def write_bag(
     Raises:
         OutputError: the folder exists, or the disk refuses.
     """
-    bag, config = folder / ("run.bag" if ros == 1 else "run"), folder / _CONFIG
-    if folder.exists():
-        if not (overwrite and config.exists()):
-            raise OutputError(f"{folder}: exists already")
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True)
-    with config.open("w", encoding="utf-8") as stream:
+    with fresh_folder(folder, overwrite=overwrite, mark=TRUTH) as fresh:
+        bag = _write(run, fresh, ros, storage, progress)
+    return folder / bag, folder / _CONFIG
+
+
+def _write(run: SimulatedRun, folder: Path, ros: int, storage: str, progress: Progress) -> str:
+    """Fill a folder; return the name of the bag in it."""
+    with (folder / _CONFIG).open("w", encoding="utf-8") as stream:
         YAML(typ="safe", pure=True).dump(effective(run.config), stream)
-    if run.harbour is not None:
-        _beside(run, folder)
+    _beside(run, folder)
     make = Messages(ros)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     serialize = make.store.serialize_ros1 if ros == 1 else make.store.serialize_cdr
     start, whole_s = _start_ns(run), round(run.scenario.duration_s)
+    bag = folder / ("run.bag" if ros == 1 else "run")
     writing = Writer1(bag) if ros == 1 else Writer2(bag, version=9, storage_plugin=plugin)
     # BLAS's own threads spin on our thin products: without them images cost half.
     with threadpool_limits(1, user_api="blas"), writing as writer:
@@ -98,7 +99,7 @@ def write_bag(
             if (item.log_ns - start) // 10**9 > done_s:
                 done_s = min((item.log_ns - start) // 10**9, whole_s)
                 progress("writing the bag", done_s, whole_s)
-    return bag, config
+    return bag.name
 
 
 def _start_ns(run: SimulatedRun) -> int:
@@ -107,26 +108,24 @@ def _start_ns(run: SimulatedRun) -> int:
 
 def _beside(run: SimulatedRun, folder: Path) -> None:
     """The aerial image, the survey of the tags, and what only a simulator knows."""
-    assert run.harbour is not None
-    image = render(run.harbour, run.seed)
-    image.write(folder / _AERIAL)
-    tags = run.harbour.config.tags
-    if tags:
-        with (folder / _TAGS).open("w", encoding="utf-8") as stream:
-            YAML(typ="safe", pure=True).dump(survey(run.harbour, np.random.default_rng([run.seed, 23])), stream)
-    secret = {
-        "scenario": run.scenario.condition,
-        "harbour": run.harbour.config.name,
+    secret: dict[str, Any] = {
         "seed": run.seed,
-        "tide_m": run.scenario.tide_m,
-        "image_shows_things_east_north_m": [round(float(v), 4) for v in image.shift_m],
-        "tags": {
+        "scenario": {k: v for k, v in dataclasses.asdict(run.scenario).items() if v != float("inf")},
+    }
+    if run.harbour is not None:
+        image = render(run.harbour, run.seed)
+        image.write(folder / _AERIAL)
+        secret["image_shows_things_east_north_m"] = [round(float(v), 4) for v in image.shift_m]
+        tags = run.harbour.config.tags
+        secret["tags"] = {
             tag.number: {"frame": tag.dock or "world", "xyz_m": p.tolist(), "R": R.round(12).tolist()}
             for tag in tags
             for p, R in [tag_pose(tag, run.harbour)]
-        },
-    }
-    (folder / _TRUTH).write_text(json.dumps(secret, indent=1) + "\n", encoding="utf-8")
+        }
+        if tags:
+            with (folder / _TAGS).open("w", encoding="utf-8") as stream:
+                YAML(typ="safe", pure=True).dump(survey(run.harbour, np.random.default_rng([run.seed, 23])), stream)
+    (folder / TRUTH).write_text(json.dumps(secret, indent=1) + "\n", encoding="utf-8")
 
 
 def _seen(run: SimulatedRun, make: Messages) -> list[Iterator[_Item]]:

@@ -82,9 +82,9 @@ class Camera:
         return Shot(pixels, ms, gain, float(np.hypot(*moved)))
 
     def _moved_px(self, t_s: float, exposed_s: float) -> Array:
-        """How far the nearest tag, or what is 20 m ahead, moves in the image (2,) during an exposure, px."""
-        ahead = [p for p, _ in self.tag_poses(t_s).values() if p[2] > 1.0]
-        target = min(ahead, key=lambda p: float(p @ p)) if ahead else np.array([0.0, 0.0, 20.0])
+        """How far the nearest tag in view, or what is 20 m ahead, moves in the image (2,) during an exposure, px."""
+        seen = [p for p, _ in self.tag_poses(t_s).values() if self._light.sees(p)]
+        target = min(seen, key=lambda p: float(p @ p)) if seen else np.array([0.0, 0.0, 20.0])
         p, R = self.pose(t_s)
         at = p + R @ target
         ends = []

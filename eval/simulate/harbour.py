@@ -26,6 +26,9 @@ from graphloc.frames import Array, Datum, yaw_from_heading_deg
 Point = tuple[Finite, Finite]
 Outline = Annotated[tuple[Point, ...], Field(min_length=3)]
 Surface = Literal["concrete", "asphalt", "wood", "grass", "roof", "stone"]
+RESERVED = frozenset({"world", "map", "odom", "base_link", "imu_link", "gnss", "truth"})  # frames of every bag
+_LARGEST_IMAGE_M = 4000.0
+_NORTHERNMOST_DEG = 80.0  # beyond, UTM ends
 _SHIPPED = resources.files("graphloc.eval.simulate") / "harbours"
 
 
@@ -204,24 +207,23 @@ class Harbour:
             )
         return np.array(routes[route], dtype=float)
 
-    def refuse_collision(self, track: Array, clear_m: float, route: str) -> None:
-        """Refuse a track (N, 2) that comes nearer than `clear_m` to a quay, a pontoon or a pole.
+    def refuse_collision(self, hulls: Sequence[shapely.Polygon], clear_m: float, route: str) -> None:
+        """Refuse a run whose hulls, as they follow each other, come nearer than `clear_m` to something solid.
 
         Raises:
-            ConfigError: it does; the line says to what, and where.
+            ConfigError: one does; the line says to what, and where.
         """
-        way = shapely.LineString(track) if len(track) > 1 else shapely.Point(track[0])
-        solids = [("quay", polygon) for polygon, _ in self.quays] + [
-            ("pontoon", polygon) for polygon, _ in self.pontoons
-        ]
+        solids = [("quay", polygon) for polygon, _ in self.quays]
+        solids += [("pontoon", polygon) for polygon, _ in self.pontoons]
         solids += [(f"dock '{dock.name}'", polygon.buffer(dock.moves_m)) for polygon, dock in self.docks]
-        solids += [("pole", shapely.Point(at)) for at, _ in self.poles]
+        solids += [("pole", shapely.Point(at).buffer(pole.radius_m)) for at, pole in self.poles]
+        swept = shapely.union_all(hulls)
         for kind, solid in solids:
-            away = way.distance(solid)
+            away = swept.distance(solid)
             if away < clear_m:
-                near, _ = ops.nearest_points(way, solid)
+                near, _ = ops.nearest_points(solid, swept)
                 raise ConfigError(
-                    f"harbour '{self.config.name}': route '{route}' comes within {away:.1f} m of a {kind}, near "
+                    f"harbour '{self.config.name}': on route '{route}' the hull comes within {away:.1f} m of a {kind}, near "
                     f"({near.x:.1f}, {near.y:.1f}); {clear_m:g} m are needed: move its waypoints"
                 )
 
@@ -261,6 +263,15 @@ def _built(config: HarbourConfig, where: str) -> Harbour:
     west, south, east, north = config.image_m
     if not (west < east and south < north):
         raise ConfigError(f"{where}: image_m: west, south, east, north; the image has no area")
+    if max(east - west, north - south) > _LARGEST_IMAGE_M:
+        raise ConfigError(f"{where}: image_m: more than {_LARGEST_IMAGE_M:g} m across")
+    if abs(config.datum.latitude_deg) > _NORTHERNMOST_DEG:
+        raise ConfigError(
+            f"{where}: datum.latitude_deg: beyond {_NORTHERNMOST_DEG:g} deg there is no UTM zone for the image"
+        )
+    for k, dock in enumerate(config.docks):
+        if dock.name in RESERVED:
+            raise ConfigError(f"{where}: docks.{k}.name: '{dock.name}' names another frame already")
     _refuse_doubles("docks", "name", [d.name for d in config.docks], where)
     _refuse_doubles("tags", "number", [t.number for t in config.tags], where)
     for k, tag in enumerate(config.tags):

@@ -11,11 +11,12 @@ from importlib import resources
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import shapely
 from pydantic import Field, model_validator
 
 from graphloc.config import Block, Finite, MountConfig, NonNegative, Positive
 from graphloc.eval.simulate._files import load_block, shipped_names
-from graphloc.eval.simulate.harbour import Outline
+from graphloc.eval.simulate.harbour import RESERVED, Outline
 from graphloc.frames import Array
 
 _SHIPPED = resources.files("graphloc.eval.simulate") / "rigs"
@@ -135,6 +136,17 @@ class RigConfig(Block):
     """LiDARs by name; all turn together."""
     cameras: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")], CameraConfig] = Field(default_factory=dict)
     """Cameras by name."""
+
+    @model_validator(mode="after")
+    def _can_be_built(self) -> RigConfig:
+        for key, outline in (("outline", self.hull.outline), ("cabin", self.hull.cabin)):
+            if not shapely.Polygon(outline).is_valid:
+                raise ValueError(f"hull.{key}: crosses itself")
+        names = [*self.lidars, *self.cameras]
+        taken = [n for k, n in enumerate(names) if n in RESERVED or n in names[:k]]
+        if taken:
+            raise ValueError(f"'{taken[0]}' cannot name a sensor: it names another frame already")
+        return self
 
 
 @lru_cache(maxsize=8)

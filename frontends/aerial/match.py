@@ -91,9 +91,14 @@ class Mode:
 
 
 def modes_of(
-    log_likelihood: NDArray[np.float32], grid: Grid, none_log: float, most: int = 5
+    log_likelihood: NDArray[np.float32], grid: Grid, none_log: float, alien: float, most: int = 5
 ) -> tuple[list[Mode], float]:
-    """Return the modes of a posterior (H, R, C), best first, and the probability that none is right."""
+    """Return the modes of a posterior (H, R, C), best first, and the probability that none is right.
+
+    Args:
+        none_log: log-likelihood of a pose of which nothing is known.
+        alien: probability that the scan shows what the image does not, whatever the score.
+    """
     top = float(log_likelihood.max())
     mass = np.exp(log_likelihood.astype(float) - top)
     none = float(np.exp(none_log - top)) * mass.size
@@ -109,7 +114,7 @@ def modes_of(
         labels, _ = ndimage.label(free & (log_likelihood > height - 4.5))
         part = labels == labels[tuple(spot)]
         free &= ~part
-        share = float(mass[part].sum() / total)
+        share = float(mass[part].sum() / total) * (1.0 - alien)
         if share < 0.01:
             continue
         h, r, c = np.nonzero(part)
@@ -119,4 +124,4 @@ def modes_of(
         cell = abs(grid.east_m[1] - grid.east_m[0])
         floor = np.diag([cell**2, cell**2, np.radians(STEP_DEG) ** 2]) / 12.0
         found.append(Mode(mean, (values - mean).T @ (w[:, None] * (values - mean)) + floor, share))
-    return sorted(found, key=lambda m: -m.probability), float(none / total)
+    return sorted(found, key=lambda m: -m.probability), 1.0 - sum(m.probability for m in found)

@@ -22,6 +22,7 @@ _TILE_M = 40.0  # a patch serves all priors of one tile
 # Log-likelihood of a face on an edge, and of a first return on a shore; fitted by benchmarks/matcher.py.
 _WEIGHTS = np.array([0.057, 0.0, 0.0, 0.0, 0.166])
 _NONE_LOG = -2.0  # that of a pose of which nothing is known
+_ALIEN = 0.15  # a scan shows boats that the image does not have, and the reverse
 _LEAST_FACES = 30
 _MODES = 5
 
@@ -94,7 +95,7 @@ class Matcher:
         half_deg = float(np.clip(np.degrees(3.0 * prior.sigma[2]) + 0.5, 1.0, config.window_deg))
         grid = grid_around(layers, prior.pose, half_m, half_deg)
         score = np.tensordot(_WEIGHTS, volumes(found, layers, grid), 1).astype(np.float32)
-        modes, none = modes_of(score, grid, _NONE_LOG, _MODES)
+        modes, none = modes_of(score, grid, _NONE_LOG, _ALIEN, _MODES)
         why_not = "" if modes else "no pose in the window stands out"
         return Match(prior, found, layers, grid, score, tuple(modes), none, why_not)
 
