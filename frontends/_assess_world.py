@@ -16,6 +16,7 @@ from graphloc.time import NS_PER_S
 _EXTENT_M = 20.0  # a shorter way does not tell directions
 _SLACK_M = 3.0  # sideways, of an antenna that may be anywhere on the craft
 _FAR_M = 50e3
+_STANDS = 0.1  # of the fixes' extent: what moves less is not the craft
 _APART_M, _APART = 5.0, 0.02  # largest distance that still fits: metres, share of the extent
 
 
@@ -43,6 +44,9 @@ def origin_of(
     extent = float(np.hypot(*np.ptp(p[:, :2], axis=0))) if len(p) else 0.0
     if len(p) < 10 or extent < _EXTENT_M:
         return None, f"the GNSS track is too short ({extent:.0f} m) to place its frame by"
+    moved = float(np.hypot(*np.ptp(q[:, :2], axis=0)))
+    if moved < _STANDS * extent:
+        return None, f"it moves by {moved:.1f} m while the fixes move by {extent:.0f} m: another body than the craft"
     # As complex numbers about their means, p = exp(i turned) q where the frames differ by a turn.
     a, b = (v[:, 0] - v[:, 0].mean() + 1j * (v[:, 1] - v[:, 1].mean()) for v in (q, p))
     turned = float(np.degrees(np.angle(np.vdot(a, b))))

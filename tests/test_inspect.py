@@ -296,6 +296,18 @@ def test_a_map_grid_is_no_world(tmp_path: Path) -> None:
     assert "looks like a map grid (UTM)" in text
 
 
+def test_another_body_is_no_truth(tmp_path: Path) -> None:
+    """Odometry of something that all but stays where it is, while the craft drives."""
+    make, items = Messages(2), drive(Messages(2))
+    for k, (_, log_ns, fix) in enumerate([item for item in items if item[0] == "/fix"]):
+        stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
+        items.append(("/truth/dock", log_ns, make.odometry(stamp, (140.0 + 0.3 * np.sin(0.1 * k), 86.0, 0.0))))
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.truth_topic is None
+    assert config.datum is None
+    assert "another body than the craft" in text
+
+
 def test_the_antenna_is_taken_off_the_datum(tmp_path: Path) -> None:
     """An antenna 30 m aft, known to /tf_static, on a craft that heads one way: the datum must not lie 30 m off."""
     make, aft = Messages(2), (-30.0, 2.0, 8.0)

@@ -7,6 +7,7 @@ world: the image is sampled point by point (on a net of 8 m, linear between, whi
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,9 @@ class AerialImage:
     def __init__(self, path: Path, datum: Datum) -> None:
         self._path, self._datum = path, datum
         try:
-            self._source: Any = rasterio.open(path)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # said below, as an error
+                self._source: Any = rasterio.open(path)
         except rasterio.errors.RasterioError as error:
             raise InputError(f"{path}: not an image that GDAL can read ({error})") from None
         if self._source.crs is None or self._source.transform.is_identity:
@@ -86,13 +89,10 @@ class AerialImage:
         knots = np.linspace(0.0, n - 1.0, max(2, int(np.ceil(n * cell_m / _NET_M)) + 1))
         columns, rows = np.meshgrid(knots, knots)
         net = self._pixels_of(np.column_stack([west + columns.ravel() * cell_m, north - rows.ravel() * cell_m]))
-        shape = (len(knots), len(knots))
-        at = np.arange(n, dtype=np.float32) * (len(knots) - 1) / (n - 1)
-        u, v = np.meshgrid(at, at)
-        column, row = (
-            cv2.remap(net[:, k].reshape(shape).astype(np.float64), u, v, cv2.INTER_LINEAR).astype(np.float64)
-            for k in (0, 1)
-        )
+        # Linear between knots, by a product: cv2.remap would round to a 32nd of their distance, 0.25 m.
+        at = np.arange(n) * (len(knots) - 1) / (n - 1)
+        between = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(len(knots))))
+        column, row = (between @ net[:, k].reshape(len(knots), -1) @ between.T for k in (0, 1))
         low = np.floor([column.min() - 2.0, row.min() - 2.0]).astype(int)
         high = np.ceil([column.max() + 3.0, row.max() + 3.0]).astype(int)
         low, high = np.maximum(low, 0), np.minimum(high, [self._source.width, self._source.height])
