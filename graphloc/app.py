@@ -22,7 +22,7 @@ from graphloc.eval import ekf, holdout, metrics, report
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Array, Datum, Geodetic
-from graphloc.frontends.aerial import match_bag
+from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import GnssPosition, Measurement
@@ -136,6 +136,34 @@ def with_matches(
         topics=topics,
         message_count=seq,
     )
+
+
+def match_at(
+    recording: Recording, config: VesselConfig, scans: Scans, at_s: float, progress: Progress = _quiet
+) -> tuple[Match, int]:
+    """Match the scan nearest to a time (s since the first IMU sample) around the run smoothed without matches.
+
+    Returns:
+        The match, and its stamp (ns).
+
+    Raises:
+        InputError: no aerial sensor is switched on, or it cannot work there.
+    """
+    sensors = config.of_kind("aerial")
+    if not sensors:
+        raise InputError("no sensor of kind aerial is enabled in vessel.yaml")
+    (sensor, *_) = sensors.values()
+    datum = choose_datum(recording, config)
+    whole = with_synthetic(recording, config, datum)
+    track = smooth(whole, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress).trajectory
+    at_ns = int(track.stamps_ns[0]) + round(at_s * 1e9)
+    found = match_bag(scans.bags, sensor, scans.folder / sensor.image, config.body_frame, track, datum, at_ns=at_ns)
+    item = next(found, None)
+    if item is None or item.match is None:
+        raise InputError(
+            f"{recording.source}: no match at {at_s:g} s: {item.why_not if item else 'no scan in the bag'}"
+        )
+    return item.match, item.stamp_ns
 
 
 def _comparable(run: Run) -> Run:
@@ -308,6 +336,7 @@ __all__ = [
     "Scans",
     "choose_datum",
     "load",
+    "match_at",
     "sha256",
     "simulated",
     "smooth_recording",

@@ -143,6 +143,34 @@ def compare(
     _smooth(bag, config, out, hold_out, overwrite, as_json, compare=True)
 
 
+@app.command()
+def match(
+    bag: BagArgument,
+    config: ConfigOption,
+    at: Annotated[float, typer.Option("--at", help="Time since the start of the run, s.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("match.png"),
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Match one scan to the aerial image, and draw it: scan on image, score, modes."""
+    from graphloc import app as application
+    from graphloc.errors import OutputError
+    from graphloc.eval.match_picture import write_picture
+    from graphloc.frames import heading_deg_from_yaw
+
+    if out.exists() and not overwrite:
+        raise OutputError(f"{out}: exists already; give another --out, or --overwrite")
+    show = _progress()
+    recording, vessel = application.load(bag, config, show)
+    found, _ = application.match_at(recording, vessel, application.Scans(tuple(bag), config.parent), at, show)
+    write_picture(found, out)
+    for mode in found.modes:
+        east, north, yaw = mode.pose
+        typer.echo(
+            f"{mode.probability:.2f}: {east:.2f} m east, {north:.2f} m north, heading {float(heading_deg_from_yaw(yaw)):.1f} deg"
+        )
+    typer.echo(f"{found.none:.2f}: none of them\n{out}")
+
+
 def _pairs(changes: list[str]) -> dict[str, str]:
     from graphloc.errors import ConfigError
 

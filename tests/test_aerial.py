@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from ruamel.yaml import YAML
 
-from graphloc import app
+from graphloc import app, cli
 from graphloc.config import AerialConfig
 from graphloc.errors import InputError
 from graphloc.eval.metrics import compare_to_truth
@@ -312,6 +312,22 @@ def test_from_a_bag_to_the_graph(bag: Path) -> None:
     assert recording.truth is not None
     with_it, without = (compare_to_truth(r.solution.trajectory, recording.truth).heading_rmse_deg for r in (run, alone))
     assert with_it < max(without, 0.3)
+
+
+def test_one_match_is_drawn(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["match", str(bag / "run"), "-c", str(bag / "vessel.yaml"), "--at", "20", "-o", str(tmp_path / "m.png")]
+    for code, said in ((0, "none of them"), (2, "exists already")):
+        monkeypatch.setattr("sys.argv", ["graphloc", *arguments])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert end.value.code == code
+        streams = capsys.readouterr()
+        assert said in streams.out + streams.err
+    drawn = np.asarray(cv2.imread(str(tmp_path / "m.png")))
+    assert min(drawn.shape[:2]) > 500
+    assert (np.abs(drawn.astype(int) - (60, 60, 255)).max(axis=2) < 3).sum() > 500  # its faces
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,8 @@ from graphloc.frontends.aerial.layers import Layer, Layers
 from graphloc.frontends.aerial.scan import Outline
 
 STEP_DEG = 0.5
+# TBB, Numba's first choice, warns on stderr where the one that is installed is older than it likes.
+numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A picture of one aerial match: the scan on the image, the score as a heat map, the modes with their ellipses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from graphloc.errors import OutputError
+from graphloc.frames import Array
+from graphloc.frontends.aerial import Match
+from graphloc.frontends.aerial.image import Pixels
+
+_ZOOM = 3
+_AROUND_M = 60.0
+_FACES, _SHORES, _PRIOR = (60, 60, 255), (80, 255, 80), (255, 160, 0)  # blue, green, red
+_MODES = ((0, 255, 255), (255, 0, 255), (255, 255, 0), (200, 200, 200), (120, 120, 120))
+
+
+def write_picture(match: Match, path: Path) -> None:
+    """Write the picture; the scan lies where the best mode has it, or the prior where there is none.
+
+    Raises:
+        OutputError: there is nothing to draw, or the disk refuses.
+    """
+    if match.layers is None or match.grid is None or match.score is None:
+        raise OutputError(f"nothing to draw: {match.why_not}")
+    pose = match.modes[0].pose if match.modes else match.prior.pose
+    canvas, corner = _image(match, pose)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    for points, colour in ((match.found.shore_m, _SHORES), (match.found.faces_m, _FACES)):
+        for at in _pixels(match, points @ np.array([[c, s], [-s, c]]) + pose[:2], corner):
+            cv2.circle(canvas, (int(at[0]), int(at[1])), 2, colour, -1)
+    _arrow(canvas, match, match.prior.pose, corner, _PRIOR)
+    for mode, colour in zip(match.modes, _MODES, strict=False):
+        _arrow(canvas, match, mode.pose, corner, colour)
+        _ellipse(canvas, match, mode.pose, mode.cov[:2, :2], corner, colour)
+    canvas = np.hstack([canvas, _heat(match, canvas.shape[0])])
+    lines = [
+        f"{m.probability:.2f}  +-{np.sqrt(m.cov[0, 0]):.2f} m east, {np.sqrt(m.cov[1, 1]):.2f} m north"
+        for m in match.modes
+    ]
+    for k, (line, colour) in enumerate(
+        zip([*lines, f"{match.none:.2f}  none of them"], (*_MODES[: len(lines)], _PRIOR), strict=True)
+    ):
+        cv2.putText(canvas, line, (12, 28 + 26 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 0, 0), 4, cv2.LINE_AA)
+        cv2.putText(canvas, line, (12, 28 + 26 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        written = cv2.imwrite(str(path), canvas)
+    except (OSError, cv2.error) as error:
+        raise OutputError(f"{path}: cannot be written ({' '.join(str(error).split())[:160]})") from None
+    if not written:
+        raise OutputError(f"{path}: cannot be written")
+
+
+def _image(match: Match, pose: Array) -> tuple[Pixels, Array]:
+    """The image around a pose, enlarged, and the cell of its top left corner."""
+    assert match.layers is not None
+    patch = match.layers.patch
+    half = int(_AROUND_M / patch.cell_m)
+    column, row = np.rint(patch.cells(pose[None, :2])[0]).astype(int)
+    low = np.maximum([column - half, row - half], 0)
+    part = patch.pixels[low[1] : row + half, low[0] : column + half, ::-1]
+    large = cv2.resize(np.ascontiguousarray(part), None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(large, dtype=np.uint8), low.astype(float)
+
+
+def _pixels(match: Match, p_m: Array, corner: Array) -> Array:
+    assert match.layers is not None
+    return (match.layers.patch.cells(p_m) - corner + 0.5) * _ZOOM
+
+
+def _arrow(canvas: Pixels, match: Match, pose: Array, corner: Array, colour: tuple[int, int, int]) -> None:
+    ahead = pose[:2] + 4.0 * np.array([np.cos(pose[2]), np.sin(pose[2])])
+    a, b = _pixels(match, np.stack([pose[:2], ahead]), corner).astype(int).tolist()
+    cv2.arrowedLine(canvas, a, b, colour, 2, cv2.LINE_AA)
+
+
+def _ellipse(
+    canvas: Pixels, match: Match, pose: Array, cov: Array, corner: Array, colour: tuple[int, int, int]
+) -> None:
+    """95 % of a mode."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 60)
+    ring = np.column_stack([np.cos(angle), np.sin(angle)]) @ np.linalg.cholesky(5.99 * cov).T + pose[:2]
+    cv2.polylines(canvas, [_pixels(match, ring, corner).astype(np.int32)], True, colour, 2, cv2.LINE_AA)
+
+
+def _heat(match: Match, rows: int) -> Pixels:
+    """The score, the best heading of each place."""
+    assert match.score is not None
+    best = match.score.max(axis=0)
+    grey = np.clip(255.0 * (1.0 + (best - best.max()) / 12.0), 0.0, 255.0).astype(np.uint8)
+    coloured = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)
+    side = rows // 2
+    heat = np.zeros((rows, side, 3), dtype=np.uint8)
+    heat[:side] = cv2.resize(coloured, (side, side), interpolation=cv2.INTER_NEAREST)
+    return heat
