@@ -40,8 +40,7 @@ def conditions(at_s: float, out: Path) -> None:
     pictures = []
     for condition in WEATHER:
         run = simulate(harbour_scenarios()[f"dock-fixed-{condition}"], SEED)
-        (config,) = run.rig.cameras.values()
-        pixels = Camera(config, scene_of(run), run).take(at_s, round(at_s * 5)).pixels
+        pixels = Camera("camera", scene_of(run), run).take(at_s, round(at_s * 5)).pixels
         small = cv2.resize(pixels, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
         cv2.putText(small, condition, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.8, 255, 2, cv2.LINE_AA)
         pictures.append(small)

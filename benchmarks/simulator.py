@@ -118,7 +118,7 @@ def _sightings(job: tuple[str, int]) -> dict[str, list[Sighting]]:
     cv2.setNumThreads(1)
     run = simulate(harbour_scenarios()[f"dock-fixed-{condition}"], seed)
     config = run.rig.cameras["camera"]
-    camera = Camera(config, scene_of(run), run)
+    camera = Camera("camera", scene_of(run), run)
     linear = np.rint(255.0 * (np.arange(256) / 255.0) ** 2.2).astype(np.uint8)
     half = 0.5 * 0.412
     corners = np.array([(-half, half, 0.0), (half, half, 0.0), (half, -half, 0.0), (-half, -half, 0.0)])

@@ -28,7 +28,7 @@ from graphloc.eval.simulate.docks import tag_pose
 from graphloc.eval.simulate.harbour import make_harbour
 from graphloc.eval.simulate.lidar import scan, world_points
 from graphloc.eval.simulate.noise import reported_sigma_m
-from graphloc.eval.simulate.rig import CameraConfig, RigConfig, load_rig
+from graphloc.eval.simulate.rig import CameraConfig, HullConfig, RigConfig, load_rig
 from graphloc.eval.simulate.scene import Scene, scene_of
 from graphloc.frames import Array
 from graphloc.measurements import GnssPosition
@@ -42,8 +42,8 @@ LOOKING_AHEAD = MountConfig(rpy_deg=(-90.0, 0.0, -90.0))
 def docking(condition: str, seed: int = 1, **changes: Any) -> tuple[SimulatedRun, Camera]:
     kind = changes.pop("kind", "fixed")
     run = simulate(replace(harbour_scenarios()[f"dock-{kind}-{condition}"], **changes), seed)
-    (config,) = run.rig.cameras.values()
-    return run, Camera(config, scene_of(run), run)
+    (name,) = run.rig.cameras
+    return run, Camera(name, scene_of(run), run)
 
 
 @pytest.fixture(scope="module")
@@ -111,16 +111,19 @@ def bench(
     harbour = make_harbour(
         {
             "name": "bench", "datum": {"latitude_deg": 57.7, "longitude_deg": 11.7}, "image_m": [-30, -30, 30, 30],
-            "quays": [{"outline": [[-20, 20], [20, 20], [20, 25], [-20, 25]], "top_m": 6.0}],
+            "quays": [{"outline": [[-20, 20], [20, 20], [20, 25], [-20, 25]], "top_m": 12.0}],
             "routes": {"here": [[0, 0]]}, "tags": [{"number": 5, "facing_deg": 180, **tag}], **more,
         },
         "bench",
     )  # fmt: skip
     run = simulate(find_scenario("bl3-clean", {"camera_hz": "1", "tide_m": "0", "condition": condition}), 1)
-    rig = RigConfig(**{**dict(load_rig("tiara")), "cameras": {"camera": camera or CameraConfig(mount=LOOKING_AHEAD)}})
+    block = ((-3.0, -1.0), (-2.0, -1.0), (-2.0, 1.0), (-3.0, 1.0))  # the vessel: behind the camera
+    hull = HullConfig(outline=block, top_m=0.5, cabin=block, cabin_top_m=1.0)
+    rig = RigConfig(
+        **{**dict(load_rig("tiara")), "hull": hull, "cameras": {"camera": camera or CameraConfig(mount=LOOKING_AHEAD)}}
+    )
     run = replace(run, harbour=harbour, docks=(), rig=rig, motion=_Still())
-    (config,) = rig.cameras.values()
-    yield run, Camera(config, Scene(harbour, (), 0.0, (), rig.hull), run)
+    yield run, Camera("camera", Scene(harbour, (), 0.0, (), rig.hull), run)
 
 
 class _Still(Motion):
@@ -233,7 +236,7 @@ def test_darkness_costs_light_and_gains_noise_and_drops_hide(detector: Detector)
     burnt = {name: (shot.pixels > 250).mean() for name, shot in shots.items()}
     assert burnt["counterlight"] > 5.0 * burnt["optimal"] + 0.005  # the sun, and its glitter on the water
     _, wet = docking("droplet")
-    hidden = [set(detected(detector, wet.take(float(t), k).pixels)) for k, t in enumerate(np.arange(50.0, 80.0, 1.5))]
+    hidden = [set(detected(detector, wet.take(float(t), k).pixels)) for k, t in enumerate(np.arange(30.0, 100.0, 2.0))]
     assert any(seen < {226, 227, 228} for seen in hidden)
     assert any(seen == {226, 227, 228} for seen in hidden)
 
@@ -271,8 +274,8 @@ def test_motion_smears_by_its_length() -> None:
 def test_what_is_beside_the_view_neither_smears_nor_shows(rig: str) -> None:
     """A tag abeam, level with the lens: its projection is nonsense, and with distortion anything at all."""
     run = simulate(find_scenario("bl1-drift", {"rig": rig, "camera_hz": "1"}), 3)
-    (config,) = run.rig.cameras.values()
-    camera = Camera(config, scene_of(run), run)
+    (name,) = run.rig.cameras
+    camera = Camera(name, scene_of(run), run)
     abeam = [
         t
         for t in np.arange(2.0, 110.0, 0.5)
@@ -296,9 +299,10 @@ def test_a_dock_wanders_as_far_as_it_says_and_its_tags_ride_on_it() -> None:
     run, camera = docking("optimal", kind="floating")
     (dock,) = run.docks
     p, R = dock.pose(np.linspace(0.0, 120.0, 2401))
-    assert np.abs(p[:, :2] - dock.rest_m).max(axis=0) == pytest.approx([0.3, 0.3], rel=0.01)
+    assert (np.abs(p[:, :2] - dock.rest_m).max(axis=0) <= 0.3).all()
+    assert np.abs(p[:, :2] - dock.rest_m).max() > 0.15
     yaw = np.degrees(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
-    assert np.abs(yaw).max() == pytest.approx(1.5, rel=0.01)
+    assert 0.5 < np.abs(yaw).max() <= 1.5
     assert p[:, 2].mean() == pytest.approx(run.scenario.tide_m, abs=0.01)
     t = 33.0
     at, turned = (v[0] for v in dock.pose(np.array([t])))
@@ -390,6 +394,193 @@ def test_the_recording_holds_images_as_drivers_write_them(tmp_path: Path, detect
     p, R = tag_pose(run.harbour.config.tags[0], run.harbour)
     np.testing.assert_allclose(p, [70.6, 96.0, 1.5])
     np.testing.assert_allclose(R, [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-12)  # faces south: x east, y up
+
+
+def quaternion_matrix(q: Any) -> Array:
+    x, y, z, w = q.x, q.y, q.z, q.w
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+def stamp_of(message: Any) -> int:
+    return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+
+def test_corners_are_where_the_bag_alone_says(tmp_path: Path, detector: Detector) -> None:
+    """Survey, `/tf_static`, `/truth`, `/truth/<dock>`, K and D, put together by hand: the chain that a user goes.
+
+    Odd on purpose: two cameras, yawed, tilted and distorting; tags that face 135 and 225 deg; a tide; a turned dock.
+    """
+    harbour = {
+        "name": "odd", "datum": {"latitude_deg": 57.7, "longitude_deg": 11.7}, "image_m": [-60, -60, 60, 60],
+        "quays": [{"outline": [[-16, 10], [-10, 16], [-10, 24], [-24, 24], [-24, 10]], "top_m": 3.5}],
+        "docks": [{"name": "raft", "outline": [[12, 7], [16, 11], [13, 14], [9, 10]], "top_m": 2.0, "moves_deg": 8, "period_s": 6}],
+        "pontoons": [{"outline": [[-1, 30], [1, 30], [1, 31], [-1, 31]], "top_m": 0.5}],
+        "tags": [
+            {"number": 3, "at": [-13, 13], "height_m": 2.2, "facing_deg": 135, "size_m": 0.9},
+            {"number": 4, "at": [10.5, 8.5], "height_m": 1.0, "facing_deg": 225, "size_m": 0.8, "dock": "raft"},
+        ],
+        "routes": {"entry": [[0, -12], [0, -2]]},
+    }  # fmt: skip
+    yaml = YAML(typ="safe", pure=True)
+    rig = yaml.load((Path(__file__).parent.parent / "eval/simulate/rigs/launch.yaml").read_text())
+    lens = {"width_px": 1600, "height_px": 1200, "focal_px": [620, 640], "centre_px": [812, 590]}
+    bent = [-0.05, 0.01, 0.002, -0.003, 0.001]
+    rig["cameras"] = {
+        name: {"mount": {"xyz_m": [0.5, y, 1.5], "rpy_deg": [-95, 3, yaw]}, "distortion": bent, **lens}
+        for name, y, yaw in (("port", 0.6, -30), ("starboard", -0.6, -150))
+    }
+    for name, block in (("harbour", harbour), ("rig", rig)):
+        with (tmp_path / f"{name}.yaml").open("w") as stream:
+            yaml.dump(block, stream)
+    changes = {
+        "harbour": str(tmp_path / "harbour.yaml"), "rig": str(tmp_path / "rig.yaml"), "camera_hz": "2", "lidar_hz": "0.3",
+        "tide_m": "0.6", "duration_s": "12", "route_s": "12",
+    }  # fmt: skip
+    run = replace(simulate(find_scenario("bl1-clean", changes), 2))
+    bag, _ = write_bag(run, tmp_path / "out", ros=2)
+    with AnyReader([bag]) as reader:
+        read: list[tuple[str, int, Any]] = [
+            (c.topic, log, reader.deserialize(m, c.msgtype)) for c, log, m in reader.messages()
+        ]
+        (latched,) = (c for c in reader.connections if c.topic == "/tf_static")
+    assert "TRANSIENT_LOCAL" in str(latched.ext)
+    tf = {t.child_frame_id: t.transform for name, _, m in read if name == "/tf_static" for t in m.transforms}
+    assert {"mast", "port_optical_frame", "starboard_optical_frame"} <= set(tf)
+    assert all(log >= stamp_of(m) for name, log, m in read if name != "/tf_static")
+
+    def pose(topic: str, stamp: int) -> tuple[Array, Array]:
+        """Of the two around a stamp, linear between."""
+        all_of_it = [m for name, _, m in read if name == topic]
+        k = int(np.searchsorted([stamp_of(m) for m in all_of_it], stamp))
+        a, b = all_of_it[k - 1], all_of_it[k]
+        share = (stamp - stamp_of(a)) / (stamp_of(b) - stamp_of(a))
+        ps = [np.array([m.pose.pose.position.x, m.pose.pose.position.y, m.pose.pose.position.z]) for m in (a, b)]
+        Rs = [quaternion_matrix(m.pose.pose.orientation) for m in (a, b)]
+        u, _, v = np.linalg.svd((1 - share) * Rs[0] + share * Rs[1])
+        return (1 - share) * ps[0] + share * ps[1], u @ v
+
+    survey = {t["id"]: t for t in yaml.load((tmp_path / "out/tags.yaml").read_text())["tags"]}
+    assert {k: (t["size_m"], t["frame"]) for k, t in survey.items()} == {3: (0.9, "world"), 4: (0.8, "raft")}
+    assert {m.child_frame_id for name, _, m in read if name == "/truth/raft"} == {"raft"}
+    off: dict[int, list[float]] = {3: [], 4: []}
+    for name in ("port", "starboard"):
+        infos = {stamp_of(m): m for topic, _, m in read if topic == f"/{name}/camera_info"}
+        images = [m for topic, _, m in read if topic == f"/{name}/image_raw/compressed"]
+        mount = tf[f"{name}_optical_frame"]
+        t_bc = np.array([mount.translation.x, mount.translation.y, mount.translation.z])
+        R_bc = quaternion_matrix(mount.rotation)
+        for image in images[2:-2]:
+            info = infos[stamp_of(image)]
+            assert image.format.startswith("mono8; jpeg")
+            assert info.distortion_model == "plumb_bob"
+            np.testing.assert_allclose(info.p.reshape(3, 4)[:, :3], info.k.reshape(3, 3))
+            k1, k2, p1, p2, k3 = info.d
+            p_wb, R_wb = pose("/truth", stamp_of(image))
+            pixels = np.asarray(cv2.imdecode(image.data, cv2.IMREAD_UNCHANGED), dtype=np.uint8)
+            for number, corners in detected(detector, LINEAR[pixels]).items():
+                tag = survey[number]
+                roll, pitch, yaw = np.radians(tag["rpy_deg"])
+                turn = [
+                    np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]]),
+                    np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]),
+                    np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]),
+                ]
+                in_frame = CORNERS * tag["size_m"] / 0.412 @ (turn[2] @ turn[1] @ turn[0]).T + tag["xyz_m"]
+                if tag["frame"] != "world":
+                    p_wd, R_wd = pose(f"/truth/{tag['frame']}", stamp_of(image))
+                    in_frame = in_frame @ R_wd.T + p_wd
+                at = ((in_frame - p_wb) @ R_wb - t_bc) @ R_bc
+                x, y = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2]
+                r2 = x**2 + y**2
+                radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+                u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+                v = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+                expected = np.column_stack([u, v]) @ info.k.reshape(3, 3)[:2, :2].T + info.k.reshape(3, 3)[:2, 2]
+                off[number].append(float(np.abs(corners - expected).max()))
+    assert min(len(o) for o in off.values()) > 10
+    # A surveyor's 1 cm at 9 m is 0.7 px, and it can be three times that; a wrong link in the chain is tens.
+    assert np.mean([v for o in off.values() for v in o]) < 1.0
+    assert max(max(o) for o in off.values()) < 2.2
+    docks = yaml.load((tmp_path / "out/tags.yaml").read_text())["docks"]
+    assert docks[0]["xyz_m"] == [12.5, 10.5, 0.0]
+    truth = json.loads((tmp_path / "out/truth.json").read_text())["tags"]["3"]
+    # Faces south-east, seen from there: right is north-east.
+    np.testing.assert_allclose(
+        np.array(truth["R"]) * np.sqrt(2.0), [[1, 0, 1], [1, 0, -1], [0, np.sqrt(2.0), 0]], atol=1e-9
+    )
+    clouds = [m for name, _, m in read if name == "/mast/points"]
+    fields = {f.name: f for f in clouds[0].fields}
+    rows = clouds[0].data.reshape(-1, clouds[0].point_step)
+    for field, kind in (("time", "<f4"), ("ring", "<u2")):
+        begin = fields[field].offset
+        column = np.ascontiguousarray(rows[:, begin : begin + np.dtype(kind).itemsize]).view(kind)
+        assert len(np.unique(column)) > 10
+        assert column.max() < {"time": 0.1, "ring": 32}[field]
+
+
+def test_two_cameras_share_the_sun_and_no_noise() -> None:
+    run = simulate(find_scenario("dock-fixed-counterlight", {}), 1)
+    mount = run.rig.cameras["camera"]
+    twins = {"a": mount, "b": mount.model_copy(update={"width_px": 1000})}
+    run = replace(run, rig=run.rig.model_copy(update={"cameras": {**twins, "c": mount}}))
+    a, b, c = (Camera(name, scene_of(run), run) for name in ("a", "b", "c"))
+    one, other = (camera.take(60.0, 0).pixels.astype(float) for camera in (a, c))
+    fine, coarse = (one - other)[900:], one[900:] - cv2.GaussianBlur(one[900:], (0, 0), 1.0)
+    assert fine.std() > 0.5 * coarse.std()  # the same noise would cancel
+    np.testing.assert_allclose(
+        a.radiance(60.0)[300:900:7, 200:990:7], b.radiance(60.0)[300:900:7, 200:990:7], rtol=0.02
+    )
+
+
+def test_a_dark_field_has_its_read_noise() -> None:
+    camera = CameraConfig(mount=LOOKING_AHEAD, width_px=640, height_px=480)
+    noise = np.random.default_rng(1).standard_normal((480, 640), dtype=np.float32)
+    ms, gain = 30.0, 16.0
+    electrons = 60.0
+    field = np.full((480, 640), electrons / (ms * camera.electrons_per_ms), dtype=np.float32)
+    level = (digitise(field, camera, (ms, gain), noise) / 255.0) ** 2.2 * camera.full_well / gain
+    assert level.std() == pytest.approx(np.sqrt(electrons + camera.read_noise**2), rel=0.02)
+
+
+def test_a_point_of_light_is_blurred_and_veiled() -> None:
+    """Its core is a Gaussian of the lens; stray light takes 4.5 % of it, times its weather, and loses none."""
+    camera = CameraConfig(mount=LOOKING_AHEAD, width_px=1600, height_px=1600, blur_px=1.5)
+    field = np.zeros((1600, 1600), dtype=np.float32)
+    field[800, 800] = 1.0
+    for times in (1.0, 4.0):
+        seen = through_lens(field, camera, times, (), 0.0, np.zeros(2)).astype(float)
+        core = seen[792:809, 792:809]
+        # Of the nearest halo, 6 px wide, erf(8.5 / 6 / sqrt(2))^2 = 0.71 lies within as well.
+        assert core.sum() == pytest.approx(1.0 - 0.045 * times + 0.71 * 0.02 * times, abs=0.002 * times)
+        _, u = np.mgrid[-8:9, -8:9]
+        floor = seen[780, 780]
+        spread = ((core - floor) * u**2).sum() / (core - floor).sum()
+        assert times > 1.0 or spread == pytest.approx(1.5**2, rel=0.15)  # else the halo bears on it
+        assert seen.sum() == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("way", ["own cabin", "water", "behind another tag"])
+def test_tags_are_hidden_by(way: str, detector: Detector) -> None:
+    tags: dict[str, Any] = {"at": [0.0, 20.0], "height_m": 3.0, "size_m": 1.0}
+    more: dict[str, Any] = {}
+    camera = None
+    if way == "own cabin":  # from behind it
+        camera = CameraConfig(mount=MountConfig(xyz_m=(-5.0, 0.0, -0.5), rpy_deg=(-90.0, 0.0, -90.0)))
+    elif way == "water":
+        tags["height_m"] = -1.0
+    else:
+        more["tags"] = [
+            {"number": 6, "facing_deg": 180, "at": [0.0, 12.0], "height_m": 2.6, "size_m": 1.0},
+            {"number": 5, "facing_deg": 180, **tags},
+        ]
+    with bench(tags, camera, **more) as (_, taker):
+        seen = detected(detector, taker.take(0.0, 0).pixels)
+        assert 5 not in seen
+        assert (6 in seen) is (way == "behind another tag")
 
 
 def test_fixes_claim_what_is_right_on_average_only() -> None:

@@ -45,7 +45,7 @@ def load_block(what: str, name_or_path: str, folder: Traversable, model: type[_B
             raise ConfigError(f"{where}: cannot be read ({error})") from None
     try:
         raw = YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
+    except (YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{where}: not valid YAML: {' '.join(str(error).split())[:200]}") from None
     if not isinstance(raw, Mapping):
         raise ConfigError(f"{where}: the top level must be a mapping")

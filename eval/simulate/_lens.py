@@ -33,7 +33,7 @@ class Drop:
 
 
 def draw_drops(rng: np.random.Generator, camera: CameraConfig, duration_s: float) -> tuple[Drop, ...]:
-    """Draw drops that come and go: about five on the lens at any time, as wide as a tag nearby."""
+    """Draw drops that come and go: three to five on the lens at any time, as wide as a tag nearby."""
     found = []
     for _ in range(max(1, int(duration_s / 2.5))):
         begin = float(rng.uniform(-12.0, duration_s))

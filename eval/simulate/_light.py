@@ -36,6 +36,7 @@ _WALL = 0.6  # of the sky's light, what a wall gets
 _SKY, _SUN = 1.2, 3000.0
 _ASTRAY_PX = 0.05  # a ray that its lens takes elsewhere
 _NEAREST_M = 0.1
+_PROUD_M = 0.05  # a tag may lie this far behind the face of its wall
 _STEP = 3  # pixels between rays of the background
 _GRAIN = 512  # pixels of the tile that surfaces take their grain from
 
@@ -138,8 +139,10 @@ class Light:
         coarse = self._background(view).reshape(self._coarse)
         fine = cv2.resize(coarse, None, fx=_STEP, fy=_STEP, interpolation=cv2.INTER_LINEAR)
         picture = np.array(fine[: self.size[0], : self.size[1]], dtype=np.float32)
-        for tag in self._harbour.config.tags:
-            self._tag(picture, tag, view)
+        p, _ = view.pose
+        placed = [(tag, tag_in_world(tag, self._harbour, self._scene, view.t_s)) for tag in self._harbour.config.tags]
+        for tag, pose in sorted(placed, key=lambda item: -float(np.linalg.norm(item[1][0] - p))):  # the nearest last
+            self._tag(picture, tag, pose, view)
         return picture
 
     def sees(self, p_m: Array) -> bool:
@@ -226,28 +229,26 @@ class Light:
         off2 = (np.mod(at[:, 0], 30.0) - 15.0) ** 2 + (np.mod(at[:, 1], 30.0) - 15.0) ** 2 + (at[:, 2] - 6.0) ** 2
         return np.asarray(0.05 / (1.0 + off2), dtype=np.float32)
 
-    def _tag(self, picture: Picture, tag: Tag, view: View) -> None:
-        p, R = view.pose
-        at, turned = tag_in_world(tag, self._harbour, self._scene, view.t_s)
+    def _tag(self, picture: Picture, tag: Tag, pose: Pose, view: View) -> None:
+        (p, R), (at, turned) = view.pose, pose
         t_camera_tag, R_camera_tag = R.T @ (at - p), R.T @ turned
         half = 0.5 * PLATE * tag.size_m
-        corners = (
-            t_camera_tag
-            + np.array([(-half, -half), (half, -half), (half, half), (-half, half)]) @ R_camera_tag[:, :2].T
-        )
+        rim = np.concatenate([np.linspace(-half, half, 9), np.full(9, half)])  # edges bend in a lens
+        square = np.column_stack([np.concatenate([rim, -rim]), np.concatenate([rim[::-1], -rim[::-1]])])
+        corners = t_camera_tag + square @ R_camera_tag[:, :2].T
         if corners[:, 2].min() < _NEAREST_M or R_camera_tag[:, 2] @ t_camera_tag >= 0.0:
             return  # behind the camera, or seen from behind
         flat = corners[:, :2] / corners[:, 2:]
         if (flat.max(axis=0) < self._low).any() or (flat.min(axis=0) > self._high).any():
             return  # beside its view
-        within = np.column_stack([np.clip(flat, self._low, self._high), np.ones(4)])
+        within = np.column_stack([np.clip(flat, self._low, self._high), np.ones(len(flat))])
         seen = project(self._camera, within)
         low = np.maximum(np.floor(seen.min(axis=0)).astype(int) - 1, 0)
         high = np.minimum(np.ceil(seen.max(axis=0)).astype(int) + 2, self.size[::-1])
         if (high <= low).any() or (low + 1 >= self.size[::-1]).any():
             return
         width, rows = high - low
-        fine = int(np.clip(600 // max(width, rows), 2, 8))  # rays a pixel, each way
+        fine = int(np.clip(600 // max(width, rows), 1, 8))  # rays a pixel, each way
         inner = (np.arange(fine) + 0.5) / fine - 0.5
         v, u = np.meshgrid(
             (low[1] + np.arange(rows)[:, None] + inner).ravel(), (low[0] + np.arange(width)[:, None] + inner).ravel(),
@@ -265,18 +266,26 @@ class Light:
         def mean(values: Array) -> Array:
             return np.asarray(values.reshape(rows, fine, width, fine).mean(axis=(1, 3)))
 
-        free = self._free(view, low, rows, width, distance)
+        free = self._free(view, low, rows, width, (t_camera_tag, R_camera_tag))
         patch = picture[low[1] : high[1], low[0] : high[0]]
         patch[:] = patch * (1.0 - free * mean(covered.astype(float))) + free * mean(np.where(covered, shown, 0.0))
 
-    def _free(self, view: View, low: NDArray[np.int64], rows: int, width: int, distance_m: float) -> Array:
-        """1 where nothing stands between the camera and a tag at a distance, (rows, width)."""
-        p, R = view.pose
+    def _free(self, view: View, low: NDArray[np.int64], rows: int, width: int, T_camera_tag: Pose) -> Array:
+        """1 where nothing stands between the camera and a tag's plane, (rows, width)."""
+        (p, R), (at, turned) = view.pose, T_camera_tag
         v, u = np.meshgrid(low[1] + np.arange(rows), low[0] + np.arange(width), indexing="ij")
         ahead = rays(self._camera, u.ravel().astype(float), v.ravel().astype(float))
-        hit = self._scene.cast(p.astype(np.float32), ahead @ R.T.astype(np.float32), view.t_s)
-        there = hit.range_m * np.linalg.norm(ahead, axis=1)
-        return np.asarray((there > distance_m - 0.4).reshape(rows, width), dtype=np.float64)
+        in_world = ahead @ R.T.astype(np.float32)
+        hit = self._scene.cast(p.astype(np.float32), in_world, view.t_s).range_m
+        mount = self._camera.mount
+        in_body = ahead @ mount.R_body_sensor.T.astype(np.float32)
+        own = self._scene.own_range_m(mount.t_body_sensor_m.astype(np.float32), in_body)
+        down = np.minimum(in_world[:, 2], -1e-6)
+        water = np.where(in_world[:, 2] < 0.0, (self._scene.tide_m - p[2]) / down, np.inf)
+        reach = (at @ turned[:, 2]) / (ahead @ turned[:, 2])
+        length = np.linalg.norm(ahead, axis=1)
+        nearest = np.minimum(np.minimum(hit, own), water)
+        return np.asarray(((nearest - reach) * length > -_PROUD_M).reshape(rows, width), dtype=np.float64)
 
 
 def _print(tag: Tag, at_m: Array) -> tuple[NDArray[np.bool_], Array]:

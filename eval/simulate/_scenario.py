@@ -201,22 +201,26 @@ def _refuse_nonsense(s: Scenario) -> None:
     Raises:
         ConfigError: the first of them.
     """
-    limits = {key: (0.0, 200.0) for key in _fields(s) if key.endswith("_hz") and not key.endswith("per_sqrt_hz")}
-    limits |= {
-        key: (0.0, 1e6) for key in _fields(s) if key.startswith(("wave_", "gnss_", "pose_sigma", "gyro_", "accel_"))
+    numbers = {
+        key: value for key in _fields(s) if isinstance(value := getattr(s, key), float) and key != "compass_until_s"
     }
+    limits = {key: (-1e6, 1e6) for key in numbers} | {key: (0.0, 200.0) for key in numbers if key.endswith("_hz")}
     limits |= {
-        "gnss_hz": (0.0, 200.0),
-        "false_fraction": (0.0, 1.0),
-        "false_stays": (0.0, 1.0),
-        "tide_m": (-10.0, 10.0),
+        key: (0.0, 1e6) for key in numbers if key.startswith(("wave_", "gnss_sigma", "gnss_rep", "false_", "gyro_b"))
     }
-    limits |= {"imu_hz": (10.0, 2000.0), "duration_s": (2.0, _LONGEST_S), "route_s": (2.0, _LONGEST_S), "case": (1, 3)}
+    limits |= {key: (1e-3, 1e6) for key in numbers if key.endswith("per_sqrt_hz") or key.startswith("pose_sigma")}
+    limits |= {"false_fraction": (0.0, 1.0), "false_stays": (0.0, 1.0), "tide_m": (-10.0, 10.0), "case": (1, 3)}
+    limits |= {"imu_hz": (10.0, 2000.0), "duration_s": (2.0, _LONGEST_S), "route_s": (2.0, _LONGEST_S)}
     limits |= {"pose_modes": (1, 20), "compass_sigma_deg": (1e-3, 90.0), "compass_offset_deg": (-180.0, 180.0)}
+    limits |= {"gnss_reported_spread": (0.0, 2.0)}
     for key, (low, high) in limits.items():
         value = getattr(s, key)
         if not low <= value <= high:
             raise ConfigError(f"--set {key}={value:g}: must be from {low:g} to {high:g}")
+        if key.endswith("_hz") and 0.0 < value < 3.0 / s.duration_s:
+            raise ConfigError(f"--set {key}={value:g}: fewer than three in {s.duration_s:g} s; 0 switches it off")
+    if s.start_heading_error_deg is not None and not np.isfinite(s.start_heading_error_deg):
+        raise ConfigError(f"--set start_heading_error_deg={s.start_heading_error_deg:g}: must be a number")
 
 
 def _fields(s: Scenario) -> tuple[str, ...]:
@@ -241,6 +245,11 @@ def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
     rng = np.random.default_rng([seed, 7])
     harbour = load_harbour(scenario.harbour) if scenario.harbour else None
     rig = load_rig(scenario.rig)
+    slow = [name for name, lidar in rig.lidars.items() if lidar.scan_s * scenario.lidar_hz > 1.0]
+    if slow:
+        raise ConfigError(
+            f"lidar_hz={scenario.lidar_hz:g}: {slow[0]} takes {rig.lidars[slow[0]].scan_s:g} s for a turn"
+        )
     motion = _motion(scenario, rng) if harbour is None else _harbour_motion(scenario, harbour, rig, rng)
     datum = Datum(DATUM) if harbour is None else harbour.datum
     config = _config(scenario, rig, motion, datum)
@@ -262,11 +271,7 @@ def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
         topics={name: sensor.topic for name, sensor in config.sensors.items()},
         truth=truth,
     )
-    docks = (
-        ()
-        if harbour is None
-        else moving_docks(harbour, scenario.tide_m, scenario.duration_s, np.random.default_rng([seed, 19]))
-    )
+    docks = () if harbour is None else moving_docks(harbour, scenario.tide_m, np.random.default_rng([seed, 19]))
     return SimulatedRun(
         scenario=scenario, seed=seed, recording=recording, truth=truth, config=config, motion=motion, rig=rig,
         harbour=harbour, docks=docks,

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -38,9 +39,14 @@ _LATENCY_NS = {
     "/gnss/heading": 60_000_000,
     "/aerial/pose": 400_000_000,
 }
-_CLOUD_LATENCY_NS = 130_000_000  # a turn, and the driver
+_DRIVER_NS = 30_000_000  # after the turn of a LiDAR
 _IMAGE_LATENCY_NS = 80_000_000
 _TRUTH_HZ = 20.0
+_ALWAYS = QosTime(2147483647, 4294967295)
+_LATCHED = Qos(
+    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, _ALWAYS, _ALWAYS, QosLiveliness.AUTOMATIC,
+    _ALWAYS, False,
+)  # fmt: skip
 _CONFIG, _AERIAL, _TAGS, TRUTH = "vessel.yaml", "aerial.tif", "tags.yaml", "truth.json"
 
 
@@ -94,12 +100,22 @@ def _write(run: SimulatedRun, folder: Path, ros: int, storage: str, progress: Pr
         done_s = 0
         for item in heapq.merge(_small(run, make), *_seen(run, make), key=lambda item: item.log_ns):
             if item.topic not in connections:
-                connections[item.topic] = writer.add_connection(item.topic, item.kind, typestore=make.store)
+                connections[item.topic] = _connect(writer, item, make)
             writer.write(connections[item.topic], item.log_ns, serialize(item.message, item.kind))
             if (item.log_ns - start) // 10**9 > done_s:
                 done_s = min((item.log_ns - start) // 10**9, whole_s)
                 progress("writing the bag", done_s, whole_s)
     return bag.name
+
+
+def _connect(writer: Writer1 | Writer2, item: _Item, make: Messages) -> Any:
+    """Announce a topic. Mounts are latched, as drivers publish them: a listener that comes late gets them."""
+    latched = item.topic == "/tf_static"
+    if isinstance(writer, Writer1):
+        return writer.add_connection(item.topic, item.kind, typestore=make.store, latching=1 if latched else None)
+    return writer.add_connection(
+        item.topic, item.kind, typestore=make.store, offered_qos_profiles=[_LATCHED] if latched else []
+    )
 
 
 def _start_ns(run: SimulatedRun) -> int:
@@ -147,13 +163,15 @@ def _clouds(run: SimulatedRun, make: Messages, scene: Scene) -> Iterator[_Item]:
         stamp = _start_ns(run) + round(t * 1e9)
         for name, lidar in run.rig.lidars.items():
             cloud = make.cloud(stamp, scan(name, lidar, scene, run.motion, t, rng))
-            yield _Item(stamp + _CLOUD_LATENCY_NS, f"/{name}/points", "sensor_msgs/msg/PointCloud2", cloud)
+            yield _Item(
+                stamp + round(lidar.scan_s * 1e9) + _DRIVER_NS, f"/{name}/points", "sensor_msgs/msg/PointCloud2", cloud
+            )
 
 
 def _images(run: SimulatedRun, make: Messages, scene: Scene, name: str) -> Iterator[_Item]:
     """A camera's images in turn, each with its `CameraInfo`; some are made ahead, one on each core."""
     s, config, frame = run.scenario, run.rig.cameras[name], f"{name}_optical_frame"
-    camera = Camera(config, scene, run)
+    camera = Camera(name, scene, run)
 
     def take(k: int) -> list[_Item]:
         t = (k + 0.3) / s.camera_hz

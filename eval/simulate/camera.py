@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,6 @@ import numpy as np
 from graphloc.eval.simulate._lens import Image, digitise, draw_drops, exposure, through_lens
 from graphloc.eval.simulate._light import Light, Picture, Pose, View, project, tag_in_world
 from graphloc.eval.simulate._scenario import SimulatedRun
-from graphloc.eval.simulate.rig import CameraConfig
 from graphloc.eval.simulate.scene import Scene
 from graphloc.eval.simulate.weather import WEATHER
 from graphloc.frames import Array
@@ -35,11 +35,13 @@ class Shot:
 class Camera:
     """Takes images along a run. An image depends on its time and number only, not on those before it."""
 
-    def __init__(self, config: CameraConfig, scene: Scene, run: SimulatedRun) -> None:
+    def __init__(self, name: str, scene: Scene, run: SimulatedRun) -> None:
         assert run.harbour is not None  # or there were no scene
         harbour, weather, seed = run.harbour, WEATHER[run.scenario.condition], run.seed
-        rng = np.random.default_rng([seed, 17])
-        self.config, self._harbour, self._scene, self._motion, self._seed = config, harbour, scene, run.motion, seed
+        config = run.rig.cameras[name]
+        self._own_seed = [seed, 17, zlib.crc32(name.encode())]  # no two cameras share noise or drops
+        rng = np.random.default_rng([*self._own_seed, 0])
+        self.config, self._harbour, self._scene, self._motion = config, harbour, scene, run.motion
         self._light = Light(config, harbour, scene, weather)
         self._drops = draw_drops(rng, config, run.scenario.duration_s) if weather.drops else ()
         self._stray = weather.stray
@@ -47,7 +49,8 @@ class Camera:
         self._sun: Array | None = None
         if weather.sun_elevation_deg is not None:
             facing = harbour.config.tags[0].facing_deg if harbour.config.tags else 180.0
-            azimuth = np.radians(facing + 180.0 + rng.normal(0.0, _SUN_OFF_DEG))
+            off_deg = np.random.default_rng([seed, 18]).normal(0.0, _SUN_OFF_DEG)  # one sun for all cameras
+            azimuth = np.radians(facing + 180.0 + off_deg)
             up = np.radians(weather.sun_elevation_deg)
             self._sun = np.array([np.cos(up) * np.sin(azimuth), np.cos(up) * np.cos(azimuth), np.sin(up)])
 
@@ -76,7 +79,7 @@ class Camera:
         ms, gain = exposure(picture, self.config)
         moved = self._moved_px(t_s, ms * 1e-3)
         picture = through_lens(picture, self.config, self._stray, self._drops, t_s, moved)
-        i, j = np.random.default_rng([self._seed, 17, number]).integers(0, 256, 2)
+        i, j = np.random.default_rng([*self._own_seed, 1, number]).integers(0, 256, 2)
         rows, columns = picture.shape
         pixels = digitise(picture, self.config, (ms, gain), self._noise[i : i + rows, j : j + columns])
         return Shot(pixels, ms, gain, float(np.hypot(*moved)))

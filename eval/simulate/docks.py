@@ -40,11 +40,9 @@ class MovingDock:
         return p, Rotation.from_euler("xyz", np.column_stack([roll, pitch, yaw])).as_matrix()
 
 
-def moving_docks(
-    harbour: Harbour, tide_m: float, duration_s: float, rng: np.random.Generator
-) -> tuple[MovingDock, ...]:
-    """Draw how the docks of a harbour move; within the run each wanders as far as its block says, and no farther."""
-    t = np.arange(0.0, max(duration_s, 1.0), 0.25)
+def moving_docks(harbour: Harbour, tide_m: float, rng: np.random.Generator) -> tuple[MovingDock, ...]:
+    """Draw how the docks of a harbour move; within four hours each wanders as far as its block says, and no farther."""
+    t = np.arange(0.0, 4.0 * 3600.0, 0.5)
 
     def wander(size: float, period_s: float) -> Waves:
         drawn = Waves.jonswap(rng, 1.0, period_s)

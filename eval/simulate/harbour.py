@@ -23,7 +23,8 @@ from graphloc.errors import ConfigError
 from graphloc.eval.simulate._files import load_block, shipped_names, validated
 from graphloc.frames import Array, Datum, yaw_from_heading_deg
 
-Point = tuple[Finite, Finite]
+Metres = Annotated[float, Field(ge=-2e4, le=2e4)]
+Point = tuple[Metres, Metres]
 Outline = Annotated[tuple[Point, ...], Field(min_length=3)]
 Surface = Literal["concrete", "asphalt", "wood", "grass", "roof", "stone"]
 RESERVED = frozenset({"world", "map", "odom", "base_link", "imu_link", "gnss", "truth"})  # frames of every bag
@@ -97,7 +98,7 @@ class Dock(Block):
     """How far it wanders east and north, m."""
     moves_deg: NonNegative = 1.5
     """How far it turns, deg."""
-    period_s: Positive = 25.0
+    period_s: Annotated[float, Field(ge=2.0, le=3600.0)] = 25.0
     """Period of its wandering, s."""
 
 
@@ -125,7 +126,7 @@ class HarbourConfig(Block):
     """For titles."""
     datum: DatumConfig
     """Origin of its metres; the height is that of mean water over the ellipsoid."""
-    image_m: tuple[Finite, Finite, Finite, Finite]
+    image_m: tuple[Metres, Metres, Metres, Metres]
     """What the aerial image shows: west, south, east, north edge, m."""
     quays: tuple[Solid, ...] = ()
     """Land, quays and piers: they stand still."""
@@ -205,7 +206,16 @@ class Harbour:
             raise ConfigError(
                 f"harbour '{self.config.name}': no route '{route}'; it has: {', '.join(routes) or 'none'}"
             )
-        return np.array(routes[route], dtype=float)
+        points = np.array(routes[route], dtype=float)
+        step = np.diff(points, axis=0)
+        if (np.hypot(*step.T) < 0.5).any():
+            raise ConfigError(f"harbour '{self.config.name}': route '{route}' has waypoints less than 0.5 m apart")
+        turn = np.abs(np.angle(np.exp(1j * np.diff(np.arctan2(step[:, 1], step[:, 0])))))
+        if (turn > np.radians(150.0)).any():
+            raise ConfigError(
+                f"harbour '{self.config.name}': route '{route}' turns back on itself: a vessel needs a bend"
+            )
+        return points
 
     def refuse_collision(self, hulls: Sequence[shapely.Polygon], clear_m: float, route: str) -> None:
         """Refuse a run whose hulls, as they follow each other, come nearer than `clear_m` to something solid.
@@ -214,6 +224,7 @@ class Harbour:
             ConfigError: one does; the line says to what, and where.
         """
         solids = [("quay", polygon) for polygon, _ in self.quays]
+        solids += [("building", polygon) for polygon, _ in self.buildings]
         solids += [("pontoon", polygon) for polygon, _ in self.pontoons]
         solids += [(f"dock '{dock.name}'", polygon.buffer(dock.moves_m)) for polygon, dock in self.docks]
         solids += [("pole", shapely.Point(at).buffer(pole.radius_m)) for at, pole in self.poles]

@@ -19,6 +19,7 @@ from graphloc.eval.simulate._files import load_block, shipped_names
 from graphloc.eval.simulate.harbour import RESERVED, Outline
 from graphloc.frames import Array
 
+Focal = Annotated[float, Field(gt=1.0, le=1e5)]
 _SHIPPED = resources.files("graphloc.eval.simulate") / "rigs"
 
 LIDAR_MAKES: dict[str, dict[str, float]] = {  # BL table 3.1
@@ -59,7 +60,7 @@ class LidarConfig(Block):
     """Between columns, deg."""
     sigma_m: NonNegative = 0.01
     """Noise of a range, m."""
-    scan_s: Positive = 0.1
+    scan_s: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
     """Time of a turn, s."""
     drop: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
     """Share of returns that are lost."""
@@ -86,7 +87,7 @@ class CameraConfig(Block):
     """Columns."""
     height_px: Annotated[int, Field(ge=64, le=8192)] = 1242
     """Rows."""
-    focal_px: tuple[Positive, Positive] = (1069.38, 1069.38)
+    focal_px: tuple[Focal, Focal] = (1069.38, 1069.38)
     """Focal lengths fx, fy, px."""
     centre_px: tuple[Finite, Finite] = (1103.67, 664.69)
     """Principal point cx, cy, px; (0, 0) is the centre of the top-left pixel."""
@@ -140,9 +141,10 @@ class RigConfig(Block):
     @model_validator(mode="after")
     def _can_be_built(self) -> RigConfig:
         for key, outline in (("outline", self.hull.outline), ("cabin", self.hull.cabin)):
-            if not shapely.Polygon(outline).is_valid:
-                raise ValueError(f"hull.{key}: crosses itself")
-        names = [*self.lidars, *self.cameras]
+            polygon = shapely.Polygon(outline)
+            if not polygon.is_valid or polygon.area < 1e-3:
+                raise ValueError(f"hull.{key}: crosses itself, or has no area")
+        names = [*self.lidars, *self.cameras, *(f"{camera}_optical_frame" for camera in self.cameras)]
         taken = [n for k, n in enumerate(names) if n in RESERVED or n in names[:k]]
         if taken:
             raise ValueError(f"'{taken[0]}' cannot name a sensor: it names another frame already")
