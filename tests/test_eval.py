@@ -15,7 +15,7 @@ from graphloc.errors import ConfigError
 from graphloc.eval import ekf, metrics
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
-from graphloc.eval.simulate._scenario import _motion
+from graphloc.eval.simulate._voyage import open_motion
 from graphloc.frames import Datum, Geodetic
 from graphloc.measurements import GnssPosition, GnssVelocity, PoseFix
 from graphloc.recording import SpeedSeries
@@ -25,7 +25,7 @@ from graphloc.trajectory import Trajectory
 def test_noise_free_imu_integrates_to_the_truth() -> None:
     """Strapdown integration (midpoint) of the noise-free samples over 60 s, at a lever arm."""
     scenario = Scenario(duration_s=60.0)
-    motion = _motion(scenario, np.random.default_rng(1))
+    motion = open_motion(scenario, np.random.default_rng(1))
     lever = np.array([0.5, -0.2, 1.0])
     t = np.arange(0.0, 60.0, 0.005)
     force, rate = motion.inertial(t + 0.0025, lever, 9.80665)  # at the middle of each step

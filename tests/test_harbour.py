@@ -295,7 +295,7 @@ def test_clouds_lie_on_the_edges_of_the_image(run: SimulatedRun) -> None:
         return float(away[row[inside], column[inside]].mean())
 
     assert len(walls) > 500
-    assert mean_m(walls + image.shift_m) < 0.25
+    assert mean_m(walls + image.shift_m) < 0.10
     assert mean_m(walls + image.shift_m + np.array([0.0, 3.0])) > 1.0
 
 

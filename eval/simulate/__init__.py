@@ -1,13 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulator of trajectory, IMU, GNSS, compass and pose measurements, so that truth exists."""
+"""A simulator of a harbour, a vessel in it, its sensors and its recordings, so that truth exists."""
 
-from graphloc.eval.simulate._scenario import (
-    Scenario,
-    SimulatedRun,
-    bl_scenario,
-    find_scenario,
-    harbour_scenarios,
-    simulate,
-)
+from graphloc.eval.simulate._run import SimulatedRun, simulate
+from graphloc.eval.simulate._scenario import Scenario, bl_scenario, find_scenario, harbour_scenarios
 
 __all__ = ["Scenario", "SimulatedRun", "bl_scenario", "find_scenario", "harbour_scenarios", "simulate"]

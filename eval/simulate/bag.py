@@ -23,7 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from graphloc.config import effective
 from graphloc.eval.simulate._messages import TF, Messages
-from graphloc.eval.simulate._scenario import SimulatedRun
+from graphloc.eval.simulate._run import SimulatedRun
 from graphloc.eval.simulate.aerial import render
 from graphloc.eval.simulate.camera import Camera
 from graphloc.eval.simulate.docks import survey, tag_pose

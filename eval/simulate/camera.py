@@ -10,7 +10,7 @@ import numpy as np
 
 from graphloc.eval.simulate._lens import Image, digitise, draw_drops, exposure, through_lens
 from graphloc.eval.simulate._light import Light, Picture, Pose, View, project, tag_in_world
-from graphloc.eval.simulate._scenario import SimulatedRun
+from graphloc.eval.simulate._run import SimulatedRun
 from graphloc.eval.simulate.scene import Scene
 from graphloc.eval.simulate.weather import WEATHER
 from graphloc.frames import Array

@@ -11,7 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from graphloc.errors import ConfigError, InputError
-from graphloc.eval.simulate._scenario import SimulatedRun
+from graphloc.eval.simulate._run import SimulatedRun
 from graphloc.eval.simulate.docks import MovingDock
 from graphloc.eval.simulate.harbour import Boat, Harbour
 from graphloc.eval.simulate.rig import HullConfig
