@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import os
 import resource
@@ -105,11 +106,13 @@ Sighting = tuple[float, bool, bool, float]  # range (m), seen, flipped, error of
 WAYS = {"defaults": (2.0, False), "full": (1.0, True)}
 
 
-@lru_cache(maxsize=2)  # never freed: freeing one crashes the process
+@lru_cache(maxsize=2)
 def _detector(decimate: float) -> Any:
     from pupil_apriltags import Detector
 
-    return Detector(families="tag36h11", quad_decimate=decimate)
+    made = Detector(families="tag36h11", quad_decimate=decimate)
+    atexit.register(setattr, made, "tag_detector_ptr", None)  # its destructor frees the families twice
+    return made
 
 
 def _sightings(job: tuple[str, int]) -> dict[str, list[Sighting]]:

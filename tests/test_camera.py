@@ -47,8 +47,10 @@ def docking(condition: str, seed: int = 1, **changes: Any) -> tuple[SimulatedRun
 
 
 @pytest.fixture(scope="module")
-def detector() -> Detector:
-    return Detector(families="tag36h11", quad_decimate=1.0)
+def detector() -> Iterator[Detector]:
+    made = Detector(families="tag36h11", quad_decimate=1.0)
+    yield made
+    made.tag_detector_ptr = None  # its destructor frees the families twice, and the heap breaks
 
 
 def detected(detector: Detector, pixels: NDArray[np.uint8]) -> dict[int, Array]:
