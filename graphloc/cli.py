@@ -220,7 +220,7 @@ def demo(
     from graphloc.eval.simulate import simulate as run_simulation
     from graphloc.eval.simulate.bag import write_bag
 
-    run = run_simulation(replace(harbour_scenarios()["bl1-drift"], lidar_hz=0.0), seed)  # nothing reads scans yet
+    run = run_simulation(replace(harbour_scenarios()["bl1-drift"], lidar_hz=0.0), seed)  # its matches are made up
     bag, config = write_bag(run, out.parent / f"{out.name}-bag", ros=2, overwrite=True, progress=_progress())
     _smooth([bag], config, out, None, True, False, compare=True)
 

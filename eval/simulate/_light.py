@@ -163,7 +163,7 @@ class Light:
         ahead = self._rays @ R.T.astype(np.float32)
         hit = self._scene.cast(p.astype(np.float32), ahead, view.t_s)
         slope = ahead[:, 2] / self._length
-        to_water = np.where(slope < -1e-3, (self._scene.tide_m - p[2]) / np.minimum(ahead[:, 2], -1e-6), np.inf)
+        to_water = self._scene.water_range(p[2], ahead[:, 2])
         solid = np.isfinite(hit.range_m) & (hit.range_m < to_water)
         water = ~solid & np.isfinite(to_water)
         sky = ~solid & ~water
@@ -280,8 +280,7 @@ class Light:
         mount = self._camera.mount
         in_body = ahead @ mount.R_body_sensor.T.astype(np.float32)
         own = self._scene.own_range_m(mount.t_body_sensor_m.astype(np.float32), in_body)
-        down = np.minimum(in_world[:, 2], -1e-6)
-        water = np.where(in_world[:, 2] < 0.0, (self._scene.tide_m - p[2]) / down, np.inf)
+        water = self._scene.water_range(p[2], in_world[:, 2])
         reach = (at @ turned[:, 2]) / (ahead @ turned[:, 2])
         length = np.linalg.norm(ahead, axis=1)
         nearest = np.minimum(np.minimum(hit, own), water)

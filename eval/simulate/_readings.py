@@ -6,10 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.config import (
-    STANDARD_GRAVITY_MPS2,
-    ImuConfig,
-)
+from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
 from graphloc.eval.simulate._scenario import Scenario
 from graphloc.eval.simulate._truth import Motion
 from graphloc.eval.simulate.noise import gnss_error_m, reported_sigma_m

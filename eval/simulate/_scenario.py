@@ -43,8 +43,9 @@ class Scenario:
             heading written to the configuration; None writes none.
         wave_roll_deg, wave_pitch_deg, wave_heave_m: RMS of the waves' motion.
         harbour: name or file of the harbour that the run lies in; empty: open water, `path` alone counts.
-        route: of the harbour. route_s: time that the vessel takes for all of it; a shorter run ends on the way. tide_m: water over its mean. lidar_hz, camera_hz: scans of each LiDAR, images of each
-            camera a second in the bag. rig: name or file of what the vessel carries. condition: for cameras.
+        route: of the harbour. route_s: time that the vessel takes for all of it; a shorter run ends on the way.
+        tide_m: water over its mean. rig: name or file of what the vessel carries.
+        lidar_hz, camera_hz: scans of each LiDAR, images of each camera a second in the bag. condition: for cameras.
         camera_raw: images as `sensor_msgs/Image`, ten times as large, not as JPEG.
     """
 
@@ -85,6 +86,9 @@ class Scenario:
     camera_hz: float = 0.0
     camera_raw: bool = False
     condition: Condition = "optimal"
+
+
+_FIELDS = tuple(f.name for f in dataclasses.fields(Scenario))
 
 
 def bl_scenario(case: int, noise: GnssNoise, *, false_fraction: float = 0.4) -> Scenario:
@@ -128,13 +132,14 @@ def find_scenario(name: str, changes: Mapping[str, str]) -> Scenario:
     known = harbour_scenarios()
     if name not in known:
         raise ConfigError(f"scenario '{name}': unknown{_near(name, known)}; there are: {', '.join(known)}")
-    fields = {f.name: getattr(known[name], f.name) for f in dataclasses.fields(Scenario)}
+    fields = {key: getattr(known[name], key) for key in _FIELDS}
     for key in changes:
         if key not in fields:
             raise ConfigError(f"--set {key}: a scenario has no such field{_near(key, fields)}")
-    spans = {key: f"[{value.strip('[]()')}]" for key, value in changes.items() if key == "outage_s"}
+    given: dict[str, object] = dict(changes)
     try:
-        given = {**changes, **{key: json.loads(value) for key, value in spans.items()}}
+        if "outage_s" in changes:
+            given["outage_s"] = json.loads(f"[{changes['outage_s'].strip('[]()')}]")
         changed = TypeAdapter(Scenario).validate_python({**fields, **given})
     except json.JSONDecodeError:
         raise ConfigError(
@@ -159,7 +164,7 @@ def _refuse_nonsense(s: Scenario) -> None:
         ConfigError: the first of them.
     """
     numbers = {
-        key: value for key in _fields(s) if isinstance(value := getattr(s, key), float) and key != "compass_until_s"
+        key: value for key in _FIELDS if isinstance(value := getattr(s, key), float) and key != "compass_until_s"
     }
     limits = {key: (-1e6, 1e6) for key in numbers} | {key: (0.0, 200.0) for key in numbers if key.endswith("_hz")}
     limits |= {
@@ -178,11 +183,6 @@ def _refuse_nonsense(s: Scenario) -> None:
             raise ConfigError(f"--set {key}={value:g}: fewer than three in {s.duration_s:g} s; 0 switches it off")
     if s.start_heading_error_deg is not None and not np.isfinite(s.start_heading_error_deg):
         raise ConfigError(f"--set start_heading_error_deg={s.start_heading_error_deg:g}: must be a number")
-
-
-def _fields(s: Scenario) -> tuple[str, ...]:
-    """Names of a scenario's fields."""
-    return tuple(f.name for f in dataclasses.fields(s))
 
 
 def _in_harbour(base: Scenario, **changes: object) -> Scenario:

@@ -28,6 +28,7 @@ from graphloc.eval.simulate.aerial import render
 from graphloc.eval.simulate.camera import Camera
 from graphloc.eval.simulate.docks import survey, tag_pose
 from graphloc.eval.simulate.lidar import scan
+from graphloc.eval.simulate.rig import CameraConfig, LidarConfig
 from graphloc.eval.simulate.scene import Scene, scene_of
 from graphloc.measurements import CompassHeading, GnssPosition, PoseFix
 from graphloc.outputs import fresh_folder
@@ -146,13 +147,22 @@ def _beside(run: SimulatedRun, folder: Path) -> None:
 
 def _seen(run: SimulatedRun, make: Messages) -> list[Iterator[_Item]]:
     """Scans and images, if the run has any."""
-    s = run.scenario
-    with_lidars, with_cameras = s.lidar_hz > 0.0 and bool(run.rig.lidars), s.camera_hz > 0.0 and bool(run.rig.cameras)
-    if run.harbour is None or not (with_lidars or with_cameras):
+    lidars, cameras = _lidars(run), _cameras(run)
+    if not (lidars or cameras):
         return []
     scene = scene_of(run)
-    found = [_images(run, make, scene, name) for name in run.rig.cameras] if with_cameras else []
-    return [_clouds(run, make, scene), *found] if with_lidars else found
+    found = [_images(run, make, scene, name) for name in cameras]
+    return [_clouds(run, make, scene), *found] if lidars else found
+
+
+def _lidars(run: SimulatedRun) -> dict[str, LidarConfig]:
+    """The LiDARs whose scans are in the bag."""
+    return run.rig.lidars if run.harbour is not None and run.scenario.lidar_hz > 0.0 else {}
+
+
+def _cameras(run: SimulatedRun) -> dict[str, CameraConfig]:
+    """The cameras whose images are in the bag."""
+    return run.rig.cameras if run.harbour is not None and run.scenario.camera_hz > 0.0 else {}
 
 
 def _clouds(run: SimulatedRun, make: Messages, scene: Scene) -> Iterator[_Item]:
@@ -228,10 +238,7 @@ def _small(run: SimulatedRun, make: Messages) -> list[_Item]:
 
 def _mounts(run: SimulatedRun) -> dict[str, Any]:
     """Where each sensor whose messages are in the bag sits in body, by frame."""
-    rig, s = run.rig, run.scenario
-    found = {"imu_link": rig.imu, "gnss": rig.gnss}
-    if run.harbour is not None and s.lidar_hz > 0.0:
-        found |= {name: lidar.mount for name, lidar in rig.lidars.items()}
-    if run.harbour is not None and s.camera_hz > 0.0:
-        found |= {f"{name}_optical_frame": camera.mount for name, camera in rig.cameras.items()}
+    found = {"imu_link": run.rig.imu, "gnss": run.rig.gnss}
+    found |= {name: lidar.mount for name, lidar in _lidars(run).items()}
+    found |= {f"{name}_optical_frame": camera.mount for name, camera in _cameras(run).items()}
     return {frame: (mount.t_body_sensor_m, mount.R_body_sensor) for frame, mount in found.items()}

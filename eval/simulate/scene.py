@@ -136,6 +136,14 @@ class Scene:
             found.normal[near[first]] = hit["primitive_normals"].numpy()[first] @ R.T
         return found
 
+    def water_range(self, height_m: Array | float, up: Array | Rays) -> Array:
+        """Return the range (N,) of the water, in lengths of the rays, inf where they miss it.
+
+        Args:
+            height_m: where rays begin, in world. up: (N,) their directions' third component.
+        """
+        return np.where(up < -1e-3, (self.tide_m - height_m) / np.minimum(up, -1e-3), np.inf)
+
     def own_range_m(self, origin_m: Rays, direction: Rays) -> Rays:
         """Return the range (N,) of the own hull along rays in body, inf where they miss it."""
         return np.asarray(self._cast(self._own, origin_m, direction)["t_hit"].numpy())
@@ -158,8 +166,7 @@ class Scene:
         start = p_m + np.einsum("nij,nj->ni", R, origin_m)
         ahead = np.einsum("nij,nj->ni", R, direction)
         world = self.cast(start.astype(np.float32), ahead.astype(np.float32), t_s).range_m
-        down = np.minimum(ahead[:, 2], -1e-6)
-        water = np.where(ahead[:, 2] < -1e-3, (self.tide_m - start[:, 2]) / down, np.inf)
+        water = self.water_range(start[:, 2], ahead[:, 2])
         nearest = np.minimum(own, world).astype(float)
         return np.minimum(nearest, water), np.asarray(water < nearest)
 

@@ -43,10 +43,9 @@ def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) ->
 
 @numba.njit(parallel=True, cache=True, fastmath=True)
 def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, columns):  # type: ignore[no-untyped-def]
-    """Sum over points of weight x layer, for each yaw, row and column of the grid: (F, H, rows, columns)."""
+    """Sum over points of weight x layer, for each yaw, row and column of the grid: (H, rows, columns)."""
     bins, height, width = layer.shape
-    features = weight.shape[1]
-    out = np.zeros((features, len(yaw), rows, columns), dtype=np.float32)
+    out = np.zeros((len(yaw), rows, columns), dtype=np.float32)
     for h in numba.prange(len(yaw)):
         c, s = np.cos(yaw[h]), np.sin(yaw[h])
         for i in range(len(p_m)):
@@ -55,18 +54,18 @@ def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, column
             if u < 0 or v < 0 or u + columns > width or v + rows > height:
                 continue
             k = int(np.rint((angle[i] + yaw[h]) % turn / turn * bins)) % bins
-            for f in range(features):
-                w = weight[i, f]
-                if w == 0.0:
-                    continue
-                for r in range(rows):
-                    for q in range(columns):
-                        out[f, h, r, q] += w * layer[k, v + r, u + q]
+            for r in range(rows):
+                for q in range(columns):
+                    out[h, r, q] += weight[i] * layer[k, v + r, u + q]
     return out
 
 
-def volumes(found: Outline, layers: Layers, grid: Grid, thin: NDArray[np.float64] | None = None) -> Layer:
-    """Return the score of each feature at each pose of the grid: (F, H, R, C)."""
+def log_likelihood_of(found: Outline, layers: Layers, grid: Grid, face_weights: Array, shore_weight: float) -> Layer:
+    """Return the score of each pose of the grid (H, R, C).
+
+    Args:
+        face_weights: (F,) one for each feature of a face. shore_weight: that of a first return.
+    """
     patch = layers.patch
     col0, row0 = np.rint(patch.cells(np.array([[grid.east_m[0], grid.north_m[0]]]))[0]).astype(int)
 
@@ -76,11 +75,11 @@ def volumes(found: Outline, layers: Layers, grid: Grid, thin: NDArray[np.float64
                   len(grid.north_m), len(grid.east_m))
         )  # fmt: skip
 
-    parts = [lay(layers.edges, found.faces_m, found.line_rad, found.kind, np.pi)]
+    score = lay(layers.edges, found.faces_m, found.line_rad, found.kind @ face_weights, np.pi)
     if layers.shores is not None:
-        ones = np.ones((len(found.shore_m), 1))
-        parts.append(lay(layers.shores, found.shore_m, found.to_land_rad, ones, 2.0 * np.pi))
-    return np.concatenate(parts)
+        weight = np.full(len(found.shore_m), shore_weight)
+        score += lay(layers.shores, found.shore_m, found.to_land_rad, weight, 2.0 * np.pi)
+    return score
 
 
 @dataclass(frozen=True, slots=True, eq=False)

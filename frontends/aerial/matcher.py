@@ -13,14 +13,14 @@ from graphloc.config import AerialConfig
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.frontends.aerial.image import AerialImage, Patch
 from graphloc.frontends.aerial.layers import Layer, Layers, edge_layer, segment_water, shore_layer
-from graphloc.frontends.aerial.match import Grid, Mode, grid_around, modes_of, volumes
+from graphloc.frontends.aerial.match import Grid, Mode, grid_around, log_likelihood_of, modes_of
 from graphloc.frontends.aerial.scan import LevelCloud, Outline, outline
 from graphloc.measurements import PoseFix, PoseMode
 
 _CELL_M = 0.25
 _TILE_M = 40.0  # a patch serves all priors of one tile
-# Log-likelihood of a face on an edge, and of a first return on a shore; fitted by benchmarks/matcher.py.
-_WEIGHTS = np.array([0.057, 0.0, 0.0, 0.0, 0.166])
+# Log-likelihood of a face on an edge, and of a first return on a shore; by `scan.FEATURES`; docs/decisions/0006.
+_FACE_WEIGHTS, _SHORE_WEIGHT = np.array([0.057, 0.0, 0.0, 0.0]), 0.166
 _NONE_LOG = -2.0  # that of a pose of which nothing is known
 _ALIEN = 0.15  # a scan shows boats that the image does not have, and the reverse
 _LEAST_FACES = 30
@@ -94,7 +94,7 @@ class Matcher:
         half_m = float(np.clip(3.0 * prior.sigma[:2].max() + 1.0, 2.0, config.window_m))
         half_deg = float(np.clip(np.degrees(3.0 * prior.sigma[2]) + 0.5, 1.0, config.window_deg))
         grid = grid_around(layers, prior.pose, half_m, half_deg)
-        score = np.tensordot(_WEIGHTS, volumes(found, layers, grid), 1).astype(np.float32)
+        score = log_likelihood_of(found, layers, grid, _FACE_WEIGHTS, _SHORE_WEIGHT)
         modes, none = modes_of(score, grid, _NONE_LOG, _ALIEN, _MODES)
         why_not = "" if modes else "no pose in the window stands out"
         return Match(prior, found, layers, grid, score, tuple(modes), none, why_not)

@@ -25,8 +25,7 @@ class LevelCloud:
     """Points of one or more scans in `level`.
 
     Attributes:
-        points_m: (N, 3). origin_m: (N, 2) where the ray of each began. column: (N,) ids of rays of one beam turn,
-            unused where unknown.
+        points_m: (N, 3). origin_m: (N, 2) where the ray of each began.
     """
 
     points_m: Array

@@ -16,10 +16,9 @@ from graphloc.frontends._source import Bag
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, decode_cloud, level
 from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
+from graphloc.frontends.bag import TF_STATIC
 from graphloc.frontends.decode import TF, header_stamp_ns
 from graphloc.trajectory import Trajectory
-
-_TF_STATIC = "/tf_static"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +101,7 @@ def _mounts(bag: Bag, config: AerialConfig, body_frame: str) -> dict[str, tuple[
             )
     tree = StaticTree()
     if any(lidar.mount.tf_frame for lidar in config.lidars.values()):
-        for raw in bag.messages({_TF_STATIC}):
+        for raw in bag.messages({TF_STATIC}):
             if raw.msgtype == TF:
                 tree.add(bag.decode(raw))
     return {
