@@ -115,7 +115,7 @@ def with_matches(
             replace(r, reason=f"read by {name}") if r.topic in read and r.outcome is Outcome.IGNORED else r
             for r in rows
         ]
-        found = match_bag(scans.bags, sensor, scans.folder / sensor.image, config.body_frame, track, datum)
+        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum)
         for item in found:
             if item.match is not None and item.match.modes:
                 measurements.append(replace(item.match.fix(item.stamp_ns, name), seq=seq))
@@ -157,7 +157,7 @@ def match_at(
     whole = with_synthetic(recording, config, datum)
     track = smooth(whole, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress).trajectory
     at_ns = int(track.stamps_ns[0]) + round(at_s * 1e9)
-    found = match_bag(scans.bags, sensor, scans.folder / sensor.image, config.body_frame, track, datum, at_ns=at_ns)
+    found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, at_ns=at_ns)
     item = next(found, None)
     if item is None or item.match is None:
         raise InputError(

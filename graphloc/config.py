@@ -292,7 +292,10 @@ class AerialConfig(AnyPoseConfig):
     kind: Literal["aerial"] = "aerial"
     """Which row of the sensor table reads this block."""
     image: str = ""
-    """A georeferenced image that GDAL reads; a relative path counts from the folder of vessel.yaml."""
+    """A georeferenced image that GDAL reads, an MBTiles file, or a folder of tiles z/x/y.png, jpg or webp; a relative
+    path counts from the folder of vessel.yaml."""
+    vector: str = ""
+    """GeoJSON of lines and polygons of quays, piers and shores; a relative path counts as that of the image."""
     image_sigma_m: NonNegative = 0.3
     """How far the image as a whole shows things from where they are, east and north, 1 sigma, m."""
     lidars: dict[str, LidarConfig] = Field(default_factory=dict)
@@ -301,8 +304,18 @@ class AerialConfig(AnyPoseConfig):
     """Corners of the vessel's outline in body, forward and port, m: points within are its own."""
     waterline_m: Finite = 0.0
     """Height of the waterline in body, m."""
+    matcher: Literal["posterior", "bl"] = "posterior"
+    """`bl`: that of Bergman & Lindell as printed (one pose, by a particle swarm), to compare with; it needs an image."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Of the particle swarm."""
+    submap: Annotated[int, Field(ge=1, le=100)] = 1
+    """So many scans are laid on the map together, moved by the vessel's own motion between them."""
     every_s: Positive = 1.0
-    """Time between two matches, s."""
+    """Least time between two matches, s."""
+    every_m: NonNegative = 0.5
+    """Least way between two matches, m: near to each other they err alike."""
+    still_s: Positive = 10.0
+    """Time after which there is a match though the vessel has not moved that far, s."""
     window_m: Positive = 6.5
     """Largest half side of the search, m; less where the estimate is surer (3 sigma)."""
     window_deg: Positive = 5.0

@@ -23,9 +23,19 @@ from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.aerial import Matcher, Prior
 from graphloc.frontends.aerial.cloud import Cloud, decode_cloud, level
 from graphloc.frontends.aerial.image import AerialImage, Patch
-from graphloc.frontends.aerial.layers import EDGE_BINS, SHORE_BINS, edge_layer, segment_water, shore_layer
+from graphloc.frontends.aerial.layers import (
+    EDGE_BINS,
+    SHORE_BINS,
+    coarse_patch,
+    drawn_layers,
+    edge_layer,
+    find_edges,
+    segment_water,
+    shore_layer,
+)
 from graphloc.frontends.aerial.match import Grid, modes_of
 from graphloc.frontends.aerial.scan import LevelCloud, inside, outline
+from graphloc.frontends.aerial.vector import VectorMap
 from graphloc.trajectory import Trajectory
 
 DATUM = Datum(Geodetic(57.7, 14.5, 30.0))
@@ -73,7 +83,7 @@ def test_an_image_lies_in_world_whatever_its_crs(epsg: int, pixel: float, bands:
     """Web Mercator's metre is 1.87 times too long there; UTM's north is 0.4 deg off; degrees are no metres."""
     picture(tmp_path / "a.tif", epsg, pixel, np.array([40.0, -60.0, 60.0, -30.0]), bands)
     patch = AerialImage(tmp_path / "a.tif", DATUM).patch(np.array([30.0, -40.0]), 60.0, 0.25)
-    light = np.where(patch.pixels[:, :, 0] > 60, (patch.pixels[:, :, 0] - 38.0) / (180.0 - 38.0), 0.0)
+    light = np.where(patch.pixels[:, :, 0] > 50, (patch.pixels[:, :, 0] - 38.0) / (180.0 - 38.0), 0.0)
     rows, columns = np.indices(light.shape)
     east, north = patch.west_m + columns * 0.25, patch.north_m - rows * 0.25
     np.testing.assert_allclose([(v * light).sum() / light.sum() for v in (east, north)], [50.0, -45.0], atol=0.03)
@@ -185,7 +195,8 @@ def test_an_outline_holds_faces_and_shores_and_not_the_vessel() -> None:
     assert np.abs(found.faces_m[:, 1] - 12.0).max() < 0.15
     assert len(found.faces_m) > 150
     assert np.abs(np.sin(found.line_rad)).mean() < 0.1
-    assert np.median(found.kind[:, 3]) == 1.0  # a long line
+    np.testing.assert_allclose(found.face_share, 1.0 / np.sqrt(len(found.faces_m)), rtol=0.02)  # one line: a root of it
+    assert found.tall.max() == 0.0  # 1.9 m: a boat's height
     assert np.abs(found.shore_m[:, 1] - 12.0).max() < 0.5
     assert np.sin(found.to_land_rad).min() > 0.3
     assert np.quantile(found.water_m[:, 1], 0.99) < 11.0
@@ -201,26 +212,68 @@ def test_an_outline_holds_faces_and_shores_and_not_the_vessel() -> None:
 
 def test_layers_know_directions() -> None:
     """A bright square on dark water: its edges by direction, its shores by the side that land is on."""
-    image = np.full((160, 160, 3), (38, 62, 72), dtype=np.uint8)
-    image[40:120, 40:120] = (180, 176, 170)
-    patch = Patch(image, np.ones((160, 160), dtype=bool), 0.0, 0.0, 0.25)
-    edges = edge_layer(patch)
+    image = np.full((320, 320, 3), (38, 62, 72), dtype=np.uint8)
+    image[80:240, 80:240] = (180, 176, 170)
+    fine = Patch(image, np.ones((320, 320), dtype=bool), 0.0, 0.0, 0.125)
+    found = find_edges(fine)
+    edges = edge_layer(fine, found)
     flat, upright = 0, EDGE_BINS // 2  # east-west; north-south
-    assert edges[flat, 39:41, 80].max() > 0.9
+    assert edges[flat, 39:41, 80].max() > 0.8
     assert edges[upright, 39:41, 80].max() < 0.1
-    assert edges[upright, 80, 39:41].max() > 0.9
+    assert edges[upright, 80, 39:41].max() > 0.8
+    coarse = coarse_patch(fine)
+    assert coarse.pixels.shape == (160, 160, 3)
+    np.testing.assert_allclose([coarse.west_m, coarse.north_m, coarse.cell_m], [0.0625, -0.0625, 0.25])
     free = np.zeros((160, 160), dtype=bool)
     free[5:30, 5:150] = True
-    water = segment_water(patch, free)
+    water = segment_water(coarse, free)
     assert water[2:36, 2:158].all()
     assert not water[44:116, 44:116].any()
-    shores = shore_layer(patch, water)
+    shores = shore_layer(fine, found, water)
     north, east = SHORE_BINS // 4, 0  # land lies that way
     assert shores[north, 119:122, 80].max() > 0.8  # south side of the square
     assert shores[north, 40, 80] < 0.2
     assert shores[east, 80, 38:41].max() > 0.8  # its west side
     assert shores[east, 80, 120] < 0.2
-    assert not segment_water(patch, np.zeros_like(free)).any()
+    assert not segment_water(coarse, np.zeros_like(free)).any()
+
+
+@pytest.mark.parametrize("kerb_m", [0.0, 0.375])
+def test_a_wall_lies_where_its_edge_is(kerb_m: float) -> None:
+    """Water north of a wall at north = -10.0 m, with and without a bright kerb: the layers lie there."""
+    cell, n = 0.125, 240
+    image = np.full((n, n, 3), (38, 62, 72), dtype=np.uint8)
+    image[80:] = (150, 147, 140)  # row 80 begins 80 cells under the top, which is 0.5 cells over the first centre
+    image[80 : 80 + round(kerb_m / cell)] = (220, 220, 215)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), dtype=np.uint8)
+    fine = Patch(image, np.ones((n, n), dtype=bool), 0.0, -0.5 * cell, cell)
+    free = np.zeros((n // 2, n // 2), dtype=bool)
+    free[5:20, 5:-5] = True
+    found = find_edges(fine)
+    coarse = coarse_patch(fine)
+    shores = shore_layer(fine, found, segment_water(coarse, free))
+    for profile in (edge_layer(fine, found)[0, :, 60], shores[SHORE_BINS * 3 // 4, :, 60]):
+        near = profile.argmax() + np.arange(-3, 4)
+        if profile is not shores and kerb_m and profile[near].max() >= 0.99:
+            near = near[:5]  # the kerb's other side is an edge as well
+        north = coarse.north_m - coarse.cell_m * near
+        assert (profile[near] @ north) / profile[near].sum() == pytest.approx(-10.0, abs=0.08 if not kerb_m else 0.2)
+
+
+def test_drawn_lines_are_edges_and_shores() -> None:
+    """A line from (5, -10) to (25, -10), land to its south; one that does not say, slanting."""
+    fine = Patch(np.zeros((240, 240, 3), np.uint8), np.ones((240, 240), dtype=bool), 0.0, 0.0, 0.125)
+    segments = np.array([[(5.0, -10.0), (25.0, -10.0)], [(5.0, -28.0), (20.0, -13.0)]])
+    edges, shores = drawn_layers(fine, VectorMap(segments, np.array([-np.pi / 2, np.nan])))
+    coarse = coarse_patch(fine)
+    column, row = np.rint(coarse.cells(np.array([[15.0, -10.0]]))[0]).astype(int)
+    assert edges[0, row, column] > 0.7
+    assert edges[EDGE_BINS // 2, row, column] < 0.05
+    assert shores[SHORE_BINS * 3 // 4, row, column] > 0.7
+    assert shores[SHORE_BINS // 4].max() == 0.0
+    column, row = np.rint(coarse.cells(np.array([[12.5, -20.5]]))[0]).astype(int)
+    assert edges[EDGE_BINS // 4, row - 1 : row + 2, column].max() > 0.7  # 45 deg
+    assert shores[:, row - 3 : row + 4, column - 3 : column + 4].max() == 0.0
 
 
 def grid(half: int = 20) -> Grid:
@@ -256,8 +309,9 @@ def test_modes_are_those_of_the_posterior() -> None:
     (ridge,), _ = modes_of(volume(g, (1.0, np.zeros(3), np.array([50.0, 0.2, np.radians(0.6)]))), g, -30.0, 0.0)
     assert np.sqrt(ridge.cov[0, 0]) > 2.5
     assert np.sqrt(ridge.cov[1, 1]) < 0.3
-    # Nothing stands out over what is not known.
-    found, none = modes_of(volume(g, (1.0, np.zeros(3), sigma)), g, 30.0, 0.0)
+    # Where nothing stands out over chance there is no mode.
+    chance = np.random.default_rng(0).normal(0.0, 0.3, (17, 41, 41)).astype(np.float32)
+    found, none = modes_of(chance, g, 5.0, 0.0)
     assert not found
     assert none == pytest.approx(1.0)
 
@@ -273,7 +327,7 @@ def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path) -> None:
     c, s = np.cos(true[2]), np.sin(true[2])
     points = np.vstack([south, west, sea])
     points[:, :2] = (points[:, :2] - true[:2]) @ np.array([[c, -s], [s, c]])
-    matcher = Matcher(AerialConfig(), tmp_path / "a.tif", DATUM)
+    matcher = Matcher(AerialConfig(image="a.tif"), tmp_path, DATUM)
     prior = Prior(true + np.array([1.2, -1.2, np.radians(2.0)]), np.array([2.0, 2.0, np.radians(2.0)]))
     found = matcher.match(LevelCloud(points, np.zeros((len(points), 2))), prior)
     assert np.hypot(*(found.modes[0].pose[:2] - true[:2])) < 0.25
@@ -282,7 +336,9 @@ def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path) -> None:
     assert fix.none_probability == pytest.approx(found.none, abs=1e-6)
     empty = matcher.match(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), prior)
     assert not empty.modes
-    assert "too few to match" in empty.why_not
+    assert empty.why_not == "a scan without a point outside the vessel"
+    wet = matcher.match(LevelCloud(sea, np.zeros((len(sea), 2))), prior)
+    assert wet.why_not == "a scan of water alone"
 
 
 @pytest.fixture(scope="module")

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """An aerial image on the grid of world: read through its CRS, part by part.
 
+What is read is whatever GDAL reads: one file, an MBTiles, or a folder of tiles (`tiles.py`), of any kind of pixels.
 Grid north is not true north and a map's metre is not always a metre, so no affine map is assumed between the image and
 world: the image is sampled point by point (on a net of 8 m, linear between, which is off by less than a millimetre).
 """
 
 from __future__ import annotations
 
+import logging
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +18,22 @@ import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
+from pyproj import CRS
+from pyproj.exceptions import ProjError
+from pyproj.transformer import AreaOfInterest, TransformerGroup
+from rasterio.enums import ColorInterp, Resampling
 
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
+from graphloc.frontends.aerial.tiles import describe_tiles
 
 Pixels = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 _NET_M = 8.0
+_LOOSE_M = 1.5  # a tie to WGS 84 that is less sure than that is worth a word; those of ETRS 89 say 1 m
+_SAMPLES, _SAMPLE_PX = 8, 128
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +46,7 @@ class Patch:
     """
 
     pixels: Pixels
-    inside: NDArray[np.bool_]
+    inside: Mask
     west_m: float
     north_m: float
     cell_m: float
@@ -47,7 +57,15 @@ class Patch:
 
 
 class AerialImage:
-    """A georeferenced image that GDAL reads: GeoTIFF, MBTiles, VRT, ...
+    """A georeferenced image.
+
+    - A file that GDAL reads: GeoTIFF, JPEG 2000, VRT, PNG with world file and CRS, ..., of any CRS, rotated or not.
+    - An MBTiles file with jpg, png or webp tiles: its deepest zoom level.
+    - A folder of tiles z/x/y.png, jpg or webp: its deepest zoom level, see `tiles.describe_tiles`.
+
+    One band is grey, a palette is expanded, of more bands those named red, green, blue are taken, else the first
+    three. Pixels of more than 8 bits are stretched: 2 to 98 % of samples over the whole image become 0 to 255, the
+    same for all bands. No data is where an alpha band, a mask or a nodata value says so, and where a tile is missing.
 
     Raises:
         InputError: it cannot be read, or has no georeference.
@@ -55,21 +73,73 @@ class AerialImage:
 
     def __init__(self, path: Path, datum: Datum) -> None:
         self._path, self._datum = path, datum
+        name = describe_tiles(path, datum) if path.is_dir() else path
+        # Cut at the bounds that it states, an MBTiles is off by half a pixel (seen with GDAL 3.10: 5 cm of 16).
+        options = {"USE_BOUNDS": "NO"} if path.suffix.lower() == ".mbtiles" else {}
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # said below, as an error
-                self._source: Any = rasterio.open(path)
+                self._source: Any = rasterio.open(name, **options)
         except rasterio.errors.RasterioError as error:
-            raise InputError(f"{path}: not an image that GDAL can read ({error})") from None
-        if self._source.crs is None or self._source.transform.is_identity:
-            raise InputError(
-                f"{path}: has no georeference (a CRS and a transform): export it as GeoTIFF, or set them with gdal_translate"
-            )
+            raise InputError(f"{path}: not an image that GDAL can read ({_line(error)})") from None
+        source = self._source
+        why_not = _why_not(source, path)
+        if why_not:
+            raise InputError(f"{path}: {why_not}")
+        lon, lat = datum.origin.longitude_deg, datum.origin.latitude_deg
         try:
-            crs = CRS.from_wkt(self._source.crs.to_wkt())
-        except CRSError as error:
-            raise InputError(f"{path}: its CRS cannot be used ({error})") from None
-        self._to_image = Transformer.from_crs(CRS.from_epsg(4326), crs, always_xy=True)
+            crs = CRS.from_wkt(source.crs.to_wkt())
+            here = AreaOfInterest(lon, lat, lon, lat)  # which tie to WGS 84 is best depends on where
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # that a better tie needs a grid: said below
+                self._to_image = TransformerGroup(4326, crs, always_xy=True, area_of_interest=here).transformers[0]
+        except (ProjError, IndexError) as error:
+            raise InputError(f"{path}: its CRS cannot be used ({_line(error)})") from None
+        if self._to_image.accuracy > _LOOSE_M:
+            log.warning("%s: its CRS (%s) is tied to WGS 84 to %g m only", path, crs.name, self._to_image.accuracy)
+        bands = {c: k for k, c in zip(source.indexes, source.colorinterp, strict=True)}
+        named = [bands.get(c, 0) for c in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
+        self._bands = named if all(named) else [1, 2, 3] if source.count >= 3 else [1]
+        self._palette = _palette_of(source) if ColorInterp.palette in bands else None
+        self._darkest, self._brightest = 0.0, 255.0
+        if self._palette is None and source.dtypes[0] != "uint8":
+            self._darkest, self._brightest = self._span()
+
+    def patch(self, centre_m: Array, half_m: float, cell_m: float) -> Patch:
+        """Return the square of `half_m` around a point (2,) in world.
+
+        Raises:
+            InputError: the image does not reach there, has no data there, or cannot be read there.
+        """
+        n = int(np.ceil(2.0 * half_m / cell_m))
+        west, north = centre_m[0] - half_m + 0.5 * cell_m, centre_m[1] + half_m - 0.5 * cell_m
+        elsewhere = InputError(
+            f"{self._path}: does not cover {centre_m[0]:.0f} m east, {centre_m[1]:.0f} m north of the datum: another image, "
+            "or another `datum:`"
+        )
+        uv = self._pixels_of_grid(west, north, n, cell_m)
+        if not np.isfinite(uv).all():  # beyond where the CRS is defined
+            raise elsewhere
+        # Pixels a cell along u and v, as they are on the ground: the CRS may count feet, degrees, or half metres.
+        finer = np.hypot((uv[:, :, -1] - uv[:, :, 0]).mean(axis=1), (uv[:, -1] - uv[:, 0]).mean(axis=1)) / (n - 1)
+        shrink = 2 ** max(0, int(np.log2(0.5 * finer.min())))  # read 2 pixels a cell or more, and not hundreds
+        if self._palette is not None:
+            shrink = 1  # its numbers have no mean, and the nearest pixel is half a pixel off
+        size = np.array([self._source.width, self._source.height])
+        low = np.clip(shrink * np.floor(uv.min(axis=(1, 2)) / shrink - 2.0), 0, size).astype(int)
+        high = np.clip(shrink * np.ceil(uv.max(axis=(1, 2)) / shrink + 3.0), 0, size).astype(int)
+        if (high - low < 2).any():
+            raise elsewhere
+        image, has = self._read(low, high - low, shrink)
+        scale = np.array(has.shape[::-1]) / (high - low)
+        if (finer * scale).max() > 1.5:  # the grid is coarser than what was read: average, do not pick
+            image = cv2.GaussianBlur(image, (0, 0), sigmaX=0.4 * finer[0] * scale[0], sigmaY=0.4 * finer[1] * scale[1])
+        at = ((uv + 0.5 - low[:, None, None]) * scale[:, None, None] - 0.5).astype(np.float32)
+        pixels = cv2.remap(image, at[0], at[1], cv2.INTER_LINEAR)
+        covered = cv2.remap(has, at[0], at[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
+        if not covered.any():
+            raise elsewhere
+        return Patch(np.asarray(pixels, dtype=np.uint8), np.asarray(covered), float(west), float(north), cell_m)
 
     def _pixels_of(self, p_m: Array) -> Array:
         """Image column and row (N, 2), 0 at the centre of the top-left pixel, of points (N, 2) in world."""
@@ -78,43 +148,86 @@ class AerialImage:
         back = ~self._source.transform
         return np.column_stack([back.a * x + back.b * y + back.c, back.d * x + back.e * y + back.f]) - 0.5
 
-    def patch(self, centre_m: Array, half_m: float, cell_m: float) -> Patch:
-        """Return the square of `half_m` around a point (2,) in world.
-
-        Raises:
-            InputError: the image does not reach there.
-        """
-        n = int(np.ceil(2.0 * half_m / cell_m))
-        west, north = centre_m[0] - half_m + 0.5 * cell_m, centre_m[1] + half_m - 0.5 * cell_m
+    def _pixels_of_grid(self, west: float, north: float, n: int, cell_m: float) -> Array:
+        """Image column and row (2, n, n) of a grid in world."""
         knots = np.linspace(0.0, n - 1.0, max(2, int(np.ceil(n * cell_m / _NET_M)) + 1))
         columns, rows = np.meshgrid(knots, knots)
         net = self._pixels_of(np.column_stack([west + columns.ravel() * cell_m, north - rows.ravel() * cell_m]))
         # Linear between knots, by a product: cv2.remap would round to a 32nd of their distance, 0.25 m.
         at = np.arange(n) * (len(knots) - 1) / (n - 1)
         between = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(len(knots))))
-        column, row = (between @ net[:, k].reshape(len(knots), -1) @ between.T for k in (0, 1))
-        low = np.floor([column.min() - 2.0, row.min() - 2.0]).astype(int)
-        high = np.ceil([column.max() + 3.0, row.max() + 3.0]).astype(int)
-        low, high = np.maximum(low, 0), np.minimum(high, [self._source.width, self._source.height])
-        if (high - low < 2).any():
-            raise InputError(
-                f"{self._path}: does not cover {centre_m[0]:.0f} m east, {centre_m[1]:.0f} m north of the datum: another image, "
-                "or another `datum:`"
+        return np.stack([between @ net[:, k].reshape(len(knots), -1) @ between.T for k in (0, 1)])
+
+    def _read(self, low: NDArray[np.int_], size: NDArray[np.int_], shrink: int) -> tuple[Any, Any]:
+        """Colours (rows, columns, 3) uint8 of a window, made smaller by a factor, and where it has data, uint8."""
+        columns, rows = (-(-int(s) // shrink) for s in size)
+        window = rasterio.windows.Window(*low, *size)
+        how = Resampling.nearest if shrink == 1 else Resampling.average
+        try:
+            bands = self._source.read(
+                self._bands, window=window, out_shape=(len(self._bands), rows, columns), resampling=how
             )
-        window = rasterio.windows.Window(low[0], low[1], *(high - low))
-        bands = self._source.read(window=window, masked=True)
-        colours = bands[:3] if len(bands) >= 3 else np.ma.repeat(bands[:1], 3, axis=0)
-        image: Any = np.ascontiguousarray(np.moveaxis(colours.filled(0), 0, 2)).astype(np.uint8)
-        has: Any = (~np.ma.getmaskarray(colours).any(axis=0)).astype(np.uint8)
-        finer = cell_m / abs(self._source.transform.a * _metres(self._source.crs))
-        if finer > 1.5:  # the grid is coarser than the image: average, do not pick
-            image = cv2.GaussianBlur(image, (0, 0), 0.4 * finer)
-        map_u, map_v = (column - low[0]).astype(np.float32), (row - low[1]).astype(np.float32)
-        pixels = cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR)
-        covered = cv2.remap(has, map_u, map_v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        return Patch(np.asarray(pixels, dtype=np.uint8), np.asarray(covered > 0), float(west), float(north), cell_m)
+            has = (self._source.dataset_mask(window=window, out_shape=(rows, columns)) > 127).astype(np.uint8)
+        except rasterio.errors.RasterioError as error:
+            raise InputError(f"{self._path}: a part of it cannot be read ({_line(error)})") from None
+        if self._palette is not None:
+            colours = self._palette[bands[0]]
+            return np.ascontiguousarray(colours[..., :3]), has * (colours[..., 3] > 0)
+        if bands.dtype != np.uint8:
+            has *= np.isfinite(bands).all(axis=0)
+            bright = (np.nan_to_num(bands.astype(np.float32)) - self._darkest) / (self._brightest - self._darkest)
+            bands = np.rint(255.0 * np.clip(bright, 0.0, 1.0)).astype(np.uint8)
+        return np.ascontiguousarray(np.moveaxis(np.broadcast_to(bands, (3, rows, columns)), 0, 2)), has
+
+    def _span(self) -> tuple[float, float]:
+        """2 and 98 % of samples all over the image."""
+        size = np.array([self._source.width, self._source.height])
+        least = np.minimum(size, _SAMPLE_PX)
+        found = [np.zeros(0)]
+        for u, v in np.ndindex(_SAMPLES, _SAMPLES):
+            corner = ((size - least) * np.array([u, v]) / (_SAMPLES - 1)).astype(int)
+            window = rasterio.windows.Window(*corner, *least)
+            try:
+                bands = self._source.read(self._bands, window=window)
+                known = self._source.dataset_mask(window=window) > 127
+            except rasterio.errors.RasterioError as error:
+                raise InputError(f"{self._path}: a part of it cannot be read ({_line(error)})") from None
+            found.append(bands[:, known & np.isfinite(bands).all(axis=0)].ravel())
+        values = np.concatenate(found)
+        darkest, brightest = np.percentile(values, [2.0, 98.0]) if len(values) else (0.0, 1.0)
+        return float(darkest), float(max(brightest, darkest + 1e-9))
 
 
-def _metres(crs: Any) -> float:
-    """Metres of a CRS's unit, roughly."""
-    return 111_000.0 if crs.is_geographic else float(crs.linear_units_factor[1])
+def _palette_of(source: Any) -> Pixels:
+    """Red, green, blue, alpha (256 or more, 4) by number; numbers without a colour have no data."""
+    colours = np.zeros((65536 if source.dtypes[0] == "uint16" else 256, 4), dtype=np.uint8)
+    for number, colour in source.colormap(1).items():
+        colours[number] = colour
+    return colours
+
+
+def _why_not(source: Any, path: Path) -> str:
+    """What keeps an image from being used: its bands or its georeference; empty where nothing does."""
+    kinds = {str(d) for d in source.dtypes}
+    if not kinds or any("complex" in k for k in kinds):
+        return "no picture in it: name one raster layer, with gdal_translate, as GeoTIFF"
+    placed = not source.transform.is_identity
+    if placed and source.crs is None:
+        return (
+            f"has no CRS, only a transform (a world file?): gdal_translate -a_srs EPSG:<its code> {path.name} out.tif"
+        )
+    if not placed and (source.gcps[0] or source.rpcs):
+        return f"is placed by control points, which is no georeference yet: gdalwarp -t_srs EPSG:<code> {path.name} out.tif"
+    if not placed and source.crs is not None:
+        return (
+            "has a CRS but no transform: put its world file beside it, "
+            f"or gdal_translate -a_ullr <left top right bottom> {path.name} out.tif"
+        )
+    if not placed:
+        return "has no georeference (a CRS and a transform): export it as GeoTIFF, or set them with gdal_translate"
+    return ""
+
+
+def _line(error: Exception) -> str:
+    """What GDAL says, without what GDAL says next."""
+    return " ".join(str(error.__cause__ or error).splitlines()[:1])

@@ -3,7 +3,7 @@
 
 A layer is (bins, rows, columns), values 0 to 1: how near a cell is to something of that direction. Edges have a
 direction without sense (`EDGE_BINS` over 180 deg); shores have one with sense, from water to land (`SHORE_BINS` over
-360 deg).
+360 deg). Edges are sought on a grid twice as fine: blurred to a cell, the bright kerb of a quay moves 0.1 m outwards.
 """
 
 from __future__ import annotations
@@ -14,68 +14,149 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc.frames import Array
 from graphloc.frontends.aerial.image import Patch, Pixels
+from graphloc.frontends.aerial.vector import VectorMap
 
 Layer = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+FINE = 2
 EDGE_BINS, SHORE_BINS = 8, 12
-_EDGE_SIGMA_M, _SHORE_SIGMA_M = 0.35, 0.6
+_EDGE_SIGMA_M, _SHORE_SIGMA_M = 0.25, 0.3
 _CANNY = (50.0, 130.0)
+_RIM_M = 0.75  # a segmented rim is that near to the shore
+_MARGIN_M = 0.5  # the image's own rim is no edge
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layers:
-    """Layers of a patch: edges, shores (none where no water is known)."""
+    """Layers of a patch: edges, and shores (none where no water is known). drawn: a user's lines are among them."""
 
     patch: Patch
     edges: Layer
     shores: Layer | None
+    drawn: bool = False
 
 
-def _near(where: Mask, sigma_m: float, cell_m: float) -> Layer:
-    """exp(-d^2 / 2 sigma^2) of the distance to the next marked cell."""
-    if not where.any():
-        return np.zeros(where.shape, dtype=np.float32)
-    away = cv2.distanceTransform((~where).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
-    return np.asarray(np.exp(-0.5 * (away / sigma_m) ** 2), dtype=np.float32)
+@dataclass(frozen=True, slots=True, eq=False)
+class Edges:
+    """Canny's edges on the fine grid: where (rows, columns), and the direction (N,) of the gradient there, rad in world."""
+
+    where: Mask
+    gradient_rad: Array
 
 
-def edge_layer(patch: Patch) -> Layer:
-    """Return edges by the direction of their line, world axes, bin k around k * 180 / EDGE_BINS deg."""
-    grey = cv2.GaussianBlur(cv2.cvtColor(patch.pixels, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
+def find_edges(fine: Patch) -> Edges:
+    """Return the edges of a patch, its margin left out."""
+    grey = cv2.GaussianBlur(cv2.cvtColor(fine.pixels, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
     dx, dy = (cv2.Sobel(grey, cv2.CV_16S, *d) for d in ((1, 0), (0, 1)))
-    edges = cv2.Canny(dx, dy, *_CANNY, L2gradient=True) > 0
-    edges &= cv2.erode(patch.inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    # Rows run south: the gradient points (dx, -dy) in world; the line lies across it.
-    line = np.arctan2(-dy.astype(np.float32), dx.astype(np.float32)) + 0.5 * np.pi
-    return _by_direction(edges, np.mod(line, np.pi), np.pi, EDGE_BINS, _EDGE_SIGMA_M, patch.cell_m)
+    where = (cv2.Canny(dx, dy, *_CANNY, L2gradient=True) > 0) & _well_inside(fine)
+    # Rows run south: the gradient points (dx, -dy) in world.
+    return Edges(where, np.arctan2(-dy[where].astype(float), dx[where].astype(float)))
 
 
-def shore_layer(patch: Patch, water: Mask) -> Layer:
-    """Return shores by the direction from water to land, bin k around k * 360 / SHORE_BINS deg."""
-    soft = cv2.GaussianBlur(water.astype(np.float32), (0, 0), 2.0)
-    dx, dy = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
-    shore = ~water & (cv2.dilate(water.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)  # the watershed's own line
-    shore &= cv2.erode(patch.inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    to_land = np.mod(np.arctan2(dy, -dx), 2.0 * np.pi)
-    return _by_direction(shore, to_land, 2.0 * np.pi, SHORE_BINS, _SHORE_SIGMA_M, patch.cell_m)
+def edge_layer(fine: Patch, edges: Edges) -> Layer:
+    """Return edges by the direction of their line, world axes, bin k around k * 180 / EDGE_BINS deg."""
+    rows, columns = np.nonzero(edges.where)
+    return _drawn(fine, rows, columns, edges.gradient_rad + 0.5 * np.pi, np.pi, EDGE_BINS, _EDGE_SIGMA_M)
 
 
-def _by_direction(
-    where: Mask, angle: NDArray[np.float32], turn: float, bins: int, sigma_m: float, cell_m: float
-) -> Layer:
-    """A layer of marked cells by their angle; each counts for the bins on both sides of it."""
-    at = angle * (bins / turn)
-    lower = np.floor(at).astype(int) % bins
-    return np.stack([
-        _near(where & ((lower == k) | ((lower + 1) % bins == k)), sigma_m, cell_m) for k in range(bins)
-    ])  # fmt: skip
+def shore_layer(fine: Patch, edges: Edges, water: Mask) -> Layer:
+    """Return shores by the direction from water to land, bin k around k * 360 / SHORE_BINS deg.
+
+    The shore is the first edge that water meets: from well within the mask it is grown up to the edges that lie
+    within `_RIM_M` of its rim, and to there where it meets none.
+
+    Args:
+        water: (rows, columns) of the coarse grid.
+    """
+    shape = edges.where.shape
+    mask = cv2.resize(water.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)
+    reach = round(_RIM_M / fine.cell_m)
+    open_to_it = cv2.dilate(mask, _disc(reach)) & (~edges.where).astype(np.uint8)
+    grown = cv2.erode(mask, _disc(reach))
+    for _ in range(2 * reach):
+        grown = cv2.dilate(grown, _CROSS) & open_to_it
+    soft = cv2.GaussianBlur(grown.astype(np.float32), (0, 0), 4.0)
+    shore = (grown == 0) & (cv2.dilate(grown, np.ones((3, 3), np.uint8)) > 0) & _well_inside(fine)
+    rows, columns = np.nonzero(shore)
+    dx = soft[rows, np.minimum(columns + 1, shape[1] - 1)] - soft[rows, np.maximum(columns - 1, 0)]
+    dy = soft[np.minimum(rows + 1, shape[0] - 1), columns] - soft[np.maximum(rows - 1, 0), columns]
+    return _drawn(fine, rows, columns, np.arctan2(dy, -dx), 2.0 * np.pi, SHORE_BINS, _SHORE_SIGMA_M)
+
+
+def drawn_layers(fine: Patch, drawn: VectorMap) -> tuple[Layer, Layer]:
+    """Return the edges and the shores that a vector layer has within a patch."""
+    a, b = drawn.segments_m[:, 0], drawn.segments_m[:, 1]
+    angle = np.arctan2(*(b - a).T[::-1])
+    count = np.ceil(np.abs(b - a).max(axis=1) / fine.cell_m).astype(np.int64)  # as many as a line has pixels
+    which = np.repeat(np.arange(len(a)), count)
+    t = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[which]
+    columns, rows = np.rint(fine.cells(a[which] + t[:, None] * (b - a)[which])).astype(np.int64).T
+    there = (columns >= 0) & (rows >= 0) & (rows < fine.inside.shape[0]) & (columns < fine.inside.shape[1])
+    which, rows, columns = which[there], rows[there], columns[there]
+    sided = np.isfinite(drawn.to_land_rad[which])
+    to_land = drawn.to_land_rad[which[sided]]
+    return (
+        _drawn(fine, rows, columns, angle[which], np.pi, EDGE_BINS, _EDGE_SIGMA_M),
+        _drawn(fine, rows[sided], columns[sided], to_land, 2.0 * np.pi, SHORE_BINS, _SHORE_SIGMA_M),
+    )
+
+
+def _well_inside(patch: Patch) -> Mask:
+    side = 2 * round(_MARGIN_M / patch.cell_m) + 1
+    return np.asarray(cv2.erode(patch.inside.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+
+
+def _drawn(
+    fine: Patch, rows: NDArray[np.int64], columns: NDArray[np.int64], angle: Array, turn: float, bins: int, sigma_m: float
+) -> Layer:  # fmt: skip
+    """Draw pixels of lines into a layer of the coarse grid: exp(-d^2 / 2 sigma^2) beside a line that stands alone.
+
+    Each counts for the bins on both sides of its angle. A slanting line has fewer pixels for its length.
+    """
+    shape = (fine.inside.shape[0] // FINE, fine.inside.shape[1] // FINE)
+    along = angle if turn < 6.0 else angle + 0.5 * np.pi
+    weight = 1.0 / (FINE * np.maximum(np.abs(np.cos(along)), np.abs(np.sin(along))))
+    lower = np.floor(np.mod(angle, turn) * (bins / turn)).astype(np.int64) % bins
+    sigma = sigma_m / (FINE * fine.cell_m)
+    # Shared out between the four nearest cells, so that a line keeps its place to less than a cell.
+    at = (np.stack([rows, columns]) - 0.5 * (FINE - 1)) / FINE
+    corner = np.floor(at).astype(np.int64)
+    part = at - corner
+    counts = np.zeros((bins, shape[0] * shape[1]), dtype=np.float32)
+    for dr, dc in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        r, c = corner[0] + dr, corner[1] + dc
+        keep = (r >= 0) & (c >= 0) & (r < shape[0]) & (c < shape[1])
+        share = weight * (part[0] if dr else 1.0 - part[0]) * (part[1] if dc else 1.0 - part[1])
+        for k in (lower, (lower + 1) % bins):
+            np.add.at(counts, (k[keep], r[keep] * shape[1] + c[keep]), share[keep].astype(np.float32))
+    layer = np.empty((bins, *shape), dtype=np.float32)
+    for k in range(bins):
+        soft = cv2.GaussianBlur(counts[k].reshape(shape), (0, 0), sigma)
+        layer[k] = np.minimum(soft * (np.sqrt(2.0 * np.pi) * sigma), 1.0)
+    return layer
+
+
+def coarse_patch(fine: Patch) -> Patch:
+    """Return a patch with cells of twice the size, each the mean of four."""
+    rows, columns = (n // FINE * FINE for n in fine.inside.shape)
+    size = (columns // FINE, rows // FINE)
+    off = 0.5 * (FINE - 1) * fine.cell_m
+    return Patch(
+        np.asarray(cv2.resize(fine.pixels[:rows, :columns], size, interpolation=cv2.INTER_AREA), dtype=np.uint8),
+        fine.inside[:rows:FINE, :columns:FINE],
+        fine.west_m + off,
+        fine.north_m - off,
+        FINE * fine.cell_m,
+    )
 
 
 def segment_water(patch: Patch, free: Mask, limit: float = 3.0) -> Mask:
     """Return where water is (rows, columns): like the cells that a LiDAR saw to be free water, and joined to them.
 
-    Colour statistics in LAB, robust; darker counts a fifth, so that shadowed water stays water.
+    Colour statistics in LAB, robust; darker counts a fifth, so that shadowed water stays water. Blur keeps its rim
+    some decimetres inside.
     """
     lab: NDArray[np.float32] = cv2.cvtColor(patch.pixels, cv2.COLOR_RGB2LAB).astype(np.float32)
     lab = np.asarray(cv2.GaussianBlur(lab, (0, 0), 1.5), dtype=np.float32)
@@ -87,36 +168,24 @@ def segment_water(patch: Patch, free: Mask, limit: float = 3.0) -> Mask:
     spread = 1.4826 * np.median(np.abs(sample - middle), axis=0) + 1.5
     keep = (np.abs(sample - middle) < 3.0 * spread).all(axis=1)
     cov = np.cov(sample[keep].T) + np.diag([4.0, 1.0, 1.0])
-    mean = sample[keep].mean(axis=0)
+    mean = sample[keep].mean(axis=0).astype(np.float32)
     # In a shadow there is less light of the same colour: chroma (OpenCV's is 128 more) falls with lightness.
     dimmed = np.clip(mean[0] / np.maximum(lab[..., 0], 1.0), 1.0, 3.0)
     off = lab - mean
     off[..., 1:] = (lab[..., 1:] - 128.0) * dimmed[..., None] - (mean[1:] - 128.0)
     off[..., 0] = np.where(off[..., 0] < 0.0, off[..., 0] / 5.0, off[..., 0])
-    far2 = np.einsum("ijk,kl,ijl->ij", off, np.linalg.inv(cov), off)
-    like = ((far2 < limit**2) & patch.inside).astype(np.uint8)
+    white = off @ np.linalg.cholesky(np.linalg.inv(cov)).astype(np.float32)
+    like = ((np.square(white).sum(axis=2) < limit**2) & patch.inside).astype(np.uint8)
     like = cv2.morphologyEx(cv2.morphologyEx(like, cv2.MORPH_OPEN, _disc(1)), cv2.MORPH_CLOSE, _disc(3))
     _, labels = cv2.connectedComponents(like)
-    touched = np.unique(labels[seed & (like > 0)])
-    return _snapped(patch, np.isin(labels, touched[touched > 0]))
-
-
-def _snapped(patch: Patch, water: Mask) -> Mask:
-    """Move the rim of a mask to the edge of the image that it is near: blur has moved it inwards."""
-    sure = cv2.erode(water.astype(np.uint8), _disc(1)) > 0
-    other = cv2.dilate(water.astype(np.uint8), _disc(4)) == 0
-    other |= (cv2.dilate(water.astype(np.uint8), _disc(2)) == 0) & ~_thin(water)
-    markers = np.zeros(water.shape, dtype=np.int32)
-    markers[sure], markers[other] = 1, 2
-    cv2.watershed(patch.pixels, markers)
-    return np.asarray((markers == 1) & patch.inside)
-
-
-def _thin(water: Mask) -> Mask:
-    """Land that is narrower than 2 m or so: all of it is near the rim."""
-    land = (~water).astype(np.uint8)
-    return np.asarray((land > 0) & (cv2.morphologyEx(land, cv2.MORPH_OPEN, _disc(6)) == 0))
+    touched = np.zeros(labels.max() + 1, dtype=bool)
+    touched[labels[seed & (like > 0)]] = True
+    touched[0] = False
+    return np.asarray(touched[labels])
 
 
 def _disc(radius: int) -> Pixels:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), dtype=np.uint8)
+
+
+_CROSS = np.asarray(cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), dtype=np.uint8)

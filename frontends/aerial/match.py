@@ -60,25 +60,35 @@ def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, column
     return out
 
 
-def log_likelihood_of(found: Outline, layers: Layers, grid: Grid, face_weights: Array, shore_weight: float) -> Layer:
-    """Return the score of each pose of the grid (H, R, C).
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """What a face that is on an edge adds to the log-likelihood, low ones and tall ones, and a first return on a shore."""
 
-    Args:
-        face_weights: (F,) one for each feature of a face. shore_weight: that of a first return.
+    low: float
+    tall: float
+    shore: float
+
+
+def log_likelihood_of(found: Outline, layers: Layers, grid: Grid, weights: Weights) -> Layer:
+    """Return the log-likelihood of each pose of the grid (H, R, C).
+
+    The sum over lines grows with their number, and so do chance and what they are wrong by together (boats that lie at
+    other berths than those of the image): it is divided by the root of the evidence there is.
     """
     patch = layers.patch
     col0, row0 = np.rint(patch.cells(np.array([[grid.east_m[0], grid.north_m[0]]]))[0]).astype(int)
+    scale = 10.0 / np.sqrt(max(found.evidence, 1.0))
 
     def lay(layer: Layer, p_m: Array, angle: Array, weight: Array, turn: float) -> Layer:
         return np.asarray(
-            _laid(layer, p_m, angle, weight.astype(np.float32), grid.yaw_rad, col0, row0, patch.cell_m, turn,
+            _laid(layer, p_m, angle, (scale * weight).astype(np.float32), grid.yaw_rad, col0, row0, patch.cell_m, turn,
                   len(grid.north_m), len(grid.east_m))
         )  # fmt: skip
 
-    score = lay(layers.edges, found.faces_m, found.line_rad, found.kind @ face_weights, np.pi)
+    weight = found.face_share * (weights.low + (weights.tall - weights.low) * found.tall)
+    score = lay(layers.edges, found.faces_m, found.line_rad, weight, np.pi)
     if layers.shores is not None:
-        weight = np.full(len(found.shore_m), shore_weight)
-        score += lay(layers.shores, found.shore_m, found.to_land_rad, weight, 2.0 * np.pi)
+        score += lay(layers.shores, found.shore_m, found.to_land_rad, weights.shore * found.shore_share, 2.0 * np.pi)
     return score
 
 
@@ -97,12 +107,12 @@ def modes_of(
     """Return the modes of a posterior (H, R, C), best first, and the probability that none is right.
 
     Args:
-        none_log: log-likelihood of a pose of which nothing is known.
+        none_log: log-likelihood of a pose where the scan fits by chance, over the mean of all.
         alien: probability that the scan shows what the image does not, whatever the score.
     """
     top = float(log_likelihood.max())
     mass = np.exp(log_likelihood.astype(float) - top)
-    none = float(np.exp(none_log - top)) * mass.size
+    none = float(np.exp(none_log + log_likelihood.mean() - top)) * mass.size
     total = mass.sum() + none
     peaks = (ndimage.maximum_filter(log_likelihood, 3) == log_likelihood) & (log_likelihood > top - 9.0)
     free = np.ones(mass.shape, dtype=bool)

@@ -10,13 +10,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from graphloc.frames import Array
 
 _CELL_M = 0.25
 _DRY_M = 0.3  # BL: what is lower is water
+_BOAT_M = 2.0  # boats end there, or a metre above
 _NEAR_M = 1.25  # neighbours that make a line
+_SAME_LINE_RAD, _SAME_LINE_M = np.radians(15.0), 0.3
 _SECTORS = 360
 
 
@@ -37,20 +41,24 @@ class Outline:
     """A scan as the matcher compares it.
 
     Attributes:
-        faces_m: (M, 2) cells of faces. line_rad: (M,) direction of the line through each. kind: (M, F) features that
-            weights are for, 0 to 1. shore_m: (K, 2) first things behind water. to_land_rad: (K,) away from the sensor.
-        water_m: (L, 2) places that were seen to be free water.
+        faces_m: (M, 2) cells of faces. line_rad: (M,) direction of the line through each. tall: (M,) 1 where it
+            rises higher than a boat, 0 where not. face_share: (M,) what each counts. shore_m: (K, 2) first things behind water. to_land_rad: (K,) away from the sensor. shore_share:
+            (K,) what each counts. water_m: (L, 2) places that were seen to be free water.
     """
 
     faces_m: Array
     line_rad: Array
-    kind: Array
+    tall: Array
+    face_share: Array
     shore_m: Array
     to_land_rad: Array
+    shore_share: Array
     water_m: Array
 
-
-FEATURES = ("all", "straight", "tall", "long")
+    @property
+    def evidence(self) -> float:
+        """How many faces and first returns it has, were they independent of each other."""
+        return float(self.face_share.sum() + self.shore_share.sum())
 
 
 def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float = 100.0) -> Outline:
@@ -64,11 +72,19 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
     cells, low, high, count = _columns(p[dry])
     # A face is hit at several heights; a roof or a quay's deck, seen at a grazing angle, is not.
     face = (high - low > 0.25) & (count >= 3)
-    at, top = cells[face], high[face]
-    direction, straight, long = _lines(at)
-    kind = np.column_stack([np.ones(len(at)), straight, np.clip((top - 0.8) / 0.8, 0.0, 1.0), long])
+    at = cells[face]
+    direction = _line_directions(at, _NEAR_M)
     shore, to_land = _first_returns(p[dry], origin[dry], low_limit=2.5)
-    return Outline(at, direction, kind, shore, to_land, _free_water(shore, to_land, p[~dry]))
+    return Outline(
+        faces_m=at,
+        line_rad=direction,
+        tall=np.clip(high[face] - _BOAT_M, 0.0, 1.0),
+        face_share=_shares(at, direction, _NEAR_M),
+        shore_m=shore,
+        to_land_rad=to_land,
+        shore_share=_shares(shore, _line_directions(shore, 2.0 * _NEAR_M), 2.0 * _NEAR_M),
+        water_m=_free_water(shore, to_land, p[~dry]),
+    )
 
 
 def inside(polygon: NDArray[np.float64], points_m: Array) -> NDArray[np.bool_]:
@@ -94,37 +110,37 @@ def _columns(p: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
     return total / count[:, None], np.minimum.reduceat(z, begin), np.maximum.reduceat(z, begin), count
 
 
-def _lines(at: Array) -> tuple[Array, Array, Array]:
-    """Direction (M,) of the line through each place, how straight it is and how long, 0 to 1."""
-    if len(at) < 3:
-        return np.zeros(len(at)), np.zeros(len(at)), np.zeros(len(at))
-    tree = cKDTree(at)
-    pairs = tree.query_pairs(_NEAR_M, output_type="ndarray")
-    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+def _line_directions(at: Array, near_m: float) -> Array:
+    """Direction (M,) of the line through each place and its neighbours."""
+    if len(at) < 2:
+        return np.zeros(len(at))
+    i, j = _neighbours(at, near_m)
     d = at[j] - at[i]
     xx, xy, yy = (np.bincount(i, v, len(at)) for v in (d[:, 0] ** 2, d[:, 0] * d[:, 1], d[:, 1] ** 2))
-    direction = 0.5 * np.arctan2(2.0 * xy, xx - yy)
-    root = np.hypot(xx - yy, 2.0 * xy)
-    straight = np.clip(root / np.maximum(xx + yy, 1e-9), 0.0, 1.0) ** 4
-    return direction, straight, np.clip((_extent_m(tree, at, direction) - 7.0) / 7.0, 0.0, 1.0)
+    return np.asarray(0.5 * np.arctan2(2.0 * xy, xx - yy))
 
 
-def _extent_m(tree: cKDTree, at: Array, direction: Array) -> Array:
-    """How long the line through each place is (M,), as far as places follow each other on it, up to 15 m each way."""
-    pairs = tree.query_pairs(15.0, output_type="ndarray")
-    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+def _shares(at: Array, direction: Array, near_m: float) -> Array:
+    """What each place counts (M,): 1 / sqrt(number of those on its line).
+
+    Places of one wall are right or wrong together: a wall of a hundred tells more than a boat's side of nine, but not
+    eleven times as much.
+    """
+    if len(at) < 2:
+        return np.ones(len(at))
+    i, j = _neighbours(at, near_m)
     d = at[j] - at[i]
-    aside = np.abs(-d[:, 0] * np.sin(direction[i]) + d[:, 1] * np.cos(direction[i]))
-    along = d[:, 0] * np.cos(direction[i]) + d[:, 1] * np.sin(direction[i])
-    on_it = aside < 0.15 + 0.02 * np.abs(along)
-    i, along = i[on_it], along[on_it]
-    bins = np.zeros((len(at), 31), dtype=bool)  # a metre each; a gap of more than two ends the line
-    bins[i, np.clip(np.rint(along).astype(int) + 15, 0, 30)] = True
-    bins[:, 15] = True
-    filled = bins | np.roll(bins, 1, axis=1) | np.roll(bins, -1, axis=1)
-    ahead = np.minimum.accumulate(filled[:, 15:], axis=1).sum(axis=1)
-    behind = np.minimum.accumulate(filled[:, 15::-1], axis=1).sum(axis=1)
-    return np.asarray(ahead + behind - 2, dtype=float)
+    turned = np.abs(np.mod(direction[i] - direction[j] + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
+    aside = np.abs(d[:, 1] * np.cos(direction[i]) - d[:, 0] * np.sin(direction[i]))
+    on_it = (turned < _SAME_LINE_RAD) & (aside < _SAME_LINE_M)
+    joined = coo_matrix((np.ones(int(on_it.sum())), (i[on_it], j[on_it])), shape=(len(at), len(at)))
+    _, line = connected_components(joined, directed=False)
+    return np.asarray(1.0 / np.sqrt(np.bincount(line)[line]))
+
+
+def _neighbours(at: Array, near_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    pairs = cKDTree(at).query_pairs(near_m, output_type="ndarray")
+    return np.concatenate([pairs[:, 0], pairs[:, 1]]), np.concatenate([pairs[:, 1], pairs[:, 0]])
 
 
 def _first_returns(p: Array, origin: Array, low_limit: float) -> tuple[Array, Array]:

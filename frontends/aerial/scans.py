@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,15 @@ from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
 from graphloc.frontends._source import Bag
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends.aerial.bl import BLMatcher
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, decode_cloud, level
+from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
 from graphloc.frontends.bag import TF_STATIC
 from graphloc.frontends.decode import TF, header_stamp_ns
 from graphloc.trajectory import Trajectory
+
+_JITTER_S = 0.05  # stamps are not a clock
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,53 +35,98 @@ class Matched:
     why_not: str
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turn:
+    """One scan of each LiDAR; or why one of them cannot be used."""
+
+    stamp_ns: int
+    clouds: list[Cloud]
+    why_not: str = ""
+
+
 def match_bag(
     paths: Sequence[Path],
     config: AerialConfig,
-    image: Path,
+    folder: Path,
     body_frame: str,
     track: Trajectory,
     datum: Datum,
     *,
     at_ns: int | None = None,
 ) -> Iterator[Matched]:
-    """Match the scans of a bag around a track, every `config.every_s`; or the one nearest to `at_ns` alone.
+    """Match the scans of a bag around a track, as often as the configuration says; or the one nearest to `at_ns` alone.
+
+    Args:
+        folder: relative paths of maps count from there.
 
     Raises:
-        InputError: no LiDAR, a topic that is not there, a mount that no chain leads to, an image that cannot be used.
+        InputError: no LiDAR, a topic that is not there, a mount that no chain leads to, a map that cannot be used.
     """
-    matcher = Matcher(config, image, datum)
-    last_ns = -(10**18)
-    best: tuple[int, list[Cloud]] | None = None
     with Bag(paths) as bag:
         mounts = _mounts(bag, config, body_frame)
-        for clouds in _groups(bag, config):
-            stamp_ns = max(c.stamp_ns for c in clouds)
-            if at_ns is not None:
-                if best is None or abs(stamp_ns - at_ns) < abs(best[0] - at_ns):
-                    best = (stamp_ns, clouds)
-                elif stamp_ns > at_ns:
-                    break
+        matcher = _matcher(config, folder, datum)
+        for turns in _submaps(bag, config, track, at_ns):
+            if turns[-1].why_not:
+                yield Matched(turns[-1].stamp_ns, None, turns[-1].why_not)
+            else:
+                yield _one(matcher, turns, mounts, track, config)
+
+
+def _matcher(config: AerialConfig, folder: Path, datum: Datum) -> Matcher | BLMatcher:
+    if config.matcher == "posterior":
+        return Matcher(config, folder, datum)
+    if not config.image:
+        raise InputError("sensors: the matcher 'bl' needs an image")
+    return BLMatcher(config, AerialImage(folder / config.image, datum), config.seed)
+
+
+def _submaps(bag: Bag, config: AerialConfig, track: Trajectory, at_ns: int | None) -> Iterator[list[_Turn]]:
+    """The turns that are matched, each with those before it that are laid together with it; newest last."""
+    if at_ns is not None:
+        nearest: list[_Turn] = []
+        for turns in _windows(bag, config):
+            if nearest and abs(turns[-1].stamp_ns - at_ns) > abs(nearest[-1].stamp_ns - at_ns):
+                break
+            nearest = turns
+        if nearest:
+            yield nearest
+        return
+    last: tuple[int, Array] | None = None
+    for turns in _windows(bag, config):
+        stamp_ns = turns[-1].stamp_ns
+        if turns[-1].why_not:
+            yield turns
+            continue
+        here = track.at(np.clip(np.array([stamp_ns]), track.stamps_ns[0], track.stamps_ns[-1])).p_world_m[0]
+        if last is not None:
+            waited_s, moved_m = (stamp_ns - last[0]) / 1e9, float(np.hypot(*(here - last[1])[:2]))
+            if waited_s < config.every_s - _JITTER_S or (moved_m < config.every_m and waited_s < config.still_s):
                 continue
-            if stamp_ns - last_ns < config.every_s * 1e9 - 5e7:
-                continue
-            last_ns = stamp_ns
-            yield _one(matcher, clouds, stamp_ns, mounts, track, config)
-        if best is not None:
-            yield _one(matcher, best[1], best[0], mounts, track, config)
+        last = (stamp_ns, here)
+        yield turns
+
+
+def _windows(bag: Bag, config: AerialConfig) -> Iterator[list[_Turn]]:
+    window: deque[_Turn] = deque(maxlen=config.submap)
+    for turn in _turns(bag, config):
+        if turn.why_not:
+            yield [turn]
+        else:
+            window.append(turn)
+            yield list(window)
 
 
 def _one(
-    matcher: Matcher,
-    clouds: list[Cloud],
-    stamp_ns: int,
+    matcher: Matcher | BLMatcher,
+    turns: list[_Turn],
     mounts: Mapping[str, tuple[Array, Array]],
     track: Trajectory,
     config: AerialConfig,
 ) -> Matched:
-    at_ns = int(np.median(np.concatenate([c.stamps_ns for c in clouds] + [np.array([stamp_ns])])))
+    newest = turns[-1]
+    at_ns = int(np.median(np.concatenate([c.stamps_ns for c in newest.clouds] + [np.array([newest.stamp_ns])])))
     try:
-        cloud = level(clouds, mounts, track, at_ns, config.waterline_m)
+        cloud = level([c for turn in turns for c in turn.clouds], mounts, track, at_ns, config.waterline_m)
         pose = track.at(np.array([at_ns]))
         sigma = np.array([1.0, 1.0, np.radians(2.0)])
         if pose.cov is not None:
@@ -112,22 +162,32 @@ def _mounts(bag: Bag, config: AerialConfig, body_frame: str) -> dict[str, tuple[
     }
 
 
-def _groups(bag: Bag, config: AerialConfig) -> Iterator[list[Cloud]]:
+def _turns(bag: Bag, config: AerialConfig) -> Iterator[_Turn]:
     """Scans that belong together: one of each LiDAR, as they arrive."""
     names = {lidar.topic: name for name, lidar in config.lidars.items()}
-    group: dict[str, Cloud] = {}
+    turn: dict[str, Cloud] = {}
+
+    def whole() -> _Turn:
+        return _Turn(max(c.stamp_ns for c in turn.values()), list(turn.values()))
+
     for raw in bag.messages(set(names)):
-        msg = bag.decode(raw)
-        stamp_ns = header_stamp_ns(msg)
-        if stamp_ns is None:
-            continue
         name = names[raw.topic]
-        if name in group:
-            yield list(group.values())
-            group = {}
-        group[name] = decode_cloud(msg, stamp_ns, name)
-        if len(group) == len(names):
-            yield list(group.values())
-            group = {}
-    if group:
-        yield list(group.values())
+        try:
+            msg = bag.decode(raw)
+            stamp_ns = header_stamp_ns(msg)
+            if stamp_ns is None:
+                raise ValueError("its header has no stamp")
+            cloud = decode_cloud(msg, stamp_ns, name)
+        except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
+            said = str(error) if isinstance(error, ValueError) else f"cannot be decoded ({type(error).__name__})"
+            yield _Turn(raw.log_ns, [], f"{raw.topic}: {said}")
+            continue
+        if name in turn:
+            yield whole()
+            turn = {}
+        turn[name] = cloud
+        if len(turn) == len(names):
+            yield whole()
+            turn = {}
+    if turn:
+        yield whole()

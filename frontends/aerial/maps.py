@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map that scans are laid on: an image, a user's lines, or both; its layers are made once for each part of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.config import AerialConfig
+from graphloc.errors import InputError
+from graphloc.frames import Array, Datum
+from graphloc.frontends.aerial.image import AerialImage, Patch
+from graphloc.frontends.aerial.layers import (
+    FINE,
+    Layer,
+    Layers,
+    coarse_patch,
+    drawn_layers,
+    edge_layer,
+    find_edges,
+    segment_water,
+    shore_layer,
+)
+from graphloc.frontends.aerial.scan import Outline
+from graphloc.frontends.aerial.vector import VectorMap, read_vector
+
+_CELL_M = 0.25
+_TILE_M = 60.0  # a patch serves all priors of one tile
+_KEPT = 2  # patches, so that a way along the border of two makes each once; 80 MB each
+
+
+class Map:
+    """What `image` and `vector` of an aerial sensor show, part by part.
+
+    Raises:
+        InputError: neither is given, or one cannot be used.
+    """
+
+    def __init__(self, config: AerialConfig, folder: Path, datum: Datum) -> None:
+        if not config.image and not config.vector:
+            raise InputError("sensors: an aerial sensor needs an image, a vector layer, or both")
+        self._image = AerialImage(folder / config.image, datum) if config.image else None
+        self._drawn = read_vector(folder / config.vector, datum) if config.vector else None
+        self._half_m = config.reach_m + 0.5 * _TILE_M + config.window_m
+        self._kept: dict[tuple[int, int], Layers] = {}
+
+    def around(self, pose: Array, found: Outline) -> Layers:
+        """Return the layers around a pose (3,); water is what is like the water that the scan saw from there.
+
+        Raises:
+            InputError: the image does not reach there.
+        """
+        tile = (int(pose[0] // _TILE_M), int(pose[1] // _TILE_M))
+        if tile not in self._kept:
+            while len(self._kept) >= _KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[tile] = self._made((np.array(tile) + 0.5) * _TILE_M, pose, found)
+        return self._kept[tile]
+
+    def _made(self, middle_m: Array, pose: Array, found: Outline) -> Layers:
+        cell = _CELL_M / FINE
+        if self._image is None:
+            fine = _blank(middle_m, self._half_m, cell)
+        else:
+            fine = self._image.patch(middle_m, self._half_m, cell)
+        coarse = coarse_patch(fine)
+        layers: list[tuple[Layer, Layer | None]] = []
+        if self._image is not None:
+            edges = find_edges(fine)
+            water = segment_water(coarse, _seen_water(coarse, pose, found))
+            layers.append((edge_layer(fine, edges), shore_layer(fine, edges, water) if water.any() else None))
+        if self._drawn is not None:
+            layers.append(drawn_layers(fine, self._near(self._drawn, middle_m)))
+        shores = [shore for _, shore in layers if shore is not None]
+        return Layers(
+            patch=coarse,
+            edges=np.maximum.reduce([edge for edge, _ in layers]),
+            shores=np.maximum.reduce(shores) if shores else None,
+            drawn=self._drawn is not None,
+        )
+
+    def _near(self, drawn: VectorMap, middle_m: Array) -> VectorMap:
+        near = drawn.around(middle_m, self._half_m)
+        if self._image is None and not len(near.segments_m):
+            raise InputError(
+                f"the vector layer has no line around {middle_m[0]:.0f} m east, {middle_m[1]:.0f} m north of the datum"
+            )
+        return near
+
+
+def _blank(middle_m: Array, half_m: float, cell_m: float) -> Patch:
+    """A patch of which nothing is known."""
+    n = int(np.ceil(2.0 * half_m / cell_m))
+    corner = half_m - 0.5 * cell_m
+    return Patch(
+        np.zeros((n, n, 3), dtype=np.uint8), np.ones((n, n), dtype=bool), middle_m[0] - corner, middle_m[1] + corner, cell_m
+    )  # fmt: skip
+
+
+def _seen_water(patch: Patch, pose: Array, found: Outline) -> NDArray[np.bool_]:
+    """Cells that the scan saw to be water, were the pose right."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    at = found.water_m @ np.array([[c, s], [-s, c]]) + pose[:2]
+    cells = np.rint(patch.cells(at)).astype(int)
+    free = np.zeros(patch.inside.shape, dtype=bool)
+    cells = cells[((cells >= 0) & (cells < np.array(free.shape)[::-1])).all(axis=1)]
+    free[cells[:, 1], cells[:, 0]] = True
+    return free

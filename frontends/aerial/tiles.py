@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of Web Mercator tiles as one image: GDAL's own tile reader, told where the files are.
+
+GDAL reads the tiles that a window needs, takes a missing file for no data, and makes RGBA of grey, palette, RGB and
+RGBA tiles alike (driver WMS, service TMS, docs: gdal.org/drivers/raster/wms.html). Nothing goes over the network.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import rasterio
+
+from graphloc.errors import InputError
+from graphloc.frames import Datum
+
+_HALF_M = 20037508.342789244  # Web Mercator is a square of twice that: pi * 6378137
+_KINDS = {".png", ".jpg", ".jpeg", ".webp"}
+_DEEPEST = 22  # 2^22 tiles of 256 pixels fill GDAL's 2^31 columns nearly; a pixel is 2 cm at 57 deg
+_FAR_M = 100e3
+_WANTED = "a folder of tiles has z/x/y.png (or jpg, jpeg, webp), Web Mercator, as QGIS and gdal2tiles write them"
+
+
+def describe_tiles(folder: Path, datum: Datum) -> str:
+    """Return GDAL's description (XML, to be opened as if it were a file) of a folder of tiles z/x/y.png, jpg, webp.
+
+    The image is the deepest zoom level that is there (22 at most); the levels without a gap above it are its
+    overviews. Rows count from the top (XYZ) or from below (TMS): whichever brings the tiles nearer to the datum, XYZ
+    on a tie (which needs a datum within a tile or so of the equator, or tiles of both hemispheres).
+
+    Raises:
+        InputError: no such tiles, several kinds of files, or they are more than 100 km from the datum either way.
+    """
+    levels = {int(p.name) for p in _numbered(folder)}
+    zoom = max((z for z in levels if z <= _DEEPEST), default=-1)
+    columns = {int(p.name): p for p in _numbered(folder / str(zoom))} if zoom >= 0 else {}
+    if not columns:
+        raise InputError(f"{folder}: no tiles in it: {_WANTED}")
+    across, down = _tile_of(datum, zoom)
+    column = min(columns, key=lambda x: abs(x + 0.5 - across))
+    tiles = {int(p.stem): p for p in _numbered(columns[column]) if p.suffix.lower() in _KINDS}
+    if not tiles:
+        raise InputError(f"{columns[column]}: no tiles in it: {_WANTED}")
+    kinds = Counter(p.suffix for p in columns[column].iterdir() if p.suffix.lower() in _KINDS)
+    if len(kinds) > 1:
+        raise InputError(
+            f"{columns[column]}: tiles of several kinds ({', '.join(kinds)}): make them one, or an MBTiles file"
+        )
+    rows, n = np.array(sorted(tiles)), 2**zoom
+    from_top, from_below = (float(np.abs(r + 0.5 - down).min()) for r in (rows, n - 1 - rows))
+    tile_m = 2.0 * _HALF_M / n * np.cos(np.radians(datum.origin.latitude_deg))
+    away_m = tile_m * float(np.hypot(column + 0.5 - across, min(from_top, from_below)))
+    if away_m > max(_FAR_M, 2.0 * tile_m):
+        raise InputError(
+            f"{folder}: the tile nearest to the datum is {away_m / 1000.0:.0f} km off, with rows from the top as from below: "
+            f"another `datum:`, or not z/x/y (z/y/x?): {_WANTED}"
+        )
+    first = tiles[int(rows[0])]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(first) as tile:
+                width, height = tile.width, tile.height
+    except rasterio.errors.RasterioError as error:
+        raise InputError(f"{first}: not an image that GDAL can read ({error})") from None
+    overviews = next(k for k in range(zoom + 1) if zoom - k - 1 not in levels)
+    # as_uri: GDAL wants blanks and such quoted. 404: no file. 200: a file without content, which some tools write.
+    return (
+        f'<GDAL_WMS><Service name="TMS"><ServerUrl>{folder.resolve().as_uri()}/${{z}}/${{x}}/${{y}}{first.suffix}</ServerUrl>'
+        f"</Service><DataWindow><UpperLeftX>{-_HALF_M!r}</UpperLeftX><UpperLeftY>{_HALF_M!r}</UpperLeftY>"
+        f"<LowerRightX>{_HALF_M!r}</LowerRightX><LowerRightY>{-_HALF_M!r}</LowerRightY><TileLevel>{zoom}</TileLevel>"
+        f"<TileCountX>1</TileCountX><TileCountY>1</TileCountY>"
+        f"<YOrigin>{'top' if from_top <= from_below else 'bottom'}</YOrigin></DataWindow><Projection>EPSG:3857</Projection>"
+        f"<BlockSizeX>{width}</BlockSizeX><BlockSizeY>{height}</BlockSizeY><BandsCount>4</BandsCount>"
+        f"<OverviewCount>{overviews}</OverviewCount><ZeroBlockHttpCodes>404,200</ZeroBlockHttpCodes></GDAL_WMS>"
+    )
+
+
+def _numbered(folder: Path) -> list[Path]:
+    return [p for p in folder.iterdir() if re.fullmatch("[0-9]+", p.stem)]
+
+
+def _tile_of(datum: Datum, zoom: int) -> tuple[float, float]:
+    """Column and row of the datum among the tiles of a level, from the top left, fractional."""
+    latitude = np.radians(np.clip(datum.origin.latitude_deg, -85.0, 85.0))
+    down = 0.5 - np.arcsinh(np.tan(latitude)) / (2.0 * np.pi)
+    return (datum.origin.longitude_deg / 360.0 + 0.5) * 2**zoom, float(down) * 2**zoom

@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lines of quays, piers and shores that a user drew or took from OpenStreetMap: GeoJSON, on the grid of world.
+
+Which side of a line is land is taken from tags of features (keys as in OpenStreetMap, "no" is as if not there):
+
+- a polygon with the property `graphloc` = "water" or "land": as said;
+- a polygon of land: `building`, `man_made` = pier, quay, breakwater, groyne or jetty, `natural` = land or coastline,
+  `place` = island or islet;
+- else a polygon of water: `water`, `natural` = water, bay or strait, `landuse` = basin or reservoir, `harbour`,
+  `waterway` = riverbank, river, canal, dock or fairway;
+- a line `natural` = coastline: land is on its left;
+- any other: not known. A line of it is an edge, not a shore.
+
+Tags that ogr2ogr packs into one text (`other_tags`) are not read. RFC 7946 wants outer rings counter-clockwise, files
+do not care: the side of a ring that is inside is computed. Where two polygons meet that have land on opposite sides of
+their common border (water in two parts, a terrace of houses) there is no shore and nothing to see: it is left out.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
+
+from graphloc.errors import InputError
+from graphloc.frames import Array, Datum, wrap_angle
+
+_LAND: dict[str, set[str] | None] = {
+    "building": None,  # whatever its value
+    "man_made": {"pier", "quay", "breakwater", "groyne", "jetty"},
+    "natural": {"land", "coastline"},
+    "place": {"island", "islet"},
+}
+_WATER: dict[str, set[str] | None] = {
+    "water": None,
+    "natural": {"water", "bay", "strait"},
+    "landuse": {"basin", "reservoir"},
+    "harbour": None,
+    "waterway": {"riverbank", "river", "canal", "dock", "fairway"},  # not dam, weir, boatyard, ...
+}
+_MOST_BYTES = 200_000_000
+_FAR_M = 50e3
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VectorMap:
+    """Lines that a user drew (QGIS) or took from OpenStreetMap, in world.
+
+    Attributes:
+        segments_m: (S, 2, 2) ends east, north of each straight piece.
+        to_land_rad: (S,) direction across the line towards land, from east, counter-clockwise; NaN where the line
+            does not say.
+        points_left: points of the file that were left out: they are no lines.
+    """
+
+    segments_m: Array
+    to_land_rad: Array
+    points_left: int = 0
+
+    def around(self, centre_m: Array, half_m: float) -> VectorMap:
+        """Return the segments, whole, that may reach into the square of `half_m` around a point (2,) in world.
+
+        A slanting segment whose box reaches into the square is returned though it may pass by.
+        """
+        low, high = self.segments_m.min(axis=1), self.segments_m.max(axis=1)
+        near = ((low <= centre_m + half_m) & (high >= centre_m - half_m)).all(axis=1)
+        return replace(self, segments_m=self.segments_m[near], to_land_rad=self.to_land_rad[near])
+
+
+class _Line(NamedTuple):
+    """A line of a file: positions (P, 2), x and y as written, P > 1; where land is: 1 left, -1 right, 0 not known.
+
+    Of a ring that holds where it runs counter-clockwise.
+    """
+
+    xy: Array
+    land: int
+    ring: bool
+
+
+@dataclass(slots=True)
+class _Found:
+    lines: list[_Line] = field(default_factory=list)
+    points: int = 0
+
+
+def read_vector(path: Path, datum: Datum) -> VectorMap:
+    """Read a GeoJSON file (RFC 7946: longitude, latitude on WGS 84; heights are not used).
+
+    A `crs` member of the older GeoJSON is honoured, with x, y as east, north, as GDAL writes them. Straight in the
+    file is taken for straight in world: 500 m east at 57 deg north bend by less than 1 cm.
+
+    Raises:
+        InputError: it cannot be read, is no GeoJSON, has no line, or is farther than 50 km from the datum.
+    """
+    try:
+        document = _document(path)
+        found = _Found()
+        for where, feature in _features(document):
+            try:
+                _gather(found, _tags_of(feature), feature.get("geometry"))
+            except ValueError as error:
+                raise ValueError(f"{where}{error}") from None
+        if not found.lines:
+            raise ValueError(f"no line or polygon in it ({found.points} points): lines are what is matched")
+        p_m = _in_world(np.vstack([line.xy for line in found.lines]), _crs_of(document), datum)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
+    except RecursionError:
+        raise InputError(f"{path}: nested too deep") from None
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    if found.points:
+        log.info("%s: %d points left out: they are no lines", path, found.points)
+    return _segments(found, p_m)
+
+
+def _document(path: Path) -> Mapping[str, Any]:
+    if path.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"more than {_MOST_BYTES // 10**6} MB: cut out what is near the run")
+
+    def refuse(constant: str) -> float:
+        raise ValueError(f"{constant} in it is no number")
+
+    content = path.read_bytes()
+    try:
+        document = json.loads(content, parse_constant=refuse)
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"not JSON ({error}): export it as GeoJSON") from None
+    if isinstance(document, dict) and isinstance(document.get("type"), str):
+        return document
+    raise ValueError("not GeoJSON (no `type`)")
+
+
+def _features(document: Mapping[str, Any]) -> Iterable[tuple[str, Mapping[str, Any]]]:
+    """Each feature, and how to name it."""
+    if document["type"] == "FeatureCollection":
+        features = document.get("features")
+        if not isinstance(features, list):
+            raise ValueError("not GeoJSON (a FeatureCollection without a list of `features`)")
+        for k, feature in enumerate(features):
+            if not isinstance(feature, dict) or feature.get("type") != "Feature":
+                raise ValueError(f"feature {k}: not GeoJSON (no Feature)")
+            yield f"feature {k}: ", feature
+    elif document["type"] == "Feature":
+        yield "", document
+    else:
+        yield "", {"geometry": document}
+
+
+def _tags_of(feature: Mapping[str, Any]) -> Mapping[str, str]:
+    properties = feature.get("properties")
+    given = properties.items() if isinstance(properties, dict) else ()
+    return {k: str(v) for k, v in given if v not in (None, False, "", "no")}
+
+
+def _gather(found: _Found, tags: Mapping[str, str], geometry: Any) -> None:
+    """Append the lines of a geometry; none has none."""
+    if geometry is None:
+        return
+    kind = geometry.get("type") if isinstance(geometry, dict) else geometry
+    try:
+        match kind:
+            case "GeometryCollection":
+                for part in geometry["geometries"]:
+                    _gather(found, tags, part)
+            case "Point":
+                found.points += 1
+            case "MultiPoint":
+                found.points += len(geometry["coordinates"])
+            case "LineString" | "MultiLineString":
+                land = _land_of(tags, polygon=False)
+                lines = geometry["coordinates"]
+                for line in [lines] if kind == "LineString" else lines:
+                    xy = _positions(line)
+                    found.lines += [_Line(xy, land, ring=False)] if len(xy) > 1 else []
+            case "Polygon" | "MultiPolygon":
+                land = _land_of(tags, polygon=True)
+                polygons = geometry["coordinates"]
+                for rings in [polygons] if kind == "Polygon" else polygons:
+                    for k, ring in enumerate(rings):
+                        xy = _positions(ring)
+                        closed = np.vstack([xy, xy[:1]])  # twice closed does no harm
+                        found.lines += [_Line(closed, -land if k else land, ring=True)] if len(xy) > 1 else []
+            case _:
+                raise ValueError(f"not GeoJSON (no geometry is of type {str(kind)[:40]!r})")
+    except (TypeError, KeyError):
+        raise ValueError(f"not GeoJSON (a {kind} without lists of positions)") from None
+
+
+def _positions(line: Any) -> Array:
+    """Positions (P, 2), x and y, of a list of them."""
+    try:
+        pairs = [(x, y) for x, y, *_ in line]
+    except ValueError:
+        raise ValueError("a position is not two or three numbers") from None
+    wrong = [v for pair in pairs for v in pair if type(v) not in (int, float)]
+    if wrong:
+        raise ValueError(f"coordinates are not numbers ({str(wrong[0])[:40]!r})")
+    try:
+        xy = np.array(pairs, dtype=float).reshape(-1, 2)
+    except OverflowError:
+        xy = np.array([[np.inf, np.inf]])
+    if not np.isfinite(xy).all():
+        raise ValueError("coordinates are not finite")
+    return xy
+
+
+def _land_of(tags: Mapping[str, str], polygon: bool) -> int:
+    """Where land is: 1 on the left, or inside a polygon, -1 opposite, 0 not known."""
+    drawn = tags.get("graphloc")
+    if drawn is not None and drawn not in ("land", "water"):
+        raise ValueError(f"the property `graphloc` is {drawn!r}: water or land")
+    if not polygon:
+        if drawn is not None:
+            raise ValueError("the property `graphloc` on a line, which has no inside: draw a polygon")
+        return 1 if tags.get("natural") == "coastline" else 0
+    if drawn is not None:
+        return 1 if drawn == "land" else -1
+    for land, keys in ((1, _LAND), (-1, _WATER)):
+        if any(k in tags and (values is None or tags[k] in values) for k, values in keys.items()):
+            return land
+    return 0
+
+
+def _crs_of(document: Mapping[str, Any]) -> CRS | None:
+    """The CRS that an older GeoJSON names; none where it names none."""
+    member = document.get("crs")
+    if member is None:
+        return None
+    try:
+        return CRS.from_user_input(member["properties"]["name"])
+    except (ProjError, TypeError, KeyError):
+        raise ValueError("its `crs` member names no CRS that is known: export it as WGS 84 (EPSG:4326)") from None
+
+
+def _in_world(xy: Array, crs: CRS | None, datum: Datum) -> Array:
+    """East, north (N, 2) in world of positions (N, 2) as written."""
+    to_wgs84 = None if crs is None else Transformer.from_crs(crs, 4326, always_xy=True)
+
+    def placed(x: Array, y: Array) -> Array | None:
+        longitude, latitude = (x, y) if to_wgs84 is None else to_wgs84.transform(x, y)
+        if not ((np.abs(longitude) <= 180.0) & (np.abs(latitude) <= 90.0)).all():
+            return None
+        return datum.enu_from_geodetic(latitude, longitude, np.full(len(x), datum.origin.height_m))
+
+    def away(p: Array | None) -> float:
+        return np.inf if p is None else float(np.linalg.norm(p, axis=1).min())
+
+    p = placed(xy[:, 0], xy[:, 1])
+    if p is not None and away(p) <= _FAR_M:
+        return p[:, :2]
+    if away(placed(xy[:, 1], xy[:, 0])) <= _FAR_M:
+        raise ValueError("looks like latitude, longitude; GeoJSON wants longitude, latitude (x, y)")
+    if p is None:
+        what = "are no degrees" if crs is None else f"are beyond {crs.name}"
+        raise ValueError(f"coordinates as large as {np.abs(xy).max():.0f} {what}: export it as WGS 84 (EPSG:4326)")
+    raise ValueError(f"lies {away(p) / 1000.0:.0f} km from the datum: another file, or another `datum:`")
+
+
+def _segments(found: _Found, p_m: Array) -> VectorMap:
+    lengths = [len(line.xy) for line in found.lines]
+    line = np.repeat(np.arange(len(lengths)), lengths)
+    of = line[1:][line[1:] == line[:-1]]
+    ends = np.stack([p_m[:-1], p_m[1:]], axis=1)[line[1:] == line[:-1]]
+    step = ends[:, 1] - ends[:, 0]
+    # Twice the area to the left of a ring, from its first point, which keeps the digits.
+    since = ends[:, 0] - p_m[np.cumsum([0, *lengths[:-1]])[of]]
+    area = np.bincount(of, since[:, 0] * step[:, 1] - since[:, 1] * step[:, 0], len(lengths))
+    ring = np.array([f.ring for f in found.lines])
+    left = (np.array([f.land for f in found.lines]) * np.where(ring, np.sign(area), 1.0))[of]
+    keep = step.any(axis=1) & ~_contradicted(ends, left)
+    to_land = np.arctan2(step[:, 1], step[:, 0]) + np.where(left == 0.0, np.nan, left * 0.5 * np.pi)
+    return VectorMap(ends[keep], wrap_angle(to_land[keep]), found.points)
+
+
+def _contradicted(ends: Array, left: Array) -> NDArray[np.bool_]:
+    """Which segments (S, 2, 2) are there again with land on the other side; `left` (S,) is 1, -1 or 0."""
+    back = (ends[:, 0, 0] > ends[:, 1, 0]) | ((ends[:, 0, 0] == ends[:, 1, 0]) & (ends[:, 0, 1] > ends[:, 1, 1]))
+    forth = np.where(back[:, None, None], ends[:, ::-1], ends).reshape(-1, 4)
+    same = np.unique(forth, axis=0, return_inverse=True)[1].ravel()
+    side = np.where(back, -left, left)
+    return np.asarray(((np.bincount(same, side > 0) > 0) & (np.bincount(same, side < 0) > 0))[same])
