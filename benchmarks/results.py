@@ -17,6 +17,7 @@ from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
 from typing import Any
 
+import matcher
 import simulator
 import smoothing
 from _rows import ROOT, Row
@@ -32,6 +33,11 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "B.2": simulator.overlays,
     "B.3": simulator.tags,
     "B.4": simulator.making,
+    "C.1": matcher.success,
+    "C.2": matcher.accuracy,
+    "C.3": matcher.honesty,
+    "C.4": matcher.runs,
+    "C.5": matcher.speed,
 }
 
 

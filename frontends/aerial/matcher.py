@@ -18,7 +18,7 @@ from graphloc.measurements import PoseFix, PoseMode
 
 # Fitted by benchmarks/tune_matcher.py on harbours drawn by chance; docs/decisions/0006. Where lines were drawn, what is
 # not on one is likely to be a boat.
-_ON_IMAGE, _ON_LINES = Weights(low=0.90, tall=1.31, shore=1.71), Weights(low=0.51, tall=1.67, shore=1.59)
+_ON_IMAGE, _ON_LINES = Weights(low=0.87, tall=0.46, shore=1.56), Weights(low=0.62, tall=1.92, shore=1.47)
 _NONE_LOG = 5.0  # the best pose of pure chance is about that much over the mean
 _ALIEN = 0.05  # a scan shows boats that the image does not have, and the reverse
 _LEAST_PLACES = 30
