@@ -16,17 +16,70 @@ from graphloc.frontends.aerial.image import Pixels
 _ZOOM = 3
 _AROUND_M = 60.0
 _FACES, _SHORES, _PRIOR = (60, 60, 255), (80, 255, 80), (255, 160, 0)  # blue, green, red
+_LINES = (200, 160, 90)
+_SAID = {
+    "best": "probability {first:.2f} and the tightest for it",
+    "worst": "{far:.1f} sigmas from where the run had the vessel without matches",
+    "most ambiguous": "modes of {first:.2f} and {second:.2f}",
+}
 _MODES = ((0, 255, 255), (255, 0, 255), (255, 255, 0), (200, 200, 200), (120, 120, 120))
 
 
+class Gallery:
+    """Of all matches of a run the best, the worst and the most ambiguous, as pictures."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, tuple[float, str, bytes]] = {}
+
+    def offer(self, match: Match, sensor: str, at_s: float) -> None:
+        """Keep a match where none before was better, worse or more ambiguous."""
+        if match.score is None or not match.modes:
+            return
+        first, *others = match.modes
+        off = first.pose[:2] - match.prior.pose[:2]
+        far = float(np.hypot(*off)) / float(
+            np.sqrt(np.trace(first.cov[:2, :2]) + np.square(match.prior.sigma[:2]).sum())
+        )
+        marks = {
+            "best": first.probability / float(np.sqrt(np.trace(first.cov[:2, :2]))),
+            "worst": far,
+            "most ambiguous": others[0].probability if others else 0.0,
+        }
+        for what, mark in marks.items():
+            if mark > self._kept.get(what, (0.0, "", b""))[0]:
+                said = _SAID[what].format(far=far, first=first.probability, second=marks["most ambiguous"])
+                coded = cv2.imencode(".jpg", drawn(match), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+                self._kept[what] = (mark, f"{sensor} at {at_s:.1f} s, {what}: {said}", coded.tobytes())
+
+    def pictures(self) -> list[tuple[str, bytes]]:
+        """Return captions and JPEGs."""
+        return [(said, coded) for _, said, coded in self._kept.values()]
+
+
 def write_picture(match: Match, path: Path) -> None:
-    """Write the picture; the scan lies where the best mode has it, or the prior where there is none.
+    """Write the picture of a match.
 
     Raises:
         OutputError: there is nothing to draw, or the disk refuses.
     """
+    canvas = drawn(match)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        written = cv2.imwrite(str(path), canvas)
+    except (OSError, cv2.error) as error:
+        raise OutputError(f"{path}: cannot be written ({' '.join(str(error).split())[:160]})") from None
+    if not written:
+        raise OutputError(f"{path}: cannot be written")
+
+
+def drawn(match: Match) -> Pixels:
+    """Return the picture (rows, columns, 3), blue, green, red; the scan lies where the best mode has it, or the prior.
+
+    Raises:
+        OutputError: there is nothing to draw.
+    """
     if match.layers is None or match.grid is None or match.score is None:
-        raise OutputError(f"nothing to draw: {match.why_not}")
+        raise OutputError(f"nothing to draw: {match.why_not or 'this matcher has no score of each pose'}")
     pose = match.modes[0].pose if match.modes else match.prior.pose
     canvas, corner = _image(match, pose)
     c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -47,13 +100,7 @@ def write_picture(match: Match, path: Path) -> None:
     ):
         cv2.putText(canvas, line, (12, 28 + 26 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 0, 0), 4, cv2.LINE_AA)
         cv2.putText(canvas, line, (12, 28 + 26 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        written = cv2.imwrite(str(path), canvas)
-    except (OSError, cv2.error) as error:
-        raise OutputError(f"{path}: cannot be written ({' '.join(str(error).split())[:160]})") from None
-    if not written:
-        raise OutputError(f"{path}: cannot be written")
+    return np.asarray(canvas, dtype=np.uint8)
 
 
 def _image(match: Match, pose: Array) -> tuple[Pixels, Array]:
@@ -63,7 +110,10 @@ def _image(match: Match, pose: Array) -> tuple[Pixels, Array]:
     half = int(_AROUND_M / patch.cell_m)
     column, row = np.rint(patch.cells(pose[None, :2])[0]).astype(int)
     low = np.maximum([column - half, row - half], 0)
-    part = patch.pixels[low[1] : row + half, low[0] : column + half, ::-1]
+    window = (slice(low[1], row + half), slice(low[0], column + half))
+    part = patch.pixels[window][..., ::-1].copy()
+    if match.layers.drawn:  # lines that a user drew may lie on no image
+        part[match.layers.edges[(slice(None), *window)].max(axis=0) > 0.7] = _LINES
     large = cv2.resize(np.ascontiguousarray(part), None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_NEAREST)
     return np.asarray(large, dtype=np.uint8), low.astype(float)
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import base64
 import enum
 import json
 from collections.abc import Sequence
@@ -31,7 +32,11 @@ _MOSTLY, _COVERED, _NOT_COVERED, _MATCHED = 0.5, 0.85, 0.5, 0.95
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ReportData:
-    """What a report shows. `truth_statement` says plainly what the numbers were measured against."""
+    """What a report shows.
+
+    Attributes:
+        truth_statement: says plainly what the numbers were measured against. pictures: captions and JPEGs of matches.
+    """
 
     title: str
     solution: Solution
@@ -42,6 +47,7 @@ class ReportData:
     levers_m: Levers
     tables: Sequence[Table]
     truth_statement: str
+    pictures: Sequence[tuple[str, bytes]] = ()
 
 
 _PAGE = Template("""<!doctype html>
@@ -69,6 +75,7 @@ $errors
 $residuals
 <h2>Slow states</h2><p class="note">GNSS error, compass offset with 95 % bands; IMU biases.</p>
 $slow
+$matches
 <h2>Solver</h2>$stats
 <details><summary>Effective configuration</summary><pre>$config</pre></details>
 </body></html>
@@ -97,6 +104,7 @@ def write_report(path: Path, data: ReportData) -> None:
         ledger=_ledger(data.solution),
         residuals=_figure(plots.residuals_over_time(data.solution), "residuals"),
         slow=_figure(plots.slow_over_time(data.solution), "slow"),
+        matches=_matches(data.pictures),
         stats=_stats(data.solution),
         config=escape(json.dumps(effective(data.config), indent=1)),
     )
@@ -207,6 +215,21 @@ def _ledger(solution: Solution) -> str:
         f"<table><tr>{head}</tr>{rows}</table><p class='note'>{len(solution.ledger)} messages in all; "
         f"ledger.csv has a row for each.</p><table class='reason'>{reasons}</table>"
     )
+
+
+def _matches(pictures: Sequence[tuple[str, bytes]]) -> str:
+    if not pictures:
+        return ""
+    note = (
+        "Scan on the map: faces red, first returns green, where the best mode has them. Arrows and ellipses (95 %): modes; "
+        "light blue: the prior. Right: the score of each place, at its best heading."
+    )
+    shown = "".join(
+        f'<p>{escape(said)}</p><img style="max-width:100%" alt="{escape(said)}" '
+        f'src="data:image/jpeg;base64,{base64.b64encode(coded).decode()}">'
+        for said, coded in pictures
+    )
+    return f'<h2>Matches</h2><p class="note">{note}</p>{shown}'
 
 
 def _stats(solution: Solution) -> str:

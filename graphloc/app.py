@@ -19,6 +19,7 @@ from graphloc.build import mount_of
 from graphloc.config import VesselConfig, load_config
 from graphloc.errors import InputError
 from graphloc.eval import ekf, holdout, metrics, report
+from graphloc.eval.match_picture import Gallery
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Array, Datum, Geodetic
@@ -44,6 +45,7 @@ class Run:
     solution: Solution
     held: tuple[GnssPosition, ...] = ()
     filters: tuple[ekf.FilterResult, ...] = ()
+    pictures: tuple[tuple[str, bytes], ...] = ()  # of matches: caption, JPEG
 
 
 def load(bags: Sequence[Path], config_path: Path, progress: Progress = _quiet) -> tuple[Recording, VesselConfig]:
@@ -72,15 +74,19 @@ def smooth_recording(
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
     solution = smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress)
+    gallery = Gallery()
     if scans is not None and config.of_kind("aerial"):
-        recording = with_matches(recording, config, datum, solution, scans, progress)
+        recording = with_matches(recording, config, datum, solution, scans, progress, gallery)
         solution = smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress)
     filters: tuple[ekf.FilterResult, ...] = ()
     if compare:
         progress("filters", 0, 1)
         filters = ekf.run_all(recording, config, datum)
         progress("filters", 1, 1)
-    run = Run(recording=recording, config=config, solution=solution, held=held, filters=filters)
+    run = Run(
+        recording=recording, config=config, solution=solution, held=held, filters=filters,
+        pictures=tuple(gallery.pictures()),
+    )  # fmt: skip
     return _comparable(run)
 
 
@@ -99,6 +105,7 @@ def with_matches(
     solution: Solution,
     scans: Scans,
     progress: Progress = _quiet,
+    gallery: Gallery | None = None,
 ) -> Recording:
     """Add the matches of every aerial sensor, made around a solution; a scan that gave none is a row of the ledger.
 
@@ -119,6 +126,8 @@ def with_matches(
         for item in found:
             if item.match is not None and item.match.modes:
                 measurements.append(replace(item.match.fix(item.stamp_ns, name), seq=seq))
+                if gallery is not None:
+                    gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
             else:
                 rows.append(
                     LedgerRow(
@@ -315,6 +324,7 @@ def write(run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overw
                 levers_m=levers_m(run),
                 tables=found,
                 truth_statement=truth_statement(run),
+                pictures=run.pictures,
             ),
         )
     return folder / "report.html"

@@ -9,6 +9,7 @@ direction without sense (`EDGE_BINS` over 180 deg); shores have one with sense, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -70,19 +71,26 @@ def shore_layer(fine: Patch, edges: Edges, water: Mask) -> Layer:
     Args:
         water: (rows, columns) of the coarse grid.
     """
-    shape = edges.where.shape
-    mask = cv2.resize(water.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)
-    reach = round(_RIM_M / fine.cell_m)
-    open_to_it = cv2.dilate(mask, _disc(reach)) & (~edges.where).astype(np.uint8)
-    grown = cv2.erode(mask, _disc(reach))
-    for _ in range(2 * reach):
-        grown = cv2.dilate(grown, _CROSS) & open_to_it
-    soft = cv2.GaussianBlur(grown.astype(np.float32), (0, 0), 4.0)
+    reach = round(_RIM_M / (FINE * fine.cell_m))
+    mask, disc = water.astype(np.uint8), _disc(reach)
+    open_to_it = _finer(cv2.dilate(mask, disc), edges.where.shape) & ~edges.where
+    grown: NDArray[Any] = _finer(cv2.erode(mask, disc), edges.where.shape).astype(np.uint8)
+    may: NDArray[Any] = open_to_it.astype(np.uint8)
+    for _ in range(2 * FINE * reach):
+        grown = cv2.bitwise_and(cv2.dilate(grown, _CROSS), may)
     shore = (grown == 0) & (cv2.dilate(grown, np.ones((3, 3), np.uint8)) > 0) & _well_inside(fine)
     rows, columns = np.nonzero(shore)
-    dx = soft[rows, np.minimum(columns + 1, shape[1] - 1)] - soft[rows, np.maximum(columns - 1, 0)]
-    dy = soft[np.minimum(rows + 1, shape[0] - 1), columns] - soft[np.maximum(rows - 1, 0), columns]
-    return _drawn(fine, rows, columns, np.arctan2(dy, -dx), 2.0 * np.pi, SHORE_BINS, _SHORE_SIGMA_M)
+    coarse = cv2.resize(grown.astype(np.float32), water.shape[::-1], interpolation=cv2.INTER_AREA)
+    soft = cv2.GaussianBlur(coarse, (0, 0), 2.0)
+    dx, dy = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
+    at = (np.minimum(rows // FINE, water.shape[0] - 1), np.minimum(columns // FINE, water.shape[1] - 1))
+    to_land = np.arctan2(dy[at].astype(float), -dx[at].astype(float))
+    return _drawn(fine, rows, columns, to_land, 2.0 * np.pi, SHORE_BINS, _SHORE_SIGMA_M)
+
+
+def _finer(mask: NDArray[Any], shape: tuple[int, ...]) -> Mask:
+    """A mask of the coarse grid on the fine one."""
+    return np.asarray(cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def drawn_layers(fine: Patch, drawn: VectorMap) -> tuple[Layer, Layer]:
@@ -129,8 +137,9 @@ def _drawn(
         r, c = corner[0] + dr, corner[1] + dc
         keep = (r >= 0) & (c >= 0) & (r < shape[0]) & (c < shape[1])
         share = weight * (part[0] if dr else 1.0 - part[0]) * (part[1] if dc else 1.0 - part[1])
-        for k in (lower, (lower + 1) % bins):
-            np.add.at(counts, (k[keep], r[keep] * shape[1] + c[keep]), share[keep].astype(np.float32))
+        cell = r[keep] * shape[1] + c[keep]
+        for which in (lower[keep], (lower[keep] + 1) % bins):
+            np.add.at(counts, (which, cell), share[keep].astype(np.float32))
     layer = np.empty((bins, *shape), dtype=np.float32)
     for k in range(bins):
         soft = cv2.GaussianBlur(counts[k].reshape(shape), (0, 0), sigma)

@@ -27,8 +27,8 @@ from graphloc.frontends.aerial.scan import Outline
 from graphloc.frontends.aerial.vector import VectorMap, read_vector
 
 _CELL_M = 0.25
-_TILE_M = 60.0  # a patch serves all priors of one tile
-_KEPT = 2  # patches, so that a way along the border of two makes each once; 80 MB each
+_TILE_M = 100.0  # a patch serves all priors of one tile
+_KEPT = 2  # patches, so that a way along the border of two makes each once; 130 MB each
 
 
 class Map:
