@@ -52,7 +52,7 @@ def volumes(sample: Sample, drawn: bool) -> tuple[Volumes, Cell] | None:
 def _of_world(seed: int, folder: Path, views: int) -> list[list[tuple[Volumes, Cell] | None]]:
     cv2.setNumThreads(1)
     numba.set_num_threads(1)
-    made = samples("world", seed, folder, views)
+    made = [*samples("world", seed, folder, views), *samples("world", seed, folder, views // 2, scans=8)]
     return [[volumes(sample, drawn) for sample in made] for drawn in (False, True)]
 
 
@@ -88,7 +88,7 @@ def fit(views: list[tuple[Volumes, Cell]]) -> Any:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--worlds", type=int, default=80)
-    parser.add_argument("--views", type=int, default=4, help="of each world")
+    parser.add_argument("--views", type=int, default=4, help="of one scan of each world; half as many of eight")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 2)
     arguments = parser.parse_args()
     folder = scratch()

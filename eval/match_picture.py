@@ -142,7 +142,7 @@ def _heat(match: Match, rows: int) -> Pixels:
     """The score, the best heading of each place."""
     assert match.score is not None
     best = match.score.max(axis=0)
-    grey = np.clip(255.0 * (1.0 + (best - best.max()) / 12.0), 0.0, 255.0).astype(np.uint8)
+    grey = np.clip(255.0 * (1.0 + (best - best.max()) / 40.0), 0.0, 255.0).astype(np.uint8)
     coloured = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)
     side = rows // 2
     heat = np.zeros((rows, side, 3), dtype=np.uint8)

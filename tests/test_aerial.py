@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans laid on an aerial image: georeference, clouds, layers, posterior, and the way through a bag."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,9 @@ from graphloc.errors import InputError
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
+from graphloc.eval.simulate.harbour import load_harbour
 from graphloc.frames import Array, Datum, Geodetic
-from graphloc.frontends.aerial import Matcher, Prior
+from graphloc.frontends.aerial import Matcher, Prior, match_bag, scans
 from graphloc.frontends.aerial.cloud import Cloud, decode_cloud, level
 from graphloc.frontends.aerial.image import AerialImage, Patch
 from graphloc.frontends.aerial.layers import (
@@ -35,6 +37,7 @@ from graphloc.frontends.aerial.layers import (
 )
 from graphloc.frontends.aerial.match import Grid, modes_of
 from graphloc.frontends.aerial.scan import LevelCloud, inside, outline
+from graphloc.frontends.aerial.scans import Matched
 from graphloc.frontends.aerial.vector import VectorMap
 from graphloc.trajectory import Trajectory
 
@@ -353,15 +356,20 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_from_a_bag_to_the_graph(bag: Path) -> None:
+def test_from_a_bag_to_the_graph(bag: Path, tmp_path: Path) -> None:
     """Scans become matches of the second smoothing; the image's offset is estimated; the ledger adds up."""
     recording, vessel = app.load([bag / "run"], bag / "vessel.yaml")
     scans = app.Scans((bag / "run",), bag)
     run = app.smooth_recording(recording, vessel, scans=scans)
     counts = run.solution.ledger.counts()
-    assert sum(counts["aerial"].values()) == 39
-    assert counts["aerial"]["used"] > 30
-    assert sum(sum(c.values()) for c in counts.values()) == recording.message_count + 39
+    matches = sum(counts["aerial"].values())
+    assert 25 <= matches <= 39  # one a second, none where the vessel has moved less than half a metre
+    assert counts["aerial"]["used"] > 0.9 * matches
+    assert sum(sum(c.values()) for c in counts.values()) == recording.message_count + matches
+    assert 1 <= len(run.pictures) <= 3
+    assert all(coded[:2] == b"\xff\xd8" and "aerial at " in said for said, coded in run.pictures)  # JPEG
+    page = app.write(run, tmp_path / "out", inputs=[], command="", overwrite=False).read_text()
+    assert page.count('src="data:image/jpeg;base64,') == len(run.pictures)
     assert [r.reason for r in run.recording.rows if r.topic == "/lidar_1/points"] == ["read by aerial"]
     assert "aerial" in run.solution.slow
     alone = app.smooth_recording(recording, vessel)
@@ -412,5 +420,106 @@ def test_an_image_of_elsewhere_leaves_rows_in_the_ledger(bag: Path, tmp_path: Pa
     vessel = vessel.model_copy(update={"sensors": {**vessel.sensors, "aerial": sensor}})
     short = replace(recording, truth=None)
     run = app.smooth_recording(short, vessel, scans=app.Scans((bag / "run",), bag))
-    assert run.solution.ledger.counts()["aerial"] == {"rejected": 39}
+    assert set(run.solution.ledger.counts()["aerial"]) == {"rejected"}
+    assert run.solution.ledger.counts()["aerial"]["rejected"] > 25
     assert any("does not cover" in row.reason for row in run.solution.ledger if row.sensor == "aerial")
+
+
+def aerial(bag: Path, **changes: Any) -> tuple[AerialConfig, Trajectory]:
+    """The aerial sensor of the bag, changed, and the true track, as sure as a smoother would be."""
+    recording, vessel = app.load([bag / "run"], bag / "vessel.yaml")
+    truth = recording.truth
+    assert truth is not None
+    cov = np.broadcast_to(np.diag([1.0, 1.0, 0.1, 1e-4, 1e-4, 1e-3]), (len(truth), 6, 6))
+    sensor = AerialConfig.model_validate({**vessel.sensors["aerial"].model_dump(), **changes})
+    return sensor, replace(truth, cov=cov)
+
+
+def matched(bag: Path, track: Trajectory, sensor: AerialConfig, **more: Any) -> list[Matched]:
+    datum = app.choose_datum(*app.load([bag / "run"], bag / "vessel.yaml"))
+    return list(match_bag([bag / "run"], sensor, bag, "base_link", track, datum, **more))
+
+
+def test_matches_are_spent_where_they_inform(bag: Path) -> None:
+    sensor, track = aerial(bag, every_m=6.0, still_s=1000.0)
+    stamps = np.array([m.stamp_ns for m in matched(bag, track, sensor)])
+    way = np.diff(track.at(stamps).p_world_m[:, :2], axis=0)
+    assert 4 <= len(stamps) < 15
+    assert np.hypot(*way.T).min() > 5.0  # from the end of a scan, stamped at its middle
+    # The same scans, were the vessel lying still.
+    moored = replace(track, p_world_m=np.zeros_like(track.p_world_m) + track.p_world_m[0])
+    assert [len(matched(bag, moored, aerial(bag, every_m=6.0, still_s=s)[0])) for s in (10.0, 1000.0)] == [4, 1]
+
+
+def test_scans_are_laid_together(bag: Path) -> None:
+    """Five scans of a moving vessel show more places than one, and at the same pose."""
+    poses, faces = [], []
+    for submap in (1, 5):
+        sensor, track = aerial(bag, submap=submap)
+        at_ns = int(track.stamps_ns[0]) + 25 * S
+        (item,) = matched(bag, track, sensor, at_ns=at_ns)
+        assert item.match is not None
+        poses.append(item.match.modes[0].pose)
+        faces.append(len(item.match.found.faces_m))
+    assert faces[1] > 1.15 * faces[0]
+    assert np.hypot(*(poses[1] - poses[0])[:2]) < 0.3
+    assert np.degrees(abs(poses[1][2] - poses[0][2])) < 0.5
+
+
+def test_lines_alone_and_bl_can_be_matched_to(bag: Path, tmp_path: Path) -> None:
+    """What stands still in the harbour, drawn as GeoJSON, without an image; and BL's matcher on the image."""
+    harbour = load_harbour("marina")
+    features = []
+    for kind, tag in (("quays", "quay"), ("pontoons", "pier"), ("buildings", "pier")):
+        for polygon, _ in getattr(harbour, kind):
+            ring = np.array(polygon.exterior.coords)
+            geodetic = harbour.datum.geodetic_from_enu(np.column_stack([ring, np.zeros(len(ring))]))
+            shape = {"type": "Polygon", "coordinates": [geodetic[:, [1, 0]].tolist()]}
+            features.append({"type": "Feature", "properties": {"man_made": tag}, "geometry": shape})
+    (tmp_path / "quays.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    shift = np.array(json.loads((bag / "truth.json").read_text())["image_shows_things_east_north_m"])
+    for changes, off in (
+        ({"image": "", "vector": str(tmp_path / "quays.geojson")}, np.zeros(2)),
+        ({"matcher": "bl"}, shift),
+    ):
+        sensor, track = aerial(bag, **changes)
+        (item,) = matched(bag, track, sensor, at_ns=int(track.stamps_ns[0]) + 10 * S)
+        assert item.match is not None
+        true = track.at(np.array([item.stamp_ns])).p_world_m[0, :2] + off
+        assert np.hypot(*(item.match.modes[0].pose[:2] - true)) < 0.25
+
+
+def test_a_broken_scan_is_a_row_of_the_ledger(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, count = scans.decode_cloud, iter(range(10**6))
+
+    def sometimes(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
+        if next(count) == 52:
+            raise ValueError("a cloud of 5 points with 3 bytes")
+        return whole(msg, stamp_ns, lidar)
+
+    monkeypatch.setattr(scans, "decode_cloud", sometimes)
+    sensor, track = aerial(bag, every_m=30.0)
+    said = [m.why_not for m in matched(bag, track, sensor) if m.match is None]
+    assert len(said) == 1
+    assert "points: a cloud of 5 points with 3 bytes" in said[0]
+
+
+def test_an_image_of_water_alone_gives_nothing(bag: Path, tmp_path: Path) -> None:
+    with rasterio.open(bag / "aerial.tif") as source:
+        profile, shape = source.profile, source.read().shape
+    noise = np.random.default_rng(0).normal(0.0, 3.0, shape)
+    with rasterio.open(tmp_path / "sea.tif", "w", **profile) as target:
+        target.write(np.clip(np.array([38, 62, 72])[:, None, None] + noise, 0, 255).astype(np.uint8))
+    sensor, track = aerial(bag, image=str(tmp_path / "sea.tif"), every_m=30.0)
+    found = matched(bag, track, sensor)
+    assert found
+    assert {m.why_not for m in found} == {"no pose in the window stands out"}
+
+
+def test_a_sensor_without_a_map_is_one_line(bag: Path) -> None:
+    sensor, track = aerial(bag, image="")
+    with pytest.raises(InputError, match="needs an image, a vector layer, or both"):
+        matched(bag, track, sensor)
+    sensor, track = aerial(bag, image="", vector="x.geojson", matcher="bl")
+    with pytest.raises(InputError, match="the matcher 'bl' needs an image"):
+        matched(bag, track, sensor)

@@ -15,6 +15,8 @@ from graphloc.frontends.aerial.layers import Layer, Layers
 from graphloc.frontends.aerial.scan import Outline
 
 STEP_DEG = 0.5
+_NARROW, _FINER = 5, 5  # a mode of fewer cells across is looked at between them, so much finer
+_FLOOR = np.array([0.05, 0.05, np.radians(0.1)])  # m, rad: no image tells more
 # TBB, Numba's first choice, warns on stderr where the one that is installed is older than it likes.
 numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]
 
@@ -43,14 +45,19 @@ def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) ->
 
 @numba.njit(parallel=True, cache=True, fastmath=True)
 def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, columns):  # type: ignore[no-untyped-def]
-    """Sum over points of weight x layer, for each yaw, row and column of the grid: (H, rows, columns)."""
+    """Sum over points of weight x layer, for each yaw, row and column of the grid: (H, rows, columns).
+
+    A point falls on one of the cells around it by a sequence that fills [0, 1) evenly: rounded, all points of a wall
+    along the grid would be off by the same part of a cell.
+    """
     bins, height, width = layer.shape
     out = np.zeros((len(yaw), rows, columns), dtype=np.float32)
     for h in numba.prange(len(yaw)):
         c, s = np.cos(yaw[h]), np.sin(yaw[h])
         for i in range(len(p_m)):
             x, y = c * p_m[i, 0] - s * p_m[i, 1], s * p_m[i, 0] + c * p_m[i, 1]
-            u, v = col0 + int(np.rint(x / cell_m)), row0 - int(np.rint(y / cell_m))
+            u = col0 + int(np.floor(x / cell_m + (0.7548776662 * i) % 1.0))
+            v = row0 + int(np.floor(-y / cell_m + (0.5698402910 * i) % 1.0))
             if u < 0 or v < 0 or u + columns > width or v + rows > height:
                 continue
             k = int(np.rint((angle[i] + yaw[h]) % turn / turn * bins)) % bins
@@ -128,11 +135,31 @@ def modes_of(
         share = float(mass[part].sum() / total) * (1.0 - alien)
         if share < 0.01:
             continue
-        h, r, c = np.nonzero(part)
-        values = np.column_stack([grid.east_m[c], grid.north_m[r], grid.yaw_rad[h]])
-        w = mass[part] / mass[part].sum()
-        mean = w @ values
-        cell = abs(grid.east_m[1] - grid.east_m[0])
-        floor = np.diag([cell**2, cell**2, np.radians(STEP_DEG) ** 2]) / 12.0
-        found.append(Mode(mean, (values - mean).T @ (w[:, None] * (values - mean)) + floor, share))
+        mean, cov = _moments(log_likelihood, np.nonzero(part), mass, grid)
+        found.append(Mode(mean, cov + np.diag(_FLOOR**2), share))
     return sorted(found, key=lambda m: -m.probability), 1.0 - sum(m.probability for m in found)
+
+
+def _moments(
+    log_likelihood: NDArray[np.float32], part: tuple[NDArray[np.int64], ...], mass: Array, grid: Grid
+) -> tuple[Array, Array]:
+    """Mean (3,) and covariance (3, 3) of a part of the posterior; of a narrow one between cells."""
+    low, high = (np.array([f(axis) for axis in part]) for f in (np.min, np.max))
+    cells = np.stack(part).astype(float)
+    if (high - low).max() < _NARROW:
+        low, high = np.maximum(low - 1, 0), np.minimum(high + 1, np.array(mass.shape) - 1)
+        box = log_likelihood[tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))]
+        steps = [np.linspace(0.0, n - 1.0, (n - 1) * _FINER + 1) for n in box.shape]
+        cells = np.stack(np.meshgrid(*steps, indexing="ij")).reshape(3, -1)
+        between = ndimage.map_coordinates(box, cells, order=2, mode="nearest").astype(float)
+        w = np.exp(between - between.max())
+        cells += low[:, None]
+    else:
+        w = mass[part]
+    axes = (grid.east_m, grid.north_m, grid.yaw_rad)
+    values = np.column_stack(
+        [np.interp(at, np.arange(len(axis)), axis) for at, axis in zip(cells[::-1], axes, strict=True)]
+    )
+    w = w / w.sum()
+    mean = w @ values
+    return mean, (values - mean).T @ (w[:, None] * (values - mean))
