@@ -20,6 +20,7 @@ import numpy as np
 from _rows import Row, row
 from _scenes import Sample, samples, scratch, together
 from scipy.stats import chi2
+from smoothing import loss_ns
 
 from graphloc import app
 from graphloc.config import AerialConfig
@@ -206,7 +207,9 @@ def _run(job: tuple[str, int]) -> _Errors:
     numba.set_num_threads(1)
     with tempfile.TemporaryDirectory() as scratch_:
         folder = Path(scratch_) / "sim"
-        write_bag(simulate(find_scenario(name, {"pose_hz": "0"}), seed), folder, ros=2)
+        simulated = simulate(find_scenario(name, {"pose_hz": "0"}), seed)
+        told = ekf.BlConfig(loss_ns=loss_ns(simulated))
+        write_bag(simulated, folder, ros=2)
         recording, config = app.load([folder / "run"], folder / "vessel.yaml")
         sensors = dict(config.sensors)
         sensors["aerial"] = sensors["aerial"].model_copy(update={"enabled": True})
@@ -231,10 +234,10 @@ def _run(job: tuple[str, int]) -> _Errors:
             sensors["aerial"] = sensors["aerial"].model_copy(update={"matcher": "bl", "every_m": 0.0})
             theirs = config.model_copy(update={"sensors": sensors})
             by_bl = app.with_matches(alone.recording, theirs, datum, alone.solution, scans)
-            filter_bl = off(ekf.run_bl(by_bl, theirs, datum).trajectory)
+            filter_bl = off(ekf.run_bl(by_bl, theirs, datum, told).trajectory)
         return _Errors(
             off(ours.trajectory), off(ours.trajectory, shown), off(alone.solution.trajectory),
-            off(ekf.run_bl(matched, config, datum).trajectory), filter_bl,
+            off(ekf.run_bl(matched, config, datum, told).trajectory), filter_bl,
             sum(m.sensor == "aerial" for m in matched.measurements),
         )  # fmt: skip
 

@@ -59,7 +59,7 @@ def kitti(_pool: ProcessPoolExecutor) -> list[Row]:
     return rows
 
 
-def _loss_ns(run: SimulatedRun) -> tuple[int, int] | None:
+def loss_ns(run: SimulatedRun) -> tuple[int, int] | None:
     """Stamps of the simulated signal loss: BL raised a2 by hand while it lasted, so their filter is told."""
     fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
     stamps = np.array([m.stamp_ns for m in fixes])
@@ -74,7 +74,7 @@ def _bl(job: tuple[int, str, int]) -> tuple[tuple[int, str, int], dict[str, floa
     solved = app.simulated(run)
     ours = compare_to_truth(solved.solution.trajectory, run.truth)
     datum = app.choose_datum(run.recording, run.config)
-    beside = ekf.run_all(run.recording, run.config, datum, ekf.BlConfig(loss_ns=_loss_ns(run)))
+    beside = ekf.run_all(run.recording, run.config, datum, ekf.BlConfig(loss_ns=loss_ns(run)))
     filters = {f.name: compare_to_truth(f.trajectory, run.truth).position_rmse_m for f in beside}
     return job, {"rmse": ours.position_rmse_m, "heading": ours.heading_rmse_deg, "coverage": ours.coverage_95}, filters
 

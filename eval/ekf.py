@@ -41,7 +41,8 @@ class BlConfig:
         gnss_rmse_m: receiver's own e; 0 takes it from the fix. heading_rmse_deg: of the GNSS compass.
         exact_jacobian: d/dpsi terms in F, which the print lacks.
 
-    R_lidar is a3 times the pose's own covariance, since diag((Nm / (10 Nk + 1))^2) needs the point count of BL's matcher.
+    R_lidar is a3 times the pose's own covariance: that of eq. 3.33 where the pose comes of BL's matcher
+    (`matcher: bl` of an aerial sensor).
     """
 
     rate_hz: float = 20.0

@@ -9,7 +9,15 @@ from pathlib import Path
 
 from graphloc.config import ImuConfig, SlowErrorConfig
 from graphloc.frontends._clock import EPOCH_LIMIT_S
-from graphloc.frontends._reports import CompassReport, GnssReport, ImuReport, Inspection, OdometryReport, VelocityReport
+from graphloc.frontends._reports import (
+    CompassReport,
+    GnssReport,
+    ImuReport,
+    Inspection,
+    LidarReport,
+    OdometryReport,
+    VelocityReport,
+)
 from graphloc.frontends.decode import IMU
 
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
@@ -54,8 +62,33 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
             f"  # its frame '{item.frame_id}': {item.world}",
             "  enabled: false  # guess: true if its frame is east-north-up at the datum and no fix went into it",
         ]
+    if inspection.lidars:
+        yield _aerial_block(inspection.lidars)
     if inspection.gnss:
         yield ["height:", "  enabled: false  # guess: set to true for a craft that floats"]
+
+
+def _aerial_block(lidars: tuple[LidarReport, ...]) -> list[str]:
+    lines = [
+        "aerial:",
+        "  kind: aerial",
+        "  enabled: false  # guess: true once there is a map: `image`, `vector`, or both",
+        "  image: ''  # an aerial image of the place: GeoTIFF, MBTiles, or a folder of tiles",
+        "  vector: ''  # GeoJSON of quays and piers",
+        "  hull_m: []  # guess: corners of the vessel's outline, [forward, port], m: what is within is its own",
+        "  waterline_m: 0.0  # guess: height of the waterline in the body frame, m",
+        "  lidars:",
+    ]
+    for k, lidar in enumerate(lidars):
+        lines.append(f"    {_numbered('lidar', k)}:")
+        lines.append(f"      topic: {lidar.topic}")
+        if lidar.tf_frame is not None:
+            lines.append(f"      mount: {{tf_frame: {json.dumps(lidar.tf_frame)}}}  # /tf_static knows it")
+        else:
+            lines.append(
+                f"      mount: {{xyz_m: [0.0, 0.0, 0.0]}}  # guess: where '{lidar.frame_id}' sits is not in the bag; measure it"
+            )
+    return lines
 
 
 def _with_offset(block: list[str], inspection: Inspection) -> list[str]:

@@ -148,6 +148,15 @@ class OdometryReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LidarReport:
+    """A topic of clouds: the frame of its first one; `tf_frame`: the same where /tf_static leads to it, else None."""
+
+    topic: str
+    frame_id: str
+    tf_frame: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
     """All of it."""
 
@@ -158,6 +167,7 @@ class Inspection:
     compasses: tuple[CompassReport, ...] = ()
     odometry: tuple[OdometryReport, ...] = ()
     velocities: tuple[VelocityReport, ...] = ()
+    lidars: tuple[LidarReport, ...] = ()
     tf_frames: tuple[str, ...] = ()
     body_frame: str = "base_link"
     warnings: tuple[str, ...] = ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from graphloc.frontends._reports import (
     GnssReport,
     ImuReport,
     Inspection,
+    LidarReport,
     MountGuess,
     OdometryReport,
     TopicReport,
@@ -37,6 +39,7 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._source import Bag
 from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import IMU, NAV_SAT_FIX, ODOMETRY, PLAIN_TWIST, POSE, QUATERNION, TWIST
 from graphloc.time import utc_text
 
@@ -67,6 +70,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     with Bag(paths) as bag:
         topics = bag.topics
         streams, tree = read_streams(bag)
+        clouds = _cloud_frames(bag)
         source, warnings = bag.name, tuple(bag.warnings)
     by_topic = {s.topic: s for s in streams}
     filled = [s for s in streams if len(s)]
@@ -101,10 +105,30 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         compasses=tuple(c for s in candidates if (c := compass_report(s, courses, turning))),
         odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first, antenna)) for s in poses),
         velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
+        lidars=tuple(
+            LidarReport(topic=topic, frame_id=frame, tf_frame=frame if tree.resolve(body, frame) else None)
+            for topic, frame in sorted(clouds.items())
+        ),
         tf_frames=tree.frames,
         body_frame=body,
         warnings=(*warnings, *_useless(streams, {g.topic for g in found_gnss} | {i.topic for i in found_imus})),
     )
+
+
+def _cloud_frames(bag: Bag) -> dict[str, str]:
+    """The frame of the first readable cloud of each topic."""
+    topics = {t.topic for t in bag.topics.values() if CLOUD in t.msgtypes}
+    found: dict[str, str] = {}
+    for raw in bag.messages(topics) if topics else ():
+        if raw.topic not in found:
+            try:
+                msg: Any = bag.decode(raw)
+                found[raw.topic] = str(msg.header.frame_id)
+            except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; a later one will do
+                continue
+        if len(found) == len(topics):
+            break
+    return found
 
 
 def _useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:

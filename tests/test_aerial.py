@@ -39,6 +39,7 @@ from graphloc.frontends.aerial.match import Grid, modes_of
 from graphloc.frontends.aerial.scan import LevelCloud, inside, outline
 from graphloc.frontends.aerial.scans import Matched
 from graphloc.frontends.aerial.vector import VectorMap
+from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.trajectory import Trajectory
 
 DATUM = Datum(Geodetic(57.7, 14.5, 30.0))
@@ -523,3 +524,16 @@ def test_a_sensor_without_a_map_is_one_line(bag: Path) -> None:
     sensor, track = aerial(bag, image="", vector="x.geojson", matcher="bl")
     with pytest.raises(InputError, match="the matcher 'bl' needs an image"):
         matched(bag, track, sensor)
+
+
+def test_inspect_drafts_the_lidars(bag: Path, tmp_path: Path) -> None:
+    """The draft works as it stands: the LiDARs with the mounts that /tf_static knows, switched off for want of a map."""
+    found = inspect_bag(bag / "run")
+    assert [(x.topic, x.tf_frame) for x in found.lidars] == [(f"/lidar_{k}/points", f"lidar_{k}") for k in range(1, 6)]
+    (tmp_path / "vessel.yaml").write_text(draft_config(found))
+    _, vessel = app.load([bag / "run"], tmp_path / "vessel.yaml")
+    sensor = vessel.sensors["aerial"]
+    assert not sensor.enabled
+    assert [(x.topic, x.mount.tf_frame) for x in sensor.lidars.values()] == [
+        (x.topic, x.tf_frame) for x in found.lidars
+    ]
