@@ -125,7 +125,7 @@ def with_matches(
         found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum)
         for item in found:
             if item.match is not None and item.match.modes:
-                measurements.append(replace(item.match.fix(item.stamp_ns, name), seq=seq))
+                measurements.append(replace(item.match.fix(item.stamp_ns, name, item.news), seq=seq))
                 if gallery is not None:
                     gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
             else:

@@ -313,7 +313,10 @@ class AerialConfig(AnyPoseConfig):
     every_s: Positive = 1.0
     """Least time between two matches, s."""
     every_m: NonNegative = 0.5
-    """Least way between two matches, m: near to each other they err alike."""
+    """Least way between two matches, m."""
+    alike_m: NonNegative = 15.0
+    """Matches within this way of each other err alike (the same walls, the same boats), so each tells but a part of
+    news: covariances grow by (1 + r) / (1 - r), r = exp(-way / alike_m); 0: each is news, m."""
     still_s: Positive = 10.0
     """Time after which there is a match though the vessel has not moved that far, s."""
     window_m: Positive = 6.5

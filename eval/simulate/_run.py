@@ -129,7 +129,6 @@ def _matcher(rig: RigConfig) -> AerialConfig:
     """What matches the rig's scans to the image; the hull with a hand's breadth around it."""
     hull = shapely.Polygon(rig.hull.outline).buffer(0.3, join_style="mitre")
     return AerialConfig(
-        enabled=False,  # still worse than none between moored boats
         image="aerial.tif",
         hull_m=tuple((round(x, 2), round(y, 2)) for x, y in hull.exterior.coords[:-1]),
         lidars={name: LidarConfig(topic=f"/{name}/points", mount=lidar.mount) for name, lidar in rig.lidars.items()},

@@ -18,7 +18,7 @@ from graphloc.measurements import PoseFix, PoseMode
 
 # Fitted by benchmarks/tune_matcher.py on harbours drawn by chance; docs/decisions/0006. Where lines were drawn, what is
 # not on one is likely to be a boat.
-_ON_IMAGE, _ON_LINES = Weights(low=0.87, tall=0.46, shore=1.56), Weights(low=0.62, tall=1.92, shore=1.47)
+_ON_IMAGE, _ON_LINES = Weights(low=0.88, tall=0.50, shore=1.70), Weights(low=0.74, tall=2.60, shore=1.74)
 _NONE_LOG = 5.0  # the best pose of pure chance is about that much over the mean
 _ALIEN = 0.05  # a scan shows boats that the image does not have, and the reverse
 _LEAST_PLACES = 30
@@ -52,12 +52,16 @@ class Match:
     none: float = 1.0
     why_not: str = ""
 
-    def fix(self, stamp_ns: int, sensor: str) -> PoseFix:
-        """Return the modes as one measurement."""
+    def fix(self, stamp_ns: int, sensor: str, news: float = 1.0) -> PoseFix:
+        """Return the modes as one measurement.
+
+        Args:
+            news: share of it that the match before has not told; covariances grow by its inverse.
+        """
         modes = tuple(
             PoseMode(
                 value=np.array([m.pose[0], m.pose[1], float(wrap_angle(m.pose[2]))]),
-                cov=m.cov,
+                cov=m.cov / news,
                 probability=m.probability,
             )
             for m in self.modes

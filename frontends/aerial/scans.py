@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,15 +24,21 @@ from graphloc.frontends.decode import TF, header_stamp_ns
 from graphloc.trajectory import Trajectory
 
 _JITTER_S = 0.05  # stamps are not a clock
+_STILL_M = 0.2  # a vessel at rest sways as much, and things about it change
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matched:
-    """A match and its stamp; or why there is none."""
+    """A match and its stamp; or why there is none.
+
+    Attributes:
+        news: share of it that the match before has not told (`AerialConfig.alike_m`).
+    """
 
     stamp_ns: int
     match: Match | None
     why_not: str
+    news: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,11 +71,24 @@ def match_bag(
     with Bag(paths) as bag:
         mounts = _mounts(bag, config, body_frame)
         matcher = _matcher(config, folder, datum)
+        before: Array | None = None
         for turns in _submaps(bag, config, track, at_ns):
             if turns[-1].why_not:
                 yield Matched(turns[-1].stamp_ns, None, turns[-1].why_not)
-            else:
-                yield _one(matcher, turns, mounts, track, config)
+                continue
+            item = _one(matcher, turns, mounts, track, config)
+            if item.match is not None and item.match.modes:
+                here = item.match.prior.pose[:2]
+                item = replace(item, news=_news(before, here, config.alike_m))
+                before = here
+            yield item
+
+
+def _news(before: Array | None, here: Array, alike_m: float) -> float:
+    """What a match adds to a mean, were errors a first-order Markov process along the way: (1 - r) / (1 + r)."""
+    if before is None or alike_m == 0.0:
+        return 1.0
+    return float(np.tanh(0.5 * max(np.hypot(*(here - before)), _STILL_M) / alike_m))
 
 
 def _matcher(config: AerialConfig, folder: Path, datum: Datum) -> Matcher | BLMatcher:
