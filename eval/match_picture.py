@@ -29,7 +29,7 @@ class Gallery:
     """Of all matches of a run the best, the worst and the most ambiguous, as pictures."""
 
     def __init__(self) -> None:
-        self._kept: dict[str, tuple[float, str, bytes]] = {}
+        self._kept: dict[str, tuple[float, str, str, bytes]] = {}
 
     def offer(self, match: Match, sensor: str, at_s: float) -> None:
         """Keep a match where none before was better, worse or more ambiguous."""
@@ -46,14 +46,18 @@ class Gallery:
             "most ambiguous": others[0].probability if others else 0.0,
         }
         for what, mark in marks.items():
-            if mark > self._kept.get(what, (0.0, "", b""))[0]:
+            if mark > self._kept.get(what, (0.0,))[0]:
                 said = _SAID[what].format(far=far, first=first.probability, second=marks["most ambiguous"])
                 coded = cv2.imencode(".jpg", drawn(match), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
-                self._kept[what] = (mark, f"{sensor} at {at_s:.1f} s, {what}: {said}", coded.tobytes())
+                self._kept[what] = (mark, f"{sensor} at {at_s:.1f} s", said, coded.tobytes())
 
     def pictures(self) -> list[tuple[str, bytes]]:
-        """Return captions and JPEGs."""
-        return [(said, coded) for _, said, coded in self._kept.values()]
+        """Return captions and JPEGs; a match that is two of these comes once."""
+        found: dict[str, tuple[str, bytes]] = {}
+        for what, (_, where, said, coded) in self._kept.items():
+            before = f"{found[where][0]}; " if where in found else ""
+            found[where] = (f"{before}{what}: {said}", coded)
+        return [(f"{where}, {said}", coded) for where, (said, coded) in found.items()]
 
 
 def write_picture(match: Match, path: Path) -> None:

@@ -12,7 +12,6 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 from pyproj import Transformer
-from ruamel.yaml import YAML
 
 from graphloc import app, cli
 from graphloc.config import AerialConfig
@@ -349,11 +348,6 @@ def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path) -> None:
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("aerial") / "sim"
     write_bag(simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "40"}), 3), folder, ros=2)
-    yaml = YAML(typ="safe", pure=True)
-    config = yaml.load((folder / "vessel.yaml").read_text())
-    config["sensors"]["aerial"]["enabled"] = True
-    with (folder / "vessel.yaml").open("w") as stream:
-        yaml.dump(config, stream)
     return folder
 
 
@@ -537,3 +531,17 @@ def test_inspect_drafts_the_lidars(bag: Path, tmp_path: Path) -> None:
     assert [(x.topic, x.mount.tf_frame) for x in sensor.lidars.values()] == [
         (x.topic, x.tf_frame) for x in found.lidars
     ]
+
+
+def test_matches_near_each_other_tell_less(bag: Path) -> None:
+    """Of a first-order Markov process along the way, r = exp(-way / 15 m), a next one tells (1 - r) / (1 + r) of a mean."""
+    sensor, track = aerial(bag, every_m=4.0, still_s=1000.0)
+    found = [m for m in matched(bag, track, sensor) if m.match is not None]
+    at = np.array([m.match.prior.pose[:2] for m in found if m.match is not None])
+    r = np.exp(-np.hypot(*np.diff(at, axis=0).T) / 15.0)
+    np.testing.assert_allclose([m.news for m in found], [1.0, *((1.0 - r) / (1.0 + r))], rtol=1e-9)
+    first, second = found[0].match, found[1].match
+    assert first is not None
+    assert second is not None
+    np.testing.assert_allclose(first.fix(0, "a", found[0].news).modes[0].cov, first.modes[0].cov)
+    np.testing.assert_allclose(second.fix(0, "a", found[1].news).modes[0].cov * found[1].news, second.modes[0].cov)
