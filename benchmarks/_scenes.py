@@ -74,7 +74,7 @@ def samples(scene: str, seed: int, folder: Path, count: int = 8, scans: int = 1)
         clouds, true = _views(run, built, float(t), scans, rng)
         true[:2] += image.shift_m
         off = np.array([*rng.uniform(-OFF_M, OFF_M, 2), np.radians(rng.uniform(-OFF_DEG, OFF_DEG))])
-        wide = np.array([WINDOW_M, WINDOW_M, np.radians(WINDOW_DEG)])  # the search covers all of it
+        wide = np.array([0.5 * OFF_M, 0.5 * OFF_M, np.radians(0.5 * OFF_DEG)])  # so off as that is 2 sigma
         found.append(
             Sample(scene, seed, clouds, true, Prior(true + off, wide), stem.with_suffix(".tif"),
                    stem.with_suffix(".geojson"), run.harbour.datum, sensor)

@@ -116,8 +116,8 @@ def _image(match: Match, pose: Array) -> tuple[Pixels, Array]:
     low = np.maximum([column - half, row - half], 0)
     window = (slice(low[1], row + half), slice(low[0], column + half))
     part = patch.pixels[window][..., ::-1].copy()
-    if match.layers.drawn:  # lines that a user drew may lie on no image
-        part[match.layers.edges[(slice(None), *window)].max(axis=0) > 0.7] = _LINES
+    if match.layers.drawn is not None:  # lines that a user drew may lie on no image
+        part[match.layers.drawn[window]] = _LINES
     large = cv2.resize(np.ascontiguousarray(part), None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_NEAREST)
     return np.asarray(large, dtype=np.uint8), low.astype(float)
 

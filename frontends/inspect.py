@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,8 @@ __all__ = [
     "inspect_bag",
     "render",
 ]
+
+_MOST_TRIED = 200  # clouds of a topic that cannot be decoded
 
 
 def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
@@ -116,18 +119,20 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
 
 
 def _cloud_frames(bag: Bag) -> dict[str, str]:
-    """The frame of the first readable cloud of each topic."""
-    topics = {t.topic for t in bag.topics.values() if CLOUD in t.msgtypes}
+    """The frame of the first readable cloud of each topic, if that is among the first 200.
+
+    Each topic is read by itself, so that one without messages, or with none that is readable, does not unpack the
+    clouds of the others to the end of the bag.
+    """
     found: dict[str, str] = {}
-    for raw in bag.messages(topics) if topics else ():
-        if raw.topic not in found:
+    for topic in (t.topic for t in bag.topics.values() if CLOUD in t.msgtypes and t.messages):
+        for raw in islice(bag.messages({topic}), _MOST_TRIED):
             try:
                 msg: Any = bag.decode(raw)
-                found[raw.topic] = str(msg.header.frame_id)
+                found[topic] = str(msg.header.frame_id)
+                break
             except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; a later one will do
                 continue
-        if len(found) == len(topics):
-            break
     return found
 
 

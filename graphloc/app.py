@@ -114,6 +114,7 @@ def with_matches(
     """
     measurements, rows, topics = list(recording.measurements), list(recording.rows), dict(recording.topics)
     track, seq = solution.trajectory, recording.message_count
+    damage: list[str] = []
     span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
     for name, sensor in config.of_kind("aerial").items():
         topics[name] = f"({name})"
@@ -122,10 +123,10 @@ def with_matches(
             replace(r, reason=f"read by {name}") if r.topic in read and r.outcome is Outcome.IGNORED else r
             for r in rows
         ]
-        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum)
+        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=damage.append)
         for item in found:
             if item.match is not None and item.match.modes:
-                measurements.append(replace(item.match.fix(item.stamp_ns, name, item.news), seq=seq))
+                measurements.append(replace(item.match.fix(item.stamp_ns, name, item.news, sensor.axes), seq=seq))
                 if gallery is not None:
                     gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
             else:
@@ -144,6 +145,7 @@ def with_matches(
         rows=tuple(rows),
         topics=topics,
         message_count=seq,
+        warnings=tuple(dict.fromkeys([*recording.warnings, *damage])),
     )
 
 

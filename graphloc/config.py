@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import shapely
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
@@ -287,10 +288,12 @@ class LidarConfig(Block):
 
 
 class AerialConfig(AnyPoseConfig):
-    """LiDAR scans laid on an aerial image (`sensor_msgs/PointCloud2` and a GeoTIFF)."""
+    """LiDAR scans (`sensor_msgs/PointCloud2`) laid on an aerial image, drawn lines, or both."""
 
     kind: Literal["aerial"] = "aerial"
     """Which row of the sensor table reads this block."""
+    axes: tuple[Literal["x", "y", "yaw"], ...] = ("x", "y", "yaw")
+    """Which axes of a match are used."""
     image: str = ""
     """A georeferenced image that GDAL reads, an MBTiles file, or a folder of tiles z/x/y.png, jpg or webp; a relative
     path counts from the folder of vessel.yaml."""
@@ -298,10 +301,11 @@ class AerialConfig(AnyPoseConfig):
     """GeoJSON of lines and polygons of quays, piers and shores; a relative path counts as that of the image."""
     image_sigma_m: NonNegative = 0.3
     """How far the image as a whole shows things from where they are, east and north, 1 sigma, m."""
-    lidars: dict[str, LidarConfig] = Field(default_factory=dict)
+    lidars: dict[str, LidarConfig] = {}
     """The LiDARs by name."""
     hull_m: tuple[tuple[Finite, Finite], ...] = ()
-    """Corners of the vessel's outline in body, forward and port, m: points within are its own."""
+    """Corners of the vessel's outline in body, forward and port, in order, m: points within are its own; none: no
+    point is."""
     waterline_m: Finite = 0.0
     """Height of the waterline in body, m."""
     matcher: Literal["posterior", "bl"] = "posterior"
@@ -319,12 +323,41 @@ class AerialConfig(AnyPoseConfig):
     news: covariances grow by (1 + r) / (1 - r), r = exp(-way / alike_m); 0: each is news, m."""
     still_s: Positive = 10.0
     """Time after which there is a match though the vessel has not moved that far, s."""
-    window_m: Positive = 6.5
-    """Largest half side of the search, m; less where the estimate is surer (3 sigma)."""
-    window_deg: Positive = 5.0
-    """The same for the heading, deg."""
-    reach_m: Positive = 100.0
-    """Points farther off are not used, m."""
+    window_m: Annotated[Positive, Field(le=50.0)] = 6.5
+    """Largest half side of the search, at most 50 m; less where the estimate is surer (3 sigma)."""
+    window_deg: Annotated[Positive, Field(le=30.0)] = 5.0
+    """The same for the heading, at most 30 deg."""
+    reach_m: Annotated[Positive, Field(le=300.0)] = 100.0
+    """Points farther off are not used; at most 300 m."""
+
+    @field_validator("topic", "mount")
+    @classmethod
+    def _of_the_lidars(cls, given: str | MountConfig) -> str | MountConfig:
+        if given not in ("", MountConfig()):
+            raise ValueError("not used here, a match is the pose of the body: set it for each of `lidars`")
+        return given
+
+    @field_validator("lidars")
+    @classmethod
+    def _one_topic_each(cls, lidars: dict[str, LidarConfig]) -> dict[str, LidarConfig]:
+        seen: dict[str, str] = {}
+        for name, lidar in lidars.items():
+            if lidar.topic in seen:
+                raise ValueError(f"{seen[lidar.topic]} and {name} have the same topic, {lidar.topic}")
+            seen[lidar.topic] = name
+        return lidars
+
+    @field_validator("hull_m")
+    @classmethod
+    def _outline(cls, corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        if not corners:
+            return corners
+        if len(corners) < 3:
+            raise ValueError("an outline has three corners or more; [] for none")
+        why = shapely.is_valid_reason(shapely.Polygon(corners))
+        if why != "Valid Geometry":
+            raise ValueError(f"the corners, in their order, make no outline: {why}")
+        return corners
 
 
 class HeightConfig(SensorConfig):

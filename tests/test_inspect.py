@@ -2,14 +2,18 @@
 """`inspect` on runs whose answer is known: mounts, units, conventions, and a draft that works as it stands."""
 
 import json
+from collections import Counter
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from graphloc.config import ImuConfig, VesselConfig, load_config
 from graphloc.frames import Datum, Geodetic
+from graphloc.frontends._source import Bag, RawMessage
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
 from graphloc.measurements import CompassHeading, GnssVelocity
@@ -405,3 +409,37 @@ def test_husky(tmp_path: Path) -> None:
     assert "compass" not in config.sensors  # its yaw drifts by tens of degrees against the course
     recording = read_recording(HUSKY, config)
     assert recording.message_count == 11865 + 989 + 3952
+
+
+def test_clouds_are_read_until_their_frame_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not to the end for a topic that has none, nor for one that cannot be decoded."""
+    make, kind = Messages(2), "sensor_msgs/msg/PointCloud2"
+    types = make.store.types
+    clouds = {
+        frame: types[kind](
+            header=make.header(START_NS, frame), height=1, width=0, fields=[], is_bigendian=False, point_step=12,
+            row_step=0, data=np.zeros(0, np.uint8), is_dense=True,
+        )
+        for frame in ("bow", "late")
+    }  # fmt: skip
+    with Writer(tmp_path / "run", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        bow, late, broken, _ = (
+            writer.add_connection(topic, kind, typestore=make.store)
+            for topic in ("/bow", "/late", "/broken", "/silent")
+        )
+        for k in range(300):
+            writer.write(bow, START_NS + k, make.store.serialize_cdr(clouds["bow"], kind))
+            writer.write(broken, START_NS + k, b"junk")
+        writer.write(late, START_NS + 300, make.store.serialize_cdr(clouds["late"], kind))
+    read: Counter[str] = Counter()
+    messages = Bag.messages
+
+    def spy(self: Bag, topics: Collection[str]) -> Iterator[RawMessage]:
+        for raw in messages(self, topics):
+            read[raw.topic] += 1
+            yield raw
+
+    monkeypatch.setattr(Bag, "messages", spy)
+    found = inspect_bag(tmp_path / "run")
+    assert [(x.topic, x.frame_id) for x in found.lidars] == [("/bow", "bow"), ("/late", "late")]
+    assert read == {"/bow": 1, "/late": 1, "/broken": 200}

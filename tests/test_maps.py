@@ -14,7 +14,9 @@ import rasterio
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from graphloc.errors import InputError
+from graphloc.config import parse_config
+from graphloc.errors import ConfigError, InputError
+from graphloc.factors import SENSORS
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.aerial.image import AerialImage, Patch
 from graphloc.frontends.aerial.tiles import describe_tiles
@@ -586,3 +588,139 @@ def test_files_that_cannot_be_read_are_one_line(tmp_path: Path) -> None:
         f.truncate(200_000_001)
     with pytest.raises(InputError, match="more than 200 MB"):
         read(tmp_path / "a.json")
+
+
+def test_a_part_of_a_folder_of_tiles_says_what_to_name(tmp_path: Path) -> None:
+    """A level of few tiles has columns that read like levels."""
+    for zoom, tiles in ((19, tiled(19)), (4, {(8, 4): np.zeros((256, 256, 3), np.uint8)})):
+        folder = lay(tmp_path / f"tiles {zoom}", zoom, tiles, "png")
+        for part, what in ((f"{zoom}", "one level"), (f"{zoom}/{next(iter(tiles))[0]}", "one column")):
+            with pytest.raises(InputError) as said:
+                AerialImage(folder / part, Datum(SWEDEN))
+            assert str(said.value).startswith(f"{folder / part}: {what} of ")
+            assert f", {folder}: a folder of tiles has z/x/y" in str(said.value)
+
+
+def test_what_else_lies_among_tiles_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But a level 019 is none: GDAL would ask for 19."""
+    folder = lay(tmp_path / "tiles", 19, tiled(19), "png")
+    column = next((folder / "19").iterdir())
+    (folder / "20").write_text("a plain file")
+    (folder / "21.d").mkdir()
+    (folder / "019").mkdir()
+    (folder / "19/12.json").write_text("{}")
+    for k in range(1, 20):
+        (folder / f"19/{tile_at(0.0, 0.0, 19)[0] + k * 2**19}").mkdir()  # no such columns
+    (column / "3.json").write_text("{}")
+    check(around(folder), atol_m=0.03)
+    (folder / "19").rename(folder / "0019")
+    with pytest.raises(InputError, match="no tiles in it"):
+        around(folder)
+
+    def refuse(self: Path) -> Any:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(InputError, match=r"tiles: cannot be listed \(Permission denied\)"):
+        around(folder)
+
+
+def test_a_path_that_is_none_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="File name too long"):
+        AerialImage(tmp_path / ("x" * 300), Datum(SWEDEN))
+
+
+def test_a_datum_may_count_longitudes_to_360(tmp_path: Path) -> None:
+    """74 deg west is 286 deg: an image in a CRS, tiles, and lines lie where they do with -74."""
+    west, east = NEW_YORK, NEW_YORK._replace(longitude_deg=NEW_YORK.longitude_deg + 360.0)
+    transform, width, height = framed(2263, 0.5, west)
+    image = drawn(2263, transform, width, height, west)
+    path = write(tmp_path / "a.tif", colours(image), crs="EPSG:2263", transform=transform)
+    check(around(path, datum=east))
+    check(around(lay(tmp_path / "tiles", 19, tiled(19, west), "png"), datum=east), atol_m=0.03)
+    line = [(-20.0, 30.0), (90.0, -25.0)]
+    at = lon_lat(np.array(line), west)
+    for written in (at, np.add(at, [360.0, 0.0])):
+        path = saved(tmp_path / "a.json", feature("LineString", written.tolist()))
+        for datum in (west, east):
+            np.testing.assert_allclose(read_vector(path, Datum(datum)).segments_m, [line], atol=1e-6)
+
+
+def test_tiles_and_lines_at_the_date_line(tmp_path: Path) -> None:
+    """The last column is beside the first, and water cut in two at 180 deg is one water."""
+    fiji = Geodetic(-16.8, -179.999, 30.0)
+    tiles = tiled(16, fiji._replace(longitude_deg=179.999))
+    assert f"{2**16 - 1}/" in str(next(lay(tmp_path / "tiles", 16, tiles, "png").glob("16/*/*.png")))
+    assert "<YOrigin>top<" in describe_tiles(tmp_path / "tiles", Datum(fiji))
+
+    with pytest.raises(InputError, match=r"the date line of its CRS runs through it -100 m east, 0 m north"):
+        AerialImage(tmp_path / "tiles", Datum(fiji)).patch(np.array([-100.0, 0.0]), 40.0, 0.25)
+
+    def water(west: float, east: float) -> dict[str, Any]:
+        ring = [[west, -16.8], [east, -16.8], [east, -16.79], [west, -16.79], [west, -16.8]]
+        return feature("Polygon", [ring], natural="water")
+
+    for name, halves in (("cut", [water(179.99, 180.0), water(-180.0, -179.99)]), ("whole", [water(179.99, 180.01)])):
+        found = read_vector(saved(tmp_path / "a.json", *halves), Datum(fiji))
+        shores = found.segments_m[np.abs(found.segments_m[:, 0, 0] - found.segments_m[:, 1, 0]) < 1.0]
+        # A hundredth of a degree is 1066 m of this parallel; the datum is a thousandth east of the line.
+        np.testing.assert_allclose(sorted(shores[:, 0, 0]), [-1172.6, 959.4], atol=1.0, err_msg=name)
+        to_land = np.cos(found.to_land_rad[np.abs(np.cos(found.to_land_rad)) > 0.5])
+        np.testing.assert_allclose(sorted(to_land), [-1.0, 1.0], atol=1e-3)
+
+
+def test_lines_across_a_part_of_the_earth(tmp_path: Path) -> None:
+    """What is far off is left out, and does not turn the sides of what is near."""
+    corner = [14.5, 57.7]
+    huge = [corner, [60.0, 57.7], [60.0, 70.0], [14.5, 70.0], corner]
+    with pytest.raises(InputError, match="no piece of its lines has a length of up to 50 km"):
+        read(saved(tmp_path / "a.json", feature("Polygon", [huge])))
+    # The sea south of a shore of 1 km, to beyond the pole: in a plane that point would lie north.
+    near = lon_lat(np.array([(0.0, 0.0), (1000.0, 0.0)]), SWEDEN).tolist()
+    far = [[-166.5, -50.0]]
+    antipode = [[-165.5, -57.7], [-165.4999, -57.7], [-165.4999, -57.6999]]
+    sea = feature("Polygon", [[near[0], near[1], *far]], natural="water")
+    found = read(saved(tmp_path / "a.json", sea, feature("LineString", antipode)))
+    np.testing.assert_allclose(found.segments_m, [[(0.0, 0.0), (1000.0, 0.0)]], atol=1e-6)
+    assert np.sin(found.to_land_rad) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_features_without_a_place_or_tags_are_passed_over(tmp_path: Path) -> None:
+    line = {"type": "LineString", "coordinates": OK}
+    bare: list[dict[str, Any]] = [{"type": "Feature", "geometry": None}, {"type": "Feature", "geometry": line}]
+    bare += [{"type": "Feature"}, {"type": "Feature", "properties": None, "geometry": line}]
+    assert len(read(saved(tmp_path / "a.json", *bare)).segments_m) == 2
+
+
+KINDS = {row.kind: row.config for row in SENSORS}
+LIDARS = {"bow": {"topic": "/a"}, "mast": {"topic": "/b"}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"reach_m": 301}, r"sensors.aerial.reach_m: .*less than or equal to 300"),
+        ({"window_m": 51}, r"sensors.aerial.window_m: .*less than or equal to 50"),
+        ({"window_deg": 31}, r"sensors.aerial.window_deg: .*less than or equal to 30"),
+        ({"lidars": {**LIDARS, "aft": {"topic": "/a"}}}, "lidars: bow and aft have the same topic, /a"),
+        ({"hull_m": [[5, 0]]}, "hull_m: an outline has three corners or more"),
+        ({"hull_m": [[5, 1], [5, -1]]}, "hull_m: an outline has three corners or more"),
+        ({"hull_m": [[5, 1], [-5, -1], [5, -1], [-5, 1]]}, "hull_m: .* make no outline: Self-intersection"),
+        ({"hull_m": [[5, 1], [4, 1], [3, 1]]}, "hull_m: .* make no outline"),
+        ({"mount": {"xyz_m": [1, 0, 0]}}, "mount: not used here.*set it for each of `lidars`"),
+        ({"mount": {"tf_frame": "lidar"}}, "mount: not used here"),
+        ({"topic": "/points"}, "topic: not used here"),
+    ],
+)
+def test_an_aerial_block_that_cannot_be_meant_is_one_line(changes: dict[str, Any], why: str) -> None:
+    with pytest.raises(ConfigError, match=why) as said:
+        parse_config({"sensors": {"aerial": {"lidars": LIDARS, **changes}}}, KINDS, "vessel.yaml")
+    assert "\n" not in str(said.value)
+    assert "sensors.aerial." in str(said.value)
+
+
+def test_an_aerial_block_at_its_bounds_is_read() -> None:
+    block = {"reach_m": 300, "window_m": 50, "window_deg": 30, "topic": "", "mount": {}, "lidars": LIDARS}
+    for hull in ([], [[5, 1], [-5, 1], [0, 0], [-5, -1], [5, -1]], [[5, 1], [-5, 1], [5, -1], [5, 1]]):
+        config = parse_config({"sensors": {"aerial": {**block, "hull_m": hull}}}, KINDS, "vessel.yaml")
+        assert len(config.sensors["aerial"].hull_m) == len(hull)

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,22 @@ from graphloc.frames import Array
 from graphloc.frontends.aerial.scan import LevelCloud
 from graphloc.trajectory import Trajectory
 
+log = logging.getLogger(__name__)
+
 CLOUD = "sensor_msgs/msg/PointCloud2"
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField
 _TIME_FIELDS = ("time", "t", "timestamp", "offset_time", "time_offset", "time_stamp")
-_LONGEST_TURN_S = 1.0
+_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
+_USUAL_UNIT_S = {"f4": 1.0, "u4": 1e-9}  # since the header: Velodyne's seconds; Ouster's and Livox's nanoseconds
+_LONGEST_S = 1.0  # from header to point; scans of 1 Hz
+_SHORTEST_TURN_S = 0.008  # the fastest LiDARs give 100 clouds a second
+_PACKET_POINTS = 4096  # a packet has no more (128 beams x 16 columns, both returns) ...
+_SHORTEST_PACKET_S = 0.25e-3  # ... and lasts 0.5 ms (Velodyne, both returns) or longer
+_LONGEST_SMALL_S = 0.5  # a small cloud that says more may as well be a packet in a smaller unit
+_BIN_NS = 2_000_000  # a pose each 2 ms is often enough: 2 cm at 10 m/s
+_NEWEST_NS = 10**9
+_CHUNK = 1 << 15  # points at a time: their rotations (2 MB) stay in the cache
+_said: set[tuple[str, str]] = set()  # a bag has thousands of scans, each with the same fault
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,52 +45,146 @@ class Cloud:
 
 
 def decode_cloud(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
-    """Return the finite points of a `PointCloud2`.
+    """Return the finite points of a `PointCloud2`, each with its time where a field says it.
 
-    The time of each point is read where a field has it: seconds or nanoseconds since the header's stamp, or absolute.
+    Times may be s, ms, us or ns, since the header's stamp or absolute, on its clock or another (`_since_header_s`).
+    No stamp is further than 1 s from the header's: points that say so, or no finite time, are dropped, not clamped,
+    as they would be laid where they were not seen. If no reading of the times makes sense, all points get the
+    header's stamp, and a warning says so once. Of fields with one name the first counts (PCL does so too).
+
+    Args:
+        stamp_ns: the header's.
 
     Raises:
-        ValueError: no x, y, z, or fewer bytes than it says.
+        ValueError: no x, y, z, a field of unknown type or outside the point, or fewer bytes than it says.
     """
-    order = ">" if msg.is_bigendian else "<"
-    fields = {f.name: f for f in msg.fields}
+    layout = _layout(msg)
+    count = msg.width * msg.height
+    points = _rows(msg, count).view(layout)
+    with np.errstate(all="ignore"):  # signalling NaNs
+        xyz = np.column_stack([points[n].astype(float) for n in "xyz"])
+    keep = np.isfinite(xyz).all(axis=1) & (np.abs(xyz).max(axis=1) > 1e-3)  # drivers fill gaps with NaN or zeros
+    xyz = xyz[keep]
+    timed = next((n for n in layout.names or () if n in _TIME_FIELDS), None)
+    if timed is None or not len(xyz):
+        return Cloud(lidar, stamp_ns, xyz, np.full(len(xyz), stamp_ns, dtype=np.int64))
+    since_s = _since_header_s(points[timed][keep], stamp_ns, count, lidar)
+    near = np.abs(since_s) <= _LONGEST_S  # false where NaN
+    if not near.all():
+        xyz, since_s = xyz[near], since_s[near]
+    return Cloud(lidar, stamp_ns, xyz, stamp_ns + np.rint(since_s * 1e9).astype(np.int64))
+
+
+def _layout(msg: Any) -> np.dtype[Any]:
+    """The fields that are read of a point, those of its place first."""
+    fields: dict[str, Any] = {}
+    for field in msg.fields:
+        fields.setdefault(field.name, field)
     if not {"x", "y", "z"} <= set(fields):
         raise ValueError(f"a cloud without x, y, z (it has: {', '.join(fields) or 'no field'})")
-    count = msg.width * msg.height
-    raw = np.asarray(msg.data, dtype=np.uint8)
+    wanted = [fields[n] for n in ("x", "y", "z", *_TIME_FIELDS) if n in fields]
+    for field in wanted:
+        if field.datatype not in _FORMATS:
+            raise ValueError(f"a cloud whose field '{field.name}' has the unknown datatype {field.datatype}")
+        if field.offset + int(_FORMATS[field.datatype][1]) > msg.point_step:
+            raise ValueError(
+                f"a cloud whose field '{field.name}' at byte {field.offset} lies outside its points of "
+                f"{msg.point_step} bytes"
+            )
+    order = ">" if msg.is_bigendian else "<"
+    return np.dtype({
+        "names": [f.name for f in wanted], "formats": [order + _FORMATS[f.datatype] for f in wanted],
+        "offsets": [f.offset for f in wanted], "itemsize": msg.point_step,
+    })  # fmt: skip
+
+
+def _rows(msg: Any, count: int) -> NDArray[np.uint8]:
+    """The bytes of all points, one after the other."""
+    raw = np.asarray(msg.data, dtype=np.uint8).reshape(-1)
+    if len(raw) == msg.point_step * count:  # no padding, whatever row_step says: some drivers leave it 0 or wrong
+        return np.ascontiguousarray(raw)
     if len(raw) < msg.row_step * msg.height or msg.point_step * msg.width > msg.row_step:
         raise ValueError(f"a cloud of {count} points with {len(raw)} bytes")
     rows = raw[: msg.row_step * msg.height].reshape(msg.height, msg.row_step)[:, : msg.point_step * msg.width]
-    wanted = [n for n in ("x", "y", "z", *_TIME_FIELDS) if n in fields]
-    layout = np.dtype({
-        "names": wanted, "formats": [order + _FORMATS[fields[n].datatype] for n in wanted],
-        "offsets": [fields[n].offset for n in wanted], "itemsize": msg.point_step,
-    })  # fmt: skip
-    points = np.ascontiguousarray(rows).reshape(-1).view(layout)
-    xyz = np.column_stack([points[n].astype(float) for n in "xyz"])
-    keep = np.isfinite(xyz).all(axis=1) & (np.abs(xyz).max(axis=1) > 1e-3)  # drivers fill gaps with NaN or zeros
-    stamps = np.full(count, stamp_ns, dtype=np.int64)
-    timed = next((n for n in wanted if n in _TIME_FIELDS), None)
-    if timed is not None:
-        stamps = stamp_ns + _since_stamp_ns(points[timed], stamp_ns)
-    return Cloud(lidar, stamp_ns, xyz[keep], stamps[keep])
+    return np.ascontiguousarray(rows).reshape(-1)
 
 
-def _since_stamp_ns(time: Any, stamp_ns: int) -> NDArray[np.int64]:
-    """What a driver's time field says, as ns since the header's stamp: its unit by its size."""
-    whole = time.dtype.kind in "iu"
-    value = time.astype(float)
-    size = float(np.nanmax(np.abs(value))) if len(value) else 0.0
-    if size > 1e17:  # absolute, ns
-        return np.asarray(time.astype(np.int64) - stamp_ns)
-    if size > 1e8 and not whole:  # absolute, s
-        return np.asarray(np.rint((value - stamp_ns * 1e-9) * 1e9), dtype=np.int64)
-    for unit_ns in (1, 1000) if whole else (10**9, 10**6, 1000, 1):
-        if size * unit_ns <= _LONGEST_TURN_S * 1e9:
-            if whole and size * unit_ns < 1e6 and unit_ns == 1:
-                continue  # a turn of less than a millisecond: these are microseconds
-            return np.asarray(np.nan_to_num(value * unit_ns), dtype=np.int64)
-    return np.zeros(len(value), dtype=np.int64)
+def _since_header_s(time: NDArray[Any], stamp_ns: int, count: int, lidar: str) -> Array:
+    """What a driver's time field says, in s since the header's stamp; NaN or far off where it says nonsense.
+
+    The first of these that fits all but 1 % at each end:
+
+    1. Since the header, in the unit usual for the field's type, if the furthest is as far as a scan or packet is long.
+    2. Absolute, in the unit that makes it about as large as the header's stamp. Where the two differ by more than
+       1 s (TAI is 37 s ahead of UTC), as 4.
+    3. Since the header, in another unit, if that gives the length of a scan. Not that of a packet, which cannot be
+       told from a slow scan in a unit 1000 times smaller; the header is right for a packet to within its length.
+    4. Absolute on another clock, such as time since boot, in the unit that gives the length of a scan. Only the
+       differences are used: the first point is at the header's stamp, as Ouster, Hesai and Livox have it (and
+       `LaserScan`, and Autoware's rules); with RoboSense, whose headers tell the last, this errs by one turn.
+    """
+    with np.errstate(all="ignore"):  # signalling NaNs; 1e308 in ns
+        value = time.astype(float)
+        finite = value if np.isfinite(value).all() else value[np.isfinite(value)]
+        if not len(finite):
+            return _at_header(value, lidar, "not finite")
+        low, high = _ends(finite)
+        spread, furthest = high - low, max(abs(low), abs(high))
+        if furthest == 0.0:
+            return np.zeros(len(value))  # a driver that does not fill it
+        step = 1.0 if time.dtype.kind in "iu" else float(np.spacing(time.dtype.newbyteorder("=").type(furthest)))
+        units = [u for u in _UNITS_S if step * u <= 1e-3]  # whole seconds, or an epoch in float32, are no point times
+        longest = _LONGEST_S if count > _PACKET_POINTS else _LONGEST_SMALL_S
+        usual = _USUAL_UNIT_S.get(time.dtype.str[1:])
+        shortest = _SHORTEST_TURN_S if count > _PACKET_POINTS else _SHORTEST_PACKET_S
+        if usual in units and shortest <= furthest * usual <= longest:
+            return value * usual
+        for unit in units:
+            if _is_epoch(low * unit, high * unit, stamp_ns * 1e-9):
+                since = (value - stamp_ns * 1e-9 / unit) * unit
+                if abs(0.5 * (low + high) * unit - stamp_ns * 1e-9) <= _LONGEST_S:
+                    return np.asarray(since)
+                return _anchored(value, low, unit, lidar)
+        for unit in units:
+            # Times since the header begin or end near it: the spread of a short turn long after boot is too small.
+            if _SHORTEST_TURN_S <= furthest * unit <= longest and spread >= 0.1 * furthest:
+                return value * unit
+        for unit in units:
+            if _SHORTEST_TURN_S <= spread * unit <= longest:
+                return _anchored(value, low, unit, lidar)
+    return _at_header(value, lidar, "of no known unit")
+
+
+def _ends(value: Array) -> tuple[float, float]:
+    """Smallest and largest, less 1 % at each end, which may be anything; fewer than 10 values are all believed."""
+    cut = -(-len(value) // 100) if len(value) >= 10 else 0
+    ordered = np.partition(value, (cut, len(value) - 1 - cut))
+    return float(ordered[cut]), float(ordered[len(value) - 1 - cut])
+
+
+def _is_epoch(low_s: float, high_s: float, stamp_s: float) -> bool:
+    """Whether times are as large as a stamp, to a half; soon after zero nothing tells them from times since it."""
+    return (
+        stamp_s > 4.0 * _LONGEST_S
+        and high_s - low_s <= _LONGEST_S
+        and abs(0.5 * (low_s + high_s) - stamp_s) <= 0.5 * stamp_s
+    )
+
+
+def _anchored(value: Array, low: float, unit: float, lidar: str) -> Array:
+    _warn_once(lidar, "the times of its points are on another clock; the first point is taken to be at the header's")
+    return np.asarray((value - low) * unit)
+
+
+def _at_header(value: Array, lidar: str, why: str) -> Array:
+    _warn_once(lidar, f"the times of its points are {why}; all are taken to be at the header's")
+    return np.zeros(len(value))
+
+
+def _warn_once(lidar: str, text: str) -> None:
+    if (lidar, text) not in _said:
+        _said.add((lidar, text))
+        log.warning("LiDAR %s: %s", lidar, text)
 
 
 def level(
@@ -85,29 +192,99 @@ def level(
 ) -> LevelCloud:
     """Return the points of clouds in `level` at a time: each from where the track says its LiDAR then was.
 
+    Points that the track does not cover are left out. Of the others,
+    p_level = R_level_world (p_world_body + R_world_body (R_body_lidar p_lidar + t_body_lidar) - p_world_level),
+    with the pose of the body at the middle of the 2 ms that the point lies in.
+
     Args:
         mounts: T_body_lidar by name. waterline_m: height of the waterline in body.
 
     Raises:
-        InputError: the track does not cover them.
+        InputError: the track does not cover `at_ns`, or no point of the newest clouds (stamped within 1 s of it).
     """
-    stamps = np.concatenate([c.stamps_ns for c in clouds] + [np.array([at_ns])])
-    coarse, back = np.unique(stamps // 2_000_000, return_inverse=True)  # every 2 ms is often enough
-    times = np.clip(coarse * 2_000_000 + 1_000_000, stamps.min(), stamps.max())
-    if not track.covers(times).all():
-        raise InputError(f"the track does not cover the scans at {at_ns}")
-    poses = track.at(times)
-    p0, yaw = poses.p_world_m[back[-1]], float(poses.yaw_rad[back[-1]])
+    newest = [k for k, c in enumerate(clouds) if abs(c.stamp_ns - at_ns) <= _NEWEST_NS]
+    names = ", ".join(dict.fromkeys(c.lidar for c in ([clouds[k] for k in newest] or clouds))) or "no LiDAR"
+    if not track.covers(np.array([at_ns])).all():
+        raise InputError(f"the track does not cover the scan of {names}: {_outside(track, at_ns)}")
+    kept = [_during(c, track) for c in clouds]
+    bins, rows = _shared_bins([*(c.stamps_ns // _BIN_NS for c in kept), np.array([at_ns // _BIN_NS])])
+    times = np.clip(bins * _BIN_NS + _BIN_NS // 2, track.stamps_ns[0], track.stamps_ns[-1])
+    covered = track.covers(times)
+    covered[rows[-1]] = True
+    if not covered.all():  # a gap of the track
+        kept = [_select(c, covered[r]) for c, r in zip(kept, rows[:-1], strict=True)]
+        renumbered = np.cumsum(covered) - 1
+        rows = [renumbered[r[covered[r]]] for r in rows]
+        times = times[covered]
+    had = [clouds[k].stamps_ns for k in newest if len(clouds[k].stamps_ns)]
+    if had and not any(len(kept[k].stamps_ns) for k in newest):
+        raise InputError(
+            f"the track does not cover the scan of {names}: {_outside(track, int(np.median(np.concatenate(had))))}"
+        )
+    poses = _around(track, times).at(times)
+    here = int(rows[-1][0])
+    yaw = float(poses.yaw_rad[here])
     c, s = np.cos(yaw), np.sin(yaw)
     to_level = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    up = p0 + np.array([0.0, 0.0, waterline_m])
-    points, origins, begin = [], [], 0
-    for cloud in clouds:
-        which = back[begin : begin + len(cloud.stamps_ns)]
-        begin += len(cloud.stamps_ns)
+    up = poses.p_world_m[here] + np.array([0.0, 0.0, waterline_m])
+    points, origins = np.empty((sum(len(r) for r in rows[:-1]), 3)), []
+    begin = 0
+    for cloud, row in zip(kept, rows[:-1], strict=True):
         t, R = mounts[cloud.lidar]
-        Rs, ps = poses.R_world_body[which], poses.p_world_m[which]
-        in_world = ps + np.einsum("nij,nj->ni", Rs, cloud.points_m @ R.T + t)
-        points.append((in_world - up) @ to_level.T)
-        origins.append(((ps + Rs @ t - up) @ to_level.T)[:, :2])
-    return LevelCloud(np.vstack(points), np.vstack(origins))
+        origin = (poses.p_world_m + poses.R_world_body @ t - up) @ to_level.T
+        _move(cloud.points_m, to_level @ poses.R_world_body @ R, origin, row, points[begin : begin + len(row)])
+        origins.append(origin[row, :2])
+        begin += len(row)
+    return LevelCloud(points, np.vstack([*origins, np.empty((0, 2))]))
+
+
+def _move(points: Array, R: Array, t: Array, row: NDArray[np.int64], out: Array) -> None:
+    """Write R[row] points + t[row]; a rotation of each point at once would take 72 bytes a point."""
+    for k in range(0, len(points), _CHUNK):
+        part = slice(k, k + _CHUNK)
+        np.einsum("nij,nj->ni", R[row[part]], points[part], out=out[part])
+        out[part] += t[row[part]]
+
+
+def _select(cloud: Cloud, mask: NDArray[np.bool_]) -> Cloud:
+    return cloud if mask.all() else replace(cloud, points_m=cloud.points_m[mask], stamps_ns=cloud.stamps_ns[mask])
+
+
+def _during(cloud: Cloud, track: Trajectory) -> Cloud:
+    return _select(cloud, (cloud.stamps_ns >= track.stamps_ns[0]) & (cloud.stamps_ns <= track.stamps_ns[-1]))
+
+
+def _shared_bins(numbers: list[NDArray[np.int64]]) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
+    """The numbers that occur, ascending, and for each array where its own are among them.
+
+    As `np.unique`, without its sort; numbers lie within a track, so that a table of them all is small.
+    """
+    some = [n for n in numbers if len(n)]
+    first, last = min(int(n.min()) for n in some), max(int(n.max()) for n in some)
+    seen = np.zeros(last - first + 1, dtype=bool)
+    for n in some:
+        seen[n - first] = True
+    place = np.cumsum(seen) - 1
+    return np.flatnonzero(seen) + first, [place[n - first] for n in numbers]
+
+
+def _around(track: Trajectory, times: NDArray[np.int64]) -> Trajectory:
+    """The poses of a track that its interpolation at these times uses; 20 000 of them cost 18 ms a scan."""
+    first = max(int(np.searchsorted(track.stamps_ns, times[0], side="right")) - 2, 0)
+    part = slice(first, int(np.searchsorted(track.stamps_ns, times[-1], side="left")) + 2)
+    v = track.v_world_mps
+    return Trajectory(
+        stamps_ns=track.stamps_ns[part], p_world_m=track.p_world_m[part], R_world_body=track.R_world_body[part],
+        v_world_mps=None if v is None else v[part], planar=track.planar,
+    )  # fmt: skip
+
+
+def _outside(track: Trajectory, stamp_ns: int) -> str:
+    first, last = int(track.stamps_ns[0]), int(track.stamps_ns[-1])
+    if stamp_ns > last:
+        return f"the scan lies {(stamp_ns - last) / 1e9:.1f} s after the end of the track"
+    if stamp_ns < first:
+        return f"the scan lies {(first - stamp_ns) / 1e9:.1f} s before the start of the track"
+    right = int(np.clip(np.searchsorted(track.stamps_ns, stamp_ns), 1, len(track) - 1))
+    gap_s = int(track.stamps_ns[right] - track.stamps_ns[right - 1]) / 1e9
+    return f"the scan lies in a gap of {gap_s:.1f} s of the track"

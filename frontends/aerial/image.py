@@ -73,7 +73,11 @@ class AerialImage:
 
     def __init__(self, path: Path, datum: Datum) -> None:
         self._path, self._datum = path, datum
-        name = describe_tiles(path, datum) if path.is_dir() else path
+        try:
+            folder = path.is_dir()
+        except OSError as error:  # such as no permission, a name that is too long
+            raise InputError(f"{path}: {error.strerror}") from None
+        name = describe_tiles(path, datum) if folder else path
         # Cut at the bounds that it states, an MBTiles is off by half a pixel (seen with GDAL 3.10: 5 cm of 16).
         options = {"USE_BOUNDS": "NO"} if path.suffix.lower() == ".mbtiles" else {}
         try:
@@ -87,6 +91,7 @@ class AerialImage:
         if why_not:
             raise InputError(f"{path}: {why_not}")
         lon, lat = datum.origin.longitude_deg, datum.origin.latitude_deg
+        lon -= 360.0 if lon > 180.0 else 0.0  # a datum may say 190 deg, PROJ's areas may not
         try:
             crs = CRS.from_wkt(source.crs.to_wkt())
             here = AreaOfInterest(lon, lat, lon, lat)  # which tie to WGS 84 is best depends on where
@@ -120,6 +125,12 @@ class AerialImage:
         uv = self._pixels_of_grid(west, north, n, cell_m)
         if not np.isfinite(uv).all():  # beyond where the CRS is defined
             raise elsewhere
+        eastward = np.hypot(*np.diff(uv[:, ::n], axis=2))  # of the first row
+        if eastward.max() > 2.0 * np.median(eastward):
+            raise InputError(
+                f"{self._path}: the date line of its CRS runs through it {centre_m[0]:.0f} m east, {centre_m[1]:.0f} m "
+                "north of the datum: gdalwarp it to the UTM zone there"
+            )
         # Pixels a cell along u and v, as they are on the ground: the CRS may count feet, degrees, or half metres.
         finer = np.hypot((uv[:, :, -1] - uv[:, :, 0]).mean(axis=1), (uv[:, -1] - uv[:, 0]).mean(axis=1)) / (n - 1)
         shrink = 2 ** max(0, int(np.log2(0.5 * finer.min())))  # read 2 pixels a cell or more, and not hundreds

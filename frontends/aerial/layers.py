@@ -8,6 +8,7 @@ direction without sense (`EDGE_BINS` over 180 deg); shores have one with sense, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,14 +30,54 @@ _RIM_M = 0.75  # a segmented rim is that near to the shore
 _MARGIN_M = 0.5  # the image's own rim is no edge
 
 
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """What a low and a tall face add to the log-likelihood that are on an edge, and a first return on a shore."""
+
+    low: float
+    tall: float
+    shore: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Layers:
-    """Layers of a patch: edges, and shores (none where no water is known). drawn: a user's lines are among them."""
+    """Log-likelihoods that a scan is laid on, in parts of `unit` (they are whole numbers, 0 to 255).
+
+    Attributes:
+        low, tall: (EDGE_BINS, rows, columns) of low and tall faces. shores: (SHORE_BINS, rows, columns) of first
+            returns; None where no water is known. drawn: (rows, columns) cells that a user's lines go through, or None.
+    """
 
     patch: Patch
-    edges: Layer
-    shores: Layer | None
-    drawn: bool = False
+    unit: float
+    low: Pixels
+    tall: Pixels
+    shores: Pixels | None
+    drawn: Mask | None = None
+
+
+def weighed(patch: Patch, sources: Sequence[tuple[Layer, Layer | None, Weights]], drawn: Mask | None) -> Layers:
+    """Lay the edges and shores of several sources over each other, each with its own weights; the largest counts.
+
+    Added, what two sources show would be told twice.
+    """
+    unit = max(max(w.low, w.tall, w.shore) for _, _, w in sources) / 255.0
+
+    def over(parts: Sequence[tuple[Layer, float]]) -> Pixels:
+        most = np.zeros(parts[0][0].shape, dtype=np.uint8)
+        for layer, weight in parts:
+            np.maximum(most, np.rint(layer * np.float32(weight / unit)).astype(np.uint8), out=most)
+        return most
+
+    shores = [(shore, w.shore) for _, shore, w in sources if shore is not None]
+    return Layers(
+        patch=patch,
+        unit=unit,
+        low=over([(edge, w.low) for edge, _, w in sources]),
+        tall=over([(edge, w.tall) for edge, _, w in sources]),
+        shores=over(shores) if shores else None,
+        drawn=drawn,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,20 +136,32 @@ def _finer(mask: NDArray[Any], shape: tuple[int, ...]) -> Mask:
 
 def drawn_layers(fine: Patch, drawn: VectorMap) -> tuple[Layer, Layer]:
     """Return the edges and the shores that a vector layer has within a patch."""
-    a, b = drawn.segments_m[:, 0], drawn.segments_m[:, 1]
+    a, b, kept = _clipped(drawn.segments_m, fine)
     angle = np.arctan2(*(b - a).T[::-1])
     count = np.ceil(np.abs(b - a).max(axis=1) / fine.cell_m).astype(np.int64)  # as many as a line has pixels
     which = np.repeat(np.arange(len(a)), count)
     t = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[which]
-    columns, rows = np.rint(fine.cells(a[which] + t[:, None] * (b - a)[which])).astype(np.int64).T
-    there = (columns >= 0) & (rows >= 0) & (rows < fine.inside.shape[0]) & (columns < fine.inside.shape[1])
-    which, rows, columns = which[there], rows[there], columns[there]
-    sided = np.isfinite(drawn.to_land_rad[which])
-    to_land = drawn.to_land_rad[which[sided]]
+    columns, rows = fine.cells(a[which] + t[:, None] * (b - a)[which]).T
+    to_land = drawn.to_land_rad[kept][which]
+    sided = np.isfinite(to_land)
     return (
         _drawn(fine, rows, columns, angle[which], np.pi, EDGE_BINS, _EDGE_SIGMA_M),
-        _drawn(fine, rows[sided], columns[sided], to_land, 2.0 * np.pi, SHORE_BINS, _SHORE_SIGMA_M),
+        _drawn(fine, rows[sided], columns[sided], to_land[sided], 2.0 * np.pi, SHORE_BINS, _SHORE_SIGMA_M),
     )
+
+
+def _clipped(segments_m: Array, fine: Patch) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Ends (K, 2) of the parts of segments (S, 2, 2) that lie within a patch, and of which each is (Liang, Barsky)."""
+    a, d = segments_m[:, 0], segments_m[:, 1] - segments_m[:, 0]
+    rows, columns = fine.inside.shape
+    low = np.array([fine.west_m, fine.north_m - (rows - 1) * fine.cell_m])
+    high = np.array([fine.west_m + (columns - 1) * fine.cell_m, fine.north_m])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.stack([(low - a) / d, (high - a) / d])
+    t = np.where(d == 0.0, np.where((a >= low) & (a <= high), [[[-np.inf]], [[np.inf]]], np.nan), t)
+    begin, end = np.maximum(t.min(axis=0).max(axis=1), 0.0), np.minimum(t.max(axis=0).min(axis=1), 1.0)
+    (kept,) = np.nonzero(end > begin)  # NaN: beside it
+    return a[kept] + begin[kept, None] * d[kept], a[kept] + end[kept, None] * d[kept], kept
 
 
 def _well_inside(patch: Patch) -> Mask:
@@ -117,7 +170,7 @@ def _well_inside(patch: Patch) -> Mask:
 
 
 def _drawn(
-    fine: Patch, rows: NDArray[np.int64], columns: NDArray[np.int64], angle: Array, turn: float, bins: int, sigma_m: float
+    fine: Patch, rows: NDArray[Any], columns: NDArray[Any], angle: Array, turn: float, bins: int, sigma_m: float
 ) -> Layer:  # fmt: skip
     """Draw pixels of lines into a layer of the coarse grid: exp(-d^2 / 2 sigma^2) beside a line that stands alone.
 

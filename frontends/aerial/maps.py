@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -16,70 +17,87 @@ from graphloc.frontends.aerial.layers import (
     FINE,
     Layer,
     Layers,
+    Weights,
     coarse_patch,
     drawn_layers,
     edge_layer,
     find_edges,
     segment_water,
     shore_layer,
+    weighed,
 )
 from graphloc.frontends.aerial.scan import Outline
 from graphloc.frontends.aerial.vector import VectorMap, read_vector
 
 _CELL_M = 0.25
 _TILE_M = 100.0  # a patch serves all priors of one tile
-_KEPT = 2  # patches, so that a way along the border of two makes each once; 130 MB each
+_KEPT = 4  # patches, about 50 MB each
+_ON_IT = 0.7
+_TRIES = 3  # a first scan may have seen no water
+
+# Fitted by benchmarks/tune_matcher.py on harbours drawn by chance; docs/decisions/0006. A tall face on an image may be on a
+# shadow as well; on a drawn line it is a house, for no boat is as tall.
+ON_IMAGE, ON_LINES = Weights(low=0.88, tall=0.50, shore=1.70), Weights(low=0.74, tall=2.60, shore=1.74)
 
 
 class Map:
     """What `image` and `vector` of an aerial sensor show, part by part.
 
+    Args:
+        on_image, on_lines: weights of either; other than the fitted ones, to fit them.
+
     Raises:
         InputError: neither is given, or one cannot be used.
     """
 
-    def __init__(self, config: AerialConfig, folder: Path, datum: Datum) -> None:
+    def __init__(
+        self, config: AerialConfig, folder: Path, datum: Datum, on_image: Weights = ON_IMAGE, on_lines: Weights = ON_LINES
+    ) -> None:  # fmt: skip
         if not config.image and not config.vector:
             raise InputError("sensors: an aerial sensor needs an image, a vector layer, or both")
         self._image = AerialImage(folder / config.image, datum) if config.image else None
         self._drawn = read_vector(folder / config.vector, datum) if config.vector else None
         self._half_m = config.reach_m + 0.5 * _TILE_M + config.window_m
+        self._weights = (on_image, on_lines)
         self._kept: dict[tuple[int, int], Layers] = {}
+        self._tries: Counter[tuple[int, int]] = Counter()
 
     def around(self, pose: Array, found: Outline) -> Layers:
-        """Return the layers around a pose (3,); water is what is like the water that the scan saw from there.
+        """Return the layers around a pose (3,); water is what is like the water that a scan saw from there.
 
         Raises:
-            InputError: the image does not reach there.
+            InputError: the map does not reach there.
         """
         tile = (int(pose[0] // _TILE_M), int(pose[1] // _TILE_M))
-        if tile not in self._kept:
-            while len(self._kept) >= _KEPT:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[tile] = self._made((np.array(tile) + 0.5) * _TILE_M, pose, found)
-        return self._kept[tile]
+        layers = self._kept.pop(tile, None)
+        if layers is None or (layers.shores is None and self._tries[tile] < _TRIES):
+            self._tries[tile] += 1
+            layers = self._made((np.array(tile) + 0.5) * _TILE_M, pose, found)
+        while len(self._kept) >= _KEPT:
+            self._kept.pop(next(iter(self._kept)))
+        self._kept[tile] = layers  # the last used is the last to go
+        return layers
 
     def _made(self, middle_m: Array, pose: Array, found: Outline) -> Layers:
         cell = _CELL_M / FINE
-        if self._image is None:
-            fine = _blank(middle_m, self._half_m, cell)
-        else:
-            fine = self._image.patch(middle_m, self._half_m, cell)
+        fine = (
+            _blank(middle_m, self._half_m, cell)
+            if self._image is None
+            else self._image.patch(middle_m, self._half_m, cell)
+        )
         coarse = coarse_patch(fine)
-        layers: list[tuple[Layer, Layer | None]] = []
+        sources: list[tuple[Layer, Layer | None, Weights]] = []
+        drawn = None
         if self._image is not None:
             edges = find_edges(fine)
             water = segment_water(coarse, _seen_water(coarse, pose, found))
-            layers.append((edge_layer(fine, edges), shore_layer(fine, edges, water) if water.any() else None))
+            shores = shore_layer(fine, edges, water) if water.any() else None
+            sources.append((edge_layer(fine, edges), shores, self._weights[0]))
         if self._drawn is not None:
-            layers.append(drawn_layers(fine, self._near(self._drawn, middle_m)))
-        shores = [shore for _, shore in layers if shore is not None]
-        return Layers(
-            patch=coarse,
-            edges=np.maximum.reduce([edge for edge, _ in layers]),
-            shores=np.maximum.reduce(shores) if shores else None,
-            drawn=self._drawn is not None,
-        )
+            lines, shores = drawn_layers(fine, self._near(self._drawn, middle_m))
+            sources.append((lines, shores, self._weights[1]))
+            drawn = lines.max(axis=0) > _ON_IT
+        return weighed(coarse, sources, drawn)
 
     def _near(self, drawn: VectorMap, middle_m: Array) -> VectorMap:
         near = drawn.around(middle_m, self._half_m)

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from graphloc.frames import Array
+from graphloc.frontends.aerial.image import Pixels
 from graphloc.frontends.aerial.layers import Layer, Layers
 from graphloc.frontends.aerial.scan import Outline
 
 STEP_DEG = 0.5
+_LEAST_SHARE = 0.01  # of the posterior that a mode must have
 _NARROW, _FINER = 5, 5  # a mode of fewer cells across is looked at between them, so much finer
 _FLOOR = np.array([0.05, 0.05, np.radians(0.1)])  # m, rad: no image tells more
 # TBB, Numba's first choice, warns on stderr where the one that is installed is older than it likes.
@@ -67,16 +69,7 @@ def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, column
     return out
 
 
-@dataclass(frozen=True, slots=True)
-class Weights:
-    """What a face that is on an edge adds to the log-likelihood, low ones and tall ones, and a first return on a shore."""
-
-    low: float
-    tall: float
-    shore: float
-
-
-def log_likelihood_of(found: Outline, layers: Layers, grid: Grid, weights: Weights) -> Layer:
+def log_likelihood_of(found: Outline, layers: Layers, grid: Grid) -> Layer:
     """Return the log-likelihood of each pose of the grid (H, R, C).
 
     The sum over lines grows with their number, and so do chance and what they are wrong by together (boats that lie at
@@ -84,18 +77,19 @@ def log_likelihood_of(found: Outline, layers: Layers, grid: Grid, weights: Weigh
     """
     patch = layers.patch
     col0, row0 = np.rint(patch.cells(np.array([[grid.east_m[0], grid.north_m[0]]]))[0]).astype(int)
-    scale = 10.0 / np.sqrt(max(found.evidence, 1.0))
+    scale = 10.0 / np.sqrt(max(found.evidence, 1.0)) * layers.unit
 
-    def lay(layer: Layer, p_m: Array, angle: Array, weight: Array, turn: float) -> Layer:
+    def lay(layer: Pixels, p_m: Array, angle: Array, weight: Array, turn: float) -> Layer:
+        some = weight > 0.0
         return np.asarray(
-            _laid(layer, p_m, angle, (scale * weight).astype(np.float32), grid.yaw_rad, col0, row0, patch.cell_m, turn,
-                  len(grid.north_m), len(grid.east_m))
+            _laid(layer, p_m[some], angle[some], (scale * weight[some]).astype(np.float32), grid.yaw_rad, col0, row0,
+                  patch.cell_m, turn, len(grid.north_m), len(grid.east_m))
         )  # fmt: skip
 
-    weight = found.face_share * (weights.low + (weights.tall - weights.low) * found.tall)
-    score = lay(layers.edges, found.faces_m, found.line_rad, weight, np.pi)
+    score = lay(layers.low, found.faces_m, found.line_rad, found.face_share * (1.0 - found.tall), np.pi)
+    score += lay(layers.tall, found.faces_m, found.line_rad, found.face_share * found.tall, np.pi)
     if layers.shores is not None:
-        score += lay(layers.shores, found.shore_m, found.to_land_rad, weights.shore * found.shore_share, 2.0 * np.pi)
+        score += lay(layers.shores, found.shore_m, found.to_land_rad, found.shore_share, 2.0 * np.pi)
     return score
 
 
@@ -126,36 +120,47 @@ def modes_of(
     found: list[Mode] = []
     spots = np.argwhere(peaks)
     for spot in spots[np.argsort(-log_likelihood[tuple(spots.T)])]:
-        if not free[tuple(spot)] or len(found) == most:
+        if not free[tuple(spot)]:
             continue
+        if len(found) == most or mass[free].sum() < _LEAST_SHARE * total:
+            break
         height = log_likelihood[tuple(spot)]
         labels, _ = ndimage.label(free & (log_likelihood > height - 4.5))
         part = labels == labels[tuple(spot)]
         free &= ~part
         share = float(mass[part].sum() / total) * (1.0 - alien)
-        if share < 0.01:
+        cells = np.nonzero(part)
+        if share < _LEAST_SHARE or _cut_off(spot, cells, mass.shape):
             continue
-        mean, cov = _moments(log_likelihood, np.nonzero(part), mass, grid)
+        mean, cov = _moments(log_likelihood, cells, mass, grid)
         found.append(Mode(mean, cov + np.diag(_FLOOR**2), share))
     return sorted(found, key=lambda m: -m.probability), 1.0 - sum(m.probability for m in found)
+
+
+def _cut_off(spot: NDArray[np.int64], cells: tuple[NDArray[np.int64], ...], shape: tuple[int, ...]) -> bool:
+    """Whether a peak is that of a slope: it lies on a face of the window and is narrow there. The top lies outside."""
+    return any(at in (0, n - 1) and np.ptp(axis) < _NARROW for at, axis, n in zip(spot, cells, shape, strict=True))
 
 
 def _moments(
     log_likelihood: NDArray[np.float32], part: tuple[NDArray[np.int64], ...], mass: Array, grid: Grid
 ) -> tuple[Array, Array]:
-    """Mean (3,) and covariance (3, 3) of a part of the posterior; of a narrow one between cells."""
+    """Mean (3,) and covariance (3, 3) of a part of the posterior; along axes where it is narrow, between cells."""
     low, high = (np.array([f(axis) for axis in part]) for f in (np.min, np.max))
+    narrow = high - low < _NARROW
     cells = np.stack(part).astype(float)
-    if (high - low).max() < _NARROW:
-        low, high = np.maximum(low - 1, 0), np.minimum(high + 1, np.array(mass.shape) - 1)
+    w = mass[part]
+    if narrow.any():
+        low, high = np.maximum(low - narrow, 0), np.minimum(high + narrow, np.array(mass.shape) - 1)
         box = log_likelihood[tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))]
-        steps = [np.linspace(0.0, n - 1.0, (n - 1) * _FINER + 1) for n in box.shape]
+        finer = _FINER if narrow.all() else _FINER - 2  # a long one has cells enough
+        steps = [
+            np.linspace(0.0, n - 1.0, (n - 1) * (finer if k else 1) + 1) for n, k in zip(box.shape, narrow, strict=True)
+        ]
         cells = np.stack(np.meshgrid(*steps, indexing="ij")).reshape(3, -1)
         between = ndimage.map_coordinates(box, cells, order=2, mode="nearest").astype(float)
-        w = np.exp(between - between.max())
+        w = np.exp(between - between.max()) * (between > between.max() - 9.0)
         cells += low[:, None]
-    else:
-        w = mass[part]
     axes = (grid.east_m, grid.north_m, grid.yaw_rad)
     values = np.column_stack(
         [np.interp(at, np.arange(len(axis)), axis) for at, axis in zip(cells[::-1], axes, strict=True)]

@@ -7,20 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy import special
 
 from graphloc.config import AerialConfig
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.frontends.aerial.layers import Layer, Layers
 from graphloc.frontends.aerial.maps import Map
-from graphloc.frontends.aerial.match import Grid, Mode, Weights, grid_around, log_likelihood_of, modes_of
+from graphloc.frontends.aerial.match import Grid, Mode, grid_around, log_likelihood_of, modes_of
 from graphloc.frontends.aerial.scan import LevelCloud, Outline, outline
 from graphloc.measurements import PoseFix, PoseMode
 
-# Fitted by benchmarks/tune_matcher.py on harbours drawn by chance; docs/decisions/0006. Where lines were drawn, what is
-# not on one is likely to be a boat.
-_ON_IMAGE, _ON_LINES = Weights(low=0.88, tall=0.50, shore=1.70), Weights(low=0.74, tall=2.60, shore=1.74)
 _NONE_LOG = 5.0  # the best pose of pure chance is about that much over the mean
-_ALIEN = 0.05  # a scan shows boats that the image does not have, and the reverse
+_CONTRAST = (-3.46, 0.096)  # log-odds of windows with the truth to those without, by tune_matcher.py as well
+_MOST_WITHIN = 0.95  # priors may be wrong, however sure
 _LEAST_PLACES = 30
 _MODES = 5
 
@@ -52,21 +51,22 @@ class Match:
     none: float = 1.0
     why_not: str = ""
 
-    def fix(self, stamp_ns: int, sensor: str, news: float = 1.0) -> PoseFix:
+    def fix(self, stamp_ns: int, sensor: str, news: float = 1.0, axes: tuple[str, ...] = ("x", "y", "yaw")) -> PoseFix:
         """Return the modes as one measurement.
 
         Args:
-            news: share of it that the match before has not told; covariances grow by its inverse.
+            news: share of it that the match before has not told; covariances grow by its inverse. axes: those wanted.
         """
+        picked = [k for k, a in enumerate(("x", "y", "yaw")) if a in axes]
         modes = tuple(
             PoseMode(
-                value=np.array([m.pose[0], m.pose[1], float(wrap_angle(m.pose[2]))]),
-                cov=m.cov / news,
+                value=np.array([m.pose[0], m.pose[1], float(wrap_angle(m.pose[2]))])[picked],
+                cov=m.cov[np.ix_(picked, picked)] / news,
                 probability=m.probability,
             )
             for m in self.modes
         )
-        return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=("x", "y", "yaw"), modes=modes)
+        return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes)
 
 
 class Matcher:
@@ -94,10 +94,25 @@ class Matcher:
         half_m = float(np.clip(3.0 * prior.sigma[:2].max() + 1.0, 2.0, config.window_m))
         half_deg = float(np.clip(np.degrees(3.0 * prior.sigma[2]) + 0.5, 1.0, config.window_deg))
         grid = grid_around(layers, prior.pose, half_m, half_deg)
-        score = log_likelihood_of(found, layers, grid, _ON_LINES if layers.drawn else _ON_IMAGE)
-        modes, none = modes_of(score, grid, _NONE_LOG, _ALIEN, _MODES)
+        score = log_likelihood_of(found, layers, grid)
+        trust = _trust(score, _within(prior.sigma, np.array([half_m, half_m, np.radians(half_deg)])))
+        modes, none = modes_of(score, grid, _NONE_LOG, 1.0 - trust, _MODES)
         why_not = "" if modes else "no pose in the window stands out"
         return Match(prior, found, layers, grid, score, tuple(modes), none, why_not)
+
+
+def _trust(score: Layer, within: float) -> float:
+    """Probability that the truth lies in the window, after the score was seen.
+
+    Windows without the truth have peaks as well, of things that look alike; they stand less high over the mean.
+    """
+    contrast = float(score.max()) - float(score.mean())
+    return float(special.expit(_CONTRAST[0] + _CONTRAST[1] * contrast + special.logit(min(within, _MOST_WITHIN))))
+
+
+def _within(sigma: Array, half: Array) -> float:
+    """Probability that the truth lies in the window, by the prior's sigmas (3,)."""
+    return float(np.prod(special.erf(half / (np.sqrt(2.0) * np.maximum(sigma, 1e-9)))))
 
 
 def _too_little(found: Outline) -> str:

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,9 +22,12 @@ from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
 from graphloc.frontends.bag import TF_STATIC
 from graphloc.frontends.decode import TF, header_stamp_ns
+from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 
+log = logging.getLogger(__name__)
 _JITTER_S = 0.05  # stamps are not a clock
+_TURN_S = 0.5  # scans of several LiDARs farther apart than this are not one
 _STILL_M = 0.2  # a vessel at rest sways as much, and things about it change
 
 
@@ -59,11 +63,12 @@ def match_bag(
     datum: Datum,
     *,
     at_ns: int | None = None,
+    warn: Callable[[str], None] = log.warning,
 ) -> Iterator[Matched]:
     """Match the scans of a bag around a track, as often as the configuration says; or the one nearest to `at_ns` alone.
 
     Args:
-        folder: relative paths of maps count from there.
+        folder: relative paths of maps count from there. warn: is told what is damaged in the bag.
 
     Raises:
         InputError: no LiDAR, a topic that is not there, a mount that no chain leads to, a map that cannot be used.
@@ -82,6 +87,8 @@ def match_bag(
                 item = replace(item, news=_news(before, here, config.alike_m))
                 before = here
             yield item
+        for line in bag.warnings:
+            warn(line)
 
 
 def _news(before: Array | None, here: Array, alike_m: float) -> float:
@@ -102,34 +109,42 @@ def _matcher(config: AerialConfig, folder: Path, datum: Datum) -> Matcher | BLMa
 def _submaps(bag: Bag, config: AerialConfig, track: Trajectory, at_ns: int | None) -> Iterator[list[_Turn]]:
     """The turns that are matched, each with those before it that are laid together with it; newest last."""
     if at_ns is not None:
-        nearest: list[_Turn] = []
-        for turns in _windows(bag, config):
-            if nearest and abs(turns[-1].stamp_ns - at_ns) > abs(nearest[-1].stamp_ns - at_ns):
+        whole = (turns for turns in _windows(bag, config, track) if not turns[-1].why_not)
+        nearest = next(whole, None)
+        for turns in whole:
+            if nearest is None or abs(turns[-1].stamp_ns - at_ns) > abs(nearest[-1].stamp_ns - at_ns):
                 break
             nearest = turns
-        if nearest:
+        if nearest is not None:
             yield nearest
         return
     last: tuple[int, Array] | None = None
-    for turns in _windows(bag, config):
+    for turns in _windows(bag, config, track):
         stamp_ns = turns[-1].stamp_ns
         if turns[-1].why_not:
             yield turns
             continue
-        here = track.at(np.clip(np.array([stamp_ns]), track.stamps_ns[0], track.stamps_ns[-1])).p_world_m[0]
+        here = track.at(np.array([stamp_ns])).p_world_m[0]
         if last is not None:
             waited_s, moved_m = (stamp_ns - last[0]) / 1e9, float(np.hypot(*(here - last[1])[:2]))
-            if waited_s < config.every_s - _JITTER_S or (moved_m < config.every_m and waited_s < config.still_s):
+            too_soon = waited_s < config.every_s - _JITTER_S or (moved_m < config.every_m and waited_s < config.still_s)
+            if waited_s >= 0.0 and too_soon:  # a clock that was set back begins anew
                 continue
         last = (stamp_ns, here)
         yield turns
 
 
-def _windows(bag: Bag, config: AerialConfig) -> Iterator[list[_Turn]]:
+def _windows(bag: Bag, config: AerialConfig, track: Trajectory) -> Iterator[list[_Turn]]:
+    """Each turn with those before it; alone if it cannot be used."""
     window: deque[_Turn] = deque(maxlen=config.submap)
     for turn in _turns(bag, config):
+        stamps = np.array([c.stamp_ns for c in turn.clouds], dtype=np.int64)
         if turn.why_not:
             yield [turn]
+        elif not track.covers(stamps).all():
+            off_s = (stamps - track.stamps_ns[0]) / 1e9
+            names = ", ".join(f"{c.lidar} {t:+.1f} s" for c, t in zip(turn.clouds, off_s, strict=True))
+            yield [_Turn(turn.stamp_ns, [], f"scans outside of the track, from its begin: {names}")]
         else:
             window.append(turn)
             yield list(window)
@@ -182,8 +197,12 @@ def _mounts(bag: Bag, config: AerialConfig, body_frame: str) -> dict[str, tuple[
 
 
 def _turns(bag: Bag, config: AerialConfig) -> Iterator[_Turn]:
-    """Scans that belong together: one of each LiDAR, as they arrive."""
+    """Scans that belong together: the newest of each LiDAR, as soon as there is one of each within `_TURN_S`.
+
+    Where one is silent, or comes less often than that, the others go without it.
+    """
     names = {lidar.topic: name for name, lidar in config.lidars.items()}
+    offset_ns = duration_ns(config.time_offset_s)
     turn: dict[str, Cloud] = {}
 
     def whole() -> _Turn:
@@ -201,7 +220,8 @@ def _turns(bag: Bag, config: AerialConfig) -> Iterator[_Turn]:
             said = str(error) if isinstance(error, ValueError) else f"cannot be decoded ({type(error).__name__})"
             yield _Turn(raw.log_ns, [], f"{raw.topic}: {said}")
             continue
-        if name in turn:
+        cloud = replace(cloud, stamp_ns=cloud.stamp_ns + offset_ns, stamps_ns=cloud.stamps_ns + offset_ns)
+        if any(abs(cloud.stamp_ns - c.stamp_ns) > _TURN_S * 1e9 for n, c in turn.items() if n != name):
             yield whole()
             turn = {}
         turn[name] = cloud

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from graphloc.frames import Datum
 
 _HALF_M = 20037508.342789244  # Web Mercator is a square of twice that: pi * 6378137
 _KINDS = {".png", ".jpg", ".jpeg", ".webp"}
+_NUMBER = re.compile("0|[1-9][0-9]*")
 _DEEPEST = 22  # 2^22 tiles of 256 pixels fill GDAL's 2^31 columns nearly; a pixel is 2 cm at 57 deg
 _FAR_M = 100e3
 _WANTED = "a folder of tiles has z/x/y.png (or jpg, jpeg, webp), Web Mercator, as QGIS and gdal2tiles write them"
@@ -33,27 +33,41 @@ def describe_tiles(folder: Path, datum: Datum) -> str:
     on a tie (which needs a datum within a tile or so of the equator, or tiles of both hemispheres).
 
     Raises:
-        InputError: no such tiles, several kinds of files, or they are more than 100 km from the datum either way.
+        InputError: no such tiles, a part of such a folder, several kinds of files, what cannot be listed, or tiles that
+            are more than 100 km from the datum either way.
     """
-    levels = {int(p.name) for p in _numbered(folder)}
-    zoom = max((z for z in levels if z <= _DEEPEST), default=-1)
-    columns = {int(p.name): p for p in _numbered(folder / str(zoom))} if zoom >= 0 else {}
+    try:
+        return _described(folder, datum)
+    except OSError as error:
+        raise InputError(f"{error.filename or folder}: cannot be listed ({error.strerror})") from None
+
+
+def _described(folder: Path, datum: Datum) -> str:
+    levels = {z: p for z, p in _folders(folder).items() if z <= _DEEPEST}
+    zoom = max(levels, default=0)
+    n: int = 2**zoom
+    columns = {x: p for x, p in _folders(levels[zoom]).items() if x < n} if levels else {}
     if not columns:
-        raise InputError(f"{folder}: no tiles in it: {_WANTED}")
+        raise InputError(f"{folder}: {_part_of(folder) or 'no tiles in it'}: {_WANTED}")
     across, down = _tile_of(datum, zoom)
-    column = min(columns, key=lambda x: abs(x + 0.5 - across))
-    tiles = {int(p.stem): p for p in _numbered(columns[column]) if p.suffix.lower() in _KINDS}
+
+    def columns_off(x: int) -> float:
+        return abs((x + 0.5 - across + 0.5 * n) % n - 0.5 * n)  # the last one is beside the first
+
+    column = min(columns, key=columns_off)
+    found = _tiles(columns[column])
+    tiles = {int(p.stem): p for p in found if int(p.stem) < n}
     if not tiles:
         raise InputError(f"{columns[column]}: no tiles in it: {_WANTED}")
-    kinds = Counter(p.suffix for p in columns[column].iterdir() if p.suffix.lower() in _KINDS)
+    kinds = sorted({p.suffix for p in found})
     if len(kinds) > 1:
         raise InputError(
             f"{columns[column]}: tiles of several kinds ({', '.join(kinds)}): make them one, or an MBTiles file"
         )
-    rows, n = np.array(sorted(tiles)), 2**zoom
+    rows = np.array(sorted(tiles))
     from_top, from_below = (float(np.abs(r + 0.5 - down).min()) for r in (rows, n - 1 - rows))
     tile_m = 2.0 * _HALF_M / n * np.cos(np.radians(datum.origin.latitude_deg))
-    away_m = tile_m * float(np.hypot(column + 0.5 - across, min(from_top, from_below)))
+    away_m = tile_m * float(np.hypot(columns_off(column), min(from_top, from_below)))
     if away_m > max(_FAR_M, 2.0 * tile_m):
         raise InputError(
             f"{folder}: the tile nearest to the datum is {away_m / 1000.0:.0f} km off, with rows from the top as from below: "
@@ -80,12 +94,27 @@ def describe_tiles(folder: Path, datum: Datum) -> str:
     )
 
 
-def _numbered(folder: Path) -> list[Path]:
-    return [p for p in folder.iterdir() if re.fullmatch("[0-9]+", p.stem)]
+def _folders(folder: Path) -> dict[int, Path]:
+    """Folders in it that have a number for a name, as GDAL will write it (16, not 016)."""
+    return {int(p.name): p for p in folder.iterdir() if _NUMBER.fullmatch(p.name) and p.is_dir()}
+
+
+def _tiles(folder: Path) -> list[Path]:
+    return [p for p in folder.iterdir() if _NUMBER.fullmatch(p.stem) and p.suffix.lower() in _KINDS]
+
+
+def _part_of(folder: Path) -> str:
+    """What a folder is that is no whole set of tiles, and what to name instead; empty where it is no part of one."""
+    here = folder.resolve()
+    if _tiles(here):
+        return f"one column of a level of tiles; name the folder above both, {here.parent.parent}"
+    if any(_tiles(p) for p in _folders(here).values()):
+        return f"one level of tiles; name the folder above it, {here.parent}"
+    return ""
 
 
 def _tile_of(datum: Datum, zoom: int) -> tuple[float, float]:
     """Column and row of the datum among the tiles of a level, from the top left, fractional."""
     latitude = np.radians(np.clip(datum.origin.latitude_deg, -85.0, 85.0))
     down = 0.5 - np.arcsinh(np.tan(latitude)) / (2.0 * np.pi)
-    return (datum.origin.longitude_deg / 360.0 + 0.5) * 2**zoom, float(down) * 2**zoom
+    return (datum.origin.longitude_deg / 360.0 + 0.5) % 1.0 * 2**zoom, float(down) * 2**zoom

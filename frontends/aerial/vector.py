@@ -48,6 +48,7 @@ _WATER: dict[str, set[str] | None] = {
 }
 _MOST_BYTES = 200_000_000
 _FAR_M = 50e3
+_HORIZON_M = 1000e3
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +99,8 @@ def read_vector(path: Path, datum: Datum) -> VectorMap:
     """Read a GeoJSON file (RFC 7946: longitude, latitude on WGS 84; heights are not used).
 
     A `crs` member of the older GeoJSON is honoured, with x, y as east, north, as GDAL writes them. Straight in the
-    file is taken for straight in world: 500 m east at 57 deg north bend by less than 1 cm.
+    file is taken for straight in world: 500 m east at 57 deg north bend by less than 1 cm. Pieces longer than 50 km,
+    which bend by 70 m, and those beyond 1000 km from the datum are left out. Longitudes may run from -180 or to 360.
 
     Raises:
         InputError: it cannot be read, is no GeoJSON, has no line, or is farther than 50 km from the datum.
@@ -113,7 +115,8 @@ def read_vector(path: Path, datum: Datum) -> VectorMap:
                 raise ValueError(f"{where}{error}") from None
         if not found.lines:
             raise ValueError(f"no line or polygon in it ({found.points} points): lines are what is matched")
-        p_m = _in_world(np.vstack([line.xy for line in found.lines]), _crs_of(document), datum)
+        p_m, degrees = _in_world(np.vstack([line.xy for line in found.lines]), _crs_of(document), datum)
+        drawn = _segments(found, p_m, degrees)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from None
     except RecursionError:
@@ -122,7 +125,7 @@ def read_vector(path: Path, datum: Datum) -> VectorMap:
         raise InputError(f"{path}: {error}") from None
     if found.points:
         log.info("%s: %d points left out: they are no lines", path, found.points)
-    return _segments(found, p_m)
+    return drawn
 
 
 def _document(path: Path) -> Mapping[str, Any]:
@@ -220,7 +223,7 @@ def _land_of(tags: Mapping[str, str], polygon: bool) -> int:
     """Where land is: 1 on the left, or inside a polygon, -1 opposite, 0 not known."""
     drawn = tags.get("graphloc")
     if drawn is not None and drawn not in ("land", "water"):
-        raise ValueError(f"the property `graphloc` is {drawn!r}: water or land")
+        raise ValueError(f"the property `graphloc` is {drawn[:40]!r}: water or land")
     if not polygon:
         if drawn is not None:
             raise ValueError("the property `graphloc` on a line, which has no inside: draw a polygon")
@@ -239,27 +242,34 @@ def _crs_of(document: Mapping[str, Any]) -> CRS | None:
     if member is None:
         return None
     try:
-        return CRS.from_user_input(member["properties"]["name"])
+        crs = CRS.from_user_input(member["properties"]["name"])
+        Transformer.from_crs(crs, 4326)
+        return crs
     except (ProjError, TypeError, KeyError):
         raise ValueError("its `crs` member names no CRS that is known: export it as WGS 84 (EPSG:4326)") from None
 
 
-def _in_world(xy: Array, crs: CRS | None, datum: Datum) -> Array:
-    """East, north (N, 2) in world of positions (N, 2) as written."""
+def _in_world(xy: Array, crs: CRS | None, datum: Datum) -> tuple[Array, Array]:
+    """Place (N, 3) in world, and degrees (N, 2) east, north of the datum, of positions (N, 2) as written."""
     to_wgs84 = None if crs is None else Transformer.from_crs(crs, 4326, always_xy=True)
 
-    def placed(x: Array, y: Array) -> Array | None:
+    def placed(x: Array, y: Array) -> tuple[Array, Array] | None:
         longitude, latitude = (x, y) if to_wgs84 is None else to_wgs84.transform(x, y)
-        if not ((np.abs(longitude) <= 180.0) & (np.abs(latitude) <= 90.0)).all():
+        if not ((np.abs(longitude) <= 360.0) & (np.abs(latitude) <= 90.0)).all():
             return None
-        return datum.enu_from_geodetic(latitude, longitude, np.full(len(x), datum.origin.height_m))
+        # In (-180, 180], so that both sides of the date line are the same to the last bit.
+        longitude = np.where(longitude > 180.0, longitude - 360.0, longitude)
+        longitude = np.where(longitude <= -180.0, longitude + 360.0, longitude)
+        east = (longitude - datum.origin.longitude_deg + 180.0) % 360.0 - 180.0
+        p = datum.enu_from_geodetic(latitude, longitude, np.full(len(x), datum.origin.height_m))
+        return p, np.column_stack([east, latitude])
 
-    def away(p: Array | None) -> float:
-        return np.inf if p is None else float(np.linalg.norm(p, axis=1).min())
+    def away(found: tuple[Array, Array] | None) -> float:
+        return np.inf if found is None else float(np.linalg.norm(found[0], axis=1).min())
 
     p = placed(xy[:, 0], xy[:, 1])
     if p is not None and away(p) <= _FAR_M:
-        return p[:, :2]
+        return p
     if away(placed(xy[:, 1], xy[:, 0])) <= _FAR_M:
         raise ValueError("looks like latitude, longitude; GeoJSON wants longitude, latitude (x, y)")
     if p is None:
@@ -268,18 +278,30 @@ def _in_world(xy: Array, crs: CRS | None, datum: Datum) -> Array:
     raise ValueError(f"lies {away(p) / 1000.0:.0f} km from the datum: another file, or another `datum:`")
 
 
-def _segments(found: _Found, p_m: Array) -> VectorMap:
+def _segments(found: _Found, p_m: Array, degrees: Array) -> VectorMap:
+    """The pieces of lines through places (N, 3) in world, which are degrees (N, 2) east, north of the datum."""
     lengths = [len(line.xy) for line in found.lines]
     line = np.repeat(np.arange(len(lengths)), lengths)
     of = line[1:][line[1:] == line[:-1]]
-    ends = np.stack([p_m[:-1], p_m[1:]], axis=1)[line[1:] == line[:-1]]
-    step = ends[:, 1] - ends[:, 0]
-    # Twice the area to the left of a ring, from its first point, which keeps the digits.
-    since = ends[:, 0] - p_m[np.cumsum([0, *lengths[:-1]])[of]]
-    area = np.bincount(of, since[:, 0] * step[:, 1] - since[:, 1] * step[:, 0], len(lengths))
+    within = line[1:] == line[:-1]
+    # Twice the area to the left of a ring, from its first point, which keeps the digits; in degrees, as a plane that
+    # touches the Earth shows what is beyond the horizon mirrored.
+    since = degrees[:-1][within] - degrees[np.cumsum([0, *lengths[:-1]])[of]]
+    turn = np.diff(degrees, axis=0)[within]
+    area = np.bincount(of, since[:, 0] * turn[:, 1] - since[:, 1] * turn[:, 0], len(lengths))
     ring = np.array([f.ring for f in found.lines])
     left = (np.array([f.land for f in found.lines]) * np.where(ring, np.sign(area), 1.0))[of]
-    keep = step.any(axis=1) & ~_contradicted(ends, left)
+    length_m = np.linalg.norm(np.diff(p_m, axis=0)[within], axis=1)
+    away_m = np.linalg.norm(p_m, axis=1)
+    useful = (length_m <= _FAR_M) & (np.maximum(away_m[:-1], away_m[1:])[within] <= _HORIZON_M)
+    if not useful.all():
+        log.info("%d pieces of lines left out: longer than 50 km, or beyond 1000 km", (~useful).sum())
+    ends = np.stack([p_m[:-1, :2], p_m[1:, :2]], axis=1)[within]
+    step = ends[:, 1] - ends[:, 0]
+    useful &= step.any(axis=1)
+    if not useful.any():
+        raise ValueError("no piece of its lines has a length of up to 50 km: draw them finer, near the run")
+    keep = useful & ~_contradicted(ends, left)
     to_land = np.arctan2(step[:, 1], step[:, 0]) + np.where(left == 0.0, np.nan, left * 0.5 * np.pi)
     return VectorMap(ends[keep], wrap_angle(to_land[keep]), found.points)
 
