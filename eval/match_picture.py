@@ -26,14 +26,18 @@ _MODES = ((0, 255, 255), (255, 0, 255), (255, 255, 0), (200, 200, 200), (120, 12
 
 
 class Gallery:
-    """Of all matches of a run the best, the worst and the most ambiguous, as pictures."""
+    """Of all matches of a run the best, the worst, the most ambiguous and the first without a mode, as pictures."""
 
     def __init__(self) -> None:
         self._kept: dict[str, tuple[float, str, str, bytes]] = {}
 
     def offer(self, match: Match, sensor: str, at_s: float) -> None:
         """Keep a match where none before was better, worse or more ambiguous."""
-        if match.score is None or not match.modes:
+        if match.score is None:
+            return
+        if not match.modes:
+            if "without a mode" not in self._kept:
+                self._keep("without a mode", 0.0, f"{sensor} at {at_s:.1f} s", match.why_not, match)
             return
         first, *others = match.modes
         off = first.pose[:2] - match.prior.pose[:2]
@@ -48,8 +52,11 @@ class Gallery:
         for what, mark in marks.items():
             if mark > self._kept.get(what, (0.0,))[0]:
                 said = _SAID[what].format(far=far, first=first.probability, second=marks["most ambiguous"])
-                coded = cv2.imencode(".jpg", drawn(match), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
-                self._kept[what] = (mark, f"{sensor} at {at_s:.1f} s", said, coded.tobytes())
+                self._keep(what, mark, f"{sensor} at {at_s:.1f} s", said, match)
+
+    def _keep(self, what: str, mark: float, where: str, said: str, match: Match) -> None:
+        coded = cv2.imencode(".jpg", drawn(match), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+        self._kept[what] = (mark, where, said, coded.tobytes())
 
     def pictures(self) -> list[tuple[str, bytes]]:
         """Return captions and JPEGs; a match that is two of these comes once."""
@@ -96,11 +103,15 @@ def drawn(match: Match) -> Pixels:
         _ellipse(canvas, match, mode.pose, mode.cov[:2, :2], corner, colour)
     canvas = np.hstack([canvas, _heat(match, canvas.shape[0])])
     lines = [
-        f"{m.probability:.2f}  +-{np.sqrt(m.cov[0, 0]):.2f} m east, {np.sqrt(m.cov[1, 1]):.2f} m north"
+        f"{m.probability:.2f}  +-{np.sqrt(m.cov[0, 0]):.2f} m east, {np.sqrt(m.cov[1, 1]):.2f} m north (1 sigma)"
         for m in match.modes
     ]
     for k, (line, colour) in enumerate(
-        zip([*lines, f"{match.none:.2f}  none of them"], (*_MODES[: len(lines)], _PRIOR), strict=True)
+        zip(
+            [*lines, f"{match.none:.2f}  none of them" + ("" if lines else ": scan at the prior"), "prior"],
+            (*_MODES[: len(lines)], (255, 255, 255), _PRIOR),
+            strict=True,
+        )
     ):
         cv2.putText(canvas, line, (12, 28 + 26 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 0, 0), 4, cv2.LINE_AA)
         cv2.putText(canvas, line, (12, 28 + 26 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)

@@ -31,6 +31,8 @@ from graphloc.recording import Progress, Recording
 from graphloc.solution import Solution
 from graphloc.solve import smooth
 
+_FAR_M = 200e3
+
 
 def _quiet(_stage: str, _done: int, _total: int) -> None:
     return None
@@ -125,10 +127,10 @@ def with_matches(
         ]
         found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=damage.append)
         for item in found:
+            if item.match is not None and gallery is not None:
+                gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
             if item.match is not None and item.match.modes:
                 measurements.append(replace(item.match.fix(item.stamp_ns, name, item.news, sensor.axes), seq=seq))
-                if gallery is not None:
-                    gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
             else:
                 rows.append(
                     LedgerRow(
@@ -139,6 +141,7 @@ def with_matches(
             seq += 1
             progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)
         progress("matching", span_s, span_s)
+        damage += _few_matches(name, rows)
     return replace(
         recording,
         measurements=tuple(sorted(measurements, key=lambda m: (m.stamp_ns, m.seq))),
@@ -147,6 +150,15 @@ def with_matches(
         message_count=seq,
         warnings=tuple(dict.fromkeys([*recording.warnings, *damage])),
     )
+
+
+def _few_matches(sensor: str, rows: Sequence[LedgerRow]) -> list[str]:
+    """Say so where most scans of a sensor gave no match."""
+    reasons = Counter(row.reason for row in rows if row.sensor == sensor and row.outcome is Outcome.REJECTED)
+    if reasons.total() < 5:
+        return []
+    ((most, count),) = reasons.most_common(1)
+    return [f"{sensor}: {reasons.total()} scans gave no match, {count} of them: {most}; `graphloc match` shows one"]
 
 
 def match_at(
@@ -162,7 +174,7 @@ def match_at(
     """
     sensors = config.of_kind("aerial")
     if not sensors:
-        raise InputError("no sensor of kind aerial is enabled in vessel.yaml")
+        raise InputError("no sensor of kind aerial is enabled: set `enabled: true` in its block")
     (sensor, *_) = sensors.values()
     datum = choose_datum(recording, config)
     whole = with_synthetic(recording, config, datum)
@@ -170,6 +182,9 @@ def match_at(
     at_ns = int(track.stamps_ns[0]) + round(at_s * 1e9)
     found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, at_ns=at_ns)
     item = next(found, None)
+    span_s = (int(track.stamps_ns[-1]) - int(track.stamps_ns[0])) / 1e9
+    if not 0.0 <= at_s <= span_s:
+        raise InputError(f"{recording.source}: --at {at_s:g}: the run is from 0 to {span_s:.1f} s")
     if item is None or item.match is None:
         raise InputError(
             f"{recording.source}: no match at {at_s:g} s: {item.why_not if item else 'no scan in the bag'}"
@@ -218,7 +233,9 @@ def choose_datum(recording: Recording, config: VesselConfig) -> Datum:
         InputError: none is configured, and there is no fix to take one from, or something is given in world.
     """
     if config.datum is not None:
-        return Datum(config.datum.geodetic)
+        datum = Datum(config.datum.geodetic)
+        _refuse_far_fixes(recording, datum)
+        return datum
     _refuse_world_without_datum(config, recording.source)
     fixes = np.array([m.position for m in recording.measurements if isinstance(m, GnssPosition)][:5])
     if not len(fixes):
@@ -226,6 +243,22 @@ def choose_datum(recording: Recording, config: VesselConfig) -> Datum:
     # Longitudes about the first one, so that fixes on both sides of the date line stay together.
     fixes[:, 1] = fixes[0, 1] + (fixes[:, 1] - fixes[0, 1] + 180.0) % 360.0 - 180.0
     return Datum(Geodetic(*(float(v) for v in np.median(fixes, axis=0))))
+
+
+def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:
+    """A forgotten minus sign puts the datum on the other side of the world, where nothing can be solved.
+
+    Raises:
+        InputError: most fixes lie farther away than any run goes.
+    """
+    fixes = [m.position for m in recording.measurements if isinstance(m, GnssPosition)]
+    if fixes:
+        away_m = np.linalg.norm(datum.enu_from_geodetic(*np.array(fixes).T), axis=1)
+        if np.median(away_m) > _FAR_M:
+            raise InputError(
+                f"{recording.source}: its fixes lie {np.median(away_m) / 1e3:.0f} km from `datum:`, near latitude "
+                f"{fixes[0].latitude_deg:.4f}, longitude {fixes[0].longitude_deg:.4f}: correct the datum"
+            )
 
 
 def _why_no_fix(recording: Recording, config: VesselConfig) -> str:

@@ -152,6 +152,8 @@ def match(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Match one scan to the aerial image, and draw it: scan on image, score, modes."""
+    import numpy as np
+
     from graphloc import app as application
     from graphloc.errors import OutputError
     from graphloc.eval.match_picture import write_picture
@@ -162,13 +164,23 @@ def match(
     show = _progress()
     recording, vessel = application.load(bag, config, show)
     found, _ = application.match_at(recording, vessel, application.Scans(tuple(bag), config.parent), at, show)
-    write_picture(found, out)
+    east, north, yaw = found.prior.pose
+    typer.echo(
+        f"prior: {east:.2f} m east, {north:.2f} m north, heading {float(heading_deg_from_yaw(yaw)):.1f} deg; 1 sigma "
+        f"{found.prior.sigma[:2].max():.2f} m, {np.degrees(found.prior.sigma[2]):.1f} deg"
+    )
     for mode in found.modes:
         east, north, yaw = mode.pose
+        sigma = np.sqrt(np.diagonal(mode.cov))
         typer.echo(
-            f"{mode.probability:.2f}: {east:.2f} m east, {north:.2f} m north, heading {float(heading_deg_from_yaw(yaw)):.1f} deg"
+            f"{mode.probability:.2f}: {east:.2f} m east, {north:.2f} m north, heading {float(heading_deg_from_yaw(yaw)):.1f} deg; "
+            f"1 sigma {sigma[0]:.2f} m, {sigma[1]:.2f} m, {np.degrees(sigma[2]):.1f} deg"
         )
-    typer.echo(f"{found.none:.2f}: none of them\n{out}")
+    typer.echo(f"{found.none:.2f}: none of them" + (f": {found.why_not}" if found.why_not else ""))
+    if found.score is None and found.modes:
+        return  # BL's matcher scores no pose but its own
+    write_picture(found, out)
+    typer.echo(str(out))
 
 
 def _pairs(changes: list[str]) -> dict[str, str]:

@@ -14,27 +14,30 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from graphloc import app, cli
-from graphloc.config import AerialConfig
+from graphloc.config import AerialConfig, LidarConfig
 from graphloc.errors import InputError
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.eval.simulate.harbour import load_harbour
 from graphloc.frames import Array, Datum, Geodetic
-from graphloc.frontends.aerial import Matcher, Prior, match_bag, scans
-from graphloc.frontends.aerial.cloud import Cloud, decode_cloud, level
+from graphloc.frontends._source import RawMessage
+from graphloc.frontends.aerial import Match, Matcher, Prior, match_bag, scans
+from graphloc.frontends.aerial.cloud import CLOUD, Cloud, decode_cloud, level
 from graphloc.frontends.aerial.image import AerialImage, Patch
 from graphloc.frontends.aerial.layers import (
     EDGE_BINS,
     SHORE_BINS,
+    Weights,
     coarse_patch,
     drawn_layers,
     edge_layer,
     find_edges,
     segment_water,
     shore_layer,
+    weighed,
 )
-from graphloc.frontends.aerial.match import Grid, modes_of
+from graphloc.frontends.aerial.match import Grid, Mode, modes_of
 from graphloc.frontends.aerial.scan import LevelCloud, inside, outline
 from graphloc.frontends.aerial.scans import Matched
 from graphloc.frontends.aerial.vector import VectorMap
@@ -393,7 +396,7 @@ def test_one_match_is_drawn(
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"lidars": {}}, "needs lidars"),
+        ({"lidars": {}}, "needs `lidars`"),
         ({"lidars": {"a": {"topic": "/imu/data"}}}, "holds no PointCloud2; such topics: /lidar_1/points"),
         ({"lidars": {"a": {"topic": "/lidar_1/points", "mount": {"tf_frame": "nowhere"}}}}, "no chain from 'base_link' to 'nowhere'"),
         ({"image": "none.tif"}, "not an image"),
@@ -514,10 +517,10 @@ def test_an_image_of_water_alone_gives_nothing(bag: Path, tmp_path: Path) -> Non
 
 def test_a_sensor_without_a_map_is_one_line(bag: Path) -> None:
     sensor, track = aerial(bag, image="")
-    with pytest.raises(InputError, match="needs an image, a vector layer, or both"):
+    with pytest.raises(InputError, match="needs an `image`, a `vector` layer, or both"):
         matched(bag, track, sensor)
     sensor, track = aerial(bag, image="", vector="x.geojson", matcher="bl")
-    with pytest.raises(InputError, match="the matcher 'bl' needs an image"):
+    with pytest.raises(InputError, match="matcher: bl needs an `image`"):
         matched(bag, track, sensor)
 
 
@@ -546,3 +549,114 @@ def test_matches_near_each_other_tell_less(bag: Path) -> None:
     assert second is not None
     np.testing.assert_allclose(first.fix(0, "a", found[0].news).modes[0].cov, first.modes[0].cov)
     np.testing.assert_allclose(second.fix(0, "a", found[1].news).modes[0].cov * found[1].news, second.modes[0].cov)
+
+
+def test_lines_elsewhere_change_nothing(bag: Path, tmp_path: Path) -> None:
+    """One drawn line 130 m away: the image is matched as if it were not there."""
+    datum = Datum(load_harbour("marina").config.datum.geodetic)
+    ends = datum.geodetic_from_enu(np.array([(-20.0, 130.0, 0.0), (0.0, 130.0, 0.0)]))
+    line = {"type": "LineString", "coordinates": ends[:, [1, 0]].tolist()}
+    (tmp_path / "line.geojson").write_text(json.dumps(line))
+    poses = []
+    for vector in ("", str(tmp_path / "line.geojson")):
+        sensor, track = aerial(bag, vector=vector)
+        (item,) = matched(bag, track, sensor, at_ns=int(track.stamps_ns[0]) + 20 * S)
+        assert item.match is not None
+        poses.append(item.match.modes[0].pose)
+    # Layers are kept in 255 parts of the largest weight, which is another one with lines.
+    np.testing.assert_allclose(poses[0][:2], poses[1][:2], atol=0.03)
+
+
+def test_a_prior_that_misses_is_not_followed(bag: Path) -> None:
+    """8 and 20 m beside the truth, and said to be off by 10 m: the window may miss, so nothing in it is sure."""
+    sensor, track = aerial(bag, every_m=6.0)
+    for off in (8.0, 20.0):
+        moved = replace(
+            track, p_world_m=track.p_world_m + np.array([0.6 * off, 0.8 * off, 0.0]), cov=100.0 * np.asarray(track.cov)
+        )  # fmt: skip
+        claims = [m.match.modes[0].probability for m in matched(bag, moved, sensor) if m.match and m.match.modes]
+        assert max(claims, default=0.0) < 0.6
+    claims = [m.match.modes[0].probability for m in matched(bag, track, sensor) if m.match and m.match.modes]
+    assert min(claims) > 0.8
+
+
+def test_a_slope_at_the_windows_edge_is_no_mode() -> None:
+    """The top lies 0.7 m beyond the edge at 5 m: what is in view of it is no pose. A ridge that runs out is one."""
+    g = grid()
+    sigma = np.array([0.3, 0.3, np.radians(0.8)])
+    found, none = modes_of(volume(g, (1.0, np.array([5.7, 0.0, 0.0]), sigma)), g, -30.0, 0.1)
+    assert not found
+    assert none == pytest.approx(1.0)
+    (ridge,), _ = modes_of(volume(g, (1.0, np.array([9.0, 0.02, 0.0]), np.array([20.0, 0.2, 0.01]))), g, -30.0, 0.0)
+    assert np.sqrt(ridge.cov[0, 0]) > 2.5
+    assert ridge.pose[1] == pytest.approx(0.02, abs=0.03)  # between cells where it is narrow
+
+
+def test_one_stamp_of_the_future_costs_one_match(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, count = scans.decode_cloud, iter(range(10**6))
+
+    def sometimes(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
+        return whole(msg, stamp_ns + (3600 * S if next(count) == 52 else 0), lidar)
+
+    sensor, track = aerial(bag, every_m=0.0, still_s=0.5)
+    usual = len(matched(bag, track, sensor))
+    monkeypatch.setattr(scans, "decode_cloud", sometimes)
+    found = matched(bag, track, sensor)
+    (lost,) = [m.why_not for m in found if m.match is None]
+    assert "outside of the track" in lost
+    assert "lidar_3 +36" in lost
+    assert len(found) - 1 >= usual - 1
+
+
+def test_lidar_clocks_can_be_set_right(bag: Path) -> None:
+    sensor, track = aerial(bag, every_m=6.0)
+    later, _ = aerial(bag, every_m=6.0, time_offset_s=0.25)
+    stamps, moved = (next(iter(matched(bag, track, s))).stamp_ns for s in (sensor, later))
+    assert moved - stamps == 250_000_000
+
+
+def test_turns_of_lidars_at_different_rates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One at 3 Hz, one at 1 Hz that falls silent: a turn as soon as there is one of each, else what there is."""
+    fast = [(k / 3.0, "fast") for k in range(15)]
+    slow = [(k + 0.1, "slow") for k in range(3)]
+
+    class Heap:
+        def messages(self, _topics: set[str]) -> list[RawMessage]:
+            return [RawMessage(f"/{n}", CLOUD, b"", int(t * S), "") for t, n in sorted(fast + slow)]  # type: ignore[arg-type]
+
+        def decode(self, raw: RawMessage) -> RawMessage:
+            return raw
+
+    monkeypatch.setattr(scans, "header_stamp_ns", lambda raw: raw.log_ns)
+    monkeypatch.setattr(
+        scans, "decode_cloud",
+        lambda raw, stamp, name: Cloud(name, stamp, np.ones((1, 3)), np.array([stamp], dtype=np.int64)),
+    )  # fmt: skip
+    config = AerialConfig(lidars={n: LidarConfig(topic=f"/{n}") for n in ("fast", "slow")})
+    turns = list(scans._turns(Heap(), config))  # type: ignore[arg-type]  # noqa: SLF001
+    together = [t for t in turns if len(t.clouds) == 2]
+    assert len(together) == 3
+    assert max(abs(t.clouds[0].stamp_ns - t.clouds[1].stamp_ns) for t in together) < 0.4 * S
+    assert turns[-1].stamp_ns > 4.5 * S  # the other one goes on alone
+
+
+def test_some_axes_of_a_match() -> None:
+    mode = Mode(np.array([1.0, 2.0, 0.3]), np.diag([0.1, 0.2, 0.01]), 0.9)
+    match = Match(
+        Prior(np.zeros(3), np.ones(3)), outline(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), None), modes=(mode,)
+    )
+    fix = match.fix(0, "a", 0.5, ("y", "yaw"))
+    np.testing.assert_allclose(fix.modes[0].value, [2.0, 0.3])
+    np.testing.assert_allclose(fix.modes[0].cov, np.diag([0.4, 0.02]))
+    assert fix.axes == ("y", "yaw")
+
+
+def test_sources_are_laid_over_each_other() -> None:
+    """Where two show an edge the larger counts, not the sum; each by its own weight."""
+    patch = Patch(np.zeros((4, 4, 3), np.uint8), np.ones((4, 4), dtype=bool), 0.0, 0.0, 0.25)
+    one, two = np.zeros((2, EDGE_BINS, 4, 4), dtype=np.float32)
+    one[0, 0], two[0, 0, :2] = 1.0, 0.5
+    layers = weighed(patch, [(one, None, Weights(0.8, 0.5, 1.0)), (two, None, Weights(0.7, 2.0, 1.0))], None)
+    np.testing.assert_allclose(layers.unit * layers.low[0, 0], [0.8, 0.8, 0.8, 0.8], atol=0.5 * layers.unit)
+    np.testing.assert_allclose(layers.unit * layers.tall[0, 0], [1.0, 1.0, 0.5, 0.5], atol=0.5 * layers.unit)
+    assert layers.shores is None

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from pathlib import Path
 
@@ -29,6 +30,8 @@ from graphloc.frontends.aerial.layers import (
 from graphloc.frontends.aerial.scan import Outline
 from graphloc.frontends.aerial.vector import VectorMap, read_vector
 
+log = logging.getLogger(__name__)
+
 _CELL_M = 0.25
 _TILE_M = 100.0  # a patch serves all priors of one tile
 _KEPT = 4  # patches, about 50 MB each
@@ -54,9 +57,14 @@ class Map:
         self, config: AerialConfig, folder: Path, datum: Datum, on_image: Weights = ON_IMAGE, on_lines: Weights = ON_LINES
     ) -> None:  # fmt: skip
         if not config.image and not config.vector:
-            raise InputError("sensors: an aerial sensor needs an image, a vector layer, or both")
+            raise InputError("vessel.yaml: an aerial sensor needs an `image`, a `vector` layer, or both")
         self._image = AerialImage(folder / config.image, datum) if config.image else None
         self._drawn = read_vector(folder / config.vector, datum) if config.vector else None
+        if self._drawn is not None and self._image is None and not np.isfinite(self._drawn.to_land_rad).any():
+            log.warning(
+                "%s: none of its lines says on which side land is (docs/aerial.md), so they are no shores",
+                config.vector,
+            )
         self._half_m = config.reach_m + 0.5 * _TILE_M + config.window_m
         self._weights = (on_image, on_lines)
         self._kept: dict[tuple[int, int], Layers] = {}

@@ -102,7 +102,7 @@ def _matcher(config: AerialConfig, folder: Path, datum: Datum) -> Matcher | BLMa
     if config.matcher == "posterior":
         return Matcher(config, folder, datum)
     if not config.image:
-        raise InputError("sensors: the matcher 'bl' needs an image")
+        raise InputError("vessel.yaml: an aerial sensor with matcher: bl needs an `image`")
     return BLMatcher(config, AerialImage(folder / config.image, datum), config.seed)
 
 
@@ -158,7 +158,8 @@ def _one(
     config: AerialConfig,
 ) -> Matched:
     newest = turns[-1]
-    at_ns = int(np.median(np.concatenate([c.stamps_ns for c in newest.clouds] + [np.array([newest.stamp_ns])])))
+    stamps = np.sort(np.concatenate([c.stamps_ns for c in newest.clouds] + [np.array([newest.stamp_ns])]))
+    at_ns = int(stamps[len(stamps) // 2])  # not a median, which goes through floats
     try:
         cloud = level([c for turn in turns for c in turn.clouds], mounts, track, at_ns, config.waterline_m)
         pose = track.at(np.array([at_ns]))
@@ -174,7 +175,7 @@ def _one(
 
 def _mounts(bag: Bag, config: AerialConfig, body_frame: str) -> dict[str, tuple[Array, Array]]:
     if not config.lidars:
-        raise InputError("sensors: an aerial sensor needs lidars: name, topic and mount of each")
+        raise InputError("vessel.yaml: an aerial sensor needs `lidars`: name, topic and mount of each")
     for name, lidar in config.lidars.items():
         have = bag.topics.get(lidar.topic)
         if have is None or CLOUD not in have.msgtypes:
