@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make docs/pictures: LiDAR scans at the true pose over the aerial image, and a tag approach in six conditions."""
+"""Make docs/pictures: LiDAR scans at the true pose over the aerial image, a match, a tag approach."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from _scenes import samples, scratch
 
+from graphloc.eval.match_picture import drawn
 from graphloc.eval.simulate import harbour_scenarios, simulate
 from graphloc.eval.simulate.aerial import grid_from_enu, render
 from graphloc.eval.simulate.camera import Camera
 from graphloc.eval.simulate.lidar import scan, world_points
 from graphloc.eval.simulate.scene import scene_of
 from graphloc.eval.simulate.weather import WEATHER
+from graphloc.frontends.aerial import Matcher
 
 FOLDER = Path(__file__).parent.parent / "docs/pictures"
 SEED = 1
@@ -47,9 +50,18 @@ def conditions(at_s: float, out: Path) -> None:
     cv2.imwrite(str(out), np.vstack([np.hstack(pictures[k : k + 2]) for k in (0, 2, 4)]))
 
 
+def match(scene: str, view: int, out: Path) -> None:
+    folder = scratch()
+    sample = samples(scene, SEED, folder)[view]
+    config = sample.config.model_copy(update={"image": sample.image.name})
+    picture = drawn(Matcher(config, folder, sample.datum).match(sample.clouds[0], sample.prior))
+    cv2.imwrite(str(out), cv2.resize(picture, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA))
+
+
 def main() -> None:
     overlay("bl1-drift", 60.0, FOLDER / "marina.jpg")
     overlay("bl2-drift", 70.0, FOLDER / "basin.jpg")
+    match("crowded", 4, FOLDER / "match.jpg")
     conditions(56.0, FOLDER / "conditions.jpg")
 
 
