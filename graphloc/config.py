@@ -320,7 +320,7 @@ class AerialConfig(AnyPoseConfig):
     """Least way between two matches, m."""
     alike_m: NonNegative = 15.0
     """Matches within this way of each other err alike (the same walls, the same boats), so each tells but a part of
-    news: covariances grow by (1 + r) / (1 - r), r = exp(-way / alike_m); 0: each is news, m."""
+    news: variances grow by (1 + r) / (1 - r), r = exp(-way / alike_m), or less after a while; 0: each is news, m."""
     still_s: Positive = 10.0
     """Time after which there is a match though the vessel has not moved that far, s."""
     window_m: Annotated[Positive, Field(le=50.0)] = 6.5

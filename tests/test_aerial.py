@@ -538,17 +538,23 @@ def test_inspect_drafts_the_lidars(bag: Path, tmp_path: Path) -> None:
 
 
 def test_matches_near_each_other_tell_less(bag: Path) -> None:
-    """Of a first-order Markov process along the way, r = exp(-way / 15 m), a next one tells (1 - r) / (1 + r) of a mean."""
-    sensor, track = aerial(bag, every_m=4.0, still_s=1000.0)
-    found = [m for m in matched(bag, track, sensor) if m.match is not None]
+    """Of a first-order Markov process along the way, r = exp(-way / 15 m), a next one tells (1 - r) / (1 + r) of a mean;
+    of a place that inertial sensors carry for 5 s, of a heading for 60 s."""
+    sensor, track = aerial(bag, every_m=0.0, every_s=3.0)
+    found = [m for m in matched(bag, track, sensor) if m.match is not None and m.match.modes]
     at = np.array([m.match.prior.pose[:2] for m in found if m.match is not None])
-    r = np.exp(-np.hypot(*np.diff(at, axis=0).T) / 15.0)
-    np.testing.assert_allclose([m.news for m in found], [1.0, *((1.0 - r) / (1.0 + r))], rtol=1e-9)
+    way = np.hypot(*np.diff(at, axis=0).T) / 15.0
+    waited_s = np.diff([m.stamp_ns for m in found]) * 1e-9
+    for axis, carried_s in ((0, 5.0), (1, 5.0), (2, 60.0)):
+        r = np.exp(-np.maximum(way, waited_s / carried_s))
+        np.testing.assert_allclose([m.news[axis] for m in found], [1.0, *((1.0 - r) / (1.0 + r))], rtol=1e-6)
     first, second = found[0].match, found[1].match
     assert first is not None
     assert second is not None
     np.testing.assert_allclose(first.fix(0, "a", found[0].news).modes[0].cov, first.modes[0].cov)
-    np.testing.assert_allclose(second.fix(0, "a", found[1].news).modes[0].cov * found[1].news, second.modes[0].cov)
+    np.testing.assert_allclose(
+        np.diagonal(second.fix(0, "a", found[1].news).modes[0].cov) * found[1].news, np.diagonal(second.modes[0].cov)
+    )
 
 
 def test_lines_elsewhere_change_nothing(bag: Path, tmp_path: Path) -> None:
@@ -645,9 +651,9 @@ def test_some_axes_of_a_match() -> None:
     match = Match(
         Prior(np.zeros(3), np.ones(3)), outline(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), None), modes=(mode,)
     )
-    fix = match.fix(0, "a", 0.5, ("y", "yaw"))
+    fix = match.fix(0, "a", (1.0, 0.5, 0.25), ("y", "yaw"))
     np.testing.assert_allclose(fix.modes[0].value, [2.0, 0.3])
-    np.testing.assert_allclose(fix.modes[0].cov, np.diag([0.4, 0.02]))
+    np.testing.assert_allclose(fix.modes[0].cov, np.diag([0.4, 0.04]))
     assert fix.axes == ("y", "yaw")
 
 

@@ -51,17 +51,25 @@ class Match:
     none: float = 1.0
     why_not: str = ""
 
-    def fix(self, stamp_ns: int, sensor: str, news: float = 1.0, axes: tuple[str, ...] = ("x", "y", "yaw")) -> PoseFix:
+    def fix(
+        self,
+        stamp_ns: int,
+        sensor: str,
+        news: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        axes: tuple[str, ...] = ("x", "y", "yaw"),
+    ) -> PoseFix:
         """Return the modes as one measurement.
 
         Args:
-            news: share of it that the match before has not told; covariances grow by its inverse. axes: those wanted.
+            news: shares of east, north, yaw that the match before has not told; variances grow by their inverse.
+            axes: those wanted.
         """
+        wider = 1.0 / np.sqrt(np.outer(news, news))
         picked = [k for k, a in enumerate(("x", "y", "yaw")) if a in axes]
         modes = tuple(
             PoseMode(
                 value=np.array([m.pose[0], m.pose[1], float(wrap_angle(m.pose[2]))])[picked],
-                cov=m.cov[np.ix_(picked, picked)] / news,
+                cov=(wider * m.cov)[np.ix_(picked, picked)],
                 probability=m.probability,
             )
             for m in self.modes

@@ -28,7 +28,7 @@ from graphloc.trajectory import Trajectory
 log = logging.getLogger(__name__)
 _JITTER_S = 0.05  # stamps are not a clock
 _TURN_S = 0.5  # scans of several LiDARs farther apart than this are not one
-_STILL_M = 0.2  # a vessel at rest sways as much, and things about it change
+_CARRIED_S = (5.0, 60.0)  # how long inertial sensors carry a place, and a heading, to a match's accuracy
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,13 +36,13 @@ class Matched:
     """A match and its stamp; or why there is none.
 
     Attributes:
-        news: share of it that the match before has not told (`AerialConfig.alike_m`).
+        news: (3,) shares of its east, north and yaw that the match before has not told (`AerialConfig.alike_m`).
     """
 
     stamp_ns: int
     match: Match | None
     why_not: str
-    news: float = 1.0
+    news: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,14 +76,14 @@ def match_bag(
     with Bag(paths) as bag:
         mounts = _mounts(bag, config, body_frame)
         matcher = _matcher(config, folder, datum)
-        before: Array | None = None
+        before: tuple[Array, int] | None = None
         for turns in _submaps(bag, config, track, at_ns):
             if turns[-1].why_not:
                 yield Matched(turns[-1].stamp_ns, None, turns[-1].why_not)
                 continue
             item = _one(matcher, turns, mounts, track, config)
             if item.match is not None and item.match.modes:
-                here = item.match.prior.pose[:2]
+                here = (item.match.prior.pose[:2], item.stamp_ns)
                 item = replace(item, news=_news(before, here, config.alike_m))
                 before = here
             yield item
@@ -91,11 +91,17 @@ def match_bag(
             warn(line)
 
 
-def _news(before: Array | None, here: Array, alike_m: float) -> float:
-    """What a match adds to a mean, were errors a first-order Markov process along the way: (1 - r) / (1 + r)."""
+def _news(before: tuple[Array, int] | None, here: tuple[Array, int], alike_m: float) -> tuple[float, float, float]:
+    """What a match adds to a mean, were errors a first-order Markov process along the way: (1 - r) / (1 + r).
+
+    The mean is over what inertial sensors carry: what was known of a place is forgotten sooner than a heading.
+    """
     if before is None or alike_m == 0.0:
-        return 1.0
-    return float(np.tanh(0.5 * max(np.hypot(*(here - before)), _STILL_M) / alike_m))
+        return (1.0, 1.0, 1.0)
+    way = float(np.hypot(*(here[0] - before[0]))) / alike_m
+    waited_s = abs(here[1] - before[1]) / 1e9
+    place, heading = (float(np.tanh(0.5 * max(way, waited_s / carried_s))) for carried_s in _CARRIED_S)
+    return (place, place, heading)
 
 
 def _matcher(config: AerialConfig, folder: Path, datum: Datum) -> Matcher | BLMatcher:
