@@ -179,12 +179,12 @@ def match_at(
     datum = choose_datum(recording, config)
     whole = with_synthetic(recording, config, datum)
     track = smooth(whole, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress).trajectory
-    at_ns = int(track.stamps_ns[0]) + round(at_s * 1e9)
-    found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, at_ns=at_ns)
-    item = next(found, None)
     span_s = (int(track.stamps_ns[-1]) - int(track.stamps_ns[0])) / 1e9
     if not 0.0 <= at_s <= span_s:
         raise InputError(f"{recording.source}: --at {at_s:g}: the run is from 0 to {span_s:.1f} s")
+    at_ns = int(track.stamps_ns[0]) + round(at_s * 1e9)
+    found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, at_ns=at_ns)
+    item = next(found, None)
     if item is None or item.match is None:
         raise InputError(
             f"{recording.source}: no match at {at_s:g} s: {item.why_not if item else 'no scan in the bag'}"

@@ -42,8 +42,9 @@ class Outline:
 
     Attributes:
         faces_m: (M, 2) cells of faces. line_rad: (M,) direction of the line through each. tall: (M,) 1 where it
-            rises higher than a boat, 0 where not. face_share: (M,) what each counts. shore_m: (K, 2) first things behind water. to_land_rad: (K,) away from the sensor. shore_share:
-            (K,) what each counts. water_m: (L, 2) places that were seen to be free water.
+            rises higher than a boat, 0 where not. face_share: (M,) what each counts. shore_m: (K, 2) first things
+            behind water. to_land_rad: (K,) away from the sensor. shore_share: (K,) what each counts. water_m: (L, 2)
+            places that were seen to be free water.
     """
 
     faces_m: Array
@@ -73,16 +74,16 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
     # A face is hit at several heights; a roof or a quay's deck, seen at a grazing angle, is not.
     face = (high - low > 0.25) & (count >= 3)
     at = cells[face]
-    direction = _line_directions(at, _NEAR_M)
+    direction, share = _lines(at, _NEAR_M)
     shore, to_land = _first_returns(p[dry], origin[dry], low_limit=2.5)
     return Outline(
         faces_m=at,
         line_rad=direction,
         tall=np.clip(high[face] - _BOAT_M, 0.0, 1.0),
-        face_share=_shares(at, direction, _NEAR_M),
+        face_share=share,
         shore_m=shore,
         to_land_rad=to_land,
-        shore_share=_shares(shore, _line_directions(shore, 2.0 * _NEAR_M), 2.0 * _NEAR_M),
+        shore_share=_lines(shore, 2.0 * _NEAR_M)[1],
         water_m=_free_water(shore, to_land, p[~dry]),
     )
 
@@ -110,37 +111,25 @@ def _columns(p: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
     return total / count[:, None], np.minimum.reduceat(z, begin), np.maximum.reduceat(z, begin), count
 
 
-def _line_directions(at: Array, near_m: float) -> Array:
-    """Direction (M,) of the line through each place and its neighbours."""
-    if len(at) < 2:
-        return np.zeros(len(at))
-    i, j = _neighbours(at, near_m)
-    d = at[j] - at[i]
-    xx, xy, yy = (np.bincount(i, v, len(at)) for v in (d[:, 0] ** 2, d[:, 0] * d[:, 1], d[:, 1] ** 2))
-    return np.asarray(0.5 * np.arctan2(2.0 * xy, xx - yy))
+def _lines(at: Array, near_m: float) -> tuple[Array, Array]:
+    """Direction (M,) of the line through each place and its neighbours, and what each place counts (M,).
 
-
-def _shares(at: Array, direction: Array, near_m: float) -> Array:
-    """What each place counts (M,): 1 / sqrt(number of those on its line).
-
-    Places of one wall are right or wrong together: a wall of a hundred tells more than a boat's side of nine, but not
-    eleven times as much.
+    It counts 1 / sqrt(number of those on its line): places of one wall are right or wrong together, so a wall of a
+    hundred tells more than a boat's side of nine, but not eleven times as much.
     """
     if len(at) < 2:
-        return np.ones(len(at))
-    i, j = _neighbours(at, near_m)
+        return np.zeros(len(at)), np.ones(len(at))
+    pairs = cKDTree(at).query_pairs(near_m, output_type="ndarray")
+    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
     d = at[j] - at[i]
+    xx, xy, yy = (np.bincount(i, v, len(at)) for v in (d[:, 0] ** 2, d[:, 0] * d[:, 1], d[:, 1] ** 2))
+    direction = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     turned = np.abs(np.mod(direction[i] - direction[j] + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
     aside = np.abs(d[:, 1] * np.cos(direction[i]) - d[:, 0] * np.sin(direction[i]))
     on_it = (turned < _SAME_LINE_RAD) & (aside < _SAME_LINE_M)
     joined = coo_matrix((np.ones(int(on_it.sum())), (i[on_it], j[on_it])), shape=(len(at), len(at)))
     _, line = connected_components(joined, directed=False)
-    return np.asarray(1.0 / np.sqrt(np.bincount(line)[line]))
-
-
-def _neighbours(at: Array, near_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    pairs = cKDTree(at).query_pairs(near_m, output_type="ndarray")
-    return np.concatenate([pairs[:, 0], pairs[:, 1]]), np.concatenate([pairs[:, 1], pairs[:, 0]])
+    return np.asarray(direction), np.asarray(1.0 / np.sqrt(np.bincount(line)[line]))
 
 
 def _first_returns(p: Array, origin: Array, low_limit: float) -> tuple[Array, Array]:
