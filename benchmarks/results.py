@@ -17,6 +17,7 @@ from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
 from typing import Any
 
+import docking
 import matcher
 import simulator
 import smoothing
@@ -38,6 +39,9 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "C.3": matcher.honesty,
     "C.4": matcher.runs,
     "C.5": matcher.speed,
+    "D.1": docking.docking,
+    "D.3": docking.cut,
+    "D.4": docking.single_tags,
 }
 
 
@@ -116,7 +120,8 @@ def main() -> None:
     for item in arguments.only.split(","):
         with ProcessPoolExecutor(arguments.jobs) as pool:
             rows = FIGURES[item](pool)
-        results["figures"] = [f for f in results["figures"] if f["item"] != item] + rows
+        made = {item, *(r["item"] for r in rows)}
+        results["figures"] = [f for f in results["figures"] if f["item"] not in made] + rows
         results["figures"].sort(key=lambda f: f["item"])
         path.write_text(json.dumps(results, indent=1) + "\n")
         (ROOT / "docs/results.md").write_text(render(results))

@@ -20,10 +20,19 @@ from scipy.stats import chi2
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig
 from graphloc.errors import SolveError
-from graphloc.frames import Array, Datum, wrap_angle
+from graphloc.frames import Array, Datum, skew, wrap_angle
 from graphloc.ledger import Ledger, LedgerRow, Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, Measurement, PoseFix
+from graphloc.measurements import (
+    CompassHeading,
+    GnssPosition,
+    GnssVelocity,
+    Measurement,
+    PoseFix,
+    PoseMode,
+    TagSighting,
+)
 from graphloc.recording import Recording
+from graphloc.survey import Survey
 from graphloc.time import NS_PER_S, seconds_since
 from graphloc.trajectory import Trajectory
 
@@ -123,10 +132,34 @@ def _events(recording: Recording, config: VesselConfig) -> list[_Event]:
     events = []
     for m in recording.measurements:
         sensor = config.sensors.get(m.sensor)
+        if isinstance(m, TagSighting) and sensor:
+            m = as_pose(m, sensor.surveyed)
         if isinstance(m, GnssPosition | GnssVelocity | CompassHeading | PoseFix) and sensor and sensor.enabled:
             t, R = mount_of(m.sensor, sensor, recording)
             events.append(_Event(m, t, float(np.arctan2(R[1, 0], R[0, 0]))))
     return events
+
+
+def as_pose(m: TagSighting, survey: Survey) -> PoseFix:
+    """Return the planar poses of the body that a sighting of tags gives, likeliest first.
+
+    With t from the camera to the tags' middle, the place is c - t: what its own error and that of the attitude make of
+    it. A dock is as likely here as there within what it wanders.
+    """
+    modes, dock = [], survey.dock(m.frame)
+    for mode in m.modes:
+        R = mode.R_world_camera @ m.R_body_camera.T
+        arm = R @ m.t_body_camera_m + m.points_m.mean(axis=0) - mode.p_world_camera_m  # from the body to the tags
+        J = np.zeros((3, 6))
+        J[:2, :3] = -mode.R_world_camera[:2]
+        J[:2, 3:], J[2, 3:] = (skew(arm) @ mode.R_world_camera)[:2], mode.R_world_camera[2]
+        cov = J @ mode.cov @ J.T + np.diag([1e-4, 1e-4, 1e-6])
+        if dock is not None:
+            cov += np.diag([dock.moves_m**2 / 4.0] * 2 + [np.radians(dock.moves_deg) ** 2 / 4.0])
+        p = mode.p_world_camera_m - R @ m.t_body_camera_m
+        yaw = float(np.arctan2(R[1, 0], R[0, 0]))
+        modes.append(PoseMode(value=np.array([p[0], p[1], yaw]), cov=cov, probability=mode.probability))
+    return PoseFix(stamp_ns=m.stamp_ns, sensor=m.sensor, seq=m.seq, axes=("x", "y", "yaw"), modes=tuple(modes))
 
 
 def _start(events: list[_Event], recording: Recording, datum: Datum) -> Array:

@@ -3,21 +3,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from graphloc.eval.ekf import FilterResult
+from graphloc.eval.ekf import FilterResult, as_pose
 from graphloc.eval.metrics import Levers, errors, held_out_errors
 from graphloc.frames import Array, Datum
 from graphloc.ledger import LedgerRow
-from graphloc.measurements import GnssPosition, Measurement, PoseFix
+from graphloc.measurements import GnssPosition, Measurement, PoseFix, TagSighting
 from graphloc.outputs import bounds_95
 from graphloc.recording import Recording
-from graphloc.solution import Health, Solution
+from graphloc.solution import Health, SlowEstimate, Solution
+from graphloc.survey import Survey
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory
 
@@ -52,13 +53,15 @@ def _place(m: Measurement, row: LedgerRow | None, datum: Datum) -> Array | None:
         return datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0, :2]
     if isinstance(m, PoseFix) and m.axes[:2] == ("x", "y"):
         return np.asarray(m.modes[row.mode if row and row.mode is not None else 0].value[:2])
+    if isinstance(m, TagSighting):
+        return np.asarray(as_pose(m, Survey()).modes[row.mode if row and row.mode is not None else 0].value[:2])
     return None
 
 
 def _hover(row: LedgerRow) -> str:
     residual = "" if row.residual_m is None else f"<br>residual {row.residual_m:.2f} m"
     weight = "" if row.weight is None else f"<br>weight {row.weight:.2f}"
-    reason = row.reason.replace("<", "&lt;")
+    reason = "<br>".join(t.replace("<", "&lt;") for t in (row.detail, row.reason) if t)
     return f"{row.sensor}: {row.outcome.value}{weight}{residual}<br>{utc_text(row.stamp_ns)}<br>{reason}"
 
 
@@ -221,10 +224,22 @@ def _keyed(names: Sequence[str]) -> str:
     return ", ".join(f'<span style="color:{COLOURS[k]}">{name}</span>' for k, name in enumerate(names))
 
 
+def _slow_panels(
+    sensor: str, e: SlowEstimate
+) -> Iterator[tuple[str, NDArray[np.int64], Array, Array | None, tuple[str, ...]]]:
+    """A panel for each unit, of three axes at most."""
+    for unit in dict.fromkeys(e.units):
+        every = [k for k, u in enumerate(e.units) if u == unit]
+        for n in range(0, len(every), 3):
+            some = every[n : n + 3]
+            title = f"{sensor}: {e.name}, {unit}"
+            yield title, e.stamps_ns, e.value[:, some], 1.96 * e.sigma[:, some], tuple(e.axes[k] for k in some)
+
+
 def slow_over_time(solution: Solution) -> go.Figure:
     """Estimated slow states (GNSS error, compass offset) with 95 % bands, and IMU biases."""
     panels: list[tuple[str, NDArray[np.int64], Array, Array | None, tuple[str, ...]]] = [
-        (f"{s}: {e.name}, {e.unit}", e.stamps_ns, e.value, 1.96 * e.sigma, e.axes) for s, e in solution.slow.items()
+        panel for sensor, estimate in solution.slow.items() for panel in _slow_panels(sensor, estimate)
     ]
     stamps, axes = solution.trajectory.stamps_ns, ("x", "y", "z")
     panels.append(("gyro bias, deg/s", stamps, np.degrees(solution.gyro_bias_radps), None, axes))

@@ -58,11 +58,11 @@ def slow(config: AerialConfig) -> SlowProcess | None:
         return None
     return SlowProcess(
         name="image offset",
-        unit="m",
-        scale=1.0,
         axes=("east", "north"),
+        units=("m", "m"),
+        scale=np.ones(2),
         sigma=np.full(2, config.image_sigma_m),
-        time_constant_s=float("inf"),
+        time_constant_s=np.full(2, np.inf),
     )
 
 

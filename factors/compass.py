@@ -66,11 +66,11 @@ def slow(config: CompassConfig) -> SlowProcess | None:
         return None
     return SlowProcess(
         name="compass offset",
-        unit="deg",
-        scale=180.0 / np.pi,
         axes=("yaw",),
+        units=("deg",),
+        scale=np.array([180.0 / np.pi]),
         sigma=np.radians([config.mount_offset_sigma_deg]),
-        time_constant_s=float("inf"),
+        time_constant_s=np.array([np.inf]),
     )
 
 

@@ -84,11 +84,11 @@ def slow(config: GnssConfig) -> SlowProcess | None:
         return None
     return SlowProcess(
         name="GNSS error",
-        unit="m",
-        scale=-1.0,
         axes=("east", "north", "up"),
+        units=("m", "m", "m"),
+        scale=np.full(3, -1.0),
         sigma=np.array([s.horizontal_sigma_m, s.horizontal_sigma_m, s.vertical_sigma_m]),
-        time_constant_s=s.time_constant_s,
+        time_constant_s=np.full(3, s.time_constant_s),
         jumps=s.jumps,
         needs_company=s.enabled is None,
     )

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Height prior: a vessel floats.
 
-    z = (p + R l)_up + d^2 / 2 R_earth + w,   w ~ N(0, s^2)
+    z = (p + R l)_up + d^2 / 2 R_earth - t + w,   w ~ N(0, s^2)
 
 p, R: state in world; l: body origin from it; d: horizontal distance from the datum, below whose tangent
-plane the sea falls off (2 m at 5 km), taken from the estimate at every pass. A native `GPSFactorArm`
-whose horizontal sigmas are 1 km wide.
+plane the sea falls off (2 m at 5 km), taken from the estimate at every pass; t: how far tide and load hold the vessel
+above what is configured, a slow state (taken for noise, a tide of 0.2 m is refuted 120 times in two minutes, and bends
+what tags on a quay say of the height). Without it a native `GPSFactorArm` whose horizontal sigmas are 1 km wide.
 """
 
 from __future__ import annotations
@@ -16,14 +17,16 @@ import gtsam
 import numpy as np
 
 from graphloc.config import HeightConfig
+from graphloc.factors._linear import linear_update
 from graphloc.factors._noise import robust
 from graphloc.frames import Array, Datum
-from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor
+from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import HeightPrior
 from graphloc.time import duration_ns
 
 _WIDE_M = 1e3
 _EARTH_M = 6_371_000.0
+_TIDE_S = 6.0 * 3600.0
 
 
 def _fall_m(p_world_m: Array) -> float:
@@ -35,7 +38,8 @@ def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Res
     """Residual predicted - expected (1,) in m."""
     lever = np.asarray(at.T_state_sensor.translation())
     point = at.T_world_body.transformFrom(lever)
-    raw = np.array([point[2] + _fall_m(point) - m.height_m])
+    tide = 0.0 if at.slow_value is None else float(at.slow_value[0])
+    raw = np.array([point[2] + _fall_m(point) - tide - m.height_m])
 
     def jacobian() -> Array:
         up = at.T_world_body.rotation().matrix()[2]
@@ -55,6 +59,13 @@ def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Res
 
 def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one height."""
+    if at.slow_key is not None:
+        (residual,) = residuals(m, config, at)
+        terms = [
+            (at.pose_key, at.T_world_body, residual.jacobian()),
+            (at.slow_key, np.array(at.slow_value), -np.eye(1)),
+        ]
+        return linear_update(residual, terms, decision)
     sigmas = np.array([_WIDE_M, _WIDE_M, m.sigma_m / np.sqrt(decision.weight)])
     model = robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas), decision.kernel)
     lever = np.asarray(at.T_state_sensor.translation())
@@ -66,8 +77,23 @@ def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Deci
 def ideal(at: Attachment, config: HeightConfig) -> HeightPrior:
     """Return the height that the attachment's estimate would give."""
     point = at.T_world_body.transformFrom(at.T_state_sensor.translation())
-    height_m = float(point[2]) + _fall_m(point)
+    tide = 0.0 if at.slow_value is None else float(at.slow_value[0])
+    height_m = float(point[2]) + _fall_m(point) - tide
     return HeightPrior(stamp_ns=0, sensor="height", seq=0, height_m=height_m, sigma_m=config.sigma_m)
+
+
+def slow(config: HeightConfig) -> SlowProcess | None:
+    """Return how far tide and load may hold the vessel above or below the configured height."""
+    if config.tide_sigma_m == 0.0:
+        return None
+    return SlowProcess(
+        name="tide and load",
+        axes=("up",),
+        units=("m",),
+        scale=np.ones(1),
+        sigma=np.array([config.tide_sigma_m]),
+        time_constant_s=np.array([_TIDE_S]),
+    )
 
 
 def synthetic(name: str, config: HeightConfig, span_ns: Sequence[int], height_m: float) -> list[HeightPrior]:
@@ -89,5 +115,6 @@ ROW = Sensor(
     factors=factors,
     ideal=ideal,
     hint=hint,
+    slow=slow,
     synthetic=synthetic,
 )

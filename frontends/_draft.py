@@ -14,7 +14,7 @@ from graphloc.frontends._reports import (
     GnssReport,
     ImuReport,
     Inspection,
-    LidarReport,
+    MountedTopic,
     OdometryReport,
     VelocityReport,
 )
@@ -64,11 +64,13 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         ]
     if inspection.lidars:
         yield _aerial_block(inspection.lidars)
+    if inspection.cameras:
+        yield _tags_block(inspection.cameras)
     if inspection.gnss:
         yield ["height:", "  enabled: false  # guess: set to true for a craft that floats"]
 
 
-def _aerial_block(lidars: tuple[LidarReport, ...]) -> list[str]:
+def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
     lines = [
         "aerial:",
         "  kind: aerial",
@@ -87,6 +89,33 @@ def _aerial_block(lidars: tuple[LidarReport, ...]) -> list[str]:
         else:
             lines.append(
                 f"      mount: {{xyz_m: [0.0, 0.0, 0.0]}}  # guess: where '{lidar.frame_id}' sits is not in the bag; measure it"
+            )
+    return lines
+
+
+def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
+    lines = [
+        "tags:",
+        "  kind: apriltag",
+        "  enabled: false  # guess: true once there is a survey of the tags",
+        "  survey: tags.yaml  # which tags stand where, and how large they are: docs/tags.md",
+        "  cameras:",
+    ]
+    for k, camera in enumerate(cameras):
+        lines.append(f"    {_numbered('camera', k)}:")
+        lines.append(f"      topic: {camera.topic}")
+        if camera.info_topic:
+            lines.append(f"      info_topic: {camera.info_topic}")
+        else:
+            lines.append("      info_topic: ''  # guess: there is no CameraInfo beside it; name its topic")
+        if camera.tf_frame is not None:
+            lines.append(
+                f"      mount: {{tf_frame: {json.dumps(camera.tf_frame)}}}  # /tf_static knows it; it must be the optical frame"
+            )
+        else:
+            lines.append(
+                f"      mount: {{xyz_m: [0.0, 0.0, 0.0], rpy_deg: [-90.0, 0.0, -90.0]}}  # guess: '{camera.frame_id}' looks "
+                "ahead; where it sits is not in the bag; measure it"
             )
     return lines
 

@@ -148,12 +148,18 @@ class OdometryReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LidarReport:
-    """A topic of clouds: the frame of its first one; `tf_frame`: the same where /tf_static leads to it, else None."""
+class MountedTopic:
+    """A topic of clouds or images: the frame of its first message.
+
+    Attributes:
+        tf_frame: the same where /tf_static leads to it, else None. info_topic: a camera's CameraInfo where one lies beside
+            it, else ''.
+    """
 
     topic: str
     frame_id: str
     tf_frame: str | None
+    info_topic: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,7 +173,8 @@ class Inspection:
     compasses: tuple[CompassReport, ...] = ()
     odometry: tuple[OdometryReport, ...] = ()
     velocities: tuple[VelocityReport, ...] = ()
-    lidars: tuple[LidarReport, ...] = ()
+    lidars: tuple[MountedTopic, ...] = ()
+    cameras: tuple[MountedTopic, ...] = ()
     tf_frames: tuple[str, ...] = ()
     body_frame: str = "base_link"
     warnings: tuple[str, ...] = ()

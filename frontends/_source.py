@@ -36,6 +36,28 @@ HINTS = {
 }
 
 
+# Types outside of rosbags' stores; bags of ROS 2 Humble and older in sqlite3 carry no definitions.
+_OTHER_TYPES = {
+    "apriltag_msgs/msg/AprilTagDetectionArray": f"""std_msgs/Header header
+AprilTagDetection[] detections
+{"=" * 80}
+MSG: apriltag_msgs/AprilTagDetection
+string family
+int32 id
+int32 hamming
+float32 goodness
+float32 decision_margin
+Point centre
+Point[4] corners
+float64[9] homography
+{"=" * 80}
+MSG: apriltag_msgs/Point
+float64 x
+float64 y
+""",
+}
+
+
 class RawMessage(NamedTuple):
     """A message as recorded: nothing is decoded yet."""
 
@@ -224,7 +246,10 @@ class Bag:
                     f"{self.name}: its definition of {msgtype} cannot be read ({_text(error)}); the standard one is used"
                 )
             break
-        return get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.LATEST)
+        store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.LATEST)
+        if msgtype in _OTHER_TYPES:
+            store.register(get_types_from_msg(_OTHER_TYPES[msgtype], msgtype))
+        return store
 
 
 def _types_from_idl(text: str, _msgtype: str) -> Typesdict:

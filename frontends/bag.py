@@ -18,6 +18,7 @@ from graphloc.config import VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends._beside import Beside, check_speed, true_trajectory
+from graphloc.frontends._mounts import TF_STATIC
 from graphloc.frontends._readings import (
     Readings,
     clock_warnings,
@@ -44,7 +45,6 @@ from graphloc.measurements import ImuSeries, Measurement
 from graphloc.recording import Progress, Recording
 from graphloc.time import duration_ns, utc_text
 
-TF_STATIC = "/tf_static"
 _REPORT_EVERY = 2000  # messages between two calls of `progress`
 
 

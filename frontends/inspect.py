@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from graphloc.frontends._reports import (
     GnssReport,
     ImuReport,
     Inspection,
-    LidarReport,
+    MountedTopic,
     MountGuess,
     OdometryReport,
     TopicReport,
@@ -42,6 +42,8 @@ from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import IMU, NAV_SAT_FIX, ODOMETRY, PLAIN_TWIST, POSE, QUATERNION, TWIST
+from graphloc.frontends.tags.listed import LISTS
+from graphloc.frontends.tags.sightings import IMAGES, INFO, info_beside
 from graphloc.time import utc_text
 
 __all__ = [
@@ -58,7 +60,7 @@ __all__ = [
     "render",
 ]
 
-_MOST_TRIED = 200  # clouds of a topic that cannot be decoded
+_MOST_TRIED = 200  # messages of a topic that cannot be decoded
 
 
 def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
@@ -73,7 +75,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     with Bag(paths) as bag:
         topics = bag.topics
         streams, tree = read_streams(bag)
-        clouds = _cloud_frames(bag)
+        clouds = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
+        images = _frames_of(bag, _pictures(bag))
         source, warnings = bag.name, tuple(bag.warnings)
     by_topic = {s.topic: s for s in streams}
     filled = [s for s in streams if len(s)]
@@ -108,24 +111,41 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         compasses=tuple(c for s in candidates if (c := compass_report(s, courses, turning))),
         odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first, antenna)) for s in poses),
         velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
-        lidars=tuple(
-            LidarReport(topic=topic, frame_id=frame, tf_frame=frame if tree.resolve(body, frame) else None)
-            for topic, frame in sorted(clouds.items())
-        ),
+        lidars=_mounted(clouds, tree, body),
+        cameras=_mounted(images, tree, body, {t.topic for t in topics.values() if INFO in t.msgtypes}),
         tf_frames=tree.frames,
         body_frame=body,
         warnings=(*warnings, *_useless(streams, {g.topic for g in found_gnss} | {i.topic for i in found_imus})),
     )
 
 
-def _cloud_frames(bag: Bag) -> dict[str, str]:
-    """The frame of the first readable cloud of each topic, if that is among the first 200.
+def _mounted(
+    frames: Mapping[str, str], tree: StaticTree, body: str, infos: Container[str] = ()
+) -> tuple[MountedTopic, ...]:
+    found = []
+    for topic, frame in sorted(frames.items()):
+        beside = info_beside(topic)
+        tf_frame = frame if tree.resolve(body, frame) else None
+        info = beside if beside in infos else ""
+        found.append(MountedTopic(topic=topic, frame_id=frame, tf_frame=tf_frame, info_topic=info))
+    return tuple(found)
 
-    Each topic is read by itself, so that one without messages, or with none that is readable, does not unpack the
-    clouds of the others to the end of the bag.
+
+def _pictures(bag: Bag) -> list[str]:
+    """Topics that tags may be seen in: of one camera the compressed images, where there are two kinds; no depth."""
+    kinds = (*IMAGES, *LISTS)
+    every = [t.topic for t in bag.topics.values() if set(kinds) & set(t.msgtypes) and t.messages]
+    return [t for t in every if f"{t}/compressed" not in every and "depth" not in t.lower()]
+
+
+def _frames_of(bag: Bag, topics: Sequence[str]) -> dict[str, str]:
+    """The frame of the first readable message of each topic, if that is among the first 200.
+
+    Each topic is read by itself, so that one without messages, or with none that is readable, does not unpack those of
+    the others to the end of the bag.
     """
     found: dict[str, str] = {}
-    for topic in (t.topic for t in bag.topics.values() if CLOUD in t.msgtypes and t.messages):
+    for topic in topics:
         for raw in islice(bag.messages({topic}), _MOST_TRIED):
             try:
                 msg: Any = bag.decode(raw)

@@ -7,10 +7,12 @@ from collections.abc import Mapping
 
 from pydantic import BaseModel
 
+from graphloc.blocks import MountConfig
 from graphloc.config import (
+    CameraConfig,
     DatumConfig,
     KernelConfig,
-    MountConfig,
+    LidarConfig,
     OutputConfig,
     SensorConfig,
     SlowErrorConfig,
@@ -18,8 +20,11 @@ from graphloc.config import (
     TimelineConfig,
     VesselConfig,
 )
+from graphloc.survey import BerthConfig, DockConfig, Survey, TagConfig
 
-_BLOCKS = (DatumConfig, TimelineConfig, StartConfig, OutputConfig, MountConfig, KernelConfig, SlowErrorConfig)
+_BLOCKS = (
+    DatumConfig, TimelineConfig, StartConfig, OutputConfig, MountConfig, KernelConfig, SlowErrorConfig, LidarConfig, CameraConfig,
+)  # fmt: skip
 
 
 def render(kinds: Mapping[str, type[SensorConfig]]) -> str:
@@ -36,6 +41,9 @@ def render(kinds: Mapping[str, type[SensorConfig]]) -> str:
         parts += [f"## Block `{block.__name__.removesuffix('Config').lower()}`", _doc(block), "", _table(block)]
     for kind, config in kinds.items():
         parts += [f"## Sensor kind `{kind}`", _doc(config), "", _table(config)]
+    parts += ["# The survey: `tags.yaml`", "", _table(Survey)]
+    for entry in (TagConfig, DockConfig, BerthConfig):
+        parts += [f"## Entry of `{entry.__name__.removesuffix('Config').lower()}s`", _doc(entry), "", _table(entry)]
     return "\n".join(parts)
 
 
@@ -46,7 +54,7 @@ def _doc(model: type[BaseModel]) -> str:
 def _table(model: type[BaseModel]) -> str:
     lines = ["| key | default | meaning |", "|---|---|---|"]
     for name, field in model.model_fields.items():
-        default = "required" if field.is_required() else _value(field.default)
+        default = "required" if field.is_required() else _value(field.get_default(call_default_factory=True))
         lines.append(f"| `{name}` | {default} | {' '.join((field.description or '').split())} |")
     return "\n".join(lines) + "\n"
 

@@ -8,34 +8,38 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from ruamel.yaml import YAML
 
 from graphloc import outputs
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig, load_config
 from graphloc.errors import InputError
 from graphloc.eval import ekf, holdout, metrics, report
+from graphloc.eval.digerud import run_digerud
+from graphloc.eval.docking import docking_table
 from graphloc.eval.match_picture import Gallery
 from graphloc.eval.simulate import SimulatedRun
+from graphloc.eval.tag_check import suspect_tags
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
-from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import GnssPosition, Measurement
-from graphloc.recording import Progress, Recording
+from graphloc.frontends.tags.unsurveyed import estimate_tags
+from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
+from graphloc.measurements import GnssPosition, Measurement, TagSighting
+from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 from graphloc.solve import smooth
+from graphloc.survey import Survey, TagConfig
+from graphloc.trajectory import Trajectory
 
 _FAR_M = 200e3
-
-
-def _quiet(_stage: str, _done: int, _total: int) -> None:
-    return None
+_FOUND_TAGS = "tags.found.yaml"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,13 +52,15 @@ class Run:
     held: tuple[GnssPosition, ...] = ()
     filters: tuple[ekf.FilterResult, ...] = ()
     pictures: tuple[tuple[str, bytes], ...] = ()  # of matches: caption, JPEG
+    tags: tuple[TagConfig, ...] = ()  # that are not surveyed, where the run puts them
 
 
-def load(bags: Sequence[Path], config_path: Path, progress: Progress = _quiet) -> tuple[Recording, VesselConfig]:
+def load(bags: Sequence[Path], config_path: Path, progress: Progress = quiet) -> tuple[Recording, VesselConfig]:
     """Read a vessel.yaml and the bag that it describes."""
-    config = load_config(config_path, KINDS)
+    config = with_surveys(load_config(config_path, KINDS), config_path.parent)
     _refuse_world_without_datum(config, str(config_path))
-    return read_recording(bags, config, progress), config
+    recording = read_recording(bags, config, progress)
+    return with_sightings(recording, config, bags, progress), config
 
 
 def smooth_recording(
@@ -64,7 +70,7 @@ def smooth_recording(
     hold_out: holdout.HoldOut | None = None,
     compare: bool = False,
     scans: Scans | None = None,
-    progress: Progress = _quiet,
+    progress: Progress = quiet,
 ) -> Run:
     """Smooth a recording; hold fixes out and run the filters beside it if asked.
 
@@ -75,94 +81,58 @@ def smooth_recording(
         recording, held = hold_out.split(recording)
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
-    solution = smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress)
+    solution = _solved(recording, config, datum, progress)
     gallery = Gallery()
     if scans is not None and config.of_kind("aerial"):
         recording = with_matches(recording, config, datum, solution, scans, progress, gallery)
-        solution = smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress)
+        solution = _solved(recording, config, datum, progress)
     filters: tuple[ekf.FilterResult, ...] = ()
     if compare:
         progress("filters", 0, 1)
         filters = ekf.run_all(recording, config, datum)
+        his = run_digerud(recording, config, datum)
+        filters += (his,) if his is not None else ()
         progress("filters", 1, 1)
+    tags, said = _about_tags(recording, config, solution)
     run = Run(
-        recording=recording, config=config, solution=solution, held=held, filters=filters,
-        pictures=tuple(gallery.pictures()),
+        recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
+        filters=filters, pictures=tuple(gallery.pictures()), tags=tags,
     )  # fmt: skip
     return _comparable(run)
 
 
-@dataclass(frozen=True, slots=True)
-class Scans:
-    """Where scans are matched from: the bags, and the folder that relative image paths count from."""
-
-    bags: tuple[Path, ...]
-    folder: Path
-
-
-def with_matches(
-    recording: Recording,
-    config: VesselConfig,
-    datum: Datum,
-    solution: Solution,
-    scans: Scans,
-    progress: Progress = _quiet,
-    gallery: Gallery | None = None,
-) -> Recording:
-    """Add the matches of every aerial sensor, made around a solution; a scan that gave none is a row of the ledger.
-
-    Raises:
-        InputError: an image or LiDAR that cannot be used.
-    """
-    measurements, rows, topics = list(recording.measurements), list(recording.rows), dict(recording.topics)
-    track, seq = solution.trajectory, recording.message_count
-    damage: list[str] = []
-    span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
-    for name, sensor in config.of_kind("aerial").items():
-        topics[name] = f"({name})"
-        read = {lidar.topic for lidar in sensor.lidars.values()}
-        rows = [
-            replace(r, reason=f"read by {name}") if r.topic in read and r.outcome is Outcome.IGNORED else r
-            for r in rows
-        ]
-        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=damage.append)
-        for item in found:
-            if item.match is not None and gallery is not None:
-                gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
-            if item.match is not None and item.match.modes:
-                measurements.append(replace(item.match.fix(item.stamp_ns, name, item.news, sensor.axes), seq=seq))
-            else:
-                rows.append(
-                    LedgerRow(
-                        seq=seq, stamp_ns=item.stamp_ns, sensor=name, topic=topics[name], outcome=Outcome.REJECTED,
-                        reason=item.why_not,
-                    )
-                )  # fmt: skip
-            seq += 1
-            progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)
-        progress("matching", span_s, span_s)
-        damage += _few_matches(name, rows)
-    return replace(
-        recording,
-        measurements=tuple(sorted(measurements, key=lambda m: (m.stamp_ns, m.seq))),
-        rows=tuple(rows),
-        topics=topics,
-        message_count=seq,
-        warnings=tuple(dict.fromkeys([*recording.warnings, *damage])),
-    )
+def _about_tags(
+    recording: Recording, config: VesselConfig, solution: Solution
+) -> tuple[tuple[TagConfig, ...], list[str]]:
+    """Return tags that the run tells the place of, and what it says against the survey."""
+    said = suspect_tags(recording, solution)
+    if not recording.tag_views:
+        return (), said
+    sizes = [sensor.surveyed.other_size_m for sensor in config.of_kind("apriltag").values()]
+    found, left = estimate_tags(recording.tag_views, solution.trajectory, next((s for s in sizes if s), None))
+    if found:
+        names = ", ".join(str(tag.id) for tag in found)
+        said.append(f"tag {names}: not in the survey; where the run puts it is in {_FOUND_TAGS}")
+    return tuple(found), [*said, *left]
 
 
-def _few_matches(sensor: str, rows: Sequence[LedgerRow]) -> list[str]:
-    """Say so where most scans of a sensor gave no match."""
-    reasons = Counter(row.reason for row in rows if row.sensor == sensor and row.outcome is Outcome.REJECTED)
-    if reasons.total() < 5:
-        return []
-    ((most, count),) = reasons.most_common(1)
-    return [f"{sensor}: {reasons.total()} scans gave no match, {count} of them: {most}; `graphloc match` shows one"]
+def _solved(recording: Recording, config: VesselConfig, datum: Datum, progress: Progress) -> Solution:
+    config = seen_frames(config, recording)
+    return smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress)
+
+
+def seen_frames(config: VesselConfig, recording: Recording) -> VesselConfig:
+    """Return the configuration whose surveys hold what was seen in the run: other frames need no states."""
+    seen = {(m.sensor, m.frame) for m in recording.measurements if isinstance(m, TagSighting)}
+    cut = {
+        name: sensor.model_copy(update={"survey": sensor.surveyed.of({f for s, f in seen if s == name})})
+        for name, sensor in config.of_kind("apriltag").items()
+    }
+    return config.model_copy(update={"sensors": {**config.sensors, **cut}})
 
 
 def match_at(
-    recording: Recording, config: VesselConfig, scans: Scans, at_s: float, progress: Progress = _quiet
+    recording: Recording, config: VesselConfig, scans: Scans, at_s: float, progress: Progress = quiet
 ) -> tuple[Match, int]:
     """Match the scan nearest to a time (s since the first IMU sample) around the run smoothed without matches.
 
@@ -178,7 +148,7 @@ def match_at(
     (sensor, *_) = sensors.values()
     datum = choose_datum(recording, config)
     whole = with_synthetic(recording, config, datum)
-    track = smooth(whole, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress).trajectory
+    track = _solved(whole, config, datum, progress).trajectory
     span_s = (int(track.stamps_ns[-1]) - int(track.stamps_ns[0])) / 1e9
     if not 0.0 <= at_s <= span_s:
         raise InputError(f"{recording.source}: --at {at_s:g}: the run is from 0 to {span_s:.1f} s")
@@ -211,8 +181,16 @@ def _comparable(run: Run) -> Run:
         speed = None
     if held and not comparable(metrics.held_out_errors, track, held, run.solution.datum, levers_m(run)):
         held = ()
-    warnings = (*run.recording.warnings, *said)
-    return replace(run, recording=replace(run.recording, truth=truth, check_speed=speed, warnings=warnings), held=held)
+
+    def fits(filtered: ekf.FilterResult) -> bool:
+        return (truth is None or comparable(metrics.errors, filtered.trajectory, truth)) and (
+            not held
+            or comparable(metrics.held_out_errors, filtered.trajectory, held, run.solution.datum, levers_m(run))
+        )
+
+    filters = tuple(f for f in run.filters if fits(f))
+    recording = replace(run.recording, truth=truth, check_speed=speed, warnings=(*run.recording.warnings, *said))
+    return replace(run, recording=recording, held=held, filters=filters)
 
 
 def levers_m(run: Run) -> dict[str, Array]:
@@ -221,7 +199,7 @@ def levers_m(run: Run) -> dict[str, Array]:
     return {name: mount_of(name, run.config.sensors[name], run.recording)[0] for name in names}
 
 
-def simulated(run: SimulatedRun, *, compare: bool = False, progress: Progress = _quiet) -> Run:
+def simulated(run: SimulatedRun, *, compare: bool = False, progress: Progress = quiet) -> Run:
     """Smooth a simulated run."""
     return smooth_recording(run.recording, run.config, compare=compare, progress=progress)
 
@@ -316,11 +294,25 @@ def tables(run: Run) -> tuple[metrics.Table, ...]:
     estimates = [("graphloc", run.solution.trajectory), *((f.name, f.trajectory) for f in run.filters)]
     if run.recording.truth is not None:
         found.append(metrics.truth_table(estimates, run.recording.truth))
+        found += _docking_tables(run, estimates, run.recording.truth)
     if run.held:
         found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, levers_m(run)))
     if run.recording.check_speed is not None:
         found.append(metrics.speed_table(estimates, run.recording.check_speed))
     return tuple(found)
+
+
+def _docking_tables(
+    run: Run, estimates: Sequence[tuple[str, Trajectory]], truth: Trajectory
+) -> Iterator[metrics.Table]:
+    """A table for each tag sensor that saw a tag."""
+    sensors = run.config.of_kind("apriltag")
+    for name, sensor in sensors.items():
+        seen = [m for m in run.recording.measurements if isinstance(m, TagSighting) and m.sensor == name]
+        if seen:
+            stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
+            table = docking_table(estimates, truth, sensor.surveyed, stamps, seen[0].t_body_camera_m)
+            yield replace(table, title=table.title if len(sensors) == 1 else f"{table.title}: {name}")
 
 
 def truth_statement(run: Run) -> str:
@@ -347,6 +339,8 @@ def write(run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overw
             command=command,
             metrics={t.title: t.as_dict() for t in found},
         )
+        if run.tags:
+            _write_tags(run, fresh / _FOUND_TAGS)
         report.write_report(
             fresh / "report.html",
             report.ReportData(
@@ -363,6 +357,18 @@ def write(run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overw
             ),
         )
     return folder / "report.html"
+
+
+def _write_tags(run: Run, path: Path) -> None:
+    """Write the surveys with the tags that were found, as one survey that can be read again."""
+    surveys = [sensor.surveyed for sensor in run.config.of_kind("apriltag").values()]
+    tags = {(tag.family, tag.id): tag for tag in (*run.tags, *(tag for s in surveys for tag in s.tags))}
+    docks = {dock.name: dock for s in surveys for dock in s.docks}
+    whole = Survey(
+        tags=tuple(tags.values()), docks=tuple(docks.values()), berths=tuple(b for s in surveys for b in s.berths)
+    )
+    with path.open("w", encoding="utf-8") as stream:
+        YAML(typ="safe", pure=True).dump(whole.model_dump(mode="json", exclude_none=True), stream)
 
 
 def sha256(path: Path) -> str:
@@ -382,12 +388,15 @@ __all__ = [
     "choose_datum",
     "load",
     "match_at",
+    "seen_frames",
     "sha256",
     "simulated",
     "smooth_recording",
     "tables",
     "truth_statement",
     "with_matches",
+    "with_sightings",
+    "with_surveys",
     "with_synthetic",
     "write",
 ]

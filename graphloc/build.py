@@ -35,6 +35,7 @@ from graphloc.timeline import Timeline, make_timeline
 
 # A step of a slow state is believed to be a jump beyond this many sigmas.
 _JUMP = KernelConfig(kind="cauchy", scale=2.0)
+_NOTHING = 1e6  # sigmas: a prior that says nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -375,25 +376,27 @@ def _add_slow_chain(
     key = [keys.slow(stream.number, j) for j in nodes]
     for j, name in zip(nodes, key, strict=True):
         guess.insert(name, np.atleast_1d(values.atVector(keys.slow(stream.number, j))))
-    constant = not np.isfinite(slow.time_constant_s)
+    constant = ~np.isfinite(slow.time_constant_s)
     zero = np.zeros(len(slow.sigma))
+    ends = slow.sigma * np.where(constant, 1.0, np.sqrt(2.0))
     diagonal = gtsam.noiseModel.Diagonal.Sigmas
     given = prior.slow.get(stream.number)
     if given is not None:
         graph.add(gtsam.PriorFactorVector(key[0], given[0], gtsam.noiseModel.Gaussian.Covariance(given[1])))
     else:
-        graph.add(gtsam.PriorFactorVector(key[0], zero, diagonal(slow.sigma * (1.0 if constant else np.sqrt(2.0)))))
+        graph.add(gtsam.PriorFactorVector(key[0], zero, diagonal(ends)))
     for n, j in enumerate(nodes[:-1]):
         dt = _node_dt_s(problem, j)
         # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
-        step = slow.sigma * (1e-4 if constant else np.sqrt(2.0 * dt / slow.time_constant_s))
+        step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt / slow.time_constant_s))
         model: Any = diagonal(step)
         if slow.jumps and jumps:
             loss = gtsam.noiseModel.mEstimator.Cauchy.Create(_JUMP.scale)
             model = gtsam.noiseModel.Robust.Create(loss, model)
         graph.add(gtsam.BetweenFactorVector(key[n], key[n + 1], zero, model))
-        if not constant:
-            standing = slow.sigma * np.sqrt(2.0 * slow.time_constant_s / dt)
+        if not constant.all():
+            standing = slow.sigma * np.where(constant, _NOTHING, np.sqrt(2.0 * slow.time_constant_s / dt))
             graph.add(gtsam.PriorFactorVector(key[n + 1], zero, diagonal(standing)))
-    if not constant:
-        graph.add(gtsam.PriorFactorVector(key[-1], zero, diagonal(slow.sigma * np.sqrt(2.0))))
+    if not constant.all():
+        last = np.where(constant, _NOTHING, np.sqrt(2.0)) * slow.sigma
+        graph.add(gtsam.PriorFactorVector(key[-1], zero, diagonal(last)))

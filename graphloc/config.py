@@ -8,7 +8,6 @@ Which sensor kinds exist is not known here: the caller hands in the table (`kind
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,25 +15,24 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from pydantic import Field, ValidationError, field_validator, model_validator
 
+from graphloc.blocks import (
+    Block,
+    Finite,
+    MountConfig,
+    NonNegative,
+    Positive,
+    nearest,
+    one_line,
+    read_mapping,
+)
 from graphloc.errors import ConfigError
-from graphloc.frames import Array, Geodetic, rotation_from_rpy_deg
+from graphloc.frames import Geodetic
 from graphloc.measurements import AXES
+from graphloc.survey import Survey
 
 STANDARD_GRAVITY_MPS2 = 9.80665
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Triple = tuple[Finite, Finite, Finite]
-
-
-class Block(BaseModel):
-    """A block of the configuration: unknown keys are errors, values are frozen."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class DatumConfig(Block):
@@ -51,27 +49,6 @@ class DatumConfig(Block):
     def geodetic(self) -> Geodetic:
         """The origin as a value."""
         return Geodetic(self.latitude_deg, self.longitude_deg, self.height_m)
-
-
-class MountConfig(Block):
-    """Pose of the sensor in body (x forward, y port, z up)."""
-
-    xyz_m: Triple = (0.0, 0.0, 0.0)
-    """Sensor origin in body, m."""
-    rpy_deg: Triple = (0.0, 0.0, 0.0)
-    """Roll, pitch, yaw of the sensor in body, deg; R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    tf_frame: str | None = None
-    """Take the mount from `/tf_static` instead: name of the sensor's frame there."""
-
-    @property
-    def t_body_sensor_m(self) -> Array:
-        """Sensor origin in body (3,), m."""
-        return np.array(self.xyz_m)
-
-    @property
-    def R_body_sensor(self) -> Array:
-        """Rotation (3, 3) that takes sensor coordinates to body."""
-        return rotation_from_rpy_deg(np.array(self.rpy_deg))
 
 
 class KernelConfig(Block):
@@ -301,7 +278,7 @@ class AerialConfig(AnyPoseConfig):
     """GeoJSON of lines and polygons of quays, piers and shores; a relative path counts as that of the image."""
     image_sigma_m: NonNegative = 0.3
     """How far the image as a whole shows things from where they are, east and north, 1 sigma, m."""
-    lidars: dict[str, LidarConfig] = {}
+    lidars: dict[str, LidarConfig] = Field(default_factory=dict)
     """The LiDARs by name."""
     hull_m: tuple[tuple[Finite, Finite], ...] = ()
     """Corners of the vessel's outline in body, forward and port, in order, m: points within are its own; none: no
@@ -360,6 +337,56 @@ class AerialConfig(AnyPoseConfig):
         return corners
 
 
+class CameraConfig(Block):
+    """A camera that sees tags; or a detector that has listed them already."""
+
+    topic: str
+    """Images (`sensor_msgs/Image`, `CompressedImage`), or detections (`apriltag_msgs/AprilTagDetectionArray`, ROS 1's
+    `apriltag_ros/AprilTagDetectionArray`)."""
+    info_topic: str = ""
+    """Its `sensor_msgs/CameraInfo`; empty: `camera_info` beside the images."""
+    rectified: bool | None = None
+    """Whether distortion is removed from the images already (`image_rect`); empty: by the topic's name for images,
+    true for detections, which are made on such images."""
+    mount: MountConfig = MountConfig()
+    """Pose of the optical frame (x right, y down, z forward) in body: looking ahead is `rpy_deg: [-90, 0, -90]`."""
+
+
+class AprilTagConfig(SensorConfig):
+    """AprilTags seen by cameras: the two poses of each sighting are kept, and the graph chooses."""
+
+    kind: Literal["apriltag"] = "apriltag"
+    """Which row of the sensor table reads this block."""
+    survey: str | Survey = ""
+    """Where the tags are: a `tags.yaml` (docs/tags.md); a relative path counts from the folder of vessel.yaml."""
+    cameras: dict[str, CameraConfig] = Field(default_factory=dict)
+    """The cameras by name."""
+    max_hamming: Annotated[int, Field(ge=0, le=3)] = 1
+    """Most bits of a tag that may be read wrong."""
+    min_margin: NonNegative = 1.5
+    """Least decision margin (AprilTag's: how far bits are from the threshold, grey levels)."""
+    corner_sigma_px: Positive = 0.5
+    """Noise of the corners of listed detections, each axis, 1 sigma, px; our own detector measures it."""
+    false_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02
+    """Share of sightings that are expected to be false: misread, or of a tag that was moved."""
+    false_repeats: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.9
+    """Probability that a false sighting after a false one repeats its error (a moved tag stays moved)."""
+    kernel: KernelConfig = KernelConfig(kind="none")
+    """Robust loss: not used; that a sighting is false is a hypothesis of its own."""
+
+    @field_validator("topic", "mount")
+    @classmethod
+    def _of_the_cameras(cls, given: str | MountConfig) -> str | MountConfig:
+        if given not in ("", MountConfig()):
+            raise ValueError("not used here: set it for each of `cameras`")
+        return given
+
+    @property
+    def surveyed(self) -> Survey:
+        """The survey, once it is read; before that one without tags."""
+        return self.survey if isinstance(self.survey, Survey) else Survey()
+
+
 class HeightConfig(SensorConfig):
     """Height prior: a vessel floats, so its height is known from waterline and tide."""
 
@@ -368,7 +395,9 @@ class HeightConfig(SensorConfig):
     height_m: Finite | None = None
     """Height of the body origin above the ellipsoid, m; empty: the median of the run's fixes."""
     sigma_m: Positive = 0.3
-    """Heave and tide around it, 1 sigma, m."""
+    """Heave around it, 1 sigma, m."""
+    tide_sigma_m: NonNegative = 0.5
+    """How far tide and load may hold the vessel above or below it, for hours, 1 sigma, m; 0: not at all."""
     period_s: Positive = 1.0
     """Time between two priors, s."""
     kernel: KernelConfig = KernelConfig(kind="none")
@@ -413,7 +442,7 @@ class VesselConfig(Block):
     """Name of the body frame in `/tf_static` and in the written bag."""
     datum: DatumConfig | None = None
     """Origin of the world frame."""
-    sensors: dict[str, Any] = {}
+    sensors: dict[str, Any] = Field(default_factory=dict)
     """Sensors by name; `kind` in each block picks the row of the sensor table."""
     truth_topic: str | None = None
     """Topic with the true body pose in world (`nav_msgs/Odometry`), for comparisons only; never fused."""
@@ -437,38 +466,6 @@ class VesselConfig(Block):
         return {n: s for n, s in self.sensors.items() if getattr(s, "kind", None) == kind and s.enabled}
 
 
-def _nearest(key: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
-    near = f"; did you mean '{close[0]}'?" if close else ""
-    return near + (f"; known here: {', '.join(sorted(known))}" if not close or len(known) <= 10 else "")
-
-
-def _fields_at(model: type[BaseModel], path: list[str]) -> list[str]:
-    """Names of the fields of the block that `path` leads to."""
-    for name in path:
-        field = model.model_fields.get(name)
-        inner = [a for a in (field.annotation, *getattr(field.annotation, "__args__", ())) if field] if field else []
-        blocks = [a for a in inner if isinstance(a, type) and issubclass(a, BaseModel)]
-        if not blocks:
-            return []
-        model = blocks[0]
-    return list(model.model_fields)
-
-
-def one_line(error: ValidationError, model: type[BaseModel], where: str, prefix: str) -> str:
-    """Return what is wrong with a block, in one line: bad keys with their nearest neighbours, bad values."""
-    lines = []
-    for item in error.errors():
-        path = [str(p) for p in item["loc"]]
-        name = ".".join([*([prefix] if prefix else []), *path])
-        if item["type"] == "extra_forbidden":
-            lines.append(f"unknown key '{name}'{_nearest(path[-1], _fields_at(model, path[:-1]))}")
-        else:
-            text = item["msg"].removeprefix("Value error, ")
-            lines.append(f"{name + ': ' if name else ''}{text} (got {item['input']!r:.80})")
-    return f"{where}: " + "; ".join(lines)
-
-
 def parse_config(raw: Mapping[str, Any], kinds: Mapping[str, type[SensorConfig]], where: str) -> VesselConfig:
     """Validate a mapping. `kinds` is the sensor table's kind -> config class; `where` names the file.
 
@@ -485,7 +482,7 @@ def parse_config(raw: Mapping[str, Any], kinds: Mapping[str, type[SensorConfig]]
             raise ConfigError(f"{where}: sensors.{name} must be a mapping")
         kind = str(block.get("kind", name))
         if kind not in kinds:
-            raise ConfigError(f"{where}: sensors.{name}.kind: unknown kind '{kind}'{_nearest(kind, list(kinds))}")
+            raise ConfigError(f"{where}: sensors.{name}.kind: unknown kind '{kind}'{nearest(kind, list(kinds))}")
         try:
             parsed[str(name)] = kinds[kind].model_validate({**block, "kind": kind})
         except ValidationError as error:
@@ -498,19 +495,8 @@ def parse_config(raw: Mapping[str, Any], kinds: Mapping[str, type[SensorConfig]]
 
 
 def load_config(path: Path, kinds: Mapping[str, type[SensorConfig]]) -> VesselConfig:
-    """Read and validate a `vessel.yaml` (YAML 1.2, no tags)."""
-    try:
-        raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); `graphloc inspect BAG` writes a first one"
-        ) from None
-    except (YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())[:200]}") from None
-    if raw is None:
-        raw = {}
-    if not isinstance(raw, Mapping):
-        raise ConfigError(f"{path}: the top level must be a mapping")
+    """Read and validate a `vessel.yaml`."""
+    raw = read_mapping(path, "; `graphloc inspect BAG` writes a first one")
     return parse_config(raw, kinds, str(path))
 
 

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc.berths import Berth
 from graphloc.config import KernelConfig, SensorConfig
 from graphloc.frames import Array, Datum
 from graphloc.measurements import ImuSeries, Measurement
@@ -71,6 +72,8 @@ class Residual:
     Attributes:
         raw: (k,) in m, rad or m/s. cov: (k, k) of the measurement.
         jacobian: gives (k, 6) d raw / d (body tangent of the state's pose), for the predicted covariance.
+        slow_jacobian: gives (k, n) d raw / d (slow state), for the same; None: it has no part in that.
+        rows: of the factor, where these are others than `raw`; 0: the same.
         prior: prior probability of this hypothesis.
         size_m, size_deg: physical size, for the ledger.
     """
@@ -81,6 +84,8 @@ class Residual:
     prior: float
     size_m: float | None
     size_deg: float | None
+    slow_jacobian: Callable[[], Array] | None = None
+    rows: int = 0
 
     def nis(self, inflation: Array | None = None) -> float:
         """Squared residual normalised by `cov` (+ `inflation`)."""
@@ -114,19 +119,19 @@ class SlowProcess:
     """A slow state: per axis a first-order Gauss-Markov process.
 
     Attributes:
-        name, unit, axes: for outputs. scale: from the state's unit to `unit`.
-        sigma: (k,) standing size. time_constant_s: correlation time; inf for a constant.
+        name: for outputs. axes: k names. units: k of them. scale: (k,) from the state's units to these.
+        sigma: (k,) standing size. time_constant_s: (k,) correlation time; inf for a constant.
         jumps: put a robust loss on its steps.
         needs_company: leave it out where no second sensor can tell it from motion; its size is then
             added to the bounds.
     """
 
     name: str
-    unit: str
-    scale: float
     axes: tuple[str, ...]
+    units: tuple[str, ...]
+    scale: Array
     sigma: Array
-    time_constant_s: float
+    time_constant_s: Array
     jumps: bool = False
     needs_company: bool = False
 
@@ -180,7 +185,11 @@ class Sensor:
         slow: the slow state that a config asks for.
         false: the hypothesis that a measurement is false; None: the sensor has no such hypothesis
             and is guarded by its kernel alone.
+        describe: what of a measurement its row of the ledger should say.
+        berths: places that its slow state moves, and that the vessel is seen from.
         synthetic: measurements made from the configuration over the run's stamps (no topic).
+        one_likelihood: the modes are maxima of one likelihood, which is the factor of each: doubt between them takes
+            no weight from it.
         absolute: whether it says something about position (for health).
         company: whether it can tell another sensor's slow error from motion.
         in_world: whether it is given in world coordinates, so that the datum must be known.
@@ -195,7 +204,10 @@ class Sensor:
     hint: Callable[[Any, float, Datum], Hint]
     slow: Callable[[Any], SlowProcess | None] = lambda _config: None
     false: Callable[[Any, Any], FalseModel] | None = None
+    describe: Callable[[Any], str] = lambda _measurement: ""
+    berths: Callable[[Any], tuple[Berth, ...]] = lambda _config: ()
     synthetic: Callable[[str, Any, Sequence[int], float], Sequence[Measurement]] | None = None
+    one_likelihood: bool = False
     absolute: bool = False
     company: bool = False
     in_world: bool = False

@@ -36,10 +36,12 @@ class LedgerRow:
         weight: final weight in [0, 1]; None where it has no meaning.
         mode: index of the chosen mode; None for sensors without modes.
         mode_probability: posterior probability of that mode.
+        mode_settled: pass over the whole run from which on this mode was the chosen one; 0: before the first.
         residual_m, residual_deg: size of the final residual in physical units.
         nis: squared residual normalised by the measurement's own covariance.
         dof: number of measured axes.
         reason: why it was not used fully.
+        detail: what of it a reader wants to know, e.g. the camera and the tags of a sighting.
         count: messages that this row stands for.
     """
 
@@ -51,11 +53,13 @@ class LedgerRow:
     weight: float | None = None
     mode: int | None = None
     mode_probability: float | None = None
+    mode_settled: int | None = None
     residual_m: float | None = None
     residual_deg: float | None = None
     nis: float | None = None
     dof: int | None = None
     reason: str = ""
+    detail: str = ""
     count: int = 1
 
 

@@ -136,6 +136,88 @@ class PoseFix(Measurement):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TagMode:
+    """One pose of a camera that explains what it saw of tags; their frame at rest.
+
+    Attributes:
+        p_world_camera_m: (3,). R_world_camera: (3, 3), optical axes to world.
+        cov: (6, 6) of the tags' middle seen from the camera, m, and of the camera's attitude, a small rotation, rad; both
+            in the camera's axes: a bearing is known to millimetres where attitude and distance are not, and so it stays
+            whatever attitude the rest of the run says.
+        probability: prior probability of this mode, by how well it fits the image.
+    """
+
+    p_world_camera_m: Array
+    R_world_camera: Array
+    cov: Array
+    probability: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "p_world_camera_m", _frozen(self.p_world_camera_m, (3,), "p_world_camera_m"))
+        object.__setattr__(self, "R_world_camera", _frozen(self.R_world_camera, (3, 3), "R_world_camera"))
+        object.__setattr__(self, "cov", _frozen_covariance(self.cov, 6, "cov"))
+        if not 0.0 < self.probability <= 1.0:
+            raise ValueError("probability must be in (0, 1]")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TagSighting(Measurement):
+    """Surveyed tags of one frame, all that one image shows of them.
+
+    Attributes:
+        camera: its name. frame: `world`, or the dock that the tags ride on.
+        numbers: K ids.
+        points_m: (4 K, 3) corners of each tag in turn, in world, the frame at rest; of a tag: top-left, top-right,
+            bottom-right, bottom-left of the print.
+        pivot_m: (3,) point in world that the frame turns about.
+        rays: (4 K, 2) where they are seen: x / z, y / z in the camera's optical axes, distortion removed.
+        cov: (8 K, 8 K) of the rays, u0, v0, u1, ...: of the corners in the image, and of the tags in the survey.
+        t_body_camera_m, R_body_camera: (3,), (3, 3) the camera's mount.
+        modes: poses that explain it, likeliest first; probabilities sum to 1.
+    """
+
+    camera: str
+    frame: str
+    numbers: tuple[int, ...]
+    points_m: Array
+    pivot_m: Array
+    rays: Array
+    cov: Array
+    t_body_camera_m: Array
+    R_body_camera: Array
+    modes: tuple[TagMode, ...]
+
+    def __post_init__(self) -> None:
+        n = 4 * len(self.numbers)
+        shapes = {
+            "points_m": (n, 3), "pivot_m": (3,), "rays": (n, 2), "t_body_camera_m": (3,), "R_body_camera": (3, 3)
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, _frozen(getattr(self, name), shape, name))
+        object.__setattr__(self, "cov", _frozen_covariance(self.cov, 2 * n, "cov"))
+        if not n or not self.modes:
+            raise ValueError("a sighting needs a tag and a mode")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TagView:
+    """A tag that is seen, but not in the survey.
+
+    Attributes:
+        family, number: of the tag. rays, cov: of its four corners, as in `TagSighting`.
+        t_body_camera_m, R_body_camera: (3,), (3, 3) the camera's mount.
+    """
+
+    stamp_ns: int
+    family: str
+    number: int
+    rays: Array
+    cov: Array
+    t_body_camera_m: Array
+    R_body_camera: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HeightPrior(Measurement):
     """Height of the body origin over the ellipsoid less that of the datum, from waterline and tide: m."""
 

@@ -11,6 +11,7 @@ import csv
 import importlib.metadata
 import json
 import platform
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,6 +28,7 @@ from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from graphloc.berths import BerthTrack
 from graphloc.config import VesselConfig, effective
 from graphloc.errors import OutputError
 from graphloc.frames import Array, heading_deg_from_yaw
@@ -104,6 +106,8 @@ def write_run(
     _geojson(folder / "track.geojson", solution, picked)
     _csv(folder / "ledger.csv", _LEDGER_COLUMNS, (_ledger_row(row) for row in solution.ledger))
     _csv(folder / "slow.csv", ("sensor", "name", "utc", "stamp_ns", "axis", "value", "sigma", "unit"), _slow(solution))
+    for name, berth in _berth_files(solution).items():
+        _csv(folder / name, _BERTH_COLUMNS, _berth_rows(berth))
     with (folder / "vessel.effective.yaml").open("w", encoding="utf-8") as stream:
         YAML(typ="safe", pure=True).dump(effective(config), stream)
     _run_json(folder / MARK, solution, config, inputs, command, metrics)
@@ -264,8 +268,28 @@ def _ledger_row(row: LedgerRow) -> list[object]:
 def _slow(solution: Solution) -> Iterator[list[object]]:
     for sensor, slow in solution.slow.items():
         for stamp, value, sigma in zip(slow.stamps_ns.tolist(), slow.value, slow.sigma, strict=True):
-            for axis, v, s in zip(slow.axes, value, sigma, strict=True):
-                yield [sensor, slow.name, utc_text(stamp), stamp, axis, f"{v:.4f}", f"{s:.4f}", slow.unit]
+            for axis, v, s, unit in zip(slow.axes, value, sigma, slow.units, strict=True):
+                yield [sensor, slow.name, utc_text(stamp), stamp, axis, f"{v:.4f}", f"{s:.4f}", unit]
+
+
+_BERTH_COLUMNS = (
+    "utc", "stamp_ns", "across_m", "along_m", "angle_deg", "across_mps", "along_mps", "turn_degps", "bound95_across_m",
+    "bound95_along_m", "bound95_angle_deg",
+)  # fmt: skip
+
+
+def _berth_files(solution: Solution) -> dict[str, BerthTrack]:
+    """File names of the berths; what a name cannot have in a file system becomes a dash."""
+    return {f"berth_{re.sub(r'[^A-Za-z0-9_-]+', '-', b.berth.name)}.csv": b for b in solution.berths}
+
+
+def _berth_rows(track: BerthTrack) -> Iterator[list[object]]:
+    assert track.cov is not None
+    bound = 1.96 * np.sqrt(np.diagonal(track.cov, axis1=1, axis2=2))
+    to_deg = np.array([1.0, 1.0, 180.0 / np.pi])
+    columns = np.hstack([track.value * to_deg, track.rate * to_deg, bound * to_deg])
+    for stamp, row in zip(track.stamps_ns.tolist(), columns, strict=True):
+        yield [utc_text(stamp), stamp, *(f"{v:.4f}" for v in row)]
 
 
 def _run_json(

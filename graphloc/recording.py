@@ -11,11 +11,15 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
-from graphloc.measurements import ImuSeries, Measurement
+from graphloc.measurements import ImuSeries, Measurement, TagView
 from graphloc.trajectory import Trajectory
 
 Progress = Callable[[str, int, int], None]
 """Called with stage, done, total."""
+
+
+def quiet(_stage: str, _done: int, _total: int) -> None:
+    """A `Progress` that says nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,6 +46,7 @@ class Recording:
         mounts: body -> sensor (t (3,), R (3, 3)) of sensors whose mount came from /tf_static.
         truth: true body trajectory in world, if known.
         check_speed: forward speed that is compared, not fused.
+        tag_views: sightings of tags that are not in the survey.
         warnings: one line each, for the report.
     """
 
@@ -54,4 +59,5 @@ class Recording:
     mounts: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
     truth: Trajectory | None = None
     check_speed: SpeedSeries | None = None
+    tag_views: tuple[TagView, ...] = ()
     warnings: tuple[str, ...] = ()

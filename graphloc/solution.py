@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc.berths import BerthTrack
 from graphloc.frames import Array, Datum
 from graphloc.ledger import Ledger
 from graphloc.trajectory import Trajectory
@@ -30,14 +31,13 @@ class SlowEstimate:
 
     Attributes:
         name: what it is, for axis labels, e.g. 'GNSS error'.
-        unit: 'm' or 'deg'.
-        axes: names of the k columns.
+        axes: names of the k columns. units: of each, 'm' or 'deg'.
         stamps_ns: (M,); value, sigma: (M, k).
     """
 
     name: str
-    unit: str
     axes: tuple[str, ...]
+    units: tuple[str, ...]
     stamps_ns: NDArray[np.int64]
     value: Array
     sigma: Array
@@ -79,6 +79,7 @@ class Solution:
         health: N values of `Health`; health_reason: one short text each.
         since_agreed_s: per absolute sensor, (N,) s since it last agreed (inf: never).
         slow: slow states by sensor.
+        berths: the vessel seen from each berth, where it is near.
         ledger: every message of the run.
         stats: how the solver fared.
     """
@@ -93,5 +94,6 @@ class Solution:
     health_reason: tuple[str, ...]
     since_agreed_s: Mapping[str, Array]
     slow: Mapping[str, SlowEstimate]
+    berths: tuple[BerthTrack, ...]
     ledger: Ledger
     stats: SolveStats

@@ -17,6 +17,17 @@ DATUM = Datum(Geodetic(59.3, 18.1, 20.0))
 RNG = np.random.default_rng(3)
 
 
+def config_of(row: Sensor) -> Any:
+    """Defaults; and tags that stand in world and ride on a dock, so that they have slow states."""
+    if row.kind != "apriltag":
+        return row.config(kind=row.kind)
+    tags = [
+        {"id": n, "size_m": 0.4, "frame": frame, "xyz_m": [5.0, n, 1.0], "facing_deg": 180.0}
+        for n, frame in enumerate(("pier", "world"))
+    ]
+    return row.config.model_validate({"kind": "apriltag", "survey": {"tags": tags, "docks": [{"name": "pier"}]}})
+
+
 def attachment(row: Sensor, config: object, *, tilt: float = 0.1, far_m: float = 50.0, slow: bool = True) -> Attachment:
     process = row.slow(config) if slow else None
     yaw = RNG.uniform(-3, 3)
@@ -56,7 +67,7 @@ CASES = [
 
 @pytest.mark.parametrize(("row", "slow"), CASES)
 def test_zero_at_the_truth(row: Sensor, slow: bool) -> None:
-    config = row.config(kind=row.kind)
+    config = config_of(row)
     for _ in range(5):
         at = attachment(row, config, slow=slow)
         m = row.ideal(at, config)
@@ -70,7 +81,7 @@ def test_zero_at_the_truth(row: Sensor, slow: bool) -> None:
 @pytest.mark.parametrize(("row", "slow"), CASES)
 def test_jacobians_are_numeric_ones(row: Sensor, slow: bool) -> None:
     """Linearised factors against central differences of their own whitened error, step 1e-5."""
-    config = row.config(kind=row.kind)
+    config = config_of(row)
     at = attachment(row, config, slow=slow)
     m = row.ideal(at, config)
     update = row.factors(m, config, at, Decision())
@@ -110,7 +121,7 @@ def _one(key: int, step: np.ndarray) -> gtsam.VectorValues:
 @pytest.mark.parametrize("row", SENSORS, ids=lambda r: r.kind)
 def test_residual_jacobian_of_the_pose(row: Sensor) -> None:
     """`Residual.jacobian`, which scales the gate, against differences of `Residual.raw`."""
-    config = row.config(kind=row.kind)
+    config = config_of(row)
     # Level: with tilt, ZYX yaw and the rotation about the world's z differ by the tilt times the other axes.
     level = gtsam.Pose3(gtsam.Rot3.Yaw(0.4), np.array([-1.5, 0.4, 2.2]))
     at = replace(attachment(row, config, tilt=0.0), T_state_sensor=level)
@@ -198,7 +209,7 @@ def test_every_kind_has_its_config() -> None:
 @pytest.mark.parametrize("row", SENSORS, ids=lambda r: r.kind)
 def test_hints_say_what_the_state_says(row: Sensor) -> None:
     """A noise-free measurement's hint is the state's own, as far as it tells; lever arms aside."""
-    config = row.config(kind=row.kind)
+    config = config_of(row)
     at = attachment(row, config, tilt=0.0, slow=False)
     at = replace(
         at, T_state_sensor=gtsam.Pose3(gtsam.Rot3.Yaw(0.4), np.zeros(3)), lever_m=np.zeros(3), dv_world_mps=np.zeros(3)

@@ -49,13 +49,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         slow={
             "gnss": SlowEstimate(
                 name="GNSS error",
-                unit="m",
                 axes=("east", "north", "up"),
+                units=("m", "m", "m"),
                 stamps_ns=stamps[:1],
                 value=np.array([[0.5, -0.6, 0.7]]),
                 sigma=np.array([[0.1, 0.2, 0.3]]),
             )
         },
+        berths=(),
         ledger=Ledger(
             [
                 LedgerRow(

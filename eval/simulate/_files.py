@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from pydantic import ValidationError
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
-from graphloc.config import Block, one_line
+from graphloc.blocks import Block, one_line, read_mapping
 from graphloc.errors import ConfigError
 
 _Block = TypeVar("_Block", bound=Block)
@@ -30,25 +28,14 @@ def load_block(what: str, name_or_path: str, folder: Traversable, model: type[_B
         ConfigError: one line that names the file, the block and what is wrong with it.
     """
     shipped = shipped_names(folder)
-    if name_or_path in shipped:
-        where = f"{name_or_path}.yaml"
-        text = (folder / where).read_text(encoding="utf-8")
-    else:
+    where, path = f"{name_or_path}.yaml", folder / f"{name_or_path}.yaml"
+    if name_or_path not in shipped:
         where, path = name_or_path, Path(name_or_path)
         if not path.is_file():
             raise ConfigError(
                 f"{what} '{name_or_path}': no such file, and none of the shipped ones: {', '.join(shipped)}"
             )
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{where}: cannot be read ({error})") from None
-    try:
-        raw = YAML(typ="safe", pure=True).load(text)
-    except (YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{where}: not valid YAML: {' '.join(str(error).split())[:200]}") from None
-    if not isinstance(raw, Mapping):
-        raise ConfigError(f"{where}: the top level must be a mapping")
+    raw = read_mapping(path)
     return validated(raw, where, model), where
 
 

@@ -10,6 +10,8 @@ import shapely
 
 from graphloc.config import (
     AerialConfig,
+    AprilTagConfig,
+    CameraConfig,
     CompassConfig,
     DatumConfig,
     GnssConfig,
@@ -112,6 +114,8 @@ def _config(s: Scenario, rig: RigConfig, motion: Motion, datum: Datum) -> Vessel
         sensors["aerial"] = PoseConfig(topic="/aerial/pose", axes=("x", "y", "yaw"))
     elif s.harbour and s.lidar_hz > 0.0 and rig.lidars:
         sensors["aerial"] = _matcher(rig)
+    if s.harbour and s.camera_hz > 0.0 and rig.cameras and load_harbour(s.harbour).config.tags:
+        sensors["tags"] = _tags(rig, s)
     return VesselConfig(
         vessel=rig.vessel,
         datum=DatumConfig(
@@ -123,6 +127,13 @@ def _config(s: Scenario, rig: RigConfig, motion: Motion, datum: Datum) -> Vessel
         truth_topic="/truth",
         start=start,
     )
+
+
+def _tags(rig: RigConfig, s: Scenario) -> AprilTagConfig:
+    """What looks for tags in the rig's cameras."""
+    topic = "/{}/image_raw" if s.camera_raw else "/{}/image_raw/compressed"
+    cameras = {name: CameraConfig(topic=topic.format(name), mount=camera.mount) for name, camera in rig.cameras.items()}
+    return AprilTagConfig(survey="tags.yaml", cameras=cameras)
 
 
 def _matcher(rig: RigConfig) -> AerialConfig:

@@ -32,7 +32,7 @@ from graphloc.eval.simulate.rig import CameraConfig, LidarConfig
 from graphloc.eval.simulate.scene import Scene, scene_of
 from graphloc.measurements import CompassHeading, GnssPosition, PoseFix
 from graphloc.outputs import fresh_folder
-from graphloc.recording import Progress
+from graphloc.recording import Progress, quiet
 
 _LATENCY_NS = {
     "/imu/data": 2_000_000,
@@ -67,7 +67,7 @@ def write_bag(
     ros: int,
     storage: str = "mcap",
     overwrite: bool = False,
-    progress: Progress = lambda *_: None,
+    progress: Progress = quiet,
 ) -> tuple[Path, Path]:
     """Write `run` into `folder`; return the paths of the bag and of its vessel.yaml.
 

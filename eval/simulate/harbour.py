@@ -18,7 +18,8 @@ from pydantic import Field
 from shapely import affinity, ops
 from shapely.validation import explain_validity
 
-from graphloc.config import Block, DatumConfig, Finite, NonNegative, Positive
+from graphloc.blocks import Block, Finite, NonNegative, Positive
+from graphloc.config import DatumConfig
 from graphloc.errors import ConfigError
 from graphloc.eval.simulate._files import load_block, shipped_names, validated
 from graphloc.frames import Array, Datum, yaw_from_heading_deg

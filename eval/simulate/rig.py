@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from pydantic import Field, model_validator
 
-from graphloc.config import Block, Finite, MountConfig, NonNegative, Positive
+from graphloc.blocks import Block, Finite, MountConfig, NonNegative, Positive
 from graphloc.eval.simulate._files import load_block, shipped_names
 from graphloc.eval.simulate.harbour import RESERVED, Outline
 from graphloc.frames import Array

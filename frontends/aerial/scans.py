@@ -14,14 +14,13 @@ import numpy as np
 from graphloc.config import AerialConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
+from graphloc.frontends._mounts import mounts_of
 from graphloc.frontends._source import Bag
-from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.aerial.bl import BLMatcher
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, decode_cloud, level
 from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
-from graphloc.frontends.bag import TF_STATIC
-from graphloc.frontends.decode import TF, header_stamp_ns
+from graphloc.frontends.decode import header_stamp_ns
 from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 
@@ -190,17 +189,7 @@ def _mounts(bag: Bag, config: AerialConfig, body_frame: str) -> dict[str, tuple[
                 f"{bag.name}: lidars.{name}.topic '{lidar.topic}' holds no PointCloud2; such topics: "
                 f"{', '.join(fitting) or 'none'}"
             )
-    tree = StaticTree()
-    if any(lidar.mount.tf_frame for lidar in config.lidars.values()):
-        for raw in bag.messages({TF_STATIC}):
-            if raw.msgtype == TF:
-                tree.add(bag.decode(raw))
-    return {
-        name: tree.mount(body_frame, lidar.mount.tf_frame, f"{bag.name}: lidars.{name}.mount.tf_frame")
-        if lidar.mount.tf_frame
-        else (lidar.mount.t_body_sensor_m, lidar.mount.R_body_sensor)
-        for name, lidar in config.lidars.items()
-    }
+    return mounts_of(bag, {name: lidar.mount for name, lidar in config.lidars.items()}, body_frame, "lidars")
 
 
 def _turns(bag: Bag, config: AerialConfig) -> Iterator[_Turn]:

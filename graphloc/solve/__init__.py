@@ -13,7 +13,7 @@ from graphloc.build import make_problem
 from graphloc.config import VesselConfig
 from graphloc.frames import Datum
 from graphloc.graph import InertialRow, Sensor
-from graphloc.recording import Progress, Recording
+from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 from graphloc.solve._batch import solve_batch
 from graphloc.solve._parts import solve_parts
@@ -32,7 +32,7 @@ def smooth(
     *,
     rows: Sequence[Sensor],
     inertial: InertialRow,
-    progress: Progress = lambda *_: None,
+    progress: Progress = quiet,
 ) -> Solution:
     """Smooth a whole run offline.
 

@@ -20,7 +20,7 @@ import gtsam
 import numpy as np
 
 from graphloc.build import Problem, StartPrior, with_noise_scale
-from graphloc.recording import Progress
+from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
 from graphloc.solve._choices import by_best_chains, judged_by_the_rest, take_more_probable
 from graphloc.solve._decide import Verdicts, weigh
@@ -48,7 +48,7 @@ class BatchResult:
     notes: tuple[str, ...]
 
 
-def solve_batch(problem: Problem, progress: Progress = lambda *_: None) -> BatchResult:
+def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     """Solve a whole run.
 
     Raises:

@@ -21,7 +21,7 @@ from graphloc.solve._decide import (
     along_best_chains,
     decisions,
     log_evidence,
-    pose_covariance,
+    predicted_covariance,
     thinned,
     weigh,
 )
@@ -70,7 +70,7 @@ def judged_by_the_rest(problem: Problem, settled: Settled, prior: StartPrior) ->
             first=0,
             last=last,
             stage="final",
-            covariance=pose_covariance(rest.tree),
+            covariance=predicted_covariance(rest.tree),
             only=own,
         )
         judged.update({key: _decisive(v) for key, v in fresh.items()})

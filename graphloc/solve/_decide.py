@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -18,7 +19,6 @@ import gtsam
 import numpy as np
 from scipy.stats import chi2
 
-from graphloc import keys
 from graphloc.build import Decisions, Problem, Stream, attach
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
@@ -31,7 +31,8 @@ _STAGE_KERNEL = {"far": KernelConfig(kind="huber", scale=1.5), "open": KernelCon
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
 
-PoseCovariance = Callable[[int], Array | None]
+# Of a state and a key: the covariance of the key's value as it is predicted for that state; None: not predicted.
+PredictedCovariance = Callable[[int, int], Array | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +44,7 @@ class Verdict:
         weight: posterior probability that the mode is right (or the kernel's weight).
         mode_probability: of the chosen mode among the modes.
         residual: of the chosen mode. at: where the measurement meets the graph.
+        settled: pass over the whole run from which on this mode was the chosen one.
     """
 
     decision: Decision | None
@@ -51,18 +53,23 @@ class Verdict:
     residual: Residual
     mode: int
     at: Attachment
+    settled: int = 0
 
 
 # By (stream number, measurement index).
 Verdicts = dict[tuple[int, int], Verdict]
 
 
-def _predicted(found: tuple[Residual, ...], P: Array | None) -> Array | None:
-    """Covariance (k, k) of the prediction, from that of the pose."""
+def _predicted(found: tuple[Residual, ...], at: Attachment, k: int, covariance: PredictedCovariance) -> Array | None:
+    """Covariance (k, k) of the prediction, from those of the pose and of the slow state; None: it is no prediction."""
+    P = covariance(k, at.pose_key)
     if P is None:
         return None
-    J = found[0].jacobian()
-    return np.asarray(J @ P @ J.T)
+    terms = [(found[0].jacobian(), P)]
+    if found[0].slow_jacobian is not None and at.slow_key is not None:
+        S = covariance(k, at.slow_key)
+        terms += [] if S is None else [(found[0].slow_jacobian(), S)]
+    return np.asarray(sum(J @ C @ J.T for J, C in terms))
 
 
 def weigh(
@@ -72,7 +79,7 @@ def weigh(
     first: int,
     last: int,
     stage: str,
-    covariance: PoseCovariance = lambda _state: None,
+    covariance: PredictedCovariance = lambda _state, _key: None,
     hypotheses: bool = True,
     sparse: bool = False,
     only: Container[tuple[int, int]] | None = None,
@@ -83,7 +90,7 @@ def weigh(
         problem: the run. values: current estimate.
         first: first state. last: last state, inclusive.
         stage: 'far' (Huber at most), 'open' (Cauchy at most) or 'final' (each sensor's own kernel).
-        covariance: state -> covariance (6, 6) of its predicted pose in the body tangent, or None.
+        covariance: (state, key) -> covariance of the key's prediction (a pose's in the body tangent), or None.
         hypotheses: weigh sensors that can be false by their hypotheses; else by the stage's kernel, on the
             nearest mode.
         sparse: thin sensors without hypotheses to one measurement for each slow node.
@@ -106,7 +113,8 @@ def weigh(
         ]
         if several and hypotheses:
             predicted = [
-                _predicted(r, covariance(int(stream.state[i]))) for i, r in zip(indices, residuals, strict=True)
+                _predicted(r, at, int(stream.state[i]), covariance)
+                for i, at, r in zip(indices, attached, residuals, strict=True)
             ]
             found = _by_hypotheses(stream, indices, attached, residuals, predicted)
         else:
@@ -173,7 +181,7 @@ def _by_hypotheses(
         logs = np.array([r.log_density(predicted[n]) for r in found])
         mode = int(np.argmax(logs))
         share = float(np.exp(logs[mode] - np.logaddexp.reduce(logs)))
-        weight = float(posterior[n]) * share
+        weight = float(posterior[n]) * (1.0 if stream.row.one_likelihood else share)
         kept = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
         verdicts.append(Verdict(kept, weight, share, found[mode], mode, attached[n]))
     return verdicts
@@ -220,6 +228,7 @@ def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> D
     return {key: None if v.decision is None or key in without else (v.decision, v.at) for key, v in verdicts.items()}
 
 
-def pose_covariance(tree: Any) -> PoseCovariance:
-    """Return state -> (6, 6) body-tangent covariance of its pose, from a Bayes tree."""
-    return lambda k: np.asarray(tree.marginalCovariance(keys.pose(k)))
+def predicted_covariance(tree: Any) -> PredictedCovariance:
+    """Return (state, key) -> covariance of the key's value, from a Bayes tree."""
+    of_key = cache(lambda key: np.atleast_2d(tree.marginalCovariance(key)))
+    return lambda _state, key: of_key(key)

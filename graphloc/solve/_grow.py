@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
@@ -14,7 +15,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import wrap_angle
 from graphloc.recording import Progress
 from graphloc.solve._align import Start, start_pose
-from graphloc.solve._decide import PoseCovariance, decisions, pose_covariance, weigh
+from graphloc.solve._decide import PredictedCovariance, Verdicts, decisions, predicted_covariance, weigh
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._stretch import StretchStep, dead_reckon, fill_slow, prior_at, solve_stretch
 
@@ -128,20 +129,36 @@ def _index_after(problem: Problem, seconds: float) -> int:
     return int(min(np.searchsorted(stamps, stamps[0] + int(seconds * 1e9)), len(stamps) - 1))
 
 
-def grow(problem: Problem, estimate: gtsam.Values, prior: StartPrior, known: int, progress: Progress) -> int:
-    """Take the estimate of states 0..known to the end of the run, a chunk at a time, in place."""
+def grow(
+    problem: Problem,
+    estimate: gtsam.Values,
+    prior: StartPrior,
+    known: int,
+    progress: Progress,
+    *,
+    chunk_s: float = _CHUNK_S,
+    overlap_s: float = _OVERLAP_S,
+    watch: Callable[[int, Verdicts], None] = lambda _last, _verdicts: None,
+) -> int:
+    """Take the estimate of states 0..known to the end of the run, a chunk at a time, in place.
+
+    Args:
+        chunk_s, overlap_s: how far a step goes, and how far back its window reaches.
+        watch: is told the last state of each window and what was decided in it: what one knew then.
+    """
     stamps, end = problem.timeline.stamps_ns, len(problem.timeline) - 1
     verdicts = weigh(problem, estimate, first=0, last=known, stage="final", sparse=True)
     step = solve_stretch(problem, estimate, 0, known, prior, decisions(verdicts))
     iterations, first = step.iterations, 0
     while known < end:
-        until = int(min(np.searchsorted(stamps, stamps[known] + int(_CHUNK_S * 1e9)), end))
-        start_of_window = int(np.searchsorted(stamps, stamps[known] - int(_OVERLAP_S * 1e9)))
+        until = int(min(np.searchsorted(stamps, stamps[known] + int(chunk_s * 1e9)), end))
+        start_of_window = int(np.searchsorted(stamps, stamps[known] - int(overlap_s * 1e9)))
         if start_of_window > first:
             prior = prior_at(problem, step, start_of_window)
             first = start_of_window
         dead_reckon(problem, estimate, known, until)
-        used, step = _solve_grown(problem, estimate, first, known, until, prior)
+        used, step, verdicts = _solve_grown(problem, estimate, first, known, until, prior)
+        watch(until, verdicts)
         iterations, known = iterations + used, until
         progress("growing", known, end)
     return iterations
@@ -149,8 +166,8 @@ def grow(problem: Problem, estimate: gtsam.Values, prior: StartPrior, known: int
 
 def _solve_grown(
     problem: Problem, values: gtsam.Values, first: int, known: int, last: int, prior: StartPrior
-) -> tuple[int, StretchStep]:
-    """Solve a window whose states after `known` are new, in place; return iterations and the last step.
+) -> tuple[int, StretchStep, Verdicts]:
+    """Solve a window whose states after `known` are new, in place; return iterations, the last step and its verdicts.
 
     New hypotheses wait until the rest has said where the vessel is, and how well it knows: with false matches
     in it, a window solved under Huber alone is off by many of its own sigmas (0.01 rad/s of gyro bias, 300 m
@@ -165,14 +182,14 @@ def _solve_grown(
         if step.moved_m < _FAR_SETTLED_M:
             break
     if not fresh:
-        return iterations, step
-    predicted = pose_covariance(bayes_tree(step.graph, step.values))
-    covariance: PoseCovariance = lambda k: predicted(k) if k > known else None
+        return iterations, step, verdicts
+    predicted = predicted_covariance(bayes_tree(step.graph, step.values))
+    covariance: PredictedCovariance = lambda k, key: predicted(k, key) if k > known else None
     for _ in range(2):
         verdicts = weigh(problem, values, first=first, last=last, stage="final", covariance=covariance, sparse=True)
         step = solve_stretch(problem, values, first, last, prior, decisions(verdicts))
         iterations += step.iterations
-        covariance = lambda _state: None
+        covariance = lambda _state, _key: None
         if step.moved_m < _SETTLED_M:
             break
-    return iterations, step
+    return iterations, step, verdicts

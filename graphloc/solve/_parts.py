@@ -7,12 +7,13 @@ has to stand for it (120 s: 4.6 m and 30 deg off beside the hole, where 0.1 m is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc.berths import BerthTrack
 from graphloc.errors import SolveError
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.recording import Recording
@@ -117,9 +118,22 @@ def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Se
         health_reason=tuple(r for s in solutions for r in s.health_reason),
         since_agreed_s=since,
         slow=slow,
+        berths=tuple(_join_berths([b for s in solutions for b in s.berths])),
         ledger=Ledger([*rows, *(row for s in solutions for row in s.ledger)]),
         stats=_join_stats([s.stats for s in solutions], warnings),
     )
+
+
+def _join_berths(parts: Sequence[BerthTrack]) -> Iterator[BerthTrack]:
+    for name in dict.fromkeys(part.berth.name for part in parts):
+        own = [part for part in parts if part.berth.name == name]
+        yield BerthTrack(
+            berth=own[0].berth,
+            stamps_ns=np.concatenate([part.stamps_ns for part in own]),
+            value=np.concatenate([part.value for part in own]),
+            rate=np.concatenate([part.rate for part in own]),
+            cov=np.concatenate([part.cov for part in own if part.cov is not None]),
+        )
 
 
 def _join_slow(parts: Sequence[SlowEstimate]) -> SlowEstimate:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Container
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -86,6 +86,7 @@ def settle(
         done = (optimise_run if n == 0 else refine_run)(problem, estimate, verdicts, prior)
         estimate, iterations = done.values, iterations + done.iterations
         used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage="final")
+        _date(verdicts, used, n + 1)
         progress("final passes", n + 1, most)
         if n > 0 and done.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
             break
@@ -99,6 +100,15 @@ def settle(
         iterations=iterations,
         converged=done.moved_m < 3 * SETTLED_M,
     )
+
+
+def _date(verdicts: Verdicts, before: Verdicts, n: int) -> None:
+    """Note in `verdicts`, in place, since when each mode stands: since pass `n` where it was another one before."""
+    for key, verdict in verdicts.items():
+        old = before[key]
+        settled = old.settled if old.mode == verdict.mode else n
+        if settled:
+            verdicts[key] = replace(verdict, settled=settled)
 
 
 def changed(before: Verdicts, after: Verdicts) -> float:
@@ -127,10 +137,11 @@ def open_passes(
 def expected_cost(problem: Problem, verdicts: Verdicts) -> float:
     """Degrees of freedom of the weighted problem: what 2 x its cost is expected to be."""
     n, m = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
-    expected = sum(len(v.residual.raw) * v.weight for v in verdicts.values())
+    expected = sum((v.residual.rows or len(v.residual.raw)) * v.weight for v in verdicts.values())
     expected += 9.0 * (n - 1) + 6.0 * (m - 1) + 15.0 - 9.0 * n - 6.0 * m
     for stream in problem.streams:
         if stream.slow is not None:
-            k, constant = len(stream.slow.sigma), not np.isfinite(stream.slow.time_constant_s)
-            expected += k * (m - 1) * (1 if constant else 2) + k * (1 if constant else 2) - k * m
+            expected += m * int(
+                np.isfinite(stream.slow.time_constant_s).sum()
+            )  # a constant's steps are as many as its nodes
     return expected

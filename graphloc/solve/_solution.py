@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,11 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from graphloc import keys
+from graphloc.berths import BerthTrack, rates, seen_from
 from graphloc.build import Problem, Stream
 from graphloc.frames import Array, skew
 from graphloc.ledger import Ledger, LedgerRow, Outcome
+from graphloc.measurements import Measurement
 from graphloc.recording import Recording
 from graphloc.solution import Health, SlowEstimate, Solution, SolveStats
 from graphloc.solve._batch import BatchResult, expected_cost
@@ -25,6 +28,7 @@ _FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-
 _GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_RAD = 2.5, 25.0, np.radians(45.0)
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
 _FAR_OFF = 3.0
+_NEAR_BERTH_M = 60.0
 _NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
 
 
@@ -65,9 +69,50 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         health_reason=reasons,
         since_agreed_s=since,
         slow={s.name: _slow(problem, s, result) for s in problem.streams if s.slow is not None},
+        berths=tuple(_berth_tracks(problem, result, trajectory)),
         ledger=ledger,
         stats=stats,
     )
+
+
+def _berth_tracks(problem: Problem, result: BatchResult, trajectory: Trajectory) -> Iterator[BerthTrack]:
+    """The vessel seen from each berth; where a berth is between two of its slow nodes, it is in between."""
+    timeline = problem.timeline
+    for stream in problem.streams:
+        if stream.slow is None:
+            continue
+        nodes = [keys.slow(stream.number, j) for j in range(len(timeline.slow_stamps_ns))]
+        for berth in stream.row.berths(stream.config):
+            near = np.linalg.norm(trajectory.p_world_m[:, :2] - berth.point_m[:2], axis=1) < _NEAR_BERTH_M
+            picked = np.flatnonzero(near)
+            if not len(picked):
+                continue
+            four = berth.moves + np.array([0, 1, 2, 5])  # roll and pitch of a berth do not show in its plane
+            held = np.array([np.atleast_1d(result.values.atVector(key))[four] for key in nodes])
+            middles = timeline.slow_stamps_ns + 0.5 * np.append(np.diff(timeline.slow_stamps_ns), 0)
+            moved = np.column_stack([np.interp(trajectory.stamps_ns, middles, column) for column in held.T])[picked]
+            p, yaw = trajectory.p_world_m[picked], trajectory.yaw_rad[picked]
+            value, J = seen_from(berth, p, yaw, moved)
+            stamps = trajectory.stamps_ns[picked]
+            cov = np.array([
+                _berth_covariance(problem, result, int(k), nodes[int(timeline.slow_of[k])], four, J[n])
+                + J[n, :, 3:] * berth.survey_sigma**2 @ J[n, :, 3:].T
+                for n, k in enumerate(picked)
+            ])  # fmt: skip
+            rate = rates(value, (stamps - stamps[0]) * 1e-9)
+            yield BerthTrack(berth=berth, stamps_ns=stamps, value=value, rate=rate, cov=cov)
+
+
+def _berth_covariance(
+    problem: Problem, result: BatchResult, k: int, slow_key: int, four: NDArray[np.int64], J: Array
+) -> Array:
+    """Covariance (3, 3) of what is seen from a berth at state k: pose and berth are known together, not apart."""
+    R = result.values.atPose3(keys.pose(k)).rotation().matrix()
+    joint = np.asarray(result.tree.jointMarginalCovariance([keys.pose(k), slow_key]).fullMatrix())
+    kept = np.zeros((7, len(joint)))
+    kept[:3, :6] = _to_world(R, -problem.t_body_imu_m)[[0, 1, 5]]
+    kept[3:, 6:][:, four] = np.eye(4)
+    return np.asarray(J @ kept @ joint @ kept.T @ J.T)
 
 
 def _left_out(problem: Problem) -> Array:
@@ -83,10 +128,10 @@ def _left_out(problem: Problem) -> Array:
 
 def _far_from_prior(stream: Stream, result: BatchResult) -> float:
     """How many of its sigmas a constant slow state (a mount's offset) lies from zero; 0 where there is none."""
-    if stream.slow is None or np.isfinite(stream.slow.time_constant_s):
+    if stream.slow is None:
         return 0.0
-    value = np.atleast_1d(result.values.atVector(keys.slow(stream.number, 0)))
-    return float(np.abs(value / stream.slow.sigma).max())
+    value = np.atleast_1d(result.values.atVector(keys.slow(stream.number, 0))) / stream.slow.sigma
+    return float(np.abs(value[~np.isfinite(stream.slow.time_constant_s)]).max(initial=0.0))
 
 
 def _misfit(stats: SolveStats, result: BatchResult) -> str:
@@ -104,10 +149,16 @@ def world_covariance(cov_body: Any, R: Array, lever_m: Array) -> Array:
     For the point `lever_m` (body axes) from the state. Only the blocks are rotated: the full adjoint
     would mix yaw times distance from the datum into position.
     """
+    turn = _to_world(R, lever_m)
+    return np.asarray(turn @ np.asarray(cov_body) @ turn.T)
+
+
+def _to_world(R: Array, lever_m: Array) -> Array:
+    """Return d (place of a point, rotation; world's axes) / d body tangent (6, 6)."""
     turn = np.zeros((6, 6))
     turn[:3, :3] = -R @ skew(lever_m)
     turn[:3, 3:], turn[3:, :3] = R, R
-    return np.asarray(turn @ np.asarray(cov_body) @ turn.T)
+    return turn
 
 
 def _slow(problem: Problem, stream: Stream, result: BatchResult) -> SlowEstimate:
@@ -118,11 +169,11 @@ def _slow(problem: Problem, stream: Stream, result: BatchResult) -> SlowEstimate
     sigma = np.array([np.sqrt(np.diagonal(np.atleast_2d(result.tree.marginalCovariance(key)))) for key in name])
     return SlowEstimate(
         name=process.name,
-        unit=process.unit,
         axes=process.axes,
+        units=process.units,
         stamps_ns=problem.timeline.slow_stamps_ns,
         value=value * process.scale,
-        sigma=sigma * abs(process.scale),
+        sigma=sigma * np.abs(process.scale),
     )
 
 
@@ -186,11 +237,11 @@ def _ledger(problem: Problem, recording: Recording, verdicts: dict[tuple[int, in
         for i, m in enumerate(stream.measurements):
             if m.seq >= 0:  # synthetic measurements are configuration, not messages
                 topic = recording.topics.get(stream.name, "")
-                ledger.add(_row(stream, m.seq, m.stamp_ns, topic, verdicts[(stream.number, i)]))
+                ledger.add(_row(stream, m, topic, verdicts[(stream.number, i)]))
     return ledger
 
 
-def _row(stream: Stream, seq: int, stamp_ns: int, topic: str, verdict: Verdict) -> LedgerRow:
+def _row(stream: Stream, m: Measurement, topic: str, verdict: Verdict) -> LedgerRow:
     residual, weight = verdict.residual, verdict.weight
     nis, dof = residual.nis(), len(residual.raw)
     if weight >= AGREES:
@@ -201,19 +252,21 @@ def _row(stream: Stream, seq: int, stamp_ns: int, topic: str, verdict: Verdict) 
         outcome, reason = Outcome.DOWN_WEIGHTED, "disagrees with the rest"
     several = stream.row.false is not None
     return LedgerRow(
-        seq=seq,
-        stamp_ns=stamp_ns,
+        seq=m.seq,
+        stamp_ns=m.stamp_ns,
         sensor=stream.name,
         topic=topic,
         outcome=outcome,
         weight=weight,
         mode=verdict.mode if several else None,
         mode_probability=verdict.mode_probability if several else None,
+        mode_settled=verdict.settled if several else None,
         residual_m=residual.size_m,
         residual_deg=residual.size_deg,
         nis=nis,
         dof=dof,
         reason=reason,
+        detail=stream.row.describe(m),
     )
 
 

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a docking run shows: error by distance to the tags, where the vessel ended up, where it lies at its berth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.berths import Berth, BerthTrack, track_from
+from graphloc.eval.metrics import Table
+from graphloc.frames import Array
+from graphloc.survey import Survey
+from graphloc.time import NS_PER_S, seconds_since
+from graphloc.trajectory import Trajectory
+
+BANDS_M = (0, 5, 8, 12, 16, 20, 25)  # of distance; D's figures 4.5 b and 4.6 b, which end at about 25 m
+DNV_M, DNV_WITHIN_M = 0.10, 5.0  # at 95 % in the docking phase (D sec. 2.1.4.1); D meets it within 4.8 m (table 4.13)
+_END_S = 5.0
+_SIDE_M = 1.0
+
+Stamps = NDArray[np.int64]
+_NOTE = (
+    "Position: 95 % of horizontal errors, by the true distance to the nearest tag, from the first sighting on (as sighted_rmse and "
+    "matched, the share of that time that an estimate covers); berth: the last 5 s. wrong_side: ends more than 1 m off, on "
+    "the other side of the nearest tag's face or of its middle. dnv_met: 0.10 m at 95 % within 5 m of the tags, time that "
+    "is not covered counted as missed (DNV 2018, by D sec. 2.1.4.1). Both: 1 yes, 0 no."
+)
+
+
+def tags_at_rest(survey: Survey) -> tuple[Array, Array]:
+    """Return middles (T, 3) m and axes (T, 3, 3) in world of all tags, docks at rest."""
+    frames = [survey.rest(tag.frame) for tag in survey.tags]
+    places = [p + R @ tag.xyz_m for (p, R), tag in zip(frames, survey.tags, strict=True)]
+    return np.array(places), np.array([R @ tag.R_frame_tag for (_, R), tag in zip(frames, survey.tags, strict=True)])
+
+
+def tag_range_m(track: Trajectory, survey: Survey, lever_m: Array | None = None) -> Array:
+    """Return the horizontal distance (N,) m to the nearest tag, docks at rest, at the track's stamps.
+
+    Args:
+        track: of the body.
+        survey: with one tag at least.
+        lever_m: (3,) point in body to measure from, a camera's say; None: the body's origin.
+    """
+    p = track.p_world_m if lever_m is None else track.p_world_m + track.R_world_body @ lever_m
+    away = p[:, None, :2] - tags_at_rest(survey)[0][None, :, :2]
+    return np.asarray(np.linalg.norm(away, axis=2).min(axis=1))
+
+
+def docking_table(
+    estimates: Sequence[tuple[str, Trajectory]],
+    truth: Trajectory,
+    survey: Survey,
+    sightings_ns: Stamps,
+    lever_m: Array | None = None,
+) -> Table:
+    """Return one row an estimate; None where an estimate does not cover any of the time that a number is of.
+
+    Args:
+        estimates: names and tracks of the body. truth: of the body.
+        survey: with one tag at least.
+        sightings_ns: stamps (S,) of the sightings; without any, only the columns of the end are filled.
+        lever_m: (3,) point in body that distances to tags are measured from; None: the body's origin.
+    """
+    stamps, range_m = truth.stamps_ns, tag_range_m(truth, survey, lever_m)
+    seen = stamps >= sightings_ns.min() if len(sightings_ns) else np.zeros(len(stamps), dtype=bool)
+    end = stamps > stamps[-1] - round(_END_S * NS_PER_S)
+    within = seen & (range_m <= DNV_WITHIN_M)
+    bands = {f"position_p95_{a}_to_{b}_m": seen & (range_m >= a) & (range_m < b) for a, b in pairwise(BANDS_M)}
+    columns = (*bands, "sighted_rmse_m", "berth_p95_m", "wrong_side", "dnv_met", "matched")
+    rows = []
+    for name, estimate in estimates:
+        off = _off(estimate, truth)
+        error = np.linalg.norm(off, axis=1)
+        covered = np.isfinite(error)
+        of_sighted = error[seen & covered]
+        values = (
+            *(_p95(error[band & covered]) for band in bands.values()),
+            float(np.sqrt(np.mean(of_sighted**2))) if len(of_sighted) else None,
+            _p95(error[end & covered]),
+            _wrong_side(off[end & covered], truth.p_world_m[end & covered], survey),
+            float(np.mean(error[within] <= DNV_M) >= 0.95) if (within & covered).any() else None,
+            float(covered[seen].mean()) if seen.any() else None,
+        )
+        rows.append((name, values))
+    return Table("Docking", columns, tuple(rows), _NOTE)
+
+
+def _p95(error: Array) -> float | None:
+    return float(np.percentile(error, 95)) if len(error) else None
+
+
+def _off(estimate: Trajectory, truth: Trajectory) -> Array:
+    """Horizontal estimate less truth (N, 2) at the truth's stamps; NaN where the estimate does not cover them."""
+    covered = estimate.covers(truth.stamps_ns)
+    off = np.full((len(truth), 2), np.nan)
+    if covered.any():
+        off[covered] = estimate.at(truth.stamps_ns[covered]).p_world_m[:, :2] - truth.p_world_m[covered, :2]
+    return off
+
+
+def _wrong_side(off: Array, true: Array, survey: Survey) -> float | None:
+    """1.0 where estimate and truth lie, on the mean, on two sides of the nearest tag's face or middle, > 1 m apart.
+
+    Args:
+        off: (M, 2) estimate less truth in world. true: (M, 2 or 3) truth in world.
+    """
+    if not len(off):
+        return None
+    middles, axes = tags_at_rest(survey)
+    there = true[:, :2].mean(axis=0)
+    nearest = int(np.linalg.norm(middles[:, :2] - there, axis=1).argmin())
+    sideways_out = axes[nearest][:2, [0, 2]]  # the print's x and the face's normal, in world's horizontal plane
+    of_truth = (there - middles[nearest, :2]) @ sideways_out
+    shift = off.mean(axis=0) @ sideways_out
+    return float((((of_truth + shift) * of_truth < 0.0) & (np.abs(shift) > _SIDE_M)).any())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DockMotion:
+    """How a dock moved: at stamps (M,), `moved` (M, 4): east, north, up in m, yaw in rad, from rest."""
+
+    stamps_ns: Stamps
+    moved: Array
+
+
+def relative(track: Trajectory, berth: Berth, dock: DockMotion | None = None) -> BerthTrack:
+    """Return a track as it is seen from a berth: across, along, angle, as `graphloc.berths` draws them, and their rates.
+
+    Args:
+        track: of the body.
+        berth: at rest.
+        dock: how it truly moved, or was said to; None: it did not. Interpolated linearly, and held beyond its ends.
+    """
+    moved = np.zeros((len(track), 4))
+    if dock is not None:
+        t, s = (seconds_since(int(track.stamps_ns[0]), stamps) for stamps in (track.stamps_ns, dock.stamps_ns))
+        whole = np.column_stack([dock.moved[:, :3], np.unwrap(dock.moved[:, 3])])
+        moved = np.column_stack([np.interp(t, s, whole[:, k]) for k in range(4)])
+    return track_from(berth, track, moved)

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mounts of the sensors that a block lists (LiDARs, cameras): from the configuration, or from `/tf_static`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from graphloc.blocks import MountConfig
+from graphloc.frames import Array
+from graphloc.frontends._source import Bag
+from graphloc.frontends._tf import StaticTree
+from graphloc.frontends.decode import TF
+
+TF_STATIC = "/tf_static"
+
+
+def mounts_of(
+    bag: Bag, mounts: Mapping[str, MountConfig], body_frame: str, block: str
+) -> dict[str, tuple[Array, Array]]:
+    """Return (t (3,), R (3, 3)) in body of each sensor, by name; `block` is what vessel.yaml calls their list.
+
+    Raises:
+        InputError: no chain of transforms leads from the body to a sensor.
+    """
+    tree = StaticTree()
+    if any(mount.tf_frame for mount in mounts.values()):
+        for raw in bag.messages({TF_STATIC}):
+            if raw.msgtype == TF:
+                tree.add(bag.decode(raw))
+    return {
+        name: tree.mount(body_frame, mount.tf_frame, f"{bag.name}: {block}.{name}.mount.tf_frame")
+        if mount.tf_frame
+        else (mount.t_body_sensor_m, mount.R_body_sensor)
+        for name, mount in mounts.items()
+    }

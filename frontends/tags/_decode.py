@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read a tag's bits, and look them up."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.errors import ConfigError
+
+FAMILIES = {
+    "16h5": cv2.aruco.DICT_APRILTAG_16h5,
+    "25h9": cv2.aruco.DICT_APRILTAG_25h9,
+    "36h10": cv2.aruco.DICT_APRILTAG_36h10,
+    "36h11": cv2.aruco.DICT_APRILTAG_36h11,
+}
+Cells = NDArray[np.uint8]
+# Threads run these side by side; what a degenerate quadrilateral divides by zero is not a number, and compares so.
+compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_SHARPEN = 0.25  # of what a cell is over each of its neighbours is added to it, as in AprilTag 3
+_SPREAD = 0.25  # of a cell, between the nine places where its level is taken
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Codebook:
+    """The tags of a family.
+
+    Attributes:
+        side: cells along a side, black border included. numbers: (T,).
+        cells: (T, side, side), first row on top, as AprilTag's own images have them; 1 is white.
+        codes: (T, 4) bits of the data cells, row by row, of a tag turned by 0, 1, 2, 3 quarters anticlockwise.
+    """
+
+    family: str
+    side: int
+    numbers: NDArray[np.int64]
+    cells: Cells
+    codes: NDArray[np.uint64]
+
+
+def codebook(family: str, numbers: Collection[int] | None = None) -> Codebook:
+    """Return a family's tags, or those of some numbers.
+
+    Raises:
+        ConfigError: the family is not known, or has no such number.
+    """
+    if family not in FAMILIES:
+        raise ConfigError(f"tag family {family!r} is not known: use one of {', '.join(FAMILIES)}")
+    dictionary = cv2.aruco.getPredefinedDictionary(FAMILIES[family])
+    side, known = dictionary.markerSize + 2, len(dictionary.bytesList)
+    chosen = sorted(range(known) if numbers is None else set(numbers))
+    strange = [number for number in chosen if not 0 <= number < known]
+    if strange:
+        raise ConfigError(f"tag family {family} has numbers 0 to {known - 1}, not {strange[0]}")
+    # OpenCV draws these families upside down.
+    drawn = [np.rot90(cv2.aruco.generateImageMarker(dictionary, number, side), 2) > 127 for number in chosen]
+    cells = np.array(drawn, dtype=np.uint8).reshape(len(chosen), side, side)
+    data = cells[:, 1:-1, 1:-1]
+    bits = np.stack([np.rot90(data, k, axes=(1, 2)).reshape(len(data), data.shape[1] ** 2) for k in range(4)], axis=1)
+    weight = np.uint64(1) << np.arange(bits.shape[2] - 1, -1, -1, dtype=np.uint64)
+    codes = (bits.astype(np.uint64) * weight).sum(axis=2, dtype=np.uint64)
+    return Codebook(family, side, np.array(chosen, dtype=np.int64), cells, codes)
+
+
+@compiled
+def homography(corners, side):  # type: ignore[no-untyped-def]
+    """Matrix (3, 3) from cells, x right and y down from the first corner in [0, side], to px; corners (4, 2) clockwise."""
+    au, av, bu, bv = corners[0, 0], corners[0, 1], corners[1, 0], corners[1, 1]
+    cu, cv, du, dv = corners[2, 0], corners[2, 1], corners[3, 0], corners[3, 1]
+    su, sv = au - bu + cu - du, av - bv + cv - dv
+    det = (bu - cu) * (dv - cv) - (du - cu) * (bv - cv)
+    g, h = (su * (dv - cv) - (du - cu) * sv) / det, ((bu - cu) * sv - su * (bv - cv)) / det
+    H = np.empty((3, 3))
+    H[0, 0], H[0, 1], H[0, 2] = (bu - au + g * bu) / side, (du - au + h * du) / side, au
+    H[1, 0], H[1, 1], H[1, 2] = (bv - av + g * bv) / side, (dv - av + h * dv) / side, av
+    H[2, 0], H[2, 1], H[2, 2] = g / side, h / side, 1.0
+    return H
+
+
+@compiled
+def bilinear(grey, u, v):  # type: ignore[no-untyped-def]
+    """Grey level at a point, -1 outside of the image."""
+    j, i = int(np.floor(u)), int(np.floor(v))
+    if not (0 <= j < grey.shape[1] - 1 and 0 <= i < grey.shape[0] - 1):
+        return -1.0
+    a, b = u - j, v - i
+    top = (1.0 - a) * grey[i, j] + a * grey[i, j + 1]
+    return (1.0 - b) * top + b * ((1.0 - a) * grey[i + 1, j] + a * grey[i + 1, j + 1])
+
+
+@compiled
+def _cell(grey, H, x0, y0):  # type: ignore[no-untyped-def]
+    """Mean level of the middle of a cell, -1 if it is not all in the image."""
+    total = 0.0
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            x, y = x0 + _SPREAD * j, y0 + _SPREAD * i
+            z = 1.0 / (H[2, 0] * x + H[2, 1] * y + H[2, 2])
+            level = bilinear(grey, (H[0, 0] * x + H[0, 1] * y + H[0, 2]) * z, (H[1, 0] * x + H[1, 1] * y + H[1, 2]) * z)
+            if level < 0.0:
+                return -1.0
+            total += level
+    return total / 9.0
+
+
+@compiled
+def _over(grey, H, side, values):  # type: ignore[no-untyped-def]
+    """Write each cell's level over the middle of black and white there (side, side); whether all of the tag is seen.
+
+    Black is a plane through the border's cells, white one through the cells around it. Both sets are symmetric, so that
+    a plane's three numbers come from three sums; where white's cells are cut
+    off by the image, its slope is left out, and where none is left, the brightest cell is white.
+    """
+    half = 0.5 * side
+    sums, squares, counts = np.zeros((2, 3)), np.zeros(2), np.zeros(2)
+    brightest, cut = 0.0, False
+    for r in range(-1, side + 1):
+        for c in range(-1, side + 1):
+            x, y = c + 0.5, r + 0.5
+            level = _cell(grey, H, x, y)
+            rim = min(r, c, side - 1 - r, side - 1 - c)
+            if level < 0.0:
+                if rim >= 0:
+                    return False
+                cut = True
+                continue
+            if rim >= 0:
+                values[r, c] = level
+                brightest = max(brightest, level)
+            if rim <= 0:
+                sums[-rim, 0] += level
+                sums[-rim, 1] += level * (x - half)
+                sums[-rim, 2] += level * (y - half)
+                squares[-rim] += (x - half) ** 2
+                counts[-rim] += 1.0
+    black, white = sums[0, 0] / counts[0], brightest
+    if counts[1] > 0.0:
+        white = sums[1, 0] / counts[1]
+    slope_x, slope_y = sums[0, 1] / squares[0], sums[0, 2] / squares[0]
+    if not cut:
+        slope_x, slope_y = 0.5 * (slope_x + sums[1, 1] / squares[1]), 0.5 * (slope_y + sums[1, 2] / squares[1])
+    for r in range(side):
+        for c in range(side):
+            values[r, c] -= 0.5 * (black + white) + slope_x * (c + 0.5 - half) + slope_y * (r + 0.5 - half)
+    return white > black
+
+
+@compiled
+def _bits_off(a, b):  # type: ignore[no-untyped-def]
+    """Number of bits that differ: sums of 2, 4, 8 neighbours, then of all bytes."""
+    x = a ^ b
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@compiled
+def read(grey, corners, side, codes):  # type: ignore[no-untyped-def]
+    """Return the tag that the bits in a quadrilateral (4, 2) are nearest to.
+
+    Returns:
+        Its index in codes (T, 4), or -1; quarters that it is turned by anticlockwise; bits that differ; the decision
+        margin (AprilTag 3: the mean distance of white or of black data cells to the middle, whichever is less), grey
+        levels.
+    """
+    values = np.empty((side, side))
+    if not _over(grey, homography(corners, side), side, values):
+        return -1, 0, 99, 0.0
+    code = np.uint64(0)
+    sums = np.zeros(2)
+    counts = np.full(2, 1e-9)
+    for r in range(1, side - 1):
+        for c in range(1, side - 1):
+            around = values[r - 1, c] + values[r + 1, c] + values[r, c - 1] + values[r, c + 1]
+            value = values[r, c] + _SHARPEN * (4.0 * values[r, c] - around)
+            bit = 1 if value > 0.0 else 0
+            code = (code << np.uint64(1)) | np.uint64(bit)
+            sums[bit] += abs(values[r, c])
+            counts[bit] += 1.0
+    best, index, turned = 99, -1, 0
+    for t in range(len(codes)):
+        for k in range(4):
+            off = _bits_off(code, codes[t, k])
+            if off < best:
+                best, index, turned = off, t, k
+    return index, turned, best, min(sums[0] / counts[0], sums[1] / counts[1])

@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Corners of a tag whose cells are known: the image of the whole tag is fitted, all of its edges at once.
+
+A pixel's grey level is (D black^g + (1 - D) white^g)^(1/g): D is the share of its light that comes from black cells,
+the tag's cells under a homography and a Gaussian blur; black and white are planes over the tag; g is what the camera
+encodes light with. Edges of both kinds, from dark to bright and from bright to dark, are in a tag, so that what widens
+white (gamma, glare, exposure) is told from what moves a corner.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+from graphloc.frontends.tags._decode import compiled, homography
+
+_MOST_PIXELS = 1600  # that are looked at: of a wide tag, evenly chosen ones
+_FLOOR_PX, _BLENDED_PX = 0.015, 0.15  # 1 sigma of a corner, whatever the image; and times the square of blur over cell
+_QUIET = 0.8  # cells around a tag that are surely white
+_START_BLUR_PX2, _START_GAMMA = 0.25, 1.8
+_GAMMA_SIGMA, _BLUR_SIGMA_PX2 = 0.5, 1.0  # of what is fitted, before an image is seen
+_SLOPE_SIGMA = 0.3  # of black and white over a tag, of the contrast
+_BLURS_PX2, _GAMMAS = (0.08, 60.0), (0.8, 3.0)  # a pixel alone blurs by 1/12
+_CLIPPED, _LEAST_BLACK, _ROUNDING = 254.0 / 255.0, 0.002, 1e-6  # of white; variance of eight bits
+_ASTRAY_PX, _ASTRAY_CELLS = 2.0, 1.5  # a fit that ends farther away has left the tag
+_TOO_SURE = 1.4  # times the variance: glare and motion are no Gaussian blur
+_BLOCKS = 4  # along a side: pixels of a block are wrong together
+_N = 17  # corners u0 v0 .. u3 v3, blur along rows and columns, black, its slopes, white, its slopes, gamma
+_STEP_PX, _SETTLED_PX, _TURNS, _MOST_DAMPED = 1e-4, 0.005, 14, 1e4
+_CELLS = 24  # that the light of a pixel comes from at most, along a side
+_PEAK = 1.0 / math.sqrt(2.0 * math.pi)
+
+
+class Fit(NamedTuple):
+    """Corners (4, 2) of a tag, their covariance (8, 8) in px^2, and the share of its pixels' variance that is explained."""
+
+    corners_px: Array
+    cov_px2: Array
+    explained: float
+
+
+def fit_tag(grey: NDArray[np.uint8], about_px: Array, cells: NDArray[np.uint8]) -> Fit | None:
+    """Lay a tag on an image; None if it does not come to rest near where it was thought to be.
+
+    Args:
+        about_px: (4, 2) about where the corners are: of the cells' first row's left and right end, then clockwise.
+        cells: (side, side), 1 is white.
+    """
+    pixels = _pixels(grey, about_px, np.linalg.inv(homography(about_px, len(cells))), len(cells))
+    prior = _prior(pixels, about_px, cells)
+    settled = None if prior is None else _settle(pixels, cells, *prior)
+    if prior is None or settled is None:
+        return None
+    theta, variance, A, b = settled
+    corners = theta[:8].reshape(4, 2)
+    cell_px = math.sqrt(_area(corners)) / len(cells)
+    inverse = np.linalg.inv(A.sum(axis=0) / variance + np.diag(prior.info))
+    floor_px = _FLOOR_PX + _BLENDED_PX * 0.5 * (theta[8] + theta[9]) / cell_px**2
+    cov = _TOO_SURE * max(_together(A, b, inverse, variance), 1.0) * inverse[:8, :8] + floor_px**2 * np.eye(8)
+    return Fit(corners, cov, 1.0 - variance / float(pixels[:, 2].var()))
+
+
+class _Prior(NamedTuple):
+    """What is assumed before the fit (17,), its inverse variances, and white's level over black's."""
+
+    theta: Array
+    info: Array
+    contrast: float
+
+
+def _prior(pixels: Array, about_px: Array, cells: NDArray[np.uint8]) -> _Prior | None:
+    at = np.column_stack([pixels[:, :2], np.ones(len(pixels))]) @ np.linalg.inv(homography(about_px, len(cells))).T
+    x, y = np.floor(at[:, :2] / at[:, 2:]).astype(int).T
+    white = np.pad(cells, 1, constant_values=1)[y + 1, x + 1] == 1
+    if len(pixels) < 2 * _N or white.all() or not white.any():
+        return None
+    levels = pixels[:, 2]
+    black_level, contrast = levels[~white].mean(), levels[white].mean() - levels[~white].mean()
+    if contrast <= 0.0:
+        return None
+    theta, info = np.zeros(_N), np.full(_N, 1e-9)
+    theta[:8] = about_px.ravel()
+    theta[8:10] = _START_BLUR_PX2
+    theta[10] = max(black_level - 0.1 * contrast, _LEAST_BLACK)  # blur mixed the two
+    theta[13] = black_level + 1.1 * contrast
+    theta[16] = _START_GAMMA
+    info[8:10] = 1.0 / _BLUR_SIGMA_PX2**2
+    info[[11, 12, 14, 15]] = 1.0 / (_SLOPE_SIGMA * contrast) ** 2
+    info[13] = 1.0 / contrast**2
+    info[16] = 1.0 / _GAMMA_SIGMA**2
+    return _Prior(theta, info, float(contrast))
+
+
+def _settle(
+    pixels: Array, cells: NDArray[np.uint8], prior: Array, info: Array, contrast: float
+) -> tuple[Array, float, Array, Array] | None:
+    """Levenberg-Marquardt: what is fitted (17,), the variance of a pixel, and the normal equations there by block.
+
+    None if the corners leave the tag.
+    """
+    astray_px = max(_ASTRAY_PX, _ASTRAY_CELLS * math.sqrt(_area(prior[:8].reshape(4, 2))) / len(cells))
+    theta, best, variance, cost, damp = prior, prior, (0.1 * contrast) ** 2, np.inf, 1e-3
+    A, b = np.empty((0, _N, _N)), np.empty((0, _N))
+    for turn in range(_TURNS):
+        moved = np.repeat(theta[None, :8], 9, axis=0) + _STEP_PX * np.eye(9, 8)
+        X = np.linalg.inv(np.array([homography(corners.reshape(4, 2), len(cells)) for corners in moved]))
+        A_here, b_here, squares, count = _gather(pixels, cells, theta, X, contrast**2 / variance)
+        strain = float(info @ (theta - prior) ** 2)
+        if squares / variance + strain < cost:
+            settled = turn > 0 and np.abs(theta[:8] - best[:8]).max() < _SETTLED_PX
+            best, A, b = theta, A_here, b_here
+            variance = max(squares / max(count - _N, 0.3 * count), _ROUNDING)
+            cost = squares / variance + strain
+            damp *= 0.2
+            if settled:
+                break
+        else:
+            damp *= 8.0
+            if damp > _MOST_DAMPED:
+                break
+        M = A.sum(axis=0) / variance + np.diag(info)
+        step = np.linalg.solve(M + damp * np.diag(np.diag(M)), b.sum(axis=0) / variance + info * (prior - best))
+        theta = best + step
+        if not np.abs(theta[:8] - prior[:8]).max() < astray_px:
+            return None
+        theta[8:10] = np.clip(theta[8:10], *_BLURS_PX2)
+        theta[16] = np.clip(theta[16], *_GAMMAS)
+    return best, variance, A, b
+
+
+def _together(A: Array, b: Array, inverse: Array, variance: float) -> float:
+    """How much more a block's pixels pull at the corners than if each were wrong on its own (Huber's sandwich)."""
+    P = inverse[:8] @ A / variance
+    alone = np.trace(inverse[:8] @ A @ inverse[:, :8] / variance - P @ inverse @ P.transpose(0, 2, 1), axis1=1, axis2=2)
+    return float(((b @ inverse[:, :8] / variance) ** 2).sum() / alone.sum())
+
+
+def _area(corners: Array) -> float:
+    (du, dv), (eu, ev) = corners[2] - corners[0], corners[3] - corners[1]
+    return 0.5 * abs(float(du * ev - dv * eu))
+
+
+@compiled
+def _normal(t):  # type: ignore[no-untyped-def]
+    """Density and distribution of a standard normal, to 1e-7 (Abramowitz and Stegun 7.1.26)."""
+    p = _PEAK * math.exp(-0.5 * t * t)
+    z = 1.0 / (1.0 + 0.2316418882 * abs(t))
+    tail = (
+        0.5
+        * p
+        / _PEAK
+        * z
+        * (0.254829592 + z * (-0.284496736 + z * (1.421413741 + z * (-1.453152027 + z * 1.061405429))))
+    )
+    return p, tail if t < 0.0 else 1.0 - tail
+
+
+@compiled
+def _shares(x, s, first, w, dx, ds):  # type: ignore[no-untyped-def]
+    """Write how much of a point's light comes from each cell from `first` on, blurred by s cells; and derivatives."""
+    t0 = (first - x) / s
+    p0, c0 = _normal(t0)
+    for i in range(len(w)):
+        t = (first + i + 1 - x) / s
+        p, c = _normal(t)
+        w[i], dx[i], ds[i] = c - c0, (p0 - p) / s, (t0 * p0 - t * p) / s
+        t0, c0, p0 = t, c, p
+
+
+@compiled
+def _place(X, u, v):  # type: ignore[no-untyped-def]
+    z = 1.0 / (X[2, 0] * u + X[2, 1] * v + X[2, 2])
+    return (X[0, 0] * u + X[0, 1] * v + X[0, 2]) * z, (X[1, 0] * u + X[1, 1] * v + X[1, 2]) * z, z
+
+
+@compiled
+def _model(theta, X, cells, u, v, J, w):  # type: ignore[no-untyped-def]
+    """Level of a pixel, its derivatives J (17,), and the share of its light that comes from beyond the quiet zone.
+
+    Args:
+        X: (9, 3, 3) matrices from px to cells: of corners moved one coordinate at a time by `_STEP_PX`, and of all unmoved.
+        w: (6, 24) to work in.
+    """
+    side = len(cells)
+    x, y, z = _place(X[8], u, v)
+    xu, xv = (X[8, 0, 0] - x * X[8, 2, 0]) * z, (X[8, 0, 1] - x * X[8, 2, 1]) * z
+    yu, yv = (X[8, 1, 0] - y * X[8, 2, 0]) * z, (X[8, 1, 1] - y * X[8, 2, 1]) * z
+    sx, sy = math.sqrt(theta[8] * (xu * xu + xv * xv)), math.sqrt(theta[9] * (yu * yu + yv * yv))
+    left, top = math.floor(x - 3.0 * sx), math.floor(y - 3.0 * sy)
+    nx = min(math.floor(x + 3.0 * sx) - left + 1, _CELLS)
+    ny = min(math.floor(y + 3.0 * sy) - top + 1, _CELLS)
+    _shares(x, sx, left, w[0, :nx], w[1, :nx], w[2, :nx])
+    _shares(y, sy, top, w[3, :ny], w[4, :ny], w[5, :ny])
+    D, Dx, Dy, Dsx, Dsy = 0.0, 0.0, 0.0, 0.0, 0.0
+    for r in range(max(-top, 0), min(ny, side - top)):
+        for c in range(max(-left, 0), min(nx, side - left)):
+            if cells[top + r, left + c] == 0:
+                D += w[0, c] * w[3, r]
+                Dx += w[1, c] * w[3, r]
+                Dy += w[0, c] * w[4, r]
+                Dsx += w[2, c] * w[3, r]
+                Dsy += w[0, c] * w[5, r]
+    a, b = 2.0 * x / side - 1.0, 2.0 * y / side - 1.0
+    gamma = theta[16]
+    black = max(theta[10] + theta[11] * a + theta[12] * b, _LEAST_BLACK)
+    white = max(theta[13] + theta[14] * a + theta[15] * b, 2.0 * _LEAST_BLACK)
+    black_log, white_log = math.log(black), math.log(white)
+    black_light, white_light = math.exp(gamma * black_log), math.exp(gamma * white_log)
+    light = D * black_light + (1.0 - D) * white_light
+    light_log = math.log(light)
+    level = math.exp(light_log / gamma)
+    slope = level / (light * gamma)
+    by_D = slope * (black_light - white_light)
+    for k in range(8):
+        xk, yk, _ = _place(X[k], u, v)
+        J[k] = by_D * (Dx * (xk - x) + Dy * (yk - y)) / _STEP_PX
+    J[8], J[9] = 0.5 * by_D * Dsx * sx / theta[8], 0.5 * by_D * Dsy * sy / theta[9]
+    by_black, by_white = slope * D * gamma * black_light / black, slope * (1.0 - D) * gamma * white_light / white
+    J[10], J[11], J[12] = by_black, by_black * a, by_black * b
+    J[13], J[14], J[15] = by_white, by_white * a, by_white * b
+    mean_log = D * black_light * black_log + (1.0 - D) * white_light * white_log
+    J[16] = slope * mean_log - level * light_log / gamma**2
+    out_x, out_y = (abs(x - 0.5 * side) - 0.5 * side - _QUIET) / sx, (abs(y - 0.5 * side) - 0.5 * side - _QUIET) / sy
+    strange = 0.0
+    if max(out_x, out_y) > -3.0:
+        strange = 1.0 - _normal(-out_x)[1] * _normal(-out_y)[1]
+    return level, strange
+
+
+@compiled
+def _pixels(grey, corners, X, side):  # type: ignore[no-untyped-def]
+    """Pixels (n, 3) of a tag and its quiet zone: u, v, level in [0, 1]; some, evenly chosen, if there are very many."""
+    low_u, high_u, low_v, high_v = 1e9, -1e9, 1e9, -1e9
+    area = 0.0
+    for k in range(4):
+        before, here, after = corners[k - 1], corners[k], corners[(k + 1) % 4]
+        u = here[0] + _QUIET / side * (2.0 * here[0] - before[0] - after[0])
+        v = here[1] + _QUIET / side * (2.0 * here[1] - before[1] - after[1])
+        low_u, high_u, low_v, high_v = min(low_u, u), max(high_u, u), min(low_v, v), max(high_v, v)
+        area += 0.5 * (before[0] * here[1] - here[0] * before[1])
+    u0, u1 = max(math.ceil(low_u), 0), min(int(high_u), grey.shape[1] - 1)
+    v0, v1 = max(math.ceil(low_v), 0), min(int(high_v), grey.shape[0] - 1)
+    step = max(1.0, math.sqrt(area * (1.0 + 2.0 * _QUIET / side) ** 2 / _MOST_PIXELS))
+    columns, rows = max(int((u1 - u0) / step) + 1, 0), max(int((v1 - v0) / step) + 1, 0)
+    found = np.empty((rows * columns, 3))
+    n = 0
+    for i in range(rows):
+        for j in range(columns):
+            u, v = u0 + int(j * step), v0 + int(i * step)
+            x, y, _ = _place(X, u, v)
+            if min(x, y) >= -_QUIET and max(x, y) <= side + _QUIET:
+                found[n, 0], found[n, 1], found[n, 2] = u, v, grey[v, u] / 255.0
+                n += 1
+    return found[:n]
+
+
+@compiled
+def _gather(pixels, cells, theta, X, doubt):  # type: ignore[no-untyped-def]
+    """Normal equations by block (n, 17, 17), (n, 17), for pixels of unit variance; weighted sum of squares, of weights.
+
+    Args:
+        X: as `_model` takes it. doubt: the variance of what lies beyond the quiet zone over that of a pixel.
+    """
+    side = len(cells)
+    A, b = np.zeros((_BLOCKS * _BLOCKS, _N, _N)), np.zeros((_BLOCKS * _BLOCKS, _N))
+    J, work = np.empty(_N), np.empty((6, _CELLS))
+    squares, count = 0.0, 0.0
+    for i in range(len(pixels)):
+        u, v = pixels[i, 0], pixels[i, 1]
+        level, strange = _model(theta, X, cells, u, v, J, work)
+        if pixels[i, 2] >= _CLIPPED and level >= pixels[i, 2]:
+            continue  # as it should be; how bright it was cannot be seen
+        weight = 1.0 / (1.0 + doubt * strange * strange)
+        off = pixels[i, 2] - level
+        x, y, _ = _place(X[8], u, v)
+        column, row = int(_BLOCKS * x / side), int(_BLOCKS * y / side)
+        block = _BLOCKS * min(max(row, 0), _BLOCKS - 1) + min(max(column, 0), _BLOCKS - 1)
+        squares += weight * off * off
+        count += weight
+        for m in range(_N):
+            b[block, m] += weight * J[m] * off
+            for n in range(m + 1):
+                A[block, m, n] += weight * J[m] * J[n]
+    for k in range(len(A)):
+        for m in range(_N):
+            for n in range(m):
+                A[k, n, m] = A[k, m, n]
+    return A, b, squares, count

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tags of one image become sightings: those of one frame together, those that contradict the rest alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import chi2
+
+from graphloc.frames import Array, skew
+from graphloc.frontends.tags.pose import KEPT, PoseOfCamera, modes_of, poses_of
+from graphloc.measurements import TagSighting
+from graphloc.survey import Survey, TagConfig
+
+# Corners fit with the noise that they are said to have, up to so many times its variance; beyond, a tag does not
+# belong to the others.
+_CONTRADICTS = 6.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenTag:
+    """A tag in an image.
+
+    Attributes:
+        tag: what the survey says of it. rays, cov: (4, 2) of its corners, and their covariance (8, 8).
+        fitted: the rays come of a pose that somebody else chose: they fit it perfectly, which says nothing for it.
+    """
+
+    tag: TagConfig
+    rays: Array
+    cov: Array
+    fitted: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seeing:
+    """Who sees, and when."""
+
+    stamp_ns: int
+    sensor: str
+    camera: str
+    t_body_camera_m: Array
+    R_body_camera: Array
+
+
+def sightings_of(seen: Sequence[SeenTag], survey: Survey, seeing: Seeing) -> tuple[list[TagSighting], list[int]]:
+    """Return the sightings of an image, and the ids of tags that no pose explains."""
+    found: list[TagSighting] = []
+    lost: list[int] = []
+    for frame in survey.frames:
+        of_frame = [s for s in seen if s.tag.frame == frame]
+        for bundle in _that_fit(of_frame, survey, frame) if of_frame else ():
+            if bundle.poses:
+                found.append(_sighting(bundle, survey, frame, seeing))
+            else:
+                lost += [s.tag.id for s in bundle.group]
+    return found, lost
+
+
+class _Bundle:
+    """Tags of one frame taken together.
+
+    Attributes:
+        points_m, rays, cov: (4 K, 3) corners in world at rest, (4 K, 2), (8 K, 8 K) with the survey's share.
+        poses: that explain them; none where nothing does. excess: how many times larger the squared error is than the
+            noise lets expect.
+    """
+
+    def __init__(self, group: Sequence[SeenTag], survey: Survey, frame: str) -> None:
+        p, R = survey.rest(frame)
+        self.group = tuple(group)
+        self.points_m = np.vstack([p + s.tag.corners_m @ R.T for s in group])
+        self.rays = np.vstack([s.rays for s in group])
+        self.cov = block_diag(*(s.cov for s in group))
+        self.dof = 8 * len(group) - 6
+        self.poses = poses_of(self.points_m, self.rays, self.cov)
+        self.excess = np.inf
+        if self.poses:
+            self.cov = self.cov + self._surveyed(self.poses[0])
+            self.poses = self._again()
+            self.excess = self.poses[0].squared / self.dof if self.poses else np.inf
+
+    def _again(self) -> list[PoseOfCamera]:
+        return poses_of(self.points_m, self.rays, self.cov, [(pose.R, pose.t_m) for pose in self.poses])
+
+    def _surveyed(self, pose: PoseOfCamera) -> Array:
+        """What the survey does not know of each tag, as a covariance of the rays."""
+        there, shares = self.points_m @ pose.R.T + pose.t_m, []
+        for k, s in enumerate(self.group):
+            corners = there[4 * k : 4 * k + 4]
+            arms = corners - corners.mean(axis=0)
+            J = np.zeros((8, 6))
+            for i, (x, y, z) in enumerate(corners):
+                projected = np.array([[1.0 / z, 0.0, -x / z**2], [0.0, 1.0 / z, -y / z**2]])
+                J[2 * i : 2 * i + 2] = projected @ np.hstack([np.eye(3), -skew(arms[i])])
+            variances = np.array([s.tag.sigma_m**2] * 3 + [np.radians(s.tag.sigma_deg) ** 2] * 3)
+            shares.append(J * variances @ J.T)
+        return np.asarray(block_diag(*shares))
+
+    def doubt(self) -> None:
+        """Robust loss on the image itself: corners that fit no pose as well as they should are blurred or half hidden.
+
+        Which minima are none is judged only now: with the noise that was claimed for blurred corners, all but one are.
+        """
+        if self.excess > chi2.ppf(0.95, self.dof) / self.dof:
+            self.cov = self.cov * self.excess
+            self.poses = self._again()
+        if len(self.group) > 1:
+            self.poses = [pose for pose in self.poses if pose.squared < self.poses[0].squared + KEPT]
+
+
+def _that_fit(seen: Sequence[SeenTag], survey: Survey, frame: str) -> list[_Bundle]:
+    """Groups of tags that one pose explains; three or more can tell who of them is wrong, two cannot.
+
+    Tags that fit no better without each other are blurred as a whole: they stay together, and are doubted together.
+    """
+    whole, alone = _Bundle(seen, survey, frame), list[_Bundle]()
+    while len(whole.group) > 1 and whole.excess > _CONTRADICTS:
+        group = whole.group
+        without = [_Bundle([*group[:k], *group[k + 1 :]], survey, frame) for k in range(len(group))]
+        worst = int(np.argmin([bundle.excess for bundle in without]))
+        apart = without[worst].excess if len(group) > 2 else 0.5 * sum(bundle.excess for bundle in without)
+        if np.isfinite(apart) and whole.excess <= _CONTRADICTS * apart:
+            break
+        if len(group) == 2:
+            return [*alone, *reversed(without)]
+        alone.append(_Bundle([group[worst]], survey, frame))
+        whole = without[worst]
+    return [whole, *alone]
+
+
+def _sighting(bundle: _Bundle, survey: Survey, frame: str, seeing: Seeing) -> TagSighting:
+    bundle.doubt()
+    return TagSighting(
+        stamp_ns=seeing.stamp_ns, sensor=seeing.sensor, seq=-1, camera=seeing.camera, frame=frame,
+        numbers=tuple(s.tag.id for s in bundle.group), points_m=bundle.points_m, pivot_m=survey.pivot_m(frame),
+        rays=bundle.rays, cov=0.5 * (bundle.cov + bundle.cov.T), t_body_camera_m=seeing.t_body_camera_m,
+        R_body_camera=seeing.R_body_camera,
+        modes=modes_of(
+            bundle.poses, bundle.points_m, bundle.rays, bundle.cov, blind=any(s.fitted for s in bundle.group)
+        ),
+    )  # fmt: skip

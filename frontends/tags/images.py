@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Image messages to grey images."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Grey = NDArray[np.uint8]
+_MOST_PIXELS = 100_000_000
+# Bytes of a pixel, and what makes it grey; None: it is.
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "mono8": (1, None), "8UC1": (1, None), "mono16": (2, None), "16UC1": (2, None),
+    "rgb8": (3, cv2.COLOR_RGB2GRAY), "bgr8": (3, cv2.COLOR_BGR2GRAY), "8UC3": (3, cv2.COLOR_BGR2GRAY),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY), "bgra8": (4, cv2.COLOR_BGRA2GRAY), "8UC4": (4, cv2.COLOR_BGRA2GRAY),
+    # OpenCV names a Bayer pattern by its second row's second and third pixel, ROS by the first of all.
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2GRAY), "bayer_bggr8": (1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2GRAY), "bayer_grbg8": (1, cv2.COLOR_BayerGB2GRAY),
+    "yuv422": (2, cv2.COLOR_YUV2GRAY_UYVY), "uyvy": (2, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2GRAY_YUY2), "yuyv": (2, cv2.COLOR_YUV2GRAY_YUY2),
+}  # fmt: skip
+
+
+def grey_image(msg: Any, msgtype: str) -> Grey:
+    """Return the image (rows, columns) of a message as rosbags decodes it; 16 bits are scaled to its brightest pixel.
+
+    Raises:
+        ValueError: it has none, or one that is not understood; the text says why.
+    """
+    if msgtype == "sensor_msgs/msg/Image":
+        return _raw(msg)
+    if msgtype == "sensor_msgs/msg/CompressedImage":
+        return _compressed(np.asarray(msg.data, dtype=np.uint8))
+    raise ValueError(f"{msgtype} is not an image")
+
+
+def _checked(width: int, height: int) -> None:
+    if min(width, height) <= 0:
+        raise ValueError(f"an image of {width} x {height} pixels")
+    if width * height > _MOST_PIXELS:
+        raise ValueError(
+            f"an image of {width} x {height} pixels: more than {_MOST_PIXELS / 1e6:g} million are not read"
+        )
+
+
+def _raw(msg: Any) -> Grey:
+    width, height, step = int(msg.width), int(msg.height), int(msg.step)
+    if msg.encoding not in _ENCODINGS:
+        raise ValueError(f"encoding {msg.encoding!r} is not known")
+    _checked(width, height)
+    size, to_grey = _ENCODINGS[msg.encoding]
+    if step < width * size:
+        raise ValueError(f"step {step} is less than {width} pixels of {msg.encoding}")
+    data = np.asarray(msg.data, dtype=np.uint8)
+    if data.size < height * step:
+        raise ValueError(f"{data.size} bytes of data where {height} rows of {step} were announced")
+    rows = data[: height * step].reshape(height, step)[:, : width * size]
+    if msg.encoding in ("mono16", "16UC1"):
+        deep = np.ascontiguousarray(rows).view(">u2" if msg.is_bigendian else "<u2")
+        return np.asarray(
+            cv2.convertScaleAbs(deep.astype(np.float32), alpha=255.0 / max(int(deep.max()), 255)), dtype=np.uint8
+        )
+    pixels = np.ascontiguousarray(rows if size == 1 else rows.reshape(height, width, size))
+    if to_grey is None:
+        return pixels
+    return np.asarray(cv2.cvtColor(pixels, to_grey), dtype=np.uint8)
+
+
+def _compressed(data: Grey) -> Grey:
+    header = data[: 1 << 20].tobytes()
+    if header.startswith(b"\x89PNG\r\n\x1a\n") and len(header) >= 24:
+        _checked(*struct.unpack(">II", header[16:24]))
+    elif header.startswith(b"\xff\xd8"):
+        size = _jpeg_size(header)
+        if size is not None:
+            _checked(*size)
+    else:
+        raise ValueError("compressed data is neither JPEG nor PNG")
+    try:
+        pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise ValueError("compressed data cannot be decoded")
+    return np.asarray(pixels, dtype=np.uint8)
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in a JPEG's frame header; None if there is none."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            return width, height
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big") if marker != 0xFF else 1
+    return None

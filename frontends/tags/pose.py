@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The poses of a camera that explain what it sees of tags: every minimum of the reprojection error, with its covariance.
+
+The four corners of a tag have two poses (infinitesimal plane-based pose estimation, Collins & Bartoli 2014, gives
+both); those of several tags together mostly have one. Each is refined to the minimum of the whitened error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from graphloc.frames import Array
+from graphloc.frontends.tags._spread import spread
+from graphloc.measurements import TagMode
+
+_ROUNDS = 30
+_SETTLED = 1e-7  # step, m and rad
+_SAME = 1e-3  # normalised distance of two solutions that are one
+_NEAREST_M = 0.05
+_FARTHEST = 2000.0  # sizes of a tag: it is less than a pixel there, and corners without sense lead there
+_TRIED = 4  # starts, of several tags
+KEPT = 25.0  # a minimum whose squared error is larger by that is none
+_UNLIKELIEST = 1e-9
+# Where a tag is seen from straight ahead its tilt does not show to first order, and a minimum's curvature says
+# nothing of it: what all tilts that one sees a tag under say instead.
+_ANY_TILT_RAD = float(np.radians(40.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseOfCamera:
+    """A minimum.
+
+    Attributes:
+        R, t_m: world in camera: x_camera = R x_world + t. squared: whitened squared error.
+        information: (6, 6) of (place of the points' middle in camera, rotation about camera's axes).
+    """
+
+    R: Array
+    t_m: Array
+    squared: float
+    information: Array
+
+
+def poses_of(
+    points_m: Array, rays: Array, cov: Array, starts: Sequence[tuple[Array, Array]] = ()
+) -> list[PoseOfCamera]:
+    """Return the poses that explain what is seen, best first; none where nothing does.
+
+    Args:
+        points_m: (4 K, 3) corners of K tags in turn, in world. rays: (4 K, 2) where they are seen.
+        cov: (8 K, 8 K) of the rays. starts: (R, t) of world in camera to begin from; none: each tag's own two poses.
+    """
+    whiten = np.linalg.inv(np.linalg.cholesky(cov))
+    found: list[PoseOfCamera] = []
+    if not starts:
+        own = [s for k in range(0, len(points_m), 4) for s in _starts(points_m[k : k + 4], rays[k : k + 4])]
+        starts = sorted(own, key=lambda start: _misfit(points_m, rays, whiten, *start))[:_TRIED]
+    for start in starts:
+        solved = _refine(points_m, rays, whiten, *start)
+        if solved is not None and not any(_same(solved, other, points_m) for other in found):
+            found.append(solved)
+    return sorted(found, key=lambda pose: pose.squared)[:_TRIED]
+
+
+def _starts(corners_m: Array, rays: Array) -> list[tuple[Array, Array]]:
+    """Both poses (R, t) of world in camera by one tag."""
+    middle = corners_m.mean(axis=0)
+    x, y = corners_m[1] - corners_m[0], corners_m[0] - corners_m[3]
+    axes = np.column_stack([x / np.linalg.norm(x), y / np.linalg.norm(y), np.zeros(3)])
+    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+    flat = (corners_m - middle) @ axes
+    flat[:, 2] = 0.0
+    try:
+        _, turns, places, _ = cv2.solvePnPGeneric(flat, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    except cv2.error:
+        return []
+    found = [
+        (np.asarray(cv2.Rodrigues(turn)[0], dtype=float), np.asarray(place[:, 0], dtype=float))
+        for turn, place in zip(turns, places, strict=True)
+    ]
+    # IPPE gives one alone, or the same twice, where it meets a tag from straight ahead; and exactly there numbers
+    # that are none, or the tag from behind.
+    found = [(R, t) for R, t in found if np.isfinite(R).all() and np.isfinite(t).all()]
+    found = [(R, t) for R, t in found if t[2] > _NEAREST_M and np.linalg.det(R) > 0.5 and R[:, 2] @ t < 0.0]
+    R, t = found[0] if found else _facing(float(np.linalg.norm(x)), rays)
+    found = [*(found or [(R, t)]), (_mirrored(R, t), t)]
+    return [(R @ axes.T, t - R @ axes.T @ middle) for R, t in found]
+
+
+def _facing(side_m: float, rays: Array) -> tuple[Array, Array]:
+    """The pose (R, t) of a tag that is seen from straight ahead, turned as its corners' rays (4, 2) are."""
+    x = 0.5 * (rays[1] + rays[2] - rays[0] - rays[3])
+    length = max(float(np.linalg.norm(x)), 1e-9)
+    x = x / length if length > 1e-9 else np.array([1.0, 0.0])
+    depth = side_m / length
+    R = np.array([(x[0], x[1], 0.0), (x[1], -x[0], 0.0), (0.0, 0.0, -1.0)])
+    return R, depth * np.array([*rays.mean(axis=0), 1.0])
+
+
+def _mirrored(R: Array, t: Array) -> Array:
+    """The attitude whose normal lies on the other side of the line of sight."""
+    sight, normal = t / np.linalg.norm(t), R[:, 2]
+    axis = np.cross(normal, -sight)
+    length = float(np.linalg.norm(axis))
+    tilt = float(np.arctan2(length, -normal @ sight))
+    if length < 1e-3:  # straight ahead: either way
+        axis, length, tilt = np.cross(normal, R[:, 0]), 1.0, 0.1
+    return np.asarray(Rotation.from_rotvec(2.0 * tilt * axis / length).as_matrix() @ R)
+
+
+def _errors(points_m: Array, rays: Array, R: Array, t: Array) -> tuple[Array, Array] | None:
+    """Errors (8 K,) and Jacobian (8 K, 6) by a shift and a turn about the points' middle, in camera; None: behind it."""
+    there = points_m @ R.T + t
+    if there[:, 2].min() < _NEAREST_M:
+        return None
+    flat = there[:, :2] / there[:, 2:]
+    projected = np.zeros((len(there), 2, 3))
+    projected[:, 0, 0] = projected[:, 1, 1] = 1.0 / there[:, 2]
+    projected[:, :, 2] = -flat / there[:, 2:]
+    x, y, z = (there - there.mean(axis=0)).T
+    turned = np.zeros((len(there), 3, 3))  # d (w x arm) / d w
+    turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2] = z, -y, x
+    turned[:, 1, 0], turned[:, 2, 0], turned[:, 2, 1] = -z, y, -x
+    return (flat - rays).ravel(), np.concatenate([projected, projected @ turned], axis=2).reshape(-1, 6)
+
+
+def _misfit(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> float:
+    now = _errors(points_m, rays, R, t)
+    return np.inf if now is None else float(np.linalg.norm(whiten @ now[0]))
+
+
+def _refine(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> PoseOfCamera | None:
+    """Levenberg-Marquardt from a start."""
+    now = _errors(points_m, rays, R, t)
+    if now is None:
+        return None
+    middle, damping = points_m.mean(axis=0), 1e-3
+    r, J = whiten @ now[0], whiten @ now[1]
+    for _ in range(_ROUNDS):
+        A = J.T @ J
+        step = np.linalg.solve(A + damping * np.diag(np.diagonal(A)) + 1e-9 * np.eye(6), -J.T @ r)
+        turn = Rotation.from_rotvec(step[3:]).as_matrix()
+        there = R @ middle + t + step[:3]
+        R_new = turn @ R
+        t_new = there - R_new @ middle
+        after = _errors(points_m, rays, R_new, t_new)
+        if after is not None and float((whiten @ after[0]) @ (whiten @ after[0])) <= float(r @ r):
+            R, t, r, J = R_new, t_new, whiten @ after[0], whiten @ after[1]
+            damping = max(damping / 5.0, 1e-12)
+            if np.abs(step).max() < _SETTLED:
+                break
+        else:
+            damping *= 8.0
+            if damping > 1e9:
+                break
+    if (R @ middle + t)[2] > _FARTHEST * float(np.linalg.norm(points_m[1] - points_m[0])):
+        return None
+    return PoseOfCamera(R, t, float(r @ r), J.T @ J)
+
+
+def _same(one: PoseOfCamera, other: PoseOfCamera, points_m: Array) -> bool:
+    middle = points_m.mean(axis=0)
+    shift = one.R @ middle + one.t_m - other.R @ middle - other.t_m
+    turn = Rotation.from_matrix(one.R @ other.R.T).as_rotvec()
+    step = np.concatenate([shift, turn])
+    return float(step @ one.information @ step) < _SAME or float(np.abs(step).max()) < 1e-5
+
+
+def modes_of(
+    poses: Sequence[PoseOfCamera], points_m: Array, rays: Array, cov: Array, *, blind: bool = False
+) -> tuple[TagMode, ...]:
+    """Return the poses as modes, the likeliest first.
+
+    Args:
+        poses: by `poses_of`, of the same points_m, rays and cov.
+        blind: how well a pose fits says nothing for it.
+    """
+    found = _weighed(poses, points_m, rays, cov)
+    logs = np.array([log + (0.5 * pose.squared if blind else 0.0) for (_, log), pose in zip(found, poses, strict=True)])
+    shares = np.maximum(np.exp(logs - logs.max()), _UNLIKELIEST)
+    shares /= shares.sum()
+    modes = []
+    for k in np.argsort(-shares):
+        R_world_camera, moment = poses[k].R.T, found[k][0].copy()
+        moment[:3, 3:], moment[3:, :3] = -moment[:3, 3:], -moment[3:, :3]  # the camera turns as the tags turn back
+        modes.append(
+            TagMode(
+                p_world_camera_m=-R_world_camera @ poses[k].t_m,
+                R_world_camera=R_world_camera,
+                cov=0.5 * (moment + moment.T),
+                probability=float(shares[k]),
+            )
+        )
+    return tuple(modes)
+
+
+def _weighed(poses: Sequence[PoseOfCamera], points_m: Array, rays: Array, cov: Array) -> list[tuple[Array, float]]:
+    """Covariance (6, 6) and log evidence of each pose: summed over tilts for one tag, by the curvature for several."""
+    tilted = np.diag([0.0] * 3 + [_ANY_TILT_RAD**-2] * 3)
+    curved = [np.asarray(np.linalg.inv(pose.information + tilted), dtype=float) for pose in poses]
+    if len(points_m) > 4:
+        return [
+            (c, -0.5 * p.squared + 0.5 * float(np.linalg.slogdet(c)[1])) for p, c in zip(poses, curved, strict=True)
+        ]
+    whiten = np.linalg.inv(np.linalg.cholesky(cov))
+    found = [
+        spread(points_m, rays, whiten, p.R, p.t_m, c, [o.R for o in poses if o is not p])
+        for p, c in zip(poses, curved, strict=True)
+    ]
+    # A hopeless minimum (of a tag that fills the image) may weigh one tilt of the grid alone: no covariance.
+    return [(moment + 1e-3 * c, log) for (moment, log), c in zip(found, curved, strict=True)]

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where tags are that the survey does not list, once the track says where the camera was.
+
+    p_tag = p_i + s R_i t_i        t_i: place of a tag of size 1 in the camera of view i, s: its size
+
+is linear in place and size; attitude comes from the pose that fits most views; all three are refined on the corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from graphloc.frames import Array, skew
+from graphloc.frontends.tags.pose import poses_of
+from graphloc.measurements import TagView
+from graphloc.survey import TagConfig
+from graphloc.trajectory import Trajectory
+
+_FEWEST = 5
+_MOST = 60  # views: more of them cost time, and share the track's error
+_TRIED = 12  # views whose poses are tried as a start
+_UNIT = np.array([(-0.5, 0.5, 0.0), (0.5, 0.5, 0.0), (0.5, -0.5, 0.0), (-0.5, -0.5, 0.0)])
+# 1 sigma: a place, an attitude or a size (share) that is known no better is no survey
+_WELL_M, _WELL_RAD, _WELL_SIZE = 1.0, float(np.radians(10.0)), 0.1
+_LEAST_SIZE_M = 0.01  # seen from one place only, size and distance shrink together
+_TRACK_M, _TRACK_RAD = 0.1, float(np.radians(0.3))  # of a track that does not say how good it is
+_UNKNOWN = 100.0  # m, rad, share: sigma of what nothing tells
+
+
+class _View:
+    """A view with its camera in world: place p (3,), axes R (3, 3); rays (4, 2), and what whitens them (8, 8).
+
+    A track that is off by 0.1 m shifts all corners of a tag 4 m ahead by 25 px: its covariance goes into that of the
+    rays, or the nearest views decide alone, and by the track's errors.
+    """
+
+    def __init__(self, view: TagView, p_world_body_m: Array, R_world_body: Array, track_cov: Array) -> None:
+        self.p_body, self.track_cov = p_world_body_m, track_cov
+        self.p = p_world_body_m + R_world_body @ view.t_body_camera_m
+        self.R = R_world_body @ view.R_body_camera
+        self.rays, self.cov = view.rays, view.cov
+        self.whiten = np.linalg.inv(np.linalg.cholesky(view.cov))
+        self.poses = poses_of(_UNIT, view.rays, view.cov)  # of a tag of size 1 m, in its own axes
+
+    def doubt_track(self, size_m: float) -> None:
+        """Widen the rays by the track's error (dp, w): a corner P moves by -R' (dp + w x (P - p_body)) in the camera."""
+        corners = size_m * (_UNIT @ self.poses[0].R.T + self.poses[0].t_m)
+        J = np.zeros((8, 6))
+        for i, (x, y, z) in enumerate(corners):
+            projected = np.array([[1.0 / z, 0.0, -x / z**2], [0.0, 1.0 / z, -y / z**2]]) @ self.R.T
+            arm = self.p + self.R @ corners[i] - self.p_body
+            J[2 * i : 2 * i + 2] = np.hstack([-projected, projected @ skew(arm)])
+        self.whiten = np.linalg.inv(np.linalg.cholesky(self.cov + J @ self.track_cov @ J.T))
+
+    def errors(self, p: Array, R: Array, size_m: float) -> Array:
+        there = (p + size_m * _UNIT @ R.T - self.p) @ self.R
+        depth = np.maximum(there[:, 2:], 0.05)
+        return np.asarray(self.whiten @ (there[:, :2] / depth - self.rays).ravel())
+
+
+def estimate_tags(
+    views: Sequence[TagView], track: Trajectory, size_m: float | None
+) -> tuple[list[TagConfig], list[str]]:
+    """Return the tags that are seen often and well enough, in world, and a line for each that is not.
+
+    Args:
+        views: of tags that are not surveyed. track: of the body, with covariance.
+        size_m: of such tags; None: it is estimated too.
+    """
+    found: list[TagConfig] = []
+    left: list[str] = []
+    for family, number in sorted({(v.family, v.number) for v in views}):
+        own = [v for v in views if (v.family, v.number) == (family, number)]
+        stamps = np.array([v.stamp_ns for v in own], dtype=np.int64)
+        own = [v for v, covered in zip(own, track.covers(stamps), strict=True) if covered]
+        tag = _estimate(own[:: -(-len(own) // _MOST)], track, size_m) if len(own) >= _FEWEST else None
+        if tag is None:
+            left.append(f"tag {number} ({family}) is not in the survey, and {len(own)} views do not tell where it is")
+        else:
+            found.append(tag)
+    return found, left
+
+
+def _estimate(own: Sequence[TagView], track: Trajectory, size_m: float | None) -> TagConfig | None:
+    at = track.at(np.sort(np.array([v.stamp_ns for v in own], dtype=np.int64)))
+    ordered = sorted(own, key=lambda v: v.stamp_ns)
+    unsaid = np.diag([_TRACK_M**2] * 3 + [_TRACK_RAD**2] * 3)
+    covs = np.broadcast_to(unsaid, (len(ordered), 6, 6)) if at.cov is None else at.cov
+    views = [_View(*each) for each in zip(ordered, at.p_world_m, at.R_world_body, covs, strict=True)]
+    views = [v for v in views if v.poses]
+    if len(views) < _FEWEST:
+        return None
+    place, size = _placed(views, size_m)
+    if not size > _LEAST_SIZE_M:
+        return None
+    for v in views:
+        v.doubt_track(size)
+    tried = [v.R @ pose.R for v in views[:: max(1, len(views) // _TRIED)] for pose in v.poses]
+    R0 = min(tried, key=lambda R: sum(min(float(e @ e), 1e4) for e in (v.errors(place, R, size) for v in views)))
+
+    def errors(x: Array) -> Array:
+        R = Rotation.from_rotvec(x[3:6]).as_matrix() @ R0
+        return np.concatenate(
+            [v.errors(x[:3], R, size * float(np.exp(x[6])) if size_m is None else size) for v in views]
+        )
+
+    free = 7 if size_m is None else 6
+    solved = least_squares(errors, np.concatenate([place, np.zeros(free - 3)]), loss="soft_l1", x_scale="jac")
+    misfit = max(2.0 * float(solved.cost) / max(len(solved.fun) - free, 1), 1.0)
+    jacobian = np.asarray(solved.jac)
+    cov = np.linalg.inv(jacobian.T @ jacobian + np.eye(free) * _UNKNOWN**-2) * misfit
+    sigma_m, sigma_rad = float(np.sqrt(cov.diagonal()[:3].max())), float(np.sqrt(cov.diagonal()[3:6].max()))
+    if sigma_m > _WELL_M or sigma_rad > _WELL_RAD or (size_m is None and np.sqrt(cov[6, 6]) > _WELL_SIZE):
+        return None
+    if at.cov is not None:  # the track's own error does not average out
+        sigma_m = float(np.hypot(sigma_m, np.sqrt(np.median(at.cov[:, :2, :2].trace(axis1=1, axis2=2) / 2.0))))
+        sigma_rad = float(np.hypot(sigma_rad, np.sqrt(np.median(at.cov[:, 5, 5]))))
+    R = Rotation.from_rotvec(solved.x[3:6]).as_matrix() @ R0
+    x, y, z = (round(float(v), 3) for v in solved.x[:3])
+    roll, pitch, yaw = (round(float(v), 2) for v in Rotation.from_matrix(R).as_euler("xyz", degrees=True))
+    return TagConfig(
+        id=own[0].number,
+        family=own[0].family,  # type: ignore[arg-type]  # one of the detector's
+        size_m=round(size * float(np.exp(solved.x[6])), 4) if size_m is None else size,
+        xyz_m=(x, y, z),
+        rpy_deg=(roll, pitch, yaw),
+        sigma_m=round(sigma_m, 3),
+        sigma_deg=round(float(np.degrees(sigma_rad)), 2),
+    )
+
+
+def _placed(views: Sequence[_View], size_m: float | None) -> tuple[Array, float]:
+    """Place (3,) and size of a tag, by the linear equations of all views; twice, far-off ones left out at last."""
+    toward = np.array([v.R @ v.poses[0].t_m for v in views])
+    p = np.array([v.p for v in views])
+    kept = np.ones(len(views), dtype=bool)
+    place, size = np.zeros(3), 0.0
+    for _ in range(2):
+        n = int(kept.sum())
+        if size_m is None:
+            A = np.column_stack([np.tile(np.eye(3), (n, 1)), -toward[kept].ravel()])
+            solution = np.linalg.lstsq(A, p[kept].ravel(), rcond=None)[0]
+            place, size = solution[:3], float(solution[3])
+        else:
+            place, size = np.median(p[kept] + size_m * toward[kept], axis=0), size_m
+        off = np.linalg.norm(p + size * toward - place, axis=1)
+        kept = off <= 2.0 * np.median(off) + 1e-9
+    return place, size

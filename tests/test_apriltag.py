@@ -1,0 +1,328 @@
+"""The factor of a sighting: where it leads, what it says of docks, and that it does not bend headings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from graphloc.config import AprilTagConfig
+from graphloc.factors._linear import linear_update
+from graphloc.factors.apriltag import ROW
+from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frontends.tags.pose import modes_of, poses_of
+from graphloc.graph import Attachment, Decision
+from graphloc.measurements import TagSighting
+from graphloc.survey import Survey
+from tests.tagfactory import AHEAD, FACES_SOUTH, SIGMA, SIZE_M, UNIT, degrees_between, nearest_mode, rays_of
+
+CAMERA_M = np.array([1.5, 0.2, 2.0])  # of the camera in body
+MIDDLE_M = np.array([0.0, 0.0, 1.5])
+CORNERS_M = MIDDLE_M + SIZE_M * UNIT @ FACES_SOUTH.T
+TAG: dict[str, object] = {"id": 7, "size_m": SIZE_M, "xyz_m": [0.0, 0.0, 1.5], "facing_deg": 180.0}
+FIXED = AprilTagConfig(survey=Survey.model_validate({"tags": [TAG]}))
+
+
+def vessel(
+    range_m: float, bearing_deg: float, off_deg: float = 0.0, roll_pitch_deg: Sequence[float] | Array = (0.0, 0.0)
+) -> Any:
+    """Pose of a body whose camera is so far from the tag, so far east of south of it, and looks past it by `off_deg`."""
+    b = np.radians(bearing_deg)
+    camera = np.array([range_m * np.sin(b), -range_m * np.cos(b), 2.0])
+    yaw = float(np.arctan2(-camera[1], -camera[0])) + np.radians(off_deg)
+    roll, pitch = np.radians(roll_pitch_deg)
+    R = gtsam.Rot3.RzRyRx(roll, pitch, yaw)
+    return gtsam.Pose3(R, camera - R.matrix() @ CAMERA_M)
+
+
+def sighting(
+    T: Any, rng: np.random.Generator | None = None, corners_m: Array = CORNERS_M, **changes: Any
+) -> TagSighting:
+    """What its camera sees of the tag, with noise if `rng` is given."""
+    R = T.rotation().matrix()
+    rays = rays_of(corners_m, np.asarray(T.translation()) + R @ CAMERA_M, R @ AHEAD)
+    rays = rays if rng is None else rays + rng.normal(0.0, SIGMA, (4, 2))
+    cov = np.eye(8) * SIGMA**2
+    points = changes.pop("points_m", corners_m)
+    return TagSighting(
+        stamp_ns=0, sensor="tags", seq=0, camera="bow", frame=changes.pop("frame", "world"), numbers=(7,), points_m=points,
+        pivot_m=changes.pop("pivot_m", MIDDLE_M), rays=rays, cov=cov, t_body_camera_m=CAMERA_M, R_body_camera=AHEAD,
+        modes=modes_of(poses_of(points, rays, cov), points, rays, cov),
+    )  # fmt: skip
+
+
+def attached(T: Any, slow_value: Array | None = None) -> Attachment:
+    zero = np.zeros(3)
+    return Attachment(
+        pose_key=1, velocity_key=2, slow_key=None if slow_value is None else 3, leaf_keys=(4, 5), T_world_body=T,
+        v_world_mps=zero, T_state_sensor=gtsam.Pose3(), dv_world_mps=zero, gyro_radps=zero, lever_m=zero,
+        slow_value=slow_value, datum=Datum(Geodetic(59.0, 18.0, 0.0)),
+    )  # fmt: skip
+
+
+def step(factors: Sequence[Any], values: gtsam.Values, keys: Sequence[int] = (1,)) -> gtsam.Values:
+    """One Gauss-Newton step by least squares (a far tag is badly conditioned for Cholesky)."""
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    A, b = graph.linearize(values).jacobian(ordering)
+    solution = np.linalg.lstsq(A, b, rcond=None)[0]
+    delta, at = gtsam.VectorValues(), 0
+    for key in keys:
+        size = 6 if key == 1 else len(solution) - 6 if 1 in keys else len(solution)
+        delta.insert(key, solution[at : at + size])
+        at += size
+    return values.retract(delta)
+
+
+def led_from(T: Any, m: TagSighting, mode: int) -> Any:
+    """Where ten re-linearisations lead, with a weak prior (30 m, 90 deg) at the start."""
+    prior = gtsam.PriorFactorPose3(1, T, gtsam.noiseModel.Diagonal.Sigmas(np.array([1.5] * 3 + [30.0] * 3)))
+    for _ in range(10):
+        values = gtsam.Values()
+        values.insert(1, T)
+        update = ROW.factors(m, FIXED, attached(T), Decision(mode=mode))
+        T = step([*update.factors, prior], values).atPose3(1)
+    return T
+
+
+def apart(a: Any, b: Any) -> tuple[float, float]:
+    """How far two poses are from each other, m and deg."""
+    return float(np.linalg.norm(a.translation() - b.translation())), degrees_between(
+        a.rotation().matrix(), b.rotation().matrix()
+    )
+
+
+def displaced(T: Any, rng: np.random.Generator, far_m: float = 1.5, turn_deg: float = 8.0) -> Any:
+    d, w = rng.normal(size=3), rng.normal(size=3)
+    d *= rng.uniform(0.3, 1.0) * far_m / np.linalg.norm(d)
+    w *= rng.uniform(0.3, 1.0) * np.radians(turn_deg) / np.linalg.norm(w)
+    return gtsam.Pose3(gtsam.Rot3(Rotation.from_rotvec(w).as_matrix() @ T.rotation().matrix()), T.translation() + d)
+
+
+def of_mode(m: TagSighting, k: int) -> Any:
+    """Pose of the body that a mode says."""
+    R = m.modes[k].R_world_camera @ AHEAD.T
+    return gtsam.Pose3(gtsam.Rot3(R), m.modes[k].p_world_camera_m - R @ CAMERA_M)
+
+
+@pytest.mark.parametrize("range_m", [3.0, 8.0, 15.0, 25.0])
+def test_leads_to_the_truth_and_the_other_mode_to_the_mirrored_pose(range_m: float) -> None:
+    """From 1.5 m and 8 deg off; poses 20 deg or more apart, so that the estimate is nearer to its own."""
+    rng = np.random.default_rng(int(range_m))
+    for _ in range(12):
+        bearing = rng.choice([-1.0, 1.0]) * rng.uniform(14.0, 50.0)
+        true = vessel(range_m, bearing, rng.uniform(-15.0, 15.0), rng.uniform(-2.0, 2.0, 2))
+        m = sighting(true)
+        right = nearest_mode(m.modes, true.rotation().matrix() @ AHEAD)
+        place, turn = apart(led_from(displaced(true, rng), m, right), true)
+        assert place < 0.01 * range_m
+        assert turn < 0.1
+        mirrored = of_mode(m, 1 - right)
+        assert apart(mirrored, true)[1] > 20.0
+        place, turn = apart(led_from(displaced(mirrored, rng), m, 1 - right), mirrored)
+        assert place < 0.01 * range_m
+        assert turn < 0.1
+
+
+def test_the_other_mode_leads_away_from_the_truth_only_where_the_two_are_far_apart() -> None:
+    """Poses within 20 deg of each other are one likelihood: its factor stays in the well where the estimate is."""
+    for bearing, stays in ((25.0, False), (8.0, True)):
+        true = vessel(8.0, bearing)
+        m = sighting(true)
+        right = nearest_mode(m.modes, true.rotation().matrix() @ AHEAD)
+        mirrored = of_mode(m, 1 - right)
+        led = led_from(true, m, 1 - right)
+        place, turn = apart(led, true if stays else mirrored)
+        assert place < 0.05
+        assert turn < 0.5
+        assert apart(true, mirrored)[1] == pytest.approx(2.0 * bearing, rel=0.2)
+
+
+def test_from_where_the_estimate_sees_nothing() -> None:
+    """Behind the quay, or turned away: the chosen mode leads, not corners that lie behind the camera."""
+    true = vessel(6.0, 30.0)
+    m = sighting(true)
+    right = nearest_mode(m.modes, true.rotation().matrix() @ AHEAD)
+    behind = gtsam.Pose3(true.rotation(), true.translation() + np.array([-2.0, 12.0, 0.0]))
+    away = gtsam.Pose3(true.rotation().compose(gtsam.Rot3.Yaw(2.5)), true.translation())
+    for start in (behind, away):
+        place, turn = apart(led_from(start, m, right), true)
+        assert place < 0.02
+        assert turn < 0.1
+
+
+def test_hint_is_the_body_behind_a_mounted_camera() -> None:
+    true = vessel(5.0, 35.0, 10.0)
+    hint = ROW.hint(sighting(true), 0.0, Datum(Geodetic(59.0, 18.0, 0.0)))
+    np.testing.assert_allclose(hint.p_world_m, true.translation(), atol=0.01)
+    assert hint.yaw_rad == pytest.approx(true.rotation().yaw(), abs=1e-3)
+    # Heading by tilt: 0.1 to 0.5 deg there; it swings a body 5 m off, and that is in its place.
+    assert np.radians(0.05) < hint.yaw_sigma_rad < np.radians(1.0)
+    assert (np.hypot(*hint.p_sigma_m[:2]) > 4.0 * hint.yaw_sigma_rad).all()
+
+
+DOCKED = AprilTagConfig(
+    survey=Survey.model_validate(
+        {
+            "tags": [{**TAG, "id": 1, "xyz_m": [30.0, 0.0, 1.5]}, {**TAG, "frame": "pier"}],
+            "docks": [{"name": "pier", "xyz_m": [4.0, 3.0, 0.0]}],
+        }
+    )
+)
+PIER_M = np.array([4.0, 3.0, 0.0])
+AT_REST_M = CORNERS_M + PIER_M
+
+
+def moved_sighting(motion: Array, T: Any) -> TagSighting:
+    """The tag of a dock that has moved by (d, w) about its origin."""
+    now = PIER_M + motion[:3] + (AT_REST_M - PIER_M) @ Rotation.from_rotvec(motion[3:]).as_matrix().T
+    return sighting(T, corners_m=now, points_m=AT_REST_M, frame="pier", pivot_m=PIER_M)
+
+
+MOTION = np.array([0.25, -0.15, 0.4, 0.004, -0.003, 0.05])
+
+
+def test_a_docks_known_motion_explains_what_is_seen() -> None:
+    """World has the first six of the slow state, the dock the next: it alone counts."""
+    near = vessel(7.0, 30.0)
+    true = gtsam.Pose3(near.rotation(), near.translation() + PIER_M)
+    m = moved_sighting(MOTION, true)
+    for other in (np.zeros(6), np.full(6, 0.3)):
+        at = attached(true, np.concatenate([other, MOTION]))
+        found = min(ROW.residuals(m, DOCKED, at), key=lambda r: float(r.raw @ r.raw))
+        np.testing.assert_allclose(found.raw, 0.0, atol=2e-3)
+        values = gtsam.Values()
+        values.insert(1, true)
+        values.insert(3, np.array(at.slow_value))
+        right = int(np.argmin([float(r.raw @ r.raw) for r in ROW.residuals(m, DOCKED, at)]))
+        assert ROW.factors(m, DOCKED, at, Decision(mode=right)).factors[0].error(values) < 1e-9
+    still = min(float(r.raw @ r.raw) for r in ROW.residuals(m, DOCKED, attached(true, np.zeros(12))))
+    assert still > 0.1**2
+
+
+def test_a_docks_motion_is_found_where_the_vessel_is_known() -> None:
+    near = vessel(6.0, 30.0)
+    true = gtsam.Pose3(near.rotation(), near.translation() + PIER_M)
+    m = moved_sighting(MOTION, true)
+    slow = np.zeros(12)
+    for _ in range(8):
+        at = attached(true, slow)
+        found = ROW.residuals(m, DOCKED, at)
+        right = int(np.argmin([float(r.raw @ r.raw) for r in found]))
+        update = ROW.factors(m, DOCKED, at, Decision(mode=right))
+        values = gtsam.Values()
+        values.insert(1, true)
+        values.insert(3, slow)
+        known = gtsam.PriorFactorPose3(1, true, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
+        loose = gtsam.PriorFactorVector(3, np.zeros(12), gtsam.noiseModel.Isotropic.Sigma(12, 30.0))
+        slow = step([*update.factors, known, loose], values, (1, 3)).atVector(3)
+    np.testing.assert_allclose(slow[6:], MOTION, atol=1e-5)
+    np.testing.assert_allclose(slow[:6], 0.0, atol=1e-9)
+
+
+def test_slow_states_of_world_and_dock() -> None:
+    tags = [
+        {**TAG, "sigma_m": 0.03, "sigma_deg": 0.5},
+        {**TAG, "id": 8, "frame": "pier", "sigma_m": 0.04, "sigma_deg": 2.0},
+    ]
+    dock = {"name": "pier", "moves_m": 0.6, "moves_deg": 3.0, "rises_m": 2.0, "period_s": 20.0}
+    process = ROW.slow(AprilTagConfig(survey=Survey.model_validate({"tags": tags, "docks": [dock]})))
+    assert process is not None
+    assert process.axes[:6] == ("world east", "world north", "world up", "world roll", "world pitch", "world yaw")
+    assert process.axes[6:9] == ("pier east", "pier north", "pier up")
+    degrees = process.scale * process.sigma
+    np.testing.assert_allclose(degrees[:6], [0.03, 0.03, 0.03, 0.5, 0.5, 0.5])
+    np.testing.assert_allclose(degrees[6:9], [np.hypot(0.04, 0.3)] * 2 + [np.hypot(0.04, 1.0)])
+    assert degrees[11] == pytest.approx(np.hypot(2.0, 1.5))
+    assert np.isinf(process.time_constant_s[:6]).all()
+    assert process.time_constant_s[8] > 1000.0  # the tide
+    assert ROW.slow(AprilTagConfig()) is None
+
+
+@pytest.mark.parametrize("period_s", [8.0, 25.0, 60.0])
+def test_a_dock_steps_as_far_in_a_second_as_a_swing_of_its_period(period_s: float) -> None:
+    """Simulated: the Markov chain of `slow`, and a sinusoid of the same RMS; their RMS steps agree."""
+    tag = {**TAG, "frame": "pier", "sigma_m": 0.0, "sigma_deg": 0.0}
+    survey = Survey.model_validate({"tags": [tag], "docks": [{"name": "pier", "moves_m": 0.5, "period_s": period_s}]})
+    process = ROW.slow(AprilTagConfig(survey=survey))
+    assert process is not None
+    sigma, tau = float(process.sigma[0]), float(process.time_constant_s[0])
+    assert sigma == pytest.approx(0.25)  # half of how far it wanders
+    rng = np.random.default_rng(0)
+    keep = np.exp(-1.0 / tau)
+    x = np.zeros(20000)
+    for k in range(1, len(x)):
+        x[k] = keep * x[k - 1] + sigma * np.sqrt(1.0 - keep**2) * rng.normal()
+    swing = sigma * np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(20000) / period_s)
+    assert np.diff(x).std() == pytest.approx(np.diff(swing).std(), rel=0.06)
+
+
+def test_a_frame_whose_survey_claims_to_be_perfect_still_has_a_state() -> None:
+    tag = {**TAG, "sigma_m": 0.0, "sigma_deg": 0.0}
+    process = ROW.slow(AprilTagConfig(survey=Survey.model_validate({"tags": [tag]})))
+    assert process is not None
+    assert (process.sigma > 0.0).all()
+
+
+def heading_off_deg(seed: int, count: int, gaussian: bool, bearing_deg: float = 3.0, range_m: float = 20.0) -> float:
+    """Error of the heading by so many noisy images of one pose and a prior of 0.5 deg about the truth.
+
+    `gaussian`: by the Gaussian of the mode that is nearer each time, which is what it would be decided by.
+    """
+    rng = np.random.default_rng(seed)
+    true = vessel(range_m, bearing_deg, 4.0)
+    seen = [sighting(true, rng) for _ in range(count)]
+    sigmas = np.array([*np.radians([1.0, 1.0, 0.5]), 2.0, 2.0, 2.0])
+    prior, T = gtsam.PriorFactorPose3(1, true, gtsam.noiseModel.Diagonal.Sigmas(sigmas)), true
+    for _ in range(5):
+        at, made = attached(T), list[Any]()
+        for m in seen:
+            found = ROW.residuals(m, FIXED, at)
+            mode = int(np.argmax([r.log_density() for r in found]))
+            if gaussian:
+                made += linear_update(found[mode], [(1, T, found[mode].jacobian())], Decision(mode=mode)).factors
+            else:
+                made += ROW.factors(m, FIXED, at, Decision(mode=mode)).factors
+        values = gtsam.Values()
+        values.insert(1, T)
+        T = step([*made, prior], values).atPose3(1)
+    return float(np.degrees(true.rotation().between(T.rotation()).yaw()))
+
+
+def test_many_sightings_of_a_far_tag_do_not_bend_the_heading() -> None:
+    """20 m before a tag, 3 deg off its normal: each image's two poses lie some 10 deg to either side of it."""
+    by_corners = [heading_off_deg(seed, 120, False) for seed in range(3)]
+    by_modes = [heading_off_deg(seed, 120, True) for seed in range(3)]
+    assert np.abs(by_corners).max() < 0.5
+    assert abs(np.mean(by_corners)) < 0.3
+    assert abs(np.mean(by_modes)) > 0.5
+
+
+def test_a_sighting_says_what_it_is() -> None:
+    m = sighting(vessel(5.0, 20.0))
+    assert ROW.describe is not None
+    assert ROW.describe(m) == "bow: tag 7 (world)"
+    two = replace(
+        m, numbers=(7, 9), points_m=np.vstack([CORNERS_M, CORNERS_M + 1.0]), rays=np.vstack([m.rays, m.rays]),
+        cov=np.eye(16) * 1e-8,
+    )  # fmt: skip
+    assert ROW.describe(two) == "bow: tags 7 9 (world)"
+
+
+def test_false_is_wider_than_any_mode_and_as_rare_as_it_is_said_to_be() -> None:
+    m = sighting(vessel(20.0, 10.0))
+    assert ROW.false is not None
+    model = ROW.false(m, FIXED.model_copy(update={"false_fraction": 0.1, "false_repeats": 0.5}))
+    assert (model.probability, model.repeats) == (0.1, 0.5)
+    found = ROW.residuals(m, FIXED, attached(vessel(20.0, 10.0)))
+    assert all((model.cov.diagonal() > r.cov.diagonal()).all() for r in found)
+    assert sum(r.prior for r in found) == pytest.approx(1.0 - FIXED.false_fraction)
