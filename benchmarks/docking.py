@@ -132,7 +132,7 @@ def _at_the_time(recording: Recording, config: VesselConfig) -> dict[int, int]:
 
 def _seen_as_far_as_he(run: SimulatedRun, config: VesselConfig, seen: Sequence[TagSighting], condition: str) -> int:
     """Stamp from which the camera is as near as Digerud's detector first saw a tag: farther off, his filter had none."""
-    stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
+    stamps = np.unique(np.array([m.stamp_ns for m in seen], dtype=np.int64))
     lever = run.rig.cameras["camera"].mount.t_body_sensor_m
     away = tag_range_m(run.truth.at(stamps), config.sensors["tags"].surveyed, lever)
     return int(stamps[np.flatnonzero(away <= _DIGERUD_SAW_M.get(condition, np.inf))[0]]) if len(stamps) else 0

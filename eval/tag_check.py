@@ -33,8 +33,9 @@ def suspect_tags(recording: Recording, solution: Solution) -> list[str]:
         doubted = [m for m in own if _weight(rows, m) < 0.5]
         if len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
             continue
-        at = track.at(np.array([m.stamp_ns for m in doubted], dtype=np.int64))
-        said = _explained(doubted, at.p_world_m, at.R_world_body)
+        stamps, where = np.unique([m.stamp_ns for m in doubted], return_inverse=True)  # two cameras may see it at once
+        at = track.at(stamps)
+        said = _explained(doubted, at.p_world_m[where], at.R_world_body[where])
         lines.append(f"{sensor}: tag {number}: {len(doubted)} of {len(own)} sightings disagree with the rest; {said}")
     return lines
 

@@ -2,24 +2,26 @@
 """AprilTags that a camera sees: the corners themselves are fused, the poses that explain them are its modes.
 
     z_i = pi(R' (P_i(s) - p)) + w_i,   w ~ N(0, C),   pi(x, y, z) = (x, y) / z
-    P_i(s) = c + d + Exp(w) (P_i - c),   s = (d, w) of the frame that the tags are in
+    P_i(s) = c + d + Exp(w) (P_i - c + k (P_i - m)),   s = (d, w, k) of the frame that the tags are in
 
-p, R: camera in world; P_i: a corner with its frame at rest; c: what the frame turns about; d: east, north, up; w: a small
-turn. s is a slow state: of a floating dock its motion, of world the survey's error as a whole (D has neither): tags in
-one line on a quay, all hung 0.2 deg forward, lift a vessel 20 m away by 7 cm.
+p, R: camera in world; P_i: a corner with its frame at rest; c: what the frame turns about, a dock's origin, or in world
+m, the middle of the tags in the image; d: east, north, up; w: a small turn; k: scale. s is a slow state: of a floating
+dock its motion, and of either what all sightings err together because the survey does (D has neither): three tags
+that hang 0.2 deg forward lift a vessel 20 m away by 7 cm, and 1 cm too much between them puts her 0.1 m farther off.
 
 Four coplanar corners have two poses, and beyond some 20 tag widths these run into each other: one pose's Gaussian is
 then no likelihood, and hundreds of sightings of which each is drawn to its nearer mode bend the heading (measured:
 docs/decisions/0007). So the factor is the reprojection itself, linearised anew at every pass: where the estimate is
 when it lies by the chosen mode, else at that mode. The modes' Gaussians are there to choose by:
 
-    e = (p + R t_m - c_tags(s), Log(R R_m(s)'))    t_m: the tags' middle in the camera of mode m
+    e = (p + (1 + k) R t_m - m(s), Log(R R_m(s)'))    t_m: the tags' middle in the camera of mode m
 
 that is the place that the tags give the camera if its attitude is the predicted one, and that attitude.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gtsam
@@ -32,7 +34,7 @@ from graphloc.factors._linear import linear_update
 from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import TagMode, TagSighting
-from graphloc.survey import WORLD, DockConfig, Survey
+from graphloc.survey import WORLD, DockConfig, Survey, TagConfig
 
 # Where a false sighting may put the camera: a berth further on, turned as one likes within a quarter of a circle.
 FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(30.0))
@@ -41,10 +43,12 @@ FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(30.0))
 _TO_DECIDE = np.array([0.05] * 3 + [np.radians(0.5)] * 3)
 _AHEAD = 0.3  # of a mode's distances: nearer than that the estimate's own are not believed
 _BY_A_MODE_RAD = float(np.radians(20.0))
-_FREEDOM = ("east", "north", "up", "roll", "pitch", "yaw")
+_FREEDOM = ("east", "north", "up", "roll", "pitch", "yaw", "scale")
 _SIZE = len(_FREEDOM)
 _LEAST_M, _LEAST_RAD = 1e-3, float(np.radians(0.01))
+_LEAST_SCALE, _LARGEST_SCALE = 1e-3, 0.02  # a print's, and what corners that fit at all allow for
 _TIDE_S = 3600.0
+_OTHER_TAGS_S = 120.0  # after about so long other tags are in view, and the survey errs in another way
 
 
 class _Seen:
@@ -66,14 +70,16 @@ class _Seen:
         moved = np.zeros(_SIZE)
         if at.slow_value is not None:
             moved = np.asarray(at.slow_value)[self.first : self.first + _SIZE]
-        self.turn = np.asarray(Rotation.from_rotvec(moved[3:]).as_matrix())
-        self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-moved[3:]))  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
-        self.arms = (m.points_m - m.pivot_m) @ self.turn.T
+        self.turn = np.asarray(Rotation.from_rotvec(moved[3:6]).as_matrix())
+        self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-moved[3:6]))  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
+        self.scale = float(moved[6])
+        self.spread = (m.points_m - m.points_m.mean(axis=0)) @ self.turn.T
+        self.arms = (m.points_m - m.pivot_m) @ self.turn.T + self.scale * self.spread
         self.points_m = m.pivot_m + moved[:3] + self.arms
         self.middle_m = self.points_m.mean(axis=0)
 
     def placed(self, per_frame: Array) -> Array:
-        """Put d / d slow state of the frame (k, 6) where it stands among those of all frames (k, n)."""
+        """Put d / d slow state of the frame (k, 7) where it stands among those of all frames (k, n)."""
         whole = np.zeros((len(per_frame), self.slow_size))
         whole[:, self.first : self.first + _SIZE] = per_frame
         return whole
@@ -91,7 +97,7 @@ def _turned(R: Array) -> Array:
 
 
 def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode) -> Residual:
-    toward = seen.R @ _middle_in_camera(m, mode)
+    toward = (1.0 + seen.scale) * seen.R @ _middle_in_camera(m, mode)
     rotation = Rotation.from_matrix(seen.R @ (seen.turn @ mode.R_world_camera).T).as_rotvec()
     raw = np.concatenate([seen.p + toward - seen.middle_m, rotation])
 
@@ -101,10 +107,11 @@ def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode)
         return np.asarray(turned @ seen.body)
 
     def slow_jacobian() -> Array:
-        per_frame = -np.eye(6)
-        per_frame[:3, 3:] = skew(seen.arms.mean(axis=0))
-        per_frame[:, 3:] = per_frame[:, 3:] @ seen.by_turn
-        return seen.placed(per_frame)
+        rigid = -np.eye(6)
+        rigid[:3, 3:] = skew(seen.arms.mean(axis=0))
+        rigid[:, 3:] = rigid[:, 3:] @ seen.by_turn
+        by_scale = np.concatenate([toward / (1.0 + seen.scale), np.zeros(3)])
+        return seen.placed(np.column_stack([rigid, by_scale]))
 
     return Residual(
         raw=raw,
@@ -141,7 +148,8 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
     rotation = np.array([skew(v) for v in off])
     camera = np.concatenate([-by_point, by_point @ rotation], axis=2).reshape(-1, 6)
     swing = np.array([-skew(arm) for arm in seen.arms]) @ seen.by_turn
-    by_frame = np.concatenate([by_point, by_point @ swing], axis=2).reshape(-1, _SIZE)
+    by_scale = by_point @ seen.spread[:, :, None]
+    by_frame = np.concatenate([by_point, by_point @ swing, by_scale], axis=2).reshape(-1, _SIZE)
     corners = Residual(
         raw=(flat - m.rays).ravel(), cov=m.cov, jacobian=lambda: np.asarray(camera @ seen.body), prior=1.0,
         size_m=None, size_deg=None,
@@ -184,31 +192,39 @@ def slow(config: AprilTagConfig) -> SlowProcess | None:
     return SlowProcess(
         name="tags moved",
         axes=tuple(f"{frame} {axis}" for frame in survey.frames for axis in _FREEDOM),
-        units=("m", "m", "m", "deg", "deg", "deg") * len(parts),
-        scale=np.tile(np.repeat([1.0, 180.0 / np.pi], 3), len(parts)),
+        units=("m", "m", "m", "deg", "deg", "deg", "%") * len(parts),
+        scale=np.tile(np.repeat([1.0, 180.0 / np.pi, 100.0], [3, 3, 1]), len(parts)),
         sigma=np.concatenate([sigma for sigma, _ in parts]),
         time_constant_s=np.concatenate([time for _, time in parts]),
     )
 
 
 def _freedom(survey: Survey, frame: str) -> tuple[Array, Array]:
-    """Sigmas (6,) of a frame's slow state, m and rad, and their time constants (6,), s.
+    """Sigmas (7,) of a frame's slow state, m and rad, and their time constants (7,), s.
 
     A dock that swings with period T and RMS s moves at 2 pi s / T; the Markov process that steps as far in 1 s has a
     time constant of T^2 / 2 pi^2. How far it wanders is taken for two sigmas.
     """
     tags = [tag for tag in survey.tags if tag.frame == frame]
-    surveyed = np.array([max(t.sigma_m for t in tags)] * 3 + [np.radians(max(t.sigma_deg for t in tags))] * 3)
-    least = np.array([_LEAST_M] * 3 + [_LEAST_RAD] * 3)
+    sigma_m, sigma_rad = _usual_sigmas(tags)
+    surveyed = np.array([sigma_m] * 3 + [sigma_rad] * 3 + [_scale_sigma(tags)])
     dock: DockConfig | None = None if frame == WORLD else survey.dock(frame)
     if dock is None:
-        return np.maximum(surveyed, least), np.full(_SIZE, np.inf)
+        return surveyed, np.full(_SIZE, _OTHER_TAGS_S)
     turns = np.radians([dock.tilts_deg, dock.tilts_deg, dock.moves_deg])
-    moves = np.concatenate([[dock.moves_m, dock.moves_m, dock.rises_m], turns]) / 2.0
+    moves = np.concatenate([[dock.moves_m, dock.moves_m, dock.rises_m], turns, [0.0]]) / 2.0
     swing_s = max(dock.period_s**2 / (2.0 * np.pi**2), 1.0)
-    return np.maximum(np.hypot(surveyed, moves), least), np.array(
-        [swing_s, swing_s, _TIDE_S, swing_s, swing_s, swing_s]
-    )
+    times = np.array([swing_s, swing_s, _TIDE_S, swing_s, swing_s, swing_s, _OTHER_TAGS_S])
+    return np.hypot(surveyed, moves), times
+
+
+def _scale_sigma(tags: Sequence[TagConfig]) -> float:
+    """How well distances between tags that are seen together are known: by the survey's noise over those to the next."""
+    place = np.array([tag.xyz_m for tag in tags])
+    away = np.linalg.norm(place[:, None] - place[None], axis=2) + np.diag(np.full(len(tags), np.inf))
+    nearest = away.min(axis=1)
+    apart = float(np.median(nearest[np.isfinite(nearest)])) if np.isfinite(nearest).any() else np.inf
+    return float(np.clip(_usual_sigmas(tags)[0] / apart, _LEAST_SCALE, _LARGEST_SCALE))
 
 
 def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:
@@ -224,14 +240,16 @@ def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:
     now = p + corners @ R.T
     moved = np.zeros(_SIZE) if at.slow_value is None else np.asarray(at.slow_value)[:_SIZE]
     pivot = now.mean(axis=0) + np.array([2.0, -1.0, 0.5])
-    back = np.asarray(Rotation.from_rotvec(-moved[3:]).as_matrix())
+    back = np.asarray(Rotation.from_rotvec(-moved[3:6]).as_matrix())
+    scaled = pivot + (now - pivot - moved[:3]) @ back.T
+    middle = scaled.mean(axis=0)
     mode = TagMode(
-        p_world_camera_m=pivot + back @ (p - pivot - moved[:3]), R_world_camera=back @ R,
+        p_world_camera_m=middle - back @ (now.mean(axis=0) - p) / (1.0 + moved[6]), R_world_camera=back @ R,
         cov=np.diag([0.02**2] * 3 + [0.01**2] * 3), probability=1.0,
     )  # fmt: skip
     return TagSighting(
         stamp_ns=0, sensor="apriltag", seq=0, camera="camera", frame=(*survey.frames, WORLD)[0], numbers=(0,),
-        points_m=pivot + (now - pivot - moved[:3]) @ back.T, pivot_m=pivot, rays=corners[:, :2] / corners[:, 2:],
+        points_m=middle + (scaled - middle) / (1.0 + moved[6]), pivot_m=pivot, rays=corners[:, :2] / corners[:, 2:],
         cov=np.eye(8) * 1e-6, t_body_camera_m=t_body_camera, R_body_camera=R_body_camera, modes=(mode,),
     )  # fmt: skip
 
@@ -256,9 +274,9 @@ def berths(config: AprilTagConfig) -> tuple[Berth, ...]:
     survey, found = config.surveyed, []
     for number, frame in enumerate(survey.frames):
         p, R = survey.rest(frame)
+        tags = [tag for tag in survey.tags if tag.frame == frame]
         listed = [(b.name, np.array(b.xyz_m), b.facing_deg) for b in survey.berths if b.frame == frame]
         if not survey.berths:
-            tags = [tag for tag in survey.tags if tag.frame == frame]
             out = np.sum([tag.R_frame_tag[:, 2] for tag in tags], axis=0)
             if np.hypot(out[0], out[1]) > 0.5 * len(tags):  # they look the same way, and to the side
                 facing = float(np.degrees(np.arctan2(out[0], out[1])))
@@ -271,20 +289,26 @@ def berths(config: AprilTagConfig) -> tuple[Berth, ...]:
                     name=name,
                     point_m=p + R @ xyz_m,
                     facing_deg=float(np.degrees(np.arctan2(out[0], out[1]))),
-                    pivot_m=survey.pivot_m(frame),
+                    pivot_m=p if frame != WORLD else R @ xyz_m,
                     moves=_SIZE * number,
-                    survey_sigma=_survey_sigma(survey, frame),
+                    survey_sigma=_survey_sigma(tags),
+                    survey_middle_m=p + R @ np.mean([tag.xyz_m for tag in tags], axis=0),
                 )
             )
     return tuple(found)
 
 
-def _survey_sigma(survey: Survey, frame: str) -> Array:
+def _usual_sigmas(tags: Sequence[TagConfig]) -> tuple[float, float]:
+    """Sigmas of place (m) and axes (rad) of the tag in the middle; what one is known worse is in its sightings."""
+    sigma_m = float(np.median([tag.sigma_m for tag in tags]))
+    sigma_rad = float(np.radians(np.median([tag.sigma_deg for tag in tags])))
+    return max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)
+
+
+def _survey_sigma(tags: Sequence[TagConfig]) -> Array:
     """How well the tags of a frame together stand to it: east, north, up in m, yaw in rad, 1 sigma (4,)."""
-    tags = [tag for tag in survey.tags if tag.frame == frame]
     place = np.array([tag.xyz_m[:2] for tag in tags])
-    sigma_m = max(max(t.sigma_m for t in tags), _LEAST_M)
-    sigma_rad = max(np.radians(max(t.sigma_deg for t in tags)), _LEAST_RAD)
+    sigma_m, sigma_rad = _usual_sigmas(tags)
     yaw_rad = (len(tags) / sigma_rad**2 + float(((place - place.mean(axis=0)) ** 2).sum()) / sigma_m**2) ** -0.5
     return np.array([sigma_m / np.sqrt(len(tags))] * 3 + [yaw_rad])
 

@@ -33,7 +33,8 @@ class Berth:
         name: for outputs. point_m: (3,) P in world. facing_deg: heading f, from north, clockwise.
         pivot_m: (3,) c in world. moves: index of its (e, n, u, roll, pitch, psi) in the slow state of the
             sensor that knows it.
-        survey_sigma: (4,) how well what the sensor sees stands to it: east, north, up in m, yaw in rad.
+        survey_sigma: (4,) how well what the sensor sees stands to it: east, north, up in m, yaw in rad, about the
+            point survey_middle_m (3,) in world.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Berth:
     pivot_m: Array
     moves: int = 0
     survey_sigma: Array = field(default_factory=lambda: np.zeros(4))
+    survey_middle_m: Array = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

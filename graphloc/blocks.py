@@ -61,7 +61,9 @@ def _fields_at(model: type[BaseModel], path: list[str]) -> list[str]:
     """Names of the fields of the block that `path` leads to."""
     for name in path:
         field = model.model_fields.get(name)
-        inner = [a for a in (field.annotation, *getattr(field.annotation, "__args__", ())) if field] if field else []
+        if field is None:  # an entry of a list or mapping of blocks
+            continue
+        inner = [field.annotation, *getattr(field.annotation, "__args__", ())]
         blocks = [a for a in inner if isinstance(a, type) and issubclass(a, BaseModel)]
         if not blocks:
             return []

@@ -183,20 +183,21 @@ AT_REST_M = CORNERS_M + PIER_M
 
 
 def moved_sighting(motion: Array, T: Any) -> TagSighting:
-    """The tag of a dock that has moved by (d, w) about its origin."""
-    now = PIER_M + motion[:3] + (AT_REST_M - PIER_M) @ Rotation.from_rotvec(motion[3:]).as_matrix().T
+    """The tag of a dock that has moved by (d, w) about its origin, and is larger by k than the survey says."""
+    grown = AT_REST_M - PIER_M + motion[6] * (AT_REST_M - AT_REST_M.mean(axis=0))
+    now = PIER_M + motion[:3] + grown @ Rotation.from_rotvec(motion[3:6]).as_matrix().T
     return sighting(T, corners_m=now, points_m=AT_REST_M, frame="pier", pivot_m=PIER_M)
 
 
-MOTION = np.array([0.25, -0.15, 0.4, 0.004, -0.003, 0.05])
+MOTION = np.array([0.25, -0.15, 0.4, 0.004, -0.003, 0.05, 0.02])
 
 
 def test_a_docks_known_motion_explains_what_is_seen() -> None:
-    """World has the first six of the slow state, the dock the next: it alone counts."""
+    """World has the first seven of the slow state, the dock the next: it alone counts."""
     near = vessel(7.0, 30.0)
     true = gtsam.Pose3(near.rotation(), near.translation() + PIER_M)
     m = moved_sighting(MOTION, true)
-    for other in (np.zeros(6), np.full(6, 0.3)):
+    for other in (np.zeros(7), np.full(7, 0.3)):
         at = attached(true, np.concatenate([other, MOTION]))
         found = min(ROW.residuals(m, DOCKED, at), key=lambda r: float(r.raw @ r.raw))
         np.testing.assert_allclose(found.raw, 0.0, atol=2e-3)
@@ -205,15 +206,17 @@ def test_a_docks_known_motion_explains_what_is_seen() -> None:
         values.insert(3, np.array(at.slow_value))
         right = int(np.argmin([float(r.raw @ r.raw) for r in ROW.residuals(m, DOCKED, at)]))
         assert ROW.factors(m, DOCKED, at, Decision(mode=right)).factors[0].error(values) < 1e-9
-    still = min(float(r.raw @ r.raw) for r in ROW.residuals(m, DOCKED, attached(true, np.zeros(12))))
+    still = min(float(r.raw @ r.raw) for r in ROW.residuals(m, DOCKED, attached(true, np.zeros(14))))
     assert still > 0.1**2
 
 
 def test_a_docks_motion_is_found_where_the_vessel_is_known() -> None:
     near = vessel(6.0, 30.0)
     true = gtsam.Pose3(near.rotation(), near.translation() + PIER_M)
-    m = moved_sighting(MOTION, true)
-    slow = np.zeros(12)
+    motion = np.append(MOTION[:6], 0.0)  # of one tag alone size and distance look alike
+    m = moved_sighting(motion, true)
+    slow = np.zeros(14)
+    free = np.append(np.full(13, 30.0), 1e-6)
     for _ in range(8):
         at = attached(true, slow)
         found = ROW.residuals(m, DOCKED, at)
@@ -223,10 +226,10 @@ def test_a_docks_motion_is_found_where_the_vessel_is_known() -> None:
         values.insert(1, true)
         values.insert(3, slow)
         known = gtsam.PriorFactorPose3(1, true, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
-        loose = gtsam.PriorFactorVector(3, np.zeros(12), gtsam.noiseModel.Isotropic.Sigma(12, 30.0))
+        loose = gtsam.PriorFactorVector(3, np.zeros(14), gtsam.noiseModel.Diagonal.Sigmas(free))
         slow = step([*update.factors, known, loose], values, (1, 3)).atVector(3)
-    np.testing.assert_allclose(slow[6:], MOTION, atol=1e-5)
-    np.testing.assert_allclose(slow[:6], 0.0, atol=1e-9)
+    np.testing.assert_allclose(slow[7:], motion, atol=1e-5)
+    np.testing.assert_allclose(slow[:7], 0.0, atol=1e-9)
 
 
 def test_slow_states_of_world_and_dock() -> None:
@@ -237,15 +240,24 @@ def test_slow_states_of_world_and_dock() -> None:
     dock = {"name": "pier", "moves_m": 0.6, "moves_deg": 3.0, "rises_m": 2.0, "period_s": 20.0}
     process = ROW.slow(AprilTagConfig(survey=Survey.model_validate({"tags": tags, "docks": [dock]})))
     assert process is not None
-    assert process.axes[:6] == ("world east", "world north", "world up", "world roll", "world pitch", "world yaw")
-    assert process.axes[6:9] == ("pier east", "pier north", "pier up")
-    degrees = process.scale * process.sigma
-    np.testing.assert_allclose(degrees[:6], [0.03, 0.03, 0.03, 0.5, 0.5, 0.5])
-    np.testing.assert_allclose(degrees[6:9], [np.hypot(0.04, 0.3)] * 2 + [np.hypot(0.04, 1.0)])
-    assert degrees[11] == pytest.approx(np.hypot(2.0, 1.5))
-    assert np.isinf(process.time_constant_s[:6]).all()
-    assert process.time_constant_s[8] > 1000.0  # the tide
+    axes = ("east", "north", "up", "roll", "pitch", "yaw", "scale")
+    assert process.axes == (*(f"world {a}" for a in axes), *(f"pier {a}" for a in axes))
+    assert process.units == ("m", "m", "m", "deg", "deg", "deg", "%") * 2
+    shown = process.scale * process.sigma
+    np.testing.assert_allclose(shown[:7], [0.03, 0.03, 0.03, 0.5, 0.5, 0.5, 0.1])  # one tag: as well as it is printed
+    np.testing.assert_allclose(shown[7:10], [np.hypot(0.04, 0.3)] * 2 + [np.hypot(0.04, 1.0)])
+    assert shown[12] == pytest.approx(np.hypot(2.0, 1.5))
+    assert (process.time_constant_s[:7] > 60.0).all()
+    assert process.time_constant_s[9] > 1000.0  # the tide
     assert ROW.slow(AprilTagConfig()) is None
+
+
+def test_distances_between_tags_are_known_as_well_as_the_survey_says() -> None:
+    """Three tags 2 m apart, each to 1 cm: 0.5 % of what lies between two; one of them known worse changes nothing."""
+    tags = [{**TAG, "id": k, "xyz_m": [2.0 * k, 0.0, 1.5], "sigma_m": s} for k, s in enumerate((0.01, 0.01, 0.3))]
+    process = ROW.slow(AprilTagConfig(survey=Survey.model_validate({"tags": tags})))
+    assert process is not None
+    np.testing.assert_allclose(process.sigma[[0, 6]], [0.01, 0.005])
 
 
 @pytest.mark.parametrize("period_s", [8.0, 25.0, 60.0])

@@ -146,7 +146,7 @@ def test_a_docks_berth_is_turned_with_it() -> None:
     dock = {"name": "pier", "xyz_m": [10.0, 20.0, 0.5], "rpy_deg": [0.0, 0.0, 90.0]}
     config = surveyed([("world", [0.0, 0.0, 1.0], 90.0), ("pier", [3.0, 0.0, 1.0], 0.0)], [dock])
     quay, pier = berths(config)
-    assert (quay.name, quay.moves, pier.name, pier.moves) == ("quay", 0, "pier", 6)
+    assert (quay.name, quay.moves, pier.name, pier.moves) == ("quay", 0, "pier", 7)
     np.testing.assert_allclose(pier.point_m, [10.0, 23.0, 1.5])
     assert pier.facing_deg % 360.0 == pytest.approx(270.0)
     np.testing.assert_allclose(pier.pivot_m, [10.0, 20.0, 0.5])
@@ -167,7 +167,7 @@ def test_listed_berths_are_the_only_ones() -> None:
     listed: list[object] = [{"name": "inner", "frame": "pier", "xyz_m": [0.0, 2.0, 0.3], "facing_deg": 90.0}]
     config = surveyed([("world", [0.0, 0.0, 1.0], 90.0), ("pier", [3.0, 0.0, 1.0], 0.0)], [dock], listed)
     (found,) = berths(config)
-    assert (found.name, found.moves) == ("inner", 6)
+    assert (found.name, found.moves) == ("inner", 7)
     np.testing.assert_allclose(found.point_m, [8.0, 20.0, 0.3], atol=1e-9)  # 2 m along its y: 2 m west
     assert found.facing_deg % 360.0 == pytest.approx(0.0, abs=1e-9)  # along its x: north
 

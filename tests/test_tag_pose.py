@@ -207,6 +207,9 @@ def test_probabilities_come_true() -> None:
         assert inside.sum() > 40
         spread = np.sqrt((c[inside] * (1.0 - c[inside])).sum()) / inside.sum()
         assert abs(r[inside].mean() - c[inside].mean()) < 3.0 * spread + 0.01, (low, inside.sum())
+    doubtful = c < 0.97
+    score = (r[doubtful] - c[doubtful]).sum() / np.sqrt((c[doubtful] * (1.0 - c[doubtful])).sum())
+    assert abs(score) < 2.0  # sigmas; the squares of the shares give -2.7, their 0.7th powers 3.3
 
 
 def test_a_blind_mode_is_not_judged_by_its_fit() -> None:
@@ -309,16 +312,14 @@ def test_tags_blurred_alike_stay_together() -> None:
 
 
 def test_a_pose_that_only_claimed_noise_rules_out_is_kept() -> None:
-    """Two blurred tags 20 m off: by the noise that is claimed, the wrong minimum may win by more than 25."""
+    """Two tags 22 m off, blurred: by the noise that is claimed, one minimum wins by more than 25; by the true one, it does not."""
     rng = np.random.default_rng(12)
     survey = Survey(tags=three(facing_deg=(180.0, 180.0, 180.0)).tags[:2])
-    lost = 0
+    modes_found = []
     for _ in range(40):
-        seen, _, R = look(survey, rng, noise=6.0, p_m=np.array([4.0, -9.0, 1.8]))
-        found = sightings_of(seen, survey, SEEING)[0]
-        assert len(found) == 1
-        lost += degrees_between(np.asarray(found[0].modes[nearest_mode(found[0].modes, R)].R_world_camera), R) > 15.0
-    assert lost <= 10
+        seen, _, _ = look(survey, rng, noise=6.0, p_m=np.array([0.0, -12.0, 1.8]))
+        modes_found += [len(s.modes) for s in sightings_of(seen, survey, SEEING)[0]]
+    assert modes_found.count(1) <= 20
 
 
 def test_a_blurred_tag_widens_the_sighting() -> None:

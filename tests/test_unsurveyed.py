@@ -121,6 +121,17 @@ def test_standing_still_tells_a_tags_place_by_its_size_alone() -> None:
             assert left == []
 
 
+def test_a_metre_of_motion_does_not_tell_a_size_where_the_track_is_off_by_half_of_it() -> None:
+    p, R = passing("rest")
+    p = p + np.linspace(0.0, 1.0, 60)[:, None] * R[0, :, 0]
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        off_m = rng.normal(0.0, 0.3, p.shape) * [1.0, 1.0, 0.1]
+        found, (line,) = estimate_tags(views_of(p, R, rng), track_of(p + off_m, R, claimed(60, 0.5, 0.1)), None)
+        assert found == []
+        assert "60 views do not tell where it is" in line
+
+
 def test_too_few_views_or_none_on_the_track() -> None:
     p, R = passing("arc")
     views = views_of(p, R, np.random.default_rng(0))

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from graphloc.frames import Array, skew
 from graphloc.frontends.tags.pose import KEPT, PoseOfCamera, modes_of, poses_of
 from graphloc.measurements import TagSighting
-from graphloc.survey import Survey, TagConfig
+from graphloc.survey import WORLD, Survey, TagConfig
 
 # Corners fit with the noise that they are said to have, up to so many times its variance; beyond, a tag does not
 # belong to the others.
@@ -136,7 +136,7 @@ def _sighting(bundle: _Bundle, survey: Survey, frame: str, seeing: Seeing) -> Ta
     bundle.doubt()
     return TagSighting(
         stamp_ns=seeing.stamp_ns, sensor=seeing.sensor, seq=-1, camera=seeing.camera, frame=frame,
-        numbers=tuple(s.tag.id for s in bundle.group), points_m=bundle.points_m, pivot_m=survey.pivot_m(frame),
+        numbers=tuple(s.tag.id for s in bundle.group), points_m=bundle.points_m, pivot_m=bundle.points_m.mean(axis=0) if frame == WORLD else survey.rest(frame)[0],
         rays=bundle.rays, cov=0.5 * (bundle.cov + bundle.cov.T), t_body_camera_m=seeing.t_body_camera_m,
         R_body_camera=seeing.R_body_camera,
         modes=modes_of(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -93,10 +94,11 @@ def _berth_tracks(problem: Problem, result: BatchResult, trajectory: Trajectory)
             moved = np.column_stack([np.interp(trajectory.stamps_ns, middles, column) for column in held.T])[picked]
             p, yaw = trajectory.p_world_m[picked], trajectory.yaw_rad[picked]
             value, J = seen_from(berth, p, yaw, moved)
+            by_survey = seen_from(replace(berth, pivot_m=berth.survey_middle_m), p, yaw, moved)[1][:, :, 3:]
             stamps = trajectory.stamps_ns[picked]
             cov = np.array([
                 _berth_covariance(problem, result, int(k), nodes[int(timeline.slow_of[k])], four, J[n])
-                + J[n, :, 3:] * berth.survey_sigma**2 @ J[n, :, 3:].T
+                + by_survey[n] * berth.survey_sigma**2 @ by_survey[n].T
                 for n, k in enumerate(picked)
             ])  # fmt: skip
             rate = rates(value, (stamps - stamps[0]) * 1e-9)

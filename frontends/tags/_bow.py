@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The image without distortion that touches a camera's image at a point: sides of tags are straight there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphloc.frames import Array
+from graphloc.frontends.tags.camera import Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unbowed:
+    """A pinhole's image, laid along the lens's own about a point; the same there, to first order.
+
+    Points of it, flat = middle + J (ray - ray of the middle), lie within parts of a pixel of those of the image near the
+    middle, and it is as sharp. J is the lens's d px / d ray at the middle.
+
+    Attributes:
+        middle_px: (2,) of the image. ray: (1, 2) there. J_px: (2, 2).
+    """
+
+    lens: Camera
+    middle_px: Array
+    ray: Array
+    J_px: Array
+
+    def flat(self, px: Array) -> Array:
+        """Return where points (N, 2), px, of the image are without distortion; NaN where no ray leads to them."""
+        return np.asarray(self.middle_px + (self.lens.rays(px) - self.ray) @ self.J_px.T)
+
+    def bowed(self, flat_px: Array) -> Array:
+        """Return where such points (N, 2) are in the image, px; NaN where the lens sends none."""
+        return self.lens.project(self._rays(flat_px))
+
+    def slope(self, flat_px: Array) -> Array:
+        """Return d bowed / d flat (N, 2, 2)."""
+        return np.asarray(self.lens.jacobian(self._rays(flat_px)) @ np.linalg.inv(self.J_px))
+
+    def _rays(self, flat_px: Array) -> Array:
+        return np.asarray(self.ray + (flat_px - self.middle_px) @ np.linalg.inv(self.J_px).T)
+
+
+def unbowed(lens: Camera | None, corners_px: Array) -> Unbowed | None:
+    """Return it about a tag's corners (4, 2); None where there is nothing to unbow, or no rays."""
+    if lens is None or lens.model == "none":
+        return None
+    points = np.vstack([corners_px, corners_px.mean(axis=0)])
+    rays = lens.rays(points)
+    if not np.isfinite(rays).all():
+        return None
+    return Unbowed(lens, points[4], rays[4:], lens.jacobian(rays[4:])[0])
