@@ -71,6 +71,8 @@ def with_sightings(
             progress("looking for tags", min(done, total), total)
         read = f"read by {name}; {without} of {total} show no tag that can be used"
         rows = [replace(r, reason=read) if r.topic in cameras and r.outcome is Outcome.IGNORED else r for r in rows]
+        if total and without == total:
+            damage.append(f"{name}: none of {total} images shows a tag of the survey: look at one, and at its family")
         damage += _troubles(name, rows)
     return replace(
         recording,
