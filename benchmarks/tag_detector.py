@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 from unittest.mock import patch
 
 import cv2
@@ -30,6 +30,7 @@ _HALF_M = 0.206
 _CORNERS = _HALF_M * np.array([(-1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, -1.0, 0.0)])
 _CONDITIONS = tuple(DIGERUD)
 _FAR_M = (12.0, 30.0)
+_Found = TypeVar("_Found")
 
 
 class View(NamedTuple):
@@ -56,7 +57,7 @@ def views(condition: str, seed: int, times: Any) -> Iterator[View]:
         yield View(camera.take(float(t), k).pixels, tags, set(poses))
 
 
-def _on_sides(_grey: Any, about_px: Any, _cells: Any) -> Any:
+def _on_sides(_grey: Any, about_px: Any, _cells: Any, _straight: Any) -> Any:
     return _edges.Fit(about_px, np.eye(8), 1.0)
 
 
@@ -114,8 +115,7 @@ def _step_job(job: tuple[str, int]) -> dict[str, Gain]:
 def steps(pool: ProcessPoolExecutor, seeds: int = 2) -> list[Row]:
     """D.0: what each step buys."""
     rows = []
-    for condition in _CONDITIONS:
-        parts = list(pool.map(_step_job, [(condition, 200 + seed) for seed in range(seeds)]))
+    for condition, parts in _by_condition(pool, _step_job, range(200, 200 + seeds)):
         for step in _OFF:
             seen = [s for part in parts for s in part[step].seen]
             off = [o for part in parts for o in part[step].off_px]
@@ -128,6 +128,15 @@ def steps(pool: ProcessPoolExecutor, seeds: int = 2) -> list[Row]:
             if off:
                 rows.append(row("D.0", f"{label}: corners off, median", np.median(off), "px"))
     return rows + _honesty(pool, seeds) + _strangers(pool)
+
+
+def _by_condition(
+    pool: ProcessPoolExecutor, job: Callable[[tuple[str, int]], _Found], seeds: range
+) -> Iterator[tuple[str, list[_Found]]]:
+    """What a job finds on each seed, by condition; all of them are under way at once."""
+    under_way = [(condition, [pool.submit(job, (condition, seed)) for seed in seeds]) for condition in _CONDITIONS]
+    for condition, futures in under_way:
+        yield condition, [future.result() for future in futures]
 
 
 def _honest_job(job: tuple[str, int]) -> list[tuple[float, float]]:
@@ -146,9 +155,8 @@ def _honest_job(job: tuple[str, int]) -> list[tuple[float, float]]:
 def _honesty(pool: ProcessPoolExecutor, seeds: int) -> list[Row]:
     """Squared errors of the 8 corner coordinates by their covariance, by range."""
     rows = []
-    for condition in _CONDITIONS:
-        jobs = [(condition, 210 + seed) for seed in range(seeds)]
-        found = np.array([pair for part in pool.map(_honest_job, jobs) for pair in part]).reshape(-1, 2)
+    for condition, parts in _by_condition(pool, _honest_job, range(210, 210 + seeds)):
+        found = np.array([pair for part in parts for pair in part]).reshape(-1, 2)
         for low, high in itertools.pairwise(BANDS_M):
             nees = found[(found[:, 0] >= low) & (found[:, 0] < high), 1]
             if len(nees) >= 5:
@@ -167,7 +175,7 @@ def _stranger_job(job: tuple[str, int]) -> tuple[int, dict[str, int]]:
     cv2.setNumThreads(1)
     images, false = 0, dict.fromkeys(_LOOKED_FOR, 0)
     looking = {family: Detector((family,), max_hamming=bits) for family, bits in _LOOKED_FOR.items()}
-    for view in views(condition, seed, np.arange(1.0, 100.0, 2.0)):
+    for view in views(condition, seed, np.arange(1.0, 100.0, 3.0)):
         images += 1
         for family, detector in looking.items():
             for d in detector.detect(view.pixels):
@@ -255,8 +263,7 @@ def _agreement_job(job: tuple[str, int]) -> tuple[int, int, int, list[float], li
 def agreement(pool: ProcessPoolExecutor, seeds: int = 2) -> list[Row]:
     """D.7: beside AprilTag 3 on every pixel, on the image as it comes."""
     rows = []
-    for condition in _CONDITIONS:
-        parts = list(pool.map(_agreement_job, [(condition, 240 + seed) for seed in range(seeds)]))
+    for condition, parts in _by_condition(pool, _agreement_job, range(240, 240 + seeds)):
         label = f"tag detector beside AprilTag 3, {condition}"
         for k, name in enumerate(("found by both", "by ours only", "by theirs only")):
             rows.append(row("D.7", f"{label}: {name}", sum(part[k] for part in parts), "count"))  # type: ignore[misc]

@@ -30,6 +30,7 @@ HEALTH = {
     Health.DEAD_RECKONING: "rgba(213,94,0,0.30)",
     Health.LOST: "rgba(120,0,0,0.45)",
 }
+_LOST = 4.0  # times the next larger error
 _MOST = 4000  # points a trace: more cannot be seen and make a heavy page
 
 
@@ -123,6 +124,7 @@ def error_over_time(
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     start = int(solution.trajectory.stamps_ns[0])
     names = [("graphloc", solution.trajectory), *((f.name, f.trajectory) for f in filters)]
+    largest_m = []
     for i, (name, track) in enumerate(names):
         line = {"color": COLOURS[i], "width": 2 if not i else 1.2}
         if recording.truth is not None:
@@ -130,6 +132,7 @@ def error_over_time(
             step = _every(len(stamps))
             t = (stamps[step] - start) * 1e-9
             size = np.hypot(error[step, 0], error[step, 1])
+            largest_m.append(float(size.max()))
             figure.add_scatter(x=t, y=size, line=line, name=name, legendgroup=name, row=1, col=1)
             shown = np.degrees(np.abs(heading[step]))
             figure.add_scatter(x=t, y=shown, line=line, name=name, legendgroup=name, showlegend=False, row=2, col=1)
@@ -157,9 +160,50 @@ def error_over_time(
         )
     _health_bands(figure, solution, start)
     figure.update_yaxes(title="position error, m", rangemode="tozero", row=1, col=1)
+    *_, second, first = sorted([0.0, 0.0, *largest_m])
+    if first > _LOST * second > 0.0:  # a filter that is lost would press the others flat; double click shows it whole
+        figure.update_yaxes(range=[0.0, _LOST * second], row=1, col=1)
     figure.update_yaxes(title="heading error, deg", rangemode="tozero", row=2, col=1)
     figure.update_xaxes(title="time, s", row=2, col=1)
     return _layout(figure, 520)
+
+
+def berths_over_time(solution: Solution) -> go.Figure:
+    """The vessel seen from each berth: across, along, angle with 95 % bands."""
+    tracks = solution.berths
+    titles = [f"{b.berth.name}: {what}" for b in tracks for what in ("across and along, m", "angle, deg")]
+    figure = make_subplots(
+        rows=max(len(titles), 1),
+        cols=1,
+        shared_xaxes=True,
+        vertical_spacing=0.25 / max(len(titles), 1),
+        subplot_titles=titles,
+    )
+    start = int(solution.trajectory.stamps_ns[0])
+    for n, track in enumerate(tracks):
+        assert track.cov is not None
+        step = _every(len(track.stamps_ns))
+        t = (track.stamps_ns[step] - start) * 1e-9
+        band = 1.96 * np.sqrt(np.diagonal(track.cov[step], axis1=1, axis2=2))
+        for k, (name, scale) in enumerate((("across", 1.0), ("along", 1.0), ("angle", 180.0 / np.pi))):
+            row = 2 * n + (2 if name == "angle" else 1)
+            value, wide = scale * track.value[step, k], scale * band[:, k]
+            line = {"color": COLOURS[k]}
+            figure.add_scatter(x=t, y=value, line=line, name=name, legendgroup=name, showlegend=n == 0, row=row, col=1)
+            figure.add_scatter(
+                x=np.concatenate([t, t[::-1]]),
+                y=np.concatenate([value + wide, (value - wide)[::-1]]),
+                fill="toself",
+                mode="none",
+                fillcolor=COLOURS[k],
+                opacity=0.15,
+                hoverinfo="skip",
+                showlegend=False,
+                row=row,
+                col=1,
+            )
+    figure.update_xaxes(title="time, s", row=max(len(titles), 1), col=1)
+    return _layout(figure, 120 + 190 * max(len(titles), 1))
 
 
 def _health_bands(figure: go.Figure, solution: Solution, start: int) -> None:

@@ -70,6 +70,7 @@ $tables
 $map
 <h2>Errors and 95 % bounds</h2><p class="note">Blue band: the bound that the estimate states. Orange: degraded; red: dead reckoning or lost.</p>
 $errors
+$berths
 <h2>Was my measurement used?</h2><div class="scroll">$ledger</div>
 <h2>Residuals</h2><p class="note">Residual of each sensor in its own standard deviations, before the loss, coloured by weight.</p>
 $residuals
@@ -101,6 +102,7 @@ def write_report(path: Path, data: ReportData) -> None:
         errors=_figure(
             plots.error_over_time(data.recording, data.solution, data.filters, data.held, data.levers_m), "errors"
         ),
+        berths=_berths(data.solution),
         ledger=_ledger(data.solution),
         residuals=_figure(plots.residuals_over_time(data.solution), "residuals"),
         slow=_figure(plots.slow_over_time(data.solution), "slow"),
@@ -214,6 +216,18 @@ def _ledger(solution: Solution) -> str:
     return (
         f"<table><tr>{head}</tr>{rows}</table><p class='note'>{len(solution.ledger)} messages in all; "
         f"ledger.csv has a row for each.</p><table class='reason'>{reasons}</table>"
+    )
+
+
+def _berths(solution: Solution) -> str:
+    if not solution.berths:
+        return ""
+    note = (
+        "Across: from the quay's face to the vessel's origin; along: to the right for who looks at the quay from the water; "
+        "angle of the bow from straight in. Bands: 95 %. berth_*.csv has the numbers, and the rates."
+    )
+    return (
+        f'<h2>Seen from the berth</h2><p class="note">{note}</p>{_figure(plots.berths_over_time(solution), "berths")}'
     )
 
 

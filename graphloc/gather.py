@@ -16,7 +16,7 @@ from graphloc.errors import ConfigError
 from graphloc.eval.match_picture import Gallery
 from graphloc.frames import Datum
 from graphloc.frontends.aerial import match_bag
-from graphloc.frontends.tags.sightings import sightings_of_bag
+from graphloc.frontends.tags.sightings import info_beside, sightings_of_bag
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
@@ -70,7 +70,12 @@ def with_sightings(
                 seq += 1
             progress("looking for tags", min(done, total), total)
         read = f"read by {name}; {without} of {total} show no tag that can be used"
-        rows = [replace(r, reason=read) if r.topic in cameras and r.outcome is Outcome.IGNORED else r for r in rows]
+        infos = {camera.info_topic or info_beside(camera.topic) for camera in sensor.cameras.values()}
+        reasons = {**dict.fromkeys(infos, f"read by {name} for its lens"), **dict.fromkeys(cameras, read)}
+        rows = [
+            replace(r, reason=reasons[r.topic]) if r.topic in reasons and r.outcome is Outcome.IGNORED else r
+            for r in rows
+        ]
         if total and without == total:
             damage.append(f"{name}: none of {total} images shows a tag of the survey: look at one, and at its family")
         damage += _troubles(name, rows)

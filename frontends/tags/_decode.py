@@ -94,22 +94,36 @@ def bilinear(grey, u, v):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _cell(grey, H, x0, y0):  # type: ignore[no-untyped-def]
-    """Mean level of the middle of a cell, -1 if it is not all in the image."""
+def spots(corners, side):  # type: ignore[no-untyped-def]
+    """Return nine places in each cell of a quadrilateral (4, 2) and of those around it (9 (side + 2)^2, 2), row by row."""
+    H = homography(corners, side)
+    found = np.empty((9 * (side + 2) ** 2, 2))
+    n = 0
+    for r in range(-1, side + 1):
+        for c in range(-1, side + 1):
+            for k in range(9):
+                x, y = c + 0.5 + _SPREAD * (k % 3 - 1), r + 0.5 + _SPREAD * (k // 3 - 1)
+                z = 1.0 / (H[2, 0] * x + H[2, 1] * y + H[2, 2])
+                found[n, 0] = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) * z
+                found[n, 1] = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) * z
+                n += 1
+    return found
+
+
+@compiled
+def _cell(grey, px, first):  # type: ignore[no-untyped-def]
+    """Mean level of the nine places from the first on, -1 if they are not all in the image."""
     total = 0.0
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            x, y = x0 + _SPREAD * j, y0 + _SPREAD * i
-            z = 1.0 / (H[2, 0] * x + H[2, 1] * y + H[2, 2])
-            level = bilinear(grey, (H[0, 0] * x + H[0, 1] * y + H[0, 2]) * z, (H[1, 0] * x + H[1, 1] * y + H[1, 2]) * z)
-            if level < 0.0:
-                return -1.0
-            total += level
+    for k in range(first, first + 9):
+        level = bilinear(grey, px[k, 0], px[k, 1])
+        if not level >= 0.0:
+            return -1.0
+        total += level
     return total / 9.0
 
 
 @compiled
-def _over(grey, H, side, values):  # type: ignore[no-untyped-def]
+def _over(grey, px, side, values):  # type: ignore[no-untyped-def]
     """Write each cell's level over the middle of black and white there (side, side); whether all of the tag is seen.
 
     Black is a plane through the border's cells, white one through the cells around it. Both sets are symmetric, so that
@@ -122,7 +136,7 @@ def _over(grey, H, side, values):  # type: ignore[no-untyped-def]
     for r in range(-1, side + 1):
         for c in range(-1, side + 1):
             x, y = c + 0.5, r + 0.5
-            level = _cell(grey, H, x, y)
+            level = _cell(grey, px, 9 * ((r + 1) * (side + 2) + c + 1))
             rim = min(r, c, side - 1 - r, side - 1 - c)
             if level < 0.0:
                 if rim >= 0:
@@ -161,8 +175,11 @@ def _bits_off(a, b):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def read(grey, corners, side, codes):  # type: ignore[no-untyped-def]
-    """Return the tag that the bits in a quadrilateral (4, 2) are nearest to.
+def read(grey, px, side, codes):  # type: ignore[no-untyped-def]
+    """Return the tag that the bits in a quadrilateral are nearest to.
+
+    Args:
+        px: its `spots`.
 
     Returns:
         Its index in codes (T, 4), or -1; quarters that it is turned by anticlockwise; bits that differ; the decision
@@ -170,7 +187,7 @@ def read(grey, corners, side, codes):  # type: ignore[no-untyped-def]
         levels.
     """
     values = np.empty((side, side))
-    if not _over(grey, homography(corners, side), side, values):
+    if not _over(grey, px, side, values):
         return -1, 0, 99, 0.0
     code = np.uint64(0)
     sums = np.zeros(2)

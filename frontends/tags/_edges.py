@@ -341,10 +341,12 @@ def _gather(pixels, cells, theta, X, slopes, doubt):  # type: ignore[no-untyped-
         block = _BLOCKS * min(max(row, 0), _BLOCKS - 1) + min(max(column, 0), _BLOCKS - 1)
         squares += weight * off * off
         count += weight
-        A_here, b_here = A[block], b[block]
         for m in range(_N):
-            by = weight * J[m]
-            b_here[m] += by * off
-            for n in range(_N):  # the upper half too: so it is done four at a time
-                A_here[m, n] += by * J[n]
+            b[block, m] += weight * J[m] * off
+            for n in range(m + 1):
+                A[block, m, n] += weight * J[m] * J[n]
+    for k in range(len(A)):
+        for m in range(_N):
+            for n in range(m):
+                A[k, n, m] = A[k, m, n]
     return A, b, squares, count

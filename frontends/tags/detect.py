@@ -2,7 +2,8 @@
 """AprilTags in grey images: which, where their corners are, and how well that is known.
 
 Three steps: dark quadrilaterals (`_quads`), whose bits are in the codebook or nearly (`_decode`), and on which the whole
-tag then fits (`_edges`); the bits are read again at the corners that come of it.
+tag then fits (`_edges`), its edges bowed by the lens where that is known (`_bow`); the bits are read again at the corners
+that come of it.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends.tags._decode import Codebook, codebook, read
+from graphloc.frontends.tags._bow import unbowed
+from graphloc.frontends.tags._decode import Codebook, codebook, read, spots
 from graphloc.frontends.tags._edges import fit_tag
 from graphloc.frontends.tags._quads import quads_in
+from graphloc.frontends.tags.camera import Camera
 
 _THREADS = 2
 _STRIPS, _OVERLAP_PX = 3, 96  # what is taller than the overlap is found at half the resolution
@@ -85,14 +88,19 @@ class Detector:
         self._books = [codebook(family, (numbers or {}).get(family)) for family in dict.fromkeys(families)]
         self._max_hamming, self._min_margin, self._min_side_px = max_hamming, min_margin, min_side_px
 
-    def detect(self, grey: NDArray[np.uint8]) -> list[Detection]:
-        """Return the tags that are seen whole in an image (rows, columns), on two threads; lowest number first."""
+    def detect(self, grey: NDArray[np.uint8], lens: Camera | None = None) -> list[Detection]:
+        """Return the tags that are seen whole in an image (rows, columns), on two threads; lowest number first.
+
+        Args:
+            lens: the image's, where it may be distorted: then a tag's edges are fitted as they are bowed. Corners stay
+                points of the image as it is.
+        """
         if min(grey.shape, default=0) < self._min_side_px or not self._books:
             return []
         grey = np.ascontiguousarray(grey)
         with ThreadPoolExecutor(_THREADS) as pool:
             candidates = itertools.chain(*pool.map(lambda part: self._candidates(*part), parts_of(grey)))
-            settled = pool.map(lambda candidate: self._settled(grey, candidate), _distinct(candidates))
+            settled = pool.map(lambda candidate: self._settled(grey, lens, candidate), _distinct(candidates))
             found = [detection for detection in settled if detection is not None]
         return sorted(found, key=lambda d: (d.family, d.number, d.corners_px[0, 0]))
 
@@ -101,20 +109,24 @@ class Detector:
         found = []
         for quad in quads_in(grey, self._min_side_px / scale, max(book.side for book in self._books)):
             for book in self._books:
-                tag, turned, off, _ = read(grey, quad, book.side, book.codes)
+                tag, turned, off, _ = read(grey, spots(quad, book.side), book.side, book.codes)
                 if off <= self._max_hamming + _MORE_BITS:
                     # A pixel of the half image has its centre between those of four.
                     corners = scale * np.roll(quad, turned, axis=0) + 0.5 * (scale - 1.0) + np.array([0.0, top])
                     found.append(_Candidate(book, tag, corners, off))
         return found
 
-    def _settled(self, grey: NDArray[np.uint8], candidate: _Candidate) -> Detection | None:
+    def _settled(self, grey: NDArray[np.uint8], lens: Camera | None, candidate: _Candidate) -> Detection | None:
         """The tag, if it is one: laid on the image, read again where it lies."""
         book = candidate.book
-        fitted = fit_tag(grey, candidate.corners_px, book.cells[candidate.tag])
+        straight = unbowed(lens, candidate.corners_px)
+        fitted = fit_tag(grey, candidate.corners_px, book.cells[candidate.tag], straight)
         if fitted is None or fitted.explained < _LEAST_EXPLAINED:
             return None
-        tag, turned, off, margin = read(grey, fitted.corners_px, book.side, book.codes)
+        px = spots(fitted.corners_px, book.side)
+        if straight is not None:
+            px = straight.bowed(spots(straight.flat(fitted.corners_px), book.side))
+        tag, turned, off, margin = read(grey, px, book.side, book.codes)
         if (tag, turned) != (candidate.tag, 0) or off > self._max_hamming or margin < self._min_margin:
             return None
         number = int(book.numbers[tag])

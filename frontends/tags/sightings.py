@@ -205,7 +205,7 @@ def _detected(msg: Any, msgtype: str, eye: _Eye, detector: Detector) -> _Raw:
     assert eye.lens is not None
     eye.lens.check_size(grey.shape[1], grey.shape[0])
     found = _Raw()
-    for d in detector.detect(grey):
+    for d in detector.detect(grey, eye.lens):
         _add(found, eye.lens, d.number, d.family, d.corners_px, d.cov_px2, None)
     return found
 
