@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a solved run says of the survey of its tags: sizes that cannot be, tags that stand elsewhere."""
+"""What a solved run says of the survey of its tags, and of the clock of the cameras that see them.
+
+Tags that stand elsewhere, sizes that cannot be, images that come late.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import combinations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
@@ -18,20 +23,29 @@ _FEWEST = 8
 _DOUBTED = 0.5  # share of a tag's sightings that disagree with the rest
 _OFF, _ALIKE = 0.04, 0.05  # a ratio of distances that is off by more, and does not scatter by as much, is a size
 _ELSEWHERE_M = 0.3
+_RANGES = 1.3  # of the farthest to the nearest view, from which on a size shows as one
+_MARGIN = "the black square without its white margin"
+# A stamp that is off by more is said; the share of a camera's errors of roll that it must explain.
+_LATE_S, _LATE_EXPLAINS = 0.03, 0.5
 
 
 def suspect_tags(recording: Recording, solution: Solution) -> list[str]:
     """Return a line for each tag most of whose sightings disagree with the run, and what would explain it."""
     rows = {row.seq: row for row in solution.ledger if row.seq >= 0}
     track = solution.trajectory
+    sightings = [
+        m for m in recording.measurements if isinstance(m, TagSighting) and track.covers(np.array([m.stamp_ns]))[0]
+    ]
+    lines = [*_late(sightings, solution)]
+    sized = _by_spacing(sightings)
+    lines += sized.values()
     by_tag: dict[tuple[str, int], list[TagSighting]] = defaultdict(list)
-    for m in recording.measurements:
-        if isinstance(m, TagSighting) and len(m.numbers) == 1 and track.covers(np.array([m.stamp_ns]))[0]:
+    for m in sightings:
+        if len(m.numbers) == 1:
             by_tag[(m.sensor, m.numbers[0])].append(m)
-    lines = []
     for (sensor, number), own in sorted(by_tag.items()):
         doubted = [m for m in own if _weight(rows, m) < 0.5]
-        if len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
+        if (sensor, number) in sized or len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
             continue
         stamps, where = np.unique([m.stamp_ns for m in doubted], return_inverse=True)  # two cameras may see it at once
         at = track.at(stamps)
@@ -45,22 +59,104 @@ def _weight(rows: Mapping[int, LedgerRow], m: TagSighting) -> float:
     return 1.0 if row is None or row.weight is None else row.weight
 
 
+def _size_m(m: TagSighting) -> float:
+    return float(np.linalg.norm(m.points_m[1] - m.points_m[0]))
+
+
+def _in_camera(m: TagSighting) -> Array:
+    """The tags' middle, by the likeliest pose."""
+    mode = m.modes[0]
+    return np.asarray(mode.R_world_camera.T @ (m.points_m.mean(axis=0) - mode.p_world_camera_m))
+
+
+def _by_spacing(sightings: list[TagSighting]) -> dict[tuple[str, int], str]:
+    """Return a line by (sensor, tag) where tags of one image, none of which fits another, are all of a wrong size.
+
+    How far apart they look, in units of their size, holds for any track, and the one that they gave may be wrong.
+    """
+    images: dict[tuple[str, str, str, int], list[TagSighting]] = defaultdict(list)
+    for m in sightings:
+        if len(m.numbers) == 1:
+            images[(m.sensor, m.camera, m.frame, m.stamp_ns)].append(m)
+    ratios: dict[tuple[str, int], list[float]] = defaultdict(list)
+    size_m = {(m.sensor, m.numbers[0]): _size_m(m) for m in sightings if len(m.numbers) == 1}
+    for own in images.values():
+        for a, b in combinations(own, 2):
+            apart = float(np.linalg.norm(a.points_m.mean(axis=0) - b.points_m.mean(axis=0)))
+            ratio = apart / max(float(np.linalg.norm(_in_camera(a) - _in_camera(b))), 1e-6)
+            for m in (a, b):
+                ratios[(m.sensor, m.numbers[0])].append(ratio)
+    said = {}
+    for key, found in sorted(ratios.items()):
+        median = float(np.median(found))
+        scatter = float(np.median(np.abs(np.array(found) - median)))
+        if len(found) >= _FEWEST and abs(median - 1.0) > _OFF and scatter < _ALIKE * median:
+            said[key] = (
+                f"{key[0]}: tag {key[1]}: beside the tags next to it, it looks {median:.2f} times as large as the survey says: "
+                f"size_m {size_m[key] * median:.3f} instead of {size_m[key]:.3f} would do ({_MARGIN})"
+            )
+    return said
+
+
 def _explained(own: list[TagSighting], p: Array, R: Array) -> str:
     middle = np.array([m.points_m.mean(axis=0) for m in own])
     camera = np.array([a + B @ m.t_body_camera_m for m, a, B in zip(own, p, R, strict=True)])
-    toward = np.array([
-        B @ m.R_body_camera @ m.modes[0].R_world_camera.T @ (c - m.modes[0].p_world_camera_m)
-        for m, B, c in zip(own, R, middle, strict=True)
-    ])  # fmt: skip
-    ratio = np.linalg.norm(middle - camera, axis=1) / np.linalg.norm(toward, axis=1)
-    median = float(np.median(ratio))
-    if abs(median - 1.0) > _OFF and float(np.median(np.abs(ratio - median))) < _ALIKE * median:
-        size_m = float(np.linalg.norm(own[0].points_m[1] - own[0].points_m[0]))
+    toward = np.array([B @ m.R_body_camera @ _in_camera(m) for m, B in zip(own, R, strict=True)])
+    size_m = _size_m(own[0])
+    scale, sure = _scale(camera, toward, middle)
+    if abs(scale - 1.0) > _OFF:
         return (
-            f"by its size it is {median:.2f} times too near: size_m {size_m * median:.3f} instead of {size_m:.3f} would do "
-            "(the black square without its white margin), or it stands elsewhere"
+            f"by its size it is {scale:.2f} times too near: size_m {size_m * scale:.3f} instead of {size_m:.3f} would do "
+            f"({_MARGIN}){'' if sure else ', or it stands elsewhere'}"
         )
     moved = np.median(camera + toward - middle, axis=0)
     if float(np.linalg.norm(moved)) > _ELSEWHERE_M:
         return f"they show it {moved[0]:.1f} m east, {moved[1]:.1f} m north, {moved[2]:.1f} m above its place in the survey"
     return "look at its attitude in the survey, and at the camera's mount"
+
+
+def _scale(camera: Array, toward: Array, middle: Array) -> tuple[float, bool]:
+    """How many times larger than the survey says a tag is, and whether that is certain.
+
+    It stands still, camera + scale toward = place, wherever that is: views from several distances tell, even with a track
+    that is off by the same all the while. Those from one distance only do if the tag is where the survey has it.
+    """
+    ranges = np.linalg.norm(toward, axis=1)
+    if ranges.max() > _RANGES * ranges.min():
+        a, b = camera - camera.mean(axis=0), toward - toward.mean(axis=0)
+        scale = -float((a * b).sum() / (b * b).sum())
+        left, before = float(((a + scale * b) ** 2).sum()), float(((a + b) ** 2).sum())
+        return (scale, True) if scale > 0.0 and left < 0.1 * before else (1.0, True)
+    ratio = np.linalg.norm(middle - camera, axis=1) / ranges
+    median = float(np.median(ratio))
+    return (median if float(np.median(np.abs(ratio - median))) < _ALIKE * median else 1.0), False
+
+
+def _late(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:
+    """Say of each camera whether its stamps are late or early, by how it rolls about its optical axis.
+
+    Stamps that are late by d come with the attitude of d ago: the camera's roll less the run's is -d times its rate. The
+    roll is what tags tell best: to first order, and whichever of two poses is the right one.
+    """
+    track = solution.trajectory
+    by_camera: dict[tuple[str, str], list[TagSighting]] = defaultdict(list)
+    for m in sightings:
+        by_camera[(m.sensor, m.camera)].append(m)
+    for (sensor, camera), own in sorted(by_camera.items()):
+        stamps, where = np.unique([m.stamp_ns for m in own], return_inverse=True)
+        if len(stamps) < _FEWEST:
+            continue
+        R = track.at(stamps).R_world_body[where]
+        t, of_states = (stamps - stamps[0]) * 1e-9, (track.stamps_ns - stamps[0]) * 1e-9
+        w = np.column_stack([np.interp(t, of_states, solution.gyro_radps[:, k]) for k in range(3)])[where]
+        rate = np.array([m.R_body_camera[:, 2] @ turning for m, turning in zip(own, w, strict=True)])
+        differs = [(B @ m.R_body_camera).T @ m.modes[0].R_world_camera for m, B in zip(own, R, strict=True)]
+        roll = Rotation.from_matrix(np.array(differs)).as_rotvec()[:, 2]
+        roll, rate = roll - np.median(roll), rate - np.median(rate)
+        late_s = -float((rate * roll).sum() / max(float((rate * rate).sum()), 1e-12))
+        left = float(((roll + rate * late_s) ** 2).sum())
+        if abs(late_s) > _LATE_S and left < (1.0 - _LATE_EXPLAINS) * float((roll * roll).sum()):
+            yield (
+                f"{sensor}: camera {camera}: its stamps are {abs(late_s):.2f} s too {'late' if late_s > 0 else 'early'} by how the "
+                f"vessel rolls: time_offset_s {-late_s:+.2f} would do, on top of what is set"
+            )

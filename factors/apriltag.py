@@ -1,27 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """AprilTags that a camera sees: the corners themselves are fused, the poses that explain them are its modes.
 
-    z_i = pi(R' (P_i(s) - p)) + w_i,   w ~ N(0, C),   pi(x, y, z) = (x, y) / z
-    P_i(s) = c + d + Exp(w) (P_i - c + k (P_i - m)),   s = (d, w, k) of the frame that the tags are in
+    z_i = pi(R' (P_i - p)) + w_i,   w_i ~ N(0, C),   pi(x, y, z) = (x, y) / z
+    P_i = c + d + Exp(w) (Q_i - c),   Q_i = S_i + e_k + f_k x (S_i - m_k)
 
-p, R: camera in world; P_i: a corner with its frame at rest; c: what the frame turns about, a dock's origin, or in world
-m, the middle of the tags in the image; d: east, north, up; w: a small turn; k: scale. s is a slow state: of a floating
-dock its motion, and of either what all sightings err together because the survey does (D has neither): three tags
-that hang 0.2 deg forward lift a vessel 20 m away by 7 cm, and 1 cm too much between them puts her 0.1 m farther off.
+p, R: camera in world; S_i: a corner as surveyed, its frame at rest; e_k, f_k: what the survey errs about tag k, its middle
+m_k, a constant of the run; d, w: motion and small turn about c of the floating dock that the tag rides on, a slow state
+(D has neither). Taken for noise of each sighting instead, the survey's errors average out over hundreds of them, and the
+bounds are too small: three tags that hang 0.2 deg forward lift a vessel 20 m away by 7 cm in every image.
 
 Four coplanar corners have two poses, and beyond some 20 tag widths these run into each other: one pose's Gaussian is
 then no likelihood, and hundreds of sightings of which each is drawn to its nearer mode bend the heading (measured:
 docs/decisions/0007). So the factor is the reprojection itself, linearised anew at every pass: where the estimate is
 when it lies by the chosen mode, else at that mode. The modes' Gaussians are there to choose by:
 
-    e = (p + (1 + k) R t_m - m(s), Log(R R_m(s)'))    t_m: the tags' middle in the camera of mode m
+    e = (p + R t_m - m, Log(R (Exp(w) R_m)'))    t_m: the tags' middle in the camera of mode m
 
 that is the place that the tags give the camera if its attitude is the predicted one, and that attitude.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import gtsam
@@ -32,9 +31,9 @@ from graphloc.berths import Berth
 from graphloc.config import AprilTagConfig
 from graphloc.factors._linear import linear_update
 from graphloc.frames import Array, Datum, skew
-from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor, SlowProcess
+from graphloc.graph import Attachment, Constant, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import TagMode, TagSighting
-from graphloc.survey import WORLD, DockConfig, Survey, TagConfig
+from graphloc.survey import WORLD, DockConfig, Survey
 
 # Where a false sighting may put the camera: a berth further on, turned as one likes within a quarter of a circle.
 FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(30.0))
@@ -43,12 +42,11 @@ FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(30.0))
 _TO_DECIDE = np.array([0.05] * 3 + [np.radians(0.5)] * 3)
 _AHEAD = 0.3  # of a mode's distances: nearer than that the estimate's own are not believed
 _BY_A_MODE_RAD = float(np.radians(20.0))
-_FREEDOM = ("east", "north", "up", "roll", "pitch", "yaw", "scale")
-_SIZE = len(_FREEDOM)
+_FREEDOM = ("east", "north", "up", "roll", "pitch", "yaw")
 _LEAST_M, _LEAST_RAD = 1e-3, float(np.radians(0.01))
-_LEAST_SCALE, _LARGEST_SCALE = 1e-3, 0.02  # a print's, and what corners that fit at all allow for
+_LEAST = np.repeat([_LEAST_M, _LEAST_RAD], 3)
+_TIE = np.repeat([1e-4, 1e-5], 3)  # where a sighting stands on a node: m, rad
 _TIDE_S = 3600.0
-_OTHER_TAGS_S = 120.0  # after about so long other tags are in view, and the survey errs in another way
 
 
 class _Seen:
@@ -65,24 +63,49 @@ class _Seen:
         self.R, self.p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
         adjoint = np.asarray(T_state_camera.inverse().AdjointMap())
         self.body = np.vstack([self.R @ adjoint[3:], self.R @ adjoint[:3]])
-        self.slow_size = 0 if at.slow_value is None else len(at.slow_value)
-        self.first = _SIZE * config.surveyed.frames.index(m.frame) if self.slow_size else 0
-        moved = np.zeros(_SIZE)
-        if at.slow_value is not None:
-            moved = np.asarray(at.slow_value)[self.first : self.first + _SIZE]
-        self.turn = np.asarray(Rotation.from_rotvec(moved[3:6]).as_matrix())
-        self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-moved[3:6]))  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
-        self.scale = float(moved[6])
-        self.spread = (m.points_m - m.points_m.mean(axis=0)) @ self.turn.T
-        self.arms = (m.points_m - m.pivot_m) @ self.turn.T + self.scale * self.spread
+        docks, self.slow_size = _docks(config.surveyed), 0 if at.slow_value is None else len(at.slow_value)
+        self.first = 6 * docks.index(m.frame) if self.slow_size and m.frame in docks else None
+        self.moved = moved = np.zeros(6)
+        if at.slow_value is not None and self.first is not None:
+            self.moved = moved = _between(at)[self.first : self.first + 6]
+        self.turn = np.asarray(Rotation.from_rotvec(moved[3:]).as_matrix())
+        self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-moved[3:]))  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
+        self.constants = _constants_of(m, config, at)
+        tags = np.array(m.points_m).reshape(-1, 4, 3)
+        self.within = tags - tags.mean(axis=1, keepdims=True)  # each corner from its tag's middle
+        for k, constant in enumerate(self.constants):
+            if constant is not None:
+                tags[k] += constant[1][:3] + np.cross(constant[1][3:], self.within[k])
+        self.arms = (tags.reshape(-1, 3) - m.pivot_m) @ self.turn.T
         self.points_m = m.pivot_m + moved[:3] + self.arms
-        self.middle_m = self.points_m.mean(axis=0)
+        self.middle_m = m.pivot_m + moved[:3] + (m.points_m.mean(axis=0) - m.pivot_m) @ self.turn.T
 
-    def placed(self, per_frame: Array) -> Array:
-        """Put d / d slow state of the frame (k, 7) where it stands among those of all frames (k, n)."""
-        whole = np.zeros((len(per_frame), self.slow_size))
-        whole[:, self.first : self.first + _SIZE] = per_frame
+    def placed(self, per_dock: Array) -> Array:
+        """Put d / d slow state of the dock (k, 6) where it stands among those of all docks (k, n)."""
+        whole = np.zeros((len(per_dock), self.slow_size))
+        if self.first is not None:
+            whole[:, self.first : self.first + 6] = per_dock
         return whole
+
+
+def _between(at: Attachment) -> Array:
+    """The slow state at the measurement, between its node and the next."""
+    value = np.asarray(at.slow_value)
+    if at.slow_next is None:
+        return value
+    _, following, share, _ = at.slow_next
+    return np.asarray((1.0 - share) * value + share * following)
+
+
+def _docks(survey: Survey) -> list[str]:
+    return [frame for frame in survey.frames if frame != WORLD]
+
+
+def _constants_of(m: TagSighting, config: AprilTagConfig, at: Attachment) -> list[tuple[int, Array] | None]:
+    """Key and estimate of what the survey errs about each tag; None where there is none."""
+    index = {(str(tag.family), tag.id): k for k, tag in enumerate(config.surveyed.tags)}
+    found = [index.get(tag) for tag in zip(m.families, m.numbers, strict=True)]
+    return [at.constants[k] if k is not None and k < len(at.constants) else None for k in found]
 
 
 def _middle_in_camera(m: TagSighting, mode: TagMode) -> Array:
@@ -97,7 +120,7 @@ def _turned(R: Array) -> Array:
 
 
 def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode) -> Residual:
-    toward = (1.0 + seen.scale) * seen.R @ _middle_in_camera(m, mode)
+    toward = seen.R @ _middle_in_camera(m, mode)
     rotation = Rotation.from_matrix(seen.R @ (seen.turn @ mode.R_world_camera).T).as_rotvec()
     raw = np.concatenate([seen.p + toward - seen.middle_m, rotation])
 
@@ -108,10 +131,9 @@ def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode)
 
     def slow_jacobian() -> Array:
         rigid = -np.eye(6)
-        rigid[:3, 3:] = skew(seen.arms.mean(axis=0))
+        rigid[:3, 3:] = skew(seen.middle_m - m.pivot_m)
         rigid[:, 3:] = rigid[:, 3:] @ seen.by_turn
-        by_scale = np.concatenate([toward / (1.0 + seen.scale), np.zeros(3)])
-        return seen.placed(np.column_stack([rigid, by_scale]))
+        return seen.placed(rigid)
 
     return Residual(
         raw=raw,
@@ -148,13 +170,47 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
     rotation = np.array([skew(v) for v in off])
     camera = np.concatenate([-by_point, by_point @ rotation], axis=2).reshape(-1, 6)
     swing = np.array([-skew(arm) for arm in seen.arms]) @ seen.by_turn
-    by_scale = by_point @ seen.spread[:, :, None]
-    by_frame = np.concatenate([by_point, by_point @ swing, by_scale], axis=2).reshape(-1, _SIZE)
-    corners = Residual(
-        raw=(flat - m.rays).ravel(), cov=m.cov, jacobian=lambda: np.asarray(camera @ seen.body), prior=1.0,
+    by_dock = np.concatenate([by_point, by_point @ swing], axis=2).reshape(-1, 6)
+    raw, by_body = (flat - m.rays).ravel(), camera @ seen.body
+    dock = config.surveyed.dock(m.frame) if seen.first is not None else None
+    tie = None if dock is None else _tie(seen, dock, at)
+    found: list[Any] = [] if tie is None else list(tie.factors)
+    for k, constant in enumerate(seen.constants):  # GTSAM's linear factors have at most three keys: one for each tag
+        own = slice(8 * k, 8 * k + 8)
+        corners = Residual(
+            raw=raw[own], cov=m.cov[own, own], jacobian=lambda: np.zeros((8, 6)), prior=1.0, size_m=None, size_deg=None
+        )
+        terms: list[tuple[int, Any, Array]] = [(at.pose_key, at.T_world_body, by_body[own])]
+        if tie is not None:
+            terms.append((at.leaf_keys[0], seen.moved, by_dock[own]))
+        if constant is not None:
+            at_rest = by_point[4 * k : 4 * k + 4] @ seen.turn
+            turned = at_rest @ np.array([-skew(arm) for arm in seen.within[k]])
+            terms.append((constant[0], np.array(constant[1]), np.concatenate([at_rest, turned], axis=2).reshape(8, 6)))
+        found += linear_update(corners, terms, decision).factors
+    return GraphUpdate(factors=tuple(found), guesses=() if tie is None else tie.guesses)
+
+
+def _tie(seen: _Seen, dock: DockConfig, at: Attachment) -> GraphUpdate:
+    """Where the dock is at the sighting, a leaf: between two nodes of its Markov process, as far off as a bridge is.
+
+    Held fast from node to node instead, a dock that swings by 0.3 m is off by 4 cm, 16 px at 2.6 m.
+    """
+    assert at.slow_key is not None
+    picked = seen.placed(np.eye(6))
+    share, dt_s = (0.0, 1.0) if at.slow_next is None else at.slow_next[2:]
+    sigma, time_s = _swing(dock)
+    bridge = sigma * np.sqrt(2.0 * dt_s / time_s * share * (1.0 - share))
+    residual = Residual(
+        raw=np.zeros(6), cov=np.diag(np.maximum(bridge, _TIE) ** 2), jacobian=lambda: np.zeros((6, 6)), prior=1.0,
         size_m=None, size_deg=None,
     )  # fmt: skip
-    return linear_update(corners, _terms(at, corners.jacobian(), lambda: seen.placed(by_frame)), decision)
+    terms: list[tuple[int, Any, Array]] = [
+        (at.leaf_keys[0], seen.moved, np.eye(6)), (at.slow_key, np.array(at.slow_value), -(1.0 - share) * picked)
+    ]  # fmt: skip
+    if at.slow_next is not None:
+        terms.append((at.slow_next[0], np.array(at.slow_next[1]), -share * picked))
+    return GraphUpdate(linear_update(residual, terms, Decision()).factors, ((at.leaf_keys[0], seen.moved),))
 
 
 def _terms(at: Attachment, jacobian: Array, slow_jacobian: Any) -> list[tuple[int, Any, Array]]:
@@ -183,48 +239,43 @@ def false(m: TagSighting, config: AprilTagConfig) -> FalseModel:
     return FalseModel(probability=config.false_fraction, cov=np.diag(sigmas**2), repeats=config.false_repeats)
 
 
-def slow(config: AprilTagConfig) -> SlowProcess | None:
-    """Return how far each frame of the survey may be from where it is said to be."""
-    survey = config.surveyed
-    if not survey.frames:
-        return None
-    parts = [_freedom(survey, frame) for frame in survey.frames]
-    return SlowProcess(
-        name="tags moved",
-        axes=tuple(f"{frame} {axis}" for frame in survey.frames for axis in _FREEDOM),
-        units=("m", "m", "m", "deg", "deg", "deg", "%") * len(parts),
-        scale=np.tile(np.repeat([1.0, 180.0 / np.pi, 100.0], [3, 3, 1]), len(parts)),
-        sigma=np.concatenate([sigma for sigma, _ in parts]),
-        time_constant_s=np.concatenate([time for _, time in parts]),
+def constants(config: AprilTagConfig) -> tuple[Constant, ...]:
+    """Return what the survey may err about each tag: place (m) and axes (rad), in world."""
+    return tuple(
+        Constant(
+            name=f"tag {tag.id}",
+            sigma=np.repeat([max(tag.sigma_m, _LEAST_M), max(np.radians(tag.sigma_deg), _LEAST_RAD)], 3),
+        )
+        for tag in config.surveyed.tags
     )
 
 
-def _freedom(survey: Survey, frame: str) -> tuple[Array, Array]:
-    """Sigmas (7,) of a frame's slow state, m and rad, and their time constants (7,), s.
+def slow(config: AprilTagConfig) -> SlowProcess | None:
+    """Return how the docks that carry tags move.
 
-    A dock that swings with period T and RMS s moves at 2 pi s / T; the Markov process that steps as far in 1 s has a
-    time constant of T^2 / 2 pi^2. How far it wanders is taken for two sigmas.
+    One that swings with period T and RMS s moves at 2 pi s / T; the Markov process that steps as far in 1 s has a time
+    constant of T^2 / 2 pi^2. How far it wanders is taken for two sigmas.
     """
-    tags = [tag for tag in survey.tags if tag.frame == frame]
-    sigma_m, sigma_rad = _usual_sigmas(tags)
-    surveyed = np.array([sigma_m] * 3 + [sigma_rad] * 3 + [_scale_sigma(tags)])
-    dock: DockConfig | None = None if frame == WORLD else survey.dock(frame)
-    if dock is None:
-        return surveyed, np.full(_SIZE, _OTHER_TAGS_S)
+    docks = [dock for name in _docks(config.surveyed) if (dock := config.surveyed.dock(name)) is not None]
+    if not docks:
+        return None
+    swings = [_swing(dock) for dock in docks]
+    return SlowProcess(
+        name="docks moved",
+        axes=tuple(f"{dock.name} {axis}" for dock in docks for axis in _FREEDOM),
+        units=("m", "m", "m", "deg", "deg", "deg") * len(docks),
+        scale=np.tile(np.repeat([1.0, 180.0 / np.pi], 3), len(docks)),
+        sigma=np.concatenate([sigma for sigma, _ in swings]),
+        time_constant_s=np.concatenate([time_s for _, time_s in swings]),
+    )
+
+
+def _swing(dock: DockConfig) -> tuple[Array, Array]:
+    """Sigmas (6,) of a dock's motion, m and rad, and their time constants (6,), s."""
     turns = np.radians([dock.tilts_deg, dock.tilts_deg, dock.moves_deg])
-    moves = np.concatenate([[dock.moves_m, dock.moves_m, dock.rises_m], turns, [0.0]]) / 2.0
+    moves = np.concatenate([[dock.moves_m, dock.moves_m, dock.rises_m], turns]) / 2.0
     swing_s = max(dock.period_s**2 / (2.0 * np.pi**2), 1.0)
-    times = np.array([swing_s, swing_s, _TIDE_S, swing_s, swing_s, swing_s, _OTHER_TAGS_S])
-    return np.hypot(surveyed, moves), times
-
-
-def _scale_sigma(tags: Sequence[TagConfig]) -> float:
-    """How well distances between tags that are seen together are known: by the survey's noise over those to the next."""
-    place = np.array([tag.xyz_m for tag in tags])
-    away = np.linalg.norm(place[:, None] - place[None], axis=2) + np.diag(np.full(len(tags), np.inf))
-    nearest = away.min(axis=1)
-    apart = float(np.median(nearest[np.isfinite(nearest)])) if np.isfinite(nearest).any() else np.inf
-    return float(np.clip(_usual_sigmas(tags)[0] / apart, _LEAST_SCALE, _LARGEST_SCALE))
+    return np.maximum(moves, _LEAST), np.array([swing_s, swing_s, _TIDE_S, swing_s, swing_s, swing_s])
 
 
 def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:
@@ -238,19 +289,19 @@ def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:
     R, p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
     corners = np.array([(-0.2, -0.2, 4.1), (0.2, -0.2, 3.9), (0.2, 0.2, 3.9), (-0.2, 0.2, 4.1)])
     now = p + corners @ R.T
-    moved = np.zeros(_SIZE) if at.slow_value is None else np.asarray(at.slow_value)[:_SIZE]
+    dock = at.slow_value is not None
+    moved = np.asarray(at.slow_value)[:6] if dock else np.zeros(6)
     pivot = now.mean(axis=0) + np.array([2.0, -1.0, 0.5])
-    back = np.asarray(Rotation.from_rotvec(-moved[3:6]).as_matrix())
-    scaled = pivot + (now - pivot - moved[:3]) @ back.T
-    middle = scaled.mean(axis=0)
+    back = np.asarray(Rotation.from_rotvec(-moved[3:]).as_matrix())
     mode = TagMode(
-        p_world_camera_m=middle - back @ (now.mean(axis=0) - p) / (1.0 + moved[6]), R_world_camera=back @ R,
+        p_world_camera_m=pivot + back @ (p - pivot - moved[:3]), R_world_camera=back @ R,
         cov=np.diag([0.02**2] * 3 + [0.01**2] * 3), probability=1.0,
     )  # fmt: skip
     return TagSighting(
-        stamp_ns=0, sensor="apriltag", seq=0, camera="camera", frame=(*survey.frames, WORLD)[0], numbers=(0,),
-        points_m=middle + (scaled - middle) / (1.0 + moved[6]), pivot_m=pivot, rays=corners[:, :2] / corners[:, 2:],
-        cov=np.eye(8) * 1e-6, t_body_camera_m=t_body_camera, R_body_camera=R_body_camera, modes=(mode,),
+        stamp_ns=0, sensor="apriltag", seq=0, camera="camera", frame=_docks(survey)[0] if dock else WORLD, numbers=(0,),
+        families=("36h11",), points_m=pivot + (now - pivot - moved[:3]) @ back.T, pivot_m=pivot,
+        rays=corners[:, :2] / corners[:, 2:], cov=np.eye(8) * 1e-6, t_body_camera_m=t_body_camera,
+        R_body_camera=R_body_camera, modes=(mode,),
     )  # fmt: skip
 
 
@@ -271,8 +322,8 @@ def hint(m: TagSighting, mount_yaw_rad: float, datum: Datum) -> Hint:
 
 def berths(config: AprilTagConfig) -> tuple[Berth, ...]:
     """Return the berths of the survey; where it lists none, each frame's tags make one."""
-    survey, found = config.surveyed, []
-    for number, frame in enumerate(survey.frames):
+    survey, docks, found = config.surveyed, _docks(config.surveyed), []
+    for frame in survey.frames:
         p, R = survey.rest(frame)
         tags = [tag for tag in survey.tags if tag.frame == frame]
         listed = [(b.name, np.array(b.xyz_m), b.facing_deg) for b in survey.berths if b.frame == frame]
@@ -289,28 +340,11 @@ def berths(config: AprilTagConfig) -> tuple[Berth, ...]:
                     name=name,
                     point_m=p + R @ xyz_m,
                     facing_deg=float(np.degrees(np.arctan2(out[0], out[1]))),
-                    pivot_m=p if frame != WORLD else R @ xyz_m,
-                    moves=_SIZE * number,
-                    survey_sigma=_survey_sigma(tags),
-                    survey_middle_m=p + R @ np.mean([tag.xyz_m for tag in tags], axis=0),
+                    pivot_m=p,
+                    moves=6 * docks.index(frame) if frame in docks else None,
                 )
             )
     return tuple(found)
-
-
-def _usual_sigmas(tags: Sequence[TagConfig]) -> tuple[float, float]:
-    """Sigmas of place (m) and axes (rad) of the tag in the middle; what one is known worse is in its sightings."""
-    sigma_m = float(np.median([tag.sigma_m for tag in tags]))
-    sigma_rad = float(np.radians(np.median([tag.sigma_deg for tag in tags])))
-    return max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)
-
-
-def _survey_sigma(tags: Sequence[TagConfig]) -> Array:
-    """How well the tags of a frame together stand to it: east, north, up in m, yaw in rad, 1 sigma (4,)."""
-    place = np.array([tag.xyz_m[:2] for tag in tags])
-    sigma_m, sigma_rad = _usual_sigmas(tags)
-    yaw_rad = (len(tags) / sigma_rad**2 + float(((place - place.mean(axis=0)) ** 2).sum()) / sigma_m**2) ** -0.5
-    return np.array([sigma_m / np.sqrt(len(tags))] * 3 + [yaw_rad])
 
 
 def describe(m: TagSighting) -> str:
@@ -328,6 +362,7 @@ ROW = Sensor(
     ideal=ideal,
     hint=hint,
     slow=slow,
+    constants=constants,
     false=false,
     describe=describe,
     berths=berths,

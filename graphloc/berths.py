@@ -16,7 +16,7 @@ rest, p -> c + Rz(-psi) (p - c - (e, n, u)), and the yaw less psi. Roll and pitc
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,18 +32,14 @@ class Berth:
     Attributes:
         name: for outputs. point_m: (3,) P in world. facing_deg: heading f, from north, clockwise.
         pivot_m: (3,) c in world. moves: index of its (e, n, u, roll, pitch, psi) in the slow state of the
-            sensor that knows it.
-        survey_sigma: (4,) how well what the sensor sees stands to it: east, north, up in m, yaw in rad, about the
-            point survey_middle_m (3,) in world.
+            sensor that sees it; None: it stands still.
     """
 
     name: str
     point_m: Array
     facing_deg: float
     pivot_m: Array
-    moves: int = 0
-    survey_sigma: Array = field(default_factory=lambda: np.zeros(4))
-    survey_middle_m: Array = field(default_factory=lambda: np.zeros(3))
+    moves: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -26,7 +26,7 @@ from graphloc import keys
 from graphloc.config import KernelConfig, SensorConfig, VesselConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array, Datum
-from graphloc.graph import Attachment, Decision, InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.graph import Attachment, Constant, Decision, InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.recording import Recording
@@ -45,6 +45,7 @@ class Stream:
     Attributes:
         number: of the sensor, for keys. name, row, config: the sensor.
         slow: its slow state, or None. left_out: the slow state that it would have in company.
+        constants: what its measurements may share.
         mount: pose of the sensor from the IMU's place, body axes.
         measurements: M of them by stamp. state: (M,) nearest state. carry: per measurement the
             preintegrated motion from the state before it, or None where it stands on a state.
@@ -58,6 +59,7 @@ class Stream:
     config: SensorConfig
     slow: SlowProcess | None
     left_out: SlowProcess | None
+    constants: tuple[Constant, ...]
     mount: Any
     measurements: tuple[Measurement, ...]
     state: NDArray[np.int64]
@@ -230,6 +232,7 @@ def _stream(
         config,
         slow,
         left_out,
+        row.constants(config),
         T_state_sensor,
         tuple(measurements),
         np.array(state, dtype=np.int64),
@@ -272,12 +275,43 @@ def attach(problem: Problem, stream: Stream, i: int, values: gtsam.Values) -> At
         lever_m=np.asarray(stream.mount.translation()),
         slow_value=None if slow_key is None else np.atleast_1d(values.atVector(slow_key)),
         datum=problem.datum,
+        slow_next=None if slow_key is None else _next_slow(problem, stream, j, stream.measurements[i].stamp_ns, values),
+        constants=_constants(stream, values),
     )
+
+
+def _next_slow(
+    problem: Problem, stream: Stream, j: int, stamp_ns: int, values: gtsam.Values
+) -> tuple[int, Array, float, float] | None:
+    stamps, key = problem.timeline.slow_stamps_ns, keys.slow(stream.number, j + 1)
+    if j + 1 >= len(stamps) or not values.exists(key):
+        return None
+    apart = int(stamps[j + 1] - stamps[j])
+    share = float(np.clip((stamp_ns - int(stamps[j])) / apart, 0.0, 1.0))
+    return key, np.atleast_1d(values.atVector(key)), share, apart * 1e-9
+
+
+def _constants(stream: Stream, values: gtsam.Values) -> tuple[tuple[int, Array], ...]:
+    """Keys and estimates; what no factor had yet is zero."""
+    return tuple(
+        (key, np.atleast_1d(values.atVector(key)) if values.exists(key) else np.zeros(len(constant.sigma)))
+        for key, constant in zip(constant_keys(stream), stream.constants, strict=True)
+    )
+
+
+def constant_keys(stream: Stream) -> list[int]:
+    """Return the keys of a sensor's constants."""
+    return [keys.constant(stream.number, k) for k in range(len(stream.constants))]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartPrior:
-    """Gaussian prior on the first state of a stretch (block-diagonal; sigmas or covariances)."""
+    """Gaussian prior on the first state of a stretch (block-diagonal; sigmas or covariances).
+
+    Attributes:
+        slow, constants: value and covariance, by the sensor's number and by key; those that are not there have the prior
+            of their kind.
+    """
 
     pose: Any
     pose_cov: Array
@@ -286,6 +320,7 @@ class StartPrior:
     bias: Any
     bias_cov: Array
     slow: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
+    constants: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
 
 
 # What was decided about (stream number, measurement index), and where it attaches; without it, or None: left out.
@@ -330,7 +365,20 @@ def build_graph(
                 graph.add(factor)
             for key, value in update.guesses:
                 guess.insert(key, value)
+        _add_constants(graph, guess, stream, values, prior)
     return graph, guess
+
+
+def _add_constants(
+    graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values, stream: Stream, values: gtsam.Values, prior: StartPrior
+) -> None:
+    """Those that a factor has, each with its prior: what is not seen in a stretch needs no state there."""
+    used = set(graph.keyVector()) if stream.constants else set()
+    for (key, known), constant in zip(_constants(stream, values), stream.constants, strict=True):
+        if key in used:
+            guess.insert(key, known)
+            value, cov = prior.constants.get(key, (np.zeros(len(constant.sigma)), np.diag(constant.sigma**2)))
+            graph.add(gtsam.PriorFactorVector(key, value, gtsam.noiseModel.Gaussian.Covariance(cov)))
 
 
 def _node_dt_s(problem: Problem, j: int) -> float:

@@ -365,6 +365,9 @@ class AprilTagConfig(SensorConfig):
     """Most bits of a tag that may be read wrong."""
     min_margin: NonNegative = 1.5
     """Least decision margin (AprilTag's: how far bits are from the threshold, grey levels)."""
+    min_corner_sigma_px: NonNegative = 0.2
+    """Floor of the corners' noise in the graph, each axis, 1 sigma, px: what calibration and stamps are off (a vessel
+    that turns by 5 deg/s moves corners by 0.5 px in 5 ms at a focal length of 1000 px)."""
     corner_sigma_px: Positive = 0.5
     """Noise of the corners of listed detections, each axis, 1 sigma, px; our own detector measures it."""
     false_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02

@@ -48,6 +48,9 @@ class Attachment:
         gyro_radps: (3,) body rate at the measurement, body axes, bias removed.
         lever_m: (3,) sensor origin from the IMU, body axes.
         slow_value: estimate of the slow state, or None.
+        slow_next: key and estimate of the next node of the slow state, how far from the one to the other the measurement
+            is (share), and how far apart they are in s; None where there is no next.
+        constants: key and estimate of each of the sensor's constants.
         datum: origin of world.
     """
 
@@ -63,6 +66,8 @@ class Attachment:
     lever_m: Array
     slow_value: Array | None
     datum: Datum
+    slow_next: tuple[int, Array, float, float] | None = None
+    constants: tuple[tuple[int, Array], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,6 +142,18 @@ class SlowProcess:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Constant:
+    """Something that does not change in a run and that some of a sensor's measurements share; expected to be zero.
+
+    Attributes:
+        name: for warnings. sigma: (k,).
+    """
+
+    name: str
+    sigma: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FalseModel:
     """What a sensor's false measurements look like.
 
@@ -185,6 +202,7 @@ class Sensor:
         slow: the slow state that a config asks for.
         false: the hypothesis that a measurement is false; None: the sensor has no such hypothesis
             and is guarded by its kernel alone.
+        constants: that a config's measurements may share.
         describe: what of a measurement its row of the ledger should say.
         berths: places that its slow state moves, and that the vessel is seen from.
         synthetic: measurements made from the configuration over the run's stamps (no topic).
@@ -204,6 +222,7 @@ class Sensor:
     hint: Callable[[Any, float, Datum], Hint]
     slow: Callable[[Any], SlowProcess | None] = lambda _config: None
     false: Callable[[Any, Any], FalseModel] | None = None
+    constants: Callable[[Any], tuple[Constant, ...]] = lambda _config: ()
     describe: Callable[[Any], str] = lambda _measurement: ""
     berths: Callable[[Any], tuple[Berth, ...]] = lambda _config: ()
     synthetic: Callable[[str, Any, Sequence[int], float], Sequence[Measurement]] | None = None

@@ -2,7 +2,8 @@
 """The only place that makes keys of the graph.
 
 X pose of body in world (Pose3); V velocity in world (3,); B IMU bias (accelerometer, gyroscope);
-S slow state of a sensor (vector), labelled with the sensor's number; A, L leaves of one measurement.
+S slow state of a sensor, C constant of one (vectors), labelled with the sensor's number; A, L leaves of one
+measurement.
 """
 
 from __future__ import annotations
@@ -28,6 +29,11 @@ def bias(j: int) -> int:
 def slow(sensor_number: int, j: int) -> int:
     """Key of the slow state of a sensor at slow node `j`."""
     return int(gtsam.LabeledSymbol(ord("s"), ord("A") + sensor_number, j).key())
+
+
+def constant(sensor_number: int, k: int) -> int:
+    """Key of constant `k` of a sensor."""
+    return int(gtsam.LabeledSymbol(ord("c"), ord("A") + sensor_number, k).key())
 
 
 def leaves(seq: int) -> tuple[int, int]:

@@ -166,12 +166,13 @@ class TagSighting(Measurement):
 
     Attributes:
         camera: its name. frame: `world`, or the dock that the tags ride on.
-        numbers: K ids.
+        numbers, families: K ids, and the family of each.
         points_m: (4 K, 3) corners of each tag in turn, in world, the frame at rest; of a tag: top-left, top-right,
             bottom-right, bottom-left of the print.
-        pivot_m: (3,) point in world that the frame turns about.
+        pivot_m: (3,) point in world that the frame turns about: a dock's origin.
         rays: (4 K, 2) where they are seen: x / z, y / z in the camera's optical axes, distortion removed.
-        cov: (8 K, 8 K) of the rays, u0, v0, u1, ...: of the corners in the image, and of the tags in the survey.
+        cov: (8 K, 8 K) of the rays, u0, v0, u1, ...: of the corners in the image. That of the modes has what the survey
+            does not know in it, too.
         t_body_camera_m, R_body_camera: (3,), (3, 3) the camera's mount.
         modes: poses that explain it, likeliest first; probabilities sum to 1.
     """
@@ -179,6 +180,7 @@ class TagSighting(Measurement):
     camera: str
     frame: str
     numbers: tuple[int, ...]
+    families: tuple[str, ...]
     points_m: Array
     pivot_m: Array
     rays: Array

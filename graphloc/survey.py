@@ -166,13 +166,6 @@ class Survey(Block):
             return np.zeros(3), np.eye(3)
         return np.array(dock.xyz_m), rotation_from_rpy_deg(np.array(dock.rpy_deg))
 
-    def pivot_m(self, frame: str) -> Array:
-        """Return the point (3,) in world that a frame turns about: a dock's origin; in world the middle of its tags."""
-        if frame != WORLD:
-            return self.rest(frame)[0]
-        places = [tag.xyz_m for tag in self.tags if tag.frame == WORLD]
-        return np.mean(places, axis=0) if places else np.zeros(3)
-
 
 def load_survey(path: Path) -> Survey:
     """Read and validate a `tags.yaml`.

@@ -135,9 +135,8 @@ def surveyed(
 def test_a_frames_tags_make_a_berth() -> None:
     config = surveyed([("world", [0.0, 10.0, 1.0], 170.0), ("world", [4.0, 10.0, 2.0], 190.0)])
     (found,) = berths(config)
-    assert (found.name, found.moves) == ("quay", 0)
+    assert (found.name, found.moves) == ("quay", None)
     np.testing.assert_allclose(found.point_m, [2.0, 10.0, 1.5])
-    np.testing.assert_allclose(found.pivot_m, [2.0, 10.0, 1.5])
     assert found.facing_deg % 360.0 == pytest.approx(180.0)
 
 
@@ -146,7 +145,7 @@ def test_a_docks_berth_is_turned_with_it() -> None:
     dock = {"name": "pier", "xyz_m": [10.0, 20.0, 0.5], "rpy_deg": [0.0, 0.0, 90.0]}
     config = surveyed([("world", [0.0, 0.0, 1.0], 90.0), ("pier", [3.0, 0.0, 1.0], 0.0)], [dock])
     quay, pier = berths(config)
-    assert (quay.name, quay.moves, pier.name, pier.moves) == ("quay", 0, "pier", 7)
+    assert (quay.name, quay.moves, pier.name, pier.moves) == ("quay", None, "pier", 0)
     np.testing.assert_allclose(pier.point_m, [10.0, 23.0, 1.5])
     assert pier.facing_deg % 360.0 == pytest.approx(270.0)
     np.testing.assert_allclose(pier.pivot_m, [10.0, 20.0, 0.5])
@@ -167,7 +166,7 @@ def test_listed_berths_are_the_only_ones() -> None:
     listed: list[object] = [{"name": "inner", "frame": "pier", "xyz_m": [0.0, 2.0, 0.3], "facing_deg": 90.0}]
     config = surveyed([("world", [0.0, 0.0, 1.0], 90.0), ("pier", [3.0, 0.0, 1.0], 0.0)], [dock], listed)
     (found,) = berths(config)
-    assert (found.name, found.moves) == ("inner", 7)
+    assert (found.name, found.moves) == ("inner", 0)
     np.testing.assert_allclose(found.point_m, [8.0, 20.0, 0.3], atol=1e-9)  # 2 m along its y: 2 m west
     assert found.facing_deg % 360.0 == pytest.approx(0.0, abs=1e-9)  # along its x: north
 
@@ -182,28 +181,3 @@ def test_a_frame_that_was_not_seen_takes_its_listed_berth_with_it() -> None:
 
 def test_no_tags_no_berths() -> None:
     assert berths(AprilTagConfig()) == ()
-
-
-def test_how_well_a_frames_tags_stand_to_it() -> None:
-    """Monte Carlo: tags are put up a little off the survey; the rigid motion that fits them best, each axis."""
-    sigma_m, sigma_deg = 0.03, 0.8
-    places = np.array([(-3.0, 10.0), (0.0, 10.0), (4.0, 11.0)])
-    tags = [
-        {"id": k, "size_m": 0.4, "xyz_m": [*p, 1.0], "facing_deg": 180.0, "sigma_m": sigma_m, "sigma_deg": sigma_deg}
-        for k, p in enumerate(places.tolist())
-    ]
-    (found,) = berths(AprilTagConfig(survey=Survey.model_validate({"tags": tags})))
-    rng = np.random.default_rng(4)
-    arms = places - places.mean(axis=0)
-    fits = []
-    for _ in range(4000):
-        off, turned = rng.normal(0.0, sigma_m, (3, 2)), rng.normal(0.0, np.radians(sigma_deg), 3)
-        # off = shift + yaw x arm, turned = yaw; weighted least squares
-        A = np.zeros((9, 3))
-        A[0:6:2, 0] = A[1:6:2, 1] = 1.0
-        A[0:6:2, 2], A[1:6:2, 2] = -arms[:, 1], arms[:, 0]
-        A[6:, 2] = 1.0
-        weight = np.array([1.0 / sigma_m] * 6 + [1.0 / np.radians(sigma_deg)] * 3)
-        fits.append(np.linalg.lstsq(A * weight[:, None], np.concatenate([off.ravel(), turned]) * weight, rcond=None)[0])
-    shown = np.std(fits, axis=0)
-    np.testing.assert_allclose(found.survey_sigma[[0, 1, 3]], shown, rtol=0.05)

@@ -49,7 +49,7 @@ def sighting(
     there = (points - p) @ R
     return TagSighting(
         stamp_ns=round(t_s * 1e9), sensor="tags", seq=seq, camera=camera, frame="world",
-        numbers=tuple(n for n, _ in tags), points_m=points, pivot_m=np.zeros(3),
+        numbers=tuple(n for n, _ in tags), families=("36h11",) * len(tags), points_m=points, pivot_m=np.zeros(3),
         rays=there[:, :2] / there[:, 2:] + (0.0 if noise is None else noise), cov=1e-7 * np.eye(2 * len(points)),
         t_body_camera_m=LEVER, R_body_camera=R_BODY_CAMERA,
         modes=(TagMode(p_world_camera_m=p, R_world_camera=R, cov=np.eye(6), probability=1.0),),

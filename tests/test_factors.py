@@ -86,19 +86,20 @@ def test_jacobians_are_numeric_ones(row: Sensor, slow: bool) -> None:
     m = row.ideal(at, config)
     update = row.factors(m, config, at, Decision())
     values = values_of(at, update.guesses)
+    sizes = {1: 6, 2: 3, 3: 0 if at.slow_value is None else len(at.slow_value)}
+    sizes |= {key: len(value) for key, value in update.guesses}
     for factor in update.factors:
         linear = factor.linearize(values)
         A, _b = linear.jacobian()
         column = 0
         for key in list(factor.keys()):
-            size = {1: 6, 2: 3, 3: 0 if at.slow_value is None else len(at.slow_value), 4: 3, 5: 3}[key]
+            size = sizes[key]
             for axis in range(size):
                 sides = []
                 for sign in (1.0, -1.0):
                     delta = gtsam.VectorValues()
                     for other in list(values.keys()):
-                        width = {1: 6, 2: 3, 3: 0 if at.slow_value is None else len(at.slow_value), 4: 3, 5: 3}[other]
-                        delta.insert(other, np.zeros(width))
+                        delta.insert(other, np.zeros(sizes[other]))
                     step = np.zeros(size)
                     step[axis] = sign * 1e-5
                     delta.update(_one(key, step))

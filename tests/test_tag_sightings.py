@@ -243,8 +243,8 @@ def test_stamps_and_their_offset(tmp_path: Path, shown: NDArray[np.uint8]) -> No
 def test_a_mount_by_tf(tmp_path: Path, shown: NDArray[np.uint8]) -> None:
     """hull -> mast -> optical frame: by hand, the mast is turned to port, and the camera on it looks over port."""
     make = Messages(2)
-    port = Rotation.from_euler("z", 90, degrees=True).as_quat()
-    optical = Rotation.from_matrix(AHEAD).as_quat()
+    port = Rotation.from_euler("z", 90, degrees=True).as_quat().tolist()
+    optical = Rotation.from_matrix(AHEAD).as_quat().tolist()
     tree = make.transforms([("hull", "mast", (1.0, 2.0, 3.0), port), ("mast", "eye_optical", (0.5, 0.0, 0.2), optical)])
     path = bag_of(tmp_path, make, ("/tf_static", tree), (INFO, info(make)), (IMAGE, image(make, shown)))
     config = tags(("bow", {"topic": IMAGE, "mount": {"tf_frame": "eye_optical"}}))

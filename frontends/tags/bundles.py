@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from graphloc.frames import Array, skew
 from graphloc.frontends.tags.pose import KEPT, PoseOfCamera, modes_of, poses_of
 from graphloc.measurements import TagSighting
-from graphloc.survey import WORLD, Survey, TagConfig
+from graphloc.survey import Survey, TagConfig
 
 # Corners fit with the noise that they are said to have, up to so many times its variance; beyond, a tag does not
 # belong to the others.
@@ -37,13 +37,14 @@ class SeenTag:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeing:
-    """Who sees, and when."""
+    """Who sees, and when; floor: least noise of a ray, each axis, 1 sigma."""
 
     stamp_ns: int
     sensor: str
     camera: str
     t_body_camera_m: Array
     R_body_camera: Array
+    floor: float = 0.0
 
 
 def sightings_of(seen: Sequence[SeenTag], survey: Survey, seeing: Seeing) -> tuple[list[TagSighting], list[int]]:
@@ -64,7 +65,8 @@ class _Bundle:
     """Tags of one frame taken together.
 
     Attributes:
-        points_m, rays, cov: (4 K, 3) corners in world at rest, (4 K, 2), (8 K, 8 K) with the survey's share.
+        points_m, rays: (4 K, 3) corners in world at rest, (4 K, 2). seen_cov, cov: (8 K, 8 K) of the rays by the image,
+            and with the survey's share.
         poses: that explain them; none where nothing does. excess: how many times larger the squared error is than the
             noise lets expect.
     """
@@ -74,7 +76,7 @@ class _Bundle:
         self.group = tuple(group)
         self.points_m = np.vstack([p + s.tag.corners_m @ R.T for s in group])
         self.rays = np.vstack([s.rays for s in group])
-        self.cov = block_diag(*(s.cov for s in group))
+        self.seen_cov = self.cov = np.asarray(block_diag(*(s.cov for s in group)))
         self.dof = 8 * len(group) - 6
         self.poses = poses_of(self.points_m, self.rays, self.cov)
         self.excess = np.inf
@@ -106,7 +108,7 @@ class _Bundle:
         Which minima are none is judged only now: with the noise that was claimed for blurred corners, all but one are.
         """
         if self.excess > chi2.ppf(0.95, self.dof) / self.dof:
-            self.cov = self.cov * self.excess
+            self.cov, self.seen_cov = self.cov * self.excess, self.seen_cov * self.excess
             self.poses = self._again()
         if len(self.group) > 1:
             self.poses = [pose for pose in self.poses if pose.squared < self.poses[0].squared + KEPT]
@@ -136,9 +138,10 @@ def _sighting(bundle: _Bundle, survey: Survey, frame: str, seeing: Seeing) -> Ta
     bundle.doubt()
     return TagSighting(
         stamp_ns=seeing.stamp_ns, sensor=seeing.sensor, seq=-1, camera=seeing.camera, frame=frame,
-        numbers=tuple(s.tag.id for s in bundle.group), points_m=bundle.points_m, pivot_m=bundle.points_m.mean(axis=0) if frame == WORLD else survey.rest(frame)[0],
-        rays=bundle.rays, cov=0.5 * (bundle.cov + bundle.cov.T), t_body_camera_m=seeing.t_body_camera_m,
-        R_body_camera=seeing.R_body_camera,
+        numbers=tuple(s.tag.id for s in bundle.group), families=tuple(s.tag.family for s in bundle.group),
+        points_m=bundle.points_m, pivot_m=survey.rest(frame)[0], rays=bundle.rays,
+        cov=0.5 * (bundle.seen_cov + bundle.seen_cov.T) + seeing.floor**2 * np.eye(len(bundle.seen_cov)),
+        t_body_camera_m=seeing.t_body_camera_m, R_body_camera=seeing.R_body_camera,
         modes=modes_of(
             bundle.poses, bundle.points_m, bundle.rays, bundle.cov, blind=any(s.fitted for s in bundle.group)
         ),

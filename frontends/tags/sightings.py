@@ -269,7 +269,8 @@ def _sorted_out(shown: _Raw, stamp_ns: int, eye: _Eye, sensor: str, config: Apri
             )
         else:
             seen.append(SeenTag(tag, rays, cov, fitted))
-    seeing = Seeing(stamp_ns, sensor, eye.name, *eye.mount)
+    focal_px = _NO_FOCAL_PX if eye.lens is None else float(eye.lens.K[0, 0])
+    seeing = Seeing(stamp_ns, sensor, eye.name, *eye.mount, floor=config.min_corner_sigma_px / focal_px)
     sightings, lost = sightings_of(seen, survey, seeing)
     troubles += [f"tag {number}: no pose explains its corners" for number in lost]
     return Seen(stamp_ns, eye.name, tuple(sightings), tuple(views), tuple(dict.fromkeys(troubles)))

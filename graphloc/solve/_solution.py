@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from graphloc import keys
-from graphloc.berths import BerthTrack, rates, seen_from
-from graphloc.build import Problem, Stream
+from graphloc.berths import Berth, BerthTrack, rates, seen_from
+from graphloc.build import Problem, Stream, constant_keys
 from graphloc.frames import Array, skew
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import Measurement
@@ -77,44 +76,48 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
 
 
 def _berth_tracks(problem: Problem, result: BatchResult, trajectory: Trajectory) -> Iterator[BerthTrack]:
-    """The vessel seen from each berth; where a berth is between two of its slow nodes, it is in between."""
-    timeline = problem.timeline
+    """The vessel seen from each berth that is near."""
     for stream in problem.streams:
-        if stream.slow is None:
-            continue
-        nodes = [keys.slow(stream.number, j) for j in range(len(timeline.slow_stamps_ns))]
         for berth in stream.row.berths(stream.config):
             near = np.linalg.norm(trajectory.p_world_m[:, :2] - berth.point_m[:2], axis=1) < _NEAR_BERTH_M
             picked = np.flatnonzero(near)
             if not len(picked):
                 continue
-            four = berth.moves + np.array([0, 1, 2, 5])  # roll and pitch of a berth do not show in its plane
-            held = np.array([np.atleast_1d(result.values.atVector(key))[four] for key in nodes])
-            middles = timeline.slow_stamps_ns + 0.5 * np.append(np.diff(timeline.slow_stamps_ns), 0)
-            moved = np.column_stack([np.interp(trajectory.stamps_ns, middles, column) for column in held.T])[picked]
-            p, yaw = trajectory.p_world_m[picked], trajectory.yaw_rad[picked]
-            value, J = seen_from(berth, p, yaw, moved)
-            by_survey = seen_from(replace(berth, pivot_m=berth.survey_middle_m), p, yaw, moved)[1][:, :, 3:]
+            moved = _moved(problem, result, stream, berth, trajectory.stamps_ns[picked])
+            value, J = seen_from(berth, trajectory.p_world_m[picked], trajectory.yaw_rad[picked], moved)
             stamps = trajectory.stamps_ns[picked]
             cov = np.array([
-                _berth_covariance(problem, result, int(k), nodes[int(timeline.slow_of[k])], four, J[n])
-                + by_survey[n] * berth.survey_sigma**2 @ by_survey[n].T
-                for n, k in enumerate(picked)
+                j @ _of_pose_and_berth(problem, result, stream, berth, int(k)) @ j.T for j, k in zip(J, picked, strict=True)
             ])  # fmt: skip
             rate = rates(value, (stamps - stamps[0]) * 1e-9)
             yield BerthTrack(berth=berth, stamps_ns=stamps, value=value, rate=rate, cov=cov)
 
 
-def _berth_covariance(
-    problem: Problem, result: BatchResult, k: int, slow_key: int, four: NDArray[np.int64], J: Array
-) -> Array:
-    """Covariance (3, 3) of what is seen from a berth at state k: pose and berth are known together, not apart."""
+_IN_PLANE = np.array([0, 1, 2, 5])  # of a berth's motion: its roll and pitch do not show
+
+
+def _moved(problem: Problem, result: BatchResult, stream: Stream, berth: Berth, stamps: NDArray[np.int64]) -> Array:
+    """How a berth has moved (N, 4) at N stamps; between two of its slow nodes it is in between."""
+    if berth.moves is None:
+        return np.zeros((len(stamps), 4))
+    at = problem.timeline.slow_stamps_ns
+    nodes = [keys.slow(stream.number, j) for j in range(len(at))]
+    held = np.array([np.atleast_1d(result.values.atVector(key))[berth.moves + _IN_PLANE] for key in nodes])
+    return np.column_stack([np.interp(stamps, at, column) for column in held.T])
+
+
+def _of_pose_and_berth(problem: Problem, result: BatchResult, stream: Stream, berth: Berth, k: int) -> Array:
+    """Covariance (7, 7) of east, north, yaw of the body and of how the berth has moved: known together, not apart."""
     R = result.values.atPose3(keys.pose(k)).rotation().matrix()
-    joint = np.asarray(result.tree.jointMarginalCovariance([keys.pose(k), slow_key]).fullMatrix())
+    wanted = [keys.pose(k)]
+    if berth.moves is not None:
+        wanted.append(keys.slow(stream.number, int(problem.timeline.slow_of[k])))
+    joint = np.asarray(result.tree.jointMarginalCovariance(wanted).fullMatrix())
     kept = np.zeros((7, len(joint)))
     kept[:3, :6] = _to_world(R, -problem.t_body_imu_m)[[0, 1, 5]]
-    kept[3:, 6:][:, four] = np.eye(4)
-    return np.asarray(J @ kept @ joint @ kept.T @ J.T)
+    if berth.moves is not None:
+        kept[3:, 6 + berth.moves + _IN_PLANE] = np.eye(4)
+    return np.asarray(kept @ joint @ kept.T)
 
 
 def _left_out(problem: Problem) -> Array:
@@ -301,6 +304,14 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
                 f"{stream.name}: its {stream.slow.name if stream.slow else 'offset'} is estimated {far:.1f} sigmas from "
                 "what the configuration allows for: check its mount, or raise that sigma"
             )
+        for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
+            if result.values.exists(key):
+                off = float(np.abs(np.atleast_1d(result.values.atVector(key)) / constant.sigma).max())
+                if off > _FAR_OFF:
+                    warnings.append(
+                        f"{stream.name}: {constant.name} is {off:.1f} sigmas from what its survey says: survey it anew, or "
+                        "raise its sigmas"
+                    )
         if stream.left_out is not None:
             warnings.append(
                 f"{stream.name}: no second sensor can tell its slow error (multipath) from motion; the bounds allow "

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from graphloc import keys
-from graphloc.build import Decisions, Problem, StartPrior, build_graph, nav_state
+from graphloc.build import Decisions, Problem, StartPrior, build_graph, constant_keys, nav_state
 from graphloc.frames import Array
 from graphloc.solve._optimize import bayes_tree, optimize
 
@@ -60,6 +60,9 @@ def update_states(problem: Problem, values: gtsam.Values, new: gtsam.Values, fir
             if stream.slow is not None:
                 key = keys.slow(stream.number, j)
                 values.update(key, np.atleast_1d(new.atVector(key)))
+    for key in _constants(problem):
+        if new.exists(key):
+            values.insert_or_assign(key, np.atleast_1d(new.atVector(key)))
 
 
 def copy_states(problem: Problem, values: gtsam.Values, first: int, last: int) -> gtsam.Values:
@@ -70,7 +73,14 @@ def copy_states(problem: Problem, values: gtsam.Values, first: int, last: int) -
         copy.insert(keys.velocity(k), values.atVector(keys.velocity(k)))
     for j in range(int(problem.timeline.slow_of[first]), int(problem.timeline.slow_of[last]) + 1):
         fill_slow(problem, copy, j, values.atConstantBias(keys.bias(j)), slow_at(problem, values, j))
+    for key in _constants(problem):
+        if values.exists(key):
+            copy.insert(key, np.atleast_1d(values.atVector(key)))
     return copy
+
+
+def _constants(problem: Problem) -> list[int]:
+    return [key for stream in problem.streams for key in constant_keys(stream)]
 
 
 def slow_at(problem: Problem, values: gtsam.Values, j: int) -> dict[int, Array]:
@@ -131,4 +141,9 @@ def prior_at(problem: Problem, step: StretchStep, k: int) -> StartPrior:
         bias=values.atConstantBias(keys.bias(j)),
         bias_cov=cov[keys.bias(j)],
         slow=slow,
+        constants={
+            key: (np.atleast_1d(values.atVector(key)), np.asarray(tree.marginalCovariance(key)))
+            for key in _constants(problem)
+            if values.exists(key)
+        },
     )

@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whole docking runs by tags, without images: how good they are, and what is said where survey, clock or mount is wrong.
+
+Corners are true ones with noise (`tests/tagfactory.py`). The vessel goes twice as fast as in `dock-*-optimal`, which makes
+a run of 60 s; three tags a metre and a half apart, first seen at 25 m, berth at 2.5 m. GNSS drifts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from graphloc import app
+from graphloc.berths import seen_from
+from graphloc.config import TimelineConfig
+from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
+from graphloc.eval.simulate._light import tag_in_world
+from graphloc.eval.simulate.scene import scene_of
+from graphloc.frames import Array, wrap_angle
+from graphloc.measurements import CompassHeading, GnssPosition, Measurement, TagSighting, TagView
+from graphloc.survey import Survey, TagConfig, load_survey
+from tests import tagfactory
+
+S = 1_000_000_000
+QUAY = (226, 227, 228)
+_LESS = {"imu_hz": "50", "gnss_hz": "2", "compass_hz": "4", "lidar_hz": "0", "camera_hz": "0"}
+
+Sightings = list[tuple[TagSighting, int]]
+Change = Callable[[Measurement], Measurement | None]
+
+
+@dataclass(frozen=True)
+class Docked:
+    """A run that was solved; which mode of each sighting is right; what was said."""
+
+    truth: SimulatedRun
+    run: app.Run
+    right: dict[int, int]
+
+    @property
+    def said(self) -> str:
+        return "\n".join([*self.run.recording.warnings, *self.run.solution.stats.warnings])
+
+    @property
+    def table(self) -> dict[str, float | None]:
+        (found,) = [t for t in app.tables(self.run) if t.title == "Docking"]
+        return found.as_dict()["graphloc"]
+
+    def number(self, column: str) -> float:
+        value = self.table[column]
+        assert value is not None
+        return value
+
+    def outcomes(self) -> dict[str, int]:
+        return self.run.solution.ledger.counts()["tags"]
+
+    def heading_error_deg(self) -> Array:
+        track = self.run.solution.trajectory
+        kept = self.truth.truth.covers(track.stamps_ns)
+        true = self.truth.truth.at(track.stamps_ns[kept])
+        return np.degrees(wrap_angle(track.yaw_rad[kept] - true.yaw_rad))
+
+
+@cache
+def voyage(kind: str, seed: int = 1) -> SimulatedRun:
+    changes = {**_LESS, "duration_s": "60", "route_s": "60"}
+    return simulate(find_scenario(f"dock-{kind}-optimal", changes), seed)
+
+
+def dock(
+    kind: str = "fixed",
+    *,
+    change: Change | None = None,
+    tag: Callable[[TagConfig], TagConfig | None] | None = None,
+    views: tuple[TagView, ...] = (),
+    compare: bool = False,
+    alone: bool = False,
+    only: tuple[int, ...] = (),
+    hidden_s: tuple[float, float] = (0.0, 0.0),
+) -> Docked:
+    """Solve a run; `change` of each measurement, `tag` of each in the survey (None: without it)."""
+    true = voyage(kind)
+    whole = tagfactory.survey_of
+
+    def surveyed(of: SimulatedRun) -> Survey:
+        survey = whole(of)
+        kept = [changed for t in survey.tags if (changed := tag(t) if tag else t) is not None]
+        return survey.model_copy(update={"tags": tuple(kept)})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tagfactory, "survey_of", surveyed)
+        seen, numbered = tagfactory.sighted(true, rate_hz=3.0, alone=alone, only=only, hidden_s=hidden_s)
+    kept = (c for m in seen.recording.measurements if (c := change(m) if change else m) is not None)
+    ordered = tuple(sorted(kept, key=lambda m: (m.stamp_ns, m.seq)))
+    recording = replace(seen.recording, measurements=ordered, tag_views=views)
+    config = seen.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)})  # half the time
+    run = app.simulated(replace(seen, recording=recording, config=config), compare=compare)
+    return Docked(true, run, {m.seq: right for m, right in numbered})
+
+
+def without(*kinds: type[Measurement]) -> Change:
+    return lambda m: None if isinstance(m, kinds) else m
+
+
+def late(by_s: float) -> Change:
+    return lambda m: replace(m, stamp_ns=m.stamp_ns + round(by_s * S)) if isinstance(m, TagSighting) else m
+
+
+def off(number: int, shift: tuple[float, float, float]) -> Callable[[TagConfig], TagConfig]:
+    def moved(t: TagConfig) -> TagConfig:
+        xyz = tuple(float(a + b) for a, b in zip(t.xyz_m, shift, strict=True))
+        return t.model_copy(update={"xyz_m": xyz}) if t.id == number else t
+
+    return moved
+
+
+def sized(size_m: float, *numbers: int) -> Callable[[TagConfig], TagConfig]:
+    return lambda t: t.model_copy(update={"size_m": size_m}) if not numbers or t.id in numbers else t
+
+
+def wrong_modes(docked: Docked) -> float:
+    """Share of sightings whose chosen mode lies 2 deg farther from the truth, on a fixed dock, than another one.
+
+    Where the truth is in the middle between both, which of them is the nearer one is as good as drawn.
+    """
+    of = {m.seq: m for m in docked.run.recording.measurements if isinstance(m, TagSighting)}
+    wrong = 0
+    for row in docked.run.solution.ledger:
+        if row.seq in of and row.mode is not None:
+            m = of[row.seq]
+            true = docked.truth.truth.at(np.array([m.stamp_ns])).R_world_body[0] @ m.R_body_camera
+            away = [tagfactory.degrees_between(mode.R_world_camera, true) for mode in m.modes]
+            wrong += away[row.mode] > min(away) + 2.0
+    return wrong / len(of)
+
+
+# what it shows
+
+
+def unlisted(run: SimulatedRun, number: int, size_m: float) -> tuple[TagView, ...]:
+    """Views of one of the quay's tags as one that is in no survey, and of this size."""
+    assert run.harbour is not None
+    rng, scene, camera = np.random.default_rng(5), scene_of(run), run.rig.cameras["camera"]
+    (tag,) = (t for t in run.harbour.config.tags if t.number == number)
+    found = []
+    for t in np.arange(20.0, 50.0, 0.5):
+        p, R, _ = (v[0] for v in run.motion.pose(np.array([t])))
+        at, turned = tag_in_world(tag, run.harbour, scene, float(t))
+        R_camera = R @ camera.mount.R_body_sensor
+        rays = tagfactory.rays_of(
+            at + size_m * tagfactory.UNIT @ turned.T, p + R @ camera.mount.t_body_sensor_m, R_camera
+        )
+        noise = 0.15 / camera.focal_px[0]
+        found.append(
+            TagView(
+                stamp_ns=int(run.truth.stamps_ns[0]) + round(t * S), family="36h11", number=99,
+                rays=rays + rng.normal(0.0, noise, (4, 2)), cov=np.eye(8) * noise**2,
+                t_body_camera_m=camera.mount.t_body_sensor_m, R_body_camera=camera.mount.R_body_sensor,
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+@pytest.fixture(scope="module")
+def fixed() -> Docked:
+    return dock(compare=True, views=unlisted(voyage("fixed"), 228, 0.3))
+
+
+@pytest.fixture(scope="module")
+def floating() -> Docked:
+    return dock("floating")
+
+
+@pytest.fixture(scope="module")
+def late_run() -> Docked:
+    return dock(change=late(0.2))
+
+
+def test_a_fixed_dock(fixed: Docked) -> None:
+    """D.1: 95 % within 0.10 m nearer than 8 m, RMSE 0.25 m from the first sighting on; GNSS alone is metres off."""
+    assert all(fixed.number(f"position_p95_{band}_m") < 0.06 for band in ("0_to_5", "5_to_8"))
+    assert fixed.number("sighted_rmse_m") < 0.08
+    assert fixed.number("dnv_met") == 1.0
+    assert fixed.outcomes() == {"used": len(fixed.right)}
+    assert "disagree" not in fixed.said
+    assert "stamps are" not in fixed.said
+
+
+def test_a_floating_dock(floating: Docked) -> None:
+    """D.5: seen from the berth 95 % within 0.10 m nearer than 5 m, and with bounds that hold; in world as good as GNSS."""
+    off_m, squared, range_m = at_berth(floating)
+    assert np.percentile(off_m[range_m < 5.0], 95) < 0.05
+    assert np.percentile(off_m[range_m < 20.0], 95) < 0.10
+    assert 0.2 < squared[range_m < 25.0].mean() / 3.0 < 2.5
+    assert floating.number("berth_p95_m") < 0.5
+    assert floating.outcomes() == {"used": len(floating.right)}
+
+
+def at_berth(docked: Docked) -> tuple[Array, Array, Array]:
+    """Horizontal error, NEES (3 degrees), and distance of the camera (N,), of what is seen from the only berth."""
+    (track,) = docked.run.solution.berths
+    assert track.cov is not None
+    stamps = track.stamps_ns
+    kept = docked.truth.truth.covers(stamps)
+    true = docked.truth.truth.at(stamps[kept])
+    t = (stamps[kept] - docked.truth.truth.stamps_ns[0]) * 1e-9
+    moved = np.zeros((len(t), 4))
+    for of in docked.truth.docks:
+        if of.dock.name == track.berth.name:
+            p, R = of.pose(t)
+            moved = np.column_stack([p[:, :2] - of.rest_m, p[:, 2], np.arctan2(R[:, 1, 0], R[:, 0, 0])])
+    value, _ = seen_from(track.berth, true.p_world_m, true.yaw_rad, moved)
+    error = track.value[kept] - value
+    error[:, 2] = wrap_angle(error[:, 2])
+    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(track.cov[kept]), error)
+    bow = true.p_world_m + true.R_world_body @ docked.truth.rig.cameras["camera"].mount.t_body_sensor_m
+    range_m = np.linalg.norm((bow - track.berth.point_m)[:, :2], axis=1)
+    return np.hypot(error[:, 0], error[:, 1]), squared, range_m
+
+
+def test_bounds_at_the_berth_hold(fixed: Docked) -> None:
+    off_m, squared, range_m = at_berth(fixed)
+    near = range_m < 25.0
+    assert 0.2 < squared[near].mean() / 3.0 < 2.5
+    assert (squared[near] < chi2.ppf(0.95, 3)).mean() > 0.8
+    assert np.percentile(off_m[range_m < 5.0], 95) < 0.05
+
+
+def test_a_tag_that_is_not_surveyed_is_found(fixed: Docked, tmp_path: Path) -> None:
+    """One of 0.3 m where tag 228 hangs; it is written with the others, and the file is a survey."""
+    app.write(fixed.run, tmp_path / "out", inputs=[], command="", overwrite=False)
+    found = load_survey(tmp_path / "out" / "tags.found.yaml")
+    tags = {tag.id: tag for tag in found.tags}
+    assert {*QUAY, 99} <= set(tags)
+    np.testing.assert_allclose(tags[99].xyz_m, [73.4, 96.0, 1.5], atol=0.05)
+    assert tags[99].size_m == pytest.approx(0.3, rel=0.02)
+    assert "tag 99: not in the survey; where the run puts it is in tags.found.yaml" in fixed.said
+
+
+def test_the_filter_of_digerud_stands_beside_it(fixed: Docked) -> None:
+    (table,) = [t for t in app.tables(fixed.run) if t.title == "Docking"]
+    (his,) = [row for name, row in table.as_dict().items() if "Digerud" in name]
+    matched = his["matched"]
+    assert matched is not None
+    assert matched > 0.9
+    assert (his["sighted_rmse_m"] or 0.0) > fixed.number("sighted_rmse_m")
+
+
+def test_gnss_is_cut_and_the_tags_are_hidden() -> None:
+    """D.3: no fix from 20 m on, no tag for 5 s on the way in; 0.15 m at the berth."""
+    start = int(voyage("fixed").truth.stamps_ns[0])
+    cut = dock(
+        change=lambda m: None if isinstance(m, GnssPosition) and m.stamp_ns > start + 17 * S else m,
+        hidden_s=(28.0, 33.0),
+    )
+    assert cut.number("berth_p95_m") < 0.10
+    assert cut.number("wrong_side") == 0.0
+
+
+def test_single_tags_without_a_compass() -> None:
+    """Their modes are the only heading there is: it is right from the beginning to the end."""
+    docked = dock(change=without(CompassHeading), alone=True)
+    assert np.abs(docked.heading_error_deg()).max() < 2.0
+    assert wrong_modes(docked) <= 0.005
+    assert docked.number("berth_p95_m") < 0.15
+
+
+# what is wrong is said
+
+
+def test_a_tag_that_stands_elsewhere_is_named() -> None:
+    """Half a metre east of its place: the other two carry the run, each of its sightings is a row that says no."""
+    docked = dock(tag=off(227, (0.5, 0.0, 0.0)))
+    assert "tags: tag 227: " in docked.said
+    assert "they show it -0.5 m east, -0.0 m north" in docked.said
+    assert docked.number("sighted_rmse_m") < 0.08
+    rejected = [r for r in docked.run.solution.ledger if r.sensor == "tags" and r.weight is not None and r.weight < 0.5]
+    assert rejected
+    assert all("tag 227 " in r.detail for r in rejected)
+
+
+def test_one_tag_of_another_size_is_named() -> None:
+    """0.162 m, the default of a well-known example, where 0.412 m hangs."""
+    docked = dock(tag=sized(0.162, 227))
+    assert suggested_m(docked) == {227: pytest.approx(0.412, rel=0.02)}
+    assert docked.number("sighted_rmse_m") < 0.08
+
+
+def test_a_size_that_is_wrong_for_all_is_named() -> None:
+    """The run follows some of them, and is metres off: what is said of sizes does not come of it, but of the images."""
+    docked = dock(tag=sized(0.162))
+    assert suggested_m(docked) == {number: pytest.approx(0.412, rel=0.02) for number in QUAY}
+
+
+def test_the_size_of_a_tag_that_is_alone_is_named() -> None:
+    """All of its sightings are refused, and the run goes where GNSS says, 1.4 m off: that does not matter to a size."""
+    docked = dock(tag=sized(0.162), only=(227,))
+    assert suggested_m(docked) == {227: pytest.approx(0.412, rel=0.02)}
+
+
+def suggested_m(docked: Docked) -> dict[int, float]:
+    """Sizes that warnings suggest, by tag."""
+    found = {}
+    for line in docked.said.splitlines():
+        if "size_m " in line:
+            found[int(line.split("tag ")[1].split(":")[0])] = float(line.split("size_m ")[1].split()[0])
+    return found
+
+
+def test_a_compass_that_is_mounted_askew_is_named() -> None:
+    """By 10 deg: the tags tell the heading all the same."""
+
+    def turned(m: Measurement) -> Measurement:
+        return replace(m, yaw_rad=m.yaw_rad + np.radians(10.0)) if isinstance(m, CompassHeading) else m
+
+    docked = dock(change=turned)
+    assert np.abs(docked.heading_error_deg()).max() < 1.5
+    assert "compass: its compass offset is estimated" in docked.said
+    assert "check its mount" in docked.said
+    assert docked.number("berth_p95_m") < 0.2
+
+
+def test_a_camera_whose_clock_is_late_is_named(late_run: Docked) -> None:
+    """By 0.2 s, in which waves turn the vessel by half a degree: 40 sigmas of a corner."""
+    assert "of its measurements disagree with the rest" in late_run.said
+    (line,) = (line for line in late_run.said.splitlines() if "tags: camera camera: its stamps are " in line)
+    assert "s too late by how the vessel rolls" in line
+    assert float(line.split("time_offset_s ")[1].split()[0]) == pytest.approx(-0.2, abs=0.02)
+    assert late_run.outcomes().get("used", 0) < 0.1 * len(late_run.right)
