@@ -222,7 +222,7 @@ def test_a_docks_known_motion_explains_what_is_seen() -> None:
     assert still > 0.1**2
 
 
-@pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 1.0])
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.5])
 def test_a_dock_is_found_between_two_nodes(share: float) -> None:
     """The next node is held at twice the motion, this one is free: what is seen says where it is."""
     near = vessel(6.0, 30.0)
@@ -244,35 +244,32 @@ def test_a_dock_is_found_between_two_nodes(share: float) -> None:
         loose = gtsam.PriorFactorVector(3, np.zeros(6), gtsam.noiseModel.Isotropic.Sigma(6, 30.0))
         held = gtsam.PriorFactorVector(6, following, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
         slow = step([*update.factors, known, loose, held], values, (1, 3, 4, 6)).atVector(3)
-    there = (1.0 - share) * slow + share * following
-    if share < 1.0:
-        np.testing.assert_allclose(there, MOTION, atol=1e-4)
-    else:  # it stands on the next node, which nothing moves
-        np.testing.assert_allclose(slow, 0.0, atol=1e-6)
+    np.testing.assert_allclose((1.0 - share) * slow + share * following, MOTION, atol=1e-4)
 
 
 def test_how_far_a_dock_may_be_from_the_line_between_two_nodes() -> None:
     """A Brownian bridge: half way between nodes a second apart, half a step of the process."""
-    true = vessel(6.0, 30.0)
-    m = moved_sighting(np.zeros(6), gtsam.Pose3(true.rotation(), true.translation() + PIER_M))
+    near = vessel(6.0, 30.0)
+    true = gtsam.Pose3(near.rotation(), near.translation() + PIER_M)
+    m = moved_sighting(np.zeros(6), true)
     process = ROW.slow(DOCKED)
     assert process is not None
     at = replace(attached(true, np.zeros(6)), slow_next=(6, np.zeros(6), 0.5, 1.0))
-    tie = ROW.factors(m, DOCKED, at, Decision()).factors[0]
+    right = int(np.argmin([float(r.raw @ r.raw) for r in ROW.residuals(m, DOCKED, at)]))
+    tie = ROW.factors(m, DOCKED, at, Decision(mode=right)).factors[0]
     values = gtsam.Values()
     values.insert(3, np.zeros(6))
     values.insert(4, np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
     values.insert(6, np.zeros(6))
     step_m = float(process.sigma[0] * np.sqrt(2.0 / process.time_constant_s[0]))
-    if not set(tie.keys()) <= {3, 4, 6}:
-        pytest.fail("the first factor ties the leaf to its nodes")
+    assert set(tie.keys()) == {3, 4, 6}
     assert tie.error(values) == pytest.approx(0.5 * (0.02 / (0.5 * step_m)) ** 2, rel=1e-6)
 
 
 def test_what_the_survey_errs_about_a_tag_is_a_constant() -> None:
     """A tag that hangs elsewhere and askew, by its constant: explained, and found where the vessel is known."""
     true = vessel(6.0, 30.0)
-    off = np.array([0.03, -0.02, 0.01, 0.02, -0.01, 0.015])
+    off = np.array([0.03, -0.02, 0.01, 0.002, -0.001, 0.0015])
     turned = Rotation.from_rotvec(off[3:]).as_matrix()
     now = CORNERS_M.mean(axis=0) + off[:3] + (CORNERS_M - CORNERS_M.mean(axis=0)) @ turned.T
     m = sighting(true, corners_m=now, points_m=CORNERS_M)
@@ -287,7 +284,7 @@ def test_what_the_survey_errs_about_a_tag_is_a_constant() -> None:
         known = gtsam.PriorFactorPose3(1, true, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
         loose = gtsam.PriorFactorVector(6, np.zeros(6), gtsam.noiseModel.Isotropic.Sigma(6, 30.0))
         constant = step([*update.factors, known, loose], values, (1, 6)).atVector(6)
-    np.testing.assert_allclose(constant, off, atol=3e-4)  # the turn is taken to first order
+    np.testing.assert_allclose(constant, off, atol=1e-4)  # the turn is taken to first order
 
 
 def test_slow_states_and_constants() -> None:
