@@ -37,7 +37,7 @@ def suspect_tags(recording: Recording, solution: Solution) -> list[str]:
         m for m in recording.measurements if isinstance(m, TagSighting) and track.covers(np.array([m.stamp_ns]))[0]
     ]
     lines = [*_late(sightings, solution)]
-    sized = _by_spacing(sightings)
+    sized = _by_spacing(sightings) | _by_the_others(sightings)
     lines += sized.values()
     by_tag: dict[tuple[str, int], list[TagSighting]] = defaultdict(list)
     for m in sightings:
@@ -94,6 +94,35 @@ def _by_spacing(sightings: list[TagSighting]) -> dict[tuple[str, int], str]:
             said[key] = (
                 f"{key[0]}: tag {key[1]}: beside the tags next to it, it looks {median:.2f} times as large as the survey says: "
                 f"size_m {size_m[key] * median:.3f} instead of {size_m[key]:.3f} would do ({_MARGIN})"
+            )
+    return said
+
+
+def _by_the_others(sightings: list[TagSighting]) -> dict[tuple[str, int], str]:
+    """Return a line by (sensor, tag) for each that others of its images, which agree, show in another place.
+
+    It holds for any track: one that follows the wrong tag, and turns the vessel by 13 deg to do so, finds nothing amiss.
+    """
+    images: dict[tuple[str, str, str, int], list[TagSighting]] = defaultdict(list)
+    for m in sightings:
+        images[(m.sensor, m.camera, m.frame, m.stamp_ns)].append(m)
+    shown: dict[tuple[str, int], list[Array]] = defaultdict(list)
+    for own in images.values():
+        most = max(own, key=lambda m: len(m.numbers))
+        if len(most.numbers) < 2:
+            continue
+        camera = most.modes[0]
+        for m in (m for m in own if len(m.numbers) == 1):
+            place = camera.p_world_camera_m + camera.R_world_camera @ _in_camera(m)
+            shown[(m.sensor, m.numbers[0])].append(place - m.points_m.mean(axis=0))
+    said = {}
+    for key, found in sorted(shown.items()):
+        moved = np.median(found, axis=0)
+        scatter = np.median(np.linalg.norm(np.array(found) - moved, axis=1))
+        if len(found) >= _FEWEST and np.linalg.norm(moved) > max(_ELSEWHERE_M, 2.0 * float(scatter)):
+            said[key] = (
+                f"{key[0]}: tag {key[1]}: the tags beside it, which agree, show it {moved[0]:.1f} m east, {moved[1]:.1f} m north, "
+                f"{moved[2]:.1f} m above its place in the survey"
             )
     return said
 
