@@ -27,6 +27,8 @@ _RANGES = 1.3  # of the farthest to the nearest view, from which on a size shows
 _MARGIN = "the black square without its white margin"
 # A stamp that is off by more is said; the share of a camera's errors of roll that it must explain.
 _LATE_S, _LATE_EXPLAINS = 0.03, 0.5
+# A mount that tags contradict by more, and by the same all the while, is a wrong one.
+_TURNED_DEG, _STEADY_DEG = 15.0, 6.0
 
 
 def suspect_tags(recording: Recording, solution: Solution) -> list[str]:
@@ -36,6 +38,9 @@ def suspect_tags(recording: Recording, solution: Solution) -> list[str]:
     sightings = [
         m for m in recording.measurements if isinstance(m, TagSighting) and track.covers(np.array([m.stamp_ns]))[0]
     ]
+    turned = _turned_mounts(sightings, rows, solution)
+    if turned:  # then nothing else that tags say can be judged
+        return turned
     lines = [*_late(sightings, solution)]
     sized = _by_spacing(sightings) | _by_the_others(sightings)
     lines += sized.values()
@@ -159,6 +164,30 @@ def _scale(camera: Array, toward: Array, middle: Array) -> tuple[float, bool]:
     ratio = np.linalg.norm(middle - camera, axis=1) / ranges
     median = float(np.median(ratio))
     return (median if float(np.median(np.abs(ratio - median))) < _ALIKE * median else 1.0), False
+
+
+def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], solution: Solution) -> list[str]:
+    """Return a line for each camera whose sightings are refused and agree on another attitude on the vessel."""
+    lines = []
+    track = solution.trajectory
+    for sensor, camera in sorted({(m.sensor, m.camera) for m in sightings}):
+        own = [m for m in sightings if (m.sensor, m.camera) == (sensor, camera)]
+        doubted = [m for m in own if _weight(rows, m) < 0.5]
+        if len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
+            continue
+        stamps, where = np.unique([m.stamp_ns for m in doubted], return_inverse=True)
+        R = track.at(stamps).R_world_body[where]
+        seen = Rotation.from_matrix([B.T @ m.modes[0].R_world_camera for m, B in zip(doubted, R, strict=True)])
+        usual = seen.mean()
+        off_deg = float(np.degrees((usual.inv() * Rotation.from_matrix(doubted[0].R_body_camera)).magnitude()))
+        scatter_deg = float(np.degrees(np.median((usual.inv() * seen).magnitude())))
+        if off_deg > _TURNED_DEG and scatter_deg < _STEADY_DEG:
+            rpy = ", ".join(f"{a:.0f}" for a in usual.as_euler("xyz", degrees=True))
+            lines.append(
+                f"{sensor}: camera {camera}: by its tags it looks {off_deg:.0f} deg elsewhere than its mount says: rpy_deg "
+                f"[{rpy}] would do (of the optical frame: x right, y down, z forward)"
+            )
+    return lines
 
 
 def _late(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:

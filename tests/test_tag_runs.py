@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from graphloc import app
@@ -340,3 +341,21 @@ def test_a_camera_whose_clock_is_late_is_named(late_run: Docked) -> None:
     assert "s too late by how the vessel rolls" in line
     assert float(line.split("time_offset_s ")[1].split()[0]) == pytest.approx(-0.2, abs=0.02)
     assert late_run.outcomes().get("used", 0) < 0.1 * len(late_run.right)
+
+
+def turned(by_deg: float) -> Change:
+    """The configured mount, and with it nothing of what is seen, is turned about the body's vertical."""
+    about = Rotation.from_euler("z", by_deg, degrees=True).as_matrix()
+    return lambda m: replace(m, R_body_camera=about @ m.R_body_camera) if isinstance(m, TagSighting) else m
+
+
+def test_a_camera_whose_mount_is_turned_is_named() -> None:
+    """It looks ahead, and the configuration has it look to port: what it truly is, is said."""
+    docked = dock(change=turned(90.0))
+    (line,) = [text for text in docked.said.split("\n") if "mount says" in text]
+    assert "camera camera" in line
+    assert "90 deg" in line
+    found = [float(a) for a in line.split("rpy_deg [")[1].split("]")[0].split(",")]
+    true = docked.truth.rig.cameras["camera"].mount.R_body_sensor
+    said = Rotation.from_euler("xyz", found, degrees=True).as_matrix()
+    assert np.degrees(Rotation.from_matrix(true.T @ said).magnitude()) < 5.0
