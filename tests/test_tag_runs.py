@@ -276,21 +276,22 @@ def test_single_tags_without_a_compass() -> None:
 
 
 def test_a_tag_that_stands_elsewhere_is_named() -> None:
-    """Half a metre east of its place, 50 of its sigmas: the run takes a third of that."""
+    """Half a metre east of its place, 50 of its sigmas."""
     docked = dock(tag=off(227, (0.5, 0.0, 0.0)))
     assert "tags: tag 227: " in docked.said
     assert "tag 227: the tags beside it, which agree, show it -0.5 m east" in docked.said
-    assert docked.number("sighted_rmse_m") < 0.20
+    assert docked.number("position_p95_0_to_5_m") < 0.08
 
 
 def test_a_tag_that_misleads_the_run_is_named() -> None:
-    """Half a metre north, in depth, at the end of the row: far off that looks as if all were turned by 13 deg, and it is believed.
+    """Half a metre north, in depth, at the end of the row: far off that looks as if all were turned by 13 deg.
 
-    The run then is off; who is to blame shows in images from near, whatever the run makes of them.
+    Who is to blame shows in images from near; the tails of its prior let it go. With a Gaussian one: 0.5 m at the berth.
     """
     docked = dock(tag=off(226, (0.0, 0.5, 0.0)))
     assert "tags: tag 226: the tags beside it, which agree, show it " in docked.said
     assert "-0.5 m north" in docked.said.split("tag 226: ")[1].splitlines()[0]
+    assert docked.number("position_p95_0_to_5_m") < 0.12
 
 
 def test_one_tag_of_another_size_is_named() -> None:
