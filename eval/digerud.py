@@ -29,10 +29,10 @@ import cv2
 import numpy as np
 
 from graphloc.config import VesselConfig
-from graphloc.eval.ekf import FilterResult
+from graphloc.eval.ekf import FilterResult, filter_row
 from graphloc.eval.metrics import errors
 from graphloc.frames import Array, Datum
-from graphloc.ledger import Ledger, LedgerRow, Outcome
+from graphloc.ledger import Ledger
 from graphloc.measurements import TagSighting
 from graphloc.recording import Recording
 from graphloc.time import NS_PER_S, seconds_between
@@ -91,11 +91,11 @@ def run_digerud(
     state: _State | None = None
     for m in sightings:
         if [m.sensor, m.camera] != camera or number not in m.numbers:
-            ledger.add(_row(m, recording, "not of the one tag and camera that it uses"))
+            ledger.add(filter_row(m, recording, None, "not of the one tag and camera that it uses"))
             continue
         pose = single_tag_pose(m, number)
         if pose is None:
-            ledger.add(_row(m, recording, "no pose from its corners"))
+            ledger.add(filter_row(m, recording, None, "no pose from its corners"))
             continue
         p_world_camera, R_world_camera = pose
         R_world_body = R_world_camera @ m.R_body_camera.T
@@ -104,7 +104,8 @@ def run_digerud(
         away_m = float(np.linalg.norm(p_world_camera - _H @ state.x))
         taken = away_m < o.gate_m
         state, nis = _filtered(state, m.stamp_ns, p_world_camera, R_world_body if taken else None, o)
-        ledger.add(_row(m, recording, "" if taken else f"outside the {o.gate_m:g} m gate", away_m, nis))
+        refused = "" if taken else f"outside the {o.gate_m:g} m gate"
+        ledger.add(filter_row(m, recording, nis, refused, away_m))
         out[m.stamp_ns] = (state, m.t_body_camera_m)  # two at one stamp: the later has both
     if len(out) < 2:
         return None
@@ -165,23 +166,6 @@ def _filtered(
         return _State(stamp_ns, x, P, before.R_world_body), nis
     K = np.linalg.solve(S, _H @ P).T
     return _State(stamp_ns, x + K @ r, P - K @ _H @ P, R_world_body), nis
-
-
-def _row(
-    m: TagSighting, recording: Recording, refused: str, away_m: float | None = None, nis: float | None = None
-) -> LedgerRow:
-    return LedgerRow(
-        seq=m.seq,
-        stamp_ns=m.stamp_ns,
-        sensor=m.sensor,
-        topic=recording.topics.get(m.sensor, ""),
-        outcome=Outcome.REJECTED if refused else Outcome.USED,
-        weight=0.0 if refused else 1.0,
-        residual_m=away_m,
-        nis=nis,
-        dof=None if nis is None else 3,
-        reason=refused,
-    )
 
 
 def _track(out: dict[int, tuple[_State, Array]], *, timed: bool) -> Trajectory:

@@ -277,7 +277,7 @@ def _run(
             if not isinstance(taken, str):
                 x, P = _update(x, P, r, H, taken)
             if event.m.seq >= 0:
-                ledger.add(_row(event.m, recording, nis, taken if isinstance(taken, str) else ""))
+                ledger.add(filter_row(event.m, recording, nis, taken if isinstance(taken, str) else ""))
         out.append((step.stop_ns, x.copy(), P.copy()))
     return FilterResult(name=name, trajectory=_planar(out), ledger=ledger)
 
@@ -291,7 +291,10 @@ def _update(x: Array, P: Array, r: Array, H: Array, R: Array) -> tuple[Array, Ar
     return x, I_KH @ P @ I_KH.T + K @ R @ K.T
 
 
-def _row(m: Measurement, recording: Recording, nis: float, refused: str) -> LedgerRow:
+def filter_row(
+    m: Measurement, recording: Recording, nis: float | None, refused: str, away_m: float | None = None
+) -> LedgerRow:
+    """Return the row of a measurement that a filter took, or refused for a reason."""
     return LedgerRow(
         seq=m.seq,
         stamp_ns=m.stamp_ns,
@@ -299,6 +302,7 @@ def _row(m: Measurement, recording: Recording, nis: float, refused: str) -> Ledg
         topic=recording.topics.get(m.sensor, ""),
         outcome=Outcome.REJECTED if refused else Outcome.USED,
         weight=0.0 if refused else 1.0,
+        residual_m=away_m,
         nis=nis,
         reason=refused,
     )

@@ -168,6 +168,22 @@ def error_over_time(
     return _layout(figure, 520)
 
 
+def _band(figure: go.Figure, t: NDArray[np.floating], value: Array, wide: Array, colour: str, row: int) -> None:
+    """Shade value +- wide."""
+    figure.add_scatter(
+        x=np.concatenate([t, t[::-1]]),
+        y=np.concatenate([value + wide, (value - wide)[::-1]]),
+        fill="toself",
+        mode="none",
+        fillcolor=colour,
+        opacity=0.15,
+        hoverinfo="skip",
+        showlegend=False,
+        row=row,
+        col=1,
+    )
+
+
 def berths_over_time(solution: Solution) -> go.Figure:
     """The vessel seen from each berth: across, along, angle with 95 % bands."""
     tracks = solution.berths
@@ -190,18 +206,7 @@ def berths_over_time(solution: Solution) -> go.Figure:
             value, wide = scale * track.value[step, k], scale * band[:, k]
             line = {"color": COLOURS[k]}
             figure.add_scatter(x=t, y=value, line=line, name=name, legendgroup=name, showlegend=n == 0, row=row, col=1)
-            figure.add_scatter(
-                x=np.concatenate([t, t[::-1]]),
-                y=np.concatenate([value + wide, (value - wide)[::-1]]),
-                fill="toself",
-                mode="none",
-                fillcolor=COLOURS[k],
-                opacity=0.15,
-                hoverinfo="skip",
-                showlegend=False,
-                row=row,
-                col=1,
-            )
+            _band(figure, t, value, wide, COLOURS[k], row)
     figure.update_xaxes(title="time, s", row=max(len(titles), 1), col=1)
     return _layout(figure, 120 + 190 * max(len(titles), 1))
 
@@ -306,18 +311,6 @@ def slow_over_time(solution: Solution) -> go.Figure:
                 col=1,
             )
             if band is not None:
-                edge = np.concatenate([value[step, a] + band[step, a], (value[step, a] - band[step, a])[::-1]])
-                figure.add_scatter(
-                    x=np.concatenate([t, t[::-1]]),
-                    y=edge,
-                    fill="toself",
-                    mode="none",
-                    fillcolor=COLOURS[a],
-                    opacity=0.15,
-                    hoverinfo="skip",
-                    showlegend=False,
-                    row=i + 1,
-                    col=1,
-                )
+                _band(figure, t, value[step, a], band[step, a], COLOURS[a], i + 1)
     figure.update_xaxes(title="time, s", row=len(panels), col=1)
     return _layout(figure, 120 + 180 * len(panels))

@@ -7,7 +7,7 @@ Each gives measurements that a recording gains, and a row of the ledger for what
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from graphloc.frames import Datum
 from graphloc.frontends.aerial import match_bag
 from graphloc.frontends.tags.sightings import info_beside, sightings_of_bag
 from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import Measurement
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 from graphloc.survey import load_survey
@@ -38,6 +39,50 @@ def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
     return config.model_copy(update={"sensors": {**config.sensors, **read}}) if read else config
 
 
+class _Gathering:
+    """A recording that gains measurements: each, and each thing that gave none, is a row of the ledger."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._measurements, self.rows = list(recording.measurements), list(recording.rows)
+        self._topics, self._seq = dict(recording.topics), recording.message_count
+        self.said: list[str] = []
+
+    def sensor(self, name: str, read: Mapping[str, str]) -> None:
+        """A sensor that gathers, and what its topics, which no decoder reads, are read for."""
+        self._topics[name] = f"({name})"
+        self.rows = [
+            replace(r, reason=read[r.topic]) if r.topic in read and r.outcome is Outcome.IGNORED else r
+            for r in self.rows
+        ]
+
+    def take(self, measurement: Measurement) -> None:
+        self._measurements.append(replace(measurement, seq=self._seq))
+        self._seq += 1
+
+    def refuse(self, sensor: str, stamp_ns: int, why: str) -> None:
+        self.rows.append(
+            LedgerRow(
+                seq=self._seq, stamp_ns=stamp_ns, sensor=sensor, topic=self._topics[sensor], outcome=Outcome.REJECTED, reason=why
+            )
+        )  # fmt: skip
+        self._seq += 1
+
+    def refused(self, sensor: str) -> Counter[str]:
+        """Why, and how often."""
+        return Counter(row.reason for row in self.rows if row.sensor == sensor and row.outcome is Outcome.REJECTED)
+
+    def recording(self) -> Recording:
+        return replace(
+            self._recording,
+            measurements=tuple(sorted(self._measurements, key=lambda m: (m.stamp_ns, m.seq))),
+            rows=tuple(self.rows),
+            topics=self._topics,
+            message_count=self._seq,
+            warnings=tuple(dict.fromkeys([*self._recording.warnings, *self.said])),
+        )
+
+
 def with_sightings(
     recording: Recording, config: VesselConfig, bags: Sequence[Path], progress: Progress = quiet
 ) -> Recording:
@@ -46,54 +91,29 @@ def with_sightings(
     Raises:
         InputError: a camera that cannot be used.
     """
-    measurements, rows, topics = list(recording.measurements), list(recording.rows), dict(recording.topics)
-    views, damage, seq = list(recording.tag_views), list[str](), recording.message_count
+    gathered, views = _Gathering(recording), list(recording.tag_views)
     for name, sensor in config.of_kind("apriltag").items():
-        topics[name] = f"({name})"
         cameras = {camera.topic for camera in sensor.cameras.values()}
-        total = sum(r.count for r in rows if r.topic in cameras)
-        without = 0
-        found = sightings_of_bag(bags, name, sensor, config.body_frame, warn=damage.append)
+        total, without = sum(r.count for r in recording.rows if r.topic in cameras), 0
+        infos = {camera.info_topic or info_beside(camera.topic) for camera in sensor.cameras.values()}
+        gathered.sensor(name, dict.fromkeys(infos, f"read by {name} for its lens"))
+        found = sightings_of_bag(bags, name, sensor, config.body_frame, warn=gathered.said.append)
         for done, seen in enumerate(found, start=1):
             views += seen.views
             without += not seen.sightings
             for sighting in seen.sightings:
-                measurements.append(replace(sighting, seq=seq))
-                seq += 1
+                gathered.take(sighting)
             for trouble in seen.troubles:
-                rows.append(
-                    LedgerRow(
-                        seq=seq, stamp_ns=seen.stamp_ns, sensor=name, topic=topics[name], outcome=Outcome.REJECTED,
-                        reason=trouble,
-                    )
-                )  # fmt: skip
-                seq += 1
+                gathered.refuse(name, seen.stamp_ns, trouble)
             progress("looking for tags", min(done, total), total)
         read = f"read by {name}; {without} of {total} show no tag that can be used"
-        infos = {camera.info_topic or info_beside(camera.topic) for camera in sensor.cameras.values()}
-        reasons = {**dict.fromkeys(infos, f"read by {name} for its lens"), **dict.fromkeys(cameras, read)}
-        rows = [
-            replace(r, reason=reasons[r.topic]) if r.topic in reasons and r.outcome is Outcome.IGNORED else r
-            for r in rows
-        ]
+        gathered.sensor(name, dict.fromkeys(cameras, read))
         if total and without == total:
-            damage.append(f"{name}: none of {total} images shows a tag of the survey: look at one, and at its family")
-        damage += _troubles(name, rows)
-    return replace(
-        recording,
-        measurements=tuple(sorted(measurements, key=lambda m: (m.stamp_ns, m.seq))),
-        rows=tuple(rows),
-        topics=topics,
-        message_count=seq,
-        tag_views=tuple(views),
-        warnings=tuple(dict.fromkeys([*recording.warnings, *damage])),
-    )
-
-
-def _troubles(sensor: str, rows: Sequence[LedgerRow]) -> list[str]:
-    """Say what of a sensor could not be used, and how often."""
-    reasons = Counter(row.reason for row in rows if row.sensor == sensor and row.outcome is Outcome.REJECTED)
-    return [f"{sensor}: {reason} ({count} times)" for reason, count in reasons.most_common(5)]
+            gathered.said.append(
+                f"{name}: none of {total} images shows a tag of the survey: look at one, and at its family"
+            )
+        gathered.said += [f"{name}: {why} ({count} times)" for why, count in gathered.refused(name).most_common(5)]
+    return replace(gathered.recording(), tag_views=tuple(views))
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,47 +138,26 @@ def with_matches(
     Raises:
         InputError: an image or LiDAR that cannot be used.
     """
-    measurements, rows, topics = list(recording.measurements), list(recording.rows), dict(recording.topics)
-    track, seq = solution.trajectory, recording.message_count
-    damage: list[str] = []
+    gathered, track = _Gathering(recording), solution.trajectory
     span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
     for name, sensor in config.of_kind("aerial").items():
-        topics[name] = f"({name})"
-        read = {lidar.topic for lidar in sensor.lidars.values()}
-        rows = [
-            replace(r, reason=f"read by {name}") if r.topic in read and r.outcome is Outcome.IGNORED else r
-            for r in rows
-        ]
-        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=damage.append)
+        gathered.sensor(name, dict.fromkeys((lidar.topic for lidar in sensor.lidars.values()), f"read by {name}"))
+        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=gathered.said.append)
         for item in found:
             if item.match is not None and gallery is not None:
                 gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
             if item.match is not None and item.match.modes:
-                measurements.append(replace(item.match.fix(item.stamp_ns, name, item.news, sensor.axes), seq=seq))
+                gathered.take(item.match.fix(item.stamp_ns, name, item.news, sensor.axes))
             else:
-                rows.append(
-                    LedgerRow(
-                        seq=seq, stamp_ns=item.stamp_ns, sensor=name, topic=topics[name], outcome=Outcome.REJECTED,
-                        reason=item.why_not,
-                    )
-                )  # fmt: skip
-            seq += 1
+                gathered.refuse(name, item.stamp_ns, item.why_not)
             progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)
         progress("matching", span_s, span_s)
-        damage += _few_matches(name, rows)
-    return replace(
-        recording,
-        measurements=tuple(sorted(measurements, key=lambda m: (m.stamp_ns, m.seq))),
-        rows=tuple(rows),
-        topics=topics,
-        message_count=seq,
-        warnings=tuple(dict.fromkeys([*recording.warnings, *damage])),
-    )
+        gathered.said += _few_matches(name, gathered.refused(name))
+    return gathered.recording()
 
 
-def _few_matches(sensor: str, rows: Sequence[LedgerRow]) -> list[str]:
+def _few_matches(sensor: str, reasons: Counter[str]) -> list[str]:
     """Say so where most scans of a sensor gave no match."""
-    reasons = Counter(row.reason for row in rows if row.sensor == sensor and row.outcome is Outcome.REJECTED)
     if reasons.total() < 5:
         return []
     ((most, count),) = reasons.most_common(1)
