@@ -26,9 +26,11 @@ _ELSEWHERE_M = 0.3
 _RANGES = 1.3  # of the farthest to the nearest view, from which on a size shows as one
 _MARGIN = "the black square without its white margin"
 # A stamp that is off by more is said; the share of a camera's errors of roll that it must explain.
-_LATE_S, _LATE_EXPLAINS = 0.03, 0.5
+_LATE_S, _LATE_EXPLAINS = 0.03, 0.3
 # A mount that tags contradict by more, and by the same all the while, is a wrong one.
-_TURNED_DEG, _STEADY_DEG = 15.0, 6.0
+_TURNED_DEG, _STEADY = 6.0, 0.5
+# All tags of a camera elsewhere together.
+_TOGETHER_M = 5.0
 
 
 def suspect_tags(recording: Recording, solution: Solution) -> list[str]:
@@ -167,7 +169,7 @@ def _scale(camera: Array, toward: Array, middle: Array) -> tuple[float, bool]:
 
 
 def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], solution: Solution) -> list[str]:
-    """Return a line for each camera whose sightings are refused and agree on another attitude on the vessel."""
+    """Return a line for each camera whose sightings are refused and agree on another attitude on the vessel, or place."""
     lines = []
     track = solution.trajectory
     for sensor, camera in sorted({(m.sensor, m.camera) for m in sightings}):
@@ -181,13 +183,26 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
         usual = seen.mean()
         off_deg = float(np.degrees((usual.inv() * Rotation.from_matrix(doubted[0].R_body_camera)).magnitude()))
         scatter_deg = float(np.degrees(np.median((usual.inv() * seen).magnitude())))
-        if off_deg > _TURNED_DEG and scatter_deg < _STEADY_DEG:
+        offs = np.array([_by_tags(m, B) for m, B in zip(doubted, R, strict=True)]) - track.at(stamps).p_world_m[where]
+        moved = np.median(offs, axis=0)
+        if off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
             rpy = ", ".join(f"{a:.0f}" for a in usual.as_euler("xyz", degrees=True))
             lines.append(
                 f"{sensor}: camera {camera}: by its tags it looks {off_deg:.0f} deg elsewhere than its mount says: rpy_deg "
                 f"[{rpy}] would do (of the optical frame: x right, y down, z forward)"
             )
+        elif np.linalg.norm(moved) > _TOGETHER_M and np.median(np.abs(offs - moved)) < 0.1 * np.linalg.norm(moved):
+            lines.append(
+                f"{sensor}: camera {camera}: its tags all put the vessel {moved[0]:.1f} m east, {moved[1]:.1f} m north, "
+                f"{moved[2]:.1f} m above of where the rest has her: is `datum` the survey's origin?"
+            )
     return lines
+
+
+def _by_tags(m: TagSighting, R_world_body: Array) -> Array:
+    """Where a sighting puts the body (3,), its attitude as in the run."""
+    toward = R_world_body @ m.R_body_camera @ _in_camera(m)
+    return np.asarray(m.points_m.mean(axis=0) - toward - R_world_body @ m.t_body_camera_m)
 
 
 def _late(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:

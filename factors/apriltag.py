@@ -323,27 +323,29 @@ def hint(m: TagSighting, mount_yaw_rad: float, datum: Datum) -> Hint:
 def berths(config: AprilTagConfig) -> tuple[Berth, ...]:
     """Return the berths of the survey; where it lists none, each frame's tags make one."""
     survey, docks, found = config.surveyed, _docks(config.surveyed), []
-    for frame in survey.frames:
-        p, R = survey.rest(frame)
+    listed = [(b.name, b.frame, np.array(b.xyz_m), b.facing_deg) for b in survey.berths]
+    for frame in () if survey.berths else survey.frames:
         tags = [tag for tag in survey.tags if tag.frame == frame]
-        listed = [(b.name, np.array(b.xyz_m), b.facing_deg) for b in survey.berths if b.frame == frame]
-        if not survey.berths:
-            out = np.sum([tag.R_frame_tag[:, 2] for tag in tags], axis=0)
-            if np.hypot(out[0], out[1]) > 0.5 * len(tags):  # they look the same way, and to the side
-                facing = float(np.degrees(np.arctan2(out[0], out[1])))
-                listed = [(frame if frame != WORLD else "quay", np.mean([tag.xyz_m for tag in tags], axis=0), facing)]
-        for name, xyz_m, facing_deg in listed:
-            f = np.radians(facing_deg)
-            out = R @ np.array([np.sin(f), np.cos(f), 0.0])
-            found.append(
-                Berth(
-                    name=name,
-                    point_m=p + R @ xyz_m,
-                    facing_deg=float(np.degrees(np.arctan2(out[0], out[1]))),
-                    pivot_m=p,
-                    moves=6 * docks.index(frame) if frame in docks else None,
-                )
+        out = np.sum([tag.R_frame_tag[:, 2] for tag in tags], axis=0)
+        if np.hypot(out[0], out[1]) > 0.5 * len(tags):  # they look the same way, and to the side
+            facing = float(np.degrees(np.arctan2(out[0], out[1])))
+            middle = np.mean([tag.xyz_m for tag in tags], axis=0)
+            listed.append((frame if frame != WORLD else "quay", frame, middle, facing))
+    for name, frame, xyz_m, facing_deg in listed:
+        if frame != WORLD and frame not in docks:
+            continue  # nothing tells where that dock is
+        p, R = survey.rest(frame)
+        f = np.radians(facing_deg)
+        out = R @ np.array([np.sin(f), np.cos(f), 0.0])
+        found.append(
+            Berth(
+                name=name,
+                point_m=p + R @ xyz_m,
+                facing_deg=float(np.degrees(np.arctan2(out[0], out[1]))),
+                pivot_m=p,
+                moves=6 * docks.index(frame) if frame in docks else None,
             )
+        )
     return tuple(found)
 
 

@@ -338,6 +338,7 @@ def write(run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overw
             inputs={str(p): sha256(p) for p in inputs},
             command=command,
             metrics={t.title: t.as_dict() for t in found},
+            warnings=(*run.recording.warnings, *run.solution.stats.warnings),
         )
         if run.tags:
             _write_tags(run, fresh / _FOUND_TAGS)

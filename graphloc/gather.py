@@ -39,6 +39,9 @@ def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
     return config.model_copy(update={"sensors": {**config.sensors, **read}}) if read else config
 
 
+_REASONS = 8  # that are said, of those why something was refused
+
+
 class _Gathering:
     """A recording that gains measurements: each, and each thing that gave none, is a row of the ledger."""
 
@@ -110,9 +113,12 @@ def with_sightings(
         gathered.sensor(name, dict.fromkeys(cameras, read))
         if total and without == total:
             gathered.said.append(
-                f"{name}: none of {total} images shows a tag of the survey: look at one, and at its family"
+                f"{name}: none of {total} images or lists shows a tag of the survey: look at one, at its ids and family"
             )
-        gathered.said += [f"{name}: {why} ({count} times)" for why, count in gathered.refused(name).most_common(5)]
+        reasons = gathered.refused(name).most_common()
+        gathered.said += [f"{name}: {why} ({count} times)" for why, count in reasons[:_REASONS]]
+        if len(reasons) > _REASONS:
+            gathered.said.append(f"{name}: {len(reasons) - _REASONS} more such reasons are in the ledger")
     return replace(gathered.recording(), tag_views=tuple(views))
 
 

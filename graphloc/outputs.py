@@ -91,12 +91,14 @@ def write_run(
     inputs: Mapping[str, str],
     command: str,
     metrics: Mapping[str, Any],
+    warnings: Sequence[str] = (),
 ) -> None:
     """Write all files of a run but the report into an existing folder.
 
     Args:
         folder: where to. solution: what to write. config: its effective form goes along.
         inputs: SHA-256 of each input. command: the command line. metrics: tables as plain data.
+        warnings: all that the report shows.
     """
     picked = thinned(solution.trajectory.stamps_ns, config.output.rate_hz)
     _csv(folder / "solution.csv", _solution_columns(solution), _solution_rows(solution, picked))
@@ -110,7 +112,7 @@ def write_run(
         _csv(folder / name, _BERTH_COLUMNS, _berth_rows(berth))
     with (folder / "vessel.effective.yaml").open("w", encoding="utf-8") as stream:
         YAML(typ="safe", pure=True).dump(effective(config), stream)
-    _run_json(folder / MARK, solution, config, inputs, command, metrics)
+    _run_json(folder / MARK, solution, config, inputs, command, metrics, warnings)
 
 
 def thinned(stamps: NDArray[np.int64], rate_hz: float) -> Array:
@@ -280,7 +282,12 @@ _BERTH_COLUMNS = (
 
 def _berth_files(solution: Solution) -> dict[str, BerthTrack]:
     """File names of the berths; what a name cannot have in a file system becomes a dash."""
-    return {f"berth_{re.sub(r'[^A-Za-z0-9_-]+', '-', b.berth.name)}.csv": b for b in solution.berths}
+    files: dict[str, BerthTrack] = {}
+    for berth in solution.berths:
+        name = re.sub(r"[^\w-]+", "-", berth.berth.name)
+        twice = sum(file.startswith((f"berth_{name}.", f"berth_{name}~")) for file in files)
+        files[f"berth_{name}{f'~{twice + 1}' if twice else ''}.csv"] = berth
+    return files
 
 
 def _berth_rows(track: BerthTrack) -> Iterator[list[object]]:
@@ -299,6 +306,7 @@ def _run_json(
     inputs: Mapping[str, str],
     command: str,
     metrics: Mapping[str, Any],
+    warnings: Sequence[str],
 ) -> None:
     names = ("graphloc", "gtsam", "numpy", "scipy", "rosbags", "pyproj")
     run = {
@@ -307,6 +315,7 @@ def _run_json(
         "versions": {"python": platform.python_version(), **{n: importlib.metadata.version(n) for n in names}},
         "datum": solution.datum.origin._asdict(),
         "stats": asdict(solution.stats),
+        "warnings": list(warnings),
         "ledger": solution.ledger.counts(),
         "ledger_total": len(solution.ledger),
         "metrics": dict(metrics),

@@ -302,7 +302,10 @@ def test_a_list_of_corners(tmp_path: Path) -> None:
     make = maker(CORNERS)
     msg = listing(make, CORNERS, with_corners(make, corners_seen()[::-1] + 0.5))
     path = bag_of(tmp_path, make, (INFO, info(make, BENT)), ("/detections", msg))
-    sighting = only(look(path, tags(("bow", {"topic": "/detections", "info_topic": INFO, "mount": MOUNT}))))
+    block = {"topic": "/detections", "info_topic": INFO, "mount": MOUNT}
+    (line,) = look(path, tags(("bow", block)))[1]  # nothing says which image it was, and it matters
+    assert "rectified: false" in line
+    sighting = only(look(path, tags(("bow", block | {"rectified": True}))))
     at_the_eye(sighting, off_m=1e-6, off_deg=1e-4)
     sigma = np.sqrt(np.diagonal(sighting.cov)) * FOCAL  # the survey's share is little
     np.testing.assert_allclose(sigma, 0.5, rtol=0.1)
@@ -526,8 +529,8 @@ def test_detections_that_cannot_be_used(tmp_path: Path) -> None:
     wrong: list[tuple[Any, str]] = [
         (with_corners(make, px, hamming=2), "tag 7: 2 bits read wrong, more than max_hamming"),
         (with_corners(make, px, decision_margin=1.0), "tag 7: decision margin 1 is below min_margin"),
-        (with_corners(make, px, id=8), "tag 8 (tag36h11) is not in the survey"),
-        (with_corners(make, px, family="tag25h9"), "tag 7 (tag25h9) is not in the survey"),
+        (with_corners(make, px, id=8), "tag 8 (36h11) is not in the survey"),
+        (with_corners(make, px, family="tag25h9"), "tag 7 (25h9) is not in the survey"),
         (with_corners(make, nan), "tag 7: its corners are not finite"),
         (with_corners(make, px[::-1]), "tag 7: its corners are no quadrilateral in AprilTag's order"),
     ]

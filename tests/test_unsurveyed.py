@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -215,3 +217,20 @@ def test_of_very_many_views_some_are_enough() -> None:
     (tag,), _ = estimate_tags(views_of(p, R, np.random.default_rng(7)), track_of(p, R, claimed(400, 0.02, 0.1)), None)
     assert off(tag)[0] < 0.05
     assert off(tag)[2] < 0.01
+
+
+@pytest.mark.parametrize("family", ["", "Standard41h12"])
+def test_a_family_that_no_survey_can_have_is_said(family: str) -> None:
+    """ROS 1's lists say no family, and AprilTag 3 has more than OpenCV: a line, not an error after the whole solve."""
+    p, R = passing("arc")
+    views = [replace(v, family=family) for v in views_of(p, R, np.random.default_rng(0))]
+    found, (line,) = estimate_tags(views, track_of(p, R), None)
+    assert found == []
+    assert "tag 77" in line
+
+
+def test_two_cameras_may_see_it_at_once() -> None:
+    p, R = passing("arc", 20)
+    views = views_of(p, R, np.random.default_rng(0)) + views_of(p, R, np.random.default_rng(1))
+    (tag,), _ = estimate_tags(views, track_of(p, R), SIZE_M)
+    assert np.linalg.norm(np.array(tag.xyz_m) - PLACE_M) < 0.1

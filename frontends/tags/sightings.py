@@ -87,7 +87,13 @@ def sightings_of_bag(
             chain leads to.
     """
     families = sorted({tag.family for tag in config.surveyed.tags}) or ["36h11"]
-    detector = Detector(families, max_hamming=config.max_hamming, min_margin=config.min_margin)
+    few_bits = {
+        "16h5": [tag.id for tag in config.surveyed.tags if tag.family == "16h5"]
+    }  # anything dark is one of its tags
+    detector = Detector(
+        families, max_hamming=config.max_hamming, min_margin=config.min_margin,
+        numbers={family: ids for family, ids in few_bits.items() if ids},
+    )  # fmt: skip
     with Bag(paths) as bag, ThreadPoolExecutor(_cores()) as pool:
         eyes = _eyes(bag, config, body_frame, warn)
         ahead: deque[Future[Seen]] = deque()
@@ -162,6 +168,10 @@ def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callabl
             break
     if first is None:
         raise InputError(f"{where}: no message can be read")
+    if listed and config.rectified is None and np.any(np.asarray(getattr(first, "D", getattr(first, "d", 0.0)))):
+        warn(
+            f"{where} has distortion: corners are taken for those of image_rect; if they were found on image_raw, set rectified: false"
+        )
     try:
         return camera_of(first, rectified=rectified)
     except ValueError as error:
@@ -251,9 +261,10 @@ def _sorted_out(shown: _Raw, stamp_ns: int, eye: _Eye, sensor: str, config: Apri
     counts = Counter((number, family) for number, family, *_ in shown.tags)
     seen: list[SeenTag] = []
     views: list[TagView] = []
-    for number, family, rays, cov, size_m, fitted in shown.tags:
+    for number, said, rays, cov, size_m, fitted in shown.tags:
+        family = said.removeprefix("tag")
         tag = _in_survey(survey.tags, number, family)
-        if counts[(number, family)] > 1:
+        if counts[(number, said)] > 1:
             troubles.append(f"tag {number} is seen twice in one image: which one is meant cannot be told")
         elif tag is None:
             troubles.append(f"tag {number} ({family or 'family not said'}) is not in the survey")
@@ -278,7 +289,7 @@ def _sorted_out(shown: _Raw, stamp_ns: int, eye: _Eye, sensor: str, config: Apri
 
 def _in_survey(tags: Sequence[TagConfig], number: int, family: str) -> TagConfig | None:
     """The tag of the survey; a list that does not say the family means the only one of that id."""
-    fitting = [tag for tag in tags if tag.id == number and family.removeprefix("tag") in ("", tag.family)]
+    fitting = [tag for tag in tags if tag.id == number and family in ("", tag.family)]
     return fitting[0] if len(fitting) == 1 else None
 
 

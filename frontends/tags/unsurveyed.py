@@ -9,6 +9,7 @@ is linear in place and size; attitude comes from the pose that fits most views; 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import get_args
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.frames import Array, skew
 from graphloc.frontends.tags.pose import poses_of
 from graphloc.measurements import TagView
-from graphloc.survey import TagConfig
+from graphloc.survey import Family, TagConfig
 from graphloc.trajectory import Trajectory
 
 _FEWEST = 5
@@ -74,6 +75,11 @@ def estimate_tags(
     found: list[TagConfig] = []
     left: list[str] = []
     for family, number in sorted({(v.family, v.number) for v in views}):
+        if family not in get_args(Family):
+            left.append(
+                f"tag {number} is not in the survey, and of a family ({family or 'not said'}) that it cannot have"
+            )
+            continue
         own = [v for v in views if (v.family, v.number) == (family, number)]
         stamps = np.array([v.stamp_ns for v in own], dtype=np.int64)
         own = [v for v, covered in zip(own, track.covers(stamps), strict=True) if covered]
@@ -86,11 +92,12 @@ def estimate_tags(
 
 
 def _estimate(own: Sequence[TagView], track: Trajectory, size_m: float | None) -> TagConfig | None:
-    at = track.at(np.sort(np.array([v.stamp_ns for v in own], dtype=np.int64)))
     ordered = sorted(own, key=lambda v: v.stamp_ns)
+    stamps, where = np.unique([v.stamp_ns for v in ordered], return_inverse=True)  # two cameras may see it at once
+    at = track.at(stamps)
     unsaid = np.diag([_TRACK_M**2] * 3 + [_TRACK_RAD**2] * 3)
-    covs = np.broadcast_to(unsaid, (len(ordered), 6, 6)) if at.cov is None else at.cov
-    views = [_View(*each) for each in zip(ordered, at.p_world_m, at.R_world_body, covs, strict=True)]
+    covs = np.broadcast_to(unsaid, (len(ordered), 6, 6)) if at.cov is None else at.cov[where]
+    views = [_View(*each) for each in zip(ordered, at.p_world_m[where], at.R_world_body[where], covs, strict=True)]
     views = [v for v in views if v.poses]
     if len(views) < _FEWEST:
         return None

@@ -27,6 +27,7 @@ from graphloc.time import duration_ns, utc_text
 
 _STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
 _STILL_SPEED_MPS = 0.15
+_BLOCK_S, _SWELL_S = 0.5, 10.0
 _MOVED_M = 15.0  # travel from which a heading can be told without a heading sensor
 
 
@@ -199,8 +200,8 @@ def _gyro_bias(
     """Bias (3,) in body axes and its sigma (3,), rad/s."""
     prior = problem.links.bias_sigmas()[3:]
     if still is not None:
-        _, _, w = _samples(problem, *still)
-        sigma = w.std(axis=0) / np.sqrt(len(w)) + 3e-4
+        t, _, w = _samples(problem, *still)
+        sigma = w.std(axis=0) / np.sqrt(len(w)) + 3e-4 + _swell(t, w)
         return w.mean(axis=0), np.minimum(sigma, prior), (f"gyro bias from {still[1] - still[0]:.0f} s of standstill",)
     t, _, w = _samples(problem, 0.0, window)
     span = float(np.ptp(t))
@@ -223,6 +224,18 @@ def _gyro_bias(
     if rate is None:
         return bias, sigma, ("gyro bias about the vertical unknown at the start",)
     return bias, sigma, (f"gyro bias from {span:.0f} s of motion and heading",)
+
+
+def _swell(t: Array, w: Array) -> Array:
+    """How far the mean rate (3,) of a quiet stretch may be from zero because the vessel rides on slow waves, rad/s.
+
+    Three quiet seconds are half a swell, whose rates do not average out: what means of half a second scatter by is what
+    their mean may be off, less only where the stretch is longer than waves are.
+    """
+    block = np.floor((t - t[0]) / _BLOCK_S).astype(np.int64)
+    starts = np.searchsorted(block, np.arange(block[-1] + 1))
+    means = np.add.reduceat(w, starts) / np.diff(np.append(starts, len(w)))[:, None]
+    return np.asarray(means.std(axis=0) * min(1.0, float(np.sqrt(_SWELL_S / max(t[-1] - t[0], 1e-3)))))
 
 
 def _turns(problem: Problem, span_s: float, bias: Array) -> Callable[[float], Array]:
