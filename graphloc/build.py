@@ -361,6 +361,8 @@ def build_graph(
             if decided is None:
                 continue
             decision, at = decided
+            if at.slow_next is not None and not guess.exists(at.slow_next[0]):
+                at = replace(at, slow_next=None)  # the next node lies beyond the stretch
             update = stream.row.factors(stream.measurements[i], stream.config, at, decision)
             for factor in update.factors:
                 graph.add(factor)
