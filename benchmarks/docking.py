@@ -40,8 +40,8 @@ from graphloc.solve._decide import Verdicts
 from graphloc.solve._grow import grow, solve_start
 from graphloc.survey import Survey, TagConfig
 
-SEEDS = {"optimal": range(6), "illuminated": range(1)}  # of a condition
-OTHER_SEEDS = range(2)  # a run takes two minutes of a core
+SEEDS = {"illuminated": range(2)}  # of a condition
+OTHER_SEEDS = range(10)  # a run takes two minutes of a core
 CONDITIONS = ("optimal", "fog", "counterlight", "droplet", "darkness", "illuminated")
 CAMERA_HZ = 3.0
 _DIGERUD_SAW_M = {"optimal": 28.0, "fog": 22.0, "counterlight": 25.0, "droplet": 16.0, "darkness": 16.0}

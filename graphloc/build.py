@@ -434,7 +434,9 @@ def _add_slow_chain(
         guess.insert(name, np.atleast_1d(values.atVector(keys.slow(stream.number, j))))
     constant = ~np.isfinite(slow.time_constant_s)
     zero = np.zeros(len(slow.sigma))
-    ends = slow.sigma * np.where(constant, 1.0, np.sqrt(2.0))
+    first = np.atleast_1d(values.atVector(key[0])) / slow.sigma
+    tails = float(np.sqrt(1.0 + float((first[constant] ** 2).sum()) / _TAILS))  # as of constants, see `_add_constants`
+    ends = slow.sigma * np.where(constant, tails, np.sqrt(2.0))
     diagonal = gtsam.noiseModel.Diagonal.Sigmas
     given = prior.slow.get(stream.number)
     if given is not None:
