@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.berths import Berth
 from graphloc.config import AprilTagConfig
 from graphloc.factors._linear import linear_update
-from graphloc.frames import Array, Datum, skew
+from graphloc.frames import Array, Datum, pinhole, skew
 from graphloc.graph import Attachment, Constant, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import TagMode, TagSighting
 from graphloc.survey import WORLD, DockConfig, Survey
@@ -160,11 +160,7 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
     toward = (seen.points_m - seen.p) @ seen.R
     if not _near(m, decision.mode, by_mode, toward):
         return linear_update(by_mode, _terms(at, by_mode.jacobian(), by_mode.slow_jacobian), decision)
-    x, y, z = toward.T
-    flat = np.column_stack([x / z, y / z])
-    projected = np.zeros((len(z), 2, 3))  # d flat / d toward
-    projected[:, 0, 0] = projected[:, 1, 1] = 1.0 / z
-    projected[:, :, 2] = -flat / z[:, None]
+    flat, projected = pinhole(toward)
     by_point = projected @ seen.R.T  # d flat / d place of the corner
     off = seen.points_m - seen.p
     rotation = np.array([skew(v) for v in off])

@@ -92,6 +92,16 @@ def skew(v: Array) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def pinhole(p_camera_m: Array) -> tuple[Array, Array]:
+    """Return rays x/z, y/z (N, 2) of points (N, 3) before a camera, optical axes, and d ray / d point (N, 2, 3)."""
+    z = p_camera_m[:, 2:]
+    rays = p_camera_m[:, :2] / z
+    J = np.zeros((len(z), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0 / z[:, 0]
+    J[:, :, 2] = -rays / z
+    return rays, J
+
+
 def wrap_angle(angle_rad: Array | float) -> Array:
     """Return angles in (-pi, pi]."""
     a = np.asarray(angle_rad, dtype=float)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from graphloc.frames import Array, skew
+from graphloc.frames import Array, pinhole, skew
 from graphloc.frontends.tags.pose import KEPT, PoseOfCamera, modes_of, poses_of
 from graphloc.measurements import TagSighting
 from graphloc.survey import Survey, TagConfig
@@ -91,13 +91,12 @@ class _Bundle:
     def _surveyed(self, pose: PoseOfCamera) -> Array:
         """What the survey does not know of each tag, as a covariance of the rays."""
         there, shares = self.points_m @ pose.R.T + pose.t_m, []
+        projected = pinhole(there)[1]
         for k, s in enumerate(self.group):
             corners = there[4 * k : 4 * k + 4]
             arms = corners - corners.mean(axis=0)
-            J = np.zeros((8, 6))
-            for i, (x, y, z) in enumerate(corners):
-                projected = np.array([[1.0 / z, 0.0, -x / z**2], [0.0, 1.0 / z, -y / z**2]])
-                J[2 * i : 2 * i + 2] = projected @ np.hstack([np.eye(3), -skew(arms[i])])
+            moved = np.array([np.hstack([np.eye(3), -skew(arm)]) for arm in arms])
+            J = (projected[4 * k : 4 * k + 4] @ moved).reshape(8, 6)
             variances = np.array([s.tag.sigma_m**2] * 3 + [np.radians(s.tag.sigma_deg) ** 2] * 3)
             shares.append(J * variances @ J.T)
         return np.asarray(block_diag(*shares))

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from graphloc.frames import Array
+from graphloc.frames import Array, pinhole
 from graphloc.frontends.tags._spread import spread
 from graphloc.measurements import TagMode
 
@@ -118,10 +118,7 @@ def _errors(points_m: Array, rays: Array, R: Array, t: Array) -> tuple[Array, Ar
     there = points_m @ R.T + t
     if there[:, 2].min() < _NEAREST_M:
         return None
-    flat = there[:, :2] / there[:, 2:]
-    projected = np.zeros((len(there), 2, 3))
-    projected[:, 0, 0] = projected[:, 1, 1] = 1.0 / there[:, 2]
-    projected[:, :, 2] = -flat / there[:, 2:]
+    flat, projected = pinhole(there)
     x, y, z = (there - there.mean(axis=0)).T
     turned = np.zeros((len(there), 3, 3))  # d (w x arm) / d w
     turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2] = z, -y, x

@@ -87,12 +87,10 @@ def sightings_of_bag(
             chain leads to.
     """
     families = sorted({tag.family for tag in config.surveyed.tags}) or ["36h11"]
-    few_bits = {
-        "16h5": [tag.id for tag in config.surveyed.tags if tag.family == "16h5"]
-    }  # anything dark is one of its tags
+    few_bits = [tag.id for tag in config.surveyed.tags if tag.family == "16h5"]  # anything dark is a tag of that family
     detector = Detector(
         families, max_hamming=config.max_hamming, min_margin=config.min_margin,
-        numbers={family: ids for family, ids in few_bits.items() if ids},
+        numbers={"16h5": few_bits} if few_bits else None,
     )  # fmt: skip
     with Bag(paths) as bag, ThreadPoolExecutor(_cores()) as pool:
         eyes = _eyes(bag, config, body_frame, warn)
