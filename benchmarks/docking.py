@@ -245,11 +245,18 @@ def docking(pool: ProcessPoolExecutor) -> list[Row]:
     rows: list[Row] = []
     kinds = list(itertools.product(("fixed", "floating"), CONDITIONS))
     jobs = [job for kind, condition in kinds for job in _jobs(kind, condition)]
-    by_job = dict(zip(jobs, pool.map(_whole, jobs), strict=True))
+    by_job, failed = {}, []
+    for job, future in {job: pool.submit(_whole, job) for job in jobs}.items():
+        try:
+            by_job[job] = future.result()
+        except Exception as error:  # a figure of its own: the other runs of an hour are kept
+            print(*job, repr(error), flush=True)
+            failed.append(job)
+    rows.append(row("D.2", f"runs of {len(jobs)} that end in an exception", len(failed), "runs", 0, "<="))
     for kind, condition in kinds:
-        found = [by_job[job][0] for job in _jobs(kind, condition)]
+        done = [by_job[job] for job in _jobs(kind, condition) if job in by_job]
+        found, cut = [whole for whole, _ in done], [part for _, part in done if part is not None]
         runs = [r for r in found if r is not None]
-        cut = [r for job in _jobs(kind, condition) if (r := by_job[job][1]) is not None]
         rows += _cut_rows(cut) if cut else []
         label = f"dock-{kind}-{condition}, {len(found)} seeds"
         rows.append(row("D.2", f"{label}: runs in which a tag is seen", len(runs), "runs"))
