@@ -249,7 +249,7 @@ def docking(pool: ProcessPoolExecutor) -> list[Row]:
     for job, future in {job: pool.submit(_whole, job) for job in jobs}.items():
         try:
             by_job[job] = future.result()
-        except Exception as error:  # a figure of its own: the other runs of an hour are kept
+        except Exception as error:  # noqa: BLE001 - a figure of its own: the other runs of an hour are kept
             print(*job, repr(error), flush=True)
             failed.append(job)
     rows.append(row("D.2", f"runs of {len(jobs)} that end in an exception", len(failed), "runs", 0, "<="))
