@@ -228,6 +228,18 @@ class HeightPrior(Measurement):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImuSample(Measurement):
+    """One sample of an IMU, as it arrives: see `ImuSeries`."""
+
+    accel_mps2: Array
+    gyro_radps: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "accel_mps2", _frozen(self.accel_mps2, (3,), "accel_mps2"))
+        object.__setattr__(self, "gyro_radps", _frozen(self.gyro_radps, (3,), "gyro_radps"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImuSeries:
     """All samples of one IMU, as columns, in stamp order, in the sensor's own axes.
 

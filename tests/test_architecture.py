@@ -11,9 +11,9 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 VOCABULARY = {
-    "errors", "time", "frames", "measurements", "ledger", "trajectory", "config", "recording", "solution", "plain", "blocks", "survey", "berths", "_config_docs",
+    "errors", "time", "frames", "measurements", "ledger", "trajectory", "config", "recording", "solution", "estimate", "plain", "blocks", "survey", "berths", "_config_docs",
 }  # fmt: skip
-GRAPH = {"graph", "keys", "timeline", "build", "solve", "outputs"}
+GRAPH = {"graph", "keys", "timeline", "build", "solve", "online", "origin", "outputs"}
 FORBIDDEN = {
     "vocabulary": {"graphloc.factors", "graphloc.frontends", "graphloc.eval", "gtsam"},
     "graph": {"graphloc.factors", "graphloc.frontends", "graphloc.eval"},

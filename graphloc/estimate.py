@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pose now: what the online mode hands out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphloc.frames import Array
+from graphloc.solution import Health
+
+_CHI2_95 = float(chi2.ppf(0.95, 2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """The body at one time, by what was known then, in two frames as REP 105 has them.
+
+    Attributes:
+        stamp_ns: sensor time.
+        p_world_m, R_world_body, v_world_mps: (3,), (3, 3), (3,) in `map`: corrected, so it may jump.
+        cov: (6, 6) x, y, z (m) and small rotations (rad) about the world's axes. v_cov: (3, 3) of the velocity.
+        p_odom_m, R_odom_body: (3,), (3, 3) in `odom`: smooth, never corrected, so it drifts.
+        step_cov: (6, 6) of the odometry's step since the estimate before, as `cov`.
+        gyro_radps: (3,) rate of the body, body axes, bias removed.
+        accel_bias_mps2, gyro_bias_radps: (3,) in IMU axes.
+        health, reason: how far it can be trusted, and why not fully.
+        since_agreed_s: s since each absolute sensor last agreed; inf: never.
+    """
+
+    stamp_ns: int
+    p_world_m: Array
+    R_world_body: Array
+    v_world_mps: Array
+    cov: Array
+    v_cov: Array
+    p_odom_m: Array
+    R_odom_body: Array
+    step_cov: Array
+    gyro_radps: Array
+    accel_bias_mps2: Array
+    gyro_bias_radps: Array
+    health: Health
+    reason: str
+    since_agreed_s: Mapping[str, float]
+
+    @property
+    def yaw_rad(self) -> float:
+        """Yaw: from east, counter-clockwise."""
+        return float(np.arctan2(self.R_world_body[1, 0], self.R_world_body[0, 0]))
+
+    @property
+    def map_from_odom(self) -> tuple[Array, Array]:
+        """Translation (3,) and rotation (3, 3) of `odom` in `map`."""
+        R = self.R_world_body @ self.R_odom_body.T
+        return self.p_world_m - R @ self.p_odom_m, R
+
+    @property
+    def bound_95_m(self) -> float:
+        """Radius that holds the horizontal position with 95 %: the long axis of its ellipse."""
+        return float(np.sqrt(_CHI2_95 * np.linalg.eigvalsh(self.cov[:2, :2])[-1]))
+
+    @property
+    def heading_bound_95_rad(self) -> float:
+        """What holds the heading with 95 %."""
+        return float(1.96 * np.sqrt(self.cov[5, 5]))
