@@ -44,6 +44,7 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
             raw=raw,
             cov=np.array([[sigma**2]]),
             jacobian=lambda: _yaw_jacobian(R, at.T_state_sensor.rotation().matrix())[None, :],
+            slow_jacobian=lambda: np.eye(1),
             prior=1.0,
             size_m=None,
             size_deg=float(abs(np.degrees(raw[0]))),

@@ -52,6 +52,7 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
             raw=raw,
             cov=white_covariance(m, config),
             jacobian=lambda: _antenna_jacobian(at),
+            slow_jacobian=lambda: -np.eye(3),
             prior=1.0,
             size_m=size,
             size_deg=None,

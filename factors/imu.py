@@ -50,6 +50,16 @@ class Links:
         )
         self._gap_params = self._make_params(_GAP_ACCEL, _GAP_GYRO, mount)
 
+    def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
+        """Add samples (N, 6) after the last one: specific force, rate."""
+        self._stamps = np.concatenate([self._stamps, stamps_ns])
+        self._samples = np.concatenate([self._samples, samples])
+
+    def forget(self, before_ns: int) -> None:
+        """Drop the samples before a stamp, but for the last of them."""
+        first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
+        self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()
+
     def _make_params(self, accel: float, gyro: float, mount: Any) -> Any:
         # Every covariance of fresh params is 1.0: set them all.
         params = gtsam.PreintegrationParams.MakeSharedU(self._gravity_mps2)

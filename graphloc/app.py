@@ -7,15 +7,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from ruamel.yaml import YAML
 
-from graphloc import outputs
+from graphloc import origin, outputs
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig, load_config
 from graphloc.errors import InputError
@@ -26,19 +25,18 @@ from graphloc.eval.match_picture import Gallery
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.tag_check import suspect_tags
 from graphloc.factors import INERTIAL, KINDS, SENSORS
-from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frames import Array, Datum
 from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.tags.unsurveyed import estimate_tags
+from graphloc.frontends.tags.unsurveyed import Riding, estimate_tags, only_beside
 from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
-from graphloc.measurements import GnssPosition, Measurement, TagSighting
+from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 from graphloc.solve import smooth
-from graphloc.survey import Survey, TagConfig
+from graphloc.survey import WORLD, Survey, TagConfig
 from graphloc.trajectory import Trajectory
 
-_FAR_M = 200e3
 _FOUND_TAGS = "tags.found.yaml"
 
 
@@ -58,7 +56,7 @@ class Run:
 def load(bags: Sequence[Path], config_path: Path, progress: Progress = quiet) -> tuple[Recording, VesselConfig]:
     """Read a vessel.yaml and the bag that it describes."""
     config = with_surveys(load_config(config_path, KINDS), config_path.parent)
-    _refuse_world_without_datum(config, str(config_path))
+    origin.refuse_world_without_datum(config, str(config_path), SENSORS)
     recording = read_recording(bags, config, progress)
     return with_sightings(recording, config, bags, progress), config
 
@@ -105,15 +103,34 @@ def _about_tags(
     recording: Recording, config: VesselConfig, solution: Solution
 ) -> tuple[tuple[TagConfig, ...], list[str]]:
     """Return tags that the run tells the place of, and what it says against the survey."""
-    said = suspect_tags(recording, solution)
+    said = suspect_tags(recording, config, solution)
     if not recording.tag_views:
         return (), said
-    sizes = [sensor.surveyed.other_size_m for sensor in config.of_kind("apriltag").values()]
-    found, left = estimate_tags(recording.tag_views, solution.trajectory, next((s for s in sizes if s), None))
-    if found:
-        names = ", ".join(str(tag.id) for tag in found)
-        said.append(f"tag {names}: not in the survey; where the run puts it is in {_FOUND_TAGS}")
+    surveys = {name: sensor.surveyed for name, sensor in config.of_kind("apriltag").items()}
+    size_m = next((s.other_size_m for s in surveys.values() if s.other_size_m), None)
+    riding = _riding(recording, surveys, solution)
+    found, left = estimate_tags(recording.tag_views, solution.trajectory, size_m, riding)
+    every = Survey.model_construct(tags=(*found, *(tag for s in surveys.values() for tag in s.tags)))
+    for frame in sorted({tag.frame for tag in found}):
+        names = ", ".join(every.called(tag.family, tag.id) for tag in found if tag.frame == frame)
+        where = (
+            "where the run puts it is" if frame == WORLD else f"seen only beside tags of {frame}, as if it rode on that"
+        )
+        said.append(f"{names}: not in the survey; {where} in {_FOUND_TAGS}")
     return tuple(found), [*said, *left]
+
+
+def _riding(recording: Recording, surveys: Mapping[str, Survey], solution: Solution) -> dict[tuple[str, int], Riding]:
+    """How the docks moved that tags which are not surveyed seem to ride on."""
+    seen = [m for m in recording.measurements if isinstance(m, TagSighting)]
+    found = {}
+    for tag, (sensor, frame) in only_beside(recording.tag_views, seen).items():
+        dock, slow = surveys[sensor].dock(frame), solution.slow[sensor]
+        assert dock is not None  # sightings are of a frame of the survey
+        first = slow.axes.index(f"{frame} east")
+        moved = slow.value[:, first : first + 6] * np.repeat([1.0, np.pi / 180.0], 3)
+        found[tag] = Riding(dock, slow.stamps_ns, moved)
+    return found
 
 
 def _solved(recording: Recording, config: VesselConfig, datum: Datum, progress: Progress) -> Solution:
@@ -205,87 +222,13 @@ def simulated(run: SimulatedRun, *, compare: bool = False, progress: Progress = 
 
 
 def choose_datum(recording: Recording, config: VesselConfig) -> Datum:
-    """Return the configured datum, or the median of the first fixes.
-
-    Raises:
-        InputError: none is configured, and there is no fix to take one from, or something is given in world.
-    """
-    if config.datum is not None:
-        datum = Datum(config.datum.geodetic)
-        _refuse_far_fixes(recording, datum)
-        return datum
-    _refuse_world_without_datum(config, recording.source)
-    fixes = np.array([m.position for m in recording.measurements if isinstance(m, GnssPosition)][:5])
-    if not len(fixes):
-        raise InputError(f"{recording.source}: {_why_no_fix(recording, config)}")
-    # Longitudes about the first one, so that fixes on both sides of the date line stay together.
-    fixes[:, 1] = fixes[0, 1] + (fixes[:, 1] - fixes[0, 1] + 180.0) % 360.0 - 180.0
-    return Datum(Geodetic(*(float(v) for v in np.median(fixes, axis=0))))
-
-
-def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:
-    """A forgotten minus sign puts the datum on the other side of the world, where nothing can be solved.
-
-    Raises:
-        InputError: most fixes lie farther away than any run goes.
-    """
-    fixes = [m.position for m in recording.measurements if isinstance(m, GnssPosition)]
-    if fixes:
-        away_m = np.linalg.norm(datum.enu_from_geodetic(*np.array(fixes).T), axis=1)
-        if np.median(away_m) > _FAR_M:
-            raise InputError(
-                f"{recording.source}: its fixes lie {np.median(away_m) / 1e3:.0f} km from `datum:`, near latitude "
-                f"{fixes[0].latitude_deg:.4f}, longitude {fixes[0].longitude_deg:.4f}: correct the datum"
-            )
-
-
-def _why_no_fix(recording: Recording, config: VesselConfig) -> str:
-    receivers = config.of_kind("gnss")
-    if not receivers:
-        return "no GNSS sensor to take a datum from; set datum: in vessel.yaml"
-    reasons = Counter(f"{row.sensor}: {row.reason}" for row in recording.rows if row.sensor in receivers)
-    if not reasons:
-        return f"no GNSS fix from {', '.join(receivers)}: the topic holds no message"
-    (reason, count), *_ = reasons.most_common(1)
-    return f"no usable GNSS fix: {count} messages of {reason}"
-
-
-def _refuse_world_without_datum(config: VesselConfig, where: str) -> None:
-    in_world = [f"sensors.{name}" for row in SENSORS if row.in_world for name in config.of_kind(row.kind)]
-    in_world += ["truth_topic"] if config.truth_topic else []
-    if in_world and config.datum is None:
-        raise InputError(
-            f"{where}: {', '.join(in_world)}: places in world, but nothing says where world's origin is; "
-            "set datum: (`graphloc inspect` guesses it)"
-        )
+    """Return the configured datum, or the median of the first fixes (see `origin.choose_datum`)."""
+    return origin.choose_datum(recording, config, SENSORS)
 
 
 def with_synthetic(recording: Recording, config: VesselConfig, datum: Datum) -> Recording:
     """Add the measurements that the configuration makes itself (the height prior)."""
-    if recording.imu is None or not len(recording.imu):
-        return recording
-    span = (int(recording.imu.stamps_ns[0]), int(recording.imu.stamps_ns[-1]))
-    added: list[Measurement] = []
-    for name, sensor in config.sensors.items():
-        row = next((r for r in SENSORS if r.kind == sensor.kind), None)
-        if row is not None and row.synthetic is not None and sensor.enabled:
-            added.extend(row.synthetic(name, sensor, span, _height_m(recording, config, sensor.height_m, datum)))
-    if not added:
-        return recording
-    every = sorted([*recording.measurements, *added], key=lambda m: (m.stamp_ns, m.seq))
-    return replace(recording, measurements=tuple(every))
-
-
-def _height_m(recording: Recording, config: VesselConfig, height_m: float | None, datum: Datum) -> float:
-    """Height of the body in world: as configured (ellipsoidal), or the median fix less its antenna's height."""
-    if height_m is not None:
-        return height_m - datum.origin.height_m
-    heights = [
-        m.position.height_m - float(mount_of(m.sensor, config.sensors[m.sensor], recording)[0][2])
-        for m in recording.measurements
-        if isinstance(m, GnssPosition)
-    ]
-    return float(np.median(heights)) - datum.origin.height_m if heights else 0.0
+    return origin.with_synthetic(recording, config, datum, SENSORS)
 
 
 def tables(run: Run) -> tuple[metrics.Table, ...]:

@@ -13,10 +13,10 @@ solution is moved to the body's origin at the end (`graphloc.solve`).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -35,7 +35,7 @@ from graphloc.timeline import Timeline, make_timeline
 
 # A step of a slow state is believed to be a jump beyond this many sigmas.
 _JUMP = KernelConfig(kind="cauchy", scale=2.0)
-_TAILS = 9.0  # of a constant's prior: squared sigmas that double its variance
+CONSTANT_TAILS = 9.0  # of a constant's prior: squared sigmas that double its variance
 _NOTHING = 1e6  # sigmas: a prior that says nothing
 
 
@@ -101,9 +101,16 @@ def mount_of(name: str, config: SensorConfig, recording: Recording) -> tuple[Arr
 
 
 def make_problem(
-    recording: Recording, config: VesselConfig, datum: Datum, rows: Sequence[Sensor], inertial: InertialRow
+    recording: Recording,
+    config: VesselConfig,
+    datum: Datum,
+    rows: Sequence[Sensor],
+    inertial: InertialRow,
+    company: int | None = None,
 ) -> Problem:
     """Lay out the timeline, preintegrate, and attach every measurement.
+
+    `company`: how many sensors can tell each other's slow errors from motion; by default those that the recording has.
 
     Raises:
         SolveError: the recording has no usable IMU data.
@@ -129,9 +136,10 @@ def make_problem(
     by_sensor: dict[str, list[Measurement]] = {}
     for m in inside:
         by_sensor.setdefault(m.sensor, []).append(m)
-    company = sum(
-        bool(s.kind in by_kind and by_kind[s.kind].company and n in by_sensor) for n, s in config.sensors.items()
-    )
+    if company is None:
+        company = sum(
+            bool(s.kind in by_kind and by_kind[s.kind].company and n in by_sensor) for n, s in config.sensors.items()
+        )
     streams = []
     for number, (name, sensor) in enumerate(config.sensors.items()):
         if name in by_sensor:
@@ -243,12 +251,112 @@ def _stream(
     )
 
 
+Carry = tuple[int, Any]
+"""A state, and the motion preintegrated from there."""
+
+
+class OnTimeline(Protocol):
+    """What `attach` needs to know of a timeline (`Timeline`, or a live one)."""
+
+    @property
+    def slow_of(self) -> Any:
+        """Slow node of each state."""
+        ...
+
+    @property
+    def slow_stamps_ns(self) -> Any:
+        """Stamp of each slow node."""
+        ...
+
+
+class Sited(Protocol):
+    """What `attach` needs to know of a problem."""
+
+    @property
+    def timeline(self) -> OnTimeline:
+        """Where the states stand."""
+        ...
+
+    @property
+    def R_body_imu(self) -> Array:
+        """The IMU's axes."""
+        ...
+
+    @property
+    def datum(self) -> Datum:
+        """Origin of world."""
+        ...
+
+
+class Attaching(Protocol):
+    """What `attach` needs to know of a stream (`Stream`, or a live one)."""
+
+    @property
+    def number(self) -> int:
+        """Of the sensor, for keys."""
+        ...
+
+    @property
+    def mount(self) -> Any:
+        """Pose of the sensor from the IMU's place."""
+        ...
+
+    @property
+    def slow(self) -> SlowProcess | None:
+        """Its slow state."""
+        ...
+
+    @property
+    def constants(self) -> tuple[Constant, ...]:
+        """What its measurements may share."""
+        ...
+
+    @property
+    def measurements(self) -> Any:
+        """By index."""
+        ...
+
+    @property
+    def state(self) -> Any:
+        """State of each."""
+        ...
+
+    @property
+    def carry(self) -> Any:
+        """Motion to each from the state before it."""
+        ...
+
+    @property
+    def gyro_radps(self) -> Any:
+        """Raw rate at each."""
+        ...
+
+
+class Judged(Attaching, Protocol):
+    """What judging needs to know of a stream."""
+
+    @property
+    def name(self) -> str:
+        """Of the sensor."""
+        ...
+
+    @property
+    def row(self) -> Sensor:
+        """Of the table."""
+        ...
+
+    @property
+    def config(self) -> Any:
+        """Of the sensor."""
+        ...
+
+
 def nav_state(values: gtsam.Values, k: int) -> Any:
     """Return the NavState of state k."""
     return gtsam.NavState(values.atPose3(keys.pose(k)), values.atVector(keys.velocity(k)))
 
 
-def attach(problem: Problem, stream: Stream, i: int, values: gtsam.Values) -> Attachment:
+def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> Attachment:
     """Return how measurement `i` of a stream meets the graph at the current estimate."""
     k = int(stream.state[i])
     j = int(problem.timeline.slow_of[k])
@@ -282,7 +390,7 @@ def attach(problem: Problem, stream: Stream, i: int, values: gtsam.Values) -> At
 
 
 def _next_slow(
-    problem: Problem, stream: Stream, j: int, stamp_ns: int, values: gtsam.Values
+    problem: Sited, stream: Attaching, j: int, stamp_ns: int, values: gtsam.Values
 ) -> tuple[int, Array, float, float] | None:
     stamps, key = problem.timeline.slow_stamps_ns, keys.slow(stream.number, j + 1)
     if j + 1 >= len(stamps) or not values.exists(key):
@@ -292,7 +400,7 @@ def _next_slow(
     return key, np.atleast_1d(values.atVector(key)), share, apart * 1e-9
 
 
-def _constants(stream: Stream, values: gtsam.Values) -> tuple[tuple[int, Array], ...]:
+def _constants(stream: Attaching, values: gtsam.Values) -> tuple[tuple[int, Array], ...]:
     """Keys and estimates; what no factor had yet is zero."""
     return tuple(
         (key, np.atleast_1d(values.atVector(key)) if values.exists(key) else np.zeros(len(constant.sigma)))
@@ -300,7 +408,7 @@ def _constants(stream: Stream, values: gtsam.Values) -> tuple[tuple[int, Array],
     )
 
 
-def constant_keys(stream: Stream) -> list[int]:
+def constant_keys(stream: Attaching) -> list[int]:
     """Return the keys of a sensor's constants."""
     return [keys.constant(stream.number, k) for k in range(len(stream.constants))]
 
@@ -385,7 +493,7 @@ def _add_constants(
         if key in used:
             guess.insert(key, known)
             value, cov = prior.constants.get(key, (np.zeros(len(constant.sigma)), np.diag(constant.sigma**2)))
-            cov = cov * (1.0 + float(((known / constant.sigma) ** 2).sum()) / _TAILS)
+            cov = cov * (1.0 + float(((known / constant.sigma) ** 2).sum()) / CONSTANT_TAILS)
             graph.add(gtsam.PriorFactorVector(key, value, gtsam.noiseModel.Gaussian.Covariance(cov)))
 
 
@@ -400,9 +508,13 @@ def _add_bias_chain(
     for j in nodes:
         guess.insert(keys.bias(j), values.atConstantBias(keys.bias(j)))
     for j in nodes[:-1]:
-        model = gtsam.noiseModel.Diagonal.Sigmas(problem.links.bias_steps(_node_dt_s(problem, j)))
-        same = gtsam.imuBias.ConstantBias()
-        graph.add(gtsam.BetweenFactorConstantBias(keys.bias(j), keys.bias(j + 1), same, model))
+        graph.add(bias_step(problem.links, j, _node_dt_s(problem, j)))
+
+
+def bias_step(links: InertialLink, j: int, dt_s: float) -> Any:
+    """Return the factor of the bias walk from slow node `j` to the next."""
+    model = gtsam.noiseModel.Diagonal.Sigmas(links.bias_steps(dt_s))
+    return gtsam.BetweenFactorConstantBias(keys.bias(j), keys.bias(j + 1), gtsam.imuBias.ConstantBias(), model)
 
 
 def _add_start(graph: gtsam.NonlinearFactorGraph, prior: StartPrior, first: int, node: int) -> None:
@@ -423,38 +535,54 @@ def _add_slow_chain(
     prior: StartPrior,
     jumps: bool,
 ) -> None:
-    """A first-order Gauss-Markov chain from native factors.
-
-    Its path measure, exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both
-    ends, is a random walk with a standing prior at each node: exact as the node period goes to 0, and
-    the steps stay free for a robust loss (a `JacobianFactor` with the decay in it takes none).
-    """
     key = [keys.slow(stream.number, j) for j in nodes]
-    for j, name in zip(nodes, key, strict=True):
-        guess.insert(name, np.atleast_1d(values.atVector(keys.slow(stream.number, j))))
-    constant = ~np.isfinite(slow.time_constant_s)
-    zero = np.zeros(len(slow.sigma))
-    first = np.atleast_1d(values.atVector(key[0])) / slow.sigma
-    tails = float(np.sqrt(1.0 + float((first[constant] ** 2).sum()) / _TAILS))  # as of constants, see `_add_constants`
-    ends = slow.sigma * np.where(constant, tails, np.sqrt(2.0))
-    diagonal = gtsam.noiseModel.Diagonal.Sigmas
+    for name in key:
+        guess.insert(name, np.atleast_1d(values.atVector(name)))
     given = prior.slow.get(stream.number)
     if given is not None:
         graph.add(gtsam.PriorFactorVector(key[0], given[0], gtsam.noiseModel.Gaussian.Covariance(given[1])))
     else:
-        graph.add(gtsam.PriorFactorVector(key[0], zero, diagonal(ends)))
+        graph.add(slow_begin(slow, key[0], np.atleast_1d(values.atVector(key[0]))))
     for n, j in enumerate(nodes[:-1]):
-        dt = _node_dt_s(problem, j)
-        # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
-        step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt / slow.time_constant_s))
-        model: Any = diagonal(step)
-        if slow.jumps and jumps:
-            loss = gtsam.noiseModel.mEstimator.Cauchy.Create(_JUMP.scale)
-            model = gtsam.noiseModel.Robust.Create(loss, model)
-        graph.add(gtsam.BetweenFactorVector(key[n], key[n + 1], zero, model))
-        if not constant.all():
-            standing = slow.sigma * np.where(constant, _NOTHING, np.sqrt(2.0 * slow.time_constant_s / dt))
-            graph.add(gtsam.PriorFactorVector(key[n + 1], zero, diagonal(standing)))
+        for factor in slow_step(slow, key[n], key[n + 1], _node_dt_s(problem, j), jumps=jumps):
+            graph.add(factor)
+    for factor in slow_end(slow, key[-1]):
+        graph.add(factor)
+
+
+# A slow state is a chain of first-order Gauss-Markov steps, from native factors. Its path measure,
+# exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both ends, is a random walk with a
+# standing prior at each node: exact as the node period goes to 0, and the steps stay free for a robust loss (a
+# `JacobianFactor` with the decay in it takes none).
+
+
+def slow_begin(slow: SlowProcess, key: int, known: Array) -> Any:
+    """Return the prior of a chain's first node; `known`: its estimate, for the tails of what is constant."""
+    constant = ~np.isfinite(slow.time_constant_s)
+    tails = float(
+        np.sqrt(1.0 + float(((known / slow.sigma)[constant] ** 2).sum()) / CONSTANT_TAILS)
+    )  # see `_add_constants`
+    ends = slow.sigma * np.where(constant, tails, np.sqrt(2.0))
+    return gtsam.PriorFactorVector(key, np.zeros(len(ends)), gtsam.noiseModel.Diagonal.Sigmas(ends))
+
+
+def slow_step(slow: SlowProcess, key: int, following: int, dt_s: float, *, jumps: bool = True) -> Iterator[Any]:
+    """Yield the factors of the step from one node to the next, `dt_s` later."""
+    constant, zero = ~np.isfinite(slow.time_constant_s), np.zeros(len(slow.sigma))
+    # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
+    step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt_s / slow.time_constant_s))
+    model: Any = gtsam.noiseModel.Diagonal.Sigmas(step)
+    if slow.jumps and jumps:
+        model = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(_JUMP.scale), model)
+    yield gtsam.BetweenFactorVector(key, following, zero, model)
+    if not constant.all():
+        standing = slow.sigma * np.where(constant, _NOTHING, np.sqrt(2.0 * slow.time_constant_s / dt_s))
+        yield gtsam.PriorFactorVector(following, zero, gtsam.noiseModel.Diagonal.Sigmas(standing))
+
+
+def slow_end(slow: SlowProcess, key: int) -> Iterator[Any]:
+    """Yield what closes a chain at its last node."""
+    constant = ~np.isfinite(slow.time_constant_s)
     if not constant.all():
         last = np.where(constant, _NOTHING, np.sqrt(2.0)) * slow.sigma
-        graph.add(gtsam.PriorFactorVector(key[-1], zero, diagonal(last)))
+        yield gtsam.PriorFactorVector(key, np.zeros(len(last)), gtsam.noiseModel.Diagonal.Sigmas(last))

@@ -256,6 +256,14 @@ class InertialLink(Protocol):
         """Return the preintegrated measurement from `start_ns` to `stop_ns` (start < stop)."""
         ...
 
+    def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
+        """Add samples (N, 6) after the last one: specific force, m/s^2, and rate, rad/s, in IMU axes."""
+        ...
+
+    def forget(self, before_ns: int) -> None:
+        """Drop the samples before a stamp, but for the last of them."""
+        ...
+
     def factor(self, k: int, j: int, preintegrated: Any) -> Any:
         """Return the factor between states `k` and `k + 1` with the bias of slow node `j`."""
         ...

@@ -1,18 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Feed measurements as they arrive, get estimates."""
+"""Feed measurements as they arrive, get estimates.
+
+Three things can be underway: the start waits (`_start`), the lag runs (`_lag`), or, within one call, a lag that
+failed is built anew from its last anchor with all that came since.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import logging
+import os
+from bisect import insort
+from collections import deque
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import gtsam
+import numpy as np
+
 from graphloc.config import VesselConfig
+from graphloc.errors import GraphlocError
 from graphloc.estimate import Estimate
-from graphloc.frames import Datum
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.graph import InertialRow, Sensor
-from graphloc.ledger import LedgerRow
-from graphloc.measurements import Measurement
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import ImuSample, ImuSeries, Measurement
+from graphloc.online._anchor import Anchor
+from graphloc.online._lag import Lag
+from graphloc.online._live import live_problem
+from graphloc.online._odometry import Odometry
+from graphloc.online._start import Started, try_start
+from graphloc.origin import refuse_world_without_datum
+from graphloc.solve._solution import health_of, left_out, world_covariance
+from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
+_TRY_EVERY_S, _LONGEST_WAIT_S = 0.5, 120.0  # for a start; what is older is let go
+_ANCHOR_S, _SNAPSHOT_S = 1.0, 2.0
+_AHEAD_S = 60.0  # of the IMU: a stamp of another clock
+_AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
+_BACK = 50  # IMU samples in a row before the newest: their clock was set back
+_PENDING = 10_000
 
 
 class OnlineSmoother:
@@ -21,8 +50,12 @@ class OnlineSmoother:
     Args:
         config: the vessel, its surveys read. rows, inertial: the table of sensors (`graphloc.factors`).
         datum: origin of world; None: from the configuration, or else from the first fixes.
+        mounts: body -> sensor (t (3,), R (3, 3)) of sensors whose mount is not the configuration's (/tf_static).
         lag_s: how long measurements can still be re-judged, and how late they may come.
         snapshot: file that is written every few seconds, and resumed from if it is there; None: no such file.
+
+    Raises:
+        InputError: something is given in world, and nothing says where its origin is.
     """
 
     def __init__(
@@ -32,44 +65,533 @@ class OnlineSmoother:
         rows: Sequence[Sensor],
         inertial: InertialRow,
         datum: Datum | None = None,
+        mounts: Mapping[str, tuple[Array, Array]] | None = None,
         lag_s: float = 10.0,
         snapshot: Path | None = None,
     ) -> None:
-        raise NotImplementedError
+        if datum is None:
+            refuse_world_without_datum(config, "vessel.yaml", rows)
+        self._config, self._rows, self._inertial = config, tuple(rows), inertial
+        self._mounts, self._lag_s, self._snapshot = dict(mounts or {}), lag_s, snapshot
+        self._datum = datum or (Datum(config.datum.geodetic) if config.datum else None)
+        imu = config.of_kind(inertial.kind)
+        self._imu_name = next(iter(imu), "")
+        self._bridge_s = min((sensor.max_bridge_s for sensor in imu.values()), default=0.0)
+        self._gap_s = min((sensor.max_gap_s for sensor in imu.values()), default=0.0)
+        kinds = {row.kind for row in rows}
+        self._asked = {name for name, s in config.sensors.items() if s.enabled and s.kind in kinds}
+        self._absolute = [n for row in rows if row.absolute for n in config.of_kind(row.kind)]
+        self._done: list[LedgerRow] = []
+        self._events: list[str] = []
+        self._lag: Lag | None = None
+        self._odometry: Odometry | None = None
+        self._agreed_ns: dict[str, int] = {}
+        self._heights_m: Mapping[str, float] = {}
+        self._newest_imu: ImuSample | None = None
+        self._leap: ImuSample | None = None
+        self._behind = 0
+        self._resumable = self._read_snapshot()
+        self._buffer: deque[Measurement] = deque()  # while it waits
+        self._pending: list[Measurement] = []  # ahead of the IMU
+        self._unread: list[ImuSample] = []
+        self._recent: deque[Measurement] = deque()  # since the anchor
+        self._wait("it to begin")
+
+    # What is known
 
     @property
     def waiting_for(self) -> str:
         """What the start waits for, in plain words; empty while there is an estimate."""
-        raise NotImplementedError
+        return "" if self._lag is not None else self._waiting
 
     @property
     def datum(self) -> Datum | None:
         """Origin of world; None before it is known."""
-        raise NotImplementedError
+        return self._datum
+
+    @property
+    def factor_slots(self) -> int:
+        """Places that the solver keeps for factors: flat, however long it runs."""
+        return 0 if self._lag is None else self._lag.factor_slots
+
+    def rows(self) -> list[LedgerRow]:
+        """Return the rows of the ledger that became final since this was last asked; measurements leave with the lag."""
+        if self._lag is not None:
+            self._done += self._lag.gone()
+        done, self._done = self._done, []
+        return done
+
+    def events(self) -> list[str]:
+        """Return what happened since this was last asked, a line each: started, restarted, rebuilt, resumed."""
+        events, self._events = self._events, []
+        return events
+
+    def finish(self) -> list[LedgerRow]:
+        """End: return the rows of all that is left."""
+        done = self.rows()
+        if self._lag is not None:
+            done += self._lag.held()
+        why = "no IMU data at this stamp" if self._lag is not None else f"never started: waiting for {self._waiting}"
+        left = [*self._pending, *([self._leap] if self._leap else [])]
+        if self._lag is None:
+            left += self._buffer
+        done += [self._row(m, Outcome.REJECTED, why) for m in left if m.seq >= 0]
+        self._pending, self._unread, self._leap, self._buffer = [], [], None, deque()
+        self._lag = None
+        return done
+
+    # What comes
 
     def feed(self, m: Measurement) -> Estimate | None:
         """Take a measurement (an `ImuSample` too); return the newest estimate if this made a new one."""
-        raise NotImplementedError
+        if isinstance(m, ImuSample):
+            return self._feed_imu(m)
+        if m.sensor not in self._asked:
+            self._drop(m, Outcome.IGNORED, "its sensor is switched off or not in the configuration")
+            return None
+        newest = self._newest_imu
+        if newest is not None and m.stamp_ns - newest.stamp_ns > _AHEAD_S * 1e9:
+            ahead_s = (m.stamp_ns - newest.stamp_ns) * 1e-9
+            self._drop(m, Outcome.REJECTED, f"its stamp lies {ahead_s:.0f} s ahead of the IMU's")
+        elif self._lag is None:
+            self._buffer.append(m)
+        elif m.stamp_ns < self._lag.first_ns:
+            late_s = (self._lag.newest.stamp_ns - m.stamp_ns) * 1e-9
+            self._drop(m, Outcome.LATE, f"came {late_s:.1f} s after the newest state; the lag is {self._lag_s:g} s")
+        else:
+            insort(self._pending, m, key=lambda p: p.stamp_ns)
+            self._recent.append(m)
+            if len(self._pending) > _PENDING:
+                self._drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
+        return None
+
+    def _feed_imu(self, m: ImuSample) -> Estimate | None:
+        if m.sensor != self._imu_name:
+            self._drop(m, Outcome.IGNORED, "its sensor is switched off or not in the configuration")
+            return None
+        newest = self._newest_imu
+        if newest is not None:
+            if self._leap is not None:  # the sample before this one was far ahead: did the clock go on from there?
+                leap, self._leap = self._leap, None
+                if 0 < m.stamp_ns - leap.stamp_ns <= self._gap_s * 1e9:
+                    self._accept_imu(leap)
+                else:
+                    self._drop(leap, Outcome.REJECTED, "its stamp leaps, and the next one does not follow")
+                newest = self._newest_imu
+                assert newest is not None
+            if m.stamp_ns <= newest.stamp_ns:
+                self._behind += 1
+                if self._behind < _BACK:
+                    self._drop(m, Outcome.REJECTED, "its stamp does not increase")
+                    return None
+                self._restart(f"the IMU's clock was set back by {(newest.stamp_ns - m.stamp_ns) * 1e-9:.1f} s")
+                self._newest_imu = None
+            elif m.stamp_ns - newest.stamp_ns > self._gap_s * 1e9:
+                self._leap = m
+                return None
+        self._behind = 0
+        return self._accept_imu(m)
+
+    def _accept_imu(self, m: ImuSample) -> Estimate | None:
+        before, self._newest_imu = self._newest_imu, m
+        silent_s = 0.0 if before is None else (m.stamp_ns - before.stamp_ns) * 1e-9
+        if silent_s > self._bridge_s:
+            self._restart(f"the IMU was silent for {silent_s:.1f} s")
+        if self._lag is None:
+            self._buffer.append(m)
+            return self._try_to_start()
+        self._unread.append(m)
+        self._recent.append(m)
+        self._done.append(self._row(m, Outcome.USED, ""))
+        return self._advance()
+
+    def _advance(self) -> Estimate | None:
+        """Make the states that are due, with all that belongs to them."""
+        assert self._lag is not None
+        assert self._newest_imu is not None
+        if self._newest_imu.stamp_ns < self._lag.problem.timeline.due_ns:
+            return None
+        try:
+            self._step(self._lag)
+        except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
+            self._rebuild(error)
+        if self._lag is None:
+            return None
+        self._keep_anchor(self._lag)
+        return self._estimate(self._lag)
+
+    def _step(self, lag: Lag) -> None:
+        assert self._newest_imu is not None
+        self._read(lag)
+        timeline, until = lag.problem.timeline, self._newest_imu.stamp_ns
+        while timeline.due_ns <= until:
+            before, made = lag.newest, 0
+            while timeline.due_ns <= until and made < _AT_ONCE:
+                lag.grow(timeline.due_ns)
+                made += 1
+                self._make_own(lag)
+            reached = timeline.stamps_ns[timeline.last]
+            while self._pending and self._pending[0].stamp_ns <= reached:
+                m = self._pending.pop(0)
+                if m.stamp_ns < lag.first_ns:
+                    self._drop(m, Outcome.LATE, "left the lag while it waited")
+                else:
+                    lag.take(m)
+            lag.judge()
+            self._go(lag, before.stamp_ns, reached)
+            lag.commit()
+            lag.try_others()
+        self._done += lag.gone()
+
+    def _read(self, lag: Lag) -> None:
+        """Hand the IMU's samples on."""
+        if self._unread:
+            stamps = np.array([m.stamp_ns for m in self._unread], dtype=np.int64)
+            lag.problem.links.extend(stamps, np.array([np.hstack([m.accel_mps2, m.gyro_radps]) for m in self._unread]))
+            self._unread = []
+
+    def _make_own(self, lag: Lag) -> None:
+        """Take what the configuration itself says at the newest state."""
+        timeline = lag.problem.timeline
+        at_ns = timeline.stamps_ns[timeline.last]
+        for name, height_m in self._heights_m.items():
+            stream = lag.problem.streams[name]
+            if stream.row.synthetic is None or at_ns < self._own_due_ns.get(name, at_ns):
+                continue
+            for m in stream.row.synthetic(name, stream.config, (at_ns, at_ns + 1), height_m):
+                lag.take(m)
+            self._own_due_ns[name] = at_ns + duration_ns(getattr(stream.config, "period_s", 1.0))
+
+    def _go(self, lag: Lag, before_ns: int, until_ns: int) -> None:
+        """Carry the odometry from the newest state on, as the IMU says."""
+        assert self._odometry is not None
+        newest = lag.newest
+        pim = lag.problem.links.integrate(before_ns, until_ns, newest.bias)
+        there = pim.predict(gtsam.NavState(newest.pose, newest.velocity), newest.bias)
+        dp, dR = self._body_step(lag, newest.pose, there.pose())
+        R = newest.pose.rotation().matrix()
+        self._odometry.step(
+            dp,
+            dR,
+            (until_ns - before_ns) * 1e-9,
+            there.pose().rotation().matrix(),
+            R.T @ newest.velocity_cov @ R,
+            float(np.sqrt(np.diagonal(pim.preintMeasCov())[:3].max())) / max((until_ns - before_ns) * 1e-9, 1e-3),
+        )
+
+    @staticmethod
+    def _body_step(lag: Lag, a: gtsam.Pose3, b: gtsam.Pose3) -> tuple[Array, Array]:
+        """The step of the body's origin, from that of the IMU's place."""
+        lever = -lag.problem.t_body_imu_m
+        R = a.rotation().matrix()
+        dp = R.T @ (b.transformFrom(lever) - a.transformFrom(lever))
+        return dp, R.T @ b.rotation().matrix()
+
+    # Estimates
 
     def predict(self, stamp_ns: int | None = None) -> Estimate | None:
         """Return the pose at a stamp (default: of the newest IMU sample) from the newest state; None before the start."""
-        raise NotImplementedError
+        lag, newest = self._lag, self._newest_imu
+        if lag is None or newest is None:
+            return None
+        self._read(lag)
+        return self._estimate(lag, newest.stamp_ns if stamp_ns is None else stamp_ns)
+
+    def _estimate(self, lag: Lag, stamp_ns: int | None = None) -> Estimate:
+        """The newest state, or what the IMU makes of it at a stamp after (a stamp before is answered with the state)."""
+        assert self._odometry is not None
+        newest, links, odometry = lag.newest, lag.problem.links, self._odometry
+        pose, v, at_ns = newest.pose, newest.velocity, newest.stamp_ns
+        p_odom, R_odom = odometry.p_m, odometry.R
+        pose_cov, v_cov = newest.pose_cov, newest.velocity_cov
+        if stamp_ns is not None and stamp_ns > at_ns:
+            pim = links.integrate(at_ns, stamp_ns, newest.bias)
+            there = pim.predict(gtsam.NavState(pose, v), newest.bias)
+            p_odom, R_odom = odometry.after(*self._body_step(lag, pose, there.pose()))
+            dt_s, noise = (stamp_ns - at_ns) * 1e-9, pim.preintMeasCov()
+            dR = pose.rotation().between(there.pose().rotation()).matrix()
+            pose_cov = _turned(pose_cov, dR.T)
+            R = there.pose().rotation().matrix()
+            pose_cov[3:, 3:] += dt_s**2 * R.T @ v_cov @ R + noise[3:6, 3:6]
+            pose_cov[:3, :3] += noise[:3, :3]
+            v_cov = v_cov + noise[6:, 6:]
+            pose, v, at_ns = there.pose(), np.asarray(there.velocity()), stamp_ns
+        lever = -lag.problem.t_body_imu_m
+        R = pose.rotation().matrix()
+        gyro = links.gyro_at(np.array([at_ns]))[0] - lag.problem.R_body_imu @ newest.bias.gyroscope()
+        cov = world_covariance(pose_cov, R, lever)
+        cov[:3, :3] += left_out(list(lag.problem.streams.values()))
+        agreed = {**self._agreed_ns, **lag.agreed_ns}
+        since = {n: max((at_ns - agreed[n]) * 1e-9, 0.0) if n in agreed else np.inf for n in self._absolute}
+        health, reason = health_of(cov, since)
+        return Estimate(
+            stamp_ns=at_ns,
+            p_world_m=np.asarray(pose.transformFrom(lever)),
+            R_world_body=R,
+            v_world_mps=v + R @ np.cross(gyro, lever),
+            cov=cov,
+            v_cov=v_cov,
+            p_odom_m=np.array(p_odom),
+            R_odom_body=np.array(R_odom),
+            step_cov=odometry.step_cov,
+            gyro_radps=gyro,
+            accel_bias_mps2=np.asarray(newest.bias.accelerometer()),
+            gyro_bias_radps=np.asarray(newest.bias.gyroscope()),
+            health=health,
+            reason=reason,
+            since_agreed_s=since,
+        )
 
     def window(self) -> Trajectory | None:
         """Return the states of the lag as they are now estimated, up to the newest IMU sample: a prior for front-ends.
 
         The covariance at all of them is that of the newest.
         """
-        raise NotImplementedError
+        now = self.predict()
+        if now is None or self._lag is None:
+            return None
+        stamps, p, R, v = self._lag.track()
+        if now.stamp_ns > stamps[-1]:
+            stamps, p = np.append(stamps, now.stamp_ns), np.vstack([p, now.p_world_m])
+            R, v = np.concatenate([R, now.R_world_body[None]]), np.vstack([v, now.v_world_mps])
+        cov = np.broadcast_to(now.cov, (len(stamps), 6, 6))
+        return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v, cov=cov)
 
-    def rows(self) -> list[LedgerRow]:
-        """Return the rows of the ledger that became final since this was last asked; measurements leave with the lag."""
-        raise NotImplementedError
+    # Start, restart, rebuild, resume
 
-    def finish(self) -> list[LedgerRow]:
-        """End: return the rows of all that is left."""
-        raise NotImplementedError
+    def _wait(self, why: str) -> None:
+        """Give up what there is, and wait for a start."""
+        self._lag = None
+        self._waiting = why
+        self._buffer.clear()
+        self._pending, self._unread, self._recent = [], [], deque()
+        self._own_due_ns: dict[str, int] = {}
+        self._tried_ns = 0
+        self._anchor: Anchor | None = None
+        self._before_anchor: ImuSample | None = None
+        self._snapshot_ns = 0
 
-    def events(self) -> list[str]:
-        """Return what happened since this was last asked, a line each: started, restarted, rebuilt, resumed."""
-        raise NotImplementedError
+    def _restart(self, why: str) -> None:
+        if self._lag is not None:
+            self._done += [*self._lag.gone(), *self._lag.held()]
+            self._agreed_ns.update(self._lag.agreed_ns)
+            self._events.append(f"{why}: starts anew")
+        stuck = "the run was cut before the IMU got there"
+        self._done += [self._row(m, Outcome.REJECTED, stuck) for m in self._pending if m.seq >= 0]
+        for m in self._buffer:
+            self._drop(m, Outcome.REJECTED, f"the run was cut while it waited for {self._waiting}")
+        self._wait("IMU data")
+
+    def _try_to_start(self) -> Estimate | None:
+        newest = self._newest_imu
+        assert newest is not None
+        if self._resumable is not None:
+            self._resume(newest)
+            return None
+        while (newest.stamp_ns - self._buffer[0].stamp_ns) > _LONGEST_WAIT_S * 1e9:
+            self._drop(self._buffer.popleft(), Outcome.REJECTED, f"came before the start: waiting for {self._waiting}")
+        if newest.stamp_ns - self._tried_ns < _TRY_EVERY_S * 1e9:
+            return None
+        self._tried_ns = newest.stamp_ns
+        samples = [m for m in self._buffer if isinstance(m, ImuSample)]
+        others = [m for m in self._buffer if not isinstance(m, ImuSample) and m.stamp_ns <= newest.stamp_ns]
+        try:
+            started = try_start(
+                self._config, self._rows, self._inertial, self._mounts, _series(samples), others, self._datum
+            )
+        except Exception as error:  # noqa: BLE001 - as in `_advance`
+            started = f"a start that can be solved: {_line(error)}"
+        if isinstance(started, str):
+            self._waiting = started
+            return None
+        self._take_over(started, samples, [m for m in self._buffer if m.stamp_ns > newest.stamp_ns])
+        assert self._lag is not None
+        self._keep_anchor(self._lag)
+        return self._estimate(self._lag)
+
+    def _take_over(self, started: Started, samples: list[ImuSample], ahead: list[Measurement]) -> None:
+        self._datum, self._heights_m = started.datum, started.heights_m
+        self._agreed_ns.update(started.agreed_ns)
+        self._done += started.rows
+        self._done += [self._row(m, Outcome.USED, "") for m in samples]
+        self._events.append(f"started at {utc_text(started.anchor.stamp_ns)}: {'; '.join(started.notes)}")
+        self._buffer = deque()
+        self._begin(started.anchor, samples)
+        for m in ahead:
+            self.feed(m)
+
+    def _begin(self, anchor: Anchor, samples: Sequence[ImuSample]) -> None:
+        """Build the lag at an anchor; `samples` reach from there, or from before, to the newest."""
+        assert self._datum is not None
+        known = [m for m in samples if m.stamp_ns >= anchor.stamp_ns - 2 * duration_ns(self._gap_s)] or samples[-1:]
+        problem = live_problem(
+            self._config, self._datum, _series(known), anchor.stamp_ns, self._rows, self._inertial, self._mounts
+        )
+        agreed = {} if self._lag is None else self._lag.agreed_ns
+        self._lag = Lag(problem, anchor, self._lag_s)
+        self._lag.agreed_ns.update(agreed)
+        self._anchor = anchor
+        if self._odometry is None:
+            pose = anchor.pose
+            self._odometry = Odometry(pose.transformFrom(-problem.t_body_imu_m), pose.rotation().matrix())
+
+    def _keep_anchor(self, lag: Lag) -> None:
+        """Remember the newest state now and then, in memory and in the snapshot."""
+        at_ns = lag.newest.stamp_ns
+        if self._anchor is not None and at_ns - self._anchor.stamp_ns < _ANCHOR_S * 1e9 and self._before_anchor:
+            return
+        try:
+            self._anchor = lag.anchor()
+        except Exception as error:  # noqa: BLE001 - as in `_advance`
+            self._rebuild(error)
+            return
+        kept: deque[Measurement] = deque()
+        for m in self._recent:
+            if m.stamp_ns > at_ns:
+                kept.append(m)
+            elif isinstance(m, ImuSample):
+                self._before_anchor = m
+        self._before_anchor = self._before_anchor or self._newest_imu
+        self._recent = kept
+        if self._snapshot is not None and at_ns - self._snapshot_ns >= _SNAPSHOT_S * 1e9:
+            self._snapshot_ns = at_ns
+            self._write_snapshot(self._snapshot)
+
+    def _rebuild(self, error: Exception) -> None:
+        """Build the lag anew from the last anchor; if that fails too, without what was measured since; or start anew."""
+        log.warning("online: %s", _line(error))
+        lag, anchor = self._lag, self._anchor
+        assert lag is not None
+        if anchor is None:
+            self._restart(f"the solver failed ({_line(error)})")
+            return
+        recent, self._pending, self._unread = list(self._recent), [], []
+        self._done += [*lag.gone(), *lag.held(anchor.stamp_ns)]
+        samples = [m for m in recent if isinstance(m, ImuSample)]
+        before = [self._before_anchor] if self._before_anchor is not None else []
+        for without in (False, True):
+            others = [m for m in recent if not isinstance(m, ImuSample)]
+            try:
+                self._begin(anchor, [*before, *samples])
+                fresh = self._lag
+                assert fresh is not None
+                for m in [] if without else others:
+                    if m.stamp_ns >= fresh.first_ns:
+                        insort(self._pending, m, key=lambda p: p.stamp_ns)
+                self._step(fresh)
+            except Exception as again:  # noqa: BLE001 - as in `_advance`
+                self._pending, error = [], again
+                continue
+            if without:
+                why = f"the solver failed with it: {_line(error)}"
+                self._done += [self._row(m, Outcome.REJECTED, why) for m in others if m.seq >= 0]
+                self._recent = deque(samples)
+            age_s = (fresh.newest.stamp_ns - anchor.stamp_ns) * 1e-9
+            self._events.append(f"the solver failed ({_line(error)}): rebuilt from {age_s:.1f} s before")
+            return
+        self._lag = None
+        self._done += [self._row(m, Outcome.REJECTED, f"the solver failed with it: {_line(error)}") for m in recent
+                       if m.seq >= 0 and not isinstance(m, ImuSample)]  # fmt: skip
+        self._events.append(f"the solver failed ({_line(error)}), and again from the last anchor: starts anew")
+        self._wait("IMU data")
+
+    # Snapshot
+
+    def _write_snapshot(self, path: Path) -> None:
+        assert self._anchor is not None
+        assert self._odometry is not None
+        assert self._datum is not None
+        last = self._before_anchor
+        raw = {
+            "version": 1,
+            "vessel": self._config.vessel,
+            "datum": list(self._datum.origin),
+            "anchor": self._anchor.as_dict(),
+            "imu": None if last is None else [last.stamp_ns, *last.accel_mps2.tolist(), *last.gyro_radps.tolist()],
+            "heights_m": dict(self._heights_m),
+            "agreed_ns": {**self._agreed_ns, **(self._lag.agreed_ns if self._lag else {})},
+            "odom": [self._odometry.p_m.tolist(), self._odometry.R.tolist()],
+        }
+        part = path.with_name(path.name + ".part")
+        try:
+            with part.open("w", encoding="utf-8") as stream:
+                json.dump(raw, stream)
+                stream.flush()
+                os.fsync(stream.fileno())
+            part.replace(path)  # at once: a kill leaves the old one or the new one
+        except OSError as error:
+            self._events.append(f"{path}: the snapshot cannot be written ({error.strerror or error})")
+
+    def _read_snapshot(self) -> tuple[Anchor, ImuSample] | None:
+        path = self._snapshot
+        if path is None or not path.exists():
+            return None
+        try:
+            raw = json.loads(path.read_text(encoding="utf-8"))
+            if raw["version"] != 1 or raw["vessel"] != self._config.vessel:
+                raise ValueError("it is of another vessel or version")
+            anchor = Anchor.from_dict(raw["anchor"])
+            stamp, *six = raw["imu"]
+            last = ImuSample(stamp_ns=int(stamp), sensor=self._imu_name, seq=-1, accel_mps2=six[:3], gyro_radps=six[3:])
+            self._datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
+            self._heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
+            self._agreed_ns = {str(n): int(s) for n, s in raw["agreed_ns"].items()}
+            p, R = (np.array(v, dtype=np.float64) for v in raw["odom"])
+            self._odometry = Odometry(p.reshape(3), R.reshape(3, 3))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            self._events.append(f"{path}: the snapshot cannot be used ({_line(error)}): starts anew")
+            return None
+        return anchor, last
+
+    def _resume(self, newest: ImuSample) -> None:
+        """Go on from the snapshot, if the first sample is not too far from it."""
+        assert self._resumable is not None
+        (anchor, last), self._resumable = self._resumable, None
+        age_s = (newest.stamp_ns - anchor.stamp_ns) * 1e-9
+        if not 0.0 < age_s <= self._bridge_s:
+            self._events.append(f"the snapshot is {age_s:.1f} s old, more than the {self._bridge_s:g} s that the IMU's "
+                                "silence is bridged for: starts anew")  # fmt: skip
+            return
+        waiting = [m for m in self._buffer if m is not newest]
+        self._buffer = deque()
+        self._begin(anchor, [last, newest])
+        self._before_anchor = last
+        self._recent = deque([newest])
+        self._done.append(self._row(newest, Outcome.USED, ""))
+        self._events.append(f"resumed from a snapshot {age_s:.1f} s old")
+        for m in waiting:
+            self.feed(m)
+
+    # The ledger
+
+    def _drop(self, m: Measurement, outcome: Outcome, reason: str) -> None:
+        if m.seq >= 0:
+            self._done.append(self._row(m, outcome, reason))
+
+    def _row(self, m: Measurement, outcome: Outcome, reason: str) -> LedgerRow:
+        sensor = self._config.sensors.get(m.sensor)
+        topic = "" if sensor is None else sensor.topic
+        return LedgerRow(
+            seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason
+        )  # fmt: skip
+
+
+def _series(samples: Sequence[ImuSample]) -> ImuSeries:
+    return ImuSeries(
+        sensor=samples[0].sensor if samples else "",
+        stamps_ns=np.array([m.stamp_ns for m in samples], dtype=np.int64),
+        accel_mps2=np.array([m.accel_mps2 for m in samples]).reshape(-1, 3),
+        gyro_radps=np.array([m.gyro_radps for m in samples]).reshape(-1, 3),
+        seqs=np.array([m.seq for m in samples], dtype=np.int64),
+    )
+
+
+def _turned(cov: Array, R: Array) -> Array:
+    """A covariance (6, 6) of the body tangent, in turned axes."""
+    both = np.kron(np.eye(2), R)
+    return np.asarray(both @ cov @ both.T)
+
+
+def _line(error: BaseException) -> str:
+    said = " ".join(str(error).split())[:160]
+    return said if isinstance(error, GraphlocError) else f"{type(error).__name__}: {said}"

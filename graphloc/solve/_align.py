@@ -28,7 +28,7 @@ from graphloc.time import duration_ns, utc_text
 _STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
 _STILL_SPEED_MPS = 0.15
 _BLOCK_S, _SWELL_S = 0.5, 10.0
-_MOVED_M = 15.0  # travel from which a heading can be told without a heading sensor
+MOVED_M = 15.0  # travel from which a heading can be told without a heading sensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -300,7 +300,7 @@ def _headings(
         )
     moved = np.hypot(*(track.p[:, :2] - np.median(track.p[:5, :2], axis=0)).T)
     noise = 5.0 * float(np.nanmedian(track.sigma[:, :2]))
-    far = np.flatnonzero(moved > max(_MOVED_M, noise))
+    far = np.flatnonzero(moved > max(MOVED_M, noise))
     if not len(far):
         return (0.0,), np.pi, window, "heading unknown: no sensor tells it and the vessel does not move"
     course = np.arange(8) * np.pi / 4.0

@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 from scipy.stats import chi2
 
-from graphloc.build import Decisions, Problem, Stream, attach
+from graphloc.build import Decisions, Judged, Problem, Stream, attach
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
@@ -116,7 +116,7 @@ def weigh(
                 _predicted(r, at, int(stream.state[i]), covariance)
                 for i, at, r in zip(indices, attached, residuals, strict=True)
             ]
-            found = _by_hypotheses(stream, indices, attached, residuals, predicted)
+            found = by_hypotheses(stream, indices, attached, residuals, predicted)
         else:
             found = _by_kernel(stream, attached, residuals, stage)
         verdicts.update({(stream.number, i): v for i, v in zip(indices, found, strict=True)})
@@ -168,13 +168,14 @@ def _spread(nis: list[float], dof: int) -> float:
     return max(1.0, float(np.sqrt(np.median(nis) / chi2.median(dof)))) if nis else 1.0
 
 
-def _by_hypotheses(
-    stream: Stream,
+def by_hypotheses(
+    stream: Judged,
     indices: list[int],
     attached: list[Attachment],
     residuals: list[tuple[Residual, ...]],
     predicted: list[Array | None],
 ) -> list[Verdict]:
+    """Judge measurements of a sensor that can be false, as a sequence (see `sequence_of`)."""
     posterior = sequence_of(stream, indices, residuals, predicted).posterior()
     verdicts = []
     for n, found in enumerate(residuals):
@@ -205,7 +206,7 @@ def along_best_chains(problem: Problem, values: gtsam.Values, verdicts: Verdicts
         if stream.row.false is None:
             continue
         met = [_residuals_at(problem, stream, i, values) for i in range(len(stream.measurements))]
-        for i, mode in enumerate(best_chain(stream, [residuals for _, residuals in met])):
+        for i, mode in enumerate(best_chain(stream, range(len(met)), [residuals for _, residuals in met])):
             at, residuals = met[i]
             chosen = 0 if mode is None else mode
             kept = None if mode is None else Decision(mode=mode)

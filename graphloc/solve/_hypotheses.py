@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphloc.build import Stream
+from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
 
@@ -65,7 +65,7 @@ class FalseSequence:
 
 
 def sequence_of(
-    stream: Stream,
+    stream: Judged,
     indices: Sequence[int],
     residuals: Sequence[tuple[Residual, ...]],
     predicted: Sequence[Array | None],
@@ -113,14 +113,15 @@ def _log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...]) -> floa
     return float(np.logaddexp.reduce(logs) - total)
 
 
-def best_chain(stream: Stream, residuals: Sequence[tuple[Residual, ...]]) -> list[int | None]:
-    """Return which mode of each of a stream's N measurements is right on the most probable chain; None: none is.
+def best_chain(stream: Judged, indices: Sequence[int], residuals: Sequence[tuple[Residual, ...]]) -> list[int | None]:
+    """Return which mode of each of N measurements of a stream is right on the most probable chain; None: none is.
 
     The longest path: nodes are modes taken for right, and an edge gains what its end gains over being false,
     less what the offset moves from one to the next. False ones between that repeat each other gain too.
     """
     assert stream.row.false is not None
-    models = [stream.row.false(m, stream.config) for m in stream.measurements]
+    taken = [stream.measurements[i] for i in indices]
+    models = [stream.row.false(m, stream.config) for m in taken]
     dof, count = len(residuals[0][0].raw), len(residuals)
     if any(len(found[0].raw) != dof for found in residuals):
         return [None] * count
@@ -133,7 +134,7 @@ def best_chain(stream: Stream, residuals: Sequence[tuple[Residual, ...]]) -> lis
         same = np.log(max(repeats * models[n].probability, 1e-12)) + _log_repeat(residuals[n - 1], residuals[n])
         again[n] = max(0.0, float(np.logaddexp(np.log1p(-repeats), same - nothing[n])))
     gained = np.concatenate([[0.0], np.cumsum(again)])  # by false ones that repeat, up to and without n
-    stamps = np.array([m.stamp_ns for m in stream.measurements]) * 1e-9
+    stamps = np.array([m.stamp_ns for m in taken]) * 1e-9
     node = [(n, mode) for n, found in enumerate(residuals) for mode in range(len(found))]
     at = np.array([n for n, _ in node])
     raw = np.array([residuals[n][mode].raw for n, mode in node])

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from graphloc import keys
 from graphloc.berths import Berth, BerthTrack, rates, seen_from
-from graphloc.build import Problem, Stream, constant_keys
+from graphloc.build import Judged, Problem, Stream, constant_keys
 from graphloc.frames import Array, skew
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import Measurement
@@ -27,6 +27,7 @@ _FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-
 # Health: DNV asks for 2.5 m at 95 % in port (Digerud); beyond 25 m a pose helps nobody there.
 _GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_RAD = 2.5, 25.0, np.radians(45.0)
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
+_CHI2_95 = float(chi2.ppf(0.95, 2))
 _FAR_OFF = 3.0
 _NEAR_BERTH_M = 60.0
 _NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
@@ -53,7 +54,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         cov=np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k], lever) for k in range(n)]),
     )
     assert trajectory.cov is not None
-    trajectory.cov[:, :3, :3] += _left_out(problem)
+    trajectory.cov[:, :3, :3] += left_out(problem.streams)
     since = {s.name: _since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = _stats(problem, result)
     health, reasons = _health(trajectory, since, _misfit(stats, result))
@@ -120,13 +121,13 @@ def _of_pose_and_berth(problem: Problem, result: BatchResult, stream: Stream, be
     return np.asarray(kept @ joint @ kept.T)
 
 
-def _left_out(problem: Problem) -> Array:
-    """Covariance (3, 3) of slow errors that nothing could tell from motion: the position is off by as much."""
+def left_out(streams: Sequence[Any]) -> Array:
+    """Return the covariance (3, 3) of slow errors that nothing can tell from motion: the position is off by as much."""
     total = np.zeros((3, 3))
-    for stream in problem.streams:
+    for stream in streams:
         if stream.left_out is not None:
             total += np.diag(stream.left_out.sigma**2)
-    if any(s.row.synthetic is not None and getattr(s.config, "height_m", None) is not None for s in problem.streams):
+    if any(s.row.synthetic is not None and getattr(s.config, "height_m", None) is not None for s in streams):
         total[2, 2] = 0.0  # the height is known otherwise; taken from the fixes, it is as far off as they are
     return total
 
@@ -205,29 +206,32 @@ def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
 
 def _health(trajectory: Trajectory, since: dict[str, Array], misfit: str) -> tuple[tuple[Health, ...], tuple[str, ...]]:
     assert trajectory.cov is not None
-    horizontal = trajectory.cov[:, :2, :2]
-    bound = np.sqrt(chi2.ppf(0.95, 2) * np.linalg.eigvalsh(horizontal)[:, -1])
-    heading = 1.96 * np.sqrt(trajectory.cov[:, 5, 5])
-    health, reasons = [], []
     away = {name: _or_until(s, trajectory.stamps_ns) for name, s in since.items()}
-    nearest = np.min(list(away.values()), axis=0) if away else np.full(len(bound), np.inf)
-    for k in range(len(bound)):
-        silent = [name for name, s in away.items() if s[k] > _SILENT_S]
-        if bound[k] > _LOST_BOUND_M or heading[k] > _LOST_HEADING_RAD:
-            state, why = Health.LOST, f"95 % bound {bound[k]:.0f} m, heading {np.degrees(heading[k]):.0f} deg"
-        elif nearest[k] > _DEAD_RECKONING_S:
-            state, why = Health.DEAD_RECKONING, "no absolute position agrees"
-        elif bound[k] > _GOOD_BOUND_M:
-            state, why = Health.DEGRADED, f"95 % bound {bound[k]:.1f} m"
-        elif silent:
-            state, why = Health.DEGRADED, f"{', '.join(silent)} missing or not agreeing"
-        elif misfit:
-            state, why = Health.DEGRADED, misfit
-        else:
-            state, why = Health.GOOD, ""
-        health.append(state)
-        reasons.append(why)
-    return tuple(health), tuple(reasons)
+    found = [
+        health_of(cov, {name: float(s[k]) for name, s in away.items()}, misfit) for k, cov in enumerate(trajectory.cov)
+    ]
+    return tuple(health for health, _ in found), tuple(why for _, why in found)
+
+
+def health_of(cov: Array, away_s: Mapping[str, float], misfit: str = "") -> tuple[Health, str]:
+    """Return how far a pose can be trusted, and why not fully.
+
+    Args:
+        cov: (6, 6) as in `Trajectory`. away_s: s to where each absolute sensor agrees.
+        misfit: what speaks against all of the run.
+    """
+    bound_m = float(np.sqrt(_CHI2_95 * np.linalg.eigvalsh(cov[:2, :2])[-1]))
+    heading = 1.96 * float(np.sqrt(cov[5, 5]))
+    silent = [name for name, s in away_s.items() if s > _SILENT_S]
+    if bound_m > _LOST_BOUND_M or heading > _LOST_HEADING_RAD:
+        return Health.LOST, f"95 % bound {bound_m:.0f} m, heading {np.degrees(heading):.0f} deg"
+    if min(away_s.values(), default=np.inf) > _DEAD_RECKONING_S:
+        return Health.DEAD_RECKONING, "no absolute position agrees"
+    if bound_m > _GOOD_BOUND_M:
+        return Health.DEGRADED, f"95 % bound {bound_m:.1f} m"
+    if silent:
+        return Health.DEGRADED, f"{', '.join(silent)} missing or not agreeing"
+    return (Health.DEGRADED, misfit) if misfit else (Health.GOOD, "")
 
 
 def _ledger(problem: Problem, recording: Recording, verdicts: dict[tuple[int, int], Verdict]) -> Ledger:
@@ -242,11 +246,12 @@ def _ledger(problem: Problem, recording: Recording, verdicts: dict[tuple[int, in
         for i, m in enumerate(stream.measurements):
             if m.seq >= 0:  # synthetic measurements are configuration, not messages
                 topic = recording.topics.get(stream.name, "")
-                ledger.add(_row(stream, m, topic, verdicts[(stream.number, i)]))
+                ledger.add(row_of(stream, m, topic, verdicts[(stream.number, i)]))
     return ledger
 
 
-def _row(stream: Stream, m: Measurement, topic: str, verdict: Verdict) -> LedgerRow:
+def row_of(stream: Judged, m: Measurement, topic: str, verdict: Verdict) -> LedgerRow:
+    """Return the row of a measurement that was judged."""
     residual, weight = verdict.residual, verdict.weight
     nis, dof = residual.nis(), len(residual.raw)
     if weight >= AGREES:

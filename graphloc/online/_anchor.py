@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known at one state, to go on from: after the start, after a failure, after a kill.
+
+Kept are the joint Gaussian of pose, velocity and bias, and each slow state and constant given the pose: what is
+known of a drifting receiver is known together with the place, not apart from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphloc.build import StartPrior
+from graphloc.frames import Array
+
+_CORE = 15  # pose, velocity, bias
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Beside:
+    """A vector known beside a pose: value (k,) at the pose's own value, gain (k, 6) by its tangent, cov (k, k) given it."""
+
+    value: Array
+    gain: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Anchor:
+    """A state and its Gaussian.
+
+    Attributes:
+        stamp_ns: of the state. pose: gtsam.Pose3 of the IMU's place, body axes. velocity: (3,). bias: (6,) accelerometer first.
+        cov: (15, 15) of pose (tangent), velocity, bias.
+        slow: by sensor. constants: by sensor and number.
+    """
+
+    stamp_ns: int
+    pose: Any
+    velocity: Array
+    bias: Array
+    cov: Array
+    slow: Mapping[str, Beside] = field(default_factory=dict)
+    constants: Mapping[tuple[str, int], Beside] = field(default_factory=dict)
+
+    @classmethod
+    def of_start(cls, stamp_ns: int, prior: StartPrior) -> Anchor:
+        """Return the prior of a start; nothing is known of slow states."""
+        cov = np.zeros((_CORE, _CORE))
+        cov[:6, :6], cov[6:9, 6:9], cov[9:, 9:] = prior.pose_cov, prior.velocity_cov, prior.bias_cov
+        bias = np.concatenate([prior.bias.accelerometer(), prior.bias.gyroscope()])
+        return cls(stamp_ns=stamp_ns, pose=prior.pose, velocity=np.asarray(prior.velocity), bias=bias, cov=cov)
+
+    def factors(self, pose: int, velocity: int, bias: int) -> list[Any]:
+        """Return the prior of the state, by its keys."""
+        whiten = np.linalg.inv(np.linalg.cholesky(_sound(self.cov)))
+        blocks = (whiten[:, :6], whiten[:, 6:9], whiten[:, 9:])
+        unit = gtsam.noiseModel.Unit.Create(_CORE)
+        make: Any = gtsam.JacobianFactor
+        linear = make(pose, blocks[0], velocity, blocks[1], bias, blocks[2], np.zeros(_CORE), unit)
+        point = gtsam.Values()
+        point.insert(pose, self.pose)
+        point.insert(velocity, self.velocity)
+        point.insert(bias, gtsam.imuBias.ConstantBias(self.bias[:3], self.bias[3:]))
+        return [gtsam.LinearContainerFactor(linear, point)]
+
+    def beside(self, known: Beside, pose: int, key: int) -> Any:
+        """Return the prior of a vector, given the pose."""
+        whiten = np.linalg.inv(np.linalg.cholesky(_sound(known.cov)))
+        make: Any = gtsam.JacobianFactor
+        size = len(known.value)
+        linear = make(pose, -whiten @ known.gain, key, whiten, np.zeros(size), gtsam.noiseModel.Unit.Create(size))
+        point = gtsam.Values()
+        point.insert(pose, self.pose)
+        point.insert(key, known.value)
+        return gtsam.LinearContainerFactor(linear, point)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data."""
+        return {
+            "stamp_ns": self.stamp_ns,
+            "pose": self.pose.matrix().tolist(),
+            "velocity": self.velocity.tolist(),
+            "bias": self.bias.tolist(),
+            "cov": self.cov.tolist(),
+            "slow": {name: _plain(b) for name, b in self.slow.items()},
+            "constants": [[name, k, _plain(b)] for (name, k), b in self.constants.items()],
+        }
+
+    @classmethod
+    def from_dict(cls, raw: Mapping[str, Any]) -> Anchor:
+        """Read plain data.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is damaged.
+        """
+        matrix = _array(raw["pose"], (4, 4))
+        return cls(
+            stamp_ns=int(raw["stamp_ns"]),
+            pose=gtsam.Pose3(gtsam.Rot3.ClosestTo(matrix[:3, :3]), matrix[:3, 3]),
+            velocity=_array(raw["velocity"], (3,)),
+            bias=_array(raw["bias"], (6,)),
+            cov=_array(raw["cov"], (_CORE, _CORE)),
+            slow={str(name): _beside(b) for name, b in raw["slow"].items()},
+            constants={(str(name), int(k)): _beside(b) for name, k, b in raw["constants"]},
+        )
+
+
+def beside(value: Array, joint: Array) -> Beside:
+    """Return what a joint covariance of pose and vector (6 + k, 6 + k) says of the vector given the pose."""
+    gain = np.linalg.solve(_sound(joint[:6, :6]), joint[:6, 6:]).T
+    return Beside(
+        value=np.asarray(value), gain=np.asarray(gain, dtype=np.float64), cov=joint[6:, 6:] - gain @ joint[:6, 6:]
+    )
+
+
+def _sound(cov: Array) -> Array:
+    """The covariance, symmetric, and positive where rounding took that away."""
+    whole = 0.5 * (cov + cov.T)
+    scale = np.sqrt(np.maximum(np.diagonal(whole), 1e-18))
+    values, vectors = np.linalg.eigh(whole / np.outer(scale, scale))
+    kept = (vectors * np.maximum(values, 1e-9)) @ vectors.T
+    return np.asarray(kept * np.outer(scale, scale))
+
+
+def _plain(b: Beside) -> dict[str, Any]:
+    return {"value": b.value.tolist(), "gain": b.gain.tolist(), "cov": b.cov.tolist()}
+
+
+def _beside(raw: Mapping[str, Any]) -> Beside:
+    size = len(raw["value"])
+    return Beside(
+        value=_array(raw["value"], (size,)), gain=_array(raw["gain"], (size, 6)), cov=_array(raw["cov"], (size, size))
+    )
+
+
+def _array(raw: Any, shape: tuple[int, ...]) -> Array:
+    array = np.array(raw, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"an array of {shape} is damaged")
+    return array

@@ -1,0 +1,530 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The last seconds of a run: states that grow, measurements that are taken, judged, judged again, and let go.
+
+A sensor with a kernel is judged when it comes, and once or twice again. What of it disagrees is asked whether the
+prediction is sure enough to say so: where it is not, after an outage, the kernel bends later. A sensor with
+hypotheses is judged as the batch does it, as a sequence, against the prediction while it is new.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from graphloc import keys
+from graphloc.build import (
+    CONSTANT_TAILS,
+    attach,
+    bias_step,
+    constant_keys,
+    nav_state,
+    slow_begin,
+    slow_end,
+    slow_step,
+)
+from graphloc.config import KernelConfig
+from graphloc.errors import SolveError
+from graphloc.frames import Array
+from graphloc.graph import Attachment, Decision, Residual
+from graphloc.ledger import LedgerRow
+from graphloc.measurements import Measurement
+from graphloc.online._anchor import Anchor, Beside, beside
+from graphloc.online._live import LiveProblem, LiveStream
+from graphloc.online._window import Held, Window, keys_of
+from graphloc.solve._decide import NEGLIGIBLE, Verdict, by_hypotheses
+from graphloc.solve._hypotheses import best_chain, sequence_of
+from graphloc.solve._solution import AGREES, row_of
+
+_AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
+_CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
+_MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
+_CHAPTER = 12  # hypotheses that are judged as one sequence
+_ROUNDS = 2  # of judging what is new
+_CHAIN = 2  # measurements that agree with each other, and not with the estimate
+_STEPS, _STEP_M = 3, 0.3  # of the solver in one commit, while the newest state moves
+
+
+@dataclass(slots=True, eq=False)
+class _Entry:
+    """A measurement in the window."""
+
+    stream: LiveStream
+    index: int
+    verdict: Verdict
+    held: Held | None = None
+    open_: bool = False  # its kernel bends later than configured
+
+    @property
+    def measurement(self) -> Measurement:
+        return self.stream.measurements[self.index]
+
+    @property
+    def state(self) -> int:
+        return self.stream.state[self.index]
+
+    def reaches(self, first: int) -> bool:
+        """Whether the states that it is carried from are still there."""
+        carry = self.stream.carry[self.index]
+        return self.state >= first and (carry is None or carry[0] >= first)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Newest:
+    """The newest state: pose (gtsam.Pose3) and velocity (3,) of the IMU's place, bias, covariances (6, 6) and (3, 3)."""
+
+    stamp_ns: int
+    pose: gtsam.Pose3
+    velocity: Array
+    bias: gtsam.imuBias.ConstantBias
+    pose_cov: Array
+    velocity_cov: Array
+
+
+class Lag:
+    """States and measurements of the last seconds, from an anchor on.
+
+    Raises (every method): SolveError: from then on it is of no use.
+    """
+
+    def __init__(self, problem: LiveProblem, anchor: Anchor, lag_s: float) -> None:
+        self.problem, self._window = problem, Window(lag_s)
+        self._origin_ns, self._lag_s = anchor.stamp_ns, lag_s
+        self._entries: dict[tuple[int, int], _Entry] = {}
+        self._again: deque[tuple[float, _Entry]] = deque()
+        self._rounds: dict[str, int] = {}
+        self._refuted: set[str] = set()  # sensors of which something new was judged false
+        self._tried: dict[str, frozenset[tuple[int, int | None]]] = {}
+        self._ends: dict[str, Held] = {}
+        self._known: dict[int, Beside] = {}
+        self._gone: list[LedgerRow] = []
+        self.agreed_ns: dict[str, int] = {}
+        self._begin(anchor)
+
+    def _begin(self, anchor: Anchor) -> None:
+        window = self._window
+        state = (keys.pose(0), keys.velocity(0), keys.bias(0))
+        window.guess(state[0], anchor.pose, 0.0)
+        window.guess(state[1], anchor.velocity, 0.0)
+        window.guess(state[2], gtsam.imuBias.ConstantBias(anchor.bias[:3], anchor.bias[3:]), 0.0)
+        window.add(anchor.factors(*state))
+        for stream in self.problem.streams.values():
+            if stream.slow is not None:
+                key, known = keys.slow(stream.number, 0), anchor.slow.get(stream.name)
+                window.guess(key, np.zeros(len(stream.slow.sigma)) if known is None else known.value, 0.0)
+                window.add([slow_begin(stream.slow, key, np.zeros(len(stream.slow.sigma)))]
+                           if known is None else [anchor.beside(known, state[0], key)])  # fmt: skip
+                if known is None:
+                    self._ends[stream.name] = window.add(slow_end(stream.slow, key))
+            for k, key in enumerate(constant_keys(stream)):
+                if (stream.name, k) in anchor.constants:
+                    self._known[key] = anchor.constants[(stream.name, k)]
+        window.commit()
+        self._newest = self._read_newest()
+
+    @property
+    def newest(self) -> Newest:
+        return self._newest
+
+    @property
+    def first_ns(self) -> int:
+        """Stamp from which on measurements can be taken."""
+        return self.problem.timeline.stamps_ns[self.problem.timeline.first]
+
+    def _seconds(self, stamp_ns: int) -> float:
+        return (stamp_ns - self._origin_ns) * 1e-9
+
+    # States
+
+    def grow(self, stamp_ns: int) -> None:
+        """Stage the next state, where the IMU says that it is."""
+        timeline, window, links = self.problem.timeline, self._window, self.problem.links
+        k, values = timeline.last, window.values
+        j, before_ns = timeline.slow_of[k], timeline.stamps_ns[k]
+        timeline.append(stamp_ns)
+        following, t = timeline.slow_of[k + 1], self._seconds(stamp_ns)
+        bias = values.atConstantBias(keys.bias(j))
+        pim = links.integrate(before_ns, stamp_ns, gtsam.imuBias.ConstantBias())
+        there = pim.predict(nav_state(values, k), bias)
+        window.guess(keys.pose(k + 1), there.pose(), t)
+        window.guess(keys.velocity(k + 1), np.asarray(there.velocity()), t)
+        window.add([links.factor(k, j, pim)])
+        if following != j:
+            dt_s = (timeline.slow_stamps_ns[following] - timeline.slow_stamps_ns[j]) * 1e-9
+            window.guess(keys.bias(following), bias, t)
+            window.add([bias_step(links, j, dt_s)])
+            self._next_slow(j, dt_s, t)
+        window.touch(keys.bias(following), t)
+        for stream in self.problem.streams.values():
+            if stream.slow is not None:
+                window.touch(keys.slow(stream.number, following), t)
+
+    def _next_slow(self, j: int, dt_s: float, t: float) -> None:
+        window = self._window
+        for stream in self.problem.streams.values():
+            if stream.slow is None:
+                continue
+            key, following = (keys.slow(stream.number, n) for n in (j, j + 1))
+            window.guess(following, np.atleast_1d(window.values.atVector(key)), t)
+            window.add(slow_step(stream.slow, key, following, dt_s))
+            if stream.name in self._ends:
+                window.remove(self._ends[stream.name])
+            ends = list(slow_end(stream.slow, following))
+            if ends:
+                self._ends[stream.name] = window.add(ends)
+
+    def commit(self) -> None:
+        """Estimate anew, and let go what has left."""
+        timeline, window = self.problem.timeline, self._window
+        pose, now_s = keys.pose(timeline.last), self._seconds(timeline.stamps_ns[timeline.last])
+        self._keep_constants(now_s)
+        before = window.values.atPose3(pose).translation()
+        window.commit()
+        for _ in range(_STEPS - 1):
+            here = window.values.atPose3(pose).translation()
+            moved_m = float(np.linalg.norm(here - before))
+            if not np.isfinite(moved_m):
+                raise SolveError("the solver's result is not a number")
+            if moved_m < _STEP_M:
+                break
+            before = here
+            window.settle()
+        self._let_go()
+        self._newest = self._read_newest()
+
+    def _read_newest(self) -> Newest:
+        timeline, values = self.problem.timeline, self._window.values
+        k = timeline.last
+        cov = self._window.covariance([keys.pose(k), keys.velocity(k)])
+        return Newest(
+            stamp_ns=timeline.stamps_ns[k],
+            pose=values.atPose3(keys.pose(k)),
+            velocity=np.asarray(values.atVector(keys.velocity(k))),
+            bias=values.atConstantBias(keys.bias(timeline.slow_of[k])),
+            pose_cov=cov[:6, :6],
+            velocity_cov=cov[6:, 6:],
+        )
+
+    def _let_go(self) -> None:
+        """Forget the states that have left the window, and enter their measurements into the ledger."""
+        timeline = self.problem.timeline
+        gone = timeline.first
+        while gone < timeline.last and not self._window.is_committed(keys.pose(gone)):
+            gone += 1
+        if gone == timeline.first:
+            return
+        timeline.forget(gone)
+        for key, entry in list(self._entries.items()):
+            if entry.state < gone:
+                self._gone.append(self._row(entry))
+                del self._entries[key]
+        for stream in self.problem.streams.values():
+            kept = min((i for n, i in self._entries if n == stream.number), default=len(stream.measurements))
+            for tape in (stream.measurements, stream.state, stream.carry, stream.gyro_radps):
+                tape.forget(kept)
+        self.problem.links.forget(timeline.stamps_ns[gone])
+
+    def _row(self, entry: _Entry) -> LedgerRow:
+        stream = entry.stream
+        return row_of(stream, entry.measurement, stream.config.topic, entry.verdict)
+
+    def gone(self) -> list[LedgerRow]:
+        """Return rows of measurements that have left since this was last asked."""
+        rows, self._gone = self._gone, []
+        return [row for row in rows if row.seq >= 0]
+
+    def held(self, before_ns: int | None = None) -> list[LedgerRow]:
+        """Return rows, as they stand, of what is in the window; with `before_ns`: of stamps up to there."""
+        return [
+            self._row(e)
+            for e in self._entries.values()
+            if e.measurement.seq >= 0 and (before_ns is None or e.measurement.stamp_ns <= before_ns)
+        ]
+
+    # Measurements
+
+    def take(self, m: Measurement) -> None:
+        """Stage a measurement whose stamp lies within the states."""
+        stream, i = self.problem.take(m)
+        at = attach(self.problem, stream, i, self._window.values)
+        residuals = stream.row.residuals(m, stream.config, at)
+        if stream.row.false is None:
+            verdict, open_ = self._by_kernel(stream, i, at, residuals[0], fresh=True)
+            entry = _Entry(stream, i, verdict, open_=open_)
+            self._again.append((self._seconds(m.stamp_ns) + _AGAIN_S[0], entry))
+            self._put(entry)
+        else:
+            entry = _Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at))
+            self._rounds[stream.name] = _ROUNDS
+        self._entries[(stream.number, i)] = entry
+
+    def judge(self) -> None:
+        """Stage what is to be decided, anew or again."""
+        for name, rounds in list(self._rounds.items()):
+            self._by_hypotheses(self.problem.streams[name])
+            if rounds == 1:
+                del self._rounds[name]
+            else:
+                self._rounds[name] = rounds - 1
+        now_s = self._seconds(self.problem.timeline.stamps_ns[self.problem.timeline.last])
+        for _ in range(len(self._again)):
+            due_s, entry = self._again[0]
+            if due_s > now_s:
+                break
+            self._again.popleft()
+            self._ask_again(entry, now_s)
+
+    # Other choices: what was chosen confirms itself, for the estimate follows it (see `graphloc.solve._choices`)
+
+    def try_others(self) -> None:
+        """Where what was judged false agrees among itself, try that instead, and keep what is more probable."""
+        names, self._refuted = self._refuted, set()
+        for name in names:
+            stream = self.problem.streams[name]
+            own = self._judged(stream)
+            if len(own) < _CHAIN:
+                continue
+            attached = [attach(self.problem, stream, e.index, self._window.values) for e in own]
+            found = [
+                stream.row.residuals(e.measurement, stream.config, at) for e, at in zip(own, attached, strict=True)
+            ]
+            chain = best_chain(stream, [e.index for e in own], found)
+            differ = [e for e, mode in zip(own, chain, strict=True)
+                      if mode is not None and (e.held is None or mode != e.verdict.mode)]  # fmt: skip
+            tried = frozenset((e.index, mode) for e, mode in zip(own, chain, strict=True))
+            if len(differ) < _CHAIN or tried == self._tried.get(name):
+                continue
+            self._tried[name] = tried
+            self._try(stream, own, [
+                Verdict(None if mode is None else Decision(mode=mode), float(mode is not None), 1.0, r[mode or 0], mode or 0, at)
+                for mode, r, at in zip(chain, found, attached, strict=True)
+            ])  # fmt: skip
+
+    def _try(self, stream: LiveStream, own: list[_Entry], others: list[Verdict]) -> None:
+        """Take other verdicts, settle around them, and go back if that is less probable."""
+        before, cost = [e.verdict for e in own], self._cost(stream, own)
+        for verdicts in (others, None):
+            if verdicts is not None:
+                for entry, verdict in zip(own, verdicts, strict=True):
+                    self._change(entry, verdict)
+            else:
+                self._by_hypotheses(stream)
+            self._window.commit()
+        if self._cost(stream, own) < cost:
+            self._rounds[stream.name] = _ROUNDS
+            return
+        for entry, verdict in zip(own, before, strict=True):
+            self._change(entry, verdict)
+        self._window.commit()
+
+    def _cost(self, stream: LiveStream, own: list[_Entry]) -> float:
+        """Minus the log of the probability of the window, all hypotheses of a stream summed over."""
+        values = self._window.values
+        found = [
+            stream.row.residuals(
+                e.measurement, stream.config, attach(self.problem, stream, e.index, values)
+            ) for e in own
+        ]  # fmt: skip
+        evidence = sequence_of(stream, [e.index for e in own], found, [None] * len(own)).log_evidence()
+        return self._window.error([e.held for e in own if e.held is not None]) - evidence
+
+    def _judged(self, stream: LiveStream) -> list[_Entry]:
+        """The newest of a stream that can still be judged, by stamp."""
+        first = self.problem.timeline.first
+        own = [e for e in self._entries.values() if e.stream is stream and e.reaches(first)]
+        return sorted(own, key=lambda e: (e.measurement.stamp_ns, e.index))[-_CHAPTER:]
+
+    def _ask_again(self, entry: _Entry, now_s: float) -> None:
+        if (entry.stream.number, entry.index) not in self._entries or not entry.reaches(self.problem.timeline.first):
+            return
+        at = attach(self.problem, entry.stream, entry.index, self._window.values)
+        residual = entry.stream.row.residuals(entry.measurement, entry.stream.config, at)[0]
+        verdict, open_ = self._by_kernel(entry.stream, entry.index, at, residual, fresh=False)
+        if entry.open_ or abs(verdict.weight - entry.verdict.weight) > _CHANGED:
+            entry.open_ = open_
+            self._change(entry, verdict)
+        else:
+            entry.verdict = replace(verdict, decision=entry.verdict.decision)
+        age_s = now_s - self._seconds(entry.measurement.stamp_ns)
+        if age_s < _AGAIN_S[1]:
+            self._again.append((now_s + _AGAIN_S[1] - age_s, entry))
+
+    def _by_kernel(
+        self, stream: LiveStream, i: int, at: Attachment, residual: Residual, *, fresh: bool
+    ) -> tuple[Verdict, bool]:
+        """The sensor's kernel: as wide as its residuals scatter, and as the prediction is unsure. True: for that reason."""
+        own, dof = stream.config.kernel, len(residual.raw)
+        spread = float(np.sqrt(np.median(stream.scatter) / chi2.median(dof))) if len(stream.scatter) >= dof + 4 else 1.0
+        scale = own.scale * max(1.0, spread) * float(np.sqrt(dof))
+        plain = nis = residual.nis()
+        opened = False
+        if fresh and own.kind != "none" and nis > scale**2:
+            unsure = self._unsure(stream, at, stream.state[i], residual)
+            nis = residual.nis(unsure)
+            opened = plain > 1.5 * nis
+            scale *= float(np.sqrt(plain / max(nis, 1e-9))) if opened else 1.0
+        if fresh:
+            stream.scatter.append(nis)
+        kernel = KernelConfig(kind=own.kind, scale=scale)
+        return Verdict(Decision(kernel=kernel), kernel.weight(plain), 1.0, residual, 0, at), opened
+
+    def _unsure(self, stream: LiveStream, at: Attachment, k: int, residual: Residual) -> Array:
+        """Covariance (m, m) of what is predicted of a residual, from pose and slow state together."""
+        timeline, window = self.problem.timeline, self._window
+        base = k if window.is_committed(keys.pose(k)) else k - 1
+        wanted = [keys.pose(base)]
+        J = residual.jacobian()
+        if residual.slow_jacobian is not None and at.slow_key is not None:
+            wanted.append(keys.slow(stream.number, timeline.slow_of[base]))
+            J = np.hstack([J, residual.slow_jacobian()])
+        if any(not window.is_committed(key) for key in wanted):
+            return np.zeros((len(residual.raw),) * 2)
+        P = np.array(window.covariance(wanted))
+        if base != k:  # what velocity adds on the way
+            dt_s = (timeline.stamps_ns[k] - timeline.stamps_ns[base]) * 1e-9
+            R = at.T_world_body.rotation().matrix()
+            P[3:6, 3:6] += dt_s**2 * R.T @ self._newest.velocity_cov @ R
+        return np.asarray(J @ P @ J.T)
+
+    def _by_hypotheses(self, stream: LiveStream) -> None:
+        """Judge the newest of a stream as one sequence; what is new, by the prediction."""
+        values, own = self._window.values, self._judged(stream)
+        if not own:
+            return
+        attached = [attach(self.problem, stream, e.index, values) for e in own]
+        residuals = [
+            stream.row.residuals(e.measurement, stream.config, at) for e, at in zip(own, attached, strict=True)
+        ]
+        predicted = [
+            self._unsure(stream, at, e.state, found[0]) if e.held is None and e.verdict.decision is None and not e.open_ else None
+            for e, at, found in zip(own, attached, residuals, strict=True)
+        ]  # fmt: skip
+        verdicts = by_hypotheses(stream, [e.index for e in own], attached, residuals, predicted)
+        for entry, verdict in zip(own, verdicts, strict=True):
+            settled = entry.verdict.settled + (entry.open_ and verdict.mode != entry.verdict.mode)
+            if not entry.open_ and verdict.weight < AGREES:
+                self._refuted.add(stream.name)
+            entry.open_ = True  # it has been judged
+            verdict = replace(verdict, settled=settled)
+            if self._differs(entry, verdict):
+                self._change(entry, verdict)
+            else:
+                entry.verdict = replace(verdict, decision=entry.verdict.decision, at=entry.verdict.at)
+
+    def _differs(self, entry: _Entry, verdict: Verdict) -> bool:
+        """Whether what is in the graph is not what was decided, or is linearised elsewhere."""
+        old = entry.verdict
+        if (entry.held is None) != (verdict.decision is None):
+            return True
+        if verdict.decision is None or old.decision is None:
+            return False
+        step = old.at.T_world_body.localCoordinates(verdict.at.T_world_body)
+        return (
+            verdict.mode != old.mode
+            or abs(verdict.decision.weight - old.decision.weight) > _CHANGED
+            or float(np.linalg.norm(step[3:])) > _MOVED_M
+            or float(np.linalg.norm(step[:3])) > _TURNED_RAD
+        )
+
+    def _change(self, entry: _Entry, verdict: Verdict) -> None:
+        """Take an entry out of the graph, and in again as it is judged now; it stays where its part has left."""
+        if entry.held is not None:
+            if not self._window.remove(entry.held):
+                return
+            entry.held = None
+        entry.verdict = verdict
+        self._put(entry)
+
+    def _put(self, entry: _Entry) -> None:
+        """Stage the factors of an entry."""
+        stream, verdict = entry.stream, entry.verdict
+        m = entry.measurement
+        if verdict.weight >= AGREES:
+            self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
+        if verdict.decision is None or verdict.decision.weight <= NEGLIGIBLE:
+            return
+        window, t = self._window, self._seconds(self.problem.timeline.stamps_ns[entry.state])
+        update = stream.row.factors(m, stream.config, verdict.at, verdict.decision)
+        for key, value in update.guesses:
+            if not window.values.exists(key):
+                window.guess(key, value, t)
+        used = {key for factor in update.factors for key in keys_of(factor)}
+        self._use_constants(stream, used)
+        entry.held = window.add(update.factors)
+
+    # Constants of a sensor: in the graph while they are seen, remembered when they are not
+
+    def _use_constants(self, stream: LiveStream, used: set[int]) -> None:
+        window, timeline = self._window, self.problem.timeline
+        now_s = self._seconds(timeline.stamps_ns[timeline.last])
+        for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
+            if key not in used:
+                continue
+            if not window.values.exists(key):
+                known = self._known.pop(key, None)
+                if known is None:
+                    value = np.zeros(len(constant.sigma))
+                    tails = gtsam.noiseModel.mEstimator.Cauchy.Create(float(np.sqrt(CONSTANT_TAILS)))
+                    model: Any = gtsam.noiseModel.Robust.Create(tails, gtsam.noiseModel.Diagonal.Sigmas(constant.sigma))
+                else:
+                    value, model = known.value, gtsam.noiseModel.Gaussian.Covariance(known.cov)
+                window.guess(key, value, now_s)
+                window.add([gtsam.PriorFactorVector(key, value, model)])
+            window.touch(key, now_s)
+
+    def _constants(self) -> Iterator[tuple[LiveStream, int, int]]:
+        for stream in self.problem.streams.values():
+            for k, key in enumerate(constant_keys(stream)):
+                yield stream, k, key
+
+    def _keep_constants(self, now_s: float) -> None:
+        for key in self._window.leaving([key for _, _, key in self._constants()], now_s):
+            value = np.atleast_1d(self._window.values.atVector(key))
+            self._known[key] = Beside(value=value, gain=np.zeros((len(value), 6)), cov=self._window.covariance([key]))
+
+    def anchor(self) -> Anchor:
+        """Return what is known at the newest state."""
+        timeline, window = self.problem.timeline, self._window
+        k = timeline.last
+        j = timeline.slow_of[k]
+        core = [keys.pose(k), keys.velocity(k), keys.bias(j)]
+        slow = {s.name: keys.slow(s.number, j) for s in self.problem.streams.values() if s.slow is not None}
+        constants = {(s.name, n): key for s, n, key in self._constants() if window.is_committed(key)}
+        kept = {(s.name, n): self._known[key] for s, n, key in self._constants() if key in self._known}
+        bias = window.values.atConstantBias(core[2])
+
+        def known(key: int) -> Beside:
+            return beside(np.atleast_1d(window.values.atVector(key)), window.covariance([core[0], key]))
+
+        return Anchor(
+            stamp_ns=timeline.stamps_ns[k],
+            pose=window.values.atPose3(core[0]),
+            velocity=np.asarray(window.values.atVector(core[1])),
+            bias=np.concatenate([bias.accelerometer(), bias.gyroscope()]),
+            cov=window.covariance(core),
+            slow={name: known(key) for name, key in slow.items()},
+            constants={**kept, **{name: known(key) for name, key in constants.items()}},
+        )
+
+    def track(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
+        """Return stamps (N,), places (N, 3), attitudes (N, 3, 3) and velocities (N, 3) of the body's origin."""
+        timeline, values, lever = self.problem.timeline, self._window.values, -self.problem.t_body_imu_m
+        states = range(timeline.first, len(timeline))
+        poses = [values.atPose3(keys.pose(k)) for k in states]
+        stamps = np.array([timeline.stamps_ns[k] for k in states], dtype=np.int64)
+        R = np.array([pose.rotation().matrix() for pose in poses])
+        bias = [values.atConstantBias(keys.bias(timeline.slow_of[k])).gyroscope() for k in states]
+        gyro = self.problem.links.gyro_at(stamps) - np.array(bias) @ self.problem.R_body_imu.T
+        v = np.array([values.atVector(keys.velocity(k)) for k in states])
+        p = np.array([pose.transformFrom(lever) for pose in poses])
+        return stamps, p, R, v + np.einsum("nij,nj->ni", R, np.cross(gyro, lever))
+
+    @property
+    def factor_slots(self) -> int:
+        return self._window.factor_slots

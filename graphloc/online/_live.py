@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A problem that grows at one end and is forgotten at the other (see `graphloc.build.Problem`)."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+import gtsam
+import numpy as np
+
+from graphloc.build import Carry
+from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
+from graphloc.frames import Array, Datum
+from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.measurements import ImuSeries, Measurement
+from graphloc.time import duration_ns
+
+T = TypeVar("T")
+_REMEMBERED = 50  # residuals that say how wide a sensor scatters
+
+
+class Tape(Generic[T]):
+    """A list that is forgotten from its beginning on; indices stay what they were."""
+
+    def __init__(self) -> None:
+        self._items: list[T] = []
+        self.first = 0
+
+    def __len__(self) -> int:
+        return self.first + len(self._items)
+
+    def __getitem__(self, k: int) -> T:
+        if k < self.first:
+            raise IndexError(f"{k} is forgotten")
+        return self._items[k - self.first]
+
+    def append(self, item: T) -> None:
+        self._items.append(item)
+
+    def forget(self, before: int) -> None:
+        del self._items[: max(before - self.first, 0)]
+        self.first = max(before, self.first)
+
+    @property
+    def kept(self) -> list[T]:
+        return self._items
+
+
+class LiveTimeline:
+    """States in turn, on a grid from `start_ns` on."""
+
+    def __init__(self, config: TimelineConfig, start_ns: int) -> None:
+        self._start_ns = start_ns
+        self._period_ns, self._slow_ns = duration_ns(1.0 / config.rate_hz), duration_ns(config.slow_period_s)
+        self.stamps_ns: Tape[int] = Tape()
+        self.slow_of: Tape[int] = Tape()
+        self.slow_stamps_ns: Tape[int] = Tape()
+        self._slow_step = -1
+        self.append(start_ns)
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def first(self) -> int:
+        """The oldest state that is not forgotten."""
+        return self.stamps_ns.first
+
+    @property
+    def last(self) -> int:
+        return len(self) - 1
+
+    @property
+    def due_ns(self) -> int:
+        """Stamp of the next state."""
+        return self.stamps_ns[self.last] + self._period_ns
+
+    def append(self, stamp_ns: int) -> None:
+        step = (stamp_ns - self._start_ns) // self._slow_ns
+        if step != self._slow_step:
+            self.slow_stamps_ns.append(stamp_ns)
+            self._slow_step = step
+        self.stamps_ns.append(stamp_ns)
+        self.slow_of.append(len(self.slow_stamps_ns) - 1)
+
+    def forget(self, before: int) -> None:
+        self.stamps_ns.forget(before)
+        self.slow_of.forget(before)
+        self.slow_stamps_ns.forget(self.slow_of[before])
+
+    def nearest(self, stamp_ns: int) -> int:
+        """Return the state nearest to a stamp."""
+        kept = self.stamps_ns.kept
+        right = min(max(bisect_left(kept, stamp_ns), 1), len(kept) - 1)
+        left = right - 1 if len(kept) > 1 else right
+        return self.first + (left if stamp_ns - kept[left] <= kept[right] - stamp_ns else right)
+
+    def floor(self, stamp_ns: int) -> int:
+        """Return the last state at or before a stamp (the first one for stamps before it)."""
+        return self.first + max(bisect_right(self.stamps_ns.kept, stamp_ns) - 1, 0)
+
+
+@dataclass(slots=True, eq=False)
+class LiveStream:
+    """The measurements of one sensor (see `graphloc.build.Stream`), by arrival."""
+
+    number: int
+    name: str
+    row: Sensor
+    config: SensorConfig
+    slow: SlowProcess | None
+    left_out: SlowProcess | None
+    constants: tuple[Constant, ...]
+    mount: Any
+    measurements: Tape[Measurement] = field(default_factory=Tape)
+    state: Tape[int] = field(default_factory=Tape)
+    carry: Tape[Carry | None] = field(default_factory=Tape)
+    gyro_radps: Tape[Array] = field(default_factory=Tape)
+    scatter: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+
+
+@dataclass(slots=True, eq=False)
+class LiveProblem:
+    """A vessel under way: what `attach` needs, and the IMU."""
+
+    config: VesselConfig
+    datum: Datum
+    timeline: LiveTimeline
+    t_body_imu_m: Array
+    R_body_imu: Array
+    links: InertialLink
+    streams: dict[str, LiveStream]
+
+    def take(self, m: Measurement) -> tuple[LiveStream, int]:
+        """Put a measurement where it belongs; return its stream and its index there."""
+        stream = self.streams[m.sensor]
+        floor = self.timeline.floor(m.stamp_ns)
+        at_ns = self.timeline.stamps_ns[floor]
+        carry = None
+        if m.stamp_ns > at_ns:
+            carry = (floor, self.links.integrate(at_ns, m.stamp_ns, gtsam.imuBias.ConstantBias()))
+        stream.measurements.append(m)
+        stream.state.append(self.timeline.nearest(m.stamp_ns))
+        stream.carry.append(carry)
+        stream.gyro_radps.append(self.links.gyro_at(np.array([m.stamp_ns]))[0])
+        return stream, len(stream.measurements) - 1
+
+
+def live_problem(
+    config: VesselConfig,
+    datum: Datum,
+    imu: ImuSeries,
+    start_ns: int,
+    rows: Sequence[Sensor],
+    inertial: InertialRow,
+    mounts: Mapping[str, tuple[Array, Array]],
+) -> LiveProblem:
+    """Return a problem whose first state stands at `start_ns`; `imu`: the samples that are known from there on."""
+    sensor = config.sensors[imu.sensor]
+
+    def mount_of(name: str) -> tuple[Array, Array]:
+        block = config.sensors[name]
+        return mounts.get(name, (block.mount.t_body_sensor_m, block.mount.R_body_sensor))
+
+    t, R = mount_of(imu.sensor)
+    by_kind = {row.kind: row for row in rows}
+    asked = {n: s for n, s in config.sensors.items() if s.kind in by_kind and s.enabled}
+    company = sum(by_kind[s.kind].company for s in asked.values())
+    streams = {}
+    for number, (name, block) in enumerate(config.sensors.items()):
+        if name not in asked:
+            continue
+        row = by_kind[block.kind]
+        slow = row.slow(block)
+        left_out = slow if slow is not None and slow.needs_company and company < 2 else None
+        t_sensor, R_sensor = mount_of(name)
+        mount = gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t)
+        kept = slow if left_out is None else None
+        streams[name] = LiveStream(number, name, row, block, kept, left_out, row.constants(block), mount)
+    return LiveProblem(
+        config=config,
+        datum=datum,
+        timeline=LiveTimeline(config.timeline, start_ns),
+        t_body_imu_m=t,
+        R_body_imu=R,
+        links=inertial.link(imu, sensor, R, datum.gravity_mps2, 1.0),
+        streams=streams,
+    )

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where world is, and what the configuration itself says of a run there."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphloc.build import mount_of
+from graphloc.config import VesselConfig
+from graphloc.errors import InputError
+from graphloc.frames import Datum, Geodetic
+from graphloc.graph import Sensor
+from graphloc.measurements import GnssPosition, Measurement
+from graphloc.recording import Recording
+
+_FAR_M = 200e3
+
+
+def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sensor]) -> Datum:
+    """Return the configured datum, or the median of the first fixes.
+
+    Raises:
+        InputError: none is configured, and there is no fix to take one from, or something is given in world.
+    """
+    if config.datum is not None:
+        datum = Datum(config.datum.geodetic)
+        _refuse_far_fixes(recording, datum)
+        return datum
+    refuse_world_without_datum(config, recording.source, rows)
+    fixes = np.array([m.position for m in recording.measurements if isinstance(m, GnssPosition)][:5])
+    if not len(fixes):
+        raise InputError(f"{recording.source}: {_why_no_fix(recording, config)}")
+    # Longitudes about the first one, so that fixes on both sides of the date line stay together.
+    fixes[:, 1] = fixes[0, 1] + (fixes[:, 1] - fixes[0, 1] + 180.0) % 360.0 - 180.0
+    return Datum(Geodetic(*(float(v) for v in np.median(fixes, axis=0))))
+
+
+def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:
+    """A forgotten minus sign puts the datum on the other side of the world, where nothing can be solved.
+
+    Raises:
+        InputError: most fixes lie farther away than any run goes.
+    """
+    fixes = [m.position for m in recording.measurements if isinstance(m, GnssPosition)]
+    if fixes:
+        away_m = np.linalg.norm(datum.enu_from_geodetic(*np.array(fixes).T), axis=1)
+        if np.median(away_m) > _FAR_M:
+            raise InputError(
+                f"{recording.source}: its fixes lie {np.median(away_m) / 1e3:.0f} km from `datum:`, near latitude "
+                f"{fixes[0].latitude_deg:.4f}, longitude {fixes[0].longitude_deg:.4f}: correct the datum"
+            )
+
+
+def _why_no_fix(recording: Recording, config: VesselConfig) -> str:
+    receivers = config.of_kind("gnss")
+    if not receivers:
+        return "no GNSS sensor to take a datum from; set datum: in vessel.yaml"
+    reasons = Counter(f"{row.sensor}: {row.reason}" for row in recording.rows if row.sensor in receivers)
+    if not reasons:
+        return f"no GNSS fix from {', '.join(receivers)}: the topic holds no message"
+    (reason, count), *_ = reasons.most_common(1)
+    return f"no usable GNSS fix: {count} messages of {reason}"
+
+
+def refuse_world_without_datum(config: VesselConfig, where: str, rows: Sequence[Sensor]) -> None:
+    """Refuse places in world that nothing says the origin of.
+
+    Raises:
+        InputError: there are such.
+    """
+    in_world = [f"sensors.{name}" for row in rows if row.in_world for name in config.of_kind(row.kind)]
+    in_world += ["truth_topic"] if config.truth_topic else []
+    if in_world and config.datum is None:
+        raise InputError(
+            f"{where}: {', '.join(in_world)}: places in world, but nothing says where world's origin is; "
+            "set datum: (`graphloc inspect` guesses it)"
+        )
+
+
+def with_synthetic(recording: Recording, config: VesselConfig, datum: Datum, rows: Sequence[Sensor]) -> Recording:
+    """Add the measurements that the configuration makes itself (the height prior)."""
+    if recording.imu is None or not len(recording.imu):
+        return recording
+    span = (int(recording.imu.stamps_ns[0]), int(recording.imu.stamps_ns[-1]))
+    added: list[Measurement] = []
+    for name, sensor in config.sensors.items():
+        row = next((r for r in rows if r.kind == sensor.kind), None)
+        if row is not None and row.synthetic is not None and sensor.enabled:
+            added.extend(row.synthetic(name, sensor, span, height_m(recording, config, sensor.height_m, datum)))
+    if not added:
+        return recording
+    every = sorted([*recording.measurements, *added], key=lambda m: (m.stamp_ns, m.seq))
+    return replace(recording, measurements=tuple(every))
+
+
+def height_m(recording: Recording, config: VesselConfig, configured_m: float | None, datum: Datum) -> float:
+    """Return the height of the body in world: as configured (ellipsoidal), or the median fix less its antenna's height."""
+    if configured_m is not None:
+        return configured_m - datum.origin.height_m
+    heights = [
+        m.position.height_m - float(mount_of(m.sensor, config.sensors[m.sensor], recording)[0][2])
+        for m in recording.measurements
+        if isinstance(m, GnssPosition)
+    ]
+    return float(np.median(heights)) - datum.origin.height_m if heights else 0.0
