@@ -23,6 +23,9 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Triple = tuple[Finite, Finite, Finite]
 
 
+_LONG = 40  # characters
+
+
 class Block(BaseModel):
     """A block of the configuration: unknown keys are errors, values are frozen."""
 
@@ -81,8 +84,20 @@ def one_line(error: ValidationError, model: type[BaseModel], where: str, prefix:
             lines.append(f"unknown key '{name}'{nearest(path[-1], _fields_at(model, path[:-1]))}")
         else:
             text = item["msg"].removeprefix("Value error, ")
-            lines.append(f"{name + ': ' if name else ''}{text} (got {item['input']!r:.80})")
+            whole_block = isinstance(item["input"], Mapping) and not item["type"].endswith("_type")
+            got = "" if whole_block else f" (got {_short(item['input'])})"
+            lines.append(f"{name + ': ' if name else ''}{text}{got}")
     return f"{where}: " + "; ".join(lines)
+
+
+def _short(given: object) -> str:
+    """What somebody wrote, or what kind of thing that is where it is long: the rest of the line is what they must read."""
+    text = repr(given)
+    if isinstance(given, Mapping):
+        return "a mapping"
+    if len(text) <= _LONG:
+        return text
+    return "a list" if isinstance(given, list) else f"{text[: _LONG - 3]}..."
 
 
 def read_mapping(path: Path | Traversable, cure: str = "") -> Mapping[str, Any]:

@@ -17,11 +17,12 @@ from graphloc.eval.match_picture import Gallery
 from graphloc.frames import Datum
 from graphloc.frontends.aerial import match_bag
 from graphloc.frontends.tags.sightings import info_beside, sightings_of_bag
+from graphloc.frontends.tags.sizes import size_factors
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import Measurement
+from graphloc.measurements import Measurement, TagSighting
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
-from graphloc.survey import load_survey
+from graphloc.survey import Survey, load_survey
 
 
 def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
@@ -40,6 +41,7 @@ def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
 
 
 _REASONS = 8  # that are said, of those why something was refused
+_DOUBTFUL = 0.5  # share of the images with tags, above which those that a limit refuses are said
 
 
 class _Gathering:
@@ -66,7 +68,7 @@ class _Gathering:
     def refuse(self, sensor: str, stamp_ns: int, why: str) -> None:
         self.rows.append(
             LedgerRow(
-                seq=self._seq, stamp_ns=stamp_ns, sensor=sensor, topic=self._topics[sensor], outcome=Outcome.REJECTED, reason=why
+                seq=self._seq, stamp_ns=stamp_ns, sensor=sensor, topic=f"({sensor})", outcome=Outcome.REJECTED, reason=why
             )
         )  # fmt: skip
         self._seq += 1
@@ -99,27 +101,53 @@ def with_sightings(
         cameras = {camera.topic for camera in sensor.cameras.values()}
         total, without = sum(r.count for r in recording.rows if r.topic in cameras), 0
         infos = {camera.info_topic or info_beside(camera.topic) for camera in sensor.cameras.values()}
-        gathered.sensor(name, dict.fromkeys(infos, f"read by {name} for its lens"))
+        taken: list[TagSighting] = []
+        reasons, doubts, shown = Counter[str](), Counter[str](), Counter[str]()
         found = sightings_of_bag(bags, name, sensor, config.body_frame, warn=gathered.said.append)
         for done, seen in enumerate(found, start=1):
             views += seen.views
             without += not seen.sightings
-            for sighting in seen.sightings:
-                gathered.take(sighting)
-            for trouble in seen.troubles:
-                gathered.refuse(name, seen.stamp_ns, trouble)
+            taken += seen.sightings
+            for why in (*seen.troubles, *seen.doubtful):
+                gathered.refuse(name, seen.stamp_ns, why)
+            reasons.update(seen.troubles)
+            doubts.update(seen.doubtful)
+            shown["doubtful"] += bool(seen.doubtful)
+            shown["tags"] += bool(seen.sightings or seen.views or seen.doubtful)
             progress("looking for tags", min(done, total), total)
+        _take_sized(gathered, name, taken, sensor.surveyed)
         read = f"read by {name}; {without} of {total} show no tag that can be used"
-        gathered.sensor(name, dict.fromkeys(cameras, read))
+        gathered.sensor(name, dict.fromkeys(infos, f"read by {name} for its lens") | dict.fromkeys(cameras, read))
         if total and without == total:
             gathered.said.append(
                 f"{name}: none of {total} images or lists shows a tag of the survey: look at one, at its ids and family"
             )
-        reasons = gathered.refused(name).most_common()
-        gathered.said += [f"{name}: {why} ({count} times)" for why, count in reasons[:_REASONS]]
+        if shown["doubtful"] > _DOUBTFUL * shown["tags"]:  # else a limit does what it is there for
+            gathered.said.append(
+                f"{name}: {shown['doubtful']} of {shown['tags']} images with tags show one that is refused, most often: "
+                f"{doubts.most_common(1)[0][0]}"
+            )
+        gathered.said += [f"{name}: {why} ({count} times)" for why, count in reasons.most_common(_REASONS)]
         if len(reasons) > _REASONS:
             gathered.said.append(f"{name}: {len(reasons) - _REASONS} more such reasons are in the ledger")
     return replace(gathered.recording(), tag_views=tuple(views))
+
+
+def _take_sized(gathered: _Gathering, name: str, sightings: Sequence[TagSighting], survey: Survey) -> None:
+    """Take the sightings but of frames whose tags have sizes that cannot be: a run that follows those is metres off."""
+    reasons = {}
+    for frame, factor in size_factors(sightings, survey).items():
+        off = 100.0 * abs(1.0 / factor - 1.0)
+        reasons[frame] = f"sizes in tags.yaml disagree with the spacing of the tags by {off:.0f} %"
+        gathered.said.append(
+            f"{name}: {reasons[frame]}: measure one, and how far apart they hang (in {frame} size_m times {factor:.2f} would "
+            "do; it is the black square without its white margin); until then no sighting of them is used"
+        )
+    for m in sightings:
+        if m.frame in reasons:
+            gathered.refuse(name, m.stamp_ns, reasons[m.frame])
+        else:
+            gathered.take(m)
 
 
 @dataclass(frozen=True, slots=True)

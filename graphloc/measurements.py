@@ -200,17 +200,23 @@ class TagSighting(Measurement):
         if not n or not self.modes:
             raise ValueError("a sighting needs a tag and a mode")
 
+    @property
+    def tags(self) -> tuple[tuple[str, int], ...]:
+        """What tells the tags from all others: family and id of each."""
+        return tuple(zip(self.families, self.numbers, strict=True))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TagView:
     """A tag that is seen, but not in the survey.
 
     Attributes:
-        family, number: of the tag. rays, cov: of its four corners, as in `TagSighting`.
+        camera: its name. family, number: of the tag. rays, cov: of its four corners, as in `TagSighting`.
         t_body_camera_m, R_body_camera: (3,), (3, 3) the camera's mount.
     """
 
     stamp_ns: int
+    camera: str
     family: str
     number: int
     rays: Array

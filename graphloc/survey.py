@@ -155,6 +155,11 @@ class Survey(Block):
         docks = tuple(dock for dock in self.docks if dock.name in frames)
         return self.model_copy(update={"tags": tags, "docks": docks})
 
+    def called(self, family: str, number: int) -> str:
+        """Return what messages call a tag: by its id, and by its family where the survey has several."""
+        several = len({tag.family for tag in self.tags}) > 1
+        return f"tag {number} ({family})" if several else f"tag {number}"
+
     def dock(self, frame: str) -> DockConfig | None:
         """Return the dock of a name; None for world."""
         return next((dock for dock in self.docks if dock.name == frame), None)

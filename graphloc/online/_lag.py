@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import gtsam
@@ -45,10 +46,16 @@ from graphloc.solve._solution import AGREES, row_of
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
 _CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
+_PAGE_S = 1.0
 _CHAPTER = 12  # hypotheses that are judged as one sequence
 _ROUNDS = 2  # of judging what is new
 _CHAIN = 2  # measurements that agree with each other, and not with the estimate
 _STEPS, _STEP_M = 3, 0.3  # of the solver in one commit, while the newest state moves
+
+
+@cache
+def _chi2_median(dof: int) -> float:
+    return float(chi2.median(dof))
 
 
 @dataclass(slots=True, eq=False)
@@ -140,6 +147,13 @@ class Lag:
     def _seconds(self, stamp_ns: int) -> float:
         return (stamp_ns - self._origin_ns) * 1e-9
 
+    def _page(self, stamp_ns: int) -> float:
+        """When keys of a stamp are told to be from: those of a page leave together.
+
+        What leaves is re-eliminated together with all that is newer: once a second, and not at every state.
+        """
+        return float(np.ceil(self._seconds(stamp_ns) / _PAGE_S)) * _PAGE_S
+
     # States
 
     def grow(self, stamp_ns: int) -> None:
@@ -148,7 +162,7 @@ class Lag:
         k, values = timeline.last, window.values
         j, before_ns = timeline.slow_of[k], timeline.stamps_ns[k]
         timeline.append(stamp_ns)
-        following, t = timeline.slow_of[k + 1], self._seconds(stamp_ns)
+        following, t = timeline.slow_of[k + 1], self._page(stamp_ns)
         bias = values.atConstantBias(keys.bias(j))
         pim = links.integrate(before_ns, stamp_ns, gtsam.imuBias.ConstantBias())
         there = pim.predict(nav_state(values, k), bias)
@@ -182,7 +196,7 @@ class Lag:
     def commit(self) -> None:
         """Estimate anew, and let go what has left."""
         timeline, window = self.problem.timeline, self._window
-        pose, now_s = keys.pose(timeline.last), self._seconds(timeline.stamps_ns[timeline.last])
+        pose, now_s = keys.pose(timeline.last), self._page(timeline.stamps_ns[timeline.last])
         self._keep_constants(now_s)
         before = window.values.atPose3(pose).translation()
         window.commit()
@@ -201,14 +215,13 @@ class Lag:
     def _read_newest(self) -> Newest:
         timeline, values = self.problem.timeline, self._window.values
         k = timeline.last
-        cov = self._window.covariance([keys.pose(k), keys.velocity(k)])
         return Newest(
             stamp_ns=timeline.stamps_ns[k],
             pose=values.atPose3(keys.pose(k)),
             velocity=np.asarray(values.atVector(keys.velocity(k))),
             bias=values.atConstantBias(keys.bias(timeline.slow_of[k])),
-            pose_cov=cov[:6, :6],
-            velocity_cov=cov[6:, 6:],
+            pose_cov=self._window.covariance([keys.pose(k)]),
+            velocity_cov=self._window.covariance([keys.velocity(k)]),
         )
 
     def _let_go(self) -> None:
@@ -360,7 +373,9 @@ class Lag:
     ) -> tuple[Verdict, bool]:
         """The sensor's kernel: as wide as its residuals scatter, and as the prediction is unsure. True: for that reason."""
         own, dof = stream.config.kernel, len(residual.raw)
-        spread = float(np.sqrt(np.median(stream.scatter) / chi2.median(dof))) if len(stream.scatter) >= dof + 4 else 1.0
+        spread = (
+            float(np.sqrt(np.median(stream.scatter) / _chi2_median(dof))) if len(stream.scatter) >= dof + 4 else 1.0
+        )
         scale = own.scale * max(1.0, spread) * float(np.sqrt(dof))
         plain = nis = residual.nis()
         opened = False
@@ -449,7 +464,7 @@ class Lag:
             self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
         if verdict.decision is None or verdict.decision.weight <= NEGLIGIBLE:
             return
-        window, t = self._window, self._seconds(self.problem.timeline.stamps_ns[entry.state])
+        window, t = self._window, self._page(self.problem.timeline.stamps_ns[entry.state])
         update = stream.row.factors(m, stream.config, verdict.at, verdict.decision)
         for key, value in update.guesses:
             if not window.values.exists(key):
@@ -462,7 +477,7 @@ class Lag:
 
     def _use_constants(self, stream: LiveStream, used: set[int]) -> None:
         window, timeline = self._window, self.problem.timeline
-        now_s = self._seconds(timeline.stamps_ns[timeline.last])
+        now_s = self._page(timeline.stamps_ns[timeline.last])
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
             if key not in used:
                 continue
@@ -497,17 +512,23 @@ class Lag:
         slow = {s.name: keys.slow(s.number, j) for s in self.problem.streams.values() if s.slow is not None}
         constants = {(s.name, n): key for s, n, key in self._constants() if window.is_committed(key)}
         kept = {(s.name, n): self._known[key] for s, n, key in self._constants() if key in self._known}
-        bias = window.values.atConstantBias(core[2])
+        every = [*core, *slow.values(), *constants.values()]
+        joint = window.covariance(every)
+        size = [6, 3, 6, *(len(np.atleast_1d(window.values.atVector(key))) for key in every[3:])]
+        start = dict(zip(every, np.cumsum([0, *size[:-1]]).tolist(), strict=True))
 
         def known(key: int) -> Beside:
-            return beside(np.atleast_1d(window.values.atVector(key)), window.covariance([core[0], key]))
+            value = np.atleast_1d(window.values.atVector(key))
+            picked = [*range(6), *range(start[key], start[key] + len(value))]
+            return beside(value, joint[np.ix_(picked, picked)])
 
+        bias = window.values.atConstantBias(core[2])
         return Anchor(
             stamp_ns=timeline.stamps_ns[k],
             pose=window.values.atPose3(core[0]),
             velocity=np.asarray(window.values.atVector(core[1])),
             bias=np.concatenate([bias.accelerometer(), bias.gyroscope()]),
-            cov=window.covariance(core),
+            cov=joint[:15, :15],
             slow={name: known(key) for name, key in slow.items()},
             constants={**kept, **{name: known(key) for name, key in constants.items()}},
         )

@@ -18,7 +18,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array
 
 _RELINEARIZE = 0.02  # of any tangent: m, rad, m/s; the gap to the batch is millimetres
-_FREE_EVERY = 1  # updates between relinearisations
+_FREE_EVERY = 3  # updates between relinearisations: as accurate as every one
 
 
 def keys_of(factor: Any) -> list[int]:
