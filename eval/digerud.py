@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 
 from graphloc.config import VesselConfig
+from graphloc.eval.docking import END_S, LOST_M
 from graphloc.eval.ekf import FilterResult, filter_row
 from graphloc.eval.metrics import errors
 from graphloc.frames import Array, Datum
@@ -41,7 +42,6 @@ from graphloc.trajectory import Trajectory
 _H = np.kron(np.eye(3), [1.0, 0.0])  # (3, 6): places of x, vx, y, vy, z, vz
 _FOCAL_PX = 1069.38  # his; OpenCV refines too little where it is given rays instead of pixels
 _ATTITUDE_RAD = float(np.radians(10.0))  # of a pose at about 10 m, unless it is flipped; his filter has no attitude
-_OFF_M, _END_S = 2.0, 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +52,8 @@ class DigerudConfig:
         dt_s: time step, the same for every sighting, s; None: the true one. Q is one step's in either case.
         r: variance of the measured place, each axis, m^2.
         gate_m: poses that far from the state, or farther, are dropped.
-        number: id of the tag that is used (his: 227); None: the one seen most often. One camera: that which sees it most.
+        number: id of the tag that is used (his: 227), of the family that is seen most with it; None: the tag seen most
+            often. One camera: that which sees it most.
     """
 
     dt_s: float | None = 0.04
@@ -82,18 +83,19 @@ def run_digerud(
         for m in recording.measurements
         if isinstance(m, TagSighting) and (sensor := config.sensors.get(m.sensor)) is not None and sensor.enabled
     ]
-    seen = Counter((m.sensor, m.camera, n) for m in sightings for n in m.numbers if o.number in (None, n))
+    seen = Counter((m.sensor, m.camera, tag) for m in sightings for tag in m.tags if o.number in (None, tag[1]))
     if not seen:
         return None
-    *camera, number = seen.most_common(1)[0][0]
+    chosen = seen.most_common(1)[0][0]
+    his = chosen[2]
     ledger = Ledger()
     out: dict[int, tuple[_State, Array]] = {}
     state: _State | None = None
     for m in sightings:
-        if [m.sensor, m.camera] != camera or number not in m.numbers:
+        if (m.sensor, m.camera, his) != chosen or his not in m.tags:
             ledger.add(filter_row(m, recording, None, "not of the one tag and camera that it uses"))
             continue
-        pose = single_tag_pose(m, number)
+        pose = single_tag_pose(m, his)
         if pose is None:
             ledger.add(filter_row(m, recording, None, "no pose from its corners"))
             continue
@@ -112,14 +114,14 @@ def run_digerud(
     return FilterResult(name="Digerud KF", trajectory=_track(out, timed=o.dt_s is None), ledger=ledger)
 
 
-def single_tag_pose(m: TagSighting, number: int) -> tuple[Array, Array] | None:
+def single_tag_pose(m: TagSighting, tag: tuple[str, int]) -> tuple[Array, Array] | None:
     """Return p_world_camera (3,) m and R_world_camera (3, 3) by one tag alone: of its two poses that which fits better.
 
     Infinitesimal plane-based pose estimation gives both, Levenberg-Marquardt brings each to its minimum of the
     reprojection error, all corners weighing the same. The tag's frame is taken at rest. None: the solver finds none, as
     for corners on a line.
     """
-    first = 4 * m.numbers.index(number)
+    first = 4 * m.tags.index(tag)
     corners, pixels = m.points_m[first : first + 4], m.rays[first : first + 4] * _FOCAL_PX
     # x right, y down, z into the print. With z towards the camera some frontal tags, seen without noise, come out wrong.
     right, down = corners[1] - corners[0], corners[3] - corners[0]
@@ -205,10 +207,10 @@ def losses(result: FilterResult, truth: Trajectory) -> Losses:
         NoCommonTimeError: it covers none.
     """
     stamps, error, _, _, _ = errors(result.trajectory, truth)
-    off = np.hypot(error[:, 0], error[:, 1]) > _OFF_M
+    off = np.hypot(error[:, 0], error[:, 1]) > LOST_M
     step_s = float(np.median(np.diff(truth.stamps_ns))) / NS_PER_S
     return Losses(
-        at_end=bool(off[stamps > stamps[-1] - round(_END_S * NS_PER_S)].all()),
+        at_end=bool(off[stamps > stamps[-1] - round(END_S * NS_PER_S)].all()),
         lost_s=float(off.sum()) * step_s,
         covered_s=len(stamps) * step_s,
     )

@@ -248,6 +248,8 @@ def _matches(pictures: Sequence[tuple[str, bytes]]) -> str:
 
 def _stats(solution: Solution) -> str:
     s = solution.stats
+    if s.online:
+        return f"<p>Online: {s.states} poses, each as it was known at its time.</p>"
     return (
         f"<p>{s.states} states, {s.factors} factors, {s.passes} passes, {s.iterations} iterations; "
         f"{'converged' if s.converged else 'NOT converged'}. Cost {s.cost:.0f}, expected {s.expected_cost:.0f} "

@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from graphloc.config import VesselConfig
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import TagSighting
@@ -32,8 +33,10 @@ _TURNED_DEG, _STEADY = 6.0, 0.5
 # All tags of a camera elsewhere together.
 _TOGETHER_M = 5.0
 
+Key = tuple[str, tuple[str, int]]  # of a tag: its sensor; its family and id
 
-def suspect_tags(recording: Recording, solution: Solution) -> list[str]:
+
+def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution) -> list[str]:
     """Return a line for each tag most of whose sightings disagree with the run, and what would explain it."""
     rows = {row.seq: row for row in solution.ledger if row.seq >= 0}
     track = solution.trajectory
@@ -43,22 +46,38 @@ def suspect_tags(recording: Recording, solution: Solution) -> list[str]:
     turned = _turned_mounts(sightings, rows, solution)
     if turned:  # then nothing else that tags say can be judged
         return turned
-    lines = [*_late(sightings, solution)]
-    sized = _by_spacing(sightings) | _by_the_others(sightings)
-    lines += sized.values()
-    by_tag: dict[tuple[str, int], list[TagSighting]] = defaultdict(list)
+    images = _by_image(sightings)
+    said = _by_spacing(images) | _by_the_others(images)
+    by_tag: dict[Key, list[TagSighting]] = defaultdict(list)
     for m in sightings:
         if len(m.numbers) == 1:
-            by_tag[(m.sensor, m.numbers[0])].append(m)
-    for (sensor, number), own in sorted(by_tag.items()):
+            by_tag[_key(m)].append(m)
+    for key, own in sorted(by_tag.items()):
         doubted = [m for m in own if _weight(rows, m) < 0.5]
-        if (sensor, number) in sized or len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
+        if key in said or len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
             continue
         stamps, where = np.unique([m.stamp_ns for m in doubted], return_inverse=True)  # two cameras may see it at once
         at = track.at(stamps)
-        said = _explained(doubted, at.p_world_m[where], at.R_world_body[where])
-        lines.append(f"{sensor}: tag {number}: {len(doubted)} of {len(own)} sightings disagree with the rest; {said}")
-    return lines
+        why = _explained(doubted, at.p_world_m[where], at.R_world_body[where])
+        said[key] = f"{len(doubted)} of {len(own)} sightings disagree with the rest; {why}"
+    surveys = {name: sensor.surveyed for name, sensor in config.of_kind("apriltag").items()}
+    return [
+        *_late(sightings, solution),
+        *(f"{sensor}: {surveys[sensor].called(*tag)}: {line}" for (sensor, tag), line in said.items()),
+    ]
+
+
+def _key(m: TagSighting) -> Key:
+    """Of a sighting of one tag."""
+    return m.sensor, m.tags[0]
+
+
+def _by_image(sightings: list[TagSighting]) -> list[list[TagSighting]]:
+    """What one image shows of one frame."""
+    images: dict[tuple[str, str, str, int], list[TagSighting]] = defaultdict(list)
+    for m in sightings:
+        images[(m.sensor, m.camera, m.frame, m.stamp_ns)].append(m)
+    return list(images.values())
 
 
 def _weight(rows: Mapping[int, LedgerRow], m: TagSighting) -> float:
@@ -76,60 +95,54 @@ def _in_camera(m: TagSighting) -> Array:
     return np.asarray(mode.R_world_camera.T @ (m.points_m.mean(axis=0) - mode.p_world_camera_m))
 
 
-def _by_spacing(sightings: list[TagSighting]) -> dict[tuple[str, int], str]:
-    """Return a line by (sensor, tag) where tags of one image, none of which fits another, are all of a wrong size.
+def _by_spacing(images: list[list[TagSighting]]) -> dict[Key, str]:
+    """Return a line by tag where tags of one image, none of which fits another, are all of a wrong size.
 
     How far apart they look, in units of their size, holds for any track, and the one that they gave may be wrong.
     """
-    images: dict[tuple[str, str, str, int], list[TagSighting]] = defaultdict(list)
-    for m in sightings:
-        if len(m.numbers) == 1:
-            images[(m.sensor, m.camera, m.frame, m.stamp_ns)].append(m)
-    ratios: dict[tuple[str, int], list[float]] = defaultdict(list)
-    size_m = {(m.sensor, m.numbers[0]): _size_m(m) for m in sightings if len(m.numbers) == 1}
-    for own in images.values():
-        for a, b in combinations(own, 2):
+    ratios: dict[Key, list[float]] = defaultdict(list)
+    size_m: dict[Key, float] = {}
+    for own in images:
+        for a, b in combinations((m for m in own if len(m.numbers) == 1), 2):
             apart = float(np.linalg.norm(a.points_m.mean(axis=0) - b.points_m.mean(axis=0)))
             ratio = apart / max(float(np.linalg.norm(_in_camera(a) - _in_camera(b))), 1e-6)
             for m in (a, b):
-                ratios[(m.sensor, m.numbers[0])].append(ratio)
+                ratios[_key(m)].append(ratio)
+                size_m[_key(m)] = _size_m(m)
     said = {}
     for key, found in sorted(ratios.items()):
         median = float(np.median(found))
         scatter = float(np.median(np.abs(np.array(found) - median)))
         if len(found) >= _FEWEST and abs(median - 1.0) > _OFF and scatter < _ALIKE * median:
             said[key] = (
-                f"{key[0]}: tag {key[1]}: beside the tags next to it, it looks {median:.2f} times as large as the survey says: "
+                f"beside the tags next to it, it looks {median:.2f} times as large as the survey says: "
                 f"size_m {size_m[key] * median:.3f} instead of {size_m[key]:.3f} would do ({_MARGIN})"
             )
     return said
 
 
-def _by_the_others(sightings: list[TagSighting]) -> dict[tuple[str, int], str]:
-    """Return a line by (sensor, tag) for each that others of its images, which agree, show in another place.
+def _by_the_others(images: list[list[TagSighting]]) -> dict[Key, str]:
+    """Return a line by tag for each that others of its images, which agree, show in another place.
 
     It holds for any track: one that follows the wrong tag, and turns the vessel by 13 deg to do so, finds nothing amiss.
     """
-    images: dict[tuple[str, str, str, int], list[TagSighting]] = defaultdict(list)
-    for m in sightings:
-        images[(m.sensor, m.camera, m.frame, m.stamp_ns)].append(m)
-    shown: dict[tuple[str, int], list[Array]] = defaultdict(list)
-    for own in images.values():
+    shown: dict[Key, list[Array]] = defaultdict(list)
+    for own in images:
         most = max(own, key=lambda m: len(m.numbers))
         if len(most.numbers) < 2:
             continue
         camera = most.modes[0]
         for m in (m for m in own if len(m.numbers) == 1):
             place = camera.p_world_camera_m + camera.R_world_camera @ _in_camera(m)
-            shown[(m.sensor, m.numbers[0])].append(place - m.points_m.mean(axis=0))
+            shown[_key(m)].append(place - m.points_m.mean(axis=0))
     said = {}
     for key, found in sorted(shown.items()):
         moved = np.median(found, axis=0)
         scatter = np.median(np.linalg.norm(np.array(found) - moved, axis=1))
         if len(found) >= _FEWEST and np.linalg.norm(moved) > max(_ELSEWHERE_M, 2.0 * float(scatter)):
             said[key] = (
-                f"{key[0]}: tag {key[1]}: the tags beside it, which agree, show it {moved[0]:.1f} m east, {moved[1]:.1f} m north, "
-                f"{moved[2]:.1f} m above its place in the survey"
+                f"the tags beside it, which agree, show it {moved[0]:.1f} m east, {moved[1]:.1f} m north, {moved[2]:.1f} m "
+                "above its place in the survey"
             )
     return said
 

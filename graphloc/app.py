@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 from graphloc import origin, outputs
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig, load_config
-from graphloc.errors import InputError
+from graphloc.errors import InputError, SolveError
 from graphloc.eval import ekf, holdout, metrics, report
 from graphloc.eval.digerud import run_digerud
 from graphloc.eval.docking import docking_table
@@ -32,6 +32,7 @@ from graphloc.frontends.tags.unsurveyed import Riding, estimate_tags, only_besid
 from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.recording import Progress, Recording, quiet
+from graphloc.replay import Status, replay, silent
 from graphloc.solution import Solution
 from graphloc.solve import smooth
 from graphloc.survey import WORLD, Survey, TagConfig
@@ -86,17 +87,44 @@ def smooth_recording(
         solution = _solved(recording, config, datum, progress)
     filters: tuple[ekf.FilterResult, ...] = ()
     if compare:
-        progress("filters", 0, 1)
-        filters = ekf.run_all(recording, config, datum)
-        his = run_digerud(recording, config, datum)
-        filters += (his,) if his is not None else ()
-        progress("filters", 1, 1)
+        filters = _causal(recording, config, datum, progress)
     tags, said = _about_tags(recording, config, solution)
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
         filters=filters, pictures=tuple(gallery.pictures()), tags=tags,
     )  # fmt: skip
     return _comparable(run)
+
+
+def _causal(
+    recording: Recording, config: VesselConfig, datum: Datum, progress: Progress
+) -> tuple[ekf.FilterResult, ...]:
+    """What can be had at the time: the online mode, and the filters."""
+    progress("filters", 0, 1)
+    filters = ekf.run_all(recording, config, datum)
+    his = run_digerud(recording, config, datum)
+    filters += (his,) if his is not None else ()
+    progress("filters", 1, 1)
+    status = lambda at_s, whole_s, *_: progress("online", int(at_s), int(whole_s))
+    try:
+        online = replay(recording, config, datum=datum, status=status).solution
+    except SolveError:
+        return filters  # what it waited for is what `graphloc replay` says
+    return (ekf.FilterResult(name="graphloc online", trajectory=online.trajectory, ledger=online.ledger), *filters)
+
+
+def replay_recording(
+    recording: Recording,
+    config: VesselConfig,
+    *,
+    scans: Scans | None = None,
+    rate: float | None = None,
+    lag_s: float = 10.0,
+    status: Status = silent,
+) -> Run:
+    """Run a recording through the online mode (see `graphloc.replay`)."""
+    replayed = replay(recording, config, scans=scans, rate=rate, lag_s=lag_s, status=status)
+    return _comparable(Run(recording=replayed.recording, config=config, solution=replayed.solution))
 
 
 def _about_tags(
@@ -332,6 +360,7 @@ __all__ = [
     "choose_datum",
     "load",
     "match_at",
+    "replay_recording",
     "seen_frames",
     "sha256",
     "simulated",

@@ -143,6 +143,58 @@ def compare(
     _smooth(bag, config, out, hold_out, overwrite, as_json, compare=True)
 
 
+def _status_line() -> Callable[[float, float, object, str], None]:
+    """A live line on stderr, on a terminal only."""
+    import time
+
+    from graphloc.estimate import Estimate
+
+    shown_s, live = 0.0, sys.stderr.isatty()
+    begun = time.monotonic()
+
+    def show(at_s: float, whole_s: float, estimate: object, waiting: str) -> None:
+        nonlocal shown_s
+        if not live or (time.monotonic() - shown_s < 0.2 and at_s < whole_s - 0.2):
+            return
+        shown_s = time.monotonic()
+        text = f"{at_s:7.1f} of {whole_s:.0f} s, {at_s / max(shown_s - begun, 1e-3):.1f} x: "
+        if isinstance(estimate, Estimate):
+            since = ", ".join(f"{name} {s:.1f} s" for name, s in estimate.since_agreed_s.items())
+            text += f"{estimate.health}, within {estimate.bound_95_m:.2f} m; agreed: {since}"
+        else:
+            text += f"waiting for {waiting}"
+        sys.stderr.write(f"\r\033[K{text[:118]}")
+        sys.stderr.flush()
+
+    return show
+
+
+@app.command()
+def replay(
+    bag: BagArgument,
+    config: ConfigOption,
+    out: OutOption,
+    rate: Annotated[
+        float | None, typer.Option(min=0.01, help="Times the run's own time, as 1; by default as fast as it can.")
+    ] = None,
+    lag: Annotated[float, typer.Option(min=1.0, help="How long measurements are re-judged, s.")] = 10.0,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a bag through the online mode, as a vessel would have, and write the run folder."""
+    from graphloc import app as application
+    from graphloc import outputs
+
+    outputs.check_folder(out, overwrite=overwrite)
+    recording, vessel = application.load(bag, config, _progress())
+    scans = application.Scans(tuple(bag), config.parent)
+    run = application.replay_recording(recording, vessel, scans=scans, rate=rate, lag_s=lag, status=_status_line())
+    if sys.stderr.isatty():
+        sys.stderr.write("\r\033[K")
+    report = application.write(run, out, inputs=bag, command=" ".join(sys.argv[1:]), overwrite=overwrite)
+    _print_run(run, report, as_json)
+
+
 @app.command()
 def match(
     bag: BagArgument,

@@ -44,7 +44,7 @@ _REASONS = 8  # that are said, of those why something was refused
 _DOUBTFUL = 0.5  # share of the images with tags, above which those that a limit refuses are said
 
 
-class _Gathering:
+class Gathering:
     """A recording that gains measurements: each, and each thing that gave none, is a row of the ledger."""
 
     def __init__(self, recording: Recording) -> None:
@@ -61,11 +61,15 @@ class _Gathering:
             for r in self.rows
         ]
 
-    def take(self, measurement: Measurement) -> None:
-        self._measurements.append(replace(measurement, seq=self._seq))
+    def take(self, measurement: Measurement) -> Measurement:
+        """Number a measurement, and keep it."""
+        numbered = replace(measurement, seq=self._seq)
+        self._measurements.append(numbered)
         self._seq += 1
+        return numbered
 
     def refuse(self, sensor: str, stamp_ns: int, why: str) -> None:
+        """Enter what gave no measurement."""
         self.rows.append(
             LedgerRow(
                 seq=self._seq, stamp_ns=stamp_ns, sensor=sensor, topic=f"({sensor})", outcome=Outcome.REJECTED, reason=why
@@ -78,6 +82,7 @@ class _Gathering:
         return Counter(row.reason for row in self.rows if row.sensor == sensor and row.outcome is Outcome.REJECTED)
 
     def recording(self) -> Recording:
+        """Return the recording with all that it gained."""
         return replace(
             self._recording,
             measurements=tuple(sorted(self._measurements, key=lambda m: (m.stamp_ns, m.seq))),
@@ -96,7 +101,7 @@ def with_sightings(
     Raises:
         InputError: a camera that cannot be used.
     """
-    gathered, views = _Gathering(recording), list(recording.tag_views)
+    gathered, views = Gathering(recording), list(recording.tag_views)
     for name, sensor in config.of_kind("apriltag").items():
         cameras = {camera.topic for camera in sensor.cameras.values()}
         total, without = sum(r.count for r in recording.rows if r.topic in cameras), 0
@@ -133,7 +138,7 @@ def with_sightings(
     return replace(gathered.recording(), tag_views=tuple(views))
 
 
-def _take_sized(gathered: _Gathering, name: str, sightings: Sequence[TagSighting], survey: Survey) -> None:
+def _take_sized(gathered: Gathering, name: str, sightings: Sequence[TagSighting], survey: Survey) -> None:
     """Take the sightings but of frames whose tags have sizes that cannot be: a run that follows those is metres off."""
     reasons = {}
     for frame, factor in size_factors(sightings, survey).items():
@@ -172,7 +177,7 @@ def with_matches(
     Raises:
         InputError: an image or LiDAR that cannot be used.
     """
-    gathered, track = _Gathering(recording), solution.trajectory
+    gathered, track = Gathering(recording), solution.trajectory
     span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
     for name, sensor in config.of_kind("aerial").items():
         gathered.sensor(name, dict.fromkeys((lidar.topic for lidar in sensor.lidars.values()), f"read by {name}"))

@@ -54,6 +54,7 @@ class SolveStats:
         cost: 2 x final weighted cost (a chi-square if the model holds); expected_cost: its degrees of freedom.
         converged: whether the last pass moved no state noticeably.
         warnings: one line each, for the report.
+        online: each pose is as it was known then; passes, factors and cost say nothing.
     """
 
     passes: int
@@ -64,6 +65,7 @@ class SolveStats:
     expected_cost: float
     converged: bool
     warnings: tuple[str, ...] = ()
+    online: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

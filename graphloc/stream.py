@@ -45,6 +45,7 @@ from graphloc.frontends.decode import DECODERS, NAV_SAT_FIX, POSE, TWIST, Reject
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, ImuSample, Measurement, PoseFix, PoseMode
 from graphloc.online import OnlineSmoother
+from graphloc.origin import refuse_world_without_datum
 from graphloc.plain import plain
 from graphloc.time import NS_PER_S, duration_ns
 
@@ -435,10 +436,14 @@ class _Session:
         if rows and self._ledger:
             self.say("ledger", {"rows": [plain(asdict(row)) for row in rows]})
 
-    def news(self) -> None:
-        """Write what happened, and what the start waits for where that changed."""
+    def events(self) -> None:
+        """Write what happened."""
         for text in self._smoother.events():
             self.say("event", {"text": text})
+
+    def news(self) -> None:
+        """Write what happened, and what the start waits for where that changed."""
+        self.events()
         if self._smoother.waiting_for != self._waiting:
             self._waiting = self._smoother.waiting_for
             if self._waiting:
@@ -490,7 +495,7 @@ def run(
             session.estimate(found)
         session.account(smoother.rows())
     session.account(smoother.finish())
-    session.news()
+    session.events()  # at the end nothing is waited for
     session.say("end", {"lines": number, "counts": session.counts})
 
 
@@ -544,7 +549,7 @@ def serve(
     """Run from standard input to standard output, until the input ends, SIGTERM or Ctrl-C.
 
     Raises:
-        ConfigError: the vessel.yaml cannot be used, or asks for what only a bag has.
+        GraphlocError: the vessel.yaml cannot be used, or asks for what only a bag has.
     """
     config = load_config(config_path, KINDS)
     _refuse(config, str(config_path))
@@ -562,13 +567,12 @@ def serve(
 
 
 def _refuse(config: VesselConfig, where: str) -> None:
+    refuse_world_without_datum(config, where, SENSORS)
     enabled = {name: sensor for name, sensor in config.sensors.items() if sensor.enabled}
     for name, sensor in enabled.items():
         if sensor.mount.tf_frame:
             raise ConfigError(
                 f"{where}: sensors.{name}.mount.tf_frame: a stream has no /tf_static; give xyz_m and rpy_deg"
             )
-        if sensor.kind == PoseLine.kind and config.datum is None:
-            raise ConfigError(f"{where}: sensors.{name} gives places in world: set datum:")
         if sensor.kind in ("aerial", "apriltag"):
             log.warning("%s: sensors.%s: a stream has no line for kind %s; it stays silent", where, name, sensor.kind)

@@ -42,7 +42,7 @@ def test_posterior_is_that_of_all_128_sequences(sequence: FalseSequence) -> None
     assert sequence.log_evidence() == pytest.approx(np.logaddexp.reduce(logs))
 
 
-def stream_of(offsets: Array, repeats: float = 0.5) -> tuple[Any, list[tuple[Residual, ...]]]:
+def stream_of(offsets: Array, repeats: float = 0.5) -> tuple[Any, range, list[tuple[Residual, ...]]]:
     """A stream of matches at 1 Hz whose residuals lie at `offsets` (N, 2), m."""
     model = FalseModel(probability=0.4, cov=np.eye(2) * 25.0, repeats=repeats)
     measurements = [SimpleNamespace(stamp_ns=n * 1_000_000_000) for n in range(len(offsets))]
@@ -52,7 +52,7 @@ def stream_of(offsets: Array, repeats: float = 0.5) -> tuple[Any, list[tuple[Res
         (Residual(raw=o, cov=cov, jacobian=lambda: np.zeros((2, 6)), prior=0.6, size_m=None, size_deg=None),)
         for o in offsets
     ]
-    return stream, found
+    return stream, range(len(found)), found
 
 
 def test_the_longest_slow_offset_is_the_right_one() -> None:

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans matched one turn at a time, around a track that may still grow: offline and online go through here."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from graphloc.config import AerialConfig
+from graphloc.errors import InputError
+from graphloc.frames import Array, Datum
+from graphloc.frontends.aerial.bl import BLMatcher
+from graphloc.frontends.aerial.cloud import Cloud, level
+from graphloc.frontends.aerial.image import AerialImage
+from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
+from graphloc.trajectory import Trajectory
+
+_JITTER_S = 0.05  # stamps are not a clock
+_AHEAD_NS = 300_000_000  # an IMU's messages are not later than that; a stamp farther ahead is on another clock
+_CARRIED_S = (5.0, 60.0)  # how long inertial sensors carry a place, and a heading, to a match's accuracy
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turn:
+    """One scan of each LiDAR; or why one of them cannot be used.
+
+    Attributes:
+        stamp_ns: of the newest scan; of a message without one, when it arrived.
+        arrival_ns: when the message arrived that ended the turn: its last, or the first of the next one where a LiDAR
+            is silent. Turns come in this order.
+    """
+
+    stamp_ns: int
+    arrival_ns: int
+    clouds: tuple[Cloud, ...]
+    why_not: str = ""
+
+    @property
+    def last_ns(self) -> int:
+        """Stamp of its last point, or of its newest scan if that is later: headers may tell the begin of a scan."""
+        return max([self.stamp_ns, *(int(c.stamps_ns.max()) for c in self.clouds if len(c.stamps_ns))])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matched:
+    """A match and its stamp; or why there is none.
+
+    Attributes:
+        news: (3,) shares of its east, north and yaw that the match before has not told (`AerialConfig.alike_m`).
+    """
+
+    stamp_ns: int
+    match: Match | None
+    why_not: str
+    news: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+class LiveMatcher:
+    """Matches turns as they come, as often as the configuration says.
+
+    One caller at a time, from any thread. It holds open files, so another process makes its own: what it is made
+    from, turns and tracks can be pickled. So can answers, but a `Match` holds the map around it (some 50 MB): send
+    its `fix`. Do not fork for it, threads of numba's OpenMP do not survive that.
+
+    Args:
+        folder: relative paths of maps count from there. mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name.
+
+    Raises:
+        InputError: a map that cannot be used.
+    """
+
+    def __init__(
+        self, config: AerialConfig, folder: Path, datum: Datum, mounts: Mapping[str, tuple[Array, Array]]
+    ) -> None:
+        self._config, self._mounts = config, mounts
+        self._matcher = _matcher(config, folder, datum)
+        self._submap: deque[Turn] = deque(maxlen=config.submap)
+        self._last: tuple[Array, int] | None = None  # place and stamp of the last turn that was due
+        self._before: tuple[Array, int] | None = None  # and of the last one that had a mode
+
+    def offer(self, turn: Turn, track: Trajectory, *, growing: bool = True) -> Matched | Literal["wait"] | None:
+        """Match a turn if it is due. Turns are offered in their order, the same one again after "wait".
+
+        Args:
+            track: body in world about the turn, two poses or more. The submap is laid by this track alone; what it
+                does not cover any more is left out.
+            growing: whether the track will reach further; else nothing waits.
+
+        Returns:
+            A match; or why there is none of a turn that is damaged or lies outside of the track for good. None: not
+            due. "wait": the track ends before the turn does, by little; nothing has changed.
+        """
+        if turn.why_not:
+            return Matched(turn.stamp_ns, None, turn.why_not)
+        end_ns = int(track.stamps_ns[-1])
+        if growing and turn.stamp_ns <= end_ns + _AHEAD_NS and turn.last_ns > end_ns:
+            return "wait"
+        if why_not := outside(turn, track):
+            return Matched(turn.stamp_ns, None, why_not)
+        self._submap.append(turn)
+        if not self._due(turn.stamp_ns, track):
+            return None
+        item = self.match(self._submap, track)
+        if item.match is not None and item.match.modes:
+            here = (item.match.prior.pose[:2], item.stamp_ns)
+            item = replace(item, news=_news(self._before, here, self._config.alike_m))
+            self._before = here
+        return item
+
+    def _due(self, stamp_ns: int, track: Trajectory) -> bool:
+        config, here = self._config, track.at(np.array([stamp_ns])).p_world_m[0]
+        if self._last is not None:
+            moved_m = float(np.hypot(*(here - self._last[0])[:2]))
+            waited_s = (stamp_ns - self._last[1]) / 1e9
+            too_soon = waited_s < config.every_s - _JITTER_S or (moved_m < config.every_m and waited_s < config.still_s)
+            if waited_s >= 0.0 and too_soon:  # a clock that was set back begins anew
+                return False
+        self._last = (here, stamp_ns)
+        return True
+
+    def match(self, turns: Sequence[Turn], track: Trajectory) -> Matched:
+        """Match the last of some turns that a track covers, those before it laid together with it; due or not."""
+        newest, config = turns[-1], self._config
+        stamps = np.sort(np.concatenate([c.stamps_ns for c in newest.clouds] + [np.array([newest.stamp_ns])]))
+        at_ns = int(stamps[len(stamps) // 2])  # not a median, which goes through floats
+        try:
+            cloud = level([c for turn in turns for c in turn.clouds], self._mounts, track, at_ns, config.waterline_m)
+            pose = track.at(np.array([at_ns]))
+            sigma = np.array([1.0, 1.0, np.radians(2.0)])
+            if pose.cov is not None:
+                sigma = np.sqrt(np.diagonal(pose.cov[0])[[0, 1, 5]])
+            prior = Prior(np.array([*pose.p_world_m[0, :2], pose.yaw_rad[0]]), sigma)
+            found = self._matcher.match(cloud, prior)
+        except InputError as error:
+            return Matched(at_ns, None, str(error))
+        return Matched(at_ns, found, found.why_not)
+
+
+def outside(turn: Turn, track: Trajectory) -> str:
+    """Say which scans lie outside of a track; empty: none does."""
+    stamps = np.array([c.stamp_ns for c in turn.clouds], dtype=np.int64)
+    if track.covers(stamps).all():
+        return ""
+    off_s = (stamps - track.stamps_ns[0]) / 1e9
+    names = ", ".join(f"{c.lidar} {t:+.1f} s" for c, t in zip(turn.clouds, off_s, strict=True))
+    return f"scans outside of the track, from its begin: {names}"
+
+
+def _matcher(config: AerialConfig, folder: Path, datum: Datum) -> Matcher | BLMatcher:
+    if config.matcher == "posterior":
+        return Matcher(config, folder, datum)
+    if not config.image:
+        raise InputError("vessel.yaml: an aerial sensor with matcher: bl needs an `image`")
+    return BLMatcher(config, AerialImage(folder / config.image, datum), config.seed)
+
+
+def _news(before: tuple[Array, int] | None, here: tuple[Array, int], alike_m: float) -> tuple[float, float, float]:
+    """What a match adds to a mean, were errors a first-order Markov process along the way: (1 - r) / (1 + r).
+
+    The mean is over what inertial sensors carry: what was known of a place is forgotten sooner than a heading.
+    """
+    if before is None or alike_m == 0.0:
+        return (1.0, 1.0, 1.0)
+    way = float(np.hypot(*(here[0] - before[0]))) / alike_m
+    waited_s = abs(here[1] - before[1]) / 1e9
+    place, heading = (float(np.tanh(0.5 * max(way, waited_s / carried_s))) for carried_s in _CARRIED_S)
+    return (place, place, heading)

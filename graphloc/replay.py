@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording through the online mode: what a vessel would have known at the time.
+
+Messages come in the order in which they arrived; sightings of tags and matches of scans, which take a
+front-end, when the IMU has reached their stamp. A match is made around the smoother's own prediction.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphloc.config import VesselConfig
+from graphloc.errors import SolveError
+from graphloc.estimate import Estimate
+from graphloc.factors import INERTIAL, SENSORS
+from graphloc.frames import Datum
+from graphloc.frontends._source import Bag
+from graphloc.frontends.aerial.live import LiveMatcher, Turn
+from graphloc.frontends.aerial.scans import ScanFeed
+from graphloc.gather import Gathering, Scans
+from graphloc.ledger import Ledger, LedgerRow
+from graphloc.measurements import ImuSample, Measurement, TagSighting
+from graphloc.online import OnlineSmoother
+from graphloc.recording import Recording
+from graphloc.solution import Solution, SolveStats
+from graphloc.trajectory import Trajectory
+
+Status = Callable[[float, float, Estimate | None, str], None]
+"""Called with s of the run, its whole length, the newest estimate, and what the start waits for."""
+
+
+def silent(_at_s: float, _whole_s: float, _estimate: Estimate | None, _waiting: str) -> None:
+    """A `Status` that says nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Replayed:
+    """What a replay gives.
+
+    Attributes:
+        recording: with the matches that were made. solution: each pose as it was known then. estimates: N of these.
+        update_s: (N,) time that each took, s.
+    """
+
+    recording: Recording
+    solution: Solution
+    estimates: tuple[Estimate, ...]
+    update_s: np.ndarray
+
+
+def arrivals(recording: Recording) -> Iterator[Measurement]:
+    """Yield IMU samples and measurements as they arrived; those that a front-end made, when the IMU got there.
+
+    A simulation without a bag has no order of arrival: its stamps stand in.
+    """
+    imu = recording.imu
+    samples = () if imu is None else zip(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps, imu.seqs, strict=True)
+    messages: list[Measurement] = [
+        ImuSample(stamp_ns=int(s), sensor=imu.sensor if imu else "", seq=int(q), accel_mps2=a, gyro_radps=w)
+        for s, a, w, q in samples
+    ]
+    made: list[Measurement] = []
+    for m in recording.measurements:
+        if m.seq >= 0:
+            (
+                made if isinstance(m, TagSighting) or recording.topics.get(m.sensor, "").startswith("(") else messages
+            ).append(m)
+    if recording.source.startswith("("):
+        messages, made = [*messages, *made], []
+        messages.sort(key=lambda m: (m.stamp_ns, m.seq))
+    else:
+        messages.sort(key=lambda m: m.seq)
+    made.sort(key=lambda m: -m.stamp_ns)
+    for m in messages:
+        yield m
+        while isinstance(m, ImuSample) and made and made[-1].stamp_ns <= m.stamp_ns:
+            yield made.pop()
+    yield from reversed(made)
+
+
+class _Matching:
+    """The scans of one aerial sensor, each matched as soon as the smoother has got there."""
+
+    def __init__(self, name: str, config: VesselConfig, scans: Scans, bag: Bag, gathering: Gathering) -> None:
+        self._name, self._sensor, self._scans = name, config.sensors[name], scans
+        self._feed = ScanFeed(bag, self._sensor, config.body_frame)
+        self._turns = iter(self._feed)
+        self._matcher: LiveMatcher | None = None
+        self._gathering = gathering
+        self._next: Turn | None = next(self._turns, None)
+        gathering.sensor(
+            name, dict.fromkeys((lidar.topic for lidar in self._sensor.lidars.values()), f"read by {name}")
+        )
+
+    def due(self, smoother: OnlineSmoother, now_ns: int) -> Iterator[Measurement]:
+        """Yield the matches that can be made now."""
+        while self._next is not None and self._next.last_ns <= now_ns:
+            turn, window, datum = self._next, smoother.window(), smoother.datum
+            if window is None or datum is None or len(window) < 2:
+                self._gathering.refuse(
+                    self._name, turn.stamp_ns, turn.why_not or "there was no estimate to match around"
+                )
+                self._next = next(self._turns, None)
+                continue
+            if self._matcher is None:
+                self._matcher = LiveMatcher(self._sensor, self._scans.folder, datum, self._feed.mounts)
+            found = self._matcher.offer(turn, window)
+            if found == "wait":
+                return
+            self._next = next(self._turns, None)
+            if found is None:
+                continue
+            if found.match is not None and found.match.modes:
+                yield self._gathering.take(found.match.fix(found.stamp_ns, self._name, found.news, self._sensor.axes))
+            else:
+                self._gathering.refuse(self._name, found.stamp_ns, found.why_not)
+
+
+def replay(
+    recording: Recording,
+    config: VesselConfig,
+    *,
+    scans: Scans | None = None,
+    rate: float | None = None,
+    lag_s: float = 10.0,
+    datum: Datum | None = None,
+    smoother: OnlineSmoother | None = None,
+    status: Status = silent,
+) -> Replayed:
+    """Run a recording through the online mode.
+
+    Args:
+        scans: where the scans of aerial sensors are matched from; None: matches that are in the recording are taken.
+        rate: of the run's own time; None: as fast as it can. datum: origin of world; None: as `OnlineSmoother` finds it.
+        smoother: another than a fresh one, for tests.
+
+    Raises:
+        SolveError: it never started. InputError: a map or LiDAR that cannot be used.
+    """
+    smoother = smoother or OnlineSmoother(
+        config, rows=SENSORS, inertial=INERTIAL, datum=datum, mounts=recording.mounts, lag_s=lag_s
+    )
+    if scans is not None:
+        recording = replace(
+            recording,
+            measurements=tuple(m for m in recording.measurements if m.sensor not in config.of_kind("aerial")),
+        )
+    gathering = Gathering(recording)
+    estimates: list[Estimate] = []
+    took_s: list[float] = []
+    rows: list[LedgerRow] = []
+    said: list[str] = []
+    imu = recording.imu
+    first_ns, last_ns = (int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])) if imu is not None and len(imu) else (0, 0)
+    begun = time.monotonic()
+
+    def feed(m: Measurement) -> None:
+        before = time.perf_counter()
+        estimate = smoother.feed(m)
+        if estimate is not None:
+            took_s.append(time.perf_counter() - before)
+            estimates.append(estimate)
+            status((estimate.stamp_ns - first_ns) / 1e9, (last_ns - first_ns) / 1e9, estimate, "")
+        rows.extend(smoother.rows())
+        said.extend(smoother.events())
+
+    with ExitStack() as stack:
+        matchings = [
+            _Matching(name, config, scans, stack.enter_context(Bag(scans.bags)), gathering)
+            for name in (config.of_kind("aerial") if scans is not None else ())
+            if scans is not None
+        ]
+        tried = -1
+        for m in arrivals(recording):
+            if rate is not None and isinstance(m, ImuSample):
+                ahead_s = (m.stamp_ns - first_ns) / 1e9 / rate - (time.monotonic() - begun)
+                if ahead_s > 0.0:
+                    time.sleep(ahead_s)
+            feed(m)
+            if isinstance(m, ImuSample):
+                for matching in matchings:
+                    for match in matching.due(smoother, m.stamp_ns):
+                        feed(match)
+                second = (m.stamp_ns - first_ns) // 1_000_000_000
+                if smoother.waiting_for and second != tried:
+                    tried = second
+                    status(float(second), (last_ns - first_ns) / 1e9, None, smoother.waiting_for)
+    waiting = smoother.waiting_for
+    rows += smoother.finish()
+    said += smoother.events()
+    if not estimates:
+        raise SolveError(f"{recording.source}: never started: it waited for {waiting or 'IMU data'}")
+    recording = gathering.recording()
+    matched = {row.seq for row in rows}
+    rows += [row for row in recording.rows if row.seq not in matched or row.seq < 0]
+    solution = _solution(estimates, Ledger(rows), smoother, said)
+    return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=np.array(took_s))
+
+
+def _solution(estimates: Sequence[Estimate], ledger: Ledger, smoother: OnlineSmoother, said: Sequence[str]) -> Solution:
+    """Each pose as it was known then; where a restart went back in time, the newer one counts."""
+    kept: list[Estimate] = []
+    for estimate in estimates:
+        while kept and kept[-1].stamp_ns >= estimate.stamp_ns:
+            kept.pop()
+        kept.append(estimate)
+    assert smoother.datum is not None
+    stamps = np.array([e.stamp_ns for e in kept], dtype=np.int64)
+    names = kept[-1].since_agreed_s
+    return Solution(
+        datum=smoother.datum,
+        trajectory=Trajectory(
+            stamps_ns=stamps,
+            p_world_m=np.array([e.p_world_m for e in kept]),
+            R_world_body=np.array([e.R_world_body for e in kept]),
+            v_world_mps=np.array([e.v_world_mps for e in kept]),
+            cov=np.array([e.cov for e in kept]),
+        ),
+        v_cov=np.array([e.v_cov for e in kept]),
+        accel_bias_mps2=np.array([e.accel_bias_mps2 for e in kept]),
+        gyro_bias_radps=np.array([e.gyro_bias_radps for e in kept]),
+        gyro_radps=np.array([e.gyro_radps for e in kept]),
+        health=tuple(e.health for e in kept),
+        health_reason=tuple(e.reason for e in kept),
+        since_agreed_s={n: np.array([e.since_agreed_s[n] for e in kept]) for n in names},
+        slow={},
+        berths=(),
+        ledger=ledger,
+        stats=SolveStats(
+            passes=0, iterations=len(estimates), states=len(kept), factors=0, cost=0.0, expected_cost=0.0, converged=True,
+            warnings=tuple(line for line in said if not line.startswith("started")),
+            online=True,
+        ),
+    )  # fmt: skip
