@@ -196,6 +196,22 @@ def replay(
 
 
 @app.command()
+def stream(
+    config: ConfigOption,
+    rate: Annotated[
+        float | None, typer.Option("--rate", min=0.001, max=1000.0, help="Estimates a second; default: each new state.")
+    ] = None,
+    ledger: Annotated[bool, typer.Option("--ledger", help="Write rows of the ledger, too.")] = False,
+    lag: Annotated[float, typer.Option("--lag", min=1.0, help="How long measurements are re-judged, s.")] = 10.0,
+    snapshot: Annotated[Path | None, typer.Option("--snapshot", help="File to resume from after a restart.")] = None,
+) -> None:
+    """Read measurements from standard input, write estimates to standard output: lines of JSON (docs/online-stream.md)."""
+    from graphloc.stream import serve
+
+    serve(config, rate_hz=rate, ledger=ledger, lag_s=lag, snapshot=snapshot)
+
+
+@app.command()
 def match(
     bag: BagArgument,
     config: ConfigOption,

@@ -304,6 +304,9 @@ def test_slow_states_and_constants() -> None:
     np.testing.assert_allclose(first.sigma, [0.03] * 3 + [np.radians(0.5)] * 3)
     assert (second.sigma > 0.0).all()
     quay = AprilTagConfig(survey=Survey.model_validate({"tags": tags[:1]}))
+    assert [c.name for c in ROW.constants(config)] == ["tag 7", "tag 8"]
+    twins = AprilTagConfig(survey=Survey.model_validate({"tags": [TAG, {**TAG, "family": "25h9"}]}))
+    assert [c.name for c in ROW.constants(twins)] == ["tag 7 (36h11)", "tag 7 (25h9)"]
     assert ROW.slow(quay) is None
     assert ROW.slow(AprilTagConfig()) is None
 

@@ -1,6 +1,7 @@
 """Digerud's filter against a scalar one written here, and his pose of one tag against synthetic sightings."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from graphloc.trajectory import Trajectory
 DATUM = Datum(Geodetic(63.4, 10.4, 0.0))
 HALF_M = 0.206
 SQUARE = HALF_M * np.array([(-1.0, 0.0, 1.0), (1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (-1.0, 0.0, -1.0)])  # faces south
+HIS = ("36h11", 227)
 AIM = np.array([0.4, 0.0, 0.2])  # beside the tag
 LEVER, R_BODY_CAMERA = np.array([0.8, 0.1, 0.5]), np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -77,7 +79,7 @@ def camera_track(result: FilterResult) -> Array:
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
     """The filter alone: the pose of a tag is the sighting's mode, to the last digit."""
 
-    def told(m: TagSighting, _number: int) -> tuple[Array, Array]:
+    def told(m: TagSighting, _tag: tuple[str, int]) -> tuple[Array, Array]:
         return m.modes[0].p_world_camera_m, m.modes[0].R_world_camera
 
     monkeypatch.setattr(digerud, "single_tag_pose", told)
@@ -224,7 +226,7 @@ def test_pose_of_one_tag_alone(view: str, tag: int) -> None:
     noise = np.full((12, 2), 0.01)
     noise[4 * tag : 4 * tag + 4] = 0.0  # the others are off by 10 px, which must not matter
     m = sighting(0, 0.0, p, R, tags=[(5, -1.5), (227, 0.0), (9, 1.5)], noise=noise)
-    pose = single_tag_pose(m, m.numbers[tag])
+    pose = single_tag_pose(m, m.tags[tag])
     assert pose is not None
     assert pose[0] == pytest.approx(p, abs=1e-3)
     assert pose[1] == pytest.approx(R, abs=1e-3)
@@ -234,7 +236,7 @@ def test_frontal_pose_is_loose_across_only() -> None:
     """Straight ahead the tilt shows to second order only: 0.1 px at 4 m are 1 cm of range, but decimetres sideways."""
     rng = np.random.default_rng(0)
     p = np.array([0.0, -4.0, 0.0])
-    poses = [single_tag_pose(sighting(0, 0.0, p, noise=rng.normal(0.0, 1e-4, (4, 2))), 227) for _ in range(20)]
+    poses = [single_tag_pose(sighting(0, 0.0, p, noise=rng.normal(0.0, 1e-4, (4, 2))), HIS) for _ in range(20)]
     places = np.array([pose[0] for pose in poses if pose is not None])
     assert len(places) == 20
     assert np.abs(np.linalg.norm(places, axis=1) - 4.0).max() < 0.01
@@ -245,15 +247,15 @@ def test_no_pose_where_the_solver_has_none() -> None:
     """Corners on one point; and straight ahead without any noise, where OpenCV divides by zero."""
     p = np.array([0.0, -4.0, 0.0])
     rays = sighting(0, 0.0, p).rays
-    assert single_tag_pose(sighting(0, 0.0, p, noise=rays[:1] - rays), 227) is None
-    assert single_tag_pose(sighting(0, 0.0, p), 227) is None
+    assert single_tag_pose(sighting(0, 0.0, p, noise=rays[:1] - rays), HIS) is None
+    assert single_tag_pose(sighting(0, 0.0, p), HIS) is None
 
 
 @pytest.mark.parametrize("east_m", [0.0, 1e-6, 1e-3, 0.04, 0.2])
 @pytest.mark.parametrize("aim", [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.0, 0.2)])
 def test_without_noise_a_frontal_pose_is_right_or_none(east_m: float, aim: tuple[float, float, float]) -> None:
     p = np.array([east_m, -4.0, 0.0])
-    pose = single_tag_pose(sighting(0, 0.0, p, looking(p, np.array(aim))), 227)
+    pose = single_tag_pose(sighting(0, 0.0, p, looking(p, np.array(aim))), HIS)
     assert pose is None or abs(np.linalg.norm(pose[0]) - np.linalg.norm(p)) < 0.01
 
 
@@ -273,7 +275,7 @@ def test_of_both_poses_the_better_one_is_taken() -> None:
         starts = [np.concatenate([q, Rotation.from_matrix(looking(q, AIM)).as_rotvec()]) for q in (p, mirrored)]
         minima = [least_squares(misfit, start, x_scale="jac", xtol=1e-12) for start in starts]
         best = min(minima, key=lambda minimum: float(minimum.cost))
-        pose = single_tag_pose(m, 227)
+        pose = single_tag_pose(m, HIS)
         assert pose is not None
         ours = np.concatenate([pose[0], Rotation.from_matrix(pose[1]).as_rotvec()])
         assert 0.5 * np.sum(misfit(ours) ** 2) <= best.cost + 1e-6
@@ -350,6 +352,20 @@ def test_every_sighting_is_in_the_ledger() -> None:
     ]
     assert len(result.trajectory) == 6
     assert ran(seen, DigerudConfig(number=9)).ledger.counts()["tags"] == {"rejected": 5, "used": 4}
+
+
+def test_one_id_in_two_families_is_two_tags() -> None:
+    """One alone, then both, the one of no account with corners that are 10 px off."""
+    p = np.array([3.0, -8.0, 0.5])
+    alone = [replace(sighting(k, 0.1 * k, p), families=("25h9",)) for k in range(3)]
+    noise = np.zeros((8, 2))
+    noise[:4] = 0.01
+    pair = [(227, 1.5), (227, 0.0)]
+    both = [replace(sighting(k, 0.1 * k, p, tags=pair, noise=noise), families=("25h9", "36h11")) for k in range(3, 7)]
+    his = [sighting(k, 0.1 * k, p) for k in range(7, 12)]
+    result = ran([*alone, *both, *his])
+    assert result.ledger.counts()["tags"] == {"rejected": 3, "used": 9}
+    assert camera_track(result) == pytest.approx(np.tile(p, (9, 1)), abs=1e-3)
 
 
 def test_no_track_without_two_sightings() -> None:

@@ -82,7 +82,7 @@ def test_numbers_of_an_approach_by_hand() -> None:
     assert table["berth_p95_m"] == pytest.approx(0.01)
     seen = truth.p_world_m[50:, 1]
     assert table["sighted_rmse_m"] == pytest.approx(0.01 * np.sqrt(np.mean(seen**2)))
-    assert (table["wrong_side"], table["dnv_met"], table["matched"]) == (0.0, 1.0, 1.0)
+    assert (table["lost"], table["wrong_side"], table["dnv_met"], table["matched"]) == (0.0, 0.0, 1.0, 1.0)
 
 
 def test_nothing_counts_before_the_first_sighting() -> None:
@@ -93,7 +93,7 @@ def test_nothing_counts_before_the_first_sighting() -> None:
     assert table["position_p95_8_to_12_m"] == pytest.approx(0.02)
     assert table["sighted_rmse_m"] == pytest.approx(0.02)
     blind = docking_table([("a", estimate)], truth, QUAY, truth.stamps_ns[:0]).as_dict()["a"]
-    assert {k for k, v in blind.items() if v is not None} == {"berth_p95_m", "wrong_side"}
+    assert {k for k, v in blind.items() if v is not None} == {"berth_p95_m", "lost", "wrong_side"}
 
 
 def test_what_is_not_covered_is_none() -> None:
@@ -130,23 +130,27 @@ def test_dnv_is_ten_centimetres(off_m: float, met: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("true", "estimate", "wrong"),
+    ("true", "estimate", "lost", "wrong"),
     [
-        ((3.5, -2.0), (0.5, -2.0), 1.0),  # mirrored about the tag at east 2
-        ((3.5, -2.0), (2.1, -2.0), 0.0),  # as far off as it may be on the right side
-        ((2.4, -2.0), (1.3, -2.0), 1.0),
-        ((2.4, -2.0), (1.5, -2.0), 0.0),  # on the other side, but 0.9 m off
-        ((2.4, -2.0), (2.4, 0.5), 1.0),  # through the quay
-        ((2.4, -0.4), (2.4, 0.4), 0.0),
-        ((2.4, -2.0), (9.0, -9.0), 0.0),  # bad, but in front and to the right
-        ((-3.5, -2.0), (-0.5, -2.0), 1.0),  # about the other tag
+        ((3.5, -2.0), (0.5, -2.0), 1.0, 1.0),  # mirrored about the tag at east 2
+        ((3.5, -2.0), (2.1, -2.0), 0.0, 0.0),  # as far off as it may be on the right side
+        ((2.4, -2.0), (1.3, -2.0), 0.0, 1.0),
+        ((2.4, -2.0), (1.5, -2.0), 0.0, 0.0),  # on the other side, but 0.9 m off
+        ((2.4, -2.0), (2.4, 0.5), 1.0, 1.0),  # through the quay
+        ((2.4, -0.4), (2.4, 0.4), 0.0, 0.0),
+        ((2.4, -2.0), (2.4, -3.9), 0.0, 0.0),
+        ((2.4, -2.0), (2.4, -4.1), 1.0, None),  # in front and to the right, and yet of no use: no 0 that reads as good
+        ((2.4, -2.0), (22.0, -22.0), 1.0, None),
+        ((-3.5, -2.0), (-0.5, -2.0), 1.0, 1.0),  # about the other tag
     ],
 )
-def test_wrong_side(true: tuple[float, float], estimate: tuple[float, float], wrong: float) -> None:
+def test_lost_and_wrong_side(
+    true: tuple[float, float], estimate: tuple[float, float], lost: float, wrong: float | None
+) -> None:
     truth = track(np.tile(true, (100, 1)))
     other = track(np.vstack([np.tile(true, (40, 1)), np.tile(estimate, (60, 1))]))
     row = docking_table([("a", other)], truth, QUAY, truth.stamps_ns[:1]).as_dict()["a"]
-    assert row["wrong_side"] == wrong
+    assert (row["lost"], row["wrong_side"]) == (lost, wrong)
 
 
 def test_table_is_like_the_others() -> None:

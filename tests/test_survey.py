@@ -75,6 +75,28 @@ def test_what_cannot_be_used_is_one_line_with_the_file_and_the_entry(tmp_path: P
     assert "\n" not in line
 
 
+@pytest.mark.parametrize(
+    ("text", "end"),
+    [
+        (entry(size_m=None), "tags.0.size_m: Field required"),
+        (entry(facing_deg=None), "tag 3 needs rpy_deg or facing_deg, one of them"),
+        (entry() + f"docks: [{{name: {'a' * 50}}}, {{name: {'a' * 50}}}]", "none may be called 'world'"),
+        (entry(xyz_m="[1, 2]"), "tags.0.xyz_m.2: Field required (got [1, 2])"),
+        (entry(xyz_m="{x: 1, y: 2}"), "Input should be a valid tuple (got a mapping)"),
+        (entry(size_m="[1, 2, 3]"), "(got [1, 2, 3])"),
+        (entry(size_m=f"[{'1, ' * 50}]"), "(got a list)"),
+        (entry(facing_deg="s" * 60), f"(got '{'s' * 36}...)"),
+        (entry(size_m="-0.4"), "(got -0.4)"),
+    ],
+)
+def test_what_was_given_is_said_in_short(tmp_path: Path, text: str, end: str) -> None:
+    """A whole block in the middle of a line hides what is wrong with it."""
+    path = written(tmp_path, text)
+    with pytest.raises(ConfigError) as caught:
+        load_survey(path)
+    assert str(caught.value).endswith(end)
+
+
 def test_a_file_that_is_not_there_says_who_names_it(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"cannot be read .*`survey:` of the apriltag sensor names it"):
         load_survey(tmp_path / "tags.yaml")

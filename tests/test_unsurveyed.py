@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array
-from graphloc.frontends.tags.unsurveyed import estimate_tags
-from graphloc.measurements import TagView
+from graphloc.frontends.tags.unsurveyed import estimate_tags, only_beside
+from graphloc.measurements import TagMode, TagSighting, TagView
 from graphloc.survey import TagConfig
 from graphloc.trajectory import Trajectory
 from tests.tagfactory import AHEAD, FACES_SOUTH, SIGMA, SIZE_M, UNIT, degrees_between, rays_of
@@ -38,7 +38,7 @@ def views_of(
     corners = place_m + SIZE_M * UNIT @ FACES_SOUTH.T
     return [
         TagView(
-            stamp_ns=k * STEP_NS, family="36h11", number=number, cov=np.eye(8) * SIGMA**2, t_body_camera_m=CAMERA_M,
+            stamp_ns=k * STEP_NS, camera="bow", family="36h11", number=number, cov=np.eye(8) * SIGMA**2, t_body_camera_m=CAMERA_M,
             rays=rays_of(corners, p[k] + R[k] @ CAMERA_M, R[k] @ AHEAD) + rng.normal(0.0, SIGMA, (4, 2)),
             R_body_camera=AHEAD,
         )
@@ -176,7 +176,7 @@ def _unit(v: Array) -> Array:
 
 def _with_rays(view: TagView, rays: Array) -> TagView:
     return TagView(
-        stamp_ns=view.stamp_ns, family=view.family, number=view.number, rays=rays, cov=view.cov,
+        stamp_ns=view.stamp_ns, camera=view.camera, family=view.family, number=view.number, rays=rays, cov=view.cov,
         t_body_camera_m=view.t_body_camera_m, R_body_camera=view.R_body_camera,
     )  # fmt: skip
 
@@ -234,3 +234,28 @@ def test_two_cameras_may_see_it_at_once() -> None:
     views = views_of(p, R, np.random.default_rng(0)) + views_of(p, R, np.random.default_rng(1))
     (tag,), _ = estimate_tags(views, track_of(p, R), SIZE_M)
     assert np.linalg.norm(np.array(tag.xyz_m) - PLACE_M) < 0.1
+
+
+def beside(view: TagView, frame: str, camera: str = "bow") -> TagSighting:
+    """A surveyed tag of a frame in the image of a view."""
+    mode = TagMode(p_world_camera_m=np.zeros(3), R_world_camera=np.eye(3), cov=np.eye(6), probability=1.0)
+    return TagSighting(
+        stamp_ns=view.stamp_ns, sensor="tags", seq=0, camera=camera, frame=frame, numbers=(1,), families=("36h11",),
+        points_m=np.zeros((4, 3)), pivot_m=np.zeros(3), rays=np.zeros((4, 2)), cov=np.eye(8), t_body_camera_m=CAMERA_M,
+        R_body_camera=AHEAD, modes=(mode,),
+    )  # fmt: skip
+
+
+def test_beside_whose_tags_a_tag_is_seen() -> None:
+    """In the same image: another camera at the same time looks elsewhere. Beside two docks, or a dock and the quay: none."""
+    p, R = passing("arc", 6)
+    views = views_of(p, R, np.random.default_rng(0))
+    on_pier = [beside(v, "pier") for v in views[:3]]
+    of = ("36h11", 77)
+    assert only_beside(views, on_pier) == {of: ("tags", "pier")}
+    assert only_beside(views, [*on_pier, beside(views[4], "world", "stern")]) == {of: ("tags", "pier")}
+    assert only_beside(views, [*on_pier, beside(views[4], "world")]) == {}
+    assert only_beside(views, [*on_pier, beside(views[4], "raft")]) == {}
+    assert only_beside(views, [beside(v, "pier", "stern") for v in views]) == {}
+    assert only_beside(views, [beside(v, "world") for v in views]) == {}
+    assert only_beside(views, []) == {}

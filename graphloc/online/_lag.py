@@ -8,10 +8,11 @@ hypotheses is judged as the batch does it, as a sequence, against the prediction
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator
+import heapq
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import count
 from typing import Any
 
 import gtsam
@@ -100,11 +101,14 @@ class Lag:
     Raises (every method): SolveError: from then on it is of no use.
     """
 
-    def __init__(self, problem: LiveProblem, anchor: Anchor, lag_s: float) -> None:
+    def __init__(
+        self, problem: LiveProblem, anchor: Anchor, lag_s: float, guess: tuple[gtsam.Pose3, Array, Array] | None = None
+    ) -> None:
         self.problem, self._window = problem, Window(lag_s)
         self._origin_ns, self._lag_s = anchor.stamp_ns, lag_s
         self._entries: dict[tuple[int, int], _Entry] = {}
-        self._again: deque[tuple[float, _Entry]] = deque()
+        self._again: list[tuple[float, int, _Entry]] = []  # a heap: when, and in turn
+        self._turn = count()
         self._rounds: dict[str, int] = {}
         self._refuted: set[str] = set()  # sensors of which something new was judged false
         self._tried: dict[str, frozenset[tuple[int, int | None]]] = {}
@@ -112,14 +116,15 @@ class Lag:
         self._known: dict[int, Beside] = {}
         self._gone: list[LedgerRow] = []
         self.agreed_ns: dict[str, int] = {}
-        self._begin(anchor)
+        self._begin(anchor, guess or (anchor.pose, anchor.velocity, anchor.bias))
 
-    def _begin(self, anchor: Anchor) -> None:
+    def _begin(self, anchor: Anchor, guess: tuple[gtsam.Pose3, Array, Array]) -> None:
         window = self._window
         state = (keys.pose(0), keys.velocity(0), keys.bias(0))
-        window.guess(state[0], anchor.pose, 0.0)
-        window.guess(state[1], anchor.velocity, 0.0)
-        window.guess(state[2], gtsam.imuBias.ConstantBias(anchor.bias[:3], anchor.bias[3:]), 0.0)
+        pose, velocity, bias = guess
+        window.guess(state[0], pose, 0.0)
+        window.guess(state[1], velocity, 0.0)
+        window.guess(state[2], gtsam.imuBias.ConstantBias(bias[:3], bias[3:]), 0.0)
         window.add(anchor.factors(*state))
         for stream in self.problem.streams.values():
             if stream.slow is not None:
@@ -133,6 +138,7 @@ class Lag:
                 if (stream.name, k) in anchor.constants:
                     self._known[key] = anchor.constants[(stream.name, k)]
         window.commit()
+        self._committed = 0  # the last state that the solver has
         self._newest = self._read_newest()
 
     @property
@@ -202,20 +208,18 @@ class Lag:
         window.commit()
         for _ in range(_STEPS - 1):
             here = window.values.atPose3(pose).translation()
-            moved_m = float(np.linalg.norm(here - before))
-            if not np.isfinite(moved_m):
-                raise SolveError("the solver's result is not a number")
-            if moved_m < _STEP_M:
+            if not float(np.linalg.norm(here - before)) >= _STEP_M:
                 break
             before = here
             window.settle()
+        self._committed = timeline.last
         self._let_go()
         self._newest = self._read_newest()
 
     def _read_newest(self) -> Newest:
         timeline, values = self.problem.timeline, self._window.values
         k = timeline.last
-        return Newest(
+        newest = Newest(
             stamp_ns=timeline.stamps_ns[k],
             pose=values.atPose3(keys.pose(k)),
             velocity=np.asarray(values.atVector(keys.velocity(k))),
@@ -223,6 +227,10 @@ class Lag:
             pose_cov=self._window.covariance([keys.pose(k)]),
             velocity_cov=self._window.covariance([keys.velocity(k)]),
         )
+        arrays = (newest.pose.matrix(), newest.velocity, newest.bias.vector(), newest.pose_cov, newest.velocity_cov)
+        if not all(np.isfinite(a).all() for a in arrays) or min(np.diagonal(newest.pose_cov)) <= 0.0:
+            raise SolveError("the solver's result is not a number")
+        return newest
 
     def _let_go(self) -> None:
         """Forget the states that have left the window, and enter their measurements into the ledger."""
@@ -270,8 +278,8 @@ class Lag:
         if stream.row.false is None:
             verdict, open_ = self._by_kernel(stream, i, at, residuals[0], fresh=True)
             entry = _Entry(stream, i, verdict, open_=open_)
-            self._again.append((self._seconds(m.stamp_ns) + _AGAIN_S[0], entry))
             self._put(entry)
+            self._ask_at(self._seconds(m.stamp_ns) + _AGAIN_S[0], entry)
         else:
             entry = _Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at))
             self._rounds[stream.name] = _ROUNDS
@@ -286,18 +294,21 @@ class Lag:
             else:
                 self._rounds[name] = rounds - 1
         now_s = self._seconds(self.problem.timeline.stamps_ns[self.problem.timeline.last])
-        for _ in range(len(self._again)):
-            due_s, entry = self._again[0]
-            if due_s > now_s:
-                break
-            self._again.popleft()
+        due = []
+        while self._again and self._again[0][0] <= now_s:
+            due.append(heapq.heappop(self._again)[2])
+        for entry in due:
             self._ask_again(entry, now_s)
+
+    def _ask_at(self, due_s: float, entry: _Entry) -> None:
+        heapq.heappush(self._again, (due_s, next(self._turn), entry))
 
     # Other choices: what was chosen confirms itself, for the estimate follows it (see `graphloc.solve._choices`)
 
     def try_others(self) -> None:
         """Where what was judged false agrees among itself, try that instead, and keep what is more probable."""
         names, self._refuted = self._refuted, set()
+        moved = False
         for name in names:
             stream = self.problem.streams[name]
             own = self._judged(stream)
@@ -314,10 +325,13 @@ class Lag:
             if len(differ) < _CHAIN or tried == self._tried.get(name):
                 continue
             self._tried[name] = tried
+            moved = True
             self._try(stream, own, [
                 Verdict(None if mode is None else Decision(mode=mode), float(mode is not None), 1.0, r[mode or 0], mode or 0, at)
                 for mode, r, at in zip(chain, found, attached, strict=True)
             ])  # fmt: skip
+        if moved:
+            self._newest = self._read_newest()
 
     def _try(self, stream: LiveStream, own: list[_Entry], others: list[Verdict]) -> None:
         """Take other verdicts, settle around them, and go back if that is less probable."""
@@ -366,7 +380,7 @@ class Lag:
             entry.verdict = replace(verdict, decision=entry.verdict.decision)
         age_s = now_s - self._seconds(entry.measurement.stamp_ns)
         if age_s < _AGAIN_S[1]:
-            self._again.append((now_s + _AGAIN_S[1] - age_s, entry))
+            self._ask_at(now_s + _AGAIN_S[1] - age_s, entry)
 
     def _by_kernel(
         self, stream: LiveStream, i: int, at: Attachment, residual: Residual, *, fresh: bool
@@ -392,7 +406,7 @@ class Lag:
     def _unsure(self, stream: LiveStream, at: Attachment, k: int, residual: Residual) -> Array:
         """Covariance (m, m) of what is predicted of a residual, from pose and slow state together."""
         timeline, window = self.problem.timeline, self._window
-        base = k if window.is_committed(keys.pose(k)) else k - 1
+        base = min(k, self._committed)
         wanted = [keys.pose(base)]
         J = residual.jacobian()
         if residual.slow_jacobian is not None and at.slow_key is not None:
@@ -401,10 +415,12 @@ class Lag:
         if any(not window.is_committed(key) for key in wanted):
             return np.zeros((len(residual.raw),) * 2)
         P = np.array(window.covariance(wanted))
-        if base != k:  # what velocity adds on the way
-            dt_s = (timeline.stamps_ns[k] - timeline.stamps_ns[base]) * 1e-9
+        if base != k:  # what velocity and the IMU's noise add on the way: much, across a gap
+            from_ns, to_ns = timeline.stamps_ns[base], timeline.stamps_ns[k]
             R = at.T_world_body.rotation().matrix()
-            P[3:6, 3:6] += dt_s**2 * R.T @ self._newest.velocity_cov @ R
+            P[3:6, 3:6] += ((to_ns - from_ns) * 1e-9) ** 2 * R.T @ self._newest.velocity_cov @ R
+            pim = self.problem.links.integrate(from_ns, to_ns, self._newest.bias)
+            P[:6, :6] += np.asarray(pim.preintMeasCov())[:6, :6]
         return np.asarray(J @ P @ J.T)
 
     def _by_hypotheses(self, stream: LiveStream) -> None:
@@ -522,6 +538,11 @@ class Lag:
             picked = [*range(6), *range(start[key], start[key] + len(value))]
             return beside(value, joint[np.ix_(picked, picked)])
 
+        def alone(key: int) -> Beside:  # not given the pose: its prior, when it is seen again, does not have that
+            value = np.atleast_1d(window.values.atVector(key))
+            own = range(start[key], start[key] + len(value))
+            return Beside(value=value, gain=np.zeros((len(value), 6)), cov=joint[np.ix_(own, own)])
+
         bias = window.values.atConstantBias(core[2])
         return Anchor(
             stamp_ns=timeline.stamps_ns[k],
@@ -530,7 +551,7 @@ class Lag:
             bias=np.concatenate([bias.accelerometer(), bias.gyroscope()]),
             cov=joint[:15, :15],
             slow={name: known(key) for name, key in slow.items()},
-            constants={**kept, **{name: known(key) for name, key in constants.items()}},
+            constants={**kept, **{name: alone(key) for name, key in constants.items()}},
         )
 
     def track(self) -> tuple[NDArray[np.int64], Array, Array, Array]:

@@ -95,7 +95,7 @@ class OnlineSmoother:
         self._pending: list[Measurement] = []  # ahead of the IMU
         self._unread: list[ImuSample] = []
         self._recent: deque[Measurement] = deque()  # since the anchor
-        self._wait("it to begin")
+        self._wait("the first IMU sample")
 
     # What is known
 
@@ -380,7 +380,7 @@ class OnlineSmoother:
         self._done += [self._row(m, Outcome.REJECTED, stuck) for m in self._pending if m.seq >= 0]
         for m in self._buffer:
             self._drop(m, Outcome.REJECTED, f"the run was cut while it waited for {self._waiting}")
-        self._wait("IMU data")
+        self._wait("the next IMU sample")
 
     def _try_to_start(self) -> Estimate | None:
         newest = self._newest_imu
@@ -404,23 +404,34 @@ class OnlineSmoother:
         if isinstance(started, str):
             self._waiting = started
             return None
-        self._take_over(started, samples, [m for m in self._buffer if m.stamp_ns > newest.stamp_ns])
+        try:
+            self._take_over(started, samples, [m for m in self._buffer if not isinstance(m, ImuSample)])
+        except Exception as error:  # noqa: BLE001 - as in `_advance`
+            self._restart(f"the start failed ({_line(error)})")
+            return None
         assert self._lag is not None
         self._keep_anchor(self._lag)
         return self._estimate(self._lag)
 
-    def _take_over(self, started: Started, samples: list[ImuSample], ahead: list[Measurement]) -> None:
+    def _take_over(self, started: Started, samples: list[ImuSample], others: list[Measurement]) -> None:
+        """Build the lag where the data begin, and bring it to now."""
         self._datum, self._heights_m = started.datum, started.heights_m
-        self._agreed_ns.update(started.agreed_ns)
-        self._done += started.rows
         self._done += [self._row(m, Outcome.USED, "") for m in samples]
-        self._events.append(f"started at {utc_text(started.anchor.stamp_ns)}: {'; '.join(started.notes)}")
-        self._buffer = deque()
-        self._begin(started.anchor, samples)
-        for m in ahead:
-            self.feed(m)
+        self._buffer.clear()
+        self._begin(started.anchor, samples, (started.pose, started.velocity, started.bias))
+        assert self._lag is not None
+        for m in others:
+            if m.stamp_ns < self._lag.first_ns:
+                self._drop(m, Outcome.REJECTED, "no IMU data at this stamp")
+            else:
+                self._pending.append(m)
+        self._pending.sort(key=lambda m: m.stamp_ns)
+        self._step(self._lag)
+        self._events.append(f"started at {utc_text(self._lag.newest.stamp_ns)}: {'; '.join(started.notes)}")
 
-    def _begin(self, anchor: Anchor, samples: Sequence[ImuSample]) -> None:
+    def _begin(
+        self, anchor: Anchor, samples: Sequence[ImuSample], guess: tuple[gtsam.Pose3, Array, Array] | None = None
+    ) -> None:
         """Build the lag at an anchor; `samples` reach from there, or from before, to the newest."""
         assert self._datum is not None
         known = [m for m in samples if m.stamp_ns >= anchor.stamp_ns - 2 * duration_ns(self._gap_s)] or samples[-1:]
@@ -428,7 +439,7 @@ class OnlineSmoother:
             self._config, self._datum, _series(known), anchor.stamp_ns, self._rows, self._inertial, self._mounts
         )
         agreed = {} if self._lag is None else self._lag.agreed_ns
-        self._lag = Lag(problem, anchor, self._lag_s)
+        self._lag = Lag(problem, anchor, self._lag_s, guess)
         self._lag.agreed_ns.update(agreed)
         self._anchor = anchor
         if self._odometry is None:
@@ -493,7 +504,7 @@ class OnlineSmoother:
         self._done += [self._row(m, Outcome.REJECTED, f"the solver failed with it: {_line(error)}") for m in recent
                        if m.seq >= 0 and not isinstance(m, ImuSample)]  # fmt: skip
         self._events.append(f"the solver failed ({_line(error)}), and again from the last anchor: starts anew")
-        self._wait("IMU data")
+        self._wait("the next IMU sample")
 
     # Snapshot
 

@@ -1,28 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The start: wait until place and heading can be told, then solve what has come as the batch would, and go on from there."""
+"""The start: wait until place and heading can be told, and solve what has come as the batch would.
+
+The lag then begins where the data do, with what was known before them, at the solution: what the start chose
+among matches stays open for as long as they are in the lag.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import gtsam
 import numpy as np
 
 from graphloc import keys, origin
-from graphloc.build import Problem, constant_keys, make_problem
+from graphloc.build import make_problem
 from graphloc.config import VesselConfig
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
 from graphloc.graph import Hint, InertialRow, Sensor
-from graphloc.ledger import LedgerRow
 from graphloc.measurements import GnssPosition, ImuSeries, Measurement
-from graphloc.online._anchor import Anchor, beside
+from graphloc.online._anchor import Anchor
 from graphloc.recording import Recording
 from graphloc.solve._align import MOVED_M
 from graphloc.solve._batch import solve_batch
-from graphloc.solve._solution import AGREES, row_of
 
 _LEAST_S = 5.0  # of inertial data: gyro bias, roll and pitch of a vessel in waves
 _FIXES = 3  # to take a datum from
@@ -33,16 +34,18 @@ class Started:
     """What the start hands over.
 
     Attributes:
-        datum: origin of world. anchor: the newest state. rows: of the measurements that took part.
-        agreed_ns: stamp of the newest of each absolute sensor that agrees.
+        datum: origin of world.
+        anchor: the first state, by what was known before any measurement: all that came is judged again in the lag.
+        pose, velocity, bias: of that state, as it was solved: (gtsam.Pose3), (3,), (6,).
         heights_m: of each sensor that the configuration makes itself, what it says.
         notes: what the alignment went by.
     """
 
     datum: Datum
     anchor: Anchor
-    rows: tuple[LedgerRow, ...]
-    agreed_ns: Mapping[str, int]
+    pose: gtsam.Pose3
+    velocity: Array
+    bias: Array
     heights_m: Mapping[str, float]
     notes: tuple[str, ...]
 
@@ -114,54 +117,19 @@ def _solved(
     whole = origin.with_synthetic(recording, config, datum, rows)
     problem = make_problem(whole, config, datum, rows, inertial, company_of(config, rows))
     result = solve_batch(problem)
-    last = len(problem.timeline) - 1
-    agreed: dict[str, int] = {}
-    found = []
-    for stream in problem.streams:
-        for i, m in enumerate(stream.measurements):
-            verdict = result.verdicts[(stream.number, i)]
-            if verdict.weight >= AGREES:
-                agreed[stream.name] = m.stamp_ns
-            if m.seq >= 0:
-                found.append(row_of(stream, m, stream.config.topic, verdict))
     heights = {
         name: origin.height_m(recording, config, sensor.height_m, datum)
         for row in rows
         if row.synthetic is not None
         for name, sensor in config.of_kind(row.kind).items()
     }
+    held = result.values.atConstantBias(keys.bias(0))
     return Started(
         datum=datum,
-        anchor=_anchor(problem, result.tree, result.values, last),
-        rows=(*found, *(row for row in problem.rejected if row.seq >= 0)),
-        agreed_ns=agreed,
+        anchor=Anchor.of_start(int(problem.timeline.stamps_ns[0]), result.prior),
+        pose=result.values.atPose3(keys.pose(0)),
+        velocity=np.asarray(result.values.atVector(keys.velocity(0))),
+        bias=np.concatenate([held.accelerometer(), held.gyroscope()]),
         heights_m=heights,
         notes=result.notes,
-    )
-
-
-def _anchor(problem: Problem, tree: Any, values: gtsam.Values, k: int) -> Anchor:
-    """What a solved stretch knows of its state `k`."""
-    j = int(problem.timeline.slow_of[k])
-    pose, velocity, bias = keys.pose(k), keys.velocity(k), keys.bias(j)
-
-    def joint(*names: int) -> Array:
-        return np.asarray(tree.jointMarginalCovariance(list(names)).fullMatrix())
-
-    def vector(key: int) -> Array:
-        return np.atleast_1d(values.atVector(key))
-
-    held = values.atConstantBias(bias)
-    slow = {s.name: keys.slow(s.number, j) for s in problem.streams if s.slow is not None}
-    constants = {
-        (s.name, n): key for s in problem.streams for n, key in enumerate(constant_keys(s)) if values.exists(key)
-    }
-    return Anchor(
-        stamp_ns=int(problem.timeline.stamps_ns[k]),
-        pose=values.atPose3(pose),
-        velocity=vector(velocity),
-        bias=np.concatenate([held.accelerometer(), held.gyroscope()]),
-        cov=joint(pose, velocity, bias),
-        slow={name: beside(vector(key), joint(pose, key)) for name, key in slow.items()},
-        constants={name: beside(vector(key), joint(pose, key)) for name, key in constants.items()},
     )

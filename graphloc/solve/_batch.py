@@ -45,6 +45,7 @@ class BatchResult:
     iterations: int
     converged: bool
     noise_scale: float
+    prior: StartPrior
     notes: tuple[str, ...]
 
 
@@ -77,6 +78,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         iterations=iterations,
         converged=settled.converged,
         noise_scale=problem.noise_scale,
+        prior=prior,
         notes=start.notes,
     )
 

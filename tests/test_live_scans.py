@@ -1,0 +1,365 @@
+"""Turns of scans from a bag, and their matches one at a time around a track that still grows."""
+
+import pickle
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.config import AerialConfig, LidarConfig
+from graphloc.eval.simulate import find_scenario, simulate
+from graphloc.eval.simulate.bag import write_bag
+from graphloc.frames import Datum, Geodetic
+from graphloc.frontends._source import Bag, RawMessage, TopicSummary
+from graphloc.frontends.aerial import live, match_bag, scans
+from graphloc.frontends.aerial.cloud import CLOUD, Cloud, level
+from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn
+from graphloc.frontends.aerial.match import Mode
+from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
+from graphloc.frontends.aerial.scan import LevelCloud, outline
+from graphloc.frontends.aerial.scans import ScanFeed
+from graphloc.trajectory import Trajectory
+
+S = 10**9
+BEGIN = 1_700_000_000 * S
+NOTHING = outline(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), None)
+
+
+# On a simulated run
+
+
+@dataclass(frozen=True)
+class Run:
+    """A simulated run with scans, its true track as sure as a smoother would be, and its aerial sensor."""
+
+    folder: Path
+    sensor: AerialConfig
+    track: Trajectory
+    datum: Datum
+
+    def matched(self, sensor: AerialConfig) -> list[Matched]:
+        return list(match_bag([self.folder / "run"], sensor, self.folder, "base_link", self.track, self.datum))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("live") / "sim"
+    scenario = find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "18", "lidar_hz": "2"})
+    write_bag(simulate(scenario, 3), folder, ros=2)
+    recording, vessel = app.load([folder / "run"], folder / "vessel.yaml")
+    truth, sensor = recording.truth, vessel.sensors["aerial"]
+    assert truth is not None
+    assert isinstance(sensor, AerialConfig)
+    cov = np.broadcast_to(np.diag([1.0, 1.0, 0.1, 1e-4, 1e-4, 1e-3]), (len(truth), 6, 6))
+    sensor = sensor.model_copy(update={"submap": 3, "every_s": 1.0, "every_m": 5.0})
+    return Run(folder, sensor, replace(truth, cov=cov), app.choose_datum(recording, vessel))
+
+
+def part(track: Trajectory, first_ns: float, last_ns: float) -> Trajectory:
+    """The poses of a track in a time, each as it is in the whole one."""
+    kept = (track.stamps_ns >= first_ns) & (track.stamps_ns <= last_ns)
+    assert track.cov is not None
+    return replace(
+        track,
+        stamps_ns=track.stamps_ns[kept],
+        p_world_m=track.p_world_m[kept],
+        R_world_body=track.R_world_body[kept],
+        v_world_mps=None if track.v_world_mps is None else track.v_world_mps[kept],
+        cov=track.cov[kept],
+    )
+
+
+def test_a_bag_is_matched_as_written_out(run: Run) -> None:
+    """The same numbers, bit for bit, as when turns are gone through in one loop around the whole track."""
+    matcher, last, before = Matcher(run.sensor, run.folder, run.datum), None, None
+    window: list[Turn] = []
+    expected: list[tuple[int, Any, tuple[float, ...]]] = []
+    with Bag([run.folder / "run"]) as bag:
+        feed = ScanFeed(bag, run.sensor, "base_link")
+        for turn in feed:
+            window = [*window, turn][-3:]
+            here = run.track.at(np.array([turn.stamp_ns])).p_world_m[0]
+            if last is not None:
+                waited_s, way_m = (turn.stamp_ns - last[0]) * 1e-9, np.hypot(*(here - last[1])[:2])
+                if waited_s < 0.95 or (way_m < 5.0 and waited_s < 10.0):
+                    continue
+            last = (turn.stamp_ns, here)
+            stamps = np.sort(np.concatenate([*(c.stamps_ns for c in turn.clouds), [turn.stamp_ns]]))
+            at_ns = int(stamps[len(stamps) // 2])
+            clouds = [c for t in window for c in t.clouds]
+            pose = run.track.at(np.array([at_ns]))
+            prior = Prior(
+                np.array([*pose.p_world_m[0, :2], pose.yaw_rad[0]]), np.sqrt(np.array([1.0, 1.0, 1e-3]))
+            )  # as `run` has it
+            found = matcher.match(level(clouds, feed.mounts, run.track, at_ns, run.sensor.waterline_m), prior)
+            news = (1.0, 1.0, 1.0)
+            if before is not None:
+                way = np.hypot(*(prior.pose[:2] - before[1])) / run.sensor.alike_m
+                place, heading = (np.tanh(0.5 * max(way, (at_ns - before[0]) / 1e9 / s)) for s in (5.0, 60.0))
+                news = (place, place, heading)
+            before = (at_ns, prior.pose[:2])
+            expected.append((at_ns, found, news))
+    assert 4 <= len(expected) <= 12
+    got = run.matched(run.sensor)
+    assert [m.stamp_ns for m in got] == [at_ns for at_ns, _, _ in expected]
+    assert [m.news for m in got] == [news for _, _, news in expected]
+    for item, (_, found, _) in zip(got, expected, strict=True):
+        assert item.match is not None
+        assert item.match.modes
+        assert item.match.none == found.none
+        np.testing.assert_array_equal(item.match.score, found.score)
+        np.testing.assert_array_equal([m.pose for m in item.match.modes], [m.pose for m in found.modes])
+        np.testing.assert_array_equal([m.cov for m in item.match.modes], [m.cov for m in found.modes])
+
+
+def test_live_as_offline_where_the_tracks_are_the_same(run: Run) -> None:
+    """A window of 6 s that follows 20 ms behind each turn's arrival, and a worker thread that matches."""
+    got, waits = [], 0
+    with Bag([run.folder / "run"]) as bag, ThreadPoolExecutor(1) as pool:
+        feed = ScanFeed(bag, run.sensor, "base_link")
+        matcher = LiveMatcher(run.sensor, run.folder, run.datum, feed.mounts)
+        for turn in feed:
+            # Drivers are a few ms late, as here the track is not: scans are complete, and the track is not there yet.
+            now_ns, answer = turn.arrival_ns - S // 20, None
+            while (
+                answer := pool.submit(matcher.offer, turn, part(run.track, now_ns - 6 * S, now_ns)).result()
+            ) == "wait":
+                waits, now_ns = waits + 1, now_ns + S // 20
+            if answer is not None:
+                got.append(answer)
+    expected = run.matched(run.sensor)
+    assert [m.stamp_ns for m in got] == [m.stamp_ns for m in expected]
+    assert waits > 10  # turns that are not due wait as well
+    for item, other in zip(got, expected, strict=True):
+        assert item.match is not None
+        assert other.match is not None
+        # Seconds since another begin of the track: places differ by their rounding.
+        np.testing.assert_allclose(item.news, other.news, rtol=1e-6)
+        assert len(item.match.found.faces_m) == pytest.approx(len(other.match.found.faces_m), abs=2)
+        assert len(item.match.modes) == len(other.match.modes)
+        for mode, same in zip(item.match.modes, other.match.modes, strict=True):
+            np.testing.assert_allclose(mode.pose, same.pose, atol=1e-3)
+            np.testing.assert_allclose(mode.cov, same.cov, rtol=1e-2, atol=1e-6)
+
+
+def test_offline_no_scan_waits(run: Run) -> None:
+    """A track that ends 0.1 s before a scan will not grow: that scan and all after it are refused."""
+    end_ns = int(run.track.stamps_ns[0]) + 99 * S // 10
+    short = replace(run, track=part(run.track, run.track.stamps_ns[0], end_ns))
+    with Bag([run.folder / "run"]) as bag:
+        after = [t.stamp_ns for t in ScanFeed(bag, run.sensor, "base_link") if t.stamp_ns > end_ns]
+    assert end_ns < after[0] < end_ns + S // 5
+    found = short.matched(run.sensor.model_copy(update={"every_s": 100.0}))
+    assert [m.stamp_ns for m in found[1:]] == after
+    assert all("outside of the track" in m.why_not for m in found[1:])
+
+
+def test_what_a_worker_gets_and_gives_can_be_sent(run: Run) -> None:
+    with Bag([run.folder / "run"]) as bag:
+        feed = ScanFeed(bag, run.sensor, "base_link")
+        turn = next(iter(feed))
+        given = (run.sensor, run.folder, run.datum, feed.mounts)
+    *made_from, turn, track = pickle.loads(pickle.dumps((*given, turn, run.track)))
+    answer = pickle.loads(pickle.dumps(LiveMatcher(*made_from).offer(turn, track)))
+    assert isinstance(answer, Matched)
+    assert answer.match is not None
+    assert answer.match.modes
+
+
+# On turns made by hand
+
+
+class Seen:
+    """A matcher that finds every scan where the prior has it, and keeps what it was shown."""
+
+    def __init__(self) -> None:
+        self.numbers: list[list[int]] = []
+
+    def match(self, cloud: LevelCloud, prior: Prior) -> Match:
+        self.numbers.append(sorted(np.rint(cloud.points_m[:, 2]).astype(int).tolist()))
+        return Match(prior, NOTHING, modes=(Mode(prior.pose, np.eye(3), 1.0),))
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
+    matcher = Seen()
+    monkeypatch.setattr(live, "_matcher", lambda *_: matcher)
+    return matcher
+
+
+def live_matcher(**changes: Any) -> LiveMatcher:
+    datum = Datum(Geodetic(57.7, 14.5, 30.0))
+    return LiveMatcher(AerialConfig(**changes), Path(), datum, {"top": (np.zeros(3), np.eye(3))})
+
+
+def turn_at(t_s: float, number: int = 0, first_s: float = 0.0, last_s: float = 0.0) -> Turn:
+    """Two points at that height above the vessel, seen so long after the header."""
+    stamps = BEGIN + np.rint((t_s + np.array([first_s, last_s])) * 1e9).astype(np.int64)
+    stamp_ns = BEGIN + round(t_s * 1e9)
+    points = np.array([(5.0, 0.0, number)] * 2)
+    return Turn(stamp_ns, int(stamps[-1]), (Cloud("top", stamp_ns, points, stamps),))
+
+
+def track_of(first_s: float, last_s: float, speed_mps: float = 1.0) -> Trajectory:
+    """Eastwards from the origin at time 0, level."""
+    t = np.arange(round(first_s * 100), round(last_s * 100) + 1) / 100.0
+    return Trajectory(
+        stamps_ns=BEGIN + np.rint(t * 1e9).astype(np.int64),
+        p_world_m=np.column_stack([speed_mps * t, 0.0 * t, 0.0 * t]),
+        R_world_body=np.broadcast_to(np.eye(3), (len(t), 3, 3)),
+    )
+
+
+def since_s(item: Matched | Literal["wait"] | None) -> float | None:
+    return round((item.stamp_ns - BEGIN) / 1e9, 3) if isinstance(item, Matched) and item.match is not None else None
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "rules", "due"),
+    [
+        (1.0, {"every_s": 2.0, "every_m": 0.5}, [0.0, 2.0, 4.0, 6.0, 8.0]),
+        (1.0, {"every_s": 0.1, "every_m": 2.9}, [0.0, 3.0, 6.0, 9.0]),
+        (0.1, {"every_s": 2.0, "every_m": 2.0, "still_s": 5.0}, [0.0, 5.0]),
+    ],
+)
+def test_matches_are_as_frequent_as_is_asked(
+    speed_mps: float, rules: dict[str, float], due: list[float], seen: Seen
+) -> None:
+    matcher = live_matcher(**rules)
+    stamps_s = np.arange(0.0, 10.0, 0.5)
+    answers = [matcher.offer(turn_at(t), track_of(t - 4.0, t + 0.1, speed_mps)) for t in stamps_s]
+    assert [since_s(a) for a in answers if a is not None] == due
+    assert len(seen.numbers) == len(due)
+    # A clock that is set back begins anew.
+    assert since_s(matcher.offer(turn_at(-60.0), track_of(-64.0, -59.0, speed_mps))) == -60.0
+
+
+def test_matches_tell_what_the_one_before_has_not(seen: Seen) -> None:
+    matcher = live_matcher(every_s=1.0, alike_m=15.0)
+    first, second = (matcher.offer(turn_at(t), track_of(t - 4.0, t + 0.1, 6.0)) for t in (0.0, 2.0))
+    assert isinstance(first, Matched)
+    assert isinstance(second, Matched)
+    assert first.news == (1.0, 1.0, 1.0)
+    r = np.exp(-12.0 / 15.0)
+    np.testing.assert_allclose(second.news, [(1.0 - r) / (1.0 + r)] * 3)
+
+
+def test_what_falls_out_of_the_window_leaves_the_submap(seen: Seen) -> None:
+    """Turns of each second, of which a track of 3.05 s covers three, and of one more the latter of its points."""
+    matcher = live_matcher(submap=8, every_s=2.0)
+    for number in range(10):
+        turn = turn_at(number, number, first_s=-0.1)
+        answer = matcher.offer(turn, track_of(number - 3.05, number))
+        assert (answer is None) == (number % 2 == 1)
+        assert number % 2 == 1 or since_s(answer) == number
+    assert seen.numbers == [
+        [0, 0], [0, 0, 1, 1, 2, 2], [1, 2, 2, 3, 3, 4, 4], [3, 4, 4, 5, 5, 6, 6], [5, 6, 6, 7, 7, 8, 8],
+    ]  # fmt: skip
+
+
+def test_a_submap_is_no_longer_than_asked(seen: Seen) -> None:
+    matcher = live_matcher(submap=2, every_s=2.0)
+    for number in range(5):
+        matcher.offer(turn_at(number, number), track_of(number - 3.5, number))
+    assert seen.numbers == [[0, 0], [1, 1, 2, 2], [3, 3, 4, 4]]
+
+
+@pytest.mark.parametrize("ends_s", [0.0, 0.05], ids=["after its last point", "at its begin"])
+def test_a_turn_waits_for_the_track(ends_s: float, seen: Seen) -> None:
+    """By its last point, 0.1 s after its header; and told to wait, it has changed nothing."""
+    matcher, turn = live_matcher(submap=3), turn_at(5.0, 7, last_s=0.1)
+    for end_s in (4.8, 4.95, 5.0 + ends_s):
+        assert matcher.offer(turn, track_of(0.0, end_s)) == "wait"
+    assert not seen.numbers
+    assert since_s(matcher.offer(turn, track_of(0.0, 5.1))) == 5.0
+    assert seen.numbers == [[7, 7]]
+    # Waiting for no more: with those points that the track covers.
+    assert since_s(matcher.offer(turn_at(9.0, 8, last_s=0.1), track_of(8.0, 9.05), growing=False)) == 9.0
+    assert seen.numbers[1:] == [[8]]
+
+
+@pytest.mark.parametrize(
+    ("track", "growing"),
+    [
+        (track_of(0.0, 4.6), True),  # farther ahead than an IMU is late
+        (track_of(0.0, 4.9), False),
+        (track_of(5.5, 9.0), True),
+        (track_of(5.5, 9.0), False),
+    ],
+)
+def test_a_turn_outside_for_good_says_so(track: Trajectory, growing: bool, seen: Seen) -> None:
+    matcher = live_matcher(submap=3)
+    answer = matcher.offer(turn_at(5.0), track, growing=growing)
+    assert isinstance(answer, Matched)
+    assert answer.match is None
+    assert answer.stamp_ns == BEGIN + 5 * S
+    assert "outside of the track" in answer.why_not
+    assert "top" in answer.why_not
+    # It is no part of the next one's submap, and the next one is due at once.
+    assert since_s(matcher.offer(turn_at(5.2, 3), track_of(0.0, 6.0))) == 5.2
+    assert seen.numbers == [[3, 3]]
+
+
+# What the bag gives
+
+
+class Heap:
+    """A bag of clouds: (LiDAR, header s, arrival s); a header that is not a number is a damaged message."""
+
+    name = "heap"
+
+    def __init__(self, *messages: tuple[str, float, float]) -> None:
+        self._messages = messages
+        self.topics = {f"/{n}": TopicSummary(f"/{n}", (CLOUD,), 1) for n in ("one", "two")}
+
+    def messages(self, _topics: set[str]) -> Iterator[RawMessage]:
+        for name, t, arrival_s in self._messages:
+            yield RawMessage(f"/{name}", CLOUD, "", BEGIN + round(arrival_s * 1e9), repr(t).encode())
+
+    def decode(self, raw: RawMessage) -> float:
+        return float(raw.data)
+
+
+def turns_of(monkeypatch: pytest.MonkeyPatch, *messages: tuple[str, float, float]) -> list[Turn]:
+    def decode_cloud(_: float, stamp_ns: int, name: str) -> Cloud:
+        return Cloud(name, stamp_ns, np.ones((1, 3)), np.array([stamp_ns], dtype=np.int64))
+
+    monkeypatch.setattr(scans, "header_stamp_ns", lambda t: None if np.isnan(t) else BEGIN + round(t * 1e9))
+    monkeypatch.setattr(scans, "decode_cloud", decode_cloud)
+    config = AerialConfig(lidars={n: LidarConfig(topic=f"/{n}") for n in ("one", "two")})
+    return list(ScanFeed(Heap(*messages), config, "base_link"))  # type: ignore[arg-type]
+
+
+def test_turns_arrive_with_the_message_that_ends_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = turns_of(
+        monkeypatch,
+        ("one", 1.0, 1.1), ("two", 1.02, 1.3),  # both
+        ("one", 2.0, 2.1), ("one", 3.0, 3.1), ("two", 3.0, 3.2),  # a newer one of the same, then both
+        ("one", 4.0, 4.1), ("two", 5.0, 5.1),  # each alone: the first is known to be so when the second comes
+        ("two", 5.2, 5.3),
+    )  # fmt: skip
+    at = [[(c.lidar, (c.stamp_ns - BEGIN) / 1e9) for c in t.clouds] for t in found]
+    assert at == [[("one", 1.0), ("two", 1.02)], [("one", 3.0), ("two", 3.0)], [("one", 4.0)], [("two", 5.2)]]
+    assert [(t.arrival_ns - BEGIN) / 1e9 for t in found] == [1.3, 3.2, 5.1, 5.3]
+    assert [(t.stamp_ns - BEGIN) / 1e9 for t in found] == [1.02, 3.0, 4.0, 5.2]
+
+
+def test_a_damaged_scan_is_answered_at_once(monkeypatch: pytest.MonkeyPatch, seen: Seen) -> None:
+    """It needs no track, and the scans beside it still make a turn; turns stay in order of arrival."""
+    found = turns_of(
+        monkeypatch, ("one", 1.0, 1.1), ("two", np.nan, 1.2), ("two", 1.1, 1.3), ("one", 9.0, 9.1), ("two", np.nan, 9.2)
+    )
+    assert [(t.arrival_ns - BEGIN) / 1e9 for t in found] == [1.2, 1.3, 9.2, 9.2]
+    assert [bool(t.why_not) for t in found] == [True, False, True, False]
+    matcher = live_matcher(every_s=1.0)
+    answer = matcher.offer(found[0], track_of(-5.0, 0.5))
+    assert isinstance(answer, Matched)
+    assert (answer.stamp_ns, answer.match, answer.why_not) == (
+        BEGIN + 12 * S // 10, None, "/two: its header has no stamp"
+    )  # fmt: skip
+    assert not seen.numbers
