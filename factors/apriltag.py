@@ -104,7 +104,7 @@ def _docks(survey: Survey) -> list[str]:
 def _constants_of(m: TagSighting, config: AprilTagConfig, at: Attachment) -> list[tuple[int, Array] | None]:
     """Key and estimate of what the survey errs about each tag; None where there is none."""
     index = {(str(tag.family), tag.id): k for k, tag in enumerate(config.surveyed.tags)}
-    found = [index.get(tag) for tag in zip(m.families, m.numbers, strict=True)]
+    found = [index.get(tag) for tag in m.tags]
     return [at.constants[k] if k is not None and k < len(at.constants) else None for k in found]
 
 
@@ -239,7 +239,7 @@ def constants(config: AprilTagConfig) -> tuple[Constant, ...]:
     """Return what the survey may err about each tag: place (m) and axes (rad), in world."""
     return tuple(
         Constant(
-            name=f"tag {tag.id}",
+            name=config.surveyed.called(tag.family, tag.id),
             sigma=np.repeat([max(tag.sigma_m, _LEAST_M), max(np.radians(tag.sigma_deg), _LEAST_RAD)], 3),
         )
         for tag in config.surveyed.tags

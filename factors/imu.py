@@ -51,9 +51,12 @@ class Links:
         self._gap_params = self._make_params(_GAP_ACCEL, _GAP_GYRO, mount)
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
-        """Add samples (N, 6) after the last one: specific force, rate."""
-        self._stamps = np.concatenate([self._stamps, stamps_ns])
-        self._samples = np.concatenate([self._samples, samples])
+        """Add samples (N, 6) at stamps that are new: specific force, rate; late ones go where they belong."""
+        stamps, rows = np.concatenate([self._stamps, stamps_ns]), np.concatenate([self._samples, samples])
+        if (np.diff(stamps[-len(stamps_ns) - 1 :]) <= 0).any():
+            order = np.argsort(stamps, kind="stable")
+            stamps, rows = stamps[order], rows[order]
+        self._stamps, self._samples = stamps, rows
 
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a stamp, but for the last of them."""

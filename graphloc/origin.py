@@ -31,12 +31,17 @@ def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sens
         _refuse_far_fixes(recording, datum)
         return datum
     refuse_world_without_datum(config, recording.source, rows)
-    fixes = np.array([m.position for m in recording.measurements if isinstance(m, GnssPosition)][:5])
+    fixes = np.array([m.position for m in fixes_of(recording)][:5])
     if not len(fixes):
         raise InputError(f"{recording.source}: {_why_no_fix(recording, config)}")
     # Longitudes about the first one, so that fixes on both sides of the date line stay together.
     fixes[:, 1] = fixes[0, 1] + (fixes[:, 1] - fixes[0, 1] + 180.0) % 360.0 - 180.0
     return Datum(Geodetic(*(float(v) for v in np.median(fixes, axis=0))))
+
+
+def fixes_of(recording: Recording) -> list[GnssPosition]:
+    """Return the fixes that an origin can be taken from."""
+    return [m for m in recording.measurements if isinstance(m, GnssPosition)]
 
 
 def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:
@@ -45,7 +50,7 @@ def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:
     Raises:
         InputError: most fixes lie farther away than any run goes.
     """
-    fixes = [m.position for m in recording.measurements if isinstance(m, GnssPosition)]
+    fixes = [m.position for m in fixes_of(recording)]
     if fixes:
         away_m = np.linalg.norm(datum.enu_from_geodetic(*np.array(fixes).T), axis=1)
         if np.median(away_m) > _FAR_M:
@@ -103,7 +108,6 @@ def height_m(recording: Recording, config: VesselConfig, configured_m: float | N
         return configured_m - datum.origin.height_m
     heights = [
         m.position.height_m - float(mount_of(m.sensor, config.sensors[m.sensor], recording)[0][2])
-        for m in recording.measurements
-        if isinstance(m, GnssPosition)
+        for m in fixes_of(recording)
     ]
     return float(np.median(heights)) - datum.origin.height_m if heights else 0.0

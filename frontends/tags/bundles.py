@@ -17,7 +17,7 @@ from graphloc.survey import Survey, TagConfig
 
 # Corners fit with the noise that they are said to have, up to so many times its variance; beyond, a tag does not
 # belong to the others.
-_CONTRADICTS = 6.0
+CONTRADICTS = 6.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +61,7 @@ def sightings_of(seen: Sequence[SeenTag], survey: Survey, seeing: Seeing) -> tup
     return found, lost
 
 
-class _Bundle:
+class Bundle:
     """Tags of one frame taken together.
 
     Attributes:
@@ -113,27 +113,27 @@ class _Bundle:
             self.poses = [pose for pose in self.poses if pose.squared < self.poses[0].squared + KEPT]
 
 
-def _that_fit(seen: Sequence[SeenTag], survey: Survey, frame: str) -> list[_Bundle]:
+def _that_fit(seen: Sequence[SeenTag], survey: Survey, frame: str) -> list[Bundle]:
     """Groups of tags that one pose explains; three or more can tell who of them is wrong, two cannot.
 
     Tags that fit no better without each other are blurred as a whole: they stay together, and are doubted together.
     """
-    whole, alone = _Bundle(seen, survey, frame), list[_Bundle]()
-    while len(whole.group) > 1 and whole.excess > _CONTRADICTS:
+    whole, alone = Bundle(seen, survey, frame), list[Bundle]()
+    while len(whole.group) > 1 and whole.excess > CONTRADICTS:
         group = whole.group
-        without = [_Bundle([*group[:k], *group[k + 1 :]], survey, frame) for k in range(len(group))]
+        without = [Bundle([*group[:k], *group[k + 1 :]], survey, frame) for k in range(len(group))]
         worst = int(np.argmin([bundle.excess for bundle in without]))
         apart = without[worst].excess if len(group) > 2 else 0.5 * sum(bundle.excess for bundle in without)
-        if np.isfinite(apart) and whole.excess <= _CONTRADICTS * apart:
+        if np.isfinite(apart) and whole.excess <= CONTRADICTS * apart:
             break
         if len(group) == 2:
             return [*alone, *reversed(without)]
-        alone.append(_Bundle([group[worst]], survey, frame))
+        alone.append(Bundle([group[worst]], survey, frame))
         whole = without[worst]
     return [whole, *alone]
 
 
-def _sighting(bundle: _Bundle, survey: Survey, frame: str, seeing: Seeing) -> TagSighting:
+def _sighting(bundle: Bundle, survey: Survey, frame: str, seeing: Seeing) -> TagSighting:
     bundle.doubt()
     return TagSighting(
         stamp_ns=seeing.stamp_ns, sensor=seeing.sensor, seq=-1, camera=seeing.camera, frame=frame,

@@ -41,7 +41,8 @@ class Seen:
 
     Attributes:
         sightings: of surveyed tags; none where it shows none. views: of tags that are not surveyed.
-        troubles: one line for each thing in it that could not be used.
+        troubles: one line for each thing in it that could not be used. doubtful: the same of tags that a limit
+            (`max_hamming`, `min_margin`) refused, which is what it is there for.
     """
 
     stamp_ns: int
@@ -49,6 +50,7 @@ class Seen:
     sightings: tuple[TagSighting, ...] = ()
     views: tuple[TagView, ...] = ()
     troubles: tuple[str, ...] = ()
+    doubtful: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,6 +74,7 @@ class _Raw:
 
     tags: list[tuple[int, str, Array, Array, float | None, bool]] = field(default_factory=list)
     troubles: list[str] = field(default_factory=list)
+    doubtful: list[str] = field(default_factory=list)
 
 
 def sightings_of_bag(
@@ -234,7 +237,7 @@ def _listed(msg: Any, msgtype: str, eye: _Eye, config: AprilTagConfig) -> _Raw:
     for tag in tags:
         why_not = _refused(tag, config)
         if why_not:
-            found.troubles.append(why_not)
+            found.doubtful.append(why_not)
         elif tag.corners_px is not None and eye.lens is not None:
             _add(found, eye.lens, tag.number, tag.family, tag.corners_px, noise_px2, tag.size_m)
         elif tag.rays is not None:
@@ -268,8 +271,8 @@ def _sorted_out(shown: _Raw, stamp_ns: int, eye: _Eye, sensor: str, config: Apri
             troubles.append(f"tag {number} ({family or 'family not said'}) is not in the survey")
             views.append(
                 TagView(
-                    stamp_ns=stamp_ns, family=family, number=number, rays=rays, cov=cov, t_body_camera_m=eye.mount[0],
-                    R_body_camera=eye.mount[1],
+                    stamp_ns=stamp_ns, camera=eye.name, family=family, number=number, rays=rays, cov=cov,
+                    t_body_camera_m=eye.mount[0], R_body_camera=eye.mount[1],
                 )
             )  # fmt: skip
         elif size_m is not None and abs(size_m / tag.size_m - 1.0) > _OTHER_SIZE:
@@ -282,7 +285,8 @@ def _sorted_out(shown: _Raw, stamp_ns: int, eye: _Eye, sensor: str, config: Apri
     seeing = Seeing(stamp_ns, sensor, eye.name, *eye.mount, floor=config.min_corner_sigma_px / focal_px)
     sightings, lost = sightings_of(seen, survey, seeing)
     troubles += [f"tag {number}: no pose explains its corners" for number in lost]
-    return Seen(stamp_ns, eye.name, tuple(sightings), tuple(views), tuple(dict.fromkeys(troubles)))
+    lines = (tuple(dict.fromkeys(each)) for each in (troubles, shown.doubtful))
+    return Seen(stamp_ns, eye.name, tuple(sightings), tuple(views), *lines)
 
 
 def _in_survey(tags: Sequence[TagConfig], number: int, family: str) -> TagConfig | None:

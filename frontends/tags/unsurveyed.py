@@ -4,21 +4,27 @@
     p_tag = p_i + s R_i t_i        t_i: place of a tag of size 1 in the camera of view i, s: its size
 
 is linear in place and size; attitude comes from the pose that fits most views; all three are refined on the corners.
+A tag that is seen beside tags of one dock, and of nothing else, is taken to ride on that: p_i, R_i are then as seen from
+the dock at rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array, skew
 from graphloc.frontends.tags.pose import poses_of
-from graphloc.measurements import TagView
-from graphloc.survey import Family, TagConfig
+from graphloc.measurements import TagSighting, TagView
+from graphloc.survey import WORLD, DockConfig, Family, Survey, TagConfig
+from graphloc.time import seconds_since
 from graphloc.trajectory import Trajectory
 
 _FEWEST = 5
@@ -63,14 +69,62 @@ class _View:
         return np.asarray(self.whiten @ (there[:, :2] / depth - self.rays).ravel())
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Riding:
+    """On which dock tags ride, and how that moved: stamps (M,), `moved` (M, 6), m and small rotations, rad, from rest."""
+
+    dock: DockConfig
+    stamps_ns: NDArray[np.int64]
+    moved: Array
+
+    def seen_from(self, track: Trajectory) -> Trajectory:
+        """Return a track as it is seen from the dock at rest; its covariance, which has the dock's share in it, is kept."""
+        t, s = (seconds_since(int(track.stamps_ns[0]), stamps) for stamps in (track.stamps_ns, self.stamps_ns))
+        moved = np.column_stack([np.interp(t, s, self.moved[:, k]) for k in range(6)])
+        back, pivot = Rotation.from_rotvec(-moved[:, 3:]).as_matrix(), np.array(self.dock.xyz_m)
+        return Trajectory(
+            stamps_ns=track.stamps_ns,
+            p_world_m=pivot + np.einsum("nij,nj->ni", back, track.p_world_m - pivot - moved[:, :3]),
+            R_world_body=back @ track.R_world_body,
+            cov=track.cov,
+        )
+
+    def on_board(self, tag: TagConfig) -> TagConfig:
+        """Return a tag whose place is in world, the dock at rest, as one that rides on it."""
+        p, R = Survey(docks=(self.dock,)).rest(self.dock.name)
+        return tag.model_copy(
+            update={
+                "frame": self.dock.name,
+                "xyz_m": tuple(round(float(v), 3) for v in R.T @ (np.array(tag.xyz_m) - p)),
+                "rpy_deg": _rpy_deg(R.T @ tag.R_frame_tag),
+            }
+        )
+
+
+def only_beside(views: Sequence[TagView], sightings: Sequence[TagSighting]) -> dict[tuple[str, int], tuple[str, str]]:
+    """Return the sensor and the dock by (family, id) of tags that share images with tags of that dock, and with no others."""
+    images: dict[tuple[int, str], set[tuple[str, str]]] = defaultdict(set)
+    for m in sightings:
+        images[(m.stamp_ns, m.camera)].add((m.sensor, m.frame))
+    beside: dict[tuple[str, int], set[tuple[str, str]]] = defaultdict(set)
+    for v in views:
+        beside[(v.family, v.number)] |= images.get((v.stamp_ns, v.camera), set())
+    alone = {tag: found.pop() for tag, found in beside.items() if len(found) == 1}
+    return {tag: (sensor, frame) for tag, (sensor, frame) in alone.items() if frame != WORLD}
+
+
 def estimate_tags(
-    views: Sequence[TagView], track: Trajectory, size_m: float | None
+    views: Sequence[TagView],
+    track: Trajectory,
+    size_m: float | None,
+    riding: Mapping[tuple[str, int], Riding] | None = None,
 ) -> tuple[list[TagConfig], list[str]]:
-    """Return the tags that are seen often and well enough, in world, and a line for each that is not.
+    """Return the tags that are seen often and well enough, and a line for each that is not.
 
     Args:
         views: of tags that are not surveyed. track: of the body, with covariance.
         size_m: of such tags; None: it is estimated too.
+        riding: by (family, id) of those that ride on a dock; the others stand in world.
     """
     found: list[TagConfig] = []
     left: list[str] = []
@@ -83,11 +137,13 @@ def estimate_tags(
         own = [v for v in views if (v.family, v.number) == (family, number)]
         stamps = np.array([v.stamp_ns for v in own], dtype=np.int64)
         own = [v for v, covered in zip(own, track.covers(stamps), strict=True) if covered]
-        tag = _estimate(own[:: -(-len(own) // _MOST)], track, size_m) if len(own) >= _FEWEST else None
+        dock = (riding or {}).get((family, number))
+        seen_from = track if dock is None else dock.seen_from(track)
+        tag = _estimate(own[:: -(-len(own) // _MOST)], seen_from, size_m) if len(own) >= _FEWEST else None
         if tag is None:
             left.append(f"tag {number} ({family}) is not in the survey, and {len(own)} views do not tell where it is")
         else:
-            found.append(tag)
+            found.append(tag if dock is None else dock.on_board(tag))
     return found, left
 
 
@@ -128,16 +184,20 @@ def _estimate(own: Sequence[TagView], track: Trajectory, size_m: float | None) -
         sigma_rad = float(np.hypot(sigma_rad, np.sqrt(np.median(at.cov[:, 5, 5]))))
     R = Rotation.from_rotvec(solved.x[3:6]).as_matrix() @ R0
     x, y, z = (round(float(v), 3) for v in solved.x[:3])
-    roll, pitch, yaw = (round(float(v), 2) for v in Rotation.from_matrix(R).as_euler("xyz", degrees=True))
     return TagConfig(
         id=own[0].number,
         family=own[0].family,  # type: ignore[arg-type]  # one of the detector's
         size_m=round(size * float(np.exp(solved.x[6])), 4) if size_m is None else size,
         xyz_m=(x, y, z),
-        rpy_deg=(roll, pitch, yaw),
+        rpy_deg=_rpy_deg(R),
         sigma_m=round(sigma_m, 3),
         sigma_deg=round(float(np.degrees(sigma_rad)), 2),
     )
+
+
+def _rpy_deg(R: Array) -> tuple[float, float, float]:
+    roll, pitch, yaw = (round(float(v), 2) for v in Rotation.from_matrix(R).as_euler("xyz", degrees=True))
+    return roll, pitch, yaw
 
 
 def _placed(views: Sequence[_View], size_m: float | None) -> tuple[Array, float]:

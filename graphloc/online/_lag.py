@@ -113,6 +113,7 @@ class Lag:
         self._refuted: set[str] = set()  # sensors of which something new was judged false
         self._tried: dict[str, frozenset[tuple[int, int | None]]] = {}
         self._ends: dict[str, Held] = {}
+        self._links: dict[int, Held] = {}  # by the state that each begins at
         self._known: dict[int, Beside] = {}
         self._gone: list[LedgerRow] = []
         self.agreed_ns: dict[str, int] = {}
@@ -174,7 +175,7 @@ class Lag:
         there = pim.predict(nav_state(values, k), bias)
         window.guess(keys.pose(k + 1), there.pose(), t)
         window.guess(keys.velocity(k + 1), np.asarray(there.velocity()), t)
-        window.add([links.factor(k, j, pim)])
+        self._links[k] = window.add([links.factor(k, j, pim)])
         if following != j:
             dt_s = (timeline.slow_stamps_ns[following] - timeline.slow_stamps_ns[j]) * 1e-9
             window.guess(keys.bias(following), bias, t)
@@ -198,6 +199,14 @@ class Lag:
             ends = list(slow_end(stream.slow, following))
             if ends:
                 self._ends[stream.name] = window.add(ends)
+
+    def mend(self, holes: Sequence[tuple[int, int]]) -> None:
+        """Stage the steps anew that IMU samples lie in which came late: between what stamps (ns) each of these lies."""
+        timeline, links, window = self.problem.timeline, self.problem.links, self._window
+        for k in sorted({k for a, b in holes for k in range(timeline.floor(a), timeline.floor(b) + 1)}):
+            if k in self._links and window.remove(self._links[k]):
+                pim = links.integrate(timeline.stamps_ns[k], timeline.stamps_ns[k + 1], gtsam.imuBias.ConstantBias())
+                self._links[k] = window.add([links.factor(k, timeline.slow_of[k], pim)])
 
     def commit(self) -> None:
         """Estimate anew, and let go what has left."""
@@ -240,6 +249,8 @@ class Lag:
             gone += 1
         if gone == timeline.first:
             return
+        for k in range(timeline.first, gone):
+            self._links.pop(k, None)
         timeline.forget(gone)
         for key, entry in list(self._entries.items()):
             if entry.state < gone:

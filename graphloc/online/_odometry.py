@@ -19,10 +19,14 @@ _FLOOR = np.diag([1e-6] * 3 + [1e-8] * 3)  # of a step: what integrating samples
 
 
 class Odometry:
-    """Pose of the body in `odom`."""
+    """Pose of the body in `odom`, and how far in time it has been carried: no stretch counts twice, whatever is built anew."""
 
-    def __init__(self, p_m: Array, R: Array) -> None:
-        self.p_m, self.R = np.array(p_m), np.array(R)
+    def __init__(self, stamp_ns: int, p_m: Array, R: Array) -> None:
+        self.stamp_ns, self.p_m, self.R = stamp_ns, np.array(p_m), np.array(R)
+        self.step_cov = np.array(_FLOOR)
+
+    def begin(self) -> None:
+        """From here on steps count towards the next estimate."""
         self.step_cov = np.array(_FLOOR)
 
     def after(self, dp_body_m: Array, dR: Array) -> tuple[Array, Array]:
@@ -30,17 +34,24 @@ class Odometry:
         return self.p_m + self.R @ dp_body_m, self.R @ dR
 
     def step(
-        self, dp_body_m: Array, dR: Array, dt_s: float, R_world_body: Array, v_cov_body: Array, w_sigma_radps: float
+        self,
+        until_ns: int,
+        dt_s: float,
+        dp_body_m: Array,
+        dR: Array,
+        R_world_body: Array,
+        v_cov_body: Array,
+        noise: Array,
     ) -> None:
         """Go a step on.
 
         Args:
-            dp_body_m, dR: as above. dt_s: how long it took. R_world_body: the map's attitude after it.
-            v_cov_body: (3, 3) of the velocity before it. w_sigma_radps: of the rate.
+            until_ns: its end. dt_s: how long it took. dp_body_m, dR: as above. R_world_body: the map's attitude after it.
+            v_cov_body: (3, 3) of the velocity before it. noise: (6, 6) of the IMU over it: rotation, place, body axes.
         """
         cov = np.array(_FLOOR)
-        cov[:3, :3] += dt_s**2 * self.R @ v_cov_body @ self.R.T
-        cov[3:, 3:] += (dt_s * w_sigma_radps) ** 2 * np.eye(3)
+        cov[:3, :3] += self.R @ (dt_s**2 * v_cov_body + noise[3:, 3:]) @ self.R.T
+        cov[3:, 3:] += self.R @ noise[:3, :3] @ self.R.T
         self.p_m, R = self.after(dp_body_m, dR)
         up = R @ R_world_body[2]  # where the map says that up is; both frames have it along z
         lean = np.cross(up, np.array([0.0, 0.0, 1.0])) * min(dt_s / _LEAN_S, 1.0)
@@ -49,4 +60,4 @@ class Odometry:
         self.R = np.asarray(Rotation.from_rotvec(lean).as_matrix() @ R)
         self.R = np.asarray(Rotation.from_matrix(self.R).as_matrix())  # a rotation still, after a day of steps
         cov[3:, 3:] += size**2 * 0.1 * np.eye(3)
-        self.step_cov = cov
+        self.stamp_ns, self.step_cov = until_ns, self.step_cov + cov

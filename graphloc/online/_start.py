@@ -19,7 +19,7 @@ from graphloc.config import VesselConfig
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
 from graphloc.graph import Hint, InertialRow, Sensor
-from graphloc.measurements import GnssPosition, ImuSeries, Measurement
+from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.recording import Recording
 from graphloc.solve._align import MOVED_M
@@ -75,8 +75,7 @@ def try_start(
         mounts=mounts,
         topics={name: sensor.topic for name, sensor in config.sensors.items()},
     )
-    fixes = sum(isinstance(m, GnssPosition) for m in measurements)
-    if datum is None and config.datum is None and fixes < _FIXES:
+    if datum is None and config.datum is None and len(origin.fixes_of(recording)) < _FIXES:
         return f"{_FIXES} GNSS fixes, for an origin of world: no `datum:` is configured"
     try:
         datum = datum or origin.choose_datum(recording, config, rows)
