@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the sizes of tags that a survey gives go with how far apart it has them.
+
+A size scales every distance: if those of all tags are 25 % too large (the white margin was measured, too), no two tags of
+an image fit one pose, each of them by itself fits well, and a run that follows them is metres off. With one more unknown,
+a factor to all sizes, they fit together again; which holds for any track.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from graphloc.frontends.tags.bundles import CONTRADICTS, Bundle, SeenTag
+from graphloc.measurements import TagSighting
+from graphloc.survey import Survey, TagConfig
+
+_FEWEST, _TRIED = 8, 12  # images
+_MOST = 0.5  # share of images
+_OFF, _ALIKE = 0.1, 0.03  # of the factor: less is left to the run, which says so; its scatter from image to image
+_LOG_FACTORS = (-1.6, 1.6)  # 0.2 to 5
+_SURE = 5.0  # sigmas, of what image and survey together tell; and of the survey alone, as large errors do not add up so
+
+
+def size_factors(sightings: Sequence[TagSighting], survey: Survey) -> dict[str, float]:
+    """Return by frame what all its sizes must be multiplied with to fit; frames whose sizes fit as they are, are not there.
+
+    Args:
+        sightings: of one sensor. survey: its own.
+    """
+    images: dict[str, dict[tuple[str, int], list[TagSighting]]] = defaultdict(lambda: defaultdict(list))
+    for m in sightings:
+        images[m.frame][(m.camera, m.stamp_ns)].append(m)
+    found = {}
+    for frame, of_frame in images.items():
+        several = [own for own in of_frame.values() if sum(len(m.tags) for m in own) > 1]
+        if len(several) < _FEWEST:
+            continue
+        tried = several[:: -(-len(several) // _TRIED)]
+        fitting = np.array([f for own in tried if (f := _factor(own, survey, frame)) is not None])
+        if len(fitting) <= _MOST * len(tried):
+            continue
+        factor = float(np.median(fitting))
+        if abs(factor - 1.0) > _OFF and np.median(np.abs(fitting - factor)) < _ALIKE * factor:
+            found[frame] = factor
+    return found
+
+
+def _factor(own: Sequence[TagSighting], survey: Survey, frame: str) -> float | None:
+    """By the tags of one image; None where no factor makes them fit."""
+    listed = {(str(tag.family), tag.id): tag for tag in survey.tags}
+
+    def excess(log_factor: float) -> float:
+        group = [
+            SeenTag(
+                listed[tag].model_copy(update={"size_m": listed[tag].size_m * np.exp(log_factor)}),
+                m.rays[4 * k : 4 * k + 4],
+                m.cov[8 * k : 8 * k + 8, 8 * k : 8 * k + 8],
+            )
+            for m in own
+            for k, tag in enumerate(m.tags)
+        ]
+        return min(Bundle(group, survey, frame).excess, 1e9)
+
+    best = minimize_scalar(excess, bounds=_LOG_FACTORS, method="bounded", options={"xatol": 1e-3})
+    as_it_is, dof = excess(0.0), 8 * sum(len(m.tags) for m in own) - 7
+    sure = dof * (as_it_is - best.fun) > _SURE**2 and abs(best.x) > _SURE * _unsure(own, listed)
+    return float(np.exp(best.x)) if sure and best.fun < as_it_is / CONTRADICTS else None
+
+
+def _unsure(own: Sequence[TagSighting], listed: Mapping[tuple[str, int], TagConfig]) -> float:
+    """What the survey does not know of how far apart the tags of an image are, as a share of that, 1 sigma."""
+    middles = np.concatenate([m.points_m.reshape(-1, 4, 3).mean(axis=1) for m in own])
+    sigma_m = max(listed[tag].sigma_m for m in own for tag in m.tags)
+    return float(np.sqrt(2.0) * sigma_m / max(np.linalg.norm(middles - middles[0], axis=1).max(), 1e-6))
