@@ -31,7 +31,7 @@ class LedgerRow:
         seq: arrival number; -1 for a row that stands for a whole topic.
         stamp_ns: sensor stamp (0 if it could not be read).
         sensor: configured name, '' if none.
-        topic: topic in the bag, or '(simulated)', '(config)'.
+        topic: topic in the bag, or '(simulated)', '(config)', '(stream)'.
         outcome: what became of it.
         weight: final weight in [0, 1]; None where it has no meaning.
         mode: index of the chosen mode; None for sensors without modes.
