@@ -125,7 +125,7 @@ def _at_the_time(recording: Recording, config: VesselConfig) -> dict[int, int]:
                 if isinstance(m, TagSighting) and verdict is not None:
                     chosen.setdefault(m.seq, verdict.mode)
 
-    values, prior, known, _ = solve_start(problem, align(problem), lambda *_: None)
+    values, prior, known, *_ = solve_start(problem, align(problem), lambda *_: None)
     grow(problem, values, prior, known, lambda *_: None, chunk_s=_STEP_S, overlap_s=_LAG_S, watch=watch)
     return chosen
 

@@ -18,7 +18,7 @@ def test_a_stretch_may_end_anywhere() -> None:
     datum = app.choose_datum(run.recording, run.config)
     whole = app.with_synthetic(run.recording, run.config, datum)
     problem = make_problem(whole, app.seen_frames(run.config, whole), datum, SENSORS, INERTIAL)
-    values, prior, known, _ = solve_start(problem, align(problem), lambda *_: None)
+    values, prior, known, *_ = solve_start(problem, align(problem), lambda *_: None)
     grow(problem, values, prior, known, lambda *_: None)
     last = len(problem.timeline) - 1
     seen = next(s for s in problem.streams if s.name == "tags")

@@ -51,6 +51,9 @@ _PAGE_S = 1.0
 _CHAPTER = 12  # hypotheses that are judged as one sequence
 _ROUNDS = 2  # of judging what is new
 _CHAIN = 2  # measurements that agree with each other, and not with the estimate
+_FAR_M = 20e3  # from the estimate: no place of this run; beyond, the linear algebra fails before a kernel helps
+_CREDIBLE = 6.0  # sigmas of a slow error: beyond, a sensor that agrees does so by an error that it does not have
+_FEW = 8  # measurements of absolute sensors in a row that disagree: not yet a sign
 _STEPS, _STEP_M = 3, 0.3  # of the solver in one commit, while the newest state moves
 
 
@@ -117,6 +120,7 @@ class Lag:
         self._known: dict[int, Beside] = {}
         self._gone: list[LedgerRow] = []
         self.agreed_ns: dict[str, int] = {}
+        self._refused: list[int] = []  # stamps of absolute measurements since the last that agreed: the first few
         self._begin(anchor, guess or (anchor.pose, anchor.velocity, anchor.bias))
 
     def _begin(self, anchor: Anchor, guess: tuple[gtsam.Pose3, Array, Array]) -> None:
@@ -286,8 +290,12 @@ class Lag:
         stream, i = self.problem.take(m)
         at = attach(self.problem, stream, i, self._window.values)
         residuals = stream.row.residuals(m, stream.config, at)
+        if (away_m := min(r.size_m or 0.0 for r in residuals)) > _FAR_M:
+            self._note(stream, m, None)
+            raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
         if stream.row.false is None:
             verdict, open_ = self._by_kernel(stream, i, at, residuals[0], fresh=True)
+            self._note(stream, m, verdict)
             entry = _Entry(stream, i, verdict, open_=open_)
             self._put(entry)
             self._ask_at(self._seconds(m.stamp_ns) + _AGAIN_S[0], entry)
@@ -295,6 +303,25 @@ class Lag:
             entry = _Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at))
             self._rounds[stream.name] = _ROUNDS
         self._entries[(stream.number, i)] = entry
+
+    def _note(self, stream: LiveStream, m: Measurement, verdict: Verdict | None) -> None:
+        """Remember when absolute sensors agreed, and how long none has."""
+        if not stream.row.absolute:
+            return
+        if verdict is not None and verdict.weight >= AGREES and _credible(stream, verdict.at):
+            self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
+            self._refused = [stamp for stamp in self._refused if stamp > m.stamp_ns]
+        elif len(self._refused) < _FEW:
+            self._refused.append(m.stamp_ns)
+
+    @property
+    def refused_s(self) -> float:
+        """For how long absolute sensors have said, more than a few times, that it is elsewhere, and none that it is here."""
+        return (
+            self._seconds(self._newest.stamp_ns) - self._seconds(self._refused[0])
+            if len(self._refused) == _FEW
+            else 0.0
+        )
 
     def judge(self) -> None:
         """Stage what is to be decided, anew or again."""
@@ -384,6 +411,8 @@ class Lag:
         at = attach(self.problem, entry.stream, entry.index, self._window.values)
         residual = entry.stream.row.residuals(entry.measurement, entry.stream.config, at)[0]
         verdict, open_ = self._by_kernel(entry.stream, entry.index, at, residual, fresh=False)
+        if verdict.weight >= AGREES:
+            self._note(entry.stream, entry.measurement, verdict)
         if entry.open_ or abs(verdict.weight - entry.verdict.weight) > _CHANGED:
             entry.open_ = open_
             self._change(entry, verdict)
@@ -450,6 +479,8 @@ class Lag:
         verdicts = by_hypotheses(stream, [e.index for e in own], attached, residuals, predicted)
         for entry, verdict in zip(own, verdicts, strict=True):
             settled = entry.verdict.settled + (entry.open_ and verdict.mode != entry.verdict.mode)
+            if not entry.open_ or verdict.weight >= AGREES:
+                self._note(stream, entry.measurement, verdict)
             if not entry.open_ and verdict.weight < AGREES:
                 self._refuted.add(stream.name)
             entry.open_ = True  # it has been judged
@@ -487,8 +518,6 @@ class Lag:
         """Stage the factors of an entry."""
         stream, verdict = entry.stream, entry.verdict
         m = entry.measurement
-        if verdict.weight >= AGREES:
-            self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
         if verdict.decision is None or verdict.decision.weight <= NEGLIGIBLE:
             return
         window, t = self._window, self._page(self.problem.timeline.stamps_ns[entry.state])
@@ -581,3 +610,10 @@ class Lag:
     @property
     def factor_slots(self) -> int:
         return self._window.factor_slots
+
+
+def _credible(stream: LiveStream, at: Attachment) -> bool:
+    """Whether a sensor agrees by an error that it may have."""
+    if stream.slow is None or at.slow_value is None:
+        return True
+    return bool((np.abs(at.slow_value) <= _CREDIBLE * stream.slow.sigma).all())

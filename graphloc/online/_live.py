@@ -20,7 +20,9 @@ from graphloc.measurements import ImuSeries, Measurement
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
-_REMEMBERED = 50  # residuals that say how wide a sensor scatters
+# Residuals that say how wide a sensor scatters: with 50, a compass that is 100 deg off for 7 s is then taken for a wide one,
+# and turns the vessel.
+_REMEMBERED = 300
 
 
 class Tape(Generic[T]):

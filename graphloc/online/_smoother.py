@@ -10,9 +10,10 @@ from __future__ import annotations
 import json
 import logging
 import os
-from bisect import insort
+from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -36,12 +37,19 @@ from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
-_TRY_EVERY_S, _LONGEST_WAIT_S = 0.5, 120.0  # for a start; what is older is let go
+_TRY_EVERY_S, _TRY_AGAIN, _LONGEST_WAIT_S = 0.5, 0.1, 120.0  # for a start; what is older is let go
 _ANCHOR_S, _SNAPSHOT_S = 1.0, 2.0
+_LOST_S, _AGAIN_S = 8.0, 6.0  # of disagreement, until it starts anew; with the data of so long
 _AHEAD_S = 60.0  # of the IMU: a stamp of another clock
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _BACK = 50  # IMU samples in a row before the newest: their clock was set back
-_PENDING = 10_000
+_PENDING, _BUFFERED = 10_000, 50_000
+_HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing
+_FORCE_MPS2, _RATE_RADPS = (
+    (3.0, 40.0),
+    3.0,
+)  # what a vessel's IMU can say; 1 g in g, and a slow turn in deg/s, are outside
+_UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # of motion where there are no samples (see `graphloc.factors.imu`)
 
 
 class OnlineSmoother:
@@ -76,8 +84,9 @@ class OnlineSmoother:
         self._datum = datum or (Datum(config.datum.geodetic) if config.datum else None)
         imu = config.of_kind(inertial.kind)
         self._imu_name = next(iter(imu), "")
-        self._bridge_s = min((sensor.max_bridge_s for sensor in imu.values()), default=0.0)
-        self._gap_s = min((sensor.max_gap_s for sensor in imu.values()), default=0.0)
+        self._bridge_s = imu[self._imu_name].max_bridge_s if imu else 0.0
+        self._gap_s = imu[self._imu_name].max_gap_s if imu else 0.0
+        self._floats = bool(imu) and imu[self._imu_name].gravity == "included"
         kinds = {row.kind for row in rows}
         self._asked = {name for name, s in config.sensors.items() if s.enabled and s.kind in kinds}
         self._absolute = [n for row in rows if row.absolute for n in config.of_kind(row.kind)]
@@ -87,15 +96,23 @@ class OnlineSmoother:
         self._odometry: Odometry | None = None
         self._agreed_ns: dict[str, int] = {}
         self._heights_m: Mapping[str, float] = {}
+        self._doubt = ""
         self._newest_imu: ImuSample | None = None
         self._leap: ImuSample | None = None
-        self._behind = 0
+        self._leap_age = self._behind = 0
+        self._imu_stamps: list[int] = []  # in order, of the lag
+        self._unwritable = False
         self._resumable = self._read_snapshot()
         self._buffer: deque[Measurement] = deque()  # while it waits
         self._pending: list[Measurement] = []  # ahead of the IMU
         self._unread: list[ImuSample] = []
-        self._recent: deque[Measurement] = deque()  # since the anchor
-        self._wait("the first IMU sample")
+        self._holes: list[tuple[int, int]] = []  # that late samples of these lie in
+        self._recent: list[Measurement] = []  # since the oldest anchor
+        self._settled: set[int] = set()  # of these, what has its row
+        self._anchors: deque[Anchor] = deque()  # of the lag, one a second
+        self._wait(
+            "the first IMU sample" if imu else f"an IMU: no enabled sensor of kind {inertial.kind} is configured"
+        )
 
     # What is known
 
@@ -117,7 +134,7 @@ class OnlineSmoother:
     def rows(self) -> list[LedgerRow]:
         """Return the rows of the ledger that became final since this was last asked; measurements leave with the lag."""
         if self._lag is not None:
-            self._done += self._lag.gone()
+            self._settle(self._lag.gone())
         done, self._done = self._done, []
         return done
 
@@ -131,7 +148,11 @@ class OnlineSmoother:
         done = self.rows()
         if self._lag is not None:
             done += self._lag.held()
-        why = "no IMU data at this stamp" if self._lag is not None else f"never started: waiting for {self._waiting}"
+        why = (
+            "the run ended before a state there"
+            if self._lag is not None
+            else f"never started: waiting for {self._waiting}"
+        )
         left = [*self._pending, *([self._leap] if self._leap else [])]
         if self._lag is None:
             left += self._buffer
@@ -154,7 +175,7 @@ class OnlineSmoother:
             ahead_s = (m.stamp_ns - newest.stamp_ns) * 1e-9
             self._drop(m, Outcome.REJECTED, f"its stamp lies {ahead_s:.0f} s ahead of the IMU's")
         elif self._lag is None:
-            self._buffer.append(m)
+            self._hold(m)
         elif m.stamp_ns < self._lag.first_ns:
             late_s = (self._lag.newest.stamp_ns - m.stamp_ns) * 1e-9
             self._drop(m, Outcome.LATE, f"came {late_s:.1f} s after the newest state; the lag is {self._lag_s:g} s")
@@ -165,40 +186,94 @@ class OnlineSmoother:
                 self._drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
         return None
 
+    def _hold(self, m: Measurement) -> None:
+        """Keep a measurement while the start waits."""
+        self._buffer.append(m)
+        if len(self._buffer) > _BUFFERED:
+            self._drop(self._buffer.popleft(), Outcome.REJECTED, f"came before the start: waiting for {self._waiting}")
+
     def _feed_imu(self, m: ImuSample) -> Estimate | None:
         if m.sensor != self._imu_name:
-            self._drop(m, Outcome.IGNORED, "its sensor is switched off or not in the configuration")
+            other = m.sensor in self._config.sensors and self._config.sensors[m.sensor].enabled and self._imu_name
+            why = f"{other} is the IMU" if other else "its sensor is switched off or not in the configuration"
+            self._drop(m, Outcome.IGNORED, why)
+            return None
+        if absurd := self._absurd(m):
+            self._drop(m, Outcome.REJECTED, absurd)
+            if self._lag is None:
+                self._waiting = f"IMU data that a vessel can have: {absurd}"
             return None
         newest = self._newest_imu
-        if newest is not None:
-            if self._leap is not None:  # the sample before this one was far ahead: did the clock go on from there?
-                leap, self._leap = self._leap, None
-                if 0 < m.stamp_ns - leap.stamp_ns <= self._gap_s * 1e9:
-                    self._accept_imu(leap)
+        if newest is None:
+            return self._accept_imu(m)
+        leap, gap_ns = self._leap, self._gap_s * 1e9
+        if leap is not None and 0 < abs(m.stamp_ns - leap.stamp_ns) <= gap_ns and m.stamp_ns > newest.stamp_ns:
+            self._leap = None  # the clock went on from there
+            made = [self._accept_imu(n) for n in sorted((leap, m), key=lambda n: n.stamp_ns)]
+            return made[1] or made[0]
+        if m.stamp_ns <= newest.stamp_ns:
+            self._feed_late_imu(m, newest)
+            return None
+        if m.stamp_ns - newest.stamp_ns > gap_ns:
+            self._drop_leap()
+            self._leap, self._leap_age = m, 0
+            return None
+        made_now = self._accept_imu(m)
+        if leap is not None:
+            self._leap_age += 1
+            if leap.stamp_ns - m.stamp_ns <= gap_ns or self._leap_age >= _BACK:
+                self._leap = None
+                if leap.stamp_ns - m.stamp_ns > gap_ns:
+                    self._leap = leap
+                    self._drop_leap()
                 else:
-                    self._drop(leap, Outcome.REJECTED, "its stamp leaps, and the next one does not follow")
-                newest = self._newest_imu
-                assert newest is not None
-            if m.stamp_ns <= newest.stamp_ns:
-                self._behind += 1
-                if self._behind < _BACK:
-                    self._drop(m, Outcome.REJECTED, "its stamp does not increase")
-                    return None
-                self._restart(f"the IMU's clock was set back by {(newest.stamp_ns - m.stamp_ns) * 1e-9:.1f} s")
-                self._newest_imu = None
-            elif m.stamp_ns - newest.stamp_ns > self._gap_s * 1e9:
-                self._leap = m
-                return None
-        self._behind = 0
-        return self._accept_imu(m)
+                    made_now = self._feed_imu(leap) or made_now
+        return made_now
+
+    def _drop_leap(self) -> None:
+        if self._leap is not None:
+            self._drop(self._leap, Outcome.REJECTED, "its stamp leaps, and those after it do not follow")
+            self._leap = None
+
+    def _absurd(self, m: ImuSample) -> str:
+        """Why a sample cannot be a vessel's; empty where it can."""
+        force, rate = float(np.linalg.norm(m.accel_mps2)), float(np.linalg.norm(m.gyro_radps))
+        if (self._floats and force < _FORCE_MPS2[0]) or force > _FORCE_MPS2[1]:
+            return f"a specific force of {force:.3g} m/s^2: another unit?"
+        return f"a rate of {rate:.3g} rad/s: another unit?" if rate > _RATE_RADPS else ""
+
+    def _feed_late_imu(self, m: ImuSample, newest: ImuSample) -> None:
+        """A sample before the newest: it is late where one is missing; else its clock is not to be trusted."""
+        stamps = self._imu_stamps
+        n = bisect_left(stamps, m.stamp_ns)
+        period_ns = float(np.quantile(np.diff(stamps[-1000:]), 0.1)) if len(stamps) > 2 else np.inf
+        if 0 < n < len(stamps) and min(m.stamp_ns - stamps[n - 1], stamps[n] - m.stamp_ns) >= _HOLE * period_ns:
+            if self._lag is None:
+                self._hold(m)
+            else:
+                self._holes.append((stamps[n - 1], stamps[n]))
+                self._unread.append(m)
+                self._recent.append(m)
+                self._done.append(self._row(m, Outcome.USED, ""))
+            stamps.insert(n, m.stamp_ns)
+            return
+        self._behind += 1
+        if self._behind < _BACK:
+            self._drop(m, Outcome.REJECTED, "its stamp does not increase")
+            return
+        self._restart(f"the IMU's clock was set back by {(newest.stamp_ns - m.stamp_ns) * 1e-9:.1f} s")
+        self._newest_imu, self._agreed_ns = None, {}  # by a clock that is no more
+        self._accept_imu(m)
 
     def _accept_imu(self, m: ImuSample) -> Estimate | None:
         before, self._newest_imu = self._newest_imu, m
+        self._behind = 0
         silent_s = 0.0 if before is None else (m.stamp_ns - before.stamp_ns) * 1e-9
         if silent_s > self._bridge_s:
             self._restart(f"the IMU was silent for {silent_s:.1f} s")
+        self._imu_stamps.append(m.stamp_ns)
         if self._lag is None:
-            self._buffer.append(m)
+            self._hold(m)
             return self._try_to_start()
         self._unread.append(m)
         self._recent.append(m)
@@ -209,16 +284,29 @@ class OnlineSmoother:
         """Make the states that are due, with all that belongs to them."""
         assert self._lag is not None
         assert self._newest_imu is not None
+        assert self._odometry is not None
         if self._newest_imu.stamp_ns < self._lag.problem.timeline.due_ns:
             return None
+        self._odometry.begin()
         try:
             self._step(self._lag)
+            self._keep_anchor(self._lag)
+            if self._lag.refused_s > _LOST_S:
+                return self._start_over(self._lag)
+            return self._estimate(self._lag)
         except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
             self._rebuild(error)
+        return self._try_estimate()
+
+    def _try_estimate(self, stamp_ns: int | None = None) -> Estimate | None:
+        """Return an estimate if there is one to be had."""
         if self._lag is None:
             return None
-        self._keep_anchor(self._lag)
-        return self._estimate(self._lag)
+        try:
+            return self._estimate(self._lag, stamp_ns)
+        except Exception as error:  # noqa: BLE001 - as in `_advance`
+            log.warning("online: %s", _line(error))
+            return None
 
     def _step(self, lag: Lag) -> None:
         assert self._newest_imu is not None
@@ -235,13 +323,16 @@ class OnlineSmoother:
                 m = self._pending.pop(0)
                 if m.stamp_ns < lag.first_ns:
                     self._drop(m, Outcome.LATE, "left the lag while it waited")
-                else:
+                    continue
+                try:
                     lag.take(m)
+                except Exception as error:  # noqa: BLE001 - as in `_advance`; nothing of it is staged yet
+                    self._drop(m, Outcome.REJECTED, f"it could not be used: {_line(error)}")
             lag.judge()
             self._go(lag, before.stamp_ns, reached)
             lag.commit()
             lag.try_others()
-        self._done += lag.gone()
+        self._settle(lag.gone())
 
     def _read(self, lag: Lag) -> None:
         """Hand the IMU's samples on."""
@@ -249,6 +340,9 @@ class OnlineSmoother:
             stamps = np.array([m.stamp_ns for m in self._unread], dtype=np.int64)
             lag.problem.links.extend(stamps, np.array([np.hstack([m.accel_mps2, m.gyro_radps]) for m in self._unread]))
             self._unread = []
+        if self._holes:
+            holes, self._holes = self._holes, []
+            lag.mend(holes)
 
     def _make_own(self, lag: Lag) -> None:
         """Take what the configuration itself says at the newest state."""
@@ -263,21 +357,21 @@ class OnlineSmoother:
             self._own_due_ns[name] = at_ns + duration_ns(getattr(stream.config, "period_s", 1.0))
 
     def _go(self, lag: Lag, before_ns: int, until_ns: int) -> None:
-        """Carry the odometry from the newest state on, as the IMU says."""
-        assert self._odometry is not None
-        newest = lag.newest
-        pim = lag.problem.links.integrate(before_ns, until_ns, newest.bias)
-        there = pim.predict(gtsam.NavState(newest.pose, newest.velocity), newest.bias)
-        dp, dR = self._body_step(lag, newest.pose, there.pose())
-        R = newest.pose.rotation().matrix()
-        self._odometry.step(
-            dp,
-            dR,
-            (until_ns - before_ns) * 1e-9,
-            there.pose().rotation().matrix(),
-            R.T @ newest.velocity_cov @ R,
-            float(np.sqrt(np.diagonal(pim.preintMeasCov())[:3].max())) / max((until_ns - before_ns) * 1e-9, 1e-3),
-        )
+        """Carry the odometry on, from the newest state or from where it is already, as the IMU says."""
+        odometry, newest, links = self._odometry, lag.newest, lag.problem.links
+        assert odometry is not None
+        if until_ns <= odometry.stamp_ns:
+            return
+        start = gtsam.NavState(newest.pose, newest.velocity)
+        if before_ns < odometry.stamp_ns:
+            start = links.integrate(before_ns, odometry.stamp_ns, newest.bias).predict(start, newest.bias)
+            before_ns = odometry.stamp_ns
+        pim = links.integrate(before_ns, until_ns, newest.bias)
+        there = pim.predict(start, newest.bias)
+        dp, dR = self._body_step(lag, start.pose(), there.pose())
+        R, noise = start.attitude().matrix(), np.asarray(pim.preintMeasCov())[:6, :6]
+        v_cov = R.T @ newest.velocity_cov @ R
+        odometry.step(until_ns, (until_ns - before_ns) * 1e-9, dp, dR, there.pose().rotation().matrix(), v_cov, noise)
 
     @staticmethod
     def _body_step(lag: Lag, a: gtsam.Pose3, b: gtsam.Pose3) -> tuple[Array, Array]:
@@ -290,12 +384,17 @@ class OnlineSmoother:
     # Estimates
 
     def predict(self, stamp_ns: int | None = None) -> Estimate | None:
-        """Return the pose at a stamp (default: of the newest IMU sample) from the newest state; None before the start."""
+        """Return the pose at a stamp (default: of the newest IMU sample) from the newest state.
+
+        None before the start, and for a stamp farther ahead of the IMU than its silence is bridged.
+        """
         lag, newest = self._lag, self._newest_imu
         if lag is None or newest is None:
             return None
-        self._read(lag)
-        return self._estimate(lag, newest.stamp_ns if stamp_ns is None else stamp_ns)
+        at_ns = newest.stamp_ns if stamp_ns is None else stamp_ns
+        if at_ns - newest.stamp_ns > self._bridge_s * 1e9:
+            return None
+        return self._try_estimate(at_ns)
 
     def _estimate(self, lag: Lag, stamp_ns: int | None = None) -> Estimate:
         """The newest state, or what the IMU makes of it at a stamp after (a stamp before is answered with the state)."""
@@ -305,6 +404,8 @@ class OnlineSmoother:
         p_odom, R_odom = odometry.p_m, odometry.R
         pose_cov, v_cov = newest.pose_cov, newest.velocity_cov
         if stamp_ns is not None and stamp_ns > at_ns:
+            assert self._newest_imu is not None
+            self._read(lag)
             pim = links.integrate(at_ns, stamp_ns, newest.bias)
             there = pim.predict(gtsam.NavState(pose, v), newest.bias)
             p_odom, R_odom = odometry.after(*self._body_step(lag, pose, there.pose()))
@@ -315,6 +416,11 @@ class OnlineSmoother:
             pose_cov[3:, 3:] += dt_s**2 * R.T @ v_cov @ R + noise[3:6, 3:6]
             pose_cov[:3, :3] += noise[:3, :3]
             v_cov = v_cov + noise[6:, 6:]
+            blind_s = (stamp_ns - self._newest_imu.stamp_ns) * 1e-9
+            if blind_s > self._gap_s:
+                pose_cov[:3, :3] += _UNKNOWN_RADPS**2 * blind_s * np.eye(3)
+                pose_cov[3:, 3:] += _UNKNOWN_MPS2**2 * blind_s**3 / 3.0 * np.eye(3)
+                v_cov = v_cov + _UNKNOWN_MPS2**2 * blind_s * np.eye(3)
             pose, v, at_ns = there.pose(), np.asarray(there.velocity()), stamp_ns
         lever = -lag.problem.t_body_imu_m
         R = pose.rotation().matrix()
@@ -323,7 +429,7 @@ class OnlineSmoother:
         cov[:3, :3] += left_out(list(lag.problem.streams.values()))
         agreed = {**self._agreed_ns, **lag.agreed_ns}
         since = {n: max((at_ns - agreed[n]) * 1e-9, 0.0) if n in agreed else np.inf for n in self._absolute}
-        health, reason = health_of(cov, since)
+        health, reason = health_of(cov, since, self._doubt)
         return Estimate(
             stamp_ns=at_ns,
             p_world_m=np.asarray(pose.transformFrom(lever)),
@@ -364,20 +470,21 @@ class OnlineSmoother:
         self._lag = None
         self._waiting = why
         self._buffer.clear()
-        self._pending, self._unread, self._recent = [], [], deque()
+        self._pending, self._unread, self._holes, self._recent, self._settled = [], [], [], [], set()
+        self._imu_stamps = []
         self._own_due_ns: dict[str, int] = {}
         self._tried_ns = 0
-        self._anchor: Anchor | None = None
-        self._before_anchor: ImuSample | None = None
+        self._anchors.clear()
+        self._before: ImuSample | None = None  # the last sample before the oldest anchor
         self._snapshot_ns = 0
 
     def _restart(self, why: str) -> None:
         if self._lag is not None:
-            self._done += [*self._lag.gone(), *self._lag.held()]
+            self._settle([*self._lag.gone(), *self._lag.held()])
             self._agreed_ns.update(self._lag.agreed_ns)
             self._events.append(f"{why}: starts anew")
-        stuck = "the run was cut before the IMU got there"
-        self._done += [self._row(m, Outcome.REJECTED, stuck) for m in self._pending if m.seq >= 0]
+        for m in self._pending:
+            self._drop(m, Outcome.REJECTED, "the run was cut before the IMU got there")
         for m in self._buffer:
             self._drop(m, Outcome.REJECTED, f"the run was cut while it waited for {self._waiting}")
         self._wait("the next IMU sample")
@@ -390,10 +497,12 @@ class OnlineSmoother:
             return None
         while (newest.stamp_ns - self._buffer[0].stamp_ns) > _LONGEST_WAIT_S * 1e9:
             self._drop(self._buffer.popleft(), Outcome.REJECTED, f"came before the start: waiting for {self._waiting}")
-        if newest.stamp_ns - self._tried_ns < _TRY_EVERY_S * 1e9:
+        waited_ns = newest.stamp_ns - self._buffer[0].stamp_ns  # the more there is to solve, the rarer
+        if newest.stamp_ns - self._tried_ns < max(_TRY_EVERY_S * 1e9, _TRY_AGAIN * waited_ns):
             return None
         self._tried_ns = newest.stamp_ns
-        samples = [m for m in self._buffer if isinstance(m, ImuSample)]
+        samples = sorted((m for m in self._buffer if isinstance(m, ImuSample)), key=lambda m: m.stamp_ns)
+        self._imu_stamps = [m.stamp_ns for m in samples]
         others = [m for m in self._buffer if not isinstance(m, ImuSample) and m.stamp_ns <= newest.stamp_ns]
         try:
             started = try_start(
@@ -409,14 +518,12 @@ class OnlineSmoother:
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             self._restart(f"the start failed ({_line(error)})")
             return None
-        assert self._lag is not None
-        self._keep_anchor(self._lag)
-        return self._estimate(self._lag)
+        return self._try_estimate()
 
     def _take_over(self, started: Started, samples: list[ImuSample], others: list[Measurement]) -> None:
         """Build the lag where the data begin, and bring it to now."""
-        self._datum, self._heights_m = started.datum, started.heights_m
-        self._done += [self._row(m, Outcome.USED, "") for m in samples]
+        self._datum, self._heights_m, self._doubt = started.datum, started.heights_m, started.doubt
+        self._done += [self._row(m, Outcome.USED, "") for m in samples if m.seq >= 0]
         self._buffer.clear()
         self._begin(started.anchor, samples, (started.pose, started.velocity, started.bias))
         assert self._lag is not None
@@ -426,7 +533,9 @@ class OnlineSmoother:
             else:
                 self._pending.append(m)
         self._pending.sort(key=lambda m: m.stamp_ns)
+        self._recent = [*samples, *self._pending]
         self._step(self._lag)
+        self._keep_anchor(self._lag)
         self._events.append(f"started at {utc_text(self._lag.newest.stamp_ns)}: {'; '.join(started.notes)}")
 
     def _begin(
@@ -441,84 +550,119 @@ class OnlineSmoother:
         agreed = {} if self._lag is None else self._lag.agreed_ns
         self._lag = Lag(problem, anchor, self._lag_s, guess)
         self._lag.agreed_ns.update(agreed)
-        self._anchor = anchor
+        self._own_due_ns = {}
         if self._odometry is None:
-            pose = anchor.pose
-            self._odometry = Odometry(pose.transformFrom(-problem.t_body_imu_m), pose.rotation().matrix())
+            pose = self._lag.newest.pose
+            place = np.asarray(pose.transformFrom(-problem.t_body_imu_m))
+            self._odometry = Odometry(anchor.stamp_ns, place, pose.rotation().matrix())
 
     def _keep_anchor(self, lag: Lag) -> None:
         """Remember the newest state now and then, in memory and in the snapshot."""
-        at_ns = lag.newest.stamp_ns
-        if self._anchor is not None and at_ns - self._anchor.stamp_ns < _ANCHOR_S * 1e9 and self._before_anchor:
+        at_ns, anchors = lag.newest.stamp_ns, self._anchors
+        if anchors and at_ns - anchors[-1].stamp_ns < _ANCHOR_S * 1e9:
             return
-        try:
-            self._anchor = lag.anchor()
-        except Exception as error:  # noqa: BLE001 - as in `_advance`
-            self._rebuild(error)
-            return
-        kept: deque[Measurement] = deque()
+        anchors.append(lag.anchor())
+        while anchors[0].stamp_ns < lag.first_ns:
+            anchors.popleft()
+        oldest_ns = anchors[0].stamp_ns
+        kept = []
         for m in self._recent:
-            if m.stamp_ns > at_ns:
+            if m.stamp_ns >= oldest_ns:
                 kept.append(m)
-            elif isinstance(m, ImuSample):
-                self._before_anchor = m
-        self._before_anchor = self._before_anchor or self._newest_imu
+            elif isinstance(m, ImuSample) and (self._before is None or m.stamp_ns > self._before.stamp_ns):
+                self._before = m
         self._recent = kept
+        self._settled &= {m.seq for m in kept}
+        del self._imu_stamps[: bisect_left(self._imu_stamps, lag.first_ns)]
         if self._snapshot is not None and at_ns - self._snapshot_ns >= _SNAPSHOT_S * 1e9:
             self._snapshot_ns = at_ns
             self._write_snapshot(self._snapshot)
 
     def _rebuild(self, error: Exception) -> None:
-        """Build the lag anew from the last anchor; if that fails too, without what was measured since; or start anew."""
+        """Build the lag anew: with all that is in it; if that fails too, from the last anchor without what came since; or start anew.
+
+        An anchor holds what was known when its state was the newest, so what was measured since can be taken again.
+        """
         log.warning("online: %s", _line(error))
-        lag, anchor = self._lag, self._anchor
-        assert lag is not None
-        if anchor is None:
-            self._restart(f"the solver failed ({_line(error)})")
-            return
-        recent, self._pending, self._unread = list(self._recent), [], []
-        self._done += [*lag.gone(), *lag.held(anchor.stamp_ns)]
-        samples = [m for m in recent if isinstance(m, ImuSample)]
-        before = [self._before_anchor] if self._before_anchor is not None else []
-        for without in (False, True):
-            others = [m for m in recent if not isinstance(m, ImuSample)]
+        assert self._lag is not None
+        old = self._lag
+        anchors = [a for a in self._anchors if a.stamp_ns >= old.first_ns]
+        self._settle(old.gone())
+        for anchor, without in [(anchors[0], False), (anchors[-1], True)] if anchors else []:
+            again = [m for m in self._recent if m.stamp_ns >= anchor.stamp_ns and m.seq not in self._settled]
+            samples = [m for m in self._recent if isinstance(m, ImuSample)]
+            samples = sorted([*([self._before] if self._before else []), *samples], key=lambda m: m.stamp_ns)
+            others = sorted((m for m in again if not isinstance(m, ImuSample)), key=lambda m: m.stamp_ns)
+            self._unread, self._holes, self._pending = [], [], [] if without else list(others)
+            settled, done = set(self._settled), list(self._done)
             try:
-                self._begin(anchor, [*before, *samples])
+                self._begin(anchor, samples)
                 fresh = self._lag
-                assert fresh is not None
-                for m in [] if without else others:
-                    if m.stamp_ns >= fresh.first_ns:
-                        insort(self._pending, m, key=lambda p: p.stamp_ns)
                 self._step(fresh)
-            except Exception as again:  # noqa: BLE001 - as in `_advance`
-                self._pending, error = [], again
+            except Exception as another:  # noqa: BLE001 - as in `_advance`
+                error, self._settled, self._done = another, settled, done
                 continue
             if without:
-                why = f"the solver failed with it: {_line(error)}"
-                self._done += [self._row(m, Outcome.REJECTED, why) for m in others if m.seq >= 0]
-                self._recent = deque(samples)
+                for m in others:
+                    self._drop(m, Outcome.REJECTED, f"the solver failed with it: {_line(error)}")
+                self._anchors = deque([anchor])
+            self._close(old, {m.seq for m in others})
             age_s = (fresh.newest.stamp_ns - anchor.stamp_ns) * 1e-9
             self._events.append(f"the solver failed ({_line(error)}): rebuilt from {age_s:.1f} s before")
             return
-        self._lag = None
-        self._done += [self._row(m, Outcome.REJECTED, f"the solver failed with it: {_line(error)}") for m in recent
-                       if m.seq >= 0 and not isinstance(m, ImuSample)]  # fmt: skip
-        self._events.append(f"the solver failed ({_line(error)}), and again from the last anchor: starts anew")
+        held = {row.seq for row in old.held()}
+        self._lag, self._pending = old, [
+            m for m in self._recent
+            if not isinstance(m, ImuSample) and m.seq not in self._settled and m.seq not in held
+        ]  # fmt: skip
+        self._restart(f"the solver failed ({_line(error)}), and again from what was known before")
+
+    def _start_over(self, lag: Lag) -> Estimate | None:
+        """Start anew, with the last seconds: what measures place agrees with itself or not, but not with the estimate."""
+        assert self._newest_imu is not None
+        since_ns = self._newest_imu.stamp_ns - duration_ns(_AGAIN_S)
+        self._settle(lag.gone())
+        again = [m for m in self._recent if m.stamp_ns >= since_ns and m.seq not in self._settled]
+        self._close(lag, {m.seq for m in again})
+        self._agreed_ns.update(lag.agreed_ns)
+        self._events.append(f"no absolute sensor agreed for {lag.refused_s:.0f} s: starts anew")
         self._wait("the next IMU sample")
+        # Samples have their rows already.
+        self._buffer.extend(replace(m, seq=-1) if isinstance(m, ImuSample) else m for m in again)
+        return self._try_to_start()
+
+    def _close(self, old: Lag, again: set[int]) -> None:
+        """Give the rows of a lag that was replaced, but for what was taken again."""
+        rows = [row for row in old.held() if row.seq not in again]
+        self._settle(rows)
+        for m in self._recent:
+            if not isinstance(m, ImuSample) and m.seq not in self._settled and m.seq not in again:
+                self._drop(m, Outcome.LATE, "came before the oldest state of a lag that was built anew")
+
+    def _settle(self, rows: Sequence[LedgerRow]) -> None:
+        """Enter rows into the ledger."""
+        self._done += rows
+        if self._lag is not None:
+            self._settled.update(row.seq for row in rows)
 
     # Snapshot
 
     def _write_snapshot(self, path: Path) -> None:
-        assert self._anchor is not None
         assert self._odometry is not None
         assert self._datum is not None
-        last = self._before_anchor
+        anchor = self._anchors[-1]
+        last = max(
+            (m for m in [self._before, *self._recent] if isinstance(m, ImuSample) and m.stamp_ns <= anchor.stamp_ns),
+            key=lambda m: m.stamp_ns,
+            default=self._newest_imu,
+        )
+        assert last is not None
         raw = {
             "version": 1,
             "vessel": self._config.vessel,
             "datum": list(self._datum.origin),
-            "anchor": self._anchor.as_dict(),
-            "imu": None if last is None else [last.stamp_ns, *last.accel_mps2.tolist(), *last.gyro_radps.tolist()],
+            "anchor": anchor.as_dict(),
+            "imu": [last.stamp_ns, *last.accel_mps2.tolist(), *last.gyro_radps.tolist()],
             "heights_m": dict(self._heights_m),
             "agreed_ns": {**self._agreed_ns, **(self._lag.agreed_ns if self._lag else {})},
             "odom": [self._odometry.p_m.tolist(), self._odometry.R.tolist()],
@@ -531,7 +675,11 @@ class OnlineSmoother:
                 os.fsync(stream.fileno())
             part.replace(path)  # at once: a kill leaves the old one or the new one
         except OSError as error:
-            self._events.append(f"{path}: the snapshot cannot be written ({error.strerror or error})")
+            if not self._unwritable:
+                self._events.append(f"{path}: the snapshot cannot be written ({error.strerror or error})")
+            self._unwritable = True
+            return
+        self._unwritable = False
 
     def _read_snapshot(self) -> tuple[Anchor, ImuSample] | None:
         path = self._snapshot
@@ -544,14 +692,20 @@ class OnlineSmoother:
             anchor = Anchor.from_dict(raw["anchor"])
             stamp, *six = raw["imu"]
             last = ImuSample(stamp_ns=int(stamp), sensor=self._imu_name, seq=-1, accel_mps2=six[:3], gyro_radps=six[3:])
-            self._datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
-            self._heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
-            self._agreed_ns = {str(n): int(s) for n, s in raw["agreed_ns"].items()}
-            p, R = (np.array(v, dtype=np.float64) for v in raw["odom"])
-            self._odometry = Odometry(p.reshape(3), R.reshape(3, 3))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
+            if self._datum is not None and not np.allclose(datum.origin, self._datum.origin, rtol=0.0, atol=1e-9):
+                raise ValueError("its origin of world is another one")
+            heights_m = {str(n): float(h) for n, h in raw["heights_m"].items() if n in self._asked}
+            agreed_ns = {str(n): int(s) for n, s in raw["agreed_ns"].items()}
+            p, R = np.array(raw["odom"][0], dtype=np.float64), np.array(raw["odom"][1], dtype=np.float64)
+            numbers = np.concatenate([p.reshape(3), R.reshape(9), datum.origin, list(heights_m.values())])
+            if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
+                raise ValueError("it is damaged")
+        except Exception as error:  # noqa: BLE001 - a file that anything may have written
             self._events.append(f"{path}: the snapshot cannot be used ({_line(error)}): starts anew")
             return None
+        self._datum, self._heights_m, self._agreed_ns = datum, heights_m, agreed_ns
+        self._odometry = Odometry(anchor.stamp_ns, p, R)
         return anchor, last
 
     def _resume(self, newest: ImuSample) -> None:
@@ -560,14 +714,18 @@ class OnlineSmoother:
         (anchor, last), self._resumable = self._resumable, None
         age_s = (newest.stamp_ns - anchor.stamp_ns) * 1e-9
         if not 0.0 < age_s <= self._bridge_s:
+            self._agreed_ns = self._agreed_ns if age_s > 0.0 else {}
             self._events.append(f"the snapshot is {age_s:.1f} s old, more than the {self._bridge_s:g} s that the IMU's "
                                 "silence is bridged for: starts anew")  # fmt: skip
             return
-        waiting = [m for m in self._buffer if m is not newest]
-        self._buffer = deque()
-        self._begin(anchor, [last, newest])
-        self._before_anchor = last
-        self._recent = deque([newest])
+        try:
+            self._begin(anchor, [last, newest])
+        except Exception as error:  # noqa: BLE001 - as in `_advance`
+            self._lag = None
+            self._events.append(f"the snapshot cannot be used ({_line(error)}): starts anew")
+            return
+        waiting, self._buffer = [m for m in self._buffer if m is not newest], deque()
+        self._anchors, self._before, self._recent = deque([anchor]), last, [newest]
         self._done.append(self._row(newest, Outcome.USED, ""))
         self._events.append(f"resumed from a snapshot {age_s:.1f} s old")
         for m in waiting:
@@ -577,7 +735,7 @@ class OnlineSmoother:
 
     def _drop(self, m: Measurement, outcome: Outcome, reason: str) -> None:
         if m.seq >= 0:
-            self._done.append(self._row(m, outcome, reason))
+            self._settle([self._row(m, outcome, reason)])
 
     def _row(self, m: Measurement, outcome: Outcome, reason: str) -> LedgerRow:
         sensor = self._config.sensors.get(m.sensor)

@@ -24,8 +24,11 @@ from graphloc.online._anchor import Anchor
 from graphloc.recording import Recording
 from graphloc.solve._align import MOVED_M
 from graphloc.solve._batch import solve_batch
+from graphloc.solve._solution import world_covariance
 
 _LEAST_S = 5.0  # of inertial data: gyro bias, roll and pitch of a vessel in waves
+_HEADING_RAD = np.radians(15.0)  # 1 sigma: from farther off a lag does not come back soon
+_HEADING_WAIT_S = 30.0  # for a heading from the way alone; then the place is worth more than nothing
 _FIXES = 3  # to take a datum from
 
 
@@ -38,6 +41,7 @@ class Started:
         anchor: the first state, by what was known before any measurement: all that came is judged again in the lag.
         pose, velocity, bias: of that state, as it was solved: (gtsam.Pose3), (3,), (6,).
         heights_m: of each sensor that the configuration makes itself, what it says.
+        doubt: why the pose cannot be called good.
         notes: what the alignment went by.
     """
 
@@ -47,6 +51,7 @@ class Started:
     velocity: Array
     bias: Array
     heights_m: Mapping[str, float]
+    doubt: str
     notes: tuple[str, ...]
 
 
@@ -112,10 +117,18 @@ def _missing(config: VesselConfig, rows: Sequence[Sensor], recording: Recording,
 
 def _solved(
     config: VesselConfig, rows: Sequence[Sensor], inertial: InertialRow, recording: Recording, datum: Datum
-) -> Started:
+) -> Started | str:
     whole = origin.with_synthetic(recording, config, datum, rows)
     problem = make_problem(whole, config, datum, rows, inertial, company_of(config, rows))
     result = solve_batch(problem)
+    last = keys.pose(len(problem.timeline) - 1)
+    R = result.values.atPose3(last).rotation().matrix()
+    sigma = float(np.sqrt(world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]))
+    doubt = ""
+    if result.headings > 1 or sigma > _HEADING_RAD:
+        doubt = f"the heading is a guess: {result.headings} explain the way so far, 1 sigma {np.degrees(sigma):.0f} deg"
+        if (problem.timeline.stamps_ns[-1] - problem.timeline.stamps_ns[0]) < _HEADING_WAIT_S * 1e9:
+            return f"a heading: {result.headings} explain the way so far; turn, or let a sensor or `start.heading_deg` tell it"
     heights = {
         name: origin.height_m(recording, config, sensor.height_m, datum)
         for row in rows
@@ -130,5 +143,6 @@ def _solved(
         velocity=np.asarray(result.values.atVector(keys.velocity(0))),
         bias=np.concatenate([held.accelerometer(), held.gyroscope()]),
         heights_m=heights,
+        doubt=doubt,
         notes=result.notes,
     )

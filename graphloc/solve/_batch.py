@@ -46,6 +46,7 @@ class BatchResult:
     converged: bool
     noise_scale: float
     prior: StartPrior
+    headings: int  # that explained the start as well as the one that was taken, and this one
     notes: tuple[str, ...]
 
 
@@ -56,7 +57,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         SolveError: it could not be started, or the linear algebra failed.
     """
     start = align(problem)
-    grown, prior, known, iterations = solve_start(problem, start, progress)
+    grown, prior, known, iterations, headings = solve_start(problem, start, progress)
     iterations += grow(problem, grown, prior, known, progress)
     passes, estimate, ratio = 0, grown, 1.0
     for attempt in range(_MAX_NOISE_ROUNDS):
@@ -79,6 +80,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         converged=settled.converged,
         noise_scale=problem.noise_scale,
         prior=prior,
+        headings=headings,
         notes=start.notes,
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -28,11 +29,18 @@ _COST_APART, _LONGEST_START_S = 8.0, 60.0
 _START_STAGES = (("far", 8, 0.5, False), ("open", 2, 0.5, False), ("final", 2, 0.5, True))
 
 
-def solve_start(problem: Problem, start: Start, progress: Progress) -> tuple[gtsam.Values, StartPrior, int, int]:
-    """Try each candidate on the first window; look further while several explain it; keep the cheapest.
+class Begun(NamedTuple):
+    """The start of a run: values, prior, the last state solved, iterations, and how many headings explain it."""
 
-    Returns values, prior, the last state solved, and iterations.
-    """
+    values: gtsam.Values
+    prior: StartPrior
+    last: int
+    iterations: int
+    headings: int
+
+
+def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
+    """Try each candidate on the first window; look further while several explain it; keep the cheapest."""
     seconds, iterations, until = start.window_s, 0, 0
     candidates = [_candidate(problem, start, yaw) for yaw in start.yaws_rad]
     failure: SolveError | None = None
@@ -54,7 +62,7 @@ def solve_start(problem: Problem, start: Start, progress: Progress) -> tuple[gts
         alive.sort(key=lambda c: c.cost)
         candidates = _different(alive)
         if len(candidates) == 1 or seconds >= _LONGEST_START_S or until == len(problem.timeline) - 1:
-            return candidates[0].values, candidates[0].prior, until, iterations
+            return Begun(candidates[0].values, candidates[0].prior, until, iterations, len(candidates))
         seconds *= 1.6
 
 
