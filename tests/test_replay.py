@@ -1,0 +1,126 @@
+"""A recording through the online mode: order of arrival, matches made under way, a run folder like any other."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from graphloc import app
+from graphloc.cli import app as cli
+from graphloc.errors import SolveError
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import SimulatedRun, bl_scenario, find_scenario, simulate
+from graphloc.eval.simulate.bag import write_bag
+from graphloc.measurements import GnssPosition, ImuSample
+from graphloc.replay import arrivals, replay
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    return simulate(replace(bl_scenario(1, "drift"), duration_s=30.0), 4)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("replay") / "sim"
+    write_bag(simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "30"}), 3), folder, ros=2)
+    return folder
+
+
+def test_messages_come_in_the_order_of_the_log(bag: Path) -> None:
+    """Those of a bag by their number, whatever their stamps; and all of them, once."""
+    recording, _ = app.load([bag / "run"], bag / "vessel.yaml")
+    fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)]
+    late = replace(fixes[10], stamp_ns=fixes[10].stamp_ns - 3_000_000_000)  # came when it came, says another time
+    changed = replace(recording, measurements=tuple(late if m is fixes[10] else m for m in recording.measurements))
+    order = [m.seq for m in arrivals(changed)]
+    assert order == sorted(order)
+    assert recording.imu is not None
+    every = [*recording.imu.seqs.tolist(), *(m.seq for m in recording.measurements if m.seq >= 0)]
+    assert sorted(order) == sorted(every)
+
+
+def test_what_a_front_end_made_comes_when_the_imu_is_there(run: SimulatedRun) -> None:
+    """Its number says when it was made, after the bag was read: not when the vessel had it."""
+    names = {m.sensor for m in run.recording.measurements if not isinstance(m, GnssPosition)}
+    made = replace(run.recording, source="a.bag", topics={**run.recording.topics, **dict.fromkeys(names, "(made)")})
+    newest_ns = 0
+    waited = 0
+    for m in arrivals(made):
+        if isinstance(m, ImuSample):
+            newest_ns = m.stamp_ns
+        elif m.sensor in names:
+            assert m.stamp_ns <= newest_ns or newest_ns == int(run.recording.imu.stamps_ns[-1])  # type: ignore[union-attr]
+            waited += 1
+    assert waited > 100
+
+
+def test_each_pose_is_as_it_was_known_then(run: SimulatedRun) -> None:
+    """What comes later changes nothing of what was said before; and each message has one row."""
+    whole = replay(run.recording, run.config)
+    imu = run.recording.imu
+    assert imu is not None
+    half_ns = int(imu.stamps_ns[len(imu) // 2])
+    n = int(np.searchsorted(imu.stamps_ns, half_ns))
+    first = replay(
+        replace(
+            run.recording,
+            imu=replace(
+                imu, stamps_ns=imu.stamps_ns[:n], accel_mps2=imu.accel_mps2[:n], gyro_radps=imu.gyro_radps[:n], seqs=imu.seqs[:n]
+            ),
+            measurements=tuple(m for m in run.recording.measurements if m.stamp_ns < half_ns),
+        ),
+        run.config,
+    )  # fmt: skip
+    a, b = first.solution.trajectory, whole.solution.trajectory
+    np.testing.assert_array_equal(a.stamps_ns, b.stamps_ns[: len(a)])
+    np.testing.assert_allclose(a.p_world_m, b.p_world_m[: len(a)], atol=1e-9)
+    assert compare_to_truth(b, run.truth).position_rmse_m < 0.6
+    rows = Counter(row.seq for row in whole.solution.ledger if row.seq >= 0)
+    assert set(rows.values()) == {1}
+    assert len(whole.solution.ledger) == run.recording.message_count or len(rows) == len(imu) + sum(
+        m.seq >= 0 for m in run.recording.measurements
+    )
+
+
+def test_scans_are_matched_around_its_own_prediction(bag: Path, tmp_path: Path) -> None:
+    """From a bag to a run folder; no match is made before there is a pose, and each turn that is refused says why."""
+    done = CliRunner().invoke(
+        cli, ["replay", str(bag / "run"), "-c", str(bag / "vessel.yaml"), "-o", str(tmp_path / "out"), "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout[: done.stdout.rindex("}") + 1])
+    assert told["Against truth"]["graphloc"]["position_rmse_m"] < 0.8
+    aerial = told["ledger"]["aerial"]
+    assert aerial["used"] > 8
+    text = (tmp_path / "out/ledger.csv").read_text()
+    assert "there was no estimate to match around" in text
+    assert (tmp_path / "out/report.html").stat().st_size > 10_000
+    assert (tmp_path / "out/solution.tum").read_text().count("\n") > 200
+
+
+def test_a_run_that_never_starts_says_what_it_waited_for(run: SimulatedRun) -> None:
+    without = replace(
+        run.recording, measurements=tuple(m for m in run.recording.measurements if not isinstance(m, GnssPosition))
+    )
+    alone = replace(without, measurements=tuple(m for m in without.measurements if m.sensor == "compass"))
+    with pytest.raises(SolveError, match="waited for a place"):
+        replay(alone, run.config)
+
+
+def test_compare_has_it_beside_the_filters(run: SimulatedRun) -> None:
+    compared = app.simulated(run, compare=True)
+    names = [f.name for f in compared.filters]
+    assert names[0] == "graphloc online"
+    assert "BL EKF" in names
+    table = next(t for t in app.tables(compared) if t.title == "Against truth").as_dict()
+    offline, online = (table[name]["position_rmse_m"] for name in ("graphloc", "graphloc online"))
+    assert offline is not None
+    assert online is not None
+    assert offline <= online + 0.05
