@@ -47,10 +47,18 @@ def arrivals_of(run: SimulatedRun) -> Arrivals:
     return [Arrival(m.stamp_ns, m) for m in every]
 
 
-def delayed(arrivals: Arrivals, rng: np.random.Generator, longest_s: float, *, imu: bool) -> Arrivals:
-    """Each message late by 0 to `longest_s`, each for itself."""
+def delayed(
+    arrivals: Arrivals, rng: np.random.Generator, longest_s: float, *, imu: bool, quiet_s: float = 0.0
+) -> Arrivals:
+    """Each message late by 0 to `longest_s`, each for itself; in the last `quiet_s` none is."""
+    until_ns = arrivals[-1].true_ns - quiet_s * 1e9
     late = [
-        a.true_ns + (rng.uniform(0.0, longest_s) * 1e9 if imu or not isinstance(a.m, ImuSample) else 0.0)
+        a.true_ns
+        + (
+            rng.uniform(0.0, longest_s) * 1e9
+            if a.true_ns <= until_ns and (imu or not isinstance(a.m, ImuSample))
+            else 0.0
+        )
         for a in arrivals
     ]
     return [arrivals[i] for i in np.argsort(late, kind="stable")]
@@ -77,9 +85,10 @@ class Fed:
     events: list[str] = field(default_factory=list)
 
     def recovered_s(self, since_ns: int, within_m: float = 3.0) -> float:
-        """Time from `since_ns` until the error is small; inf: never."""
-        good = [t for t, e in zip(self.true_ns, self.errors_m, strict=True) if t >= since_ns and e < within_m]
-        return (good[0] - since_ns) * 1e-9 if good else float("inf")
+        """Time from `since_ns` until there are estimates again and their error is, and stays, small; inf: never."""
+        later = [(t, e) for t, e in zip(self.true_ns, self.errors_m, strict=True) if t >= since_ns]
+        last_bad = max((n for n, (_, e) in enumerate(later) if e >= within_m), default=-1)
+        return (later[last_bad + 1][0] - since_ns) * 1e-9 if last_bad + 1 < len(later) else float("inf")
 
     def worst_m(self, since_ns: int = 0) -> float:
         """Largest error from `since_ns` on."""

@@ -24,11 +24,12 @@ from graphloc.online._anchor import Anchor
 from graphloc.recording import Recording
 from graphloc.solve._align import MOVED_M
 from graphloc.solve._batch import solve_batch
-from graphloc.solve._solution import world_covariance
+from graphloc.solve._solution import AGREES, world_covariance
 
 _LEAST_S = 5.0  # of inertial data: gyro bias, roll and pitch of a vessel in waves
 _HEADING_RAD = np.radians(15.0)  # 1 sigma: from farther off a lag does not come back soon
 _HEADING_WAIT_S = 30.0  # for a heading from the way alone; then the place is worth more than nothing
+_AGREEING, _SHARE, _CHOICE_WAIT_S = 3, 0.4, 15.0  # two false matches of five may agree with each other
 _FIXES = 3  # to take a datum from
 
 
@@ -121,13 +122,20 @@ def _solved(
     whole = origin.with_synthetic(recording, config, datum, rows)
     problem = make_problem(whole, config, datum, rows, inertial, company_of(config, rows))
     result = solve_batch(problem)
+    span_s = (problem.timeline.stamps_ns[-1] - problem.timeline.stamps_ns[0]) * 1e-9
+    if span_s < _CHOICE_WAIT_S:
+        for stream in problem.streams:
+            weights = [result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))]
+            agreeing = sum(weight >= AGREES for weight in weights)
+            if stream.row.false is not None and (agreeing < _AGREEING or agreeing < _SHARE * len(weights)):
+                return f"{_AGREEING} of {stream.name} that agree with each other ({agreeing} of {len(weights)} do)"
     last = keys.pose(len(problem.timeline) - 1)
     R = result.values.atPose3(last).rotation().matrix()
     sigma = float(np.sqrt(world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]))
     doubt = ""
     if result.headings > 1 or sigma > _HEADING_RAD:
         doubt = f"the heading is a guess: {result.headings} explain the way so far, 1 sigma {np.degrees(sigma):.0f} deg"
-        if (problem.timeline.stamps_ns[-1] - problem.timeline.stamps_ns[0]) < _HEADING_WAIT_S * 1e9:
+        if span_s < _HEADING_WAIT_S:
             return f"a heading: {result.headings} explain the way so far; turn, or let a sensor or `start.heading_deg` tell it"
     heights = {
         name: origin.height_m(recording, config, sensor.height_m, datum)

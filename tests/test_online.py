@@ -1,0 +1,357 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The online mode on runs that go well: start, lateness, lag, odometry, memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from graphloc import app
+from graphloc.config import ImuConfig, PoseConfig
+from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
+from graphloc.eval.simulate._scenario import harbour_scenarios
+from graphloc.factors import INERTIAL, SENSORS
+from graphloc.frames import Array
+from graphloc.ledger import Outcome
+from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix, PoseMode
+from graphloc.online import OnlineSmoother
+from graphloc.trajectory import Trajectory
+from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, delayed, feed, finish
+from tests.tagfactory import sighted
+
+
+def smoother(run: SimulatedRun, *, lag_s: float = 10.0) -> OnlineSmoother:
+    return OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, lag_s=lag_s)
+
+
+@cache
+def drift() -> SimulatedRun:
+    return simulate(replace(bl_scenario(1, "drift"), duration_s=30.0), 0)
+
+
+def whole(run: SimulatedRun, arrivals: Arrivals, *, lag_s: float = 10.0) -> tuple[Fed, Trajectory]:
+    """Feed all of a run; return what came of it, and the lag at the end."""
+    online = smoother(run, lag_s=lag_s)
+    fed = feed(online, run, arrivals)
+    lag = online.window()
+    assert lag is not None
+    return finish(online, fed), lag
+
+
+@cache
+def in_order() -> tuple[Fed, Trajectory]:
+    return whole(drift(), arrivals_of(drift()))
+
+
+def apart_m(a: Trajectory, b: Trajectory) -> Array:
+    """Horizontal distances at the stamps of `a` that `b` has, too."""
+    stamps = a.stamps_ns[(a.stamps_ns >= b.stamps_ns[0]) & (a.stamps_ns <= b.stamps_ns[-1])]
+    off = a.at(stamps).p_world_m - b.at(stamps).p_world_m
+    return np.hypot(off[:, 0], off[:, 1])
+
+
+def without(arrivals: Arrivals, gone: Callable[[Arrival], bool]) -> Arrivals:
+    return [a for a in arrivals if not gone(a)]
+
+
+def test_a_clean_run_is_followed_and_each_message_has_its_row() -> None:
+    fed, _ = in_order()
+    assert complaints(arrivals_of(drift()), fed) == []
+    assert np.sqrt(np.mean(np.square(fed.errors_m))) < 0.5
+    off = [
+        (e.p_world_m - drift().truth.at(np.array([e.stamp_ns])).p_world_m[0])[:2] for e in fed.estimates
+    ]  # fmt: skip
+    inside = [
+        o @ np.linalg.solve(e.cov[:2, :2], o) < chi2.ppf(0.95, 2) for o, e in zip(off, fed.estimates, strict=True)
+    ]
+    assert np.mean(inside) > 0.8
+
+
+def test_estimates_come_at_ten_hertz_and_stamps_increase() -> None:
+    stamps = np.array([e.stamp_ns for e in in_order()[0].estimates])
+    assert np.allclose(np.diff(stamps), 0.1e9, atol=1)
+
+
+def test_false_matches_are_rejected_with_a_reason() -> None:
+    truth = drift().truth
+    stamps = {a.m.seq: a.m for a in arrivals_of(drift()) if isinstance(a.m, PoseFix)}
+    right = wrong = 0
+    for row in in_order()[0].rows:
+        if row.seq in stamps:
+            m = stamps[row.seq]
+            off = m.modes[0].value[:2] - truth.at(np.array([m.stamp_ns])).p_world_m[0, :2]
+            if np.hypot(*off) > 1.5:  # five sigmas of a true one, both axes
+                wrong += row.outcome is not Outcome.REJECTED
+                assert row.outcome is Outcome.USED or row.reason
+            else:
+                right += row.outcome is Outcome.USED
+    assert wrong == 0
+    assert right >= 15
+
+
+def test_the_end_agrees_with_the_batch() -> None:
+    """On the same data, in a lag that holds all of it. What differs: the batch sees at once how wide a sensor scatters."""
+    _, lag = whole(drift(), arrivals_of(drift()), lag_s=60.0)
+    apart = apart_m(lag, app.simulated(drift()).solution.trajectory)
+    assert np.median(apart) < 0.02
+    assert apart.max() < 0.08
+
+
+# Lateness
+
+
+def test_late_and_shuffled_ends_where_in_order_ends() -> None:
+    """Late within the lag is as good as in time: the states of the lag come out the same to a centimetre."""
+    arrivals = delayed(arrivals_of(drift()), np.random.default_rng(3), 2.0, imu=False, quiet_s=2.5)
+    fed, lag = whole(drift(), arrivals)
+    assert complaints(arrivals, fed) == []
+    assert not [row for row in fed.rows if row.outcome is Outcome.LATE]
+    assert apart_m(lag, in_order()[1]).max() < 0.01
+
+
+def test_late_imu_samples_fill_their_holes() -> None:
+    """Once it runs: at the start, attitude and biases are told from what is there."""
+    every = arrivals_of(drift())
+    n = next(n for n, a in enumerate(every) if a.true_ns > every[0].true_ns + 6_000_000_000)
+    arrivals = [*every[:n], *delayed(every[n:], np.random.default_rng(3), 2.0, imu=True, quiet_s=2.5)]
+    fed, lag = whole(drift(), arrivals)
+    assert complaints(arrivals, fed) == []
+    imu = [row for row in fed.rows if row.sensor == "imu"]
+    assert sum(row.outcome is Outcome.USED for row in imu) > 0.98 * len(imu)
+    assert apart_m(lag, in_order()[1]).max() < 0.01
+
+
+def test_everything_late_from_the_first_message_on() -> None:
+    arrivals = delayed(arrivals_of(drift()), np.random.default_rng(3), 2.0, imu=True, quiet_s=2.5)
+    fed, _ = whole(drift(), arrivals)
+    assert complaints(arrivals, fed) == []
+    assert fed.errors_m[-1] < 0.6
+
+
+def test_a_step_is_integrated_anew_when_its_samples_come_late() -> None:
+    """One hole, filled 1.5 s later: the end is that of the run without it."""
+    arrivals = arrivals_of(drift())
+    begin = arrivals[0].true_ns + 20_000_000_000
+    hole = [a for a in arrivals if isinstance(a.m, ImuSample) and begin <= a.true_ns < begin + 300_000_000]
+    rest = [a for a in arrivals if a not in hole]
+    after = next(n for n, a in enumerate(rest) if a.true_ns > begin + 1_800_000_000)
+    _, lag = whole(drift(), [*rest[:after], *hole, *rest[after:]])
+    assert apart_m(lag, in_order()[1]).max() < 0.01
+    _, holed = whole(drift(), rest)
+    assert apart_m(holed, in_order()[1]).max() > 0.02  # else this shows nothing
+
+
+def test_later_than_the_lag_is_late() -> None:
+    arrivals = arrivals_of(drift())
+    fixes = [a for a in arrivals if isinstance(a.m, GnssPosition)]
+    old = [a for a in fixes if a.true_ns < arrivals[0].true_ns + 8_000_000_000][-10:]
+    rest = [a for a in arrivals if a not in old]
+    after = next(n for n, a in enumerate(rest) if a.true_ns > arrivals[0].true_ns + 25_000_000_000)
+    shuffled = [*rest[:after], *old, *rest[after:]]
+    fed, _ = whole(drift(), shuffled)
+    assert complaints(shuffled, fed) == []
+    late = [row for row in fed.rows if row.outcome is Outcome.LATE]
+    assert {row.seq for row in late} == {a.m.seq for a in old}
+    assert all("the lag is 10 s" in row.reason for row in late)
+
+
+# Start
+
+
+def said_while_waiting(run: SimulatedRun, arrivals: Arrivals) -> tuple[list[str], Fed]:
+    online, said = smoother(run), []
+    fed = Fed()
+    for a in arrivals:
+        feed(online, run, [a], fed)
+        if not said or said[-1] != online.waiting_for:
+            said.append(online.waiting_for)
+    return said, finish(online, fed)
+
+
+def test_starts_from_fix_and_compass() -> None:
+    arrivals = without(arrivals_of(drift()), lambda a: isinstance(a.m, PoseFix))
+    said, fed = said_while_waiting(drift(), arrivals[: len(arrivals) // 2])
+    assert said[0] != ""
+    assert said[-1] == ""
+    assert any("s of IMU data" in s for s in said)
+    assert (fed.true_ns[0] - arrivals[0].true_ns) * 1e-9 == pytest.approx(5.0, abs=0.6)
+    assert fed.errors_m[0] < 3.0
+
+
+def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
+    run = drift()
+    arrivals = without(arrivals_of(run), lambda a: isinstance(a.m, (PoseFix, CompassHeading)))
+    said, fed = said_while_waiting(run, arrivals)
+    (wanted,) = {s for s in said if s.startswith("a heading")}
+    assert "m of way" in wanted
+    first = run.truth.at(np.array([arrivals[0].true_ns, fed.true_ns[0]])).p_world_m
+    assert np.hypot(*(first[1] - first[0])[:2]) > 10.0
+    assert fed.errors_m[-1] < 3.0
+    yaw = fed.estimates[-1].yaw_rad
+    R = run.truth.at(np.array([fed.true_ns[-1]])).R_world_body[0]
+    assert abs(np.angle(np.exp(1j * (yaw - np.arctan2(R[1, 0], R[0, 0]))))) < np.radians(10.0)
+
+
+def test_starts_from_a_given_pose() -> None:
+    """One pose and the IMU: the place is known, and then dead reckoned."""
+    run = drift()
+    t0 = arrivals_of(run)[0].true_ns
+    at = t0 + 3_000_000_000
+    true = run.truth.at(np.array([at]))
+    R = true.R_world_body[0]
+    value = np.array([*true.p_world_m[0, :2], np.arctan2(R[1, 0], R[0, 0])])
+    mode = PoseMode(value=value, cov=np.diag([0.01, 0.01, 1e-4]), probability=1.0)
+    given = PoseFix(stamp_ns=at, sensor="given", seq=900_000, axes=("x", "y", "yaw"), modes=(mode,))
+    sensors = {"imu": run.config.sensors["imu"], "height": run.config.sensors["height"], "given": PoseConfig()}
+    posed = replace(run, config=run.config.model_copy(update={"sensors": sensors}))
+    imu = [a for a in arrivals_of(run) if isinstance(a.m, ImuSample) and a.true_ns < t0 + 9_000_000_000]
+    n = next(n for n, a in enumerate(imu) if a.true_ns > at)
+    arrivals = [*imu[:n], Arrival(at, given), *imu[n:]]
+    said, fed = said_while_waiting(posed, arrivals)
+    assert complaints(arrivals, fed) == []
+    assert said[-1] == ""
+    assert fed.errors_m[0] < 1.5
+    online = smoother(posed)
+    feed(online, posed, imu)
+    assert online.waiting_for == "a place: a fix, a match, a tag or a pose"
+
+
+def test_starts_from_a_tag_alone() -> None:
+    scenario = replace(harbour_scenarios()["dock-fixed-optimal"], duration_s=120.0, gnss_hz=0.0, compass_hz=0.0)
+    run, _ = sighted(simulate(scenario, 0), rate_hz=2.0)
+    arrivals = arrivals_of(run)
+    first = next(n for n, a in enumerate(arrivals) if a.m.sensor == "tags")
+    begin = arrivals[first].true_ns - 6_000_000_000
+    arrivals = [a for a in arrivals if begin <= a.true_ns < begin + 16_000_000_000]
+    said, fed = said_while_waiting(run, arrivals)
+    assert complaints(arrivals, fed) == []
+    assert "a place: a fix, a match, a tag or a pose" in said
+    assert said[-1] == ""
+    assert fed.errors_m[-1] < 1.0
+
+
+def test_without_an_imu_it_says_so() -> None:
+    run = drift()
+    sensors = {n: s for n, s in run.config.sensors.items() if n != "imu"}
+    bare = replace(run, config=run.config.model_copy(update={"sensors": sensors}))
+    arrivals = arrivals_of(run)[:1500]
+    said, fed = said_while_waiting(bare, arrivals)
+    assert said == ["an IMU: no enabled sensor of kind imu is configured"]
+    assert complaints(arrivals, fed) == []
+
+
+def test_a_second_imu_is_left_aside() -> None:
+    run = drift()
+    two = replace(run, config=run.config.model_copy(update={"sensors": {**run.config.sensors, "spare": ImuConfig()}}))
+    arrivals = arrivals_of(run)[:900]
+    spare = [
+        replace(a, m=replace(a.m, sensor="spare", seq=a.m.seq + 1_000_000))
+        for a in arrivals if isinstance(a.m, ImuSample)
+    ]  # fmt: skip
+    arrivals = sorted([*arrivals, *spare], key=lambda a: a.true_ns)
+    _, fed = said_while_waiting(two, arrivals)
+    assert complaints(arrivals, fed) == []
+    assert {row.reason for row in fed.rows if row.sensor == "spare"} == {"imu is the IMU"}
+    assert fed.estimates
+
+
+# Odometry
+
+
+def test_odom_does_not_jump_where_the_map_does() -> None:
+    """Fixes come back after 60 s of dead reckoning: the map jumps by metres, odometry goes on as the vessel does."""
+    scenario = replace(bl_scenario(1, "drift"), duration_s=90.0, outage_s=(12.0, 72.0), gyro_bias_radps=0.01)
+    run = simulate(scenario, 2)
+    fed, _ = whole(run, arrivals_of(run))
+    e = fed.estimates
+    true = run.truth.at(np.array([x.stamp_ns for x in e]))
+    map_jump, odom_off, nis = 0.0, 0.0, []
+    for n in range(1, len(e)):
+        step = true.R_world_body[n - 1].T @ (true.p_world_m[n] - true.p_world_m[n - 1])
+        own = e[n - 1].R_odom_body.T @ (e[n].p_odom_m - e[n - 1].p_odom_m)
+        mapped = e[n - 1].R_world_body.T @ (e[n].p_world_m - e[n - 1].p_world_m)
+        map_jump = max(map_jump, float(np.linalg.norm((mapped - step)[:2])))
+        off = e[n - 1].R_odom_body @ (own - step)
+        odom_off = max(odom_off, float(np.linalg.norm(off[:2])))
+        nis.append(float(off[:2] @ np.linalg.solve(e[n].step_cov[:2, :2], off[:2])))
+    assert map_jump > 1.0
+    assert odom_off < 0.2
+    assert np.mean(np.array(nis) < chi2.ppf(0.99, 2)) > 0.97
+
+
+# Memory
+
+
+def sizes(online: OnlineSmoother) -> dict[str, int]:
+    """Lengths of all containers inside, followed through the objects of this package."""
+    found: dict[str, int] = {}
+    seen: set[int] = set()
+
+    def look(name: str, thing: object, depth: int) -> None:
+        if id(thing) in seen or depth > 6:
+            return
+        seen.add(id(thing))
+        if isinstance(thing, (list, dict, set)) or type(thing).__name__ == "deque":
+            found[name] = len(thing)  # type: ignore[arg-type]
+            if isinstance(thing, dict) and len(thing) < 20:
+                for key, value in thing.items():
+                    look(f"{name}.{key}", value, depth + 1)
+        elif type(thing).__module__.startswith("graphloc.") and "config" not in type(thing).__module__:
+            names = [*getattr(thing, "__dict__", {}), *getattr(type(thing), "__slots__", ())]
+            for n in names:
+                look(f"{name}.{n}", getattr(thing, n, None), depth + 1)
+        elif isinstance(thing, np.ndarray):
+            found[name] = len(np.atleast_1d(thing))
+
+    look("online", online, 0)
+    return found | {"slots": online.factor_slots}
+
+
+def test_nothing_grows() -> None:
+    """Sensors at low rates and a short lag, so that a minute holds many lags: nothing is larger at its end than before."""
+    scenario = replace(bl_scenario(2, "drift"), duration_s=50.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0)
+    run = simulate(scenario, 1)
+    online, arrivals = smoother(run, lag_s=3.0), arrivals_of(run)
+    early: dict[str, int] = {}
+    late: dict[str, int] = {}
+    for n, a in enumerate(arrivals):
+        feed(online, run, [a])
+        if n % 20 == 0:
+            t = (a.true_ns - arrivals[0].true_ns) * 1e-9
+            if 14.0 < t < 28.0 or t > 36.0:
+                largest = early if t < 30.0 else late
+                for name, size in sizes(online).items():
+                    largest[name] = max(size, largest.get(name, 0))
+    remembered = {name for name in early if name.endswith("scatter")}  # fill up to their limit
+    grown = {n: (early.get(n, 0), s) for n, s in late.items() if n not in remembered and s > 1.15 * early.get(n, 0) + 5}
+    assert len(early) > 30
+    assert grown == {}
+
+
+# Prediction
+
+
+def test_prediction_goes_as_far_as_the_imu_can_say() -> None:
+    run, online = drift(), smoother(drift())
+    assert online.predict() is None
+    arrivals = [a for a in arrivals_of(run) if a.true_ns < arrivals_of(run)[0].true_ns + 12_000_000_000]
+    fed = feed(online, run, arrivals)
+    newest, state = max(a.true_ns for a in arrivals), fed.estimates[-1]
+    now, later = online.predict(), online.predict(newest + 2_000_000_000)
+    assert now is not None
+    assert later is not None
+    assert now.stamp_ns == max(a.true_ns for a in arrivals if isinstance(a.m, ImuSample))
+    off = now.p_world_m - run.truth.at(np.array([now.stamp_ns])).p_world_m[0]
+    assert np.hypot(*off[:2]) < 1.0
+    assert now.bound_95_m >= 0.99 * state.bound_95_m
+    # 2 s of motion that nobody measured, 1 m/s^2 correlated over a second: sqrt(2^3 / 3) = 1.6 m more, 1 sigma.
+    assert later.bound_95_m > 2.45 * np.sqrt(8.0 / 3.0)
+    assert online.predict(newest + 60_000_000_000) is None
+    before = online.predict(newest - 5_000_000_000)
+    assert before is not None
+    assert before.stamp_ns == state.stamp_ns
