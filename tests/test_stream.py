@@ -24,10 +24,11 @@ from graphloc.estimate import Estimate
 from graphloc.factors import KINDS
 from graphloc.frames import Datum, Geodetic
 from graphloc.frontends.bag import read_recording
+from graphloc.frontends.lines import MAX_LINE, Request, Trouble, parse
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, ImuSample, Measurement, PoseFix
 from graphloc.solution import Health
-from graphloc.stream import MAX_LINE, Lines, Request, Trouble, as_json, parse, run, serve
+from graphloc.stream import Lines, as_json, run, serve
 from tests.bagfactory import START_NS, Messages, write_bag
 
 ROOT = Path(__file__).parent.parent

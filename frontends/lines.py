@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lines of JSON -> measurements (docs/online-stream.md).
+
+A line becomes the message that a bag would hold and goes through the decoders of bags, so that a stream and a bag of
+one run give the same measurements.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+from pydantic_core import from_json
+from scipy.spatial.transform import Rotation
+
+from graphloc.blocks import Block, Finite, Triple, nearest
+from graphloc.config import (
+    CompassConfig,
+    GnssConfig,
+    ImuConfig,
+    PoseConfig,
+    SensorConfig,
+    VelocityConfig,
+    VesselConfig,
+)
+from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
+from graphloc.frontends.decode import DECODERS, NAV_SAT_FIX, POSE, TWIST, Rejection, malformed
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import CompassHeading, ImuSample, Measurement, PoseFix, PoseMode
+from graphloc.time import NS_PER_S, duration_ns
+
+MAX_LINE = 1 << 20
+"""Longest line that is read, bytes."""
+TOPIC = "(stream)"
+"""In rows of the ledger, of lines that gave no measurement."""
+_MAX_REASON = 200
+_STATUS = {"none": -1, "fix": 0, "sbas": 1, "gbas": 2}  # sensor_msgs/NavSatStatus
+_UNKNOWN, _KNOWN = 0, 3  # NavSatFix.position_covariance_type
+_STAMP_LIMIT_NS = 9 * 10**18  # 64 bits, less room for a time offset
+_ZERO = (0.0, 0.0, 0.0)
+
+
+Positive = Annotated[float, Field(gt=0.0, le=1e9)]
+Deviations = tuple[Positive, Positive, Positive]
+Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+Matrix3 = tuple[Triple, Triple, Triple]
+Matrix6 = tuple[Six, Six, Six, Six, Six, Six]
+_Groups = tuple[tuple[str, ...], ...]
+
+
+class _At(NamedTuple):
+    """When, which arrival, by which sensor: of a measurement."""
+
+    stamp_ns: int
+    seq: int
+    sensor: str
+
+
+class _Said(Block, strict=True):
+    """Part of a line: no key but these, no number that is a string or a bool."""
+
+    one_of: ClassVar[_Groups] = ()
+    at_most_one_of: ClassVar[_Groups] = ()
+
+    @model_validator(mode="after")
+    def _no_two_of_a_kind(self) -> Self:
+        for keys in (*self.one_of, *self.at_most_one_of):
+            given = [key for key in keys if getattr(self, key) is not None]
+            if len(given) > 1 or (not given and keys in self.one_of):
+                raise ValueError(f"give one of {', '.join(keys)}")
+        return self
+
+
+class _Stamped(_Said):
+    """A time: `stamp`, s since 1970 as a decimal string, or `stamp_ns`. Both are exact."""
+
+    stamp: Annotated[str, Field(max_length=20)] | None = None
+    stamp_ns: int | None = None
+
+    @model_validator(mode="after")
+    def _decimal(self) -> Self:
+        if self.stamp is not None and not re.fullmatch(r"[0-9]{1,10}(\.[0-9]{1,9})?", self.stamp):
+            raise ValueError("stamp: write s as decimals, at most nine behind the point, as in '1700000000.25'")
+        return self
+
+    @property
+    def ns(self) -> int | None:
+        """The stamp as the sender has it, ns."""
+        if self.stamp is None:
+            return self.stamp_ns
+        whole, _, rest = self.stamp.partition(".")
+        return int(whole) * NS_PER_S + int(rest.ljust(9, "0"))
+
+
+class _Line(_Stamped):
+    """A measurement; `sensor` may be left out where only one of its kind is switched on."""
+
+    one_of: ClassVar[_Groups] = (("stamp", "stamp_ns"),)
+    kind: ClassVar[str]  # of the sensor that says it
+    sensor: str = ""
+
+    def sensor_in(self, config: VesselConfig) -> str | Rejection:
+        """Return the name of the sensor that is meant."""
+        names = [name for name, sensor in config.sensors.items() if sensor.kind == self.kind]
+        enabled = list(config.of_kind(self.kind))
+        if self.sensor and self.sensor not in names:
+            return malformed(
+                f"vessel.yaml has no sensor '{self.sensor[:60]}' of kind {self.kind}{nearest(self.sensor[:60], names)}"
+            )
+        if self.sensor and self.sensor not in enabled:
+            return Rejection(Outcome.IGNORED, "switched off in vessel.yaml")
+        if not self.sensor and len(enabled) != 1:
+            return malformed(f"'sensor' is missing: vessel.yaml has {len(enabled)} enabled sensors of kind {self.kind}")
+        return self.sensor or enabled[0]
+
+
+class ImuLine(_Line):
+    """Specific force (+g upwards at rest) and angular rate, in the IMU's axes."""
+
+    kind = "imu"
+    type: Literal["imu"]
+    accel_mps2: Triple
+    gyro_radps: Triple
+
+    def measured(self, at: _At, _config: ImuConfig) -> Measurement | Rejection:
+        """Return the sample."""
+        accel, gyro = np.array(self.accel_mps2), np.array(self.gyro_radps)
+        return ImuSample(stamp_ns=at.stamp_ns, sensor=at.sensor, seq=at.seq, accel_mps2=accel, gyro_radps=gyro)
+
+
+class GnssLine(_Line):
+    """A fix of the antenna on WGS 84, height above the ellipsoid; noise east, north, up."""
+
+    kind = "gnss"
+    at_most_one_of = (("sigma_m", "cov_enu_m2"),)
+    type: Literal["gnss"]
+    lat_deg: Finite
+    lon_deg: Finite
+    height_m: Finite
+    sigma_m: Deviations | None = None
+    cov_enu_m2: Matrix3 | None = None
+    status: Literal["none", "fix", "sbas", "gbas"] = "fix"
+
+    def measured(self, at: _At, config: GnssConfig) -> Measurement | Rejection:
+        """Return the fix, or why it is none."""
+        fix = SimpleNamespace(
+            status=SimpleNamespace(status=_STATUS[self.status]), latitude=self.lat_deg, longitude=self.lon_deg,
+            altitude=self.height_m, position_covariance=_covariance(self.cov_enu_m2, self.sigma_m or _ZERO),
+            position_covariance_type=_KNOWN if self.cov_enu_m2 or self.sigma_m else _UNKNOWN,
+        )  # fmt: skip
+        return _decoded(NAV_SAT_FIX, fix, at, config)
+
+
+class HeadingLine(_Line):
+    """Compass heading (from true north, clockwise), or yaw (from east, counter-clockwise), of the sensor's x axis."""
+
+    kind = "compass"
+    one_of = (("stamp", "stamp_ns"), ("heading_deg", "yaw_rad"))
+    type: Literal["heading"]
+    heading_deg: Annotated[float, Field(ge=-360.0, le=360.0)] | None = None
+    yaw_rad: Annotated[float, Field(ge=-6.2832, le=6.2832)] | None = None
+    sigma_deg: Positive | None = None
+
+    def measured(self, at: _At, config: CompassConfig) -> Measurement | Rejection:
+        """Return the heading, with the configured sigma where the line has none or is not to be believed."""
+        yaw = wrap_angle(self.yaw_rad) if self.yaw_rad is not None else yaw_from_heading_deg(self.heading_deg or 0.0)
+        sigma_deg = (self.sigma_deg if config.use_reported_sigma else None) or config.sigma_deg
+        sigma = float(np.radians(sigma_deg))
+        return CompassHeading(stamp_ns=at.stamp_ns, sensor=at.sensor, seq=at.seq, yaw_rad=float(yaw), sigma_rad=sigma)
+
+
+class VelocityLine(_Line):
+    """Velocity of the antenna, east, north, up."""
+
+    kind = "gnss_velocity"
+    at_most_one_of = (("sigma_mps", "cov_enu_m2ps2"),)
+    type: Literal["velocity"]
+    v_enu_mps: Triple
+    sigma_mps: Deviations | None = None
+    cov_enu_m2ps2: Matrix3 | None = None
+
+    def measured(self, at: _At, config: VelocityConfig) -> Measurement | Rejection:
+        """Return the velocity."""
+        cov = np.zeros((6, 6))
+        cov[:3, :3] = _covariance(self.cov_enu_m2ps2, self.sigma_mps or _ZERO)
+        twist = SimpleNamespace(twist=SimpleNamespace(linear=_xyz(self.v_enu_mps)), covariance=cov)
+        return _decoded(TWIST, SimpleNamespace(twist=twist), at, config)
+
+
+class ModeSaid(_Said):
+    """One pose of the sensor in world; covariance x, y, z (m), then small rotations about world's axes (rad)."""
+
+    at_most_one_of = (("rpy_deg", "quaternion_xyzw"), ("sigma_m", "cov_m_rad"), ("sigma_deg", "cov_m_rad"))
+    xyz_m: Triple
+    rpy_deg: Triple | None = None
+    quaternion_xyzw: tuple[Finite, Finite, Finite, Finite] | None = None
+    sigma_m: Deviations | None = None
+    sigma_deg: Deviations | None = None
+    cov_m_rad: Matrix6 | None = None
+    probability: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+
+    def message(self) -> SimpleNamespace:
+        """Return the same as a `geometry_msgs/PoseWithCovarianceStamped`."""
+        turn: Sequence[float] = self.quaternion_xyzw or (0.0, 0.0, 0.0, 0.0)  # as drivers write that have none
+        if self.rpy_deg:
+            turn = Rotation.from_euler("xyz", self.rpy_deg, degrees=True).as_quat().tolist()
+        cov = _covariance(self.cov_m_rad, (*(self.sigma_m or _ZERO), *np.radians(self.sigma_deg or _ZERO)))
+        pose = SimpleNamespace(position=_xyz(self.xyz_m), orientation=_xyz(turn))
+        return SimpleNamespace(pose=SimpleNamespace(pose=pose, covariance=cov))
+
+
+class PoseLine(_Line):
+    """A pose of the sensor in world, as one mode or several; `axes` of its configuration are used."""
+
+    kind = "pose"
+    type: Literal["pose"]
+    modes: Annotated[tuple[ModeSaid, ...], Field(min_length=1, max_length=64)]
+
+    def measured(self, at: _At, config: PoseConfig) -> Measurement | Rejection:
+        """Return the pose with its modes; each goes through the decoder of a pose."""
+        modes: list[PoseMode] = []
+        for said in self.modes:
+            fix = _decoded(POSE, said.message(), at, config)
+            if not isinstance(fix, PoseFix):
+                return fix
+            modes.append(replace(fix.modes[0], probability=said.probability))
+        return PoseFix(stamp_ns=at.stamp_ns, sensor=at.sensor, seq=at.seq, axes=config.axes, modes=tuple(modes))
+
+
+class PredictLine(_Stamped):
+    """Ask for the pose at a stamp, or at that of the newest IMU sample."""
+
+    at_most_one_of = (("stamp", "stamp_ns"),)
+    type: Literal["predict"]
+
+
+_Any = ImuLine | GnssLine | HeadingLine | VelocityLine | PoseLine | PredictLine
+_LINES: dict[str, type[_Any]] = {
+    "imu": ImuLine,
+    "gnss": GnssLine,
+    "heading": HeadingLine,
+    "velocity": VelocityLine,
+    "pose": PoseLine,
+    "predict": PredictLine,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A line that asks for the pose at `stamp_ns`; None: at that of the newest IMU sample."""
+
+    stamp_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """A line that gave no measurement: its row of the ledger, which says why."""
+
+    row: LedgerRow
+
+
+def parse(line: bytes, number: int, seq: int, config: VesselConfig) -> Measurement | Request | Trouble:
+    """Return what a line says; never raises.
+
+    Args:
+        line: one JSON object. number: of the line, from 1. seq: arrival number of a measurement.
+        config: the sensors, whose `time_offset_s` is added to the stamps as it is for bags.
+    """
+    stamp_ns, sensor = 0, ""
+
+    def trouble(why: Rejection) -> Trouble:
+        reason = " ".join(why.reason.split())[:_MAX_REASON]
+        return Trouble(
+            LedgerRow(
+                seq=seq, stamp_ns=stamp_ns, sensor=sensor, topic=TOPIC, outcome=why.outcome, reason=reason,
+                detail=f"line {number}",
+            )
+        )  # fmt: skip
+
+    if len(line) > MAX_LINE:
+        return trouble(malformed(f"longer than {MAX_LINE} bytes"))
+    try:
+        raw = from_json(line, allow_inf_nan=False)
+    except ValueError as error:
+        return trouble(malformed(f"not JSON in UTF-8: {str(error).replace(' line 1 column', ' byte')}"))
+    said = raw.get("type") if isinstance(raw, dict) else None
+    if not isinstance(said, str) or said not in _LINES:
+        return trouble(malformed(f"no JSON object with a known 'type'{nearest(str(said)[:60], list(_LINES))}"))
+    if isinstance(raw.get("sensor"), str) and raw["sensor"] in config.sensors:
+        sensor = raw["sensor"]
+    try:
+        message = _LINES[said].model_validate_json(line)
+    except ValidationError as error:
+        return trouble(malformed(f"{said}: {_first_of(error, _LINES[said])}"))
+    if message.ns is not None and not 0 < message.ns < _STAMP_LIMIT_NS:
+        return trouble(malformed(f"{said}: the stamp is zero, negative or too large"))
+    if isinstance(message, PredictLine):
+        return Request(message.ns)
+    found = message.sensor_in(config)
+    if isinstance(found, Rejection):
+        return trouble(found)
+    sensor = found
+    stamp_ns = (message.ns or 0) + duration_ns(config.sensors[sensor].time_offset_s)
+    try:
+        with np.errstate(all="ignore"):
+            value = message.measured(_At(stamp_ns, seq, sensor), config.sensors[sensor])
+    except (ValueError, ArithmeticError) as error:
+        value = malformed(f"{said}: {error}")
+    return trouble(value) if isinstance(value, Rejection) else value
+
+
+def _first_of(error: ValidationError, model: type[Block]) -> str:
+    """What is wrong with a line; a long one may have thousands of errors."""
+    first = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in first["loc"])[:60]
+    if first["type"] == "extra_forbidden":
+        return f"unknown key '{key}'" + (nearest(key, list(model.model_fields)) if len(first["loc"]) == 1 else "")
+    if first["type"] == "missing":
+        return f"'{key}' is missing"
+    text = first["msg"].removeprefix("Value error, ")
+    return f"{key}: {text} (got {str(first['input'])[:40]!r})" if key else text
+
+
+def _decoded(msgtype: str, msg: SimpleNamespace, at: _At, config: SensorConfig) -> Measurement | Rejection:
+    value = DECODERS[(config.kind, msgtype)](msg, at.stamp_ns, at.seq, at.sensor, config)
+    assert isinstance(value, Measurement | Rejection)
+    return value
+
+
+def _xyz(values: Sequence[float]) -> SimpleNamespace:
+    """A vector of three, or a quaternion, as ROS has them."""
+    return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
+
+
+def _covariance(full: Sequence[Sequence[float]] | None, sigmas: Sequence[float]) -> Array:
+    """The matrix, or that of the sigmas; decoders take zeros for 'not known'."""
+    return np.array(full, dtype=float) if full else np.diag(np.square(sigmas))
