@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from graphloc.estimate import Estimate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum
 from graphloc.frontends._source import Bag
-from graphloc.frontends.aerial.live import LiveMatcher, Turn
+from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn
 from graphloc.frontends.aerial.scans import ScanFeed
 from graphloc.gather import Gathering, Scans
 from graphloc.ledger import Ledger, LedgerRow
@@ -84,41 +86,65 @@ def arrivals(recording: Recording) -> Iterator[Measurement]:
 
 
 class _Matching:
-    """The scans of one aerial sensor, each matched as soon as the smoother has got there."""
+    """The scans of one aerial sensor, each matched as soon as the smoother has got there.
 
-    def __init__(self, name: str, config: VesselConfig, scans: Scans, bag: Bag, gathering: Gathering) -> None:
-        self._name, self._sensor, self._scans = name, config.sensors[name], scans
+    With a `pool` the vessel does not wait: a match comes when it is done, and what came meanwhile is not matched.
+    """
+
+    def __init__(
+        self, name: str, config: VesselConfig, scans: Scans, bag: Bag, gathering: Gathering, pool: Executor | None
+    ) -> None:
+        self._name, self._sensor, self._scans, self._pool = name, config.sensors[name], scans, pool
         self._feed = ScanFeed(bag, self._sensor, config.body_frame)
         self._turns = iter(self._feed)
         self._matcher: LiveMatcher | None = None
         self._gathering = gathering
         self._next: Turn | None = next(self._turns, None)
+        self._underway: Future[Matched | Literal["wait"] | None] | None = None
         gathering.sensor(
             name, dict.fromkeys((lidar.topic for lidar in self._sensor.lidars.values()), f"read by {name}")
         )
 
     def due(self, smoother: OnlineSmoother, now_ns: int) -> Iterator[Measurement]:
-        """Yield the matches that can be made now."""
+        """Yield the matches that there are now."""
+        if self._underway is not None and self._underway.done():
+            found, self._underway = self._underway.result(), None
+            if found == "wait":  # offered too early, and too late to be offered again
+                self._gathering.refuse(self._name, now_ns, "the scan ended after the newest pose")
+            elif found is not None:
+                yield from self._taken(found)
         while self._next is not None and self._next.last_ns <= now_ns:
             turn, window, datum = self._next, smoother.window(), smoother.datum
             if window is None or datum is None or len(window) < 2:
-                self._gathering.refuse(
-                    self._name, turn.stamp_ns, turn.why_not or "there was no estimate to match around"
-                )
-                self._next = next(self._turns, None)
+                self._refuse(turn, "there was no estimate to match around")
+                continue
+            if self._underway is not None:
+                self._refuse(turn, "the scan before it was still being matched")
                 continue
             if self._matcher is None:
                 self._matcher = LiveMatcher(self._sensor, self._scans.folder, datum, self._feed.mounts)
+            if self._pool is not None:
+                self._underway, self._next = (
+                    self._pool.submit(self._matcher.offer, turn, window),
+                    next(self._turns, None),
+                )
+                return
             found = self._matcher.offer(turn, window)
             if found == "wait":
                 return
             self._next = next(self._turns, None)
-            if found is None:
-                continue
-            if found.match is not None and found.match.modes:
-                yield self._gathering.take(found.match.fix(found.stamp_ns, self._name, found.news, self._sensor.axes))
-            else:
-                self._gathering.refuse(self._name, found.stamp_ns, found.why_not)
+            if found is not None:
+                yield from self._taken(found)
+
+    def _refuse(self, turn: Turn, why: str) -> None:
+        self._gathering.refuse(self._name, turn.stamp_ns, turn.why_not or why)
+        self._next = next(self._turns, None)
+
+    def _taken(self, found: Matched) -> Iterator[Measurement]:
+        if found.match is not None and found.match.modes:
+            yield self._gathering.take(found.match.fix(found.stamp_ns, self._name, found.news, self._sensor.axes))
+        else:
+            self._gathering.refuse(self._name, found.stamp_ns, found.why_not)
 
 
 def replay(
@@ -170,8 +196,9 @@ def replay(
         said.extend(smoother.events())
 
     with ExitStack() as stack:
+        pool = None if rate is None else stack.enter_context(ThreadPoolExecutor(1))
         matchings = [
-            _Matching(name, config, scans, stack.enter_context(Bag(scans.bags)), gathering)
+            _Matching(name, config, scans, stack.enter_context(Bag(scans.bags)), gathering, pool)
             for name in (config.of_kind("aerial") if scans is not None else ())
             if scans is not None
         ]
