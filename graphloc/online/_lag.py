@@ -134,6 +134,8 @@ class Lag:
         for stream in self.problem.streams.values():
             if stream.slow is not None:
                 key, known = keys.slow(stream.number, 0), anchor.slow.get(stream.name)
+                if known is not None and len(known.value) != len(stream.slow.sigma):
+                    raise SolveError(f"{stream.name}: its slow error is of another size")
                 window.guess(key, np.zeros(len(stream.slow.sigma)) if known is None else known.value, 0.0)
                 window.add([slow_begin(stream.slow, key, np.zeros(len(stream.slow.sigma)))]
                            if known is None else [anchor.beside(known, state[0], key)])  # fmt: skip

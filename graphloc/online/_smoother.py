@@ -44,6 +44,7 @@ _AHEAD_S = 60.0  # of the IMU: a stamp of another clock
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _BACK = 50  # IMU samples in a row before the newest: their clock was set back
 _PENDING, _BUFFERED = 10_000, 50_000
+_LATE_S = 3.0  # of IMU samples, before the start
 _HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing
 _FORCE_MPS2, _RATE_RADPS = (
     (3.0, 40.0),
@@ -247,7 +248,9 @@ class OnlineSmoother:
         stamps = self._imu_stamps
         n = bisect_left(stamps, m.stamp_ns)
         period_ns = float(np.quantile(np.diff(stamps[-1000:]), 0.1)) if len(stamps) > 2 else np.inf
-        if 0 < n < len(stamps) and min(m.stamp_ns - stamps[n - 1], stamps[n] - m.stamp_ns) >= _HOLE * period_ns:
+        apart_ns = min(m.stamp_ns - stamps[n - 1], stamps[n] - m.stamp_ns) if 0 < n < len(stamps) else 0
+        new = apart_ns > 0 and newest.stamp_ns - m.stamp_ns < _LATE_S * 1e9  # before the start no period is known
+        if apart_ns >= _HOLE * period_ns or (self._lag is None and new):
             if self._lag is None:
                 self._hold(m)
             else:
@@ -548,6 +551,9 @@ class OnlineSmoother:
             self._config, self._datum, _series(known), anchor.stamp_ns, self._rows, self._inertial, self._mounts
         )
         agreed = {} if self._lag is None else self._lag.agreed_ns
+        if self._lag is not None:
+            for name, stream in self._lag.problem.streams.items():
+                problem.streams[name].scatter.extend(stream.scatter)
         self._lag = Lag(problem, anchor, self._lag_s, guess)
         self._lag.agreed_ns.update(agreed)
         self._own_due_ns = {}

@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The online mode when things go wrong: input, the solver, the disk, the process."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
+from graphloc.factors import INERTIAL, SENSORS
+from graphloc.factors.imu import Links
+from graphloc.ledger import Outcome
+from graphloc.measurements import GnssPosition, ImuSample
+from graphloc.online import OnlineSmoother
+from graphloc.online._window import Window
+from tests.faults import FAULTS, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
+
+
+def smoother(run: SimulatedRun, **options: Any) -> OnlineSmoother:
+    return OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, **options)
+
+
+@cache
+def run_of(seed: int = 0) -> SimulatedRun:
+    return simulate(replace(bl_scenario(1, "drift", false_fraction=0.1), duration_s=26.0), seed)
+
+
+@cache
+def undisturbed() -> Fed:
+    return whole(arrivals_of(run_of()))
+
+
+def whole(arrivals: Arrivals, online: OnlineSmoother | None = None) -> Fed:
+    online = online or smoother(run_of())
+    return finish(online, feed(online, run_of(), arrivals))
+
+
+def at_s(arrivals: Arrivals, t_s: float) -> int:
+    """Index of the first arrival from a time on."""
+    return next(n for n, a in enumerate(arrivals) if a.true_ns >= arrivals[0].true_ns + t_s * 1e9)
+
+
+QUICK = ["backward stamps", "leaping stamps", "zero stamps", "repeated", "clock back", "latitude and longitude swapped",
+         "GNSS jump", "absurd GNSS covariance", "wrong headings", "strangers", "flood", "accelerometer in g"]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_fault_is_survived(name: str) -> None:
+    """All faults, and many of each, are in the benchmark; here one of most kinds."""
+    base = arrivals_of(run_of())
+    begin = base[0].true_ns + 9_000_000_000
+    broken, until = FAULTS[name](base, begin, np.random.default_rng(5))
+    arrivals = numbered(broken)
+    fed = whole(arrivals)
+    assert complaints(arrivals, fed) == []
+    # A clock that jumps costs a new start: 5 s of IMU data, and up to half a second until it is tried.
+    assert fed.recovered_s(until) < 6.0
+    assert fed.errors_m[-1] < 1.5
+
+
+def test_wrong_units_are_said_and_waited_out() -> None:
+    base = arrivals_of(run_of())
+    in_g = [
+        replace(a, m=replace(a.m, accel_mps2=a.m.accel_mps2 / 9.81)) if isinstance(a.m, ImuSample) else a for a in base
+    ]  # fmt: skip
+    online = smoother(run_of())
+    fed = feed(online, run_of(), in_g[:800])
+    assert "another unit" in online.waiting_for
+    finish(online, fed)
+    assert complaints(in_g[:800], fed) == []
+    assert not fed.estimates
+
+
+def test_starts_anew_after_a_long_silence() -> None:
+    """20 s of silence are bridged, more are not: 21 s."""
+    run = simulate(replace(bl_scenario(2, "clean"), duration_s=40.0), 3)
+    base = arrivals_of(run)
+    arrivals = [*base[: at_s(base, 7.0)], *base[at_s(base, 28.5) :]]
+    online = smoother(run)
+    fed = finish(online, feed(online, run, arrivals))
+    assert complaints(arrivals, fed) == []
+    assert [e for e in fed.events if "silent for 21.5 s: starts anew" in e]
+    assert len([e for e in fed.events if e.startswith("started")]) == 2
+    assert fed.errors_m[-1] < 1.0
+    # Odometry goes on from where it was: no jump between the two pieces but the way of the new start's data.
+    stamps = np.array([e.stamp_ns for e in fed.estimates])
+    n = int(np.argmax(np.diff(stamps)))
+    step = np.linalg.norm(fed.estimates[n + 1].p_odom_m - fed.estimates[n].p_odom_m)
+    assert step < 6.0 * (np.linalg.norm(fed.estimates[n].v_world_mps) + 1.0)
+
+
+def test_a_lost_estimate_starts_anew() -> None:
+    """Its state put 300 m aside, with confidence: all sensors disagree, and after some seconds they are believed."""
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    n = at_s(base, 8.0)
+    fed = feed(online, run_of(), base[:n])
+    anchor = online._anchors[-1]  # noqa: SLF001
+    pose = type(anchor.pose)(anchor.pose.rotation(), anchor.pose.translation() + np.array([300.0, 0.0, 0.0]))
+    known = {name: replace(b, cov=b.cov * 1e-4) for name, b in anchor.slow.items()}
+    online._anchors.clear()  # noqa: SLF001
+    online._anchors.append(replace(anchor, pose=pose, cov=anchor.cov * 1e-4, slow=known))  # noqa: SLF001
+    online._recent = [m for m in online._recent if m.stamp_ns >= anchor.stamp_ns]  # noqa: SLF001
+    online._rebuild(RuntimeError("planted"))  # noqa: SLF001
+    feed(online, run_of(), base[n:], fed)
+    assert complaints(base, finish(online, fed)) == []
+    assert max(fed.errors_m) > 100.0
+    assert fed.recovered_s(base[n].true_ns) < 10.0
+
+
+# The solver
+
+
+def broken_at(
+    monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, calls: Callable[[int], bool], error: Exception
+) -> list[int]:
+    """Let a method raise at some of its calls; return the count of those that did."""
+    real, count, raised = getattr(owner, name), [0], [0]
+
+    def broken(*args: Any, **options: Any) -> Any:
+        count[0] += 1
+        if calls(count[0]):
+            raised[0] += 1
+            raise error
+        return real(*args, **options)
+
+    monkeypatch.setattr(owner, name, broken)
+    return raised
+
+
+@pytest.mark.parametrize("error", [RuntimeError("planted"), MemoryError(), ValueError("planted")])
+def test_a_rebuild_loses_nothing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    """One failure of the solver in the middle: a second later the estimate is that of the run without it, to cm."""
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    n = at_s(base, 16.0)
+    fed = feed(online, run_of(), base[:n])
+    with monkeypatch.context() as patch:
+        raised = broken_at(patch, Window, "commit", lambda k: k == 1, error)
+        feed(online, run_of(), base[n : n + 30], fed)
+    assert raised == [1]
+    feed(online, run_of(), base[n + 30 :], fed)
+    assert complaints(base, finish(online, fed)) == []
+    assert len([e for e in fed.events if "rebuilt from" in e]) == 1
+    plain = {e.stamp_ns: e for e in undisturbed().estimates}
+    assert [e.stamp_ns for e in fed.estimates] == list(plain)  # not even one is missing
+    off = [np.linalg.norm((e.p_world_m - plain[e.stamp_ns].p_world_m)[:2]) for e in fed.estimates]
+    assert max(off) < 0.05
+    assert off[-1] < 0.03
+    odom = [np.linalg.norm(e.p_odom_m - plain[e.stamp_ns].p_odom_m) for e in fed.estimates]
+    assert max(odom) < 0.15  # what was built anew is not walked twice
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "share"), [(Window, "commit", 0.08), (Links, "integrate", 0.005), (Window, "add", 0.005), (Window, "covariance", 0.01)]
+)  # fmt: skip
+def test_exceptions_in_the_solver_are_survived(
+    monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, share: float
+) -> None:
+    base, rng = arrivals_of(run_of()), np.random.default_rng(4)
+    online = smoother(run_of())
+    n = at_s(base, 6.0)
+    fed = feed(online, run_of(), base[:n])
+    with monkeypatch.context() as patch:
+        errors = [RuntimeError("planted"), MemoryError(), ValueError("planted")]
+        raised = broken_at(patch, owner, name, lambda _: bool(rng.random() < share), errors[int(rng.integers(3))])
+        feed(online, run_of(), base[n : at_s(base, 16.0)], fed)
+    assert raised[0] > 2
+    feed(online, run_of(), base[at_s(base, 16.0) :], fed)
+    assert complaints(base, finish(online, fed)) == []
+    assert fed.errors_m[-1] < 1.0
+    assert fed.recovered_s(base[at_s(base, 16.0)].true_ns) < 6.0
+
+
+def test_a_measurement_that_cannot_be_used_goes_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A row of the table that raises for one fix: that fix is rejected with the reason, nothing else happens."""
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    n = at_s(base, 10.0)
+    bad = next(a.m for a in base[n:] if isinstance(a.m, GnssPosition))
+    row = next(row for row in SENSORS if row.kind == "gnss")
+
+    def factors(m: GnssPosition, *rest: Any) -> Any:
+        if m.seq == bad.seq:
+            raise ZeroDivisionError("planted")
+        return row.factors(m, *rest)
+
+    rows = tuple(replace(r, factors=factors) if r is row else r for r in SENSORS)
+    online = OnlineSmoother(run_of().config, rows=rows, inertial=INERTIAL)
+    fed = whole(base, online)
+    assert complaints(base, fed) == []
+    (own,) = [r for r in fed.rows if r.seq == bad.seq]
+    assert own.outcome is Outcome.REJECTED
+    assert "ZeroDivisionError" in own.reason
+    assert not [e for e in fed.events if "failed" in e]
+
+
+# Snapshots
+
+
+def test_resumes_after_a_kill(tmp_path: Path) -> None:
+    path, base = tmp_path / "snapshot.json", arrivals_of(run_of())
+    first = smoother(run_of(), snapshot=path)
+    cut = at_s(base, 13.7)
+    before = feed(first, run_of(), base[:cut])
+    del first
+    again = at_s(base, 16.0)  # 2.3 s until it runs again
+    second = smoother(run_of(), snapshot=path)
+    fed = feed(second, run_of(), base[again:])
+    finish(second, fed)
+    assert complaints(base[again:], fed) == []
+    assert [e for e in fed.events if e.startswith("resumed from a snapshot")]
+    assert (fed.true_ns[0] - base[again].true_ns) * 1e-9 < 0.3  # no new start, which takes 5 s
+    assert max(fed.errors_m) < 3.0
+    assert fed.recovered_s(base[again].true_ns, within_m=1.5) < 3.0
+    walked = run_of().truth.at(np.array([before.true_ns[-1], fed.true_ns[0]])).p_world_m
+    odom = np.linalg.norm(fed.estimates[0].p_odom_m - before.estimates[-1].p_odom_m)
+    assert abs(odom - np.linalg.norm(walked[1] - walked[0])) < 2.0  # odometry goes on
+
+
+def _truncated(text: str) -> str:
+    return text[: len(text) // 2]
+
+
+def _nan(text: str) -> str:
+    raw = json.loads(text)
+    raw["anchor"]["velocity"][0] = float("nan")
+    return json.dumps(raw)
+
+
+def _other(text: str) -> str:
+    return json.dumps(json.loads(text) | {"vessel": "another"})
+
+
+def _elsewhere(text: str) -> str:
+    raw = json.loads(text)
+    raw["datum"][0] += 1.0
+    return json.dumps(raw)
+
+
+def _slow_of_other_size(text: str) -> str:
+    raw = json.loads(text)
+    known = raw["anchor"]["slow"]["gnss"]
+    raw["anchor"]["slow"]["gnss"] = {"value": known["value"][:1], "gain": known["gain"][:1], "cov": [[1.0]]}
+    return json.dumps(raw)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [lambda _: "", lambda _: "[1, 2]", lambda _: "{}", _truncated, _nan, _other, _elsewhere, _slow_of_other_size],
+)
+def test_a_damaged_snapshot_is_said_and_left(tmp_path: Path, damage: Callable[[str], str]) -> None:
+    path, base = tmp_path / "snapshot.json", arrivals_of(run_of())
+    feed(smoother(run_of(), snapshot=path), run_of(), base[: at_s(base, 8.0)])
+    path.write_text(damage(path.read_text(encoding="utf-8")), encoding="utf-8")
+    online, again = smoother(run_of(), snapshot=path), base[at_s(base, 8.5) : at_s(base, 18.0)]
+    fed = finish(online, feed(online, run_of(), again))
+    assert complaints(again, fed) == []
+    assert [e for e in fed.events if "the snapshot cannot be used" in e and e.endswith("starts anew")]
+    assert [e for e in fed.events if e.startswith("started")]
+    assert fed.errors_m[-1] < 2.0
+
+
+def test_an_old_snapshot_is_not_resumed(tmp_path: Path) -> None:
+    path, base = tmp_path / "snapshot.json", arrivals_of(run_of())
+    feed(smoother(run_of(), snapshot=path), run_of(), base[: at_s(base, 6.0)])
+    later = [replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns + 60_000_000_000)) for a in base[: at_s(base, 7.0)]]
+    online = smoother(run_of(), snapshot=path)
+    fed = finish(online, feed(online, run_of(), later))
+    assert complaints(later, fed) == []
+    assert [e for e in fed.events if "s old, more than the 20 s" in e]
+    assert fed.estimates
+
+
+def test_a_full_disk_is_said_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    import os
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    fed = whole(arrivals_of(run_of()), smoother(run_of(), snapshot=tmp_path / "snapshot.json"))
+    assert len([e for e in fed.events if "No space left" in e]) == 1
+    assert [e.stamp_ns for e in fed.estimates] == [e.stamp_ns for e in undisturbed().estimates]
