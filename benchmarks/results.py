@@ -19,6 +19,7 @@ from typing import Any
 
 import docking
 import matcher
+import online
 import simulator
 import smoothing
 import tag_detector
@@ -45,6 +46,12 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "D.4": docking.single_tags,
     "D.6": tag_detector.cost,
     "D.7": tag_detector.agreement,
+    "E.1": online.cases,
+    "E.2": online.latency,
+    "E.3": online.starts,
+    "E.4": online.shuffled,
+    "E.5": online.faults,
+    "E.6": online.odometry,
 }
 
 

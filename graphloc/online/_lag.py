@@ -561,6 +561,17 @@ class Lag:
             value = np.atleast_1d(self._window.values.atVector(key))
             self._known[key] = Beside(value=value, gain=np.zeros((len(value), 6)), cov=self._window.covariance([key]))
 
+    def misfit(self) -> float:
+        """Return the cost of the window over its expectation (see `solve._passes.expected_cost`)."""
+        held = [e.verdict for e in self._entries.values() if e.held is not None]
+        expected = sum((v.residual.rows or len(v.residual.raw)) * v.weight for v in held)
+        timeline = self.problem.timeline
+        nodes = len(timeline.slow_stamps_ns) - timeline.slow_stamps_ns.first
+        for stream in self.problem.streams.values():
+            if stream.slow is not None:
+                expected += nodes * int(np.isfinite(stream.slow.time_constant_s).sum())
+        return 2.0 * self._window.error() / max(expected, 1.0)
+
     def anchor(self) -> Anchor:
         """Return what is known at the newest state."""
         timeline, window = self.problem.timeline, self._window

@@ -160,6 +160,7 @@ def live_problem(
     rows: Sequence[Sensor],
     inertial: InertialRow,
     mounts: Mapping[str, tuple[Array, Array]],
+    noise_scale: float,
 ) -> LiveProblem:
     """Return a problem whose first state stands at `start_ns`; `imu`: the samples that are known from there on."""
     sensor = config.sensors[imu.sensor]
@@ -189,6 +190,6 @@ def live_problem(
         timeline=LiveTimeline(config.timeline, start_ns),
         t_body_imu_m=t,
         R_body_imu=R,
-        links=inertial.link(imu, sensor, R, datum.gravity_mps2, 1.0),
+        links=inertial.link(imu, sensor, R, datum.gravity_mps2, noise_scale),
         streams=streams,
     )

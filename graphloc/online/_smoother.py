@@ -32,7 +32,8 @@ from graphloc.online._live import live_problem
 from graphloc.online._odometry import Odometry
 from graphloc.online._start import Started, try_start
 from graphloc.origin import refuse_world_without_datum
-from graphloc.solve._solution import health_of, left_out, world_covariance
+from graphloc.solve._batch import CONTRADICTION
+from graphloc.solve._solution import NO_NOISE, health_of, left_out, world_covariance
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 
@@ -45,11 +46,9 @@ _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _BACK = 50  # IMU samples in a row before the newest: their clock was set back
 _PENDING, _BUFFERED = 10_000, 50_000
 _LATE_S = 3.0  # of IMU samples, before the start
+_FIT_S, _MISFITS = 5.0, 2  # how often the fit is looked at, and how often in turn it must be bad
 _HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing
-_FORCE_MPS2, _RATE_RADPS = (
-    (3.0, 40.0),
-    3.0,
-)  # what a vessel's IMU can say; 1 g in g, and a slow turn in deg/s, are outside
+_FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # what an IMU aboard can say; in g, or deg/s of a turn, it says other
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # of motion where there are no samples (see `graphloc.factors.imu`)
 
 
@@ -98,6 +97,8 @@ class OnlineSmoother:
         self._agreed_ns: dict[str, int] = {}
         self._heights_m: Mapping[str, float] = {}
         self._doubt = ""
+        self._noise_scale = 1.0  # of the IMU
+        self._fit_ns, self._misfits = 0, 0
         self._newest_imu: ImuSample | None = None
         self._leap: ImuSample | None = None
         self._leap_age = self._behind = 0
@@ -296,10 +297,27 @@ class OnlineSmoother:
             self._keep_anchor(self._lag)
             if self._lag.refused_s > _LOST_S:
                 return self._start_over(self._lag)
+            if said := self._contradicted(self._lag):
+                self._rebuild(said)
+                return self._try_estimate()
             return self._estimate(self._lag)
         except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
             self._rebuild(error)
         return self._try_estimate()
+
+    def _contradicted(self, lag: Lag) -> str:
+        """Take the IMU for noisier where the lag contradicts it time and again, as the batch does; what to say of it."""
+        at_ns = lag.newest.stamp_ns
+        if at_ns - self._fit_ns < _FIT_S * 1e9 or not self._config.sensors[self._imu_name].adapt_noise:
+            return ""
+        self._fit_ns = at_ns
+        misfit = lag.misfit()
+        self._misfits = self._misfits + 1 if misfit > CONTRADICTION else 0
+        if self._misfits < _MISFITS or self._noise_scale >= NO_NOISE:
+            return ""
+        self._misfits = 0
+        self._noise_scale *= float(np.clip(np.sqrt(misfit), 1.5, 3.0))
+        return f"the IMU contradicts the other sensors: its noise is taken for {self._noise_scale:.1f} times as large"
 
     def _try_estimate(self, stamp_ns: int | None = None) -> Estimate | None:
         """Return an estimate if there is one to be had."""
@@ -526,6 +544,7 @@ class OnlineSmoother:
     def _take_over(self, started: Started, samples: list[ImuSample], others: list[Measurement]) -> None:
         """Build the lag where the data begin, and bring it to now."""
         self._datum, self._heights_m, self._doubt = started.datum, started.heights_m, started.doubt
+        self._noise_scale = max(self._noise_scale, started.noise_scale)
         self._done += [self._row(m, Outcome.USED, "") for m in samples if m.seq >= 0]
         self._buffer.clear()
         self._begin(started.anchor, samples, (started.pose, started.velocity, started.bias))
@@ -548,7 +567,14 @@ class OnlineSmoother:
         assert self._datum is not None
         known = [m for m in samples if m.stamp_ns >= anchor.stamp_ns - 2 * duration_ns(self._gap_s)] or samples[-1:]
         problem = live_problem(
-            self._config, self._datum, _series(known), anchor.stamp_ns, self._rows, self._inertial, self._mounts
+            self._config,
+            self._datum,
+            _series(known),
+            anchor.stamp_ns,
+            self._rows,
+            self._inertial,
+            self._mounts,
+            self._noise_scale,
         )
         agreed = {} if self._lag is None else self._lag.agreed_ns
         if self._lag is not None:
@@ -584,12 +610,13 @@ class OnlineSmoother:
             self._snapshot_ns = at_ns
             self._write_snapshot(self._snapshot)
 
-    def _rebuild(self, error: Exception) -> None:
+    def _rebuild(self, error: Exception | str) -> None:
         """Build the lag anew: with all that is in it; if that fails too, from the last anchor without what came since; or start anew.
 
         An anchor holds what was known when its state was the newest, so what was measured since can be taken again.
         """
-        log.warning("online: %s", _line(error))
+        why = error if isinstance(error, str) else f"the solver failed ({_line(error)})"
+        log.warning("online: %s", why)
         assert self._lag is not None
         old = self._lag
         anchors = [a for a in self._anchors if a.stamp_ns >= old.first_ns]
@@ -606,22 +633,22 @@ class OnlineSmoother:
                 fresh = self._lag
                 self._step(fresh)
             except Exception as another:  # noqa: BLE001 - as in `_advance`
-                error, self._settled, self._done = another, settled, done
+                why, self._settled, self._done = f"the solver failed ({_line(another)})", settled, done
                 continue
             if without:
                 for m in others:
-                    self._drop(m, Outcome.REJECTED, f"the solver failed with it: {_line(error)}")
+                    self._drop(m, Outcome.REJECTED, f"left out: {why}")
                 self._anchors = deque([anchor])
             self._close(old, {m.seq for m in others})
             age_s = (fresh.newest.stamp_ns - anchor.stamp_ns) * 1e-9
-            self._events.append(f"the solver failed ({_line(error)}): rebuilt from {age_s:.1f} s before")
+            self._events.append(f"{why}: rebuilt from {age_s:.1f} s before")
             return
         held = {row.seq for row in old.held()}
         self._lag, self._pending = old, [
             m for m in self._recent
             if not isinstance(m, ImuSample) and m.seq not in self._settled and m.seq not in held
         ]  # fmt: skip
-        self._restart(f"the solver failed ({_line(error)}), and again from what was known before")
+        self._restart(f"{why}, and again from what was known before")
 
     def _start_over(self, lag: Lag) -> Estimate | None:
         """Start anew, with the last seconds: what measures place agrees with itself or not, but not with the estimate."""
@@ -670,6 +697,7 @@ class OnlineSmoother:
             "anchor": anchor.as_dict(),
             "imu": [last.stamp_ns, *last.accel_mps2.tolist(), *last.gyro_radps.tolist()],
             "heights_m": dict(self._heights_m),
+            "noise_scale": self._noise_scale,
             "agreed_ns": {**self._agreed_ns, **(self._lag.agreed_ns if self._lag else {})},
             "odom": [self._odometry.p_m.tolist(), self._odometry.R.tolist()],
         }
@@ -703,14 +731,16 @@ class OnlineSmoother:
                 raise ValueError("its origin of world is another one")
             heights_m = {str(n): float(h) for n, h in raw["heights_m"].items() if n in self._asked}
             agreed_ns = {str(n): int(s) for n, s in raw["agreed_ns"].items()}
+            scale = float(raw["noise_scale"])
             p, R = np.array(raw["odom"][0], dtype=np.float64), np.array(raw["odom"][1], dtype=np.float64)
-            numbers = np.concatenate([p.reshape(3), R.reshape(9), datum.origin, list(heights_m.values())])
+            numbers = np.concatenate([p.reshape(3), R.reshape(9), datum.origin, list(heights_m.values()), [scale]])
             if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
                 raise ValueError("it is damaged")
         except Exception as error:  # noqa: BLE001 - a file that anything may have written
             self._events.append(f"{path}: the snapshot cannot be used ({_line(error)}): starts anew")
             return None
         self._datum, self._heights_m, self._agreed_ns = datum, heights_m, agreed_ns
+        self._noise_scale = float(np.clip(scale, 1.0, NO_NOISE))
         self._odometry = Odometry(anchor.stamp_ns, p, R)
         return anchor, last
 

@@ -29,6 +29,7 @@ from graphloc.solve._solution import AGREES, world_covariance
 _LEAST_S = 5.0  # of inertial data: gyro bias, roll and pitch of a vessel in waves
 _HEADING_RAD = np.radians(15.0)  # 1 sigma: from farther off a lag does not come back soon
 _HEADING_WAIT_S = 30.0  # for a heading from the way alone; then the place is worth more than nothing
+_DOUBTFUL = 0.25  # probability of being false: a pose that is given, or a tag, is believed at once
 _AGREEING, _SHARE, _CHOICE_WAIT_S = 3, 0.4, 15.0  # two false matches of five may agree with each other
 _FIXES = 3  # to take a datum from
 
@@ -42,7 +43,7 @@ class Started:
         anchor: the first state, by what was known before any measurement: all that came is judged again in the lag.
         pose, velocity, bias: of that state, as it was solved: (gtsam.Pose3), (3,), (6,).
         heights_m: of each sensor that the configuration makes itself, what it says.
-        doubt: why the pose cannot be called good.
+        doubt: why the pose cannot be called good. noise_scale: of the IMU.
         notes: what the alignment went by.
     """
 
@@ -53,6 +54,7 @@ class Started:
     bias: Array
     heights_m: Mapping[str, float]
     doubt: str
+    noise_scale: float
     notes: tuple[str, ...]
 
 
@@ -127,7 +129,9 @@ def _solved(
         for stream in problem.streams:
             weights = [result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))]
             agreeing = sum(weight >= AGREES for weight in weights)
-            if stream.row.false is not None and (agreeing < _AGREEING or agreeing < _SHARE * len(weights)):
+            doubtful = [m for m in stream.measurements if stream.row.false is not None
+                        and stream.row.false(m, stream.config).probability > _DOUBTFUL]  # fmt: skip
+            if doubtful and (agreeing < _AGREEING or agreeing < _SHARE * len(weights)):
                 return f"{_AGREEING} of {stream.name} that agree with each other ({agreeing} of {len(weights)} do)"
     last = keys.pose(len(problem.timeline) - 1)
     R = result.values.atPose3(last).rotation().matrix()
@@ -152,5 +156,6 @@ def _solved(
         bias=np.concatenate([held.accelerometer(), held.gyroscope()]),
         heights_m=heights,
         doubt=doubt,
+        noise_scale=result.noise_scale,
         notes=result.notes,
     )

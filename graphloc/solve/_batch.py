@@ -30,7 +30,7 @@ from graphloc.solve._passes import Settled, expected_cost, open_passes, settle
 _MAX_NOISE_ROUNDS = 5
 # Before other choices are tried, the passes need not stand: what creeps on is a choice that confirms itself.
 _FIRST_PASSES, _LAST_PASSES = 6, 15
-_CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
+CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +68,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         settled = _final_passes(problem, estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
         ratio = 2.0 * float(settled.graph.error(estimate)) / max(expected_cost(problem, settled.verdicts), 1.0)
-        if ratio < _CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
+        if ratio < CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
     return BatchResult(
         values=estimate,

@@ -30,7 +30,7 @@ _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
 _CHI2_95 = float(chi2.ppf(0.95, 2))
 _FAR_OFF = 3.0
 _NEAR_BERTH_M = 60.0
-_NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
+NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
 
 
 def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
@@ -144,7 +144,7 @@ def _misfit(stats: SolveStats, result: BatchResult) -> str:
     """Why no part of the run can be called good; empty where nothing speaks against it."""
     if not result.converged:
         return "the solver did not converge"
-    if result.noise_scale > _NO_NOISE or stats.cost > _NO_FIT * max(stats.expected_cost, 1.0):
+    if result.noise_scale > NO_NOISE or stats.cost > _NO_FIT * max(stats.expected_cost, 1.0):
         return "the measurements contradict each other"
     return ""
 
@@ -289,7 +289,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
         said = (
             f"IMU noise scaled up {result.noise_scale:.1f} times: as configured, the IMU contradicts the other sensors"
         )
-        if result.noise_scale > _NO_NOISE:
+        if result.noise_scale > NO_NOISE:
             cure = "no IMU is that noisy: look for a wrong mount, unit, axis convention, time offset or sensor"
         else:
             cure = (
