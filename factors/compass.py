@@ -21,6 +21,8 @@ from graphloc.frames import Array, Datum, skew, wrap_angle
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import CompassHeading
 
+_FLOOR_RAD = np.radians(0.05)  # no compass is better, whatever it says
+
 
 def _yaw_jacobian(R: Array, R_state_sensor: Array) -> Array:
     """Derivative (6,) of yaw(R Exp(theta) R_state_sensor) by the body tangent (theta, rho)."""
@@ -38,7 +40,7 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
     x = (R @ at.T_state_sensor.rotation().matrix())[:, 0]
     offset = 0.0 if at.slow_value is None else float(at.slow_value[0])
     raw = np.array([math.remainder(math.atan2(x[1], x[0]) + offset - m.yaw_rad, math.tau)])
-    sigma = m.sigma_rad
+    sigma = max(m.sigma_rad, _FLOOR_RAD)
     return (
         Residual(
             raw=raw,

@@ -11,7 +11,7 @@ Without a slow state: `GPSFactorArm`. Not handled: correlation between axes of d
 
 from __future__ import annotations
 
-from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import gtsam
 import numpy as np
@@ -32,13 +32,20 @@ def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
     return with_floors(m.cov_enu_m2 * config.sigma_scale**2, np.array([horizontal, horizontal, vertical]))
 
 
-@lru_cache(maxsize=1 << 18)
-def _world_m(position: Geodetic, datum: Datum) -> Array:
-    return np.asarray(datum.enu_from_geodetic(*(np.array([v]) for v in position))[0])
+# A fix is asked for its place at every pass; remembered for as long as the fix itself is, however long a vessel is out.
+_PLACES: WeakKeyDictionary[GnssPosition, tuple[Datum, Array]] = WeakKeyDictionary()
+
+
+def _world_m(m: GnssPosition, datum: Datum) -> Array:
+    known = _PLACES.get(m)
+    if known is None or known[0] != datum:
+        known = (datum, np.asarray(datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0]))
+        _PLACES[m] = known
+    return known[1]
 
 
 def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
-    return _world_m(m.position, at.datum)
+    return _world_m(m, at.datum)
 
 
 def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Residual, ...]:
@@ -113,7 +120,7 @@ def _antenna_jacobian(at: Attachment) -> Array:
 
 def hint(m: GnssPosition, mount_yaw_rad: float, datum: Datum) -> Hint:
     """Return the antenna's place."""
-    return Hint(p_world_m=_world_m(m.position, datum), p_sigma_m=np.sqrt(np.diagonal(m.cov_enu_m2)))
+    return Hint(p_world_m=_world_m(m, datum), p_sigma_m=np.sqrt(np.diagonal(m.cov_enu_m2)))
 
 
 ROW = Sensor(

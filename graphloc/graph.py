@@ -257,7 +257,7 @@ class InertialLink(Protocol):
         ...
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
-        """Add samples (N, 6) after the last one: specific force, m/s^2, and rate, rad/s, in IMU axes."""
+        """Add samples (N, 6), late ones among them: specific force, m/s^2, and rate, rad/s, in IMU axes."""
         ...
 
     def forget(self, before_ns: int) -> None:

@@ -43,7 +43,7 @@ class Measurement:
     seq: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class GnssPosition(Measurement):
     """A GNSS fix of the antenna.
 

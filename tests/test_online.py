@@ -340,7 +340,8 @@ def test_nothing_grows() -> None:
 def test_prediction_goes_as_far_as_the_imu_can_say() -> None:
     run, online = drift(), smoother(drift())
     assert online.predict() is None
-    arrivals = [a for a in arrivals_of(run) if a.true_ns < arrivals_of(run)[0].true_ns + 12_000_000_000]
+    every = arrivals_of(run)
+    arrivals = [a for a in every if a.true_ns < every[0].true_ns + 12_000_000_000]
     fed = feed(online, run, arrivals)
     newest, state = max(a.true_ns for a in arrivals), fed.estimates[-1]
     now, later = online.predict(), online.predict(newest + 2_000_000_000)

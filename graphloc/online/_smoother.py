@@ -38,7 +38,7 @@ from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
-_TRY_EVERY_S, _TRY_AGAIN, _LONGEST_WAIT_S = 0.5, 0.1, 120.0  # for a start; what is older is let go
+_TRY_EVERY_S, _TRY_AGAIN, _LONGEST_WAIT_S = 0.5, 0.15, 120.0  # for a start; what is older is let go
 _ANCHOR_S, _SNAPSHOT_S = 1.0, 2.0
 _LOST_S, _AGAIN_S = 8.0, 6.0  # of disagreement, until it starts anew; with the data of so long
 _AHEAD_S = 60.0  # of the IMU: a stamp of another clock
