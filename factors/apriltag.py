@@ -68,14 +68,14 @@ class _Seen:
         self.moved = moved = np.zeros(6)
         if at.slow_value is not None and self.first is not None:
             self.moved = moved = _between(at)[self.first : self.first + 6]
-        self.turn = np.asarray(Rotation.from_rotvec(moved[3:]).as_matrix())
+        self.turn = gtsam.Rot3.Expmap(moved[3:]).matrix()
         self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-moved[3:]))  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
         self.constants = _constants_of(m, config, at)
         tags = np.array(m.points_m).reshape(-1, 4, 3)
         self.within = tags - tags.mean(axis=1, keepdims=True)  # each corner from its tag's middle
         for k, constant in enumerate(self.constants):
             if constant is not None:
-                tags[k] += constant[1][:3] + np.cross(constant[1][3:], self.within[k])
+                tags[k] += constant[1][:3] + self.within[k] @ skew(constant[1][3:]).T
         self.arms = (tags.reshape(-1, 3) - m.pivot_m) @ self.turn.T
         self.points_m = m.pivot_m + moved[:3] + self.arms
         self.middle_m = m.pivot_m + moved[:3] + (m.points_m.mean(axis=0) - m.pivot_m) @ self.turn.T
@@ -121,7 +121,7 @@ def _turned(R: Array) -> Array:
 
 def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode) -> Residual:
     toward = seen.R @ _middle_in_camera(m, mode)
-    rotation = Rotation.from_matrix(seen.R @ (seen.turn @ mode.R_world_camera).T).as_rotvec()
+    rotation = np.asarray(gtsam.Rot3.Logmap(gtsam.Rot3(seen.R @ (seen.turn @ mode.R_world_camera).T)))
     raw = np.concatenate([seen.p + toward - seen.middle_m, rotation])
 
     def jacobian() -> Array:

@@ -48,7 +48,11 @@ _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
 _CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
 _PAGE_S = 1.0
-_CHAPTER = 12  # hypotheses that are judged as one sequence
+_LEAF_S, _SURE = 1.0, 0.9  # how often an older chapter is judged again; a weight that needs no second look
+_STEP_COST = (
+    1.0  # of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10
+)
+_CHAPTER = 10  # hypotheses that are judged as one sequence
 _ROUNDS = 2  # of judging what is new
 _CHAIN = 2  # measurements that agree with each other, and not with the estimate
 _FAR_M = 20e3  # from the estimate: no place of this run; beyond, the linear algebra fails before a kernel helps
@@ -113,6 +117,8 @@ class Lag:
         self._again: list[tuple[float, int, _Entry]] = []  # a heap: when, and in turn
         self._turn = count()
         self._rounds: dict[str, int] = {}
+        self._leaves: dict[str, int] = {}  # how many chapters back was judged again
+        self._leafed_s: dict[str, float] = {}  # and when
         self._refuted: set[str] = set()  # sensors of which something new was judged false
         self._tried: dict[str, frozenset[tuple[int, int | None]]] = {}
         self._ends: dict[str, Held] = {}
@@ -272,6 +278,11 @@ class Lag:
         stream = entry.stream
         return row_of(stream, entry.measurement, stream.config.topic, entry.verdict)
 
+    def settle(self) -> None:
+        """Relinearise, where many states came at once."""
+        self._window.settle()
+        self._newest = self._read_newest()
+
     def gone(self) -> list[LedgerRow]:
         """Return rows of measurements that have left since this was last asked."""
         rows, self._gone = self._gone, []
@@ -327,18 +338,28 @@ class Lag:
 
     def judge(self) -> None:
         """Stage what is to be decided, anew or again."""
-        for name, rounds in list(self._rounds.items()):
-            self._by_hypotheses(self.problem.streams[name])
-            if rounds == 1:
-                del self._rounds[name]
-            else:
-                self._rounds[name] = rounds - 1
         now_s = self._seconds(self.problem.timeline.stamps_ns[self.problem.timeline.last])
+        for name, stream in self.problem.streams.items():
+            rounds = self._rounds.pop(name, 0)
+            if rounds:
+                unsettled = self._by_hypotheses(stream, self._judged(stream))
+                if rounds > 1 and unsettled:
+                    self._rounds[name] = rounds - 1
+            elif stream.row.false is not None and now_s >= self._leafed_s.get(name, 0.0) + _LEAF_S:
+                self._leaf_back(stream, now_s)
         due = []
         while self._again and self._again[0][0] <= now_s:
             due.append(heapq.heappop(self._again)[2])
         for entry in due:
             self._ask_again(entry, now_s)
+
+    def _leaf_back(self, stream: LiveStream, now_s: float) -> None:
+        """Judge an older chapter again, each in its turn: what came since may say otherwise."""
+        self._leafed_s[stream.name] = now_s
+        back = self._leaves.get(stream.name, 0) + 1
+        own = self._judged(stream, back)
+        self._leaves[stream.name] = back if own else 0
+        self._by_hypotheses(stream, own)
 
     def _ask_at(self, due_s: float, entry: _Entry) -> None:
         heapq.heappush(self._again, (due_s, next(self._turn), entry))
@@ -381,7 +402,7 @@ class Lag:
                 for entry, verdict in zip(own, verdicts, strict=True):
                     self._change(entry, verdict)
             else:
-                self._by_hypotheses(stream)
+                self._by_hypotheses(stream, self._judged(stream))
             self._window.commit()
         if self._cost(stream, own) < cost:
             self._rounds[stream.name] = _ROUNDS
@@ -401,11 +422,12 @@ class Lag:
         evidence = sequence_of(stream, [e.index for e in own], found, [None] * len(own)).log_evidence()
         return self._window.error([e.held for e in own if e.held is not None]) - evidence
 
-    def _judged(self, stream: LiveStream) -> list[_Entry]:
-        """The newest of a stream that can still be judged, by stamp."""
+    def _judged(self, stream: LiveStream, back: int = 0) -> list[_Entry]:
+        """A chapter of a stream that can still be judged, by stamp: the newest, or so many before it."""
         first = self.problem.timeline.first
         own = [e for e in self._entries.values() if e.stream is stream and e.reaches(first)]
-        return sorted(own, key=lambda e: (e.measurement.stamp_ns, e.index))[-_CHAPTER:]
+        end = len(own) - back * _CHAPTER
+        return sorted(own, key=lambda e: (e.measurement.stamp_ns, e.index))[max(end - _CHAPTER, 0) : max(end, 0)]
 
     def _ask_again(self, entry: _Entry, now_s: float) -> None:
         if (entry.stream.number, entry.index) not in self._entries or not entry.reaches(self.problem.timeline.first):
@@ -465,11 +487,11 @@ class Lag:
             P[:6, :6] += np.asarray(pim.preintMeasCov())[:6, :6]
         return np.asarray(J @ P @ J.T)
 
-    def _by_hypotheses(self, stream: LiveStream) -> None:
-        """Judge the newest of a stream as one sequence; what is new, by the prediction."""
-        values, own = self._window.values, self._judged(stream)
+    def _by_hypotheses(self, stream: LiveStream, own: list[_Entry]) -> bool:
+        """Judge measurements of a stream as one sequence; what is new, by the prediction. Tell whether it may change yet."""
+        values, unsettled = self._window.values, False
         if not own:
-            return
+            return False
         attached = [attach(self.problem, stream, e.index, values) for e in own]
         residuals = [
             stream.row.residuals(e.measurement, stream.config, at) for e, at in zip(own, attached, strict=True)
@@ -485,12 +507,14 @@ class Lag:
                 self._note(stream, entry.measurement, verdict)
             if not entry.open_ and verdict.weight < AGREES:
                 self._refuted.add(stream.name)
+            verdict, differs = replace(verdict, settled=settled), self._differs(entry, verdict)
+            unsettled |= differs if entry.open_ else verdict.weight < _SURE
             entry.open_ = True  # it has been judged
-            verdict = replace(verdict, settled=settled)
-            if self._differs(entry, verdict):
+            if differs:
                 self._change(entry, verdict)
             else:
                 entry.verdict = replace(verdict, decision=entry.verdict.decision, at=entry.verdict.at)
+        return unsettled
 
     def _differs(self, entry: _Entry, verdict: Verdict) -> bool:
         """Whether what is in the graph is not what was decided, or is linearised elsewhere."""
@@ -562,7 +586,13 @@ class Lag:
             self._known[key] = Beside(value=value, gain=np.zeros((len(value), 6)), cov=self._window.covariance([key]))
 
     def misfit(self) -> float:
-        """Return the cost of the window over its expectation (see `solve._passes.expected_cost`)."""
+        """Return the cost of the window over its expectation (see `solve._passes.expected_cost`); 1 where the IMU agrees.
+
+        A jump of GNSS, or a step that is not relinearised yet, costs as much in a window: but not in most of its steps.
+        """
+        steps = self._window.errors_of(held for held in self._links.values() if held.slots)
+        if not steps or 2.0 * float(np.median(steps)) < _STEP_COST:
+            return 1.0
         held = [e.verdict for e in self._entries.values() if e.held is not None]
         expected = sum((v.residual.rows or len(v.residual.raw)) * v.weight for v in held)
         timeline = self.problem.timeline

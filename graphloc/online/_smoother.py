@@ -30,7 +30,7 @@ from graphloc.online._anchor import Anchor
 from graphloc.online._lag import Lag
 from graphloc.online._live import live_problem
 from graphloc.online._odometry import Odometry
-from graphloc.online._start import Started, try_start
+from graphloc.online._start import LEAST_S, Started, try_start
 from graphloc.origin import refuse_world_without_datum
 from graphloc.solve._batch import CONTRADICTION
 from graphloc.solve._solution import NO_NOISE, health_of, left_out, world_covariance
@@ -518,7 +518,7 @@ class OnlineSmoother:
             return None
         while (newest.stamp_ns - self._buffer[0].stamp_ns) > _LONGEST_WAIT_S * 1e9:
             self._drop(self._buffer.popleft(), Outcome.REJECTED, f"came before the start: waiting for {self._waiting}")
-        waited_ns = newest.stamp_ns - self._buffer[0].stamp_ns  # the more there is to solve, the rarer
+        waited_ns = newest.stamp_ns - self._buffer[0].stamp_ns - duration_ns(LEAST_S)  # the more to solve, the rarer
         if newest.stamp_ns - self._tried_ns < max(_TRY_EVERY_S * 1e9, _TRY_AGAIN * waited_ns):
             return None
         self._tried_ns = newest.stamp_ns
@@ -632,6 +632,7 @@ class OnlineSmoother:
                 self._begin(anchor, samples)
                 fresh = self._lag
                 self._step(fresh)
+                fresh.settle()
             except Exception as another:  # noqa: BLE001 - as in `_advance`
                 why, self._settled, self._done = f"the solver failed ({_line(another)})", settled, done
                 continue

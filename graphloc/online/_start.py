@@ -26,7 +26,7 @@ from graphloc.solve._align import MOVED_M
 from graphloc.solve._batch import solve_batch
 from graphloc.solve._solution import AGREES, world_covariance
 
-_LEAST_S = 5.0  # of inertial data: gyro bias, roll and pitch of a vessel in waves
+LEAST_S = 5.0  # of inertial data: gyro bias, roll and pitch of a vessel in waves
 _HEADING_RAD = np.radians(15.0)  # 1 sigma: from farther off a lag does not come back soon
 _HEADING_WAIT_S = 30.0  # for a heading from the way alone; then the place is worth more than nothing
 _DOUBTFUL = 0.25  # probability of being false: a pose that is given, or a tag, is believed at once
@@ -74,8 +74,8 @@ def try_start(
 ) -> Started | str:
     """Return the start, or what it waits for."""
     span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 if len(imu) else 0.0
-    if span_s < _LEAST_S:
-        return f"{_LEAST_S:g} s of IMU data"
+    if span_s < LEAST_S:
+        return f"{LEAST_S:g} s of IMU data"
     recording = Recording(
         source="(online)",
         imu=imu,

@@ -18,7 +18,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array
 
 _RELINEARIZE = 0.02  # of any tangent: m, rad, m/s; the gap to the batch is millimetres
-_FREE_EVERY = 3  # updates between relinearisations: as accurate as every one
+_FREE_EVERY = 10  # updates between relinearisations: as accurate as every one
 
 
 def keys_of(factor: Any) -> list[int]:
@@ -112,8 +112,9 @@ class Window:
         self._alive = self._smoother.timestamps()
 
     def settle(self) -> None:
-        """One more step of the solver, with nothing new."""
-        self.commit()
+        """Relinearise, with nothing new."""
+        for _ in range(_FREE_EVERY):
+            self.commit()
 
     def leaving(self, keys: Iterable[int], now_s: float) -> list[int]:
         """Return those of the keys that the next commit at `now_s` lets go."""
@@ -135,9 +136,12 @@ class Window:
 
     def error(self, without: Iterable[Held] = ()) -> float:
         """Return the cost of the graph at the estimate (half of the weighted squares), less that of some factors."""
+        return float(self._smoother.getFactors().error(self.values)) - sum(self.errors_of(without))
+
+    def errors_of(self, parts: Iterable[Held]) -> list[float]:
+        """Return the share of the cost that committed factors have, together as they went in."""
         factors = self._smoother.getFactors()
-        less = sum(factors.at(slot).error(self.values) for held in without for slot in held.slots)
-        return float(factors.error(self.values)) - float(less)
+        return [float(sum(factors.at(slot).error(self.values) for slot in held.slots)) for held in parts]
 
     def is_committed(self, key: int) -> bool:
         return key in self._alive
