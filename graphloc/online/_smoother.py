@@ -7,9 +7,7 @@ failed is built anew from its last anchor with all that came since.
 
 from __future__ import annotations
 
-import json
 import logging
-import os
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -22,7 +20,7 @@ import numpy as np
 from graphloc.config import VesselConfig
 from graphloc.errors import GraphlocError
 from graphloc.estimate import Estimate
-from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frames import Array, Datum
 from graphloc.graph import InertialRow, Sensor
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
@@ -30,6 +28,7 @@ from graphloc.online._anchor import Anchor
 from graphloc.online._lag import Lag
 from graphloc.online._live import live_problem
 from graphloc.online._odometry import Odometry
+from graphloc.online._snapshot import Snapshot
 from graphloc.online._start import LEAST_S, Started, try_start
 from graphloc.origin import refuse_world_without_datum
 from graphloc.solve._batch import CONTRADICTION
@@ -691,24 +690,19 @@ class OnlineSmoother:
             default=self._newest_imu,
         )
         assert last is not None
-        raw = {
-            "version": 1,
-            "vessel": self._config.vessel,
-            "datum": list(self._datum.origin),
-            "anchor": anchor.as_dict(),
-            "imu": [last.stamp_ns, *last.accel_mps2.tolist(), *last.gyro_radps.tolist()],
-            "heights_m": dict(self._heights_m),
-            "noise_scale": self._noise_scale,
-            "agreed_ns": {**self._agreed_ns, **(self._lag.agreed_ns if self._lag else {})},
-            "odom": [self._odometry.p_m.tolist(), self._odometry.R.tolist()],
-        }
-        part = path.with_name(path.name + ".part")
+        snapshot = Snapshot(
+            vessel=self._config.vessel,
+            anchor=anchor,
+            imu=last,
+            datum=self._datum,
+            heights_m=self._heights_m,
+            agreed_ns={**self._agreed_ns, **(self._lag.agreed_ns if self._lag else {})},
+            noise_scale=self._noise_scale,
+            p_odom_m=self._odometry.p_m,
+            R_odom_body=self._odometry.R,
+        )
         try:
-            with part.open("w", encoding="utf-8") as stream:
-                json.dump(raw, stream)
-                stream.flush()
-                os.fsync(stream.fileno())
-            part.replace(path)  # at once: a kill leaves the old one or the new one
+            snapshot.write(path)
         except OSError as error:
             if not self._unwritable:
                 self._events.append(f"{path}: the snapshot cannot be written ({error.strerror or error})")
@@ -716,39 +710,29 @@ class OnlineSmoother:
             return
         self._unwritable = False
 
-    def _read_snapshot(self) -> tuple[Anchor, ImuSample] | None:
+    def _read_snapshot(self) -> Snapshot | None:
         path = self._snapshot
         if path is None or not path.exists():
             return None
         try:
-            raw = json.loads(path.read_text(encoding="utf-8"))
-            if raw["version"] != 1 or raw["vessel"] != self._config.vessel:
-                raise ValueError("it is of another vessel or version")
-            anchor = Anchor.from_dict(raw["anchor"])
-            stamp, *six = raw["imu"]
-            last = ImuSample(stamp_ns=int(stamp), sensor=self._imu_name, seq=-1, accel_mps2=six[:3], gyro_radps=six[3:])
-            datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
-            if self._datum is not None and not np.allclose(datum.origin, self._datum.origin, rtol=0.0, atol=1e-9):
+            found = Snapshot.read(path, self._imu_name)
+            if found.vessel != self._config.vessel:
+                raise ValueError("it is of another vessel")
+            if self._datum is not None and not np.allclose(found.datum.origin, self._datum.origin, rtol=0.0, atol=1e-9):
                 raise ValueError("its origin of world is another one")
-            heights_m = {str(n): float(h) for n, h in raw["heights_m"].items() if n in self._asked}
-            agreed_ns = {str(n): int(s) for n, s in raw["agreed_ns"].items()}
-            scale = float(raw["noise_scale"])
-            p, R = np.array(raw["odom"][0], dtype=np.float64), np.array(raw["odom"][1], dtype=np.float64)
-            numbers = np.concatenate([p.reshape(3), R.reshape(9), datum.origin, list(heights_m.values()), [scale]])
-            if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
-                raise ValueError("it is damaged")
         except Exception as error:  # noqa: BLE001 - a file that anything may have written
             self._events.append(f"{path}: the snapshot cannot be used ({_line(error)}): starts anew")
             return None
-        self._datum, self._heights_m, self._agreed_ns = datum, heights_m, agreed_ns
-        self._noise_scale = float(np.clip(scale, 1.0, NO_NOISE))
-        self._odometry = Odometry(anchor.stamp_ns, p, R)
-        return anchor, last
+        self._datum, self._agreed_ns, self._noise_scale = found.datum, dict(found.agreed_ns), found.noise_scale
+        self._heights_m = {n: h for n, h in found.heights_m.items() if n in self._asked}
+        self._odometry = Odometry(found.anchor.stamp_ns, found.p_odom_m, found.R_odom_body)
+        return found
 
     def _resume(self, newest: ImuSample) -> None:
         """Go on from the snapshot, if the first sample is not too far from it."""
         assert self._resumable is not None
-        (anchor, last), self._resumable = self._resumable, None
+        anchor, last = self._resumable.anchor, self._resumable.imu
+        self._resumable = None
         age_s = (newest.stamp_ns - anchor.stamp_ns) * 1e-9
         if not 0.0 < age_s <= self._bridge_s:
             self._agreed_ns = self._agreed_ns if age_s > 0.0 else {}
