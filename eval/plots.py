@@ -103,7 +103,7 @@ def track_map(recording: Recording, solution: Solution, filters: Sequence[Filter
     ]
     if recording.truth is not None:
         tracks.append(("truth", recording.truth, TRUTH, "dot"))
-    tracks.append(("graphloc", solution.trajectory, COLOURS[0], "solid"))
+    tracks.append((solution.name, solution.trajectory, COLOURS[0], "solid"))
     for name, track, colour, dash in tracks:
         p = track.p_world_m[_every(len(track))]
         line = {"color": colour, "dash": dash, "width": 2}
@@ -123,7 +123,7 @@ def error_over_time(
     """Position and heading error over time where truth or held-out fixes exist, and the 95 % bounds."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     start = int(solution.trajectory.stamps_ns[0])
-    names = [("graphloc", solution.trajectory), *((f.name, f.trajectory) for f in filters)]
+    names = [(solution.name, solution.trajectory), *((f.name, f.trajectory) for f in filters)]
     largest_m = []
     for i, (name, track) in enumerate(names):
         line = {"color": COLOURS[i], "width": 2 if not i else 1.2}

@@ -27,7 +27,7 @@ from graphloc.recording import Recording
 from graphloc.solution import Solution
 
 # Shares of the run: called good, covered by the 95 % bounds, compared at all; below, a reader has to look closer.
-_MOSTLY, _COVERED, _NOT_COVERED, _MATCHED = 0.5, 0.85, 0.5, 0.95
+_MOSTLY, _COVERED, _NOT_COVERED, _MATCHED, _STARTED = 0.5, 0.85, 0.5, 0.95, 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -140,15 +140,20 @@ def verdict(data: ReportData) -> tuple[Trust, str]:
     assert solution.trajectory.cov is not None
     bound = float(np.percentile(bounds_95(solution.trajectory.cov)[:, 0], 95))
     good = float(np.mean([h.value == "good" for h in solution.health]))
-    said = [_accuracy(data.tables)] if data.tables else []
+    said = ["Online: each pose as it was known at its time."] if solution.stats.online else []
+    said += [_accuracy(data)] if data.tables else []
     said.append(
         f"It states a 95 % bound of {bound:.2f} m or better for 95 % of the run, and calls itself good for {good:.0%}."
     )
-    covered, matched, headed = (_ours(data.tables, c) for c in ("coverage_95", "matched", "heading_coverage_95"))
+    covered, matched, headed = (_ours(data, c) for c in ("coverage_95", "matched", "heading_coverage_95"))
     trust = Trust.YES
     if covered is not None:
         said.append(f"Its 95 % bounds held the truth for {covered:.0%} of the time.")
-    if matched is not None and matched < _MATCHED:
+    if matched is not None and _MATCHED > matched >= _STARTED and solution.stats.online:
+        said.append(
+            f"It covers {matched:.0%} of what it is compared with: it begins when place and heading can be told."
+        )
+    elif matched is not None and matched < _MATCHED:
         trust = Trust.WITH_CARE
         said.append(f"IT COVERS ONLY {matched:.0%} of what it is compared with; the filters may cover more.")
     if headed is not None and headed < _COVERED:
@@ -166,20 +171,19 @@ def verdict(data: ReportData) -> tuple[Trust, str]:
     return trust, " ".join(said)
 
 
-def _ours(tables: Sequence[Table], column: str) -> float | None:
+def _ours(data: ReportData, column: str) -> float | None:
     """The graph's number in the first table that has such a column."""
-    return next((t.as_dict()["graphloc"][column] for t in tables if column in t.columns), None)
+    return next((t.as_dict()[data.solution.name][column] for t in data.tables if column in t.columns), None)
 
 
-def _accuracy(tables: Sequence[Table]) -> str:
-    for table in tables:
+def _accuracy(data: ReportData) -> str:
+    ours = data.solution.name
+    for table in data.tables:
         key = next((k for k in ("position_rmse_m", "horizontal_rmse_m") if k in table.columns), None)
         if key is not None:
             values = table.as_dict()
-            others = ", ".join(
-                f"{n} {v[key]:.2f} m" for n, v in values.items() if n != "graphloc" and v[key] is not None
-            )
-            return f"Horizontal RMSE {values['graphloc'][key]:.2f} m" + (f" (beside it: {others})." if others else ".")
+            others = ", ".join(f"{n} {v[key]:.2f} m" for n, v in values.items() if n != ours and v[key] is not None)
+            return f"Horizontal RMSE {values[ours][key]:.2f} m" + (f" (beside it: {others})." if others else ".")
     return ""
 
 
@@ -249,7 +253,8 @@ def _matches(pictures: Sequence[tuple[str, bytes]]) -> str:
 def _stats(solution: Solution) -> str:
     s = solution.stats
     if s.online:
-        return f"<p>Online: {s.states} poses, each as it was known at its time.</p>"
+        events = "".join(f"<li>{escape(event)}</li>" for event in s.events)
+        return f"<p>Online: {s.states} poses, each as it was known at its time.</p><ul>{events}</ul>"
     return (
         f"<p>{s.states} states, {s.factors} factors, {s.passes} passes, {s.iterations} iterations; "
         f"{'converged' if s.converged else 'NOT converged'}. Cost {s.cost:.0f}, expected {s.expected_cost:.0f} "

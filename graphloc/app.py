@@ -262,7 +262,7 @@ def with_synthetic(recording: Recording, config: VesselConfig, datum: Datum) -> 
 def tables(run: Run) -> tuple[metrics.Table, ...]:
     """Return the numbers of a run: against truth, held-out fixes, and the speed check."""
     found: list[metrics.Table] = []
-    estimates = [("graphloc", run.solution.trajectory), *((f.name, f.trajectory) for f in run.filters)]
+    estimates = [(run.solution.name, run.solution.trajectory), *((f.name, f.trajectory) for f in run.filters)]
     if run.recording.truth is not None:
         found.append(metrics.truth_table(estimates, run.recording.truth))
         found += _docking_tables(run, estimates, run.recording.truth)

@@ -36,6 +36,10 @@ Status = Callable[[float, float, Estimate | None, str], None]
 """Called with s of the run, its whole length, the newest estimate, and what the start waits for."""
 
 
+_WARNS = ("anew", "rebuilt", "no second sensor", "a guess")  # of events, that a reader must see
+_BUSY = "not tried: the scan before it was still being matched"
+
+
 def silent(_at_s: float, _whole_s: float, _estimate: Estimate | None, _waiting: str) -> None:
     """A `Status` that says nothing."""
 
@@ -119,7 +123,7 @@ class _Matching:
                 self._refuse(turn, "there was no estimate to match around")
                 continue
             if self._underway is not None:
-                self._refuse(turn, "the scan before it was still being matched")
+                self._refuse(turn, _BUSY)
                 continue
             if self._matcher is None:
                 self._matcher = LiveMatcher(self._sensor, self._scans.folder, datum, self._feed.mounts)
@@ -135,6 +139,15 @@ class _Matching:
             self._next = next(self._turns, None)
             if found is not None:
                 yield from self._taken(found)
+
+    def end(self) -> Iterator[Measurement]:
+        """Yield the match that is still being made; what is left of the scans is refused."""
+        if self._underway is not None:
+            found = self._underway.result()
+            if found is not None and found != "wait":
+                yield from self._taken(found)
+        while self._next is not None:
+            self._refuse(self._next, "the run ended before it could be matched")
 
     def _refuse(self, turn: Turn, why: str) -> None:
         self._gathering.refuse(self._name, turn.stamp_ns, turn.why_not or why)
@@ -217,12 +230,25 @@ def replay(
                 if smoother.waiting_for and second != tried:
                     tried = second
                     status(float(second), (last_ns - first_ns) / 1e9, None, smoother.waiting_for)
+        for matching in matchings:
+            for match in matching.end():
+                feed(match)
     waiting = smoother.waiting_for
     rows += smoother.finish()
     said += smoother.events()
     if not estimates:
         raise SolveError(f"{recording.source}: never started: it waited for {waiting or 'IMU data'}")
     recording = gathering.recording()
+    if len(took_s) > 1:
+        p50, p99, most = (1e3 * float(np.quantile(took_s[1:], q)) for q in (0.5, 0.99, 1.0))
+        said.append(
+            f"an update took {p50:.1f} ms (median), {p99:.0f} ms (99 %), {most:.0f} ms at most; the start {1e3 * took_s[0]:.0f} ms"
+        )
+    behind = sum(row.reason == _BUSY for row in recording.rows)
+    if behind > 0.2 * sum(row.reason == _BUSY or row.sensor in config.of_kind("aerial") for row in recording.rows):
+        recording = replace(
+            recording, warnings=(*recording.warnings, f"the matcher did not keep up: {behind} scans were never tried")
+        )
     matched = {row.seq for row in rows}
     rows += [row for row in recording.rows if row.seq not in matched or row.seq < 0]
     solution = _solution(estimates, Ledger(rows), smoother, said)
@@ -260,7 +286,7 @@ def _solution(estimates: Sequence[Estimate], ledger: Ledger, smoother: OnlineSmo
         ledger=ledger,
         stats=SolveStats(
             passes=0, iterations=len(estimates), states=len(kept), factors=0, cost=0.0, expected_cost=0.0, converged=True,
-            warnings=tuple(line for line in said if not line.startswith("started")),
+            warnings=tuple(line for line in said if any(word in line for word in _WARNS)), events=tuple(said),
             online=True,
         ),
     )  # fmt: skip

@@ -55,6 +55,7 @@ class SolveStats:
         converged: whether the last pass moved no state noticeably.
         warnings: one line each, for the report.
         online: each pose is as it was known then; passes, factors and cost say nothing.
+        events: what happened on the way, online.
     """
 
     passes: int
@@ -66,6 +67,7 @@ class SolveStats:
     converged: bool
     warnings: tuple[str, ...] = ()
     online: bool = False
+    events: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -99,3 +101,8 @@ class Solution:
     berths: tuple[BerthTrack, ...]
     ledger: Ledger
     stats: SolveStats
+
+    @property
+    def name(self) -> str:
+        """What tables and pictures call it."""
+        return "graphloc online" if self.stats.online else "graphloc"

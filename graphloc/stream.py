@@ -157,7 +157,7 @@ def run(
             if found is not None:
                 session.estimate(found, line=number)
             else:
-                session.say("waiting", {"for": smoother.waiting_for, "line": number})
+                session.say("waiting", {"for": smoother.waiting_for or "IMU data nearer to that stamp", "line": number})
             continue
         seq += 1
         if isinstance(said, Trouble):

@@ -28,8 +28,8 @@ def smoother(run: SimulatedRun, **options: Any) -> OnlineSmoother:
 
 
 @cache
-def run_of(seed: int = 0) -> SimulatedRun:
-    return simulate(replace(bl_scenario(1, "drift", false_fraction=0.1), duration_s=26.0), seed)
+def run_of(seed: int = 0, length_s: float = 26.0) -> SimulatedRun:
+    return simulate(replace(bl_scenario(1, "drift", false_fraction=0.1), duration_s=length_s), seed)
 
 
 @cache
@@ -98,9 +98,10 @@ def test_starts_anew_after_a_long_silence() -> None:
 
 def test_a_lost_estimate_starts_anew() -> None:
     """Its state put 300 m aside, with confidence: all sensors disagree, and after some seconds they are believed."""
-    base, online = arrivals_of(run_of()), smoother(run_of())
+    run = run_of(length_s=40.0)
+    base, online = arrivals_of(run), smoother(run)
     n = at_s(base, 8.0)
-    fed = feed(online, run_of(), base[:n])
+    fed = feed(online, run, base[:n])
     anchor = online._anchors[-1]  # noqa: SLF001
     pose = type(anchor.pose)(anchor.pose.rotation(), anchor.pose.translation() + np.array([300.0, 0.0, 0.0]))
     known = {name: replace(b, cov=b.cov * 1e-4) for name, b in anchor.slow.items()}
@@ -108,10 +109,12 @@ def test_a_lost_estimate_starts_anew() -> None:
     online._anchors.append(replace(anchor, pose=pose, cov=anchor.cov * 1e-4, slow=known))  # noqa: SLF001
     online._recent = [m for m in online._recent if m.stamp_ns >= anchor.stamp_ns]  # noqa: SLF001
     online._rebuild(RuntimeError("planted"))  # noqa: SLF001
-    feed(online, run_of(), base[n:], fed)
+    feed(online, run, base[n:], fed)
     assert complaints(base, finish(online, fed)) == []
     assert max(fed.errors_m) > 100.0
-    assert fed.recovered_s(base[n].true_ns) < 10.0
+    assert (
+        fed.recovered_s(base[n].true_ns) < 20.0
+    )  # 15 s of disagreement, and a start that waits for matches at 1 Hz to agree
 
 
 # The solver
@@ -277,12 +280,10 @@ def test_an_old_snapshot_is_not_resumed(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_said_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    import os
-
-    def full(_: int) -> None:
+    def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr("graphloc.online._snapshot.json.dump", full)
     fed = whole(arrivals_of(run_of()), smoother(run_of(), snapshot=tmp_path / "snapshot.json"))
     assert len([e for e in fed.events if "No space left" in e]) == 1
     assert [e.stamp_ns for e in fed.estimates] == [e.stamp_ns for e in undisturbed().estimates]

@@ -45,6 +45,9 @@ from graphloc.solve._hypotheses import best_chain, sequence_of
 from graphloc.solve._solution import AGREES, row_of
 
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
+_CREEPS = (
+    0.01  # a weight below this is none: a hundred fixes that are refused still creep, and take velocity and tilt along
+)
 _CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
 _PAGE_S = 1.0
@@ -74,7 +77,8 @@ class _Entry:
     index: int
     verdict: Verdict
     held: Held | None = None
-    open_: bool = False  # its kernel bends later than configured
+    opened: bool = False  # its kernel bends later than configured
+    judged: bool = False  # as a hypothesis, once at least
 
     @property
     def measurement(self) -> Measurement:
@@ -175,8 +179,8 @@ class Lag:
 
     # States
 
-    def grow(self, stamp_ns: int) -> None:
-        """Stage the next state, where the IMU says that it is."""
+    def grow(self, stamp_ns: int) -> bool:
+        """Stage the next state, where the IMU says that it is; tell whether slow states got a node, which closes a commit."""
         timeline, window, links = self.problem.timeline, self._window, self.problem.links
         k, values = timeline.last, window.values
         j, before_ns = timeline.slow_of[k], timeline.stamps_ns[k]
@@ -197,6 +201,7 @@ class Lag:
         for stream in self.problem.streams.values():
             if stream.slow is not None:
                 window.touch(keys.slow(stream.number, following), t)
+        return bool(following != j)
 
     def _next_slow(self, j: int, dt_s: float, t: float) -> None:
         window = self._window
@@ -307,10 +312,11 @@ class Lag:
             self._note(stream, m, None)
             raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
         if stream.row.false is None:
-            verdict, open_ = self._by_kernel(stream, i, at, residuals[0], fresh=True)
+            verdict, opened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
             self._note(stream, m, verdict)
-            entry = _Entry(stream, i, verdict, open_=open_)
-            self._put(entry)
+            entry = _Entry(stream, i, verdict, opened=opened)
+            if verdict.weight >= _CREEPS:
+                self._put(entry)
             self._ask_at(self._seconds(m.stamp_ns) + _AGAIN_S[0], entry)
         else:
             entry = _Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at))
@@ -396,6 +402,7 @@ class Lag:
 
     def _try(self, stream: LiveStream, own: list[_Entry], others: list[Verdict]) -> None:
         """Take other verdicts, settle around them, and go back if that is less probable."""
+        self._window.settle()
         before, cost = [e.verdict for e in own], self._cost(stream, own)
         for verdicts in (others, None):
             if verdicts is not None:
@@ -403,13 +410,13 @@ class Lag:
                     self._change(entry, verdict)
             else:
                 self._by_hypotheses(stream, self._judged(stream))
-            self._window.commit()
+            self._window.settle(_STEPS)  # a metre off, one step says nothing of the cost
         if self._cost(stream, own) < cost:
             self._rounds[stream.name] = _ROUNDS
             return
         for entry, verdict in zip(own, before, strict=True):
             self._change(entry, verdict)
-        self._window.commit()
+        self._window.settle(_STEPS)
 
     def _cost(self, stream: LiveStream, own: list[_Entry]) -> float:
         """Minus the log of the probability of the window, all hypotheses of a stream summed over."""
@@ -434,11 +441,13 @@ class Lag:
             return
         at = attach(self.problem, entry.stream, entry.index, self._window.values)
         residual = entry.stream.row.residuals(entry.measurement, entry.stream.config, at)[0]
-        verdict, open_ = self._by_kernel(entry.stream, entry.index, at, residual, fresh=False)
+        verdict, opened = self._by_kernel(entry.stream, entry.index, at, residual, fresh=False)
         if verdict.weight >= AGREES:
             self._note(entry.stream, entry.measurement, verdict)
-        if entry.open_ or abs(verdict.weight - entry.verdict.weight) > _CHANGED:
-            entry.open_ = open_
+        if entry.held is None and verdict.weight < _CREEPS:
+            entry.verdict = verdict
+        elif entry.held is None or entry.opened or abs(verdict.weight - entry.verdict.weight) > _CHANGED:
+            entry.opened = opened
             self._change(entry, verdict)
         else:
             entry.verdict = replace(verdict, decision=entry.verdict.decision)
@@ -497,19 +506,19 @@ class Lag:
             stream.row.residuals(e.measurement, stream.config, at) for e, at in zip(own, attached, strict=True)
         ]
         predicted = [
-            self._unsure(stream, at, e.state, found[0]) if e.held is None and e.verdict.decision is None and not e.open_ else None
+            self._unsure(stream, at, e.state, found[0]) if e.held is None and e.verdict.decision is None and not e.judged else None
             for e, at, found in zip(own, attached, residuals, strict=True)
         ]  # fmt: skip
         verdicts = by_hypotheses(stream, [e.index for e in own], attached, residuals, predicted)
         for entry, verdict in zip(own, verdicts, strict=True):
-            settled = entry.verdict.settled + (entry.open_ and verdict.mode != entry.verdict.mode)
-            if not entry.open_ or verdict.weight >= AGREES:
+            settled = entry.verdict.settled + (entry.judged and verdict.mode != entry.verdict.mode)
+            if not entry.judged or verdict.weight >= AGREES:
                 self._note(stream, entry.measurement, verdict)
-            if not entry.open_ and verdict.weight < AGREES:
+            if not entry.judged and verdict.weight < AGREES:
                 self._refuted.add(stream.name)
             verdict, differs = replace(verdict, settled=settled), self._differs(entry, verdict)
-            unsettled |= differs if entry.open_ else verdict.weight < _SURE
-            entry.open_ = True  # it has been judged
+            unsettled |= differs if entry.judged else verdict.weight < _SURE
+            entry.judged = True  # it has been judged
             if differs:
                 self._change(entry, verdict)
             else:

@@ -32,14 +32,14 @@ from graphloc.online._snapshot import Snapshot
 from graphloc.online._start import LEAST_S, Started, try_start
 from graphloc.origin import refuse_world_without_datum
 from graphloc.solve._batch import CONTRADICTION
-from graphloc.solve._solution import NO_NOISE, health_of, left_out, world_covariance
+from graphloc.solve._solution import NO_NOISE, alone, health_of, left_out, world_covariance
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 _TRY_EVERY_S, _TRY_AGAIN, _LONGEST_WAIT_S = 0.5, 0.15, 120.0  # for a start; what is older is let go
 _ANCHOR_S, _SNAPSHOT_S = 1.0, 2.0
-_LOST_S, _AGAIN_S = 8.0, 6.0  # of disagreement, until it starts anew; with the data of so long
+_LOST_S, _AGAIN_S = 15.0, 6.0  # of disagreement, until it starts anew; with the data of so long
 _AHEAD_S = 60.0  # of the IMU: a stamp of another clock
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _BACK = 50  # IMU samples in a row before the newest: their clock was set back
@@ -79,6 +79,7 @@ class OnlineSmoother:
         if datum is None:
             refuse_world_without_datum(config, "vessel.yaml", rows)
         self._config, self._rows, self._inertial = config, tuple(rows), inertial
+        self._at_start = config  # a heading that is configured holds for the first start alone
         self._mounts, self._lag_s, self._snapshot = dict(mounts or {}), lag_s, snapshot
         self._datum = datum or (Datum(config.datum.geodetic) if config.datum else None)
         imu = config.of_kind(inertial.kind)
@@ -260,12 +261,15 @@ class OnlineSmoother:
                 self._done.append(self._row(m, Outcome.USED, ""))
             stamps.insert(n, m.stamp_ns)
             return
-        self._behind += 1
+        self._behind += newest.stamp_ns - m.stamp_ns > self._gap_s * 1e9  # less is caught up with, and bridged
         if self._behind < _BACK:
             self._drop(m, Outcome.REJECTED, "its stamp does not increase")
             return
         self._restart(f"the IMU's clock was set back by {(newest.stamp_ns - m.stamp_ns) * 1e-9:.1f} s")
         self._newest_imu, self._agreed_ns = None, {}  # by a clock that is no more
+        self._fit_ns = self._misfits = 0
+        if self._odometry is not None:
+            self._odometry.stamp_ns = m.stamp_ns
         self._accept_imu(m)
 
     def _accept_imu(self, m: ImuSample) -> Estimate | None:
@@ -315,7 +319,7 @@ class OnlineSmoother:
         if self._misfits < _MISFITS or self._noise_scale >= NO_NOISE:
             return ""
         self._misfits = 0
-        self._noise_scale *= float(np.clip(np.sqrt(misfit), 1.5, 3.0))
+        self._noise_scale = min(self._noise_scale * float(np.clip(np.sqrt(misfit), 1.5, 3.0)), NO_NOISE)
         return f"the IMU contradicts the other sensors: its noise is taken for {self._noise_scale:.1f} times as large"
 
     def _try_estimate(self, stamp_ns: int | None = None) -> Estimate | None:
@@ -335,9 +339,11 @@ class OnlineSmoother:
         while timeline.due_ns <= until:
             before, made = lag.newest, 0
             while timeline.due_ns <= until and made < _AT_ONCE:
-                lag.grow(timeline.due_ns)
+                turned = lag.grow(timeline.due_ns)
                 made += 1
                 self._make_own(lag)
+                if turned:
+                    break
             reached = timeline.stamps_ns[timeline.last]
             while self._pending and self._pending[0].stamp_ns <= reached:
                 m = self._pending.pop(0)
@@ -450,6 +456,8 @@ class OnlineSmoother:
         agreed = {**self._agreed_ns, **lag.agreed_ns}
         since = {n: max((at_ns - agreed[n]) * 1e-9, 0.0) if n in agreed else np.inf for n in self._absolute}
         health, reason = health_of(cov, since, self._doubt)
+        if self._doubt and reason != self._doubt:
+            reason = f"{reason}; {self._doubt}"
         return Estimate(
             stamp_ns=at_ns,
             p_world_m=np.asarray(pose.transformFrom(lever)),
@@ -526,7 +534,7 @@ class OnlineSmoother:
         others = [m for m in self._buffer if not isinstance(m, ImuSample) and m.stamp_ns <= newest.stamp_ns]
         try:
             started = try_start(
-                self._config, self._rows, self._inertial, self._mounts, _series(samples), others, self._datum
+                self._at_start, self._rows, self._inertial, self._mounts, _series(samples), others, self._datum
             )
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             started = f"a start that can be solved: {_line(error)}"
@@ -542,6 +550,9 @@ class OnlineSmoother:
 
     def _take_over(self, started: Started, samples: list[ImuSample], others: list[Measurement]) -> None:
         """Build the lag where the data begin, and bring it to now."""
+        self._at_start = self._config.model_copy(
+            update={"start": self._config.start.model_copy(update={"heading_deg": None})}
+        )
         self._datum, self._heights_m, self._doubt = started.datum, started.heights_m, started.doubt
         self._noise_scale = max(self._noise_scale, started.noise_scale)
         self._done += [self._row(m, Outcome.USED, "") for m in samples if m.seq >= 0]
@@ -558,6 +569,11 @@ class OnlineSmoother:
         self._step(self._lag)
         self._keep_anchor(self._lag)
         self._events.append(f"started at {utc_text(self._lag.newest.stamp_ns)}: {'; '.join(started.notes)}")
+        if started.doubt:
+            self._events.append(started.doubt)
+        for stream in self._lag.problem.streams.values():
+            if stream.left_out is not None:
+                self._events.append(alone(stream.name, stream.left_out))
 
     def _begin(
         self, anchor: Anchor, samples: Sequence[ImuSample], guess: tuple[gtsam.Pose3, Array, Array] | None = None
@@ -698,6 +714,7 @@ class OnlineSmoother:
             heights_m=self._heights_m,
             agreed_ns={**self._agreed_ns, **(self._lag.agreed_ns if self._lag else {})},
             noise_scale=self._noise_scale,
+            doubt=self._doubt,
             p_odom_m=self._odometry.p_m,
             R_odom_body=self._odometry.R,
         )
@@ -723,28 +740,30 @@ class OnlineSmoother:
         except Exception as error:  # noqa: BLE001 - a file that anything may have written
             self._events.append(f"{path}: the snapshot cannot be used ({_line(error)}): starts anew")
             return None
-        self._datum, self._agreed_ns, self._noise_scale = found.datum, dict(found.agreed_ns), found.noise_scale
-        self._heights_m = {n: h for n, h in found.heights_m.items() if n in self._asked}
-        self._odometry = Odometry(found.anchor.stamp_ns, found.p_odom_m, found.R_odom_body)
         return found
 
     def _resume(self, newest: ImuSample) -> None:
         """Go on from the snapshot, if the first sample is not too far from it."""
         assert self._resumable is not None
-        anchor, last = self._resumable.anchor, self._resumable.imu
-        self._resumable = None
+        found, self._resumable = self._resumable, None
+        anchor, last = found.anchor, found.imu
         age_s = (newest.stamp_ns - anchor.stamp_ns) * 1e-9
         if not 0.0 < age_s <= self._bridge_s:
-            self._agreed_ns = self._agreed_ns if age_s > 0.0 else {}
             self._events.append(f"the snapshot is {age_s:.1f} s old, more than the {self._bridge_s:g} s that the IMU's "
                                 "silence is bridged for: starts anew")  # fmt: skip
             return
+        before = self._datum
+        self._datum, self._noise_scale = found.datum, found.noise_scale
         try:
             self._begin(anchor, [last, newest])
         except Exception as error:  # noqa: BLE001 - as in `_advance`
-            self._lag = None
+            self._lag, self._datum, self._noise_scale = None, before, 1.0
             self._events.append(f"the snapshot cannot be used ({_line(error)}): starts anew")
             return
+        self._agreed_ns = dict(found.agreed_ns)
+        self._heights_m = {n: h for n, h in found.heights_m.items() if n in self._asked}
+        self._odometry = Odometry(anchor.stamp_ns, found.p_odom_m, found.R_odom_body)
+        self._doubt = found.doubt
         waiting, self._buffer = [m for m in self._buffer if m is not newest], deque()
         self._anchors, self._before, self._recent = deque([anchor]), last, [newest]
         self._done.append(self._row(newest, Outcome.USED, ""))

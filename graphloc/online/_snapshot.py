@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ class Snapshot:
         vessel: its name. anchor: the newest state. imu: the sample at it or before.
         datum: origin of world. heights_m: of each sensor that the configuration makes itself, what it says.
         agreed_ns: when each absolute sensor last agreed. noise_scale: of the IMU.
+        doubt: why the pose cannot be called good.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
     """
 
@@ -37,6 +37,7 @@ class Snapshot:
     heights_m: Mapping[str, float]
     agreed_ns: Mapping[str, int]
     noise_scale: float
+    doubt: str
     p_odom_m: Array
     R_odom_body: Array
 
@@ -54,14 +55,13 @@ class Snapshot:
             "imu": [self.imu.stamp_ns, *self.imu.accel_mps2.tolist(), *self.imu.gyro_radps.tolist()],
             "heights_m": dict(self.heights_m),
             "noise_scale": self.noise_scale,
+            "doubt": self.doubt,
             "agreed_ns": dict(self.agreed_ns),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
         }
         part = path.with_name(path.name + ".part")
         with part.open("w", encoding="utf-8") as stream:
-            json.dump(raw, stream)
-            stream.flush()
-            os.fsync(stream.fileno())
+            json.dump(raw, stream)  # no fsync: a kill loses nothing, and a card may take a second for it
         part.replace(path)
 
     @classmethod
@@ -90,6 +90,7 @@ class Snapshot:
             heights_m=heights_m,
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
             noise_scale=float(np.clip(scale, 1.0, NO_NOISE)),
+            doubt=str(raw["doubt"]),
             p_odom_m=p,
             R_odom_body=R,
         )

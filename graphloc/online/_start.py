@@ -29,7 +29,7 @@ from graphloc.solve._solution import AGREES, world_covariance
 LEAST_S = 5.0  # of inertial data: gyro bias, roll and pitch of a vessel in waves
 _HEADING_RAD = np.radians(15.0)  # 1 sigma: from farther off a lag does not come back soon
 _HEADING_WAIT_S = 30.0  # for a heading from the way alone; then the place is worth more than nothing
-_DOUBTFUL = 0.25  # probability of being false: a pose that is given, or a tag, is believed at once
+_DOUBTFUL = 0.1  # probability of being false: a tag is believed at once, and so is a single pose that is given
 _AGREEING, _SHARE, _CHOICE_WAIT_S = 3, 0.4, 15.0  # two false matches of five may agree with each other
 _FIXES = 3  # to take a datum from
 
@@ -131,7 +131,7 @@ def _solved(
             agreeing = sum(weight >= AGREES for weight in weights)
             doubtful = [m for m in stream.measurements if stream.row.false is not None
                         and stream.row.false(m, stream.config).probability > _DOUBTFUL]  # fmt: skip
-            if doubtful and (agreeing < _AGREEING or agreeing < _SHARE * len(weights)):
+            if len(doubtful) > 1 and (agreeing < _AGREEING or agreeing < _SHARE * len(weights)):
                 return f"{_AGREEING} of {stream.name} that agree with each other ({agreeing} of {len(weights)} do)"
     last = keys.pose(len(problem.timeline) - 1)
     R = result.values.atPose3(last).rotation().matrix()

@@ -111,10 +111,15 @@ class Window:
         self._clear()
         self._alive = self._smoother.timestamps()
 
-    def settle(self) -> None:
-        """Relinearise, with nothing new."""
-        for _ in range(_FREE_EVERY):
-            self.commit()
+    def settle(self, steps: int = 1) -> None:
+        """Relinearise at once, with what is staged or nothing new, `steps` times."""
+        params = self._smoother.params()  # the smoother's own, not a copy
+        params.relinearizeSkip = 1
+        try:
+            for _ in range(steps):
+                self.commit()
+        finally:
+            params.relinearizeSkip = _FREE_EVERY
 
     def leaving(self, keys: Iterable[int], now_s: float) -> list[int]:
         """Return those of the keys that the next commit at `now_s` lets go."""

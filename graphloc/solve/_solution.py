@@ -14,6 +14,7 @@ from graphloc import keys
 from graphloc.berths import Berth, BerthTrack, rates, seen_from
 from graphloc.build import Judged, Problem, Stream, constant_keys
 from graphloc.frames import Array, skew
+from graphloc.graph import SlowProcess
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import Measurement
 from graphloc.recording import Recording
@@ -280,6 +281,14 @@ def row_of(stream: Judged, m: Measurement, topic: str, verdict: Verdict) -> Ledg
     )
 
 
+def alone(sensor: str, slow: SlowProcess) -> str:
+    """Say what a slow error that nothing can tell from motion does to the bounds."""
+    return (
+        f"{sensor}: no second sensor can tell its slow error (multipath) from motion; the bounds allow "
+        f"{slow.sigma[0]:.1f} m (1 sigma) for it; slow_error.enabled: false where there is none"
+    )
+
+
 def _stats(problem: Problem, result: BatchResult) -> SolveStats:
     expected = expected_cost(problem, result.verdicts)
     warnings = list(problem.warnings)
@@ -319,10 +328,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
                         "raise its sigmas"
                     )
         if stream.left_out is not None:
-            warnings.append(
-                f"{stream.name}: no second sensor can tell its slow error (multipath) from motion; the bounds allow "
-                f"{stream.left_out.sigma[0]:.1f} m (1 sigma) for it; slow_error.enabled: false where there is none"
-            )
+            warnings.append(alone(stream.name, stream.left_out))
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
         share = float((weights < AGREES).mean()) if len(weights) else 0.0
         if share > 0.5 and len(weights) > 10:
