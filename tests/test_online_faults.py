@@ -17,7 +17,7 @@ from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import Links
 from graphloc.ledger import Outcome
-from graphloc.measurements import GnssPosition, ImuSample
+from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix
 from graphloc.online import OnlineSmoother
 from graphloc.online._window import Window
 from tests.faults import FAULTS, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
@@ -115,6 +115,51 @@ def test_a_lost_estimate_starts_anew() -> None:
     assert (
         fed.recovered_s(base[n].true_ns) < 20.0
     )  # 15 s of disagreement, and a start that waits for matches at 1 Hz to agree
+
+
+def test_a_receiver_alone_that_jumps_is_not_overshot() -> None:
+    """20 m for 20 s, and nothing to tell it from motion: it may be followed, but not left behind."""
+    run = simulate(replace(bl_scenario(1, "clean"), duration_s=45.0), 1)
+    base = [a for a in arrivals_of(run) if not isinstance(a.m, PoseFix)]
+    begin, end = base[at_s(base, 12.0)].true_ns, base[at_s(base, 32.0)].true_ns
+    jumped = [
+        replace(a, m=replace(a.m, position=a.m.position._replace(latitude_deg=a.m.position.latitude_deg + 20.0 / 111e3)))
+        if isinstance(a.m, GnssPosition) and begin < a.true_ns < end
+        else a
+        for a in base
+    ]  # fmt: skip
+    fed = finish(online := smoother(run), feed(online, run, jumped))
+    assert max(fed.errors_m) < 20.0
+    assert max(np.linalg.norm(e.v_world_mps) for e in fed.estimates) < 8.0  # the vessel goes 4 m/s
+    assert fed.recovered_s(end) < 5.0
+
+
+def test_odometry_goes_on_by_a_clock_that_was_set_back() -> None:
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    n = at_s(base, 10.0)
+    back = [replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns - 3_600_000_000_000)) for a in base[n:]]
+    before = feed(online, run_of(), base[:n])
+    after = feed(online, run_of(), back)
+    assert [e for e in after.events if "set back" in e]
+    walked = run_of().truth.at(np.array([after.true_ns[0], after.true_ns[-1]])).p_world_m
+    way = np.linalg.norm(after.estimates[-1].p_odom_m - after.estimates[0].p_odom_m)
+    assert abs(way - np.linalg.norm(walked[1] - walked[0])) < 2.0
+    assert before.estimates
+
+
+def test_a_configured_heading_holds_for_the_first_start_alone() -> None:
+    """Half a minute of silence later the vessel lies otherwise: with no sensor to tell, it must not start by it again."""
+    run = simulate(replace(bl_scenario(1, "clean"), duration_s=26.0), 1)
+    heading = run.config.start.model_copy(update={"heading_deg": 200.0})
+    online = OnlineSmoother(run.config.model_copy(update={"start": heading}), rows=SENSORS, inertial=INERTIAL)
+    base = [a for a in arrivals_of(run) if not isinstance(a.m, PoseFix | CompassHeading)]
+    n = at_s(base, 8.0)
+    feed(online, run, base[:n])
+    assert online.waiting_for == ""
+    later = [replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns + 60_000_000_000)) for a in base[n : at_s(base, 14.0)]]
+    for a in later:
+        online.feed(a.m)
+    assert online.waiting_for.startswith("a heading")
 
 
 # The solver
@@ -223,6 +268,32 @@ def test_resumes_after_a_kill(tmp_path: Path) -> None:
     walked = run_of().truth.at(np.array([before.true_ns[-1], fed.true_ns[0]])).p_world_m
     odom = np.linalg.norm(fed.estimates[0].p_odom_m - before.estimates[-1].p_odom_m)
     assert abs(odom - np.linalg.norm(walked[1] - walked[0])) < 2.0  # odometry goes on
+
+
+def test_a_snapshot_that_is_too_old_leaves_nothing_behind(tmp_path: Path) -> None:
+    """A week later, in another harbour: neither its origin of world nor its odometry is taken."""
+    path, run = tmp_path / "snapshot.json", run_of()
+    config = run.config.model_copy(update={"datum": None, "truth_topic": None})
+    fixes = [a for a in arrivals_of(run) if isinstance(a.m, GnssPosition | ImuSample | CompassHeading)]
+    no_world = {n: s for n, s in config.sensors.items() if s.kind not in ("aerial", "pose")}
+    config = config.model_copy(update={"sensors": no_world})
+    first = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, snapshot=path)
+    feed(first, run, fixes[: at_s(fixes, 9.0)])
+    assert path.exists()
+    week_ns = 7 * 86_400 * 1_000_000_000
+    second = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, snapshot=path)
+    for a in fixes[: at_s(fixes, 9.0)]:
+        m = replace(a.m, stamp_ns=a.m.stamp_ns + week_ns)
+        if isinstance(m, GnssPosition):
+            m = replace(m, position=m.position._replace(latitude_deg=m.position.latitude_deg - 5.0))
+        second.feed(m)
+    assert [e for e in second.events() if "old" in e]
+    now = second.predict()
+    assert now is not None
+    assert first.datum is not None
+    assert second.datum is not None
+    assert abs(second.datum.origin.latitude_deg - first.datum.origin.latitude_deg + 5.0) < 1e-3
+    assert np.linalg.norm(now.p_world_m[:2]) < 200.0
 
 
 def _truncated(text: str) -> str:

@@ -45,9 +45,6 @@ from graphloc.solve._hypotheses import best_chain, sequence_of
 from graphloc.solve._solution import AGREES, row_of
 
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
-_CREEPS = (
-    0.01  # a weight below this is none: a hundred fixes that are refused still creep, and take velocity and tilt along
-)
 _CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
 _PAGE_S = 1.0
@@ -315,8 +312,7 @@ class Lag:
             verdict, opened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
             self._note(stream, m, verdict)
             entry = _Entry(stream, i, verdict, opened=opened)
-            if verdict.weight >= _CREEPS:
-                self._put(entry)
+            self._put(entry)
             self._ask_at(self._seconds(m.stamp_ns) + _AGAIN_S[0], entry)
         else:
             entry = _Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at))
@@ -444,9 +440,7 @@ class Lag:
         verdict, opened = self._by_kernel(entry.stream, entry.index, at, residual, fresh=False)
         if verdict.weight >= AGREES:
             self._note(entry.stream, entry.measurement, verdict)
-        if entry.held is None and verdict.weight < _CREEPS:
-            entry.verdict = verdict
-        elif entry.held is None or entry.opened or abs(verdict.weight - entry.verdict.weight) > _CHANGED:
+        if entry.opened or abs(verdict.weight - entry.verdict.weight) > _CHANGED:
             entry.opened = opened
             self._change(entry, verdict)
         else:
