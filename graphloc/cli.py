@@ -22,6 +22,7 @@ app = typer.Typer(
     help="Factor-graph localisation for vessels where GNSS lies.",
     no_args_is_help=True,
     add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
 

@@ -69,7 +69,7 @@ def as_json(estimate: Estimate, datum: Datum) -> dict[str, object]:
         "heading_bound_95_deg": float(np.degrees(estimate.heading_bound_95_rad)),
         "health": estimate.health.value,
         "reason": estimate.reason,
-        "since_agreed_s": dict(estimate.since_agreed_s),
+        "since_agreed_s": {name: round(s, 3) for name, s in estimate.since_agreed_s.items()},
     }
     return {key: plain(value) for key, value in told.items()}
 

@@ -180,7 +180,7 @@ class OnlineSmoother:
             self._hold(m)
         elif m.stamp_ns < self._lag.first_ns:
             late_s = (self._lag.newest.stamp_ns - m.stamp_ns) * 1e-9
-            self._drop(m, Outcome.LATE, f"came {late_s:.1f} s after the newest state; the lag is {self._lag_s:g} s")
+            self._drop(m, Outcome.LATE, f"its stamp is {late_s:.1f} s before the newest state; the lag is {self._lag_s:g} s")
         else:
             insort(self._pending, m, key=lambda p: p.stamp_ns)
             self._recent.append(m)
