@@ -57,7 +57,7 @@ class Anchor:
 
     def factors(self, pose: int, velocity: int, bias: int) -> list[Any]:
         """Return the prior of the state, by its keys."""
-        whiten = np.linalg.inv(np.linalg.cholesky(_sound(self.cov)))
+        whiten = np.linalg.inv(np.linalg.cholesky(sound(self.cov)))
         blocks = (whiten[:, :6], whiten[:, 6:9], whiten[:, 9:])
         unit = gtsam.noiseModel.Unit.Create(_CORE)
         make: Any = gtsam.JacobianFactor
@@ -70,7 +70,7 @@ class Anchor:
 
     def beside(self, known: Beside, pose: int, key: int) -> Any:
         """Return the prior of a vector, given the pose."""
-        whiten = np.linalg.inv(np.linalg.cholesky(_sound(known.cov)))
+        whiten = np.linalg.inv(np.linalg.cholesky(sound(known.cov)))
         make: Any = gtsam.JacobianFactor
         size = len(known.value)
         linear = make(pose, -whiten @ known.gain, key, whiten, np.zeros(size), gtsam.noiseModel.Unit.Create(size))
@@ -112,14 +112,14 @@ class Anchor:
 
 def beside(value: Array, joint: Array) -> Beside:
     """Return what a joint covariance of pose and vector (6 + k, 6 + k) says of the vector given the pose."""
-    gain = np.linalg.solve(_sound(joint[:6, :6]), joint[:6, 6:]).T
+    gain = np.linalg.solve(sound(joint[:6, :6]), joint[:6, 6:]).T
     return Beside(
         value=np.asarray(value), gain=np.asarray(gain, dtype=np.float64), cov=joint[6:, 6:] - gain @ joint[:6, 6:]
     )
 
 
-def _sound(cov: Array) -> Array:
-    """The covariance, symmetric, and positive where rounding took that away."""
+def sound(cov: Array) -> Array:
+    """Return the covariance, symmetric, and positive where rounding took that away."""
     whole = 0.5 * (cov + cov.T)
     scale = np.sqrt(np.maximum(np.diagonal(whole), 1e-18))
     values, vectors = np.linalg.eigh(whole / np.outer(scale, scale))

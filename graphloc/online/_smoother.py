@@ -24,7 +24,7 @@ from graphloc.frames import Array, Datum
 from graphloc.graph import InertialRow, Sensor
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
-from graphloc.online._anchor import Anchor
+from graphloc.online._anchor import Anchor, sound
 from graphloc.online._lag import Lag
 from graphloc.online._live import live_problem
 from graphloc.online._odometry import Odometry
@@ -180,7 +180,9 @@ class OnlineSmoother:
             self._hold(m)
         elif m.stamp_ns < self._lag.first_ns:
             late_s = (self._lag.newest.stamp_ns - m.stamp_ns) * 1e-9
-            self._drop(m, Outcome.LATE, f"its stamp is {late_s:.1f} s before the newest state; the lag is {self._lag_s:g} s")
+            self._drop(
+                m, Outcome.LATE, f"its stamp is {late_s:.1f} s before the newest state; the lag is {self._lag_s:g} s"
+            )
         else:
             insort(self._pending, m, key=lambda p: p.stamp_ns)
             self._recent.append(m)
@@ -451,7 +453,7 @@ class OnlineSmoother:
         lever = -lag.problem.t_body_imu_m
         R = pose.rotation().matrix()
         gyro = links.gyro_at(np.array([at_ns]))[0] - lag.problem.R_body_imu @ newest.bias.gyroscope()
-        cov = world_covariance(pose_cov, R, lever)
+        cov = world_covariance(sound(pose_cov), R, lever)
         cov[:3, :3] += left_out(list(lag.problem.streams.values()))
         agreed = {**self._agreed_ns, **lag.agreed_ns}
         since = {n: max((at_ns - agreed[n]) * 1e-9, 0.0) if n in agreed else np.inf for n in self._absolute}
