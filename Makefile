@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: system-libraries demo test check bench results clean
+.PHONY: system-libraries demo test check bench bench-update results clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -39,7 +39,10 @@ check: $(STAMP)
 	@$(BIN)/mypy
 
 bench: $(STAMP)
-	@$(BIN)/python benchmarks/results.py --only A.6
+	@$(BIN)/python benchmarks/bench.py
+
+bench-update: $(STAMP)
+	@$(BIN)/python benchmarks/bench.py --update
 
 results: $(STAMP)
 	@$(BIN)/python benchmarks/results.py

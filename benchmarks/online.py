@@ -74,12 +74,13 @@ def _case(job: Case) -> tuple[Case, Values]:
     ours = compare_to_truth(track, true)
     assert ours.coverage_95 is not None
     span = (track.stamps_ns[-1] - track.stamps_ns[0]) / (run.truth.stamps_ns[-1] - run.truth.stamps_ns[0])
-    beside = ekf.run_all(
-        run.recording, run.config, app.choose_datum(run.recording, run.config), ekf.BlConfig(loss_ns=loss_ns(run))
-    )
+    datum = app.choose_datum(run.recording, run.config)
+    told = ekf.run_all(run.recording, run.config, datum, ekf.BlConfig(loss_ns=loss_ns(run)))
+    plain = next(f for f in ekf.run_all(run.recording, run.config, datum) if f.name == "BL EKF")
     return job, {
         "rmse": ours.position_rmse_m, "heading": ours.heading_rmse_deg, "coverage": ours.coverage_95, "span": span,
-        **{f.name: compare_to_truth(f.trajectory, true).position_rmse_m for f in beside},
+        **{f.name: compare_to_truth(f.trajectory, true).position_rmse_m for f in told},
+        "untold": compare_to_truth(plain.trajectory, true).position_rmse_m,
     }  # fmt: skip
 
 
@@ -109,7 +110,15 @@ def cases(pool: ProcessPoolExecutor, seeds: int = 10, batches: int = 5) -> list[
                 row("E.1", f"{label}: position RMSE, mean", rmse, "m", 0.4, "<="),
                 row("E.1", f"{label}: position RMSE, worst seed", max(v["rmse"] for v in mine), "m"),
                 row("E.1", f"{label}: RMSE of the BL EKF there (told of a signal loss)", mean["BL EKF"], "m"),
-                row("E.1", f"{label}: RMSE / that of the BL EKF", rmse / mean["BL EKF"], "ratio", 1 / 3, "<="),
+                row("E.1", f"{label}: RMSE / that of the BL EKF (told)", rmse / mean["BL EKF"], "ratio", 1 / 3, "<="),
+                row(
+                    "E.1",
+                    f"{label}: RMSE / that of the BL EKF that is told of no loss, as on a vessel",
+                    rmse / mean["untold"],
+                    "ratio",
+                    1 / 3,
+                    "<=",
+                ),
                 row("E.1", f"{label}: RMSE / that of the honest EKF", rmse / mean["honest EKF"], "ratio"),
                 row("E.1", f"{label}: heading RMSE", mean["heading"], "deg"),
                 row("E.1", f"{label}: 95 % coverage", 100.0 * mean["coverage"], "%"),
@@ -330,7 +339,7 @@ def _line(m: Measurement) -> bytes:
 
 def _stream(folder: Path, lines: Sequence[bytes], kill: bool) -> list[dict[str, Any]]:
     """Feed a `graphloc stream` as fast as it reads; kill it once all is written, or let it end."""
-    command = [sys.executable, "-c", "from graphloc.cli import main; main()", "stream"]
+    command = [sys.executable, "-m", "graphloc", "stream"]
     options = ["-c", str(folder / "vessel.yaml"), "--snapshot", str(folder / "snapshot.json")]
     with (folder / "out").open("wb") as out, (folder / "err").open("wb") as err:
         child = subprocess.Popen([*command, *options], stdin=subprocess.PIPE, stdout=out, stderr=err, bufsize=0)

@@ -1,17 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make docs/pictures: LiDAR scans at the true pose over the aerial image, a match, a tag approach."""
+"""Make docs/pictures: LiDAR scans at the true pose over the aerial image, a match, a tag approach, reports.
+
+`python benchmarks/pictures.py report` makes those of the reports alone; they need Chromium.
+"""
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from _scenes import samples, scratch
+from PIL import Image
 
+from graphloc import app
 from graphloc.eval.match_picture import drawn
-from graphloc.eval.simulate import harbour_scenarios, simulate
+from graphloc.eval.simulate import Scenario, harbour_scenarios, simulate
 from graphloc.eval.simulate.aerial import grid_from_enu, render
+from graphloc.eval.simulate.bag import write_bag
 from graphloc.eval.simulate.camera import Camera
 from graphloc.eval.simulate.lidar import scan, world_points
 from graphloc.eval.simulate.scene import scene_of
@@ -58,11 +69,58 @@ def match(scene: str, view: int, out: Path) -> None:
     cv2.imwrite(str(out), cv2.resize(picture, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA))
 
 
+def report(name: str, scenario: Scenario, out: Path, seed: int = 0) -> None:
+    """The first screens of the report of `graphloc compare` on a simulated bag."""
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    assert chromium, "no Chromium on PATH"
+    with tempfile.TemporaryDirectory() as scratch_folder:
+        folder = Path(scratch_folder)
+        bag, config_path = write_bag(simulate(scenario, seed), folder / name, ros=2)
+        recording, config = app.load([bag], config_path)
+        scans = app.Scans((bag,), config_path.parent)
+        run = app.smooth_recording(recording, config, compare=True, scans=scans)
+        page = app.write(
+            run,
+            folder / "run",
+            inputs=(),
+            command=f"compare {name}/run -c {name}/vessel.yaml -o runs/{name}",
+            overwrite=True,
+        )
+        shot = folder / "shot.png"
+        options = (
+            "--headless",
+            "--no-sandbox",
+            "--hide-scrollbars",
+            "--virtual-time-budget=8000",
+            "--window-size=1150,1750",
+        )
+        subprocess.run(
+            [chromium, *options, f"--user-data-dir={folder / 'chromium'}", f"--screenshot={shot}", page.as_uri()],
+            check=True, capture_output=True,
+        )  # fmt: skip
+        with Image.open(shot) as picture:
+            small = picture.convert("RGB").resize((920, 1400), Image.Resampling.LANCZOS)
+            colours = small.quantize(256, kmeans=4)
+            small.quantize(palette=colours, dither=Image.Dither.FLOYDSTEINBERG).save(out, optimize=True)
+
+
+def reports() -> None:
+    every = harbour_scenarios()
+    report(
+        "bl1-drift", replace(every["bl1-drift"], lidar_hz=0.0), FOLDER / "report-bl1-drift.png"
+    )  # as `graphloc demo`
+    report("dock-fixed-optimal", every["dock-fixed-optimal"], FOLDER / "report-docking.png")
+
+
 def main() -> None:
+    if sys.argv[1:] == ["report"]:
+        reports()
+        return
     overlay("bl1-drift", 60.0, FOLDER / "marina.jpg")
     overlay("bl2-drift", 70.0, FOLDER / "basin.jpg")
     match("crowded", 4, FOLDER / "match.jpg")
     conditions(56.0, FOLDER / "conditions.jpg")
+    reports()
 
 
 if __name__ == "__main__":

@@ -17,12 +17,18 @@ from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
 from typing import Any
 
+import batch
+import calibration
 import docking
+import drills
+import fuzz
 import matcher
 import online
 import simulator
 import smoothing
+import sweep
 import tag_detector
+import where
 from _rows import ROOT, Row
 
 FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
@@ -52,6 +58,12 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "E.4": online.shuffled,
     "E.5": online.faults,
     "E.6": online.odometry,
+    "F.3": batch.figures,
+    "F.3p": where.figures,
+    "F.4": fuzz.figures,
+    "F.5": drills.both,
+    "F.6": sweep.workers,
+    "F.cal": calibration.figures,
 }
 
 

@@ -189,7 +189,7 @@ def making(_pool: ProcessPoolExecutor) -> list[Row]:
     """A whole recording, as a user makes it, on two cores."""
     os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:2]))
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "graphloc.cli", "simulate", "dock-fixed-optimal", "-o", f"{folder}/sim"]
+        command = [sys.executable, "-m", "graphloc", "simulate", "dock-fixed-optimal", "-o", f"{folder}/sim"]
         begin = time.perf_counter()
         subprocess.run(command, check=True, capture_output=True)
         took = time.perf_counter() - begin

@@ -84,10 +84,9 @@ def _resident_mib() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / _MIB
 
 
-def measured(hours: float, seed: int = 0) -> list[Minute]:
+def measured(hours: float, seed: int = 0) -> Iterator[Minute]:
     """Run it; one thing at a time, on two cores."""
     os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:2]))
-    found: list[Minute] = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run"
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as other:
@@ -106,8 +105,7 @@ def measured(hours: float, seed: int = 0) -> list[Minute]:
             if took_ms:
                 p50, p99, longest = np.quantile(took_ms, [0.5, 0.99, 1.0]).tolist()
                 slots, rms_m = smoother.factor_slots, float(np.sqrt(np.mean(squared)))
-                found.append(Minute(n, p50, p99, longest, _resident_mib(), slots, rms_m))
-    return found
+                yield Minute(n, p50, p99, longest, _resident_mib(), slots, rms_m)
 
 
 def slope(minutes: Sequence[Minute], name: str) -> tuple[float, float]:
@@ -156,7 +154,7 @@ def rows_of(minutes: Sequence[Minute], hours: float) -> list[Row]:
 
 def figures(hours: float) -> list[Row]:
     """For results.py."""
-    return rows_of(measured(hours), hours)
+    return rows_of(list(measured(hours)), hours)
 
 
 def draw(minutes: Sequence[Minute], out: Path) -> None:
@@ -188,11 +186,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("soak.png"))
     arguments = parser.parse_args()
-    minutes = measured(arguments.hours, arguments.seed)
-    with arguments.out.with_suffix(".csv").open("w", newline="", encoding="utf-8") as stream:
+    table = arguments.out.with_suffix(".csv")
+    with table.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, [f.name for f in fields(Minute)])
         writer.writeheader()
-        writer.writerows({k: round(v, 3) for k, v in asdict(m).items()} for m in minutes)
+        for m in measured(arguments.hours, arguments.seed):  # not kept: it is this process whose memory is measured
+            writer.writerow({k: round(v, 3) for k, v in asdict(m).items()})
+            stream.flush()  # hours are not lost where it is cut
+    with table.open(encoding="utf-8") as stream:
+        kept = [{k: float(v) for k, v in line.items()} for line in csv.DictReader(stream)]
+    minutes = [Minute(**{**m, "minute": int(m["minute"]), "factor_slots": int(m["factor_slots"])}) for m in kept]  # type: ignore[arg-type]
     draw(minutes, arguments.out)
     for figure in rows_of(minutes, arguments.hours):
         print(figure["name"], figure["value"], figure["unit"])

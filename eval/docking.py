@@ -95,6 +95,33 @@ def docking_table(
     return Table("Docking", columns, tuple(rows), _NOTE)
 
 
+def accurate_within_m(
+    estimate: Trajectory,
+    truth: Trajectory,
+    survey: Survey,
+    sightings_ns: Stamps,
+    lever_m: Array | None = None,
+    limit_m: float = DNV_M,
+) -> float | None:
+    """Return the largest distance (m) to the tags within which 95 % of horizontal errors are below a limit.
+
+    Args:
+        estimate, truth: of the body. survey: with one tag at least. sightings_ns: (S,), one at least: time counts from
+            the first on; what the estimate does not cover counts as missed.
+        lever_m: (3,) point in body that distances are measured from; None: the body's origin.
+
+    Returns:
+        None where there is no such distance.
+    """
+    seen = truth.stamps_ns >= sightings_ns.min()
+    range_m = tag_range_m(truth, survey, lever_m)[seen]
+    error = np.linalg.norm(_off(estimate, truth), axis=1)[seen]
+    order = np.argsort(range_m, kind="stable")
+    share = np.cumsum(error[order] <= limit_m) / np.arange(1, len(order) + 1)
+    enough = np.flatnonzero(share >= 0.95)
+    return float(range_m[order][enough[-1]]) if len(enough) else None
+
+
 def _p95(error: Array) -> float | None:
     return float(np.percentile(error, 95)) if len(error) else None
 

@@ -109,7 +109,7 @@ def _intervals(recording: Recording, config: VesselConfig, rate_hz: float) -> li
     if imu is None:
         raise SolveError(f"{recording.source}: no IMU data for the filter")
     imu_config = config.sensors[imu.sensor]
-    _, R = mount_of(imu.sensor, imu_config, recording)
+    _, R = mount_of(imu.sensor, imu_config, recording.mounts)
     samples = np.hstack([imu.accel_mps2 @ R.T, imu.gyro_radps @ R.T])
     t = seconds_since(int(imu.stamps_ns[0]), imu.stamps_ns)
     edges = np.arange(0.0, t[-1], 1.0 / rate_hz)
@@ -135,7 +135,7 @@ def _events(recording: Recording, config: VesselConfig) -> list[_Event]:
         if isinstance(m, TagSighting) and sensor:
             m = as_pose(m, sensor.surveyed)
         if isinstance(m, GnssPosition | GnssVelocity | CompassHeading | PoseFix) and sensor and sensor.enabled:
-            t, R = mount_of(m.sensor, sensor, recording)
+            t, R = mount_of(m.sensor, sensor, recording.mounts)
             events.append(_Event(m, t, float(np.arctan2(R[1, 0], R[0, 0]))))
     return events
 

@@ -90,13 +90,19 @@ def errors(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], 
     )
 
 
+def squared_over_covariance(error: Array, cov: Array) -> Array:
+    """Return the horizontal error (N, 3 or 2) m squared over its covariance (N, 6, 6): chi-square of 2 if that is honest."""
+    solved = np.linalg.solve(cov[:, :2, :2], error[:, :2, None])[..., 0]
+    return np.asarray(np.einsum("ni,ni->n", error[:, :2], solved))
+
+
 def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
     """Return the metrics of an estimate against truth."""
     _, error, heading, there, matched = errors(estimate, truth)
     horizontal = np.hypot(error[:, 0], error[:, 1])
     nees = coverage = heading_coverage = None
     if there.cov is not None:
-        squared = np.einsum("ni,ni->n", error[:, :2], np.linalg.solve(there.cov[:, :2, :2], error[:, :2, None])[..., 0])
+        squared = squared_over_covariance(error, there.cov)
         nees, coverage = float(squared.mean()), float((squared <= chi2.ppf(0.95, 2)).mean())
         heading_coverage = float((heading**2 <= chi2.ppf(0.95, 1) * there.cov[:, 5, 5]).mean())
     return TruthMetrics(

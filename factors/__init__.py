@@ -1,12 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one table of sensors. A new sensor is its measurement, its config, its file here, and one entry."""
+"""The one table of sensors. A new sensor is its measurement, its config, its file here, and one entry.
+
+Or it comes in a package of its own, which names its row as an entry point (docs/adding-a-sensor.md).
+"""
 
 from graphloc.config import SensorConfig
+from graphloc.errors import ConfigError
+from graphloc.extras import added
 from graphloc.factors import aerial, apriltag, compass, gnss, height, imu, pose, velocity
 from graphloc.graph import Sensor
 
+GROUP = "graphloc.sensors"  # of entry points: their name is the kind
 INERTIAL = imu.ROW
-SENSORS: tuple[Sensor, ...] = (gnss.ROW, compass.ROW, velocity.ROW, pose.ROW, aerial.ROW, apriltag.ROW, height.ROW)
+_OURS: tuple[Sensor, ...] = (gnss.ROW, compass.ROW, velocity.ROW, pose.ROW, aerial.ROW, apriltag.ROW, height.ROW)
+
+
+def _theirs() -> tuple[Sensor, ...]:
+    """Return the rows of installed packages.
+
+    Raises:
+        ConfigError: one is no row, goes by another kind than its entry point, or has a kind that is taken.
+    """
+    taken = {INERTIAL.kind, *(row.kind for row in _OURS)}
+    for name, row in added(GROUP).items():
+        if not isinstance(row, Sensor) or row.kind != name or name in taken:
+            why = (
+                f"is a {type(row).__name__}, no Sensor" if not isinstance(row, Sensor)
+                else f"its row is of kind '{row.kind}'" if row.kind != name else "graphloc has that kind itself"
+            )  # fmt: skip
+            raise ConfigError(f"{GROUP}: '{name}': {why}: mend or uninstall the package that adds it")
+    return tuple(added(GROUP).values())
+
+
+SENSORS: tuple[Sensor, ...] = (*_OURS, *_theirs())
 KINDS: dict[str, type[SensorConfig]] = {INERTIAL.kind: INERTIAL.config, **{row.kind: row.config for row in SENSORS}}
 
-__all__ = ["INERTIAL", "KINDS", "SENSORS"]
+__all__ = ["GROUP", "INERTIAL", "KINDS", "SENSORS"]

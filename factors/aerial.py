@@ -16,9 +16,9 @@ import numpy as np
 
 from graphloc.config import AerialConfig
 from graphloc.factors import pose
-from graphloc.factors._linear import linear_update
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
+from graphloc.linear import linear_update
 from graphloc.measurements import PoseFix, PoseMode
 
 

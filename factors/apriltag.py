@@ -29,9 +29,9 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.berths import Berth
 from graphloc.config import AprilTagConfig
-from graphloc.factors._linear import linear_update
 from graphloc.frames import Array, Datum, pinhole, skew
 from graphloc.graph import Attachment, Constant, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor, SlowProcess
+from graphloc.linear import linear_update
 from graphloc.measurements import TagMode, TagSighting
 from graphloc.survey import WORLD, DockConfig, Survey
 

@@ -16,9 +16,9 @@ import math
 import numpy as np
 
 from graphloc.config import CompassConfig
-from graphloc.factors._linear import linear_update
 from graphloc.frames import Array, Datum, skew, wrap_angle
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
+from graphloc.linear import linear_update
 from graphloc.measurements import CompassHeading
 
 _FLOOR_RAD = np.radians(0.05)  # no compass is better, whatever it says
@@ -37,7 +37,7 @@ def _yaw_jacobian(R: Array, R_state_sensor: Array) -> Array:
 def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual predicted - measured (1,) in rad."""
     R = at.T_world_body.rotation().matrix()
-    x = (R @ at.T_state_sensor.rotation().matrix())[:, 0]
+    x = R @ at.T_state_sensor.rotation().matrix()[:, 0]
     offset = 0.0 if at.slow_value is None else float(at.slow_value[0])
     raw = np.array([math.remainder(math.atan2(x[1], x[0]) + offset - m.yaw_rad, math.tau)])
     sigma = max(m.sigma_rad, _FLOOR_RAD)
@@ -49,7 +49,7 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
             slow_jacobian=lambda: np.eye(1),
             prior=1.0,
             size_m=None,
-            size_deg=float(abs(np.degrees(raw[0]))),
+            size_deg=abs(math.degrees(raw[0])),
         ),
     )
 

@@ -17,10 +17,10 @@ import gtsam
 import numpy as np
 
 from graphloc.config import HeightConfig
-from graphloc.factors._linear import linear_update
 from graphloc.factors._noise import robust
 from graphloc.frames import Array, Datum
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
+from graphloc.linear import linear_update
 from graphloc.measurements import HeightPrior
 from graphloc.time import duration_ns
 

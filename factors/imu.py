@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.config import ImuConfig
 from graphloc.frames import Array
+from graphloc.graph import UNKNOWN_MPS2, UNKNOWN_RADPS
 from graphloc.measurements import ImuSeries
 
 _INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz)-like floor that keeps position covariance positive
-# In a hole of the data: 1 m/s^2 and 0.2 rad/s of unknown motion, correlated over about a second.
-_GAP_ACCEL, _GAP_GYRO = 1.0, 0.2
 
 
 class Links:
@@ -48,7 +47,7 @@ class Links:
         self._params = self._make_params(
             config.accel_noise_mps2 * noise_scale, config.gyro_noise_radps * noise_scale, mount
         )
-        self._gap_params = self._make_params(_GAP_ACCEL, _GAP_GYRO, mount)
+        self._gap_params = self._make_params(UNKNOWN_MPS2, UNKNOWN_RADPS, mount)
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
         """Add samples (N, 6) at stamps that are new: specific force, rate; late ones go where they belong."""

@@ -15,10 +15,10 @@ from __future__ import annotations
 import numpy as np
 
 from graphloc.config import VelocityConfig
-from graphloc.factors._linear import linear_update
 from graphloc.factors._noise import with_floors
 from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor
+from graphloc.linear import linear_update
 from graphloc.measurements import GnssVelocity
 
 

@@ -200,13 +200,25 @@ def _against_turning(turning: Turning | None, at_ns: NDArray[np.int64], angle: A
     return int(np.sign(together)) if abs(together) > 0.5 else 0
 
 
+def _quaternions(stream: Stream, rows: Array) -> Array:
+    return rows[:, 6:10] if stream.msgtype == IMU else rows[:, :4]
+
+
+def headings(stream: Stream) -> tuple[NDArray[np.int64], Array]:
+    """Return stamps (N,) and unwrapped yaw (N,), rad, as the messages say it, of those that say one."""
+    keep = sane(stream)
+    yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in _quaternions(stream, stream.rows[keep])]
+    good = np.array([not isinstance(y, Rejection) for y in yaw], dtype=bool)
+    return stream.stamps_ns[keep][good], np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
+
+
 def compass_report(stream: Stream, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
     """Return whether an orientation is a heading, and in which convention; None where there is none."""
     keep = sane(stream)
     if len(keep) < 10:
         return None
     rows = stream.rows[keep]
-    quaternions = rows[:, 6:10] if stream.msgtype == IMU else rows[:, :4]
+    quaternions = _quaternions(stream, rows)
     if stream.msgtype == IMU and (float(np.median(rows[:, 12])) == -1.0 or len(np.unique(quaternions, axis=0)) < 3):
         return None
     yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in quaternions]

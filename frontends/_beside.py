@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.frontends import _clock
-from graphloc.frontends.decode import pose_of
+from graphloc.frontends.decode import MOST_DISTANCE_M, MOST_SPEED_MPS, pose_of
 from graphloc.recording import SpeedSeries
 from graphloc.time import seconds_since
 from graphloc.trajectory import Trajectory
@@ -33,7 +33,7 @@ class Beside:
 def true_trajectory(item: Beside, warnings: list[str]) -> Trajectory | None:
     """Return the true trajectory, with velocity."""
     poses = [(s, *pose_of(m), m) for s, m in zip(item.stamps_ns, item.messages, strict=True)]
-    good = [(s, p, R, m) for s, p, R, m in poses if R is not None and np.isfinite(p).all()]
+    good = [(s, p, R, m) for s, p, R, m in poses if R is not None and (np.abs(p) <= MOST_DISTANCE_M).all()]
     stamps = np.array([s for s, _, _, _ in good], dtype=np.int64)
     keep = np.flatnonzero(_clock.longest_increasing(stamps))
     if len(keep) < item.count:
@@ -56,7 +56,10 @@ def _true_velocity(stamps_ns: NDArray[np.int64], p_m: Array, R: Array, messages:
     if not all(hasattr(m, "twist") for m in messages):
         return np.asarray(derivative)
     linear = (m.twist.twist.linear for m in messages)
-    twist = np.einsum("nij,nj->ni", R, np.array([[v.x, v.y, v.z] for v in linear], dtype=float))
+    said = np.array([[v.x, v.y, v.z] for v in linear], dtype=float)
+    if not (np.abs(said) <= MOST_DISTANCE_M).all():
+        return np.asarray(derivative)
+    twist = np.einsum("nij,nj->ni", R, said)
     apart = float(np.median(np.linalg.norm(twist - derivative, axis=1)))
     speed = float(np.median(np.linalg.norm(derivative, axis=1)))
     return np.asarray(twist if apart < 0.1 + 0.1 * speed else derivative)
@@ -67,7 +70,7 @@ def check_speed(item: Beside) -> SpeedSeries | None:
     stamps = np.array(item.stamps_ns, dtype=np.int64)
     speed = np.array([float(m.twist.twist.linear.x) for m in item.messages])
     keep = np.flatnonzero(_clock.longest_increasing(stamps))
-    keep = keep[np.isfinite(speed[keep])]
+    keep = keep[np.abs(speed[keep]) <= MOST_SPEED_MPS]
     if len(keep) == 0:
         return None
     return SpeedSeries(topic=item.topic, stamps_ns=stamps[keep], speed_mps=speed[keep])

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import heapq
 import logging
+import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
+from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
@@ -26,8 +28,12 @@ from rosbags.typesys.store import Typestore
 
 from graphloc.errors import InputError
 from graphloc.frontends._recover import Recovered, recover
+from graphloc.frontends._unpack import limit_unpacking
 
 log = logging.getLogger(__name__)
+limit_unpacking()
+LATEST_NS = 2**62 - 1
+"""The last time that is worked with (year 2116): a difference of differences still fits 64 bits."""
 HINTS = {
     ".bag": "try `rosbag reindex`",
     ".mcap": "try `mcap recover`",
@@ -154,13 +160,12 @@ class Bag:
             if files[0].suffix != ".bag":
                 self.warnings.append(f"{reason}; its files were read one by one ({HINTS['']})")
         else:
-            self._broken.append(f"{reason}; and no readable .bag, .mcap or .db3 file lies in it ({HINTS['']})")
+            self._broken.append(f"{reason}; and no readable .bag, .mcap or .db3 file lies in it ({_instead(path)})")
 
     def _try(self, path: Path, kind: type[Reader1 | Reader2]) -> bool:
         """Open with rosbags; a file that is cut short is opened again as far as it is whole."""
         try:
-            reader = kind(path)
-            reader.open()
+            reader = _open_reader(kind, path)
         except Exception as error:  # noqa: BLE001 - rosbags lets struct, assertion, sqlite and codec errors through
             reason = f"{path}: cannot be read ({_text(error)})"
             repaired = recover(path) if path.is_file() else None
@@ -178,8 +183,7 @@ class Bag:
 
     def _try_recovered(self, path: Path, kind: type[Reader1 | Reader2], repaired: Recovered) -> bool:
         try:
-            reader = kind(repaired)
-            reader.open()
+            reader = _open_reader(kind, repaired)
         except Exception as error:  # noqa: BLE001 - as above
             log.debug("%s: recovery failed: %s", path, error)
             return False
@@ -215,7 +219,8 @@ class Bag:
         try:
             for connection, log_ns, data in _stream(opened, wanted):
                 read += 1
-                yield RawMessage(connection.topic, connection.msgtype, opened.path.name, log_ns, data)
+                at_ns = min(max(log_ns, 0), LATEST_NS)
+                yield RawMessage(connection.topic, connection.msgtype, opened.path.name, at_ns, data)
         except Exception as error:  # noqa: BLE001 - as above
             self.warnings.append(
                 f"{opened.path}: damaged after {read} messages ({_text(error)}): the rest was not read; "
@@ -227,6 +232,7 @@ class Bag:
         if message.msgtype not in self._stores:
             self._stores[message.msgtype] = self._store_of(message.msgtype)
         store = self._stores[message.msgtype]
+        store.max_sequence_length = len(message.data) or 1  # of what takes no bytes there could be 2^32
         decode = store.deserialize_ros1 if self.ros1 else store.deserialize_cdr
         return decode(message.data, message.msgtype)
 
@@ -236,11 +242,8 @@ class Bag:
         for definition in definitions:
             if definition.format == MessageDefinitionFormat.NONE:
                 continue
-            parse = get_types_from_msg if definition.format == MessageDefinitionFormat.MSG else _types_from_idl
-            store = get_typestore(Stores.EMPTY)
             try:
-                store.register(parse(definition.data, msgtype))
-                return store
+                return _defined(definition.format, definition.data, msgtype)
             except Exception as error:  # noqa: BLE001 - a definition may be any text
                 self.warnings.append(
                     f"{self.name}: its definition of {msgtype} cannot be read ({_text(error)}); the standard one is used"
@@ -250,6 +253,35 @@ class Bag:
         if msgtype in _OTHER_TYPES:
             store.register(get_types_from_msg(_OTHER_TYPES[msgtype], msgtype))
         return store
+
+
+def _instead(folder: Path) -> str:
+    """Say what may have been meant by a folder that is no bag: one of graphloc's own, or one level up."""
+    if (folder / "run.json").exists():
+        return "it is the folder of a finished run: give the bag, which its run.json names"
+    inside = sorted(p.name for p in folder.iterdir() if (p / "metadata.yaml").exists())
+    return f"a bag lies in it: {folder / inside[0]}" if inside else HINTS[""]
+
+
+def _open_reader(kind: type[Reader1 | Reader2], path: Path | Recovered) -> Reader1 | Reader2:
+    """Open with rosbags, and look at what it says of its topics: sqlite3 gives back whatever bytes were damaged to."""
+    reader = kind(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what a YAML reader thinks of metadata.yaml
+        reader.open()
+    for c in reader.connections:
+        if not (isinstance(c.topic, str) and isinstance(c.msgtype, str) and isinstance(c.msgcount, int)):
+            reader.close()
+            raise TypeError("its list of topics is damaged")
+    return reader
+
+
+@lru_cache(maxsize=64)  # a run opens its bag several times, and rosbags writes a program for each type
+def _defined(form: MessageDefinitionFormat, text: str, msgtype: str) -> Typestore:
+    parse = get_types_from_msg if form == MessageDefinitionFormat.MSG else _types_from_idl
+    store = get_typestore(Stores.EMPTY)
+    store.register(parse(text, msgtype))
+    return store
 
 
 def _types_from_idl(text: str, _msgtype: str) -> Typesdict:

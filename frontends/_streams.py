@@ -64,6 +64,9 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
 }
 
 
+_MOST = 1e12
+
+
 @dataclass(slots=True)
 class Stream:
     """One topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`)."""
@@ -95,8 +98,10 @@ class Stream:
 
     @property
     def rows(self) -> Array:
-        """The numbers (N, k)."""
-        return np.array(self._rows, dtype=float)
+        """The numbers (N, k); NaN for what nothing measures, whose square is no number."""
+        rows = np.array(self._rows, dtype=float)
+        rows[np.abs(rows) > _MOST] = np.nan
+        return rows
 
     def __len__(self) -> int:
         return len(self._stamps)

@@ -11,10 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
 from graphloc.frames import Array
+from graphloc.frontends.decode import is_unit
 
 # Names of the body frame, likeliest first.
 _WORLD_NAMES = ("map", "odom", "world", "earth", "utm")
 _BODY_NAMES = ("base_link", "base_footprint", "body", "base", "vessel", "vehicle", "boat")
+
+_FARTHEST_M = 1e4
 
 Pose = tuple[Array, Array]  # t (3,), R (3, 3): T_parent_child
 
@@ -25,14 +28,18 @@ class StaticTree:
     def __init__(self) -> None:
         self._edges: dict[str, dict[str, Pose]] = {}
         self._children: set[str] = set()
+        self._unusable: set[str] = set()
 
     def add(self, msg: Any) -> None:
         """Take the transforms of a `tf2_msgs/TFMessage`; a later one of the same pair replaces an earlier one."""
         for stamped in msg.transforms:
             parent, child = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
             t, q = stamped.transform.translation, stamped.transform.rotation
-            R = np.asarray(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix())
-            p = np.array([t.x, t.y, t.z])
+            quaternion, p = np.array([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z])
+            if not (is_unit(quaternion) and (np.abs(p) < _FARTHEST_M).all()):
+                self._unusable.add(child)
+                continue
+            R = np.asarray(Rotation.from_quat(quaternion).as_matrix())
             self._children.add(child)
             self._edges.setdefault(parent, {})[child] = (p, R)
             self._edges.setdefault(child, {})[parent] = (-R.T @ p, R.T)
@@ -71,6 +78,10 @@ class StaticTree:
         pose = self.resolve(body, sensor)
         if pose is None:
             known = ", ".join(self.frames) or "none"
+            if self._unusable:
+                known += (
+                    f"; without a pose, as NaN or no unit quaternion stands there: {', '.join(sorted(self._unusable))}"
+                )
             raise InputError(
                 f"{where}: no chain from '{body}' to '{sensor}' in /tf_static (frames there: {known}); "
                 "set body_frame and mount.tf_frame to such names, or give mount.xyz_m and mount.rpy_deg"

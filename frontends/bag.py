@@ -27,15 +27,15 @@ from graphloc.frontends._readings import (
     reject_jumps,
     reject_repeats,
 )
-from graphloc.frontends._source import Bag, RawMessage, TopicSummary
+from graphloc.frontends._source import LATEST_NS, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.decode import (
-    DECODERS,
     ODOMETRY,
     POSE,
     TF,
     Decoded,
     Rejection,
+    decoder_of,
     header_stamp_ns,
     malformed,
     supported_types,
@@ -169,11 +169,15 @@ class _Reader:
         """Hand a message to its decoder; what gives no reading gives a row."""
         stamp_ns = header_stamp_ns(msg)
         if stamp_ns is None:
-            text = f"{raw.file}: header stamp is zero, recorded at {utc_text(raw.log_ns)}"
+            text = f"{raw.file}: header stamp is zero or negative, recorded at {utc_text(raw.log_ns)}"
             self._rows.append(readings.row(seq, 0, malformed(text)))
             return
         stamp_ns += duration_ns(readings.config.time_offset_s)
-        decoder = DECODERS.get((readings.config.kind, raw.msgtype))
+        if not 0 < stamp_ns <= LATEST_NS:
+            text = f"{raw.file}: no time with time_offset_s on it, recorded at {utc_text(raw.log_ns)}"
+            self._rows.append(readings.row(seq, 0, malformed(text)))
+            return
+        decoder = decoder_of(readings.config.kind, raw.msgtype)
         value: Decoded = malformed(f"{raw.msgtype} is not read by a {readings.config.kind} sensor")
         if decoder is not None:
             try:

@@ -23,9 +23,10 @@ from graphloc.config import (
     PoseConfig,
     VelocityConfig,
 )
+from graphloc.extras import added
 from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.ledger import Outcome
-from graphloc.measurements import AXES, CompassHeading, GnssPosition, GnssVelocity, PoseFix, PoseMode
+from graphloc.measurements import AXES, CompassHeading, GnssPosition, GnssVelocity, Measurement, PoseFix, PoseMode
 from graphloc.time import NS_PER_S
 
 IMU = "sensor_msgs/msg/Imu"
@@ -39,6 +40,10 @@ TF = "tf2_msgs/msg/TFMessage"
 
 _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
+# Beyond these no sensor of a vessel measures; they are finite, and a sum or a square of them need not be.
+_MOST_INERTIAL = 1e4  # in the unit of the bag: 1000 g; 30 turns a second in deg/s
+MOST_SPEED_MPS, MOST_DISTANCE_M, _MOST_HEIGHT_M = 1e4, 1e7, 1e5
+_VARIANCES = (1e-18, 1e12)  # m^2 and the like: 1 nm to 1000 km
 
 
 class Rejection(NamedTuple):
@@ -55,7 +60,7 @@ class ImuSample(NamedTuple):
     gyro_radps: tuple[float, float, float]
 
 
-Decoded = GnssPosition | CompassHeading | GnssVelocity | PoseFix | ImuSample | Rejection
+Decoded = Measurement | ImuSample | Rejection
 # The message and the configuration are whatever this row of the table asks for, hence Any.
 Decoder = Callable[[Any, int, int, str, Any], Decoded]
 
@@ -71,11 +76,12 @@ def rejected(reason: str) -> Rejection:
 
 
 def header_stamp_ns(msg: Any) -> int | None:
-    """Return the header's stamp in ns; None where the message has no stamp or a zero one."""
+    """Return the header's stamp in ns; None where the message has no stamp, a zero or a negative one."""
     stamp = getattr(getattr(msg, "header", None), "stamp", None)
     if stamp is None:
         return None
-    return (int(stamp.sec) * NS_PER_S + int(stamp.nanosec)) or None
+    stamp_ns = int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+    return stamp_ns if stamp_ns > 0 else None
 
 
 def covariance_translation_first(values: ArrayLike) -> Array:
@@ -90,15 +96,17 @@ def covariance_translation_first(values: ArrayLike) -> Array:
 def usable_covariance(cov: Array, default_variances: Array) -> Array:
     """Return `cov` (k, k) with axes that carry no variance (zero, negative, NaN) set to the default.
 
-    A replaced axis loses its correlations; a matrix that is then still not positive definite keeps
-    its diagonal only.
+    A replaced axis loses its correlations, as does one whose variance is beyond (1 nm)^2 to (1000 km)^2, which becomes
+    the nearer of these; a matrix that is then still not positive definite keeps its diagonal only.
     """
     variance = np.diagonal(cov)
     good = np.isfinite(variance) & (variance > 0.0)
-    both = np.outer(good, good) & np.isfinite(cov)
+    known = good & (variance >= _VARIANCES[0]) & (variance <= _VARIANCES[1])
+    # No correlation is larger than 1; one that says so may be of any size.
+    both = np.outer(known, known) & (np.abs(cov) <= _VARIANCES[1])
     clean = np.where(both, cov, 0.0)
     clean = 0.5 * (clean + clean.T)
-    clean[np.diag_indices_from(clean)] = np.where(good, variance, default_variances)
+    clean[np.diag_indices_from(clean)] = np.where(good, np.clip(variance, *_VARIANCES), default_variances)
     if np.linalg.eigvalsh(clean).min() <= 1e-9 * clean.diagonal().min():
         clean = np.diag(clean.diagonal())
     return clean
@@ -132,6 +140,8 @@ def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -
     accel, gyro = (float(a.x), float(a.y), float(a.z)), (float(w.x), float(w.y), float(w.z))
     if not all(map(isfinite, (*accel, *gyro))):
         return malformed("acceleration or angular rate is NaN")
+    if max(map(abs, (*accel, *gyro))) > _MOST_INERTIAL:
+        return malformed(f"acceleration or angular rate is beyond {_MOST_INERTIAL:g}, which nothing measures")
     for name, values, cov in (
         ("linear_acceleration", accel, msg.linear_acceleration_covariance),
         ("angular_velocity", gyro, msg.angular_velocity_covariance),
@@ -152,6 +162,8 @@ def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) ->
     lat, lon, height = float(msg.latitude), float(msg.longitude), float(msg.altitude)
     if not np.isfinite([lat, lon, height]).all():
         return malformed("latitude, longitude or height is NaN")
+    if abs(height) > _MOST_HEIGHT_M:
+        return malformed(f"height is beyond {_MOST_HEIGHT_M / 1e3:g} km")
     if lat == 0.0 and lon == 0.0:
         return rejected("position 0, 0: the receiver had none")
     if abs(lat) > 90.0:
@@ -182,7 +194,7 @@ def _heading(orientation: Any, variance: float, stamp_ns: int, seq: int, sensor:
     if config.convention == "ned":  # there yaw is the heading: clockwise from north
         yaw = float(wrap_angle(np.pi / 2.0 - yaw))
     reported = config.use_reported_sigma and np.isfinite(variance) and variance > 0.0
-    sigma = float(np.sqrt(variance)) if reported else float(np.radians(config.sigma_deg))
+    sigma = float(np.sqrt(np.clip(variance, *_VARIANCES))) if reported else float(np.radians(config.sigma_deg))
     return CompassHeading(stamp_ns=stamp_ns, sensor=sensor, seq=seq, yaw_rad=yaw, sigma_rad=sigma)
 
 
@@ -202,11 +214,18 @@ def _velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityCo
     value = np.array([v.x, v.y, v.z], dtype=float)
     if not np.isfinite(value).all():
         return malformed("velocity is NaN")
+    if np.abs(value).max() > MOST_SPEED_MPS:
+        return malformed(f"velocity is beyond {MOST_SPEED_MPS:g} m/s")
     cov = covariance_translation_first(msg.twist.covariance)[:3, :3] if with_covariance else np.zeros((3, 3))
     default = np.full(3, config.default_sigma_mps**2)
     return GnssVelocity(
         stamp_ns=stamp_ns, sensor=sensor, seq=seq, v_world_mps=value, cov_m2ps2=usable_covariance(cov, default)
     )
+
+
+def is_unit(quaternion: Array) -> bool:
+    """Return whether a quaternion (4,) is one of a rotation, to the digits that drivers write."""
+    return bool((np.abs(quaternion) < 2.0).all()) and abs(float(np.linalg.norm(quaternion)) - 1.0) < 0.1
 
 
 def pose_of(msg: Any) -> tuple[Array, Array | None]:
@@ -217,8 +236,7 @@ def pose_of(msg: Any) -> tuple[Array, Array | None]:
     p, q = msg.pose.pose.position, msg.pose.pose.orientation
     position = np.array([p.x, p.y, p.z], dtype=float)
     quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
-    valid = bool(np.isfinite(quaternion).all()) and abs(float(np.linalg.norm(quaternion)) - 1.0) < 0.1
-    return position, np.asarray(Rotation.from_quat(quaternion).as_matrix()) if valid else None
+    return position, np.asarray(Rotation.from_quat(quaternion).as_matrix()) if is_unit(quaternion) else None
 
 
 def _pose(msg: Any, stamp_ns: int, seq: int, sensor: str, config: PoseConfig) -> Decoded:
@@ -230,6 +248,8 @@ def _pose(msg: Any, stamp_ns: int, seq: int, sensor: str, config: PoseConfig) ->
     value = np.concatenate([position, angles])[picked]
     if not np.isfinite(value).all():
         return malformed("position is NaN")
+    if np.abs(value).max() > MOST_DISTANCE_M:
+        return malformed(f"position is over {MOST_DISTANCE_M / 1e3:g} km from the datum")
     default = np.array([config.default_sigma_m] * 3 + [np.radians(config.default_sigma_deg)] * 3) ** 2
     cov = covariance_translation_first(msg.pose.covariance)[np.ix_(picked, picked)]
     mode = PoseMode(value=value, cov=usable_covariance(cov, default[picked]))
@@ -248,6 +268,14 @@ DECODERS: dict[tuple[str, str], Decoder] = {
 }
 
 
+GROUP = "graphloc.decoders"  # of entry points: name a kind, load a mapping of message type to decoder
+
+
+def decoder_of(kind: str, msgtype: str) -> Decoder | None:
+    """Return what reads messages of a type for a kind of sensor, ours or an installed package's; None: nothing does."""
+    return DECODERS.get((kind, msgtype)) or added(GROUP).get(kind, {}).get(msgtype)
+
+
 def supported_types(kind: str) -> tuple[str, ...]:
     """Return the message types that a sensor kind can be read from; empty where the kind reads no topic."""
-    return tuple(msgtype for have, msgtype in DECODERS if have == kind)
+    return (*(msgtype for have, msgtype in DECODERS if have == kind), *added(GROUP).get(kind, {}))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,11 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import (
+    Turning,
     compass_report,
     courses_of,
     gnss_report,
+    headings,
     motion_of,
     sane,
     topic_report,
@@ -25,6 +28,7 @@ from graphloc.frontends._assess_imu import imu_report, turning_of
 from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._assess_world import origin_of
 from graphloc.frontends._draft import draft_config
+from graphloc.frontends._lag import lag
 from graphloc.frontends._reports import (
     CompassReport,
     GnssReport,
@@ -108,7 +112,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         ),
         imus=tuple(found_imus),
         gnss=tuple(found_gnss),
-        compasses=tuple(c for s in candidates if (c := compass_report(s, courses, turning))),
+        compasses=tuple(_timed(c, s, turning) for s in candidates if (c := compass_report(s, courses, turning))),
         odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first, antenna)) for s in poses),
         velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
         lidars=_mounted(clouds, tree, body),
@@ -117,6 +121,18 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         body_frame=body,
         warnings=(*warnings, *_useless(streams, {g.topic for g in found_gnss} | {i.topic for i in found_imus})),
     )
+
+
+def _timed(report: CompassReport, stream: Stream, turning: Turning | None) -> CompassReport:
+    """The report, with what the gyroscope says of the stamps."""
+    if turning is None or not report.usable:
+        return report
+    stamps, angle = headings(stream)
+    found = lag(turning, stamps, angle if report.convention == "enu" else -angle)
+    if found is None:
+        return report
+    value, sigma = found
+    return replace(report, why=f"{report.why}; by the gyro, time_offset_s should be {value:.3f} +- {sigma:.3f}")
 
 
 def _mounted(

@@ -7,9 +7,11 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from ruamel.yaml import YAML
@@ -18,12 +20,14 @@ from graphloc import origin, outputs
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig, load_config
 from graphloc.errors import InputError, SolveError
-from graphloc.eval import ekf, holdout, metrics, report
+from graphloc.eval import calibrate, ekf, holdout, metrics, report
 from graphloc.eval.digerud import run_digerud
 from graphloc.eval.docking import docking_table
 from graphloc.eval.match_picture import Gallery
+from graphloc.eval.plots import Underlay
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.tag_check import suspect_tags
+from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Array, Datum
 from graphloc.frontends.aerial import Match, match_bag
@@ -31,6 +35,7 @@ from graphloc.frontends.bag import read_recording
 from graphloc.frontends.tags.unsurveyed import Riding, estimate_tags, only_beside
 from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
 from graphloc.measurements import GnssPosition, TagSighting
+from graphloc.offsets import Probe
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.replay import Status, replay, silent
 from graphloc.solution import Solution
@@ -52,11 +57,18 @@ class Run:
     filters: tuple[ekf.FilterResult, ...] = ()
     pictures: tuple[tuple[str, bytes], ...] = ()  # of matches: caption, JPEG
     tags: tuple[TagConfig, ...] = ()  # that are not surveyed, where the run puts them
+    underlay: Underlay | None = None  # the aerial image under the report's map
+    calibration: calibrate.Calibration | None = None  # offline
 
 
-def load(bags: Sequence[Path], config_path: Path, progress: Progress = quiet) -> tuple[Recording, VesselConfig]:
-    """Read a vessel.yaml and the bag that it describes."""
-    config = with_surveys(load_config(config_path, KINDS), config_path.parent)
+def load(
+    bags: Sequence[Path],
+    config_path: Path,
+    progress: Progress = quiet,
+    changes: Mapping[str, object] = MappingProxyType({}),
+) -> tuple[Recording, VesselConfig]:
+    """Read a vessel.yaml, some of its keys changed (`config.with_changes`), and the bag that it describes."""
+    config = with_surveys(load_config(config_path, KINDS, changes), config_path.parent)
     origin.refuse_world_without_datum(config, str(config_path), SENSORS)
     recording = read_recording(bags, config, progress)
     return with_sightings(recording, config, bags, progress), config
@@ -80,11 +92,12 @@ def smooth_recording(
         recording, held = hold_out.split(recording)
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
-    solution = _solved(recording, config, datum, progress)
+    matched = scans is not None and bool(config.of_kind("aerial"))
+    solution = _solved(recording, config, datum, progress, None if matched else calibrate.PROBE)
     gallery = Gallery()
-    if scans is not None and config.of_kind("aerial"):
+    if scans is not None and matched:
         recording = with_matches(recording, config, datum, solution, scans, progress, gallery)
-        solution = _solved(recording, config, datum, progress)
+        solution = _solved(recording, config, datum, progress, calibrate.PROBE)
     filters: tuple[ekf.FilterResult, ...] = ()
     if compare:
         filters = _causal(recording, config, datum, progress)
@@ -92,8 +105,18 @@ def smooth_recording(
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
         filters=filters, pictures=tuple(gallery.pictures()), tags=tags,
+        calibration=calibrate.calibrate(recording, config, solution),
     )  # fmt: skip
-    return _comparable(run)
+    return _comparable(_with_underlay(run, scans))
+
+
+def _with_underlay(run: Run, scans: Scans | None) -> Run:
+    """Add the aerial image under the report's map, or the reason why the one that was asked for cannot be had."""
+    if scans is None:
+        return run
+    picture, why_not = underlay(run.config, scans.folder, run.solution.datum, run.solution.trajectory.p_world_m)
+    said = (*run.recording.warnings, *([why_not] if why_not else []))
+    return replace(run, recording=replace(run.recording, warnings=said), underlay=picture)
 
 
 def _causal(
@@ -123,8 +146,9 @@ def replay_recording(
     status: Status = silent,
 ) -> Run:
     """Run a recording through the online mode (see `graphloc.replay`)."""
-    replayed = replay(recording, config, scans=scans, rate=rate, lag_s=lag_s, status=status)
-    return _comparable(Run(recording=replayed.recording, config=config, solution=replayed.solution))
+    replayed = replay(recording, config, scans=scans, rate=rate, lag_s=lag_s, stoppable=True, status=status)
+    run = Run(recording=replayed.recording, config=config, solution=replayed.solution)
+    return _comparable(_with_underlay(run, scans))
 
 
 def _about_tags(
@@ -161,9 +185,11 @@ def _riding(recording: Recording, surveys: Mapping[str, Survey], solution: Solut
     return found
 
 
-def _solved(recording: Recording, config: VesselConfig, datum: Datum, progress: Progress) -> Solution:
+def _solved(
+    recording: Recording, config: VesselConfig, datum: Datum, progress: Progress, probe: Probe | None = None
+) -> Solution:
     config = seen_frames(config, recording)
-    return smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, progress=progress)
+    return smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, probe=probe, progress=progress)
 
 
 def seen_frames(config: VesselConfig, recording: Recording) -> VesselConfig:
@@ -241,7 +267,7 @@ def _comparable(run: Run) -> Run:
 def levers_m(run: Run) -> dict[str, Array]:
     """Return the antenna of each receiver that fixes were held out of, in body."""
     names = dict.fromkeys(m.sensor for m in run.held)
-    return {name: mount_of(name, run.config.sensors[name], run.recording)[0] for name in names}
+    return {name: mount_of(name, run.config.sensors[name], run.recording.mounts)[0] for name in names}
 
 
 def simulated(run: SimulatedRun, *, compare: bool = False, progress: Progress = quiet) -> Run:
@@ -289,18 +315,47 @@ def _docking_tables(
 def truth_statement(run: Run) -> str:
     """Say plainly what the numbers were measured against."""
     if run.recording.truth is not None:
-        return "Truth: " + (run.config.truth_topic or "given with the recording") + "; it was not fused."
+        truth = run.recording.truth
+        span_s = (int(truth.stamps_ns[-1]) - int(truth.stamps_ns[0])) / 1e9
+        named = run.config.truth_topic or "given with the recording"
+        imu = run.recording.imu
+        begun = bool(run.filters) and imu is not None and bool(truth.covers(imu.stamps_ns[:1]).all())
+        started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
+        return f"Truth: {named}, {len(truth)} poses over {span_s:.0f} s; it was not fused.{started}"
     if run.held:
         return (
             f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
             "of the error. The track in this folder lacks them: for the best track run again without --hold-out."
         )
-    return "No truth and no held-out fixes: nothing here measures accuracy. Try --hold-out every:5."
+    return (
+        "No truth and no held-out fixes: nothing here measures accuracy. `graphloc compare --hold-out gaps:8x10` does."
+    )
 
 
-def write(run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overwrite: bool) -> Path:
-    """Write the run folder with its report; return the report's path."""
-    found = tables(run)
+def report_data(run: Run, command: str = "") -> report.ReportData:
+    """Return what the report of a run shows."""
+    return report.ReportData(
+        title=f"{run.config.vessel}: {Path(run.recording.source).name}",
+        solution=run.solution,
+        recording=run.recording,
+        config=run.config,
+        filters=run.filters,
+        held=run.held,
+        levers_m=levers_m(run),
+        tables=tables(run),
+        truth_statement=truth_statement(run),
+        pictures=run.pictures,
+        underlay=run.underlay,
+        calibration=run.calibration,
+        command=command,
+    )
+
+
+def write(
+    run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overwrite: bool, figures: bool = False
+) -> Path:
+    """Write the run folder with its report, and its figures as PNG and SVG if asked; return the report's path."""
+    data = report_data(run, command)
     with outputs.fresh_folder(folder, overwrite=overwrite) as fresh:
         outputs.write_run(
             fresh,
@@ -308,26 +363,20 @@ def write(run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overw
             run.config,
             inputs={str(p): sha256(p) for p in inputs},
             command=command,
-            metrics={t.title: t.as_dict() for t in found},
+            metrics={t.title: t.as_dict() for t in data.tables},
             warnings=(*run.recording.warnings, *run.solution.stats.warnings),
         )
         if run.tags:
             _write_tags(run, fresh / _FOUND_TAGS)
-        report.write_report(
-            fresh / "report.html",
-            report.ReportData(
-                title=f"{run.config.vessel}: {Path(run.recording.source).name}",
-                solution=run.solution,
-                recording=run.recording,
-                config=run.config,
-                filters=run.filters,
-                held=run.held,
-                levers_m=levers_m(run),
-                tables=found,
-                truth_statement=truth_statement(run),
-                pictures=run.pictures,
-            ),
-        )
+        if run.calibration is not None:
+            text = json.dumps(run.calibration.as_dict(), indent=1)
+            (fresh / "calibration.json").write_text(text + "\n", encoding="utf-8")
+        report.write_report(fresh / "report.html", data)
+        if figures:
+            from graphloc.eval.plots.paper import write_figures
+
+            (fresh / "figures").mkdir()
+            write_figures(tuple(report.figures(data).values()), fresh / "figures")
     return folder / "report.html"
 
 
@@ -361,6 +410,7 @@ __all__ = [
     "load",
     "match_at",
     "replay_recording",
+    "report_data",
     "seen_frames",
     "sha256",
     "simulated",

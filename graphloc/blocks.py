@@ -4,26 +4,41 @@
 from __future__ import annotations
 
 import difflib
+import reprlib
+import warnings
 from collections.abc import Mapping
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from ruamel.yaml.error import YAMLWarning
 
 from graphloc.errors import ConfigError
 from graphloc.frames import Array, rotation_from_rpy_deg
 
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+_LEAST, _MOST = 1e-12, 1e12  # of any length, angle or time: squares and inverses of it are numbers, too
+
+
+def _not_tiny(given: float) -> float:
+    if 0.0 < given < _LEAST:
+        raise ValueError(f"smaller than {_LEAST:g}")
+    return given
+
+
+Positive = Annotated[float, Field(gt=0.0, le=_MOST, allow_inf_nan=False), AfterValidator(_not_tiny)]
+NonNegative = Annotated[float, Field(ge=0.0, le=_MOST, allow_inf_nan=False), AfterValidator(_not_tiny)]
+Finite = Annotated[float, Field(ge=-_MOST, le=_MOST, allow_inf_nan=False)]
 Triple = tuple[Finite, Finite, Finite]
 
 
 _LONG = 40  # characters
+_MOST_SAID = 8  # things that are wrong with one file
+_MOST_BYTES, _MOST_VALUES = 10_000_000, 300_000  # a survey of 10 000 tags has 2 MB and 100 000 values
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, _LONG, _LONG
 
 
 class Block(BaseModel):
@@ -77,7 +92,7 @@ def _fields_at(model: type[BaseModel], path: list[str]) -> list[str]:
 def one_line(error: ValidationError, model: type[BaseModel], where: str, prefix: str) -> str:
     """Return what is wrong with a block, in one line: bad keys with their nearest neighbours, bad values."""
     lines = []
-    for item in error.errors():
+    for item in error.errors()[:_MOST_SAID]:
         path = [str(p) for p in item["loc"]]
         name = ".".join([*([prefix] if prefix else []), *path])
         if item["type"] == "extra_forbidden":
@@ -87,21 +102,29 @@ def one_line(error: ValidationError, model: type[BaseModel], where: str, prefix:
             whole_block = isinstance(item["input"], Mapping) and not item["type"].endswith("_type")
             got = "" if whole_block else f" (got {_short(item['input'])})"
             lines.append(f"{name + ': ' if name else ''}{text}{got}")
-    return f"{where}: " + "; ".join(lines)
+    if error.error_count() > _MOST_SAID:
+        lines.append(f"and {error.error_count() - _MOST_SAID} more")
+    return f"{where}: " + " ".join("; ".join(lines).split())
 
 
 def _short(given: object) -> str:
     """What somebody wrote, or what kind of thing that is where it is long: the rest of the line is what they must read."""
-    text = repr(given)
     if isinstance(given, Mapping):
         return "a mapping"
-    if len(text) <= _LONG:
-        return text
-    return "a list" if isinstance(given, list) else f"{text[: _LONG - 3]}..."
+    if isinstance(given, list | tuple):  # whose whole text may be larger than memory: aliases
+        text = _SHORT.repr(given)
+        return text if len(text) <= _LONG and "..." not in text else "a list"
+    try:
+        text = repr(given[:_LONG] if isinstance(given, str) else given)
+    except ValueError:
+        return "a number of thousands of digits"
+    return text if len(text) <= _LONG else f"{text[: _LONG - 3]}..."
 
 
 def read_mapping(path: Path | Traversable, cure: str = "") -> Mapping[str, Any]:
     """Read a file of YAML 1.2 (no tags) whose top level is a mapping; an empty one gives an empty mapping.
+
+    At most 10 MB and 300 000 values are read, an alias counting as all that it stands for.
 
     Args:
         path: the file. cure: what to do where it cannot be read, for the message.
@@ -110,13 +133,41 @@ def read_mapping(path: Path | Traversable, cure: str = "") -> Mapping[str, Any]:
         ConfigError: it cannot be read, or is something else.
     """
     try:
-        raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        with path.open("rb") as stream:
+            content = stream.read(_MOST_BYTES + 1)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}){cure}") from None
-    except (YAMLError, ValueError, RecursionError) as error:
+    if len(content) > _MOST_BYTES:
+        raise ConfigError(f"{path}: larger than {_MOST_BYTES // 10**6} MB: not a file of settings")
+    try:
+        raw = _loaded(content.decode("utf-8"))
+    except Exception as error:  # noqa: BLE001 - besides its own errors ruamel.yaml lets those of int() and such through
         raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())[:200]}") from None
+    if _values_in(raw, {}) > _MOST_VALUES:
+        raise ConfigError(f"{path}: more than {_MOST_VALUES} values, each alias (*) counted as what it stands for")
     if raw is None:
         raw = {}
     if not isinstance(raw, Mapping):
         raise ConfigError(f"{path}: the top level must be a mapping")
     return raw
+
+
+def _loaded(text: str) -> Any:
+    reader = YAML(typ="safe", pure=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", YAMLWarning)  # that an anchor is there twice
+        for event in reader.parse(text):
+            if getattr(event, "tag", None) is not None:
+                raise ValueError(f"a tag ({event.tag}): write the value alone")
+        return reader.load(text)
+
+
+def _values_in(node: object, known: dict[int, int]) -> int:
+    """How many values a tree has if aliases are written out; what several of them share is counted once, then known."""
+    if not isinstance(node, Mapping | list):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = 1 + _MOST_VALUES  # of one that holds itself
+        parts = node.values() if isinstance(node, Mapping) else node
+        known[id(node)] = 1 + sum(_values_in(part, known) for part in parts)
+    return known[id(node)]

@@ -34,7 +34,7 @@ from graphloc.time import utc_text
 from graphloc.timeline import Timeline, make_timeline
 
 # A step of a slow state is believed to be a jump beyond this many sigmas.
-_JUMP = KernelConfig(kind="cauchy", scale=2.0)
+JUMP = KernelConfig(kind="cauchy", scale=2.0)
 CONSTANT_TAILS = 9.0  # of a constant's prior: squared sigmas that double its variance
 _NOTHING = 1e6  # sigmas: a prior that says nothing
 
@@ -76,7 +76,11 @@ class Stream:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """A run, ready to be solved."""
+    """A run, ready to be solved.
+
+    `preintegrated` and `inertial` have the motion from each state to the next, and the factor of it: neither depends on
+    the estimate, so every graph shares them.
+    """
 
     config: VesselConfig
     datum: Datum
@@ -88,16 +92,24 @@ class Problem:
     links: InertialLink
     noise_scale: float
     preintegrated: tuple[Any, ...]
+    inertial: tuple[Any, ...]
     streams: tuple[Stream, ...]
     rejected: tuple[LedgerRow, ...]
     warnings: tuple[str, ...] = field(default=())
 
 
-def mount_of(name: str, config: SensorConfig, recording: Recording) -> tuple[Array, Array]:
+Mounts = Mapping[str, tuple[Array, Array]]  # by sensor, from /tf_static: t (3,), R (3, 3) in body
+
+
+def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Array]:
     """Return (t (3,), R (3, 3)) of a sensor in body: from /tf_static where it was asked for."""
-    if name in recording.mounts:
-        return recording.mounts[name]
-    return config.mount.t_body_sensor_m, config.mount.R_body_sensor
+    return mounts.get(name) or (config.mount.t_body_sensor_m, config.mount.R_body_sensor)
+
+
+def company_of(config: VesselConfig, rows: Sequence[Sensor], seen: Container[str] | None = None) -> int:
+    """Return how many of the sensors (of those in `seen`, if given) can tell each other's slow errors from motion."""
+    able = (name for row in rows if row.company for name in config.of_kind(row.kind))
+    return sum(seen is None or name in seen for name in able)
 
 
 def make_problem(
@@ -123,7 +135,7 @@ def make_problem(
     if imu is None or len(imu) < 10:
         raise SolveError(f"{recording.source}: no IMU data (need at least 10 samples); check its topic and stamps")
     imu_config = config.sensors[imu.sensor]
-    t_body_imu, R = mount_of(imu.sensor, imu_config, recording)
+    t_body_imu, R = mount_of(imu.sensor, imu_config, recording.mounts)
 
     def relink(noise_scale: float) -> InertialLink:
         return inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale)
@@ -137,19 +149,18 @@ def make_problem(
     for m in inside:
         by_sensor.setdefault(m.sensor, []).append(m)
     if company is None:
-        company = sum(
-            bool(s.kind in by_kind and by_kind[s.kind].company and n in by_sensor) for n, s in config.sensors.items()
-        )
+        company = company_of(config, rows, by_sensor)
     streams = []
     for number, (name, sensor) in enumerate(config.sensors.items()):
         if name in by_sensor:
             row = by_kind[sensor.kind]
-            t, R_mount = mount_of(name, sensor, recording)
+            t, R_mount = mount_of(name, sensor, recording.mounts)
             mount = (t - t_body_imu, R_mount)
             slow = row.slow(sensor)
             left_out = slow if slow is not None and slow.needs_company and company < 2 else None
             slow = slow if left_out is None else None
             streams.append(_stream(number, name, row, sensor, slow, left_out, mount, by_sensor[name], timeline, links))
+    preintegrated = _preintegrate(timeline, links)
     warnings += [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
     return Problem(
         config=config,
@@ -161,7 +172,8 @@ def make_problem(
         relink=relink,
         links=links,
         noise_scale=1.0,
-        preintegrated=_preintegrate(timeline, links),
+        preintegrated=preintegrated,
+        inertial=_inertial(timeline, links, preintegrated),
         streams=tuple(streams),
         rejected=tuple(rejected),
         warnings=tuple(warnings),
@@ -208,10 +220,18 @@ def _preintegrate(timeline: Timeline, links: InertialLink) -> tuple[Any, ...]:
     return tuple(links.integrate(a, b, zero) for a, b in pairwise(stamps))
 
 
+def _inertial(timeline: Timeline, links: InertialLink, preintegrated: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(links.factor(k, int(timeline.slow_of[k]), pim) for k, pim in enumerate(preintegrated))
+
+
 def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
     """Return the problem with the IMU's noise densities scaled."""
     links = problem.relink(noise_scale)
-    return replace(problem, links=links, noise_scale=noise_scale, preintegrated=_preintegrate(problem.timeline, links))
+    preintegrated = _preintegrate(problem.timeline, links)
+    return replace(
+        problem, links=links, noise_scale=noise_scale, preintegrated=preintegrated,
+        inertial=_inertial(problem.timeline, links, preintegrated),
+    )  # fmt: skip
 
 
 def _stream(
@@ -396,7 +416,7 @@ def _next_slow(
     if j + 1 >= len(stamps) or not values.exists(key):
         return None
     apart = int(stamps[j + 1] - stamps[j])
-    share = float(np.clip((stamp_ns - int(stamps[j])) / apart, 0.0, 1.0))
+    share = min(max((stamp_ns - int(stamps[j])) / apart, 0.0), 1.0)
     return key, np.atleast_1d(values.atVector(key)), share, apart * 1e-9
 
 
@@ -445,19 +465,22 @@ def build_graph(
     prior: StartPrior,
     *,
     jumps: bool = True,
+    made: dict[tuple[int, int], range] | None = None,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """Return the graph of states first..last and the values of its keys.
+
+    `made` is filled with where the factors of each measurement stand in the graph; those between states come first.
 
     `jumps` lets slow states jump where their process may. Not while the estimate is far off: a GNSS error
     that may jump explains a dead-reckoned track that is 300 m off better than the track's own correction.
     """
     graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    timeline, links = problem.timeline, problem.links
+    timeline = problem.timeline
     for k in range(first, last + 1):
         guess.insert(keys.pose(k), values.atPose3(keys.pose(k)))
         guess.insert(keys.velocity(k), values.atVector(keys.velocity(k)))
     for k in range(first, last):
-        graph.add(links.factor(k, int(timeline.slow_of[k]), problem.preintegrated[k]))
+        graph.add(problem.inertial[k])
     nodes = range(int(timeline.slow_of[first]), int(timeline.slow_of[last]) + 1)
     _add_bias_chain(graph, guess, problem, values, nodes)
     _add_start(graph, prior, first, nodes[0])
@@ -472,6 +495,8 @@ def build_graph(
             if at.slow_next is not None and not guess.exists(at.slow_next[0]):
                 at = replace(at, slow_next=None)  # the next node lies beyond the stretch
             update = stream.row.factors(stream.measurements[i], stream.config, at, decision)
+            if made is not None:
+                made[(stream.number, i)] = range(graph.size(), graph.size() + len(update.factors))
             for factor in update.factors:
                 graph.add(factor)
             for key, value in update.guesses:
@@ -573,7 +598,7 @@ def slow_step(slow: SlowProcess, key: int, following: int, dt_s: float, *, jumps
     step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt_s / slow.time_constant_s))
     model: Any = gtsam.noiseModel.Diagonal.Sigmas(step)
     if slow.jumps and jumps:
-        model = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(_JUMP.scale), model)
+        model = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(JUMP.scale), model)
     yield gtsam.BetweenFactorVector(key, following, zero, model)
     if not constant.all():
         standing = slow.sigma * np.where(constant, _NOTHING, np.sqrt(2.0 * slow.time_constant_s / dt_s))

@@ -8,9 +8,11 @@ Which sensor kinds exist is not known here: the caller hands in the table (`kind
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -84,7 +86,7 @@ class SensorConfig(Block):
     """Switch the sensor off without deleting its block."""
     mount: MountConfig = MountConfig()
     """Where the sensor sits on the vessel."""
-    time_offset_s: Finite = 0.0
+    time_offset_s: Annotated[float, Field(ge=-4e9, le=4e9)] = 0.0
     """Added to the sensor's stamps, s."""
     kernel: KernelConfig = KernelConfig()
     """Robust loss."""
@@ -401,7 +403,7 @@ class HeightConfig(SensorConfig):
     """Heave around it, 1 sigma, m."""
     tide_sigma_m: NonNegative = 0.5
     """How far tide and load may hold the vessel above or below it, for hours, 1 sigma, m; 0: not at all."""
-    period_s: Positive = 1.0
+    period_s: Annotated[float, Field(ge=0.02, le=1e6)] = 1.0
     """Time between two priors, s."""
     kernel: KernelConfig = KernelConfig(kind="none")
     """Robust loss: not used for the waterline."""
@@ -412,7 +414,7 @@ class TimelineConfig(Block):
 
     rate_hz: Annotated[float, Field(gt=0.5, le=200.0)] = 10.0
     """States a second; a state moves onto a measurement's stamp where one is near."""
-    slow_period_s: Positive = 1.0
+    slow_period_s: Annotated[float, Field(ge=0.05, le=1e6)] = 1.0
     """Time between two states of the slow quantities (IMU bias, GNSS error), s."""
 
 
@@ -430,10 +432,12 @@ class StartConfig(Block):
 class OutputConfig(Block):
     """What is written to the run folder."""
 
-    rate_hz: Positive = 10.0
+    rate_hz: Annotated[float, Field(gt=0.0, le=1e4)] = 10.0
     """Rows a second in the solution."""
     bag: bool = True
     """Write `solution_bag/`, a bag with `nav_msgs/Odometry`."""
+    map_image: str = ""
+    """Georeferenced image under the report's map, a path as that of an aerial sensor; none: that of the first such sensor."""
 
 
 class VesselConfig(Block):
@@ -497,10 +501,36 @@ def parse_config(raw: Mapping[str, Any], kinds: Mapping[str, type[SensorConfig]]
         raise ConfigError(one_line(error, VesselConfig, where, "")) from None
 
 
-def load_config(path: Path, kinds: Mapping[str, type[SensorConfig]]) -> VesselConfig:
-    """Read and validate a `vessel.yaml`."""
+def load_config(
+    path: Path, kinds: Mapping[str, type[SensorConfig]], changes: Mapping[str, object] = MappingProxyType({})
+) -> VesselConfig:
+    """Read and validate a `vessel.yaml`, some of its keys changed (see `with_changes`)."""
     raw = read_mapping(path, "; `graphloc inspect BAG` writes a first one")
-    return parse_config(raw, kinds, str(path))
+    return parse_config(with_changes(raw, changes, str(path)), kinds, str(path))
+
+
+def with_changes(raw: Mapping[str, Any], changes: Mapping[str, object], where: str) -> dict[str, Any]:
+    """Return a configuration, not yet validated, with keys set that are written with dots (`sensors.gnss.sigma_scale`).
+
+    Raises:
+        ConfigError: it has no such sensor, or the way to a key leads through a value.
+    """
+    tree = copy.deepcopy(dict(raw))
+    for key, value in changes.items():
+        *way, last = key.split(".")
+        sensors = tree.get("sensors")
+        known = list(sensors) if isinstance(sensors, Mapping) else []
+        if way[:1] == ["sensors"] and (name := [*way, last][1]) not in known:
+            raise ConfigError(f"{where}: {key}: there is no sensor '{name}'{nearest(name, known)}")
+        block: Any = tree
+        for name in way:
+            if block.get(name) is None:
+                block[name] = {}
+            block = block[name]
+            if not isinstance(block, dict):
+                raise ConfigError(f"{where}: {key}: '{name}' is a value, and holds no keys")
+        block[last] = value
+    return tree
 
 
 def effective(config: VesselConfig) -> dict[str, Any]:

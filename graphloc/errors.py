@@ -5,9 +5,17 @@ The text of each says what is wrong, where (file, topic, stamp) and what to do, 
 the CLI prints it as it is and exits with 2.
 """
 
+import re
+
+_LONGEST = 1500
+
 
 class GraphlocError(Exception):
-    """Base of every error that graphloc raises on purpose."""
+    """Base of every error that graphloc raises on purpose. Its text is one line, whatever names of files or topics hold."""
+
+    def __init__(self, text: str) -> None:
+        line = re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", text)
+        super().__init__(line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}")
 
 
 class ConfigError(GraphlocError):
@@ -20,6 +28,10 @@ class InputError(GraphlocError):
 
 class SolveError(GraphlocError):
     """The graph could not be started or solved."""
+
+
+class ExtraError(GraphlocError):
+    """An optional part that is not installed."""
 
 
 class OutputError(GraphlocError):

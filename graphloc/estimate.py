@@ -7,12 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from graphloc.frames import Array
 from graphloc.solution import Health
-
-_CHI2_95 = float(chi2.ppf(0.95, 2))
+from graphloc.trajectory import bounds_95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,9 +59,9 @@ class Estimate:
     @property
     def bound_95_m(self) -> float:
         """Radius that holds the horizontal position with 95 %: the long axis of its ellipse."""
-        return float(np.sqrt(_CHI2_95 * np.linalg.eigvalsh(self.cov[:2, :2])[-1]))
+        return float(bounds_95(self.cov[None])[0, 0])
 
     @property
     def heading_bound_95_rad(self) -> float:
         """What holds the heading with 95 %."""
-        return float(1.96 * np.sqrt(self.cov[5, 5]))
+        return float(np.radians(bounds_95(self.cov[None])[0, 2]))

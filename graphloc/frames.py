@@ -124,6 +124,13 @@ def rotation_from_rpy_deg(rpy_deg: Array) -> Array:
 
 
 def rpy_from_rotation(rotation: Array) -> Array:
-    """Return roll, pitch, yaw in rad, (3,) or (N, 3), of rotation matrices: the inverse of the above."""
-    with np.errstate(all="ignore"):
-        return np.asarray(Rotation.from_matrix(rotation).as_euler("xyz"))
+    """Return roll, pitch, yaw in rad, (3,) or (N, 3), of rotation matrices: the inverse of the above.
+
+    Where x points straight up or down only the sum of roll and yaw is told: yaw is zero there.
+    """
+    R = np.moveaxis(np.asarray(rotation, dtype=float), (-2, -1), (0, 1))
+    level = np.hypot(R[0, 0], R[1, 0])
+    told = level > 1e-9
+    yaw = np.where(told, np.arctan2(R[1, 0], R[0, 0]), 0.0)
+    roll = np.where(told, np.arctan2(R[2, 1], R[2, 2]), np.arctan2(-R[1, 2], R[1, 1]))
+    return np.stack([roll, np.arctan2(-R[2, 0], level), yaw], axis=-1)

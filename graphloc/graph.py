@@ -95,6 +95,8 @@ class Residual:
     def nis(self, inflation: Array | None = None) -> float:
         """Squared residual normalised by `cov` (+ `inflation`)."""
         s = self.cov if inflation is None else self.cov + inflation
+        if len(self.raw) == 1:
+            return float(self.raw[0]) ** 2 / float(s[0, 0])
         return float(self.raw @ np.linalg.solve(s, self.raw))
 
     def log_density(self, inflation: Array | None = None) -> float:
@@ -247,6 +249,9 @@ class InertialRow(Protocol):
     ) -> InertialLink:
         """Return the links that one IMU gives, its noise densities scaled."""
         ...
+
+
+UNKNOWN_MPS2, UNKNOWN_RADPS = 1.0, 0.2  # of motion in a hole of the IMU's data, correlated over about a second
 
 
 class InertialLink(Protocol):

@@ -107,7 +107,7 @@ def height_m(recording: Recording, config: VesselConfig, configured_m: float | N
     if configured_m is not None:
         return configured_m - datum.origin.height_m
     heights = [
-        m.position.height_m - float(mount_of(m.sensor, config.sensors[m.sensor], recording)[0][2])
+        m.position.height_m - float(mount_of(m.sensor, config.sensors[m.sensor], recording.mounts)[0][2])
         for m in fixes_of(recording)
     ]
     return float(np.median(heights)) - datum.origin.height_m if heights else 0.0

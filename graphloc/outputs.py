@@ -8,8 +8,10 @@ interrupted run leaves nothing half-written. Columns and units: docs/outputs.md.
 from __future__ import annotations
 
 import csv
+import errno
 import importlib.metadata
 import json
+import os
 import platform
 import re
 import shutil
@@ -26,7 +28,6 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from graphloc.berths import BerthTrack
 from graphloc.config import VesselConfig, effective
@@ -36,6 +37,7 @@ from graphloc.ledger import LedgerRow
 from graphloc.plain import plain
 from graphloc.solution import Solution
 from graphloc.time import utc_text
+from graphloc.trajectory import bounds_95
 
 MARK = "run.json"  # a folder with this file is ours to replace
 
@@ -46,9 +48,9 @@ def check_folder(folder: Path, *, overwrite: bool, mark: str = MARK) -> None:
     A folder is replaced only if it holds the file `mark`, so that nobody's own work is.
 
     Raises:
-        OutputError: `folder` exists and may not be replaced, or there is a file in its place.
+        OutputError: `folder` exists and may not be replaced, there is a file in its place, or it cannot be made there.
     """
-    if folder.is_file():
+    if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file, and a folder is wanted")
     if folder.exists() and not (overwrite and (folder / mark).exists()) and any(folder.iterdir()):
         what = (
@@ -57,6 +59,20 @@ def check_folder(folder: Path, *, overwrite: bool, mark: str = MARK) -> None:
             else "exists already; give --overwrite"
         )
         raise OutputError(f"{folder}: {what}")
+    check_writable(folder)
+
+
+def check_writable(path: Path) -> None:
+    """Refuse what cannot be made at `path`, which need not be there, nor the folders that it lies in.
+
+    Raises:
+        OutputError: the nearest folder that is there may not be written to.
+    """
+    around = next(folder for folder in path.absolute().parents if folder.exists())
+    if not around.is_dir():
+        raise OutputError(f"{path}: {around} is a file, and a folder is wanted")
+    if not os.access(around, os.W_OK | os.X_OK):
+        raise OutputError(f"{path}: cannot be written ({os.strerror(errno.EACCES)} in {around})")
 
 
 @contextmanager
@@ -135,22 +151,6 @@ def _solution_columns(solution: Solution) -> list[str]:
         "v_east_mps v_north_mps v_up_mps bound95_horizontal_m bound95_height_m bound95_heading_deg health health_reason"
     )
     return [*fixed.split(), *(f"since_agreed_{name}_s" for name in solution.since_agreed_s)]
-
-
-def bounds_95(cov: Array) -> Array:
-    """95 % bounds (N, 3) of covariances (N, 6, 6): horizontal radius m, height m, heading deg.
-
-    The radius is the semi-major axis of the 95 % ellipse; so it holds at least 95 %.
-    """
-    major = np.linalg.eigvalsh(cov[:, :2, :2])[:, -1]
-    one = chi2.ppf(0.95, 1)
-    return np.column_stack(
-        [
-            np.sqrt(chi2.ppf(0.95, 2) * major),
-            np.sqrt(one * cov[:, 2, 2]),
-            np.degrees(np.sqrt(one * cov[:, 5, 5])),
-        ]
-    )
 
 
 def _solution_rows(solution: Solution, picked: Array) -> Iterator[list[object]]:

@@ -8,7 +8,7 @@ front-end, when the IMU has reached their stamp. A match is made around the smoo
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn
 from graphloc.frontends.aerial.scans import ScanFeed
 from graphloc.gather import Gathering, Scans
-from graphloc.ledger import Ledger, LedgerRow
+from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement, TagSighting
 from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
@@ -36,7 +36,7 @@ Status = Callable[[float, float, Estimate | None, str], None]
 """Called with s of the run, its whole length, the newest estimate, and what the start waits for."""
 
 
-_WARNS = ("anew", "rebuilt", "no second sensor", "a guess")  # of events, that a reader must see
+_WARNS = ("anew", "rebuilt", "interrupted", "no second sensor", "a guess")  # of events, that a reader must see
 _BUSY = "not tried: the scan before it was still being matched"
 
 
@@ -59,11 +59,15 @@ class Replayed:
     update_s: np.ndarray
 
 
-def arrivals(recording: Recording) -> Iterator[Measurement]:
+def arrivals(recording: Recording, late_ns: Mapping[int, int] | None = None) -> Iterator[Measurement]:
     """Yield IMU samples and measurements as they arrived; those that a front-end made, when the IMU got there.
 
     A simulation without a bag has no order of arrival: its stamps stand in.
+
+    Args:
+        late_ns: by arrival number, how long after its stamp a measurement comes instead.
     """
+    late_ns = late_ns or {}
     imu = recording.imu
     samples = () if imu is None else zip(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps, imu.seqs, strict=True)
     messages: list[Measurement] = [
@@ -71,20 +75,20 @@ def arrivals(recording: Recording) -> Iterator[Measurement]:
         for s, a, w, q in samples
     ]
     made: list[Measurement] = []
+    simulated = recording.source.startswith("(")
     for m in recording.measurements:
         if m.seq >= 0:
-            (
-                made if isinstance(m, TagSighting) or recording.topics.get(m.sensor, "").startswith("(") else messages
-            ).append(m)
-    if recording.source.startswith("("):
-        messages, made = [*messages, *made], []
-        messages.sort(key=lambda m: (m.stamp_ns, m.seq))
-    else:
-        messages.sort(key=lambda m: m.seq)
-    made.sort(key=lambda m: -m.stamp_ns)
+            gathered = isinstance(m, TagSighting) or recording.topics.get(m.sensor, "").startswith("(")
+            (made if m.seq in late_ns or (gathered and not simulated) else messages).append(m)
+    messages.sort(key=lambda m: (m.stamp_ns if simulated else 0, m.seq))
+
+    def due_ns(m: Measurement) -> int:
+        return m.stamp_ns + late_ns.get(m.seq, 0)
+
+    made.sort(key=lambda m: -due_ns(m))
     for m in messages:
         yield m
-        while isinstance(m, ImuSample) and made and made[-1].stamp_ns <= m.stamp_ns:
+        while isinstance(m, ImuSample) and made and due_ns(made[-1]) <= m.stamp_ns:
             yield made.pop()
     yield from reversed(made)
 
@@ -169,6 +173,8 @@ def replay(
     lag_s: float = 10.0,
     datum: Datum | None = None,
     smoother: OnlineSmoother | None = None,
+    late_ns: Mapping[int, int] | None = None,
+    stoppable: bool = False,
     status: Status = silent,
 ) -> Replayed:
     """Run a recording through the online mode.
@@ -176,7 +182,8 @@ def replay(
     Args:
         scans: where the scans of aerial sensors are matched from; None: matches that are in the recording are taken.
         rate: of the run's own time; None: as fast as it can. datum: origin of world; None: as `OnlineSmoother` finds it.
-        smoother: another than a fresh one, for tests.
+        smoother: another than a fresh one, for tests. late_ns: as `arrivals` takes it.
+        stoppable: Ctrl-C ends it early, and what there is until then is returned.
 
     Raises:
         SolveError: it never started. InputError: a map or LiDAR that cannot be used.
@@ -194,6 +201,7 @@ def replay(
     took_s: list[float] = []
     rows: list[LedgerRow] = []
     said: list[str] = []
+    cut = False
     imu = recording.imu
     first_ns, last_ns = (int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])) if imu is not None and len(imu) else (0, 0)
     begun = time.monotonic()
@@ -216,21 +224,26 @@ def replay(
             if scans is not None
         ]
         tried = -1
-        for m in arrivals(recording):
-            if rate is not None and isinstance(m, ImuSample):
-                ahead_s = (m.stamp_ns - first_ns) / 1e9 / rate - (time.monotonic() - begun)
-                if ahead_s > 0.0:
-                    time.sleep(ahead_s)
-            feed(m)
-            if isinstance(m, ImuSample):
-                for matching in matchings:
-                    for match in matching.due(smoother, m.stamp_ns):
-                        feed(match)
-                second = (m.stamp_ns - first_ns) // 1_000_000_000
-                if smoother.waiting_for and second != tried:
-                    tried = second
-                    status(float(second), (last_ns - first_ns) / 1e9, None, smoother.waiting_for)
-        for matching in matchings:
+        try:
+            for m in arrivals(recording, late_ns):
+                if rate is not None and isinstance(m, ImuSample):
+                    ahead_s = (m.stamp_ns - first_ns) / 1e9 / rate - (time.monotonic() - begun)
+                    if ahead_s > 0.0:
+                        time.sleep(ahead_s)
+                feed(m)
+                if isinstance(m, ImuSample):
+                    for matching in matchings:
+                        for match in matching.due(smoother, m.stamp_ns):
+                            feed(match)
+                    second = (m.stamp_ns - first_ns) // 1_000_000_000
+                    if smoother.waiting_for and second != tried:
+                        tried = second
+                        status(float(second), (last_ns - first_ns) / 1e9, None, smoother.waiting_for)
+        except KeyboardInterrupt:
+            if not stoppable:
+                raise
+            cut = True
+        for matching in () if cut else matchings:
             for match in matching.end():
                 feed(match)
     waiting = smoother.waiting_for
@@ -249,8 +262,17 @@ def replay(
         recording = replace(
             recording, warnings=(*recording.warnings, f"the matcher did not keep up: {behind} scans were never tried")
         )
-    matched = {row.seq for row in rows}
-    rows += [row for row in recording.rows if row.seq not in matched or row.seq < 0]
+    told = {row.seq for row in rows}
+    rows += [row for row in recording.rows if row.seq not in told or row.seq < 0]
+    if cut:
+        said.append(
+            f"interrupted at {(estimates[-1].stamp_ns - first_ns) / 1e9:.1f} s: the run goes on, this track does not"
+        )
+        rows += [
+            LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=recording.topics.get(m.sensor, ""),
+                      outcome=Outcome.IGNORED, reason="the replay was interrupted before")
+            for m in arrivals(recording) if m.seq >= 0 and m.seq not in told
+        ]  # fmt: skip
     solution = _solution(estimates, Ledger(rows), smoother, said)
     return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=np.array(took_s))
 

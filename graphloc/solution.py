@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from graphloc.berths import BerthTrack
 from graphloc.frames import Array, Datum
 from graphloc.ledger import Ledger
+from graphloc.offsets import Offsets
 from graphloc.trajectory import Trajectory
 
 
@@ -86,6 +87,7 @@ class Solution:
         berths: the vessel seen from each berth, where it is near.
         ledger: every message of the run.
         stats: how the solver fared.
+        offsets: what the run says of levers, mounts and stamps; None where it was not asked.
     """
 
     datum: Datum
@@ -101,6 +103,7 @@ class Solution:
     berths: tuple[BerthTrack, ...]
     ledger: Ledger
     stats: SolveStats
+    offsets: Offsets | None = None
 
     @property
     def name(self) -> str:

@@ -9,9 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
+from scipy.stats import chi2
 
 from graphloc.frames import Array, rpy_from_rotation
 from graphloc.time import seconds_since
+
+_CHI2_95 = tuple(float(chi2.ppf(0.95, dof)) for dof in (1, 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,3 +103,13 @@ class Trajectory:
             cov=cov,
             planar=self.planar,
         )
+
+
+def bounds_95(cov: Array) -> Array:
+    """95 % bounds (N, 3) of covariances (N, 6, 6) as a `Trajectory` has them: horizontal radius m, height m, heading deg.
+
+    The radius is the semi-major axis of the 95 % ellipse; so it holds at least 95 %.
+    """
+    one, two = _CHI2_95
+    major = np.linalg.eigvalsh(cov[:, :2, :2])[:, -1]
+    return np.column_stack([np.sqrt(two * major), np.sqrt(one * cov[:, 2, 2]), np.degrees(np.sqrt(one * cov[:, 5, 5]))])

@@ -12,11 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import AprilTagConfig
-from graphloc.factors._linear import linear_update
 from graphloc.factors.apriltag import ROW
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.tags.pose import modes_of, poses_of
 from graphloc.graph import Attachment, Decision
+from graphloc.linear import linear_update
 from graphloc.measurements import TagSighting
 from graphloc.survey import Survey
 from tests.tagfactory import AHEAD, FACES_SOUTH, SIGMA, SIZE_M, UNIT, degrees_between, nearest_mode, rays_of

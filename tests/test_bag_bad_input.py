@@ -56,6 +56,20 @@ def test_no_bag(tmp_path: Path) -> None:
     one_line(error, "empty", "metadata.yaml")
 
 
+def test_a_folder_of_ours_that_is_no_bag_says_which_is_meant(tmp_path: Path) -> None:
+    (tmp_path / "sim" / "run").mkdir(parents=True)
+    (tmp_path / "sim" / "run" / "metadata.yaml").write_text("")
+    with pytest.raises(InputError) as error:
+        read_recording(tmp_path / "sim", vessel())
+    one_line(error, "sim: has no metadata.yaml", f"a bag lies in it: {tmp_path / 'sim' / 'run'}")
+    (tmp_path / "sim" / "solution_bag").mkdir()
+    (tmp_path / "sim" / "solution_bag" / "metadata.yaml").write_text("")
+    (tmp_path / "sim" / "run.json").write_text("{}")
+    with pytest.raises(InputError) as error:
+        read_recording(tmp_path / "sim", vessel())
+    one_line(error, "sim: has no metadata.yaml", "folder of a finished run")
+
+
 @pytest.mark.parametrize(
     ("name", "hint"), [("a.bag", "rosbag reindex"), ("a.mcap", "mcap recover"), ("a.db3", "ros2 bag reindex")]
 )

@@ -141,3 +141,14 @@ def test_covariance_of_a_point_on_a_lever() -> None:
     assert cov[1, 1] == pytest.approx(0.04)
     assert cov[5, 5] == pytest.approx(0.01)
     assert cov[0, 5] == pytest.approx(-0.1)  # turned to port, the bow goes west
+
+
+def test_keys_are_those_of_gtsam() -> None:
+    for k in (0, 1, 77, 863_999, 2**47):
+        assert keys.pose(k) == gtsam.symbol("x", k)
+        assert keys.velocity(k) == gtsam.symbol("v", k)
+        assert keys.bias(k) == gtsam.symbol("b", k)
+        assert keys.leaves(k) == (gtsam.symbol("a", k), gtsam.symbol("l", k))
+        for number in (0, 5, 30):
+            assert keys.slow(number, k) == gtsam.LabeledSymbol(ord("s"), ord("A") + number, k).key()
+            assert keys.constant(number, k) == gtsam.LabeledSymbol(ord("c"), ord("A") + number, k).key()

@@ -45,7 +45,8 @@ def test_smooth_writes_a_run_folder_and_does_not_replace_it_unasked(
     bag: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out, "--json") == 0
+    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out, "--json", "--figures") == 0
+    assert {"map.png", "map.svg", "errors.png", "nees.svg"} <= {p.name for p in (out / "figures").iterdir()}
     printed = capsys.readouterr().out
     numbers = json.loads(printed[: printed.rindex("}") + 1])
     assert numbers["Against truth"]["graphloc"]["position_rmse_m"] < 0.5
@@ -126,6 +127,8 @@ def test_bad_arguments_are_one_line(
         ([*good, "--hold-out", "gaps:500x10"], "gaps"),
         ([*good[:5], mine, "--overwrite"], "holds no run.json"),
         ([*good[:5], file], "is a file"),
+        ([*good[:5], Path(os.devnull)], "is a file"),
+        ([*good[:5], file / "run"], "is a file"),
         (["simulate", "bl1-pink", "-o", tmp_path / "sim"], "bl1-pink"),
         (["inspect", bag[0], "-w", tmp_path / "nowhere/x.yaml"], "nowhere/x.yaml"),
     ):
@@ -134,6 +137,24 @@ def test_bad_arguments_are_one_line(
         assert len(lines) == 1, lines
         assert said in lines[0]
     assert (mine / "thesis.txt").read_text() == "precious"
+
+
+def test_a_place_that_may_not_be_written_to_is_refused_before_the_work(
+    bag: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "shut").mkdir()
+    may = os.access  # tests may run as root, who may write everywhere
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path / "shut" and may(path, mode))
+    monkeypatch.setattr("graphloc.app.load", lambda *_, **__: pytest.fail("refused only after the bag was read"))
+    good = ["-c", bag[1], "-o", tmp_path / "shut/new/run"]
+    for arguments in (
+        *([command, bag[0], *good] for command in ("smooth", "compare", "replay", "ablate", "drill")),
+        ["smooth", bag[0], *good[:3], tmp_path / "run", "--rerun", tmp_path / "shut/run.rrd"],
+    ):
+        assert run(monkeypatch, *arguments) == 2, arguments
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert "Permission denied" in line
+        assert str(tmp_path / "shut") in line
 
 
 def test_a_full_disk_leaves_nothing(
@@ -170,7 +191,7 @@ def test_an_interrupt_while_writing_leaves_nothing_and_keeps_the_old_run(
 
 def test_ctrl_c_in_the_solver_ends_at_once(tmp_path: Path) -> None:
     where, config = write_bag(simulate(bl_scenario(1, "drift"), 2), tmp_path / "bag", ros=2)
-    command = [sys.executable, "-m", "graphloc.cli", "smooth", where, "-c", config, "-o", tmp_path / "run"]
+    command = [sys.executable, "-m", "graphloc", "smooth", where, "-c", config, "-o", tmp_path / "run"]
     code = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a `nohup` runner ignores it
         "from graphloc import cli; from graphloc.solve import _grow; grow = _grow.solve_start\n"

@@ -137,7 +137,7 @@ def test_folders_are_made_whole_or_not_at_all(
     with pytest.raises(OutputError, match=r"holds no truth\.json"):
         write_bag(small, tmp_path / "mine", ros=2, overwrite=True)
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="file is a file, and a folder is wanted"):
         write_bag(small, tmp_path / "file/below", ros=2)
 
     def full(*_: object, **__: object) -> None:

@@ -176,7 +176,7 @@ def test_pixels_of_every_kind(tmp_path: Path) -> None:
         around(utm(tmp_path / "c.tif", lambda g: g[None].astype(np.complex64)))
 
 
-def test_a_palette_is_expanded(tmp_path: Path) -> None:
+def test_a_palette_is_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = utm(tmp_path / "a.tif", palette, photometric="PALETTE")
     with rasterio.open(path, "r+") as f:
         f.write_colormap(1, {3: (DARK, 0, 50, 255), 7: (BRIGHT, 0, 60, 255), 9: (120, 0, 70, 255)})
@@ -184,6 +184,9 @@ def test_a_palette_is_expanded(tmp_path: Path) -> None:
     check(patch, atol_m=0.04)
     assert set(np.unique(patch.pixels[..., 1])) == {0}
     check(around(path, cell_m=1.0), atol_m=0.1)
+    monkeypatch.setattr("graphloc.frontends.aerial.image._PALETTE_PX", 1000)  # a whole map would fill the memory
+    with pytest.raises(InputError, match=r"\d+ x \d+ pixels with a palette are too many"):
+        around(path)
 
 
 @pytest.mark.parametrize(("kind", "scale"), [("uint16", 12.0), ("int16", 100.0), ("float32", 0.004)])

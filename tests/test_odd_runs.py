@@ -19,11 +19,10 @@ from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum, Geodetic
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import GnssPosition, HeightPrior, ImuSeries, Measurement
-from graphloc.outputs import bounds_95
 from graphloc.recording import Recording
 from graphloc.solve._align import align
 from graphloc.solve._parts import _join_stats
-from graphloc.trajectory import Trajectory
+from graphloc.trajectory import Trajectory, bounds_95
 
 BASE = Scenario(path="loops", duration_s=40.0, noise="clean", pose_hz=0.0)
 

@@ -114,6 +114,20 @@ def test_a_run_that_never_starts_says_what_it_waited_for(run: SimulatedRun) -> N
         replay(alone, run.config)
 
 
+def test_ctrl_c_keeps_what_there_is(run: SimulatedRun) -> None:
+    def status(at_s: float, *_: object) -> None:
+        if at_s > 12.0:
+            raise KeyboardInterrupt
+
+    found = replay(run.recording, run.config, stoppable=True, status=status)
+    stamps = found.solution.trajectory.stamps_ns
+    assert 11.5 < (stamps[-1] - int(run.truth.stamps_ns[0])) / 1e9 < 12.5
+    assert any("interrupted at 12" in line for line in found.solution.stats.warnings)
+    assert run.recording.imu is not None
+    every = sorted([m.seq for m in run.recording.measurements if m.seq >= 0] + run.recording.imu.seqs.tolist())
+    assert sorted(row.seq for row in found.solution.ledger if row.seq >= 0) == every
+
+
 def test_compare_has_it_beside_the_filters(run: SimulatedRun) -> None:
     compared = app.simulated(run, compare=True)
     names = [f.name for f in compared.filters]

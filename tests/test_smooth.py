@@ -173,7 +173,7 @@ def test_run_folder(short: app.Run, tmp_path: Path) -> None:
     report = app.write(short, tmp_path / "run", inputs=[], command="test", overwrite=False)
     folder = report.parent
     assert sorted(p.name for p in folder.iterdir()) == [
-        "ledger.csv", "report.html", "run.json", "slow.csv", "solution.csv", "solution.tum", "solution_bag",
+        "calibration.json", "ledger.csv", "report.html", "run.json", "slow.csv", "solution.csv", "solution.tum", "solution_bag",
         "track.geojson", "vessel.effective.yaml",
     ]  # fmt: skip
     with (folder / "ledger.csv").open() as stream:

@@ -399,7 +399,7 @@ def test_an_estimate_as_json() -> None:
     np.testing.assert_allclose(between["xyz_m"], [10.0, -1.0, 2.0])  # odom's x is north: 1 m along it is at 0 north
     np.testing.assert_allclose(between["quaternion_xyzw"], [0, 0, half, half])
     assert found["bound_95_m"] == pytest.approx(2.0 * np.sqrt(5.991464547))  # sigma 2 m on the long axis
-    assert found["heading_bound_95_deg"] == pytest.approx(1.96 * np.degrees(0.02))
+    assert found["heading_bound_95_deg"] == pytest.approx(1.959963985 * np.degrees(0.02))
     assert found["cov_m_rad"] == np.diag([4.0, 1.0, 1.0, 0.01, 0.01, 0.0004]).tolist()
 
 

@@ -86,8 +86,11 @@ def write_bag(
 
 def _write(run: SimulatedRun, folder: Path, ros: int, storage: str, progress: Progress) -> str:
     """Fill a folder; return the name of the bag in it."""
+    config = run.config
+    if run.harbour is not None:
+        config = config.model_copy(update={"output": config.output.model_copy(update={"map_image": _AERIAL})})
     with (folder / _CONFIG).open("w", encoding="utf-8") as stream:
-        YAML(typ="safe", pure=True).dump(effective(run.config), stream)
+        YAML(typ="safe", pure=True).dump(effective(config), stream)
     _beside(run, folder)
     make = Messages(ros)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3

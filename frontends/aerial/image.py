@@ -32,6 +32,7 @@ Mask = NDArray[np.bool_]
 _NET_M = 8.0
 _LOOSE_M = 1.5  # a tie to WGS 84 that is less sure than that is worth a word; those of ETRS 89 say 1 m
 _SAMPLES, _SAMPLE_PX = 8, 128
+_PALETTE_PX = 300_000_000  # read at once of an image with a palette, which cannot be read coarser
 
 log = logging.getLogger(__name__)
 
@@ -141,6 +142,11 @@ class AerialImage:
         high = np.clip(shrink * np.ceil(uv.max(axis=(1, 2)) / shrink + 3.0), 0, size).astype(int)
         if (high - low < 2).any():
             raise elsewhere
+        if self._palette is not None and int(np.prod(high - low, dtype=np.int64)) > _PALETTE_PX:
+            raise InputError(
+                f"{self._path}: {' x '.join(map(str, high - low))} pixels with a palette are too many to read at once: "
+                "gdal_translate -expand rgb"
+            )
         image, has = self._read(low, high - low, shrink)
         scale = np.array(has.shape[::-1]) / (high - low)
         if (finer * scale).max() > 1.5:  # the grid is coarser than what was read: average, do not pick
@@ -161,7 +167,8 @@ class AerialImage:
 
     def _pixels_of_grid(self, west: float, north: float, n: int, cell_m: float) -> Array:
         """Image column and row (2, n, n) of a grid in world."""
-        knots = np.linspace(0.0, n - 1.0, max(2, int(np.ceil(n * cell_m / _NET_M)) + 1))
+        net_m = max(_NET_M, 2.0 * cell_m)  # a picture of kilometres needs no net finer than its pixels
+        knots = np.linspace(0.0, n - 1.0, max(2, int(np.ceil(n * cell_m / net_m)) + 1))
         columns, rows = np.meshgrid(knots, knots)
         net = self._pixels_of(np.column_stack([west + columns.ravel() * cell_m, north - rows.ravel() * cell_m]))
         # Linear between knots, by a product: cv2.remap would round to a 32nd of their distance, 0.25 m.
@@ -219,6 +226,9 @@ def _palette_of(source: Any) -> Pixels:
 
 def _why_not(source: Any, path: Path) -> str:
     """What keeps an image from being used: its bands or its georeference; empty where nothing does."""
+    sizes = {n for shape in source.block_shapes for n in shape} if source.driver in ("MBTiles", "WMS") else set()
+    if any(not 64 <= n <= 4096 for n in sizes):  # a tile of 1 kB may say that it has 30000 x 30000 pixels
+        return f"its tiles have {max(sizes)} pixels a side: 64 to 4096 are read"
     kinds = {str(d) for d in source.dtypes}
     if not kinds or any("complex" in k for k in kinds):
         return "no picture in it: name one raster layer, with gdal_translate, as GeoTIFF"

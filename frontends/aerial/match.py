@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from graphloc.frames import Array
+from graphloc.frontends._compiled import compiled
 from graphloc.frontends.aerial.image import Pixels
 from graphloc.frontends.aerial.layers import Layer, Layers
 from graphloc.frontends.aerial.scan import Outline
@@ -45,7 +46,7 @@ def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) ->
     )
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@compiled(parallel=True, fastmath=True)
 def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, columns):  # type: ignore[no-untyped-def]
     """Sum over points of weight x layer, for each yaw, row and column of the grid: (H, rows, columns).
 

@@ -7,11 +7,11 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.errors import ConfigError
+from graphloc.frontends import _compiled
 
 FAMILIES = {
     "16h5": cv2.aruco.DICT_APRILTAG_16h5,
@@ -21,7 +21,7 @@ FAMILIES = {
 }
 Cells = NDArray[np.uint8]
 # Threads run these side by side; what a degenerate quadrilateral divides by zero is not a number, and compares so.
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+compiled = _compiled.compiled(nogil=True, error_model="numpy")
 _SHARPEN = 0.25  # of what a cell is over each of its neighbours is added to it, as in AprilTag 3
 _SPREAD = 0.25  # of a cell, between the nine places where its level is taken
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from graphloc.frames import Array, skew
+from graphloc.frames import Array, rpy_from_rotation, skew
 from graphloc.frontends.tags.pose import poses_of
 from graphloc.measurements import TagSighting, TagView
 from graphloc.survey import WORLD, DockConfig, Family, Survey, TagConfig
@@ -196,7 +196,7 @@ def _estimate(own: Sequence[TagView], track: Trajectory, size_m: float | None) -
 
 
 def _rpy_deg(R: Array) -> tuple[float, float, float]:
-    roll, pitch, yaw = (round(float(v), 2) for v in Rotation.from_matrix(R).as_euler("xyz", degrees=True))
+    roll, pitch, yaw = (round(float(v), 2) for v in np.degrees(rpy_from_rotation(R)))
     return roll, pitch, yaw
 
 

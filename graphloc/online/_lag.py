@@ -11,14 +11,12 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import count
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from graphloc import keys
 from graphloc.build import (
@@ -47,7 +45,7 @@ from graphloc.solve._solution import AGREES, row_of
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
 _CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
-_PAGE_S = 1.0
+_PAGE_S = 1.0  # states leave together by so much
 _LEAF_S, _SURE = 1.0, 0.9  # how often an older chapter is judged again; a weight that needs no second look
 _STEP_COST = (
     1.0  # of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10
@@ -59,11 +57,6 @@ _FAR_M = 20e3  # from the estimate: no place of this run; beyond, the linear alg
 _CREDIBLE = 6.0  # sigmas of a slow error: beyond, a sensor that agrees does so by an error that it does not have
 _FEW = 8  # measurements of absolute sensors in a row that disagree: not yet a sign
 _STEPS, _STEP_M = 3, 0.3  # of the solver in one commit, while the newest state moves
-
-
-@cache
-def _chi2_median(dof: int) -> float:
-    return float(chi2.median(dof))
 
 
 @dataclass(slots=True, eq=False)
@@ -215,9 +208,17 @@ class Lag:
                 self._ends[stream.name] = window.add(ends)
 
     def mend(self, holes: Sequence[tuple[int, int]]) -> None:
-        """Stage the steps anew that IMU samples lie in which came late: between what stamps (ns) each of these lies."""
+        """Stage anew what was integrated without IMU samples that came late; holes: the stamps (ns) that each lies between."""
         timeline, links, window = self.problem.timeline, self.problem.links, self._window
-        for k in sorted({k for a, b in holes for k in range(timeline.floor(a), timeline.floor(b) + 1)}):
+        torn = {k for a, b in holes for k in range(timeline.floor(a), timeline.floor(b) + 1)}
+        for entry in self._entries.values():
+            carry = entry.stream.carry[entry.index]
+            if carry is not None and carry[0] in torn and entry.reaches(timeline.first):
+                self.problem.carry_anew(entry.stream, entry.index)
+                if entry.held is not None:
+                    at = attach(self.problem, entry.stream, entry.index, window.values)
+                    self._change(entry, replace(entry.verdict, at=at))
+        for k in sorted(torn):
             if k in self._links and window.remove(self._links[k]):
                 pim = links.integrate(timeline.stamps_ns[k], timeline.stamps_ns[k + 1], gtsam.imuBias.ConstantBias())
                 self._links[k] = window.add([links.factor(k, timeline.slow_of[k], pim)])
@@ -290,13 +291,9 @@ class Lag:
         rows, self._gone = self._gone, []
         return [row for row in rows if row.seq >= 0]
 
-    def held(self, before_ns: int | None = None) -> list[LedgerRow]:
-        """Return rows, as they stand, of what is in the window; with `before_ns`: of stamps up to there."""
-        return [
-            self._row(e)
-            for e in self._entries.values()
-            if e.measurement.seq >= 0 and (before_ns is None or e.measurement.stamp_ns <= before_ns)
-        ]
+    def held(self) -> list[LedgerRow]:
+        """Return rows, as they stand, of what is in the window."""
+        return [self._row(e) for e in self._entries.values() if e.measurement.seq >= 0]
 
     # Measurements
 
@@ -454,10 +451,7 @@ class Lag:
     ) -> tuple[Verdict, bool]:
         """The sensor's kernel: as wide as its residuals scatter, and as the prediction is unsure. True: for that reason."""
         own, dof = stream.config.kernel, len(residual.raw)
-        spread = (
-            float(np.sqrt(np.median(stream.scatter) / _chi2_median(dof))) if len(stream.scatter) >= dof + 4 else 1.0
-        )
-        scale = own.scale * max(1.0, spread) * float(np.sqrt(dof))
+        scale = own.scale * stream.spread * float(np.sqrt(dof))
         plain = nis = residual.nis()
         opened = False
         if fresh and own.kind != "none" and nis > scale**2:
@@ -466,7 +460,7 @@ class Lag:
             opened = plain > 1.5 * nis
             scale *= float(np.sqrt(plain / max(nis, 1e-9))) if opened else 1.0
         if fresh:
-            stream.scatter.append(nis)
+            stream.scattered(nis, dof)
         kernel = KernelConfig(kind=own.kind, scale=scale)
         return Verdict(Decision(kernel=kernel), kernel.weight(plain), 1.0, residual, 0, at), opened
 

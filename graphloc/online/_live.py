@@ -5,14 +5,16 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, Generic, TypeVar
 
 import gtsam
 import numpy as np
+from scipy.stats import chi2
 
-from graphloc.build import Carry
+from graphloc.build import Carry, Mounts, company_of, mount_of
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProcess
@@ -23,6 +25,11 @@ T = TypeVar("T")
 # Residuals that say how wide a sensor scatters: with 50, a compass that is 100 deg off for 7 s is then taken for a wide one,
 # and turns the vessel.
 _REMEMBERED = 300
+
+
+@cache
+def _chi2_median(dof: int) -> float:
+    return float(chi2.median(dof))
 
 
 class Tape(Generic[T]):
@@ -39,6 +46,11 @@ class Tape(Generic[T]):
         if k < self.first:
             raise IndexError(f"{k} is forgotten")
         return self._items[k - self.first]
+
+    def __setitem__(self, k: int, item: T) -> None:
+        if k < self.first:
+            raise IndexError(f"{k} is forgotten")
+        self._items[k - self.first] = item
 
     def append(self, item: T) -> None:
         self._items.append(item)
@@ -123,6 +135,13 @@ class LiveStream:
     carry: Tape[Carry | None] = field(default_factory=Tape)
     gyro_radps: Tape[Array] = field(default_factory=Tape)
     scatter: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    spread: float = 1.0
+
+    def scattered(self, nis: float, dof: int) -> None:
+        """Remember a squared normalised residual; `spread` is how many times wider than configured they are, at least 1."""
+        self.scatter.append(nis)
+        if len(self.scatter) >= dof + 4:
+            self.spread = max(1.0, float(np.sqrt(np.median(self.scatter) / _chi2_median(dof))))
 
 
 @dataclass(slots=True, eq=False)
@@ -140,16 +159,25 @@ class LiveProblem:
     def take(self, m: Measurement) -> tuple[LiveStream, int]:
         """Put a measurement where it belongs; return its stream and its index there."""
         stream = self.streams[m.sensor]
-        floor = self.timeline.floor(m.stamp_ns)
-        at_ns = self.timeline.stamps_ns[floor]
-        carry = None
-        if m.stamp_ns > at_ns:
-            carry = (floor, self.links.integrate(at_ns, m.stamp_ns, gtsam.imuBias.ConstantBias()))
+        carry, gyro_radps = self._motion(m.stamp_ns)
         stream.measurements.append(m)
         stream.state.append(self.timeline.nearest(m.stamp_ns))
         stream.carry.append(carry)
-        stream.gyro_radps.append(self.links.gyro_at(np.array([m.stamp_ns]))[0])
+        stream.gyro_radps.append(gyro_radps)
         return stream, len(stream.measurements) - 1
+
+    def carry_anew(self, stream: LiveStream, index: int) -> None:
+        """Integrate the way from the state before a measurement again: samples of it came late."""
+        stream.carry[index], stream.gyro_radps[index] = self._motion(stream.measurements[index].stamp_ns)
+
+    def _motion(self, stamp_ns: int) -> tuple[Carry | None, Array]:
+        """How a stamp is reached from the state before it, and the rate there."""
+        floor = self.timeline.floor(stamp_ns)
+        at_ns = self.timeline.stamps_ns[floor]
+        carry = None
+        if stamp_ns > at_ns:
+            carry = (floor, self.links.integrate(at_ns, stamp_ns, gtsam.imuBias.ConstantBias()))
+        return carry, self.links.gyro_at(np.array([stamp_ns]))[0]
 
 
 def live_problem(
@@ -159,20 +187,15 @@ def live_problem(
     start_ns: int,
     rows: Sequence[Sensor],
     inertial: InertialRow,
-    mounts: Mapping[str, tuple[Array, Array]],
+    mounts: Mounts,
     noise_scale: float,
 ) -> LiveProblem:
     """Return a problem whose first state stands at `start_ns`; `imu`: the samples that are known from there on."""
     sensor = config.sensors[imu.sensor]
-
-    def mount_of(name: str) -> tuple[Array, Array]:
-        block = config.sensors[name]
-        return mounts.get(name, (block.mount.t_body_sensor_m, block.mount.R_body_sensor))
-
-    t, R = mount_of(imu.sensor)
+    t, R = mount_of(imu.sensor, sensor, mounts)
     by_kind = {row.kind: row for row in rows}
     asked = {n: s for n, s in config.sensors.items() if s.kind in by_kind and s.enabled}
-    company = sum(by_kind[s.kind].company for s in asked.values())
+    company = company_of(config, rows)
     streams = {}
     for number, (name, block) in enumerate(config.sensors.items()):
         if name not in asked:
@@ -180,7 +203,7 @@ def live_problem(
         row = by_kind[block.kind]
         slow = row.slow(block)
         left_out = slow if slow is not None and slow.needs_company and company < 2 else None
-        t_sensor, R_sensor = mount_of(name)
+        t_sensor, R_sensor = mount_of(name, block, mounts)
         mount = gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t)
         kept = slow if left_out is None else None
         streams[name] = LiveStream(number, name, row, block, kept, left_out, row.constants(block), mount)

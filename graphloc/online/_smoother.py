@@ -8,7 +8,7 @@ failed is built anew from its last anchor with all that came since.
 from __future__ import annotations
 
 import logging
-from bisect import bisect_left, insort
+from bisect import insort
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,10 +21,11 @@ from graphloc.config import VesselConfig
 from graphloc.errors import GraphlocError
 from graphloc.estimate import Estimate
 from graphloc.frames import Array, Datum
-from graphloc.graph import InertialRow, Sensor
+from graphloc.graph import UNKNOWN_MPS2, UNKNOWN_RADPS, InertialRow, Sensor
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor, sound
+from graphloc.online._intake import ImuIntake
 from graphloc.online._lag import Lag
 from graphloc.online._live import live_problem
 from graphloc.online._odometry import Odometry
@@ -42,13 +43,8 @@ _ANCHOR_S, _SNAPSHOT_S = 1.0, 2.0
 _LOST_S, _AGAIN_S = 15.0, 6.0  # of disagreement, until it starts anew; with the data of so long
 _AHEAD_S = 60.0  # of the IMU: a stamp of another clock
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
-_BACK = 50  # IMU samples in a row before the newest: their clock was set back
 _PENDING, _BUFFERED = 10_000, 50_000
-_LATE_S = 3.0  # of IMU samples, before the start
 _FIT_S, _MISFITS = 5.0, 2  # how often the fit is looked at, and how often in turn it must be bad
-_HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing
-_FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # what an IMU aboard can say; in g, or deg/s of a turn, it says other
-_UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # of motion where there are no samples (see `graphloc.factors.imu`)
 
 
 class OnlineSmoother:
@@ -86,7 +82,6 @@ class OnlineSmoother:
         self._imu_name = next(iter(imu), "")
         self._bridge_s = imu[self._imu_name].max_bridge_s if imu else 0.0
         self._gap_s = imu[self._imu_name].max_gap_s if imu else 0.0
-        self._floats = bool(imu) and imu[self._imu_name].gravity == "included"
         kinds = {row.kind for row in rows}
         self._asked = {name for name, s in config.sensors.items() if s.enabled and s.kind in kinds}
         self._absolute = [n for row in rows if row.absolute for n in config.of_kind(row.kind)]
@@ -99,10 +94,7 @@ class OnlineSmoother:
         self._doubt = ""
         self._noise_scale = 1.0  # of the IMU
         self._fit_ns, self._misfits = 0, 0
-        self._newest_imu: ImuSample | None = None
-        self._leap: ImuSample | None = None
-        self._leap_age = self._behind = 0
-        self._imu_stamps: list[int] = []  # in order, of the lag
+        self._intake = ImuIntake(self._gap_s, bool(imu) and imu[self._imu_name].gravity == "included")
         self._unwritable = False
         self._resumable = self._read_snapshot()
         self._buffer: deque[Measurement] = deque()  # while it waits
@@ -155,11 +147,11 @@ class OnlineSmoother:
             if self._lag is not None
             else f"never started: waiting for {self._waiting}"
         )
-        left = [*self._pending, *([self._leap] if self._leap else [])]
+        left = [*self._pending, *([self._intake.leap] if self._intake.leap else [])]
         if self._lag is None:
             left += self._buffer
         done += [self._row(m, Outcome.REJECTED, why) for m in left if m.seq >= 0]
-        self._pending, self._unread, self._leap, self._buffer = [], [], None, deque()
+        self._pending, self._unread, self._intake.leap, self._buffer = [], [], None, deque()
         self._lag = None
         return done
 
@@ -172,7 +164,7 @@ class OnlineSmoother:
         if m.sensor not in self._asked:
             self._drop(m, Outcome.IGNORED, "its sensor is switched off or not in the configuration")
             return None
-        newest = self._newest_imu
+        newest = self._intake.newest
         if newest is not None and m.stamp_ns - newest.stamp_ns > _AHEAD_S * 1e9:
             ahead_s = (m.stamp_ns - newest.stamp_ns) * 1e-9
             self._drop(m, Outcome.REJECTED, f"its stamp lies {ahead_s:.0f} s ahead of the IMU's")
@@ -202,99 +194,58 @@ class OnlineSmoother:
             why = f"{other} is the IMU" if other else "its sensor is switched off or not in the configuration"
             self._drop(m, Outcome.IGNORED, why)
             return None
-        if absurd := self._absurd(m):
-            self._drop(m, Outcome.REJECTED, absurd)
-            if self._lag is None:
-                self._waiting = f"IMU data that a vessel can have: {absurd}"
-            return None
-        newest = self._newest_imu
-        if newest is None:
-            return self._accept_imu(m)
-        leap, gap_ns = self._leap, self._gap_s * 1e9
-        if leap is not None and 0 < abs(m.stamp_ns - leap.stamp_ns) <= gap_ns and m.stamp_ns > newest.stamp_ns:
-            self._leap = None  # the clock went on from there
-            made = [self._accept_imu(n) for n in sorted((leap, m), key=lambda n: n.stamp_ns)]
-            return made[1] or made[0]
-        if m.stamp_ns <= newest.stamp_ns:
-            self._feed_late_imu(m, newest)
-            return None
-        if m.stamp_ns - newest.stamp_ns > gap_ns:
-            self._drop_leap()
-            self._leap, self._leap_age = m, 0
-            return None
-        made_now = self._accept_imu(m)
-        if leap is not None:
-            self._leap_age += 1
-            if leap.stamp_ns - m.stamp_ns <= gap_ns or self._leap_age >= _BACK:
-                self._leap = None
-                if leap.stamp_ns - m.stamp_ns > gap_ns:
-                    self._leap = leap
-                    self._drop_leap()
-                else:
-                    made_now = self._feed_imu(leap) or made_now
-        return made_now
+        taken = self._intake.take(m, started=self._lag is not None)
+        for lost, why in taken.dropped:
+            self._drop(lost, Outcome.REJECTED, why)
+        if taken.absurd and self._lag is None:
+            self._waiting = f"IMU data that a vessel can have: {taken.absurd}"
+        if taken.late is not None:
+            self._keep_late_imu(taken.late, taken.hole)
+        if taken.set_back_s:
+            self._forget_clock(taken.set_back_s, m.stamp_ns)
+        made = None
+        for sample in taken.accepted:
+            made = self._accept_imu(sample) or made
+        return made
 
-    def _drop_leap(self) -> None:
-        if self._leap is not None:
-            self._drop(self._leap, Outcome.REJECTED, "its stamp leaps, and those after it do not follow")
-            self._leap = None
-
-    def _absurd(self, m: ImuSample) -> str:
-        """Why a sample cannot be a vessel's; empty where it can."""
-        force, rate = float(np.linalg.norm(m.accel_mps2)), float(np.linalg.norm(m.gyro_radps))
-        if (self._floats and force < _FORCE_MPS2[0]) or force > _FORCE_MPS2[1]:
-            return f"a specific force of {force:.3g} m/s^2: another unit?"
-        return f"a rate of {rate:.3g} rad/s: another unit?" if rate > _RATE_RADPS else ""
-
-    def _feed_late_imu(self, m: ImuSample, newest: ImuSample) -> None:
-        """A sample before the newest: it is late where one is missing; else its clock is not to be trusted."""
-        stamps = self._imu_stamps
-        n = bisect_left(stamps, m.stamp_ns)
-        period_ns = float(np.quantile(np.diff(stamps[-1000:]), 0.1)) if len(stamps) > 2 else np.inf
-        apart_ns = min(m.stamp_ns - stamps[n - 1], stamps[n] - m.stamp_ns) if 0 < n < len(stamps) else 0
-        new = apart_ns > 0 and newest.stamp_ns - m.stamp_ns < _LATE_S * 1e9  # before the start no period is known
-        if apart_ns >= _HOLE * period_ns or (self._lag is None and new):
-            if self._lag is None:
-                self._hold(m)
-            else:
-                self._holes.append((stamps[n - 1], stamps[n]))
-                self._unread.append(m)
-                self._recent.append(m)
-                self._done.append(self._row(m, Outcome.USED, ""))
-            stamps.insert(n, m.stamp_ns)
-            return
-        self._behind += newest.stamp_ns - m.stamp_ns > self._gap_s * 1e9  # less is caught up with, and bridged
-        if self._behind < _BACK:
-            self._drop(m, Outcome.REJECTED, "its stamp does not increase")
-            return
-        self._restart(f"the IMU's clock was set back by {(newest.stamp_ns - m.stamp_ns) * 1e-9:.1f} s")
-        self._newest_imu, self._agreed_ns = None, {}  # by a clock that is no more
-        self._fit_ns = self._misfits = 0
-        if self._odometry is not None:
-            self._odometry.stamp_ns = m.stamp_ns
-        self._accept_imu(m)
-
-    def _accept_imu(self, m: ImuSample) -> Estimate | None:
-        before, self._newest_imu = self._newest_imu, m
-        self._behind = 0
-        silent_s = 0.0 if before is None else (m.stamp_ns - before.stamp_ns) * 1e-9
-        if silent_s > self._bridge_s:
-            self._restart(f"the IMU was silent for {silent_s:.1f} s")
-        self._imu_stamps.append(m.stamp_ns)
+    def _keep_late_imu(self, m: ImuSample, hole: tuple[int, int] | None) -> None:
         if self._lag is None:
             self._hold(m)
-            return self._try_to_start()
+            return
+        assert hole is not None
+        self._holes.append(hole)
+        self._keep_imu(m)
+
+    def _keep_imu(self, m: ImuSample) -> None:
         self._unread.append(m)
         self._recent.append(m)
         self._done.append(self._row(m, Outcome.USED, ""))
+
+    def _forget_clock(self, back_s: float, stamp_ns: int) -> None:
+        """Start anew by a clock that was set back."""
+        self._restart(f"the IMU's clock was set back by {back_s:.1f} s")
+        self._agreed_ns = {}
+        self._fit_ns = self._misfits = 0
+        if self._odometry is not None:
+            self._odometry.stamp_ns = stamp_ns
+
+    def _accept_imu(self, m: ImuSample) -> Estimate | None:
+        silent_s = self._intake.accept(m)
+        if silent_s > self._bridge_s:
+            self._restart(f"the IMU was silent for {silent_s:.1f} s")
+            self._intake.restart([m.stamp_ns])
+        if self._lag is None:
+            self._hold(m)
+            return self._try_to_start()
+        self._keep_imu(m)
         return self._advance()
 
     def _advance(self) -> Estimate | None:
         """Make the states that are due, with all that belongs to them."""
         assert self._lag is not None
-        assert self._newest_imu is not None
+        assert self._intake.newest is not None
         assert self._odometry is not None
-        if self._newest_imu.stamp_ns < self._lag.problem.timeline.due_ns:
+        if self._intake.newest.stamp_ns < self._lag.problem.timeline.due_ns:
             return None
         self._odometry.begin()
         try:
@@ -335,9 +286,9 @@ class OnlineSmoother:
             return None
 
     def _step(self, lag: Lag) -> None:
-        assert self._newest_imu is not None
+        assert self._intake.newest is not None
         self._read(lag)
-        timeline, until = lag.problem.timeline, self._newest_imu.stamp_ns
+        timeline, until = lag.problem.timeline, self._intake.newest.stamp_ns
         while timeline.due_ns <= until:
             before, made = lag.newest, 0
             while timeline.due_ns <= until and made < _AT_ONCE:
@@ -416,7 +367,7 @@ class OnlineSmoother:
 
         None before the start, and for a stamp farther ahead of the IMU than its silence is bridged.
         """
-        lag, newest = self._lag, self._newest_imu
+        lag, newest = self._lag, self._intake.newest
         if lag is None or newest is None:
             return None
         at_ns = newest.stamp_ns if stamp_ns is None else stamp_ns
@@ -432,7 +383,7 @@ class OnlineSmoother:
         p_odom, R_odom = odometry.p_m, odometry.R
         pose_cov, v_cov = newest.pose_cov, newest.velocity_cov
         if stamp_ns is not None and stamp_ns > at_ns:
-            assert self._newest_imu is not None
+            assert self._intake.newest is not None
             self._read(lag)
             pim = links.integrate(at_ns, stamp_ns, newest.bias)
             there = pim.predict(gtsam.NavState(pose, v), newest.bias)
@@ -444,11 +395,11 @@ class OnlineSmoother:
             pose_cov[3:, 3:] += dt_s**2 * R.T @ v_cov @ R + noise[3:6, 3:6]
             pose_cov[:3, :3] += noise[:3, :3]
             v_cov = v_cov + noise[6:, 6:]
-            blind_s = (stamp_ns - self._newest_imu.stamp_ns) * 1e-9
+            blind_s = (stamp_ns - self._intake.newest.stamp_ns) * 1e-9
             if blind_s > self._gap_s:
-                pose_cov[:3, :3] += _UNKNOWN_RADPS**2 * blind_s * np.eye(3)
-                pose_cov[3:, 3:] += _UNKNOWN_MPS2**2 * blind_s**3 / 3.0 * np.eye(3)
-                v_cov = v_cov + _UNKNOWN_MPS2**2 * blind_s * np.eye(3)
+                pose_cov[:3, :3] += UNKNOWN_RADPS**2 * blind_s * np.eye(3)
+                pose_cov[3:, 3:] += UNKNOWN_MPS2**2 * blind_s**3 / 3.0 * np.eye(3)
+                v_cov = v_cov + UNKNOWN_MPS2**2 * blind_s * np.eye(3)
             pose, v, at_ns = there.pose(), np.asarray(there.velocity()), stamp_ns
         lever = -lag.problem.t_body_imu_m
         R = pose.rotation().matrix()
@@ -501,7 +452,7 @@ class OnlineSmoother:
         self._waiting = why
         self._buffer.clear()
         self._pending, self._unread, self._holes, self._recent, self._settled = [], [], [], [], set()
-        self._imu_stamps = []
+        self._intake.restart([])
         self._own_due_ns: dict[str, int] = {}
         self._tried_ns = 0
         self._anchors.clear()
@@ -520,7 +471,7 @@ class OnlineSmoother:
         self._wait("the next IMU sample")
 
     def _try_to_start(self) -> Estimate | None:
-        newest = self._newest_imu
+        newest = self._intake.newest
         assert newest is not None
         if self._resumable is not None:
             self._resume(newest)
@@ -532,7 +483,7 @@ class OnlineSmoother:
             return None
         self._tried_ns = newest.stamp_ns
         samples = sorted((m for m in self._buffer if isinstance(m, ImuSample)), key=lambda m: m.stamp_ns)
-        self._imu_stamps = [m.stamp_ns for m in samples]
+        self._intake.restart([m.stamp_ns for m in samples])
         others = [m for m in self._buffer if not isinstance(m, ImuSample) and m.stamp_ns <= newest.stamp_ns]
         try:
             started = try_start(
@@ -597,6 +548,7 @@ class OnlineSmoother:
         if self._lag is not None:
             for name, stream in self._lag.problem.streams.items():
                 problem.streams[name].scatter.extend(stream.scatter)
+                problem.streams[name].spread = stream.spread
         self._lag = Lag(problem, anchor, self._lag_s, guess)
         self._lag.agreed_ns.update(agreed)
         self._own_due_ns = {}
@@ -622,7 +574,7 @@ class OnlineSmoother:
                 self._before = m
         self._recent = kept
         self._settled &= {m.seq for m in kept}
-        del self._imu_stamps[: bisect_left(self._imu_stamps, lag.first_ns)]
+        self._intake.forget(lag.first_ns)
         if self._snapshot is not None and at_ns - self._snapshot_ns >= _SNAPSHOT_S * 1e9:
             self._snapshot_ns = at_ns
             self._write_snapshot(self._snapshot)
@@ -670,8 +622,8 @@ class OnlineSmoother:
 
     def _start_over(self, lag: Lag) -> Estimate | None:
         """Start anew, with the last seconds: what measures place agrees with itself or not, but not with the estimate."""
-        assert self._newest_imu is not None
-        since_ns = self._newest_imu.stamp_ns - duration_ns(_AGAIN_S)
+        assert self._intake.newest is not None
+        since_ns = self._intake.newest.stamp_ns - duration_ns(_AGAIN_S)
         self._settle(lag.gone())
         again = [m for m in self._recent if m.stamp_ns >= since_ns and m.seq not in self._settled]
         self._close(lag, {m.seq for m in again})
@@ -705,7 +657,7 @@ class OnlineSmoother:
         last = max(
             (m for m in [self._before, *self._recent] if isinstance(m, ImuSample) and m.stamp_ns <= anchor.stamp_ns),
             key=lambda m: m.stamp_ns,
-            default=self._newest_imu,
+            default=self._intake.newest,
         )
         assert last is not None
         snapshot = Snapshot(

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from graphloc import keys, origin
-from graphloc.build import make_problem
+from graphloc.build import company_of, make_problem, mount_of
 from graphloc.config import VesselConfig
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
@@ -58,11 +58,6 @@ class Started:
     notes: tuple[str, ...]
 
 
-def company_of(config: VesselConfig, rows: Sequence[Sensor]) -> int:
-    """Return how many sensors of a configuration can tell each other's slow errors from motion."""
-    return sum(len(config.of_kind(row.kind)) for row in rows if row.company)
-
-
 def try_start(
     config: VesselConfig,
     rows: Sequence[Sensor],
@@ -103,7 +98,7 @@ def _missing(config: VesselConfig, rows: Sequence[Sensor], recording: Recording,
     hints: list[Hint] = []
     for m in recording.measurements:
         sensor = config.sensors[m.sensor]
-        R = recording.mounts[m.sensor][1] if m.sensor in recording.mounts else sensor.mount.R_body_sensor
+        R = mount_of(m.sensor, sensor, recording.mounts)[1]
         hints.append(by_kind[sensor.kind].hint(m, float(np.arctan2(R[1, 0], R[0, 0])), datum))
     places = [h for h in hints if np.isfinite(h.p_world_m[:2]).all()]
     if not places:

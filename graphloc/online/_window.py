@@ -40,6 +40,7 @@ class Window:
 
     def __init__(self, lag_s: float) -> None:
         params = gtsam.ISAM2Params()
+        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         params.setFactorization("QR")  # Cholesky gives up on slow biases
         params.findUnusedFactorSlots = True  # else slots grow without end
         params.relinearizeSkip = _FREE_EVERY
@@ -108,8 +109,10 @@ class Window:
             raise SolveError(f"the solver failed: {' '.join(str(error).split())[:200]}") from error
         for held in self._added:
             held.slots, slots = slots[: held.count], slots[held.count :]
+        self._alive |= self._stamps
         self._clear()
-        self._alive = self._smoother.timestamps()
+        if min(self._alive.values(), default=0.0) < max(self._alive.values(), default=0.0) - self.lag_s:
+            self._alive = self._smoother.timestamps()  # some have left; asked for each time it is a tenth of an update
 
     def settle(self, steps: int = 1) -> None:
         """Relinearise at once, with what is staged or nothing new, `steps` times."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -13,9 +14,11 @@ from graphloc.build import make_problem
 from graphloc.config import VesselConfig
 from graphloc.frames import Datum
 from graphloc.graph import InertialRow, Sensor
+from graphloc.offsets import Probe
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
-from graphloc.solve._batch import solve_batch
+from graphloc.solve._batch import BatchResult, solve_batch
+from graphloc.solve._offsets import offsets_of
 from graphloc.solve._parts import solve_parts
 from graphloc.solve._solution import make_solution
 
@@ -32,6 +35,7 @@ def smooth(
     *,
     rows: Sequence[Sensor],
     inertial: InertialRow,
+    probe: Probe | None = None,
     progress: Progress = quiet,
 ) -> Solution:
     """Smooth a whole run offline.
@@ -39,6 +43,7 @@ def smooth(
     Args:
         recording: what was measured. config: the vessel. datum: origin of world.
         rows, inertial: the table of sensors (`graphloc.factors`).
+        probe: offsets of sensors to look at (`Solution.offsets`); by default none.
         progress: called with stage, done, total; an exception raised in it cancels cleanly.
 
     Raises:
@@ -47,11 +52,22 @@ def smooth(
 
     def solve(part: Recording) -> Solution:
         problem = make_problem(part, config, datum, rows, inertial)
-        return make_solution(problem, part, solve_batch(problem, progress))
+        result = solve_batch(problem, progress)
+        solution = make_solution(problem, part, result)
+        return solution if probe is None else _with_offsets(solution, result, probe)
 
     imu = config.of_kind(inertial.kind).values()
     bridge_s = min((sensor.max_bridge_s for sensor in imu), default=np.inf)
     return _on_deep_stack(lambda: solve_parts(recording, bridge_s, solve))
+
+
+def _with_offsets(solution: Solution, result: BatchResult, probe: Probe) -> Solution:
+    """The solution, with what it says of its sensors' offsets: an aid, so where that fails the solution stands."""
+    try:
+        return replace(solution, offsets=offsets_of(result, probe))
+    except (RuntimeError, np.linalg.LinAlgError, MemoryError) as error:
+        said = f"the calibration could not be examined: {' '.join(str(error).split())[:100]}"
+        return replace(solution, stats=replace(solution.stats, warnings=(*solution.stats.warnings, said)))
 
 
 def _on_deep_stack(work: Callable[[], _T]) -> _T:

@@ -233,7 +233,7 @@ def _swell(t: Array, w: Array) -> Array:
     their mean may be off, less only where the stretch is longer than waves are.
     """
     block = np.floor((t - t[0]) / _BLOCK_S).astype(np.int64)
-    starts = np.searchsorted(block, np.arange(block[-1] + 1))
+    starts = np.flatnonzero(np.diff(block, prepend=-1))  # a gap may leave blocks empty
     means = np.add.reduceat(w, starts) / np.diff(np.append(starts, len(w)))[:, None]
     return np.asarray(means.std(axis=0) * min(1.0, float(np.sqrt(_SWELL_S / max(t[-1] - t[0], 1e-3)))))
 

@@ -35,8 +35,9 @@ CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchResult:
-    """The solved graph, before it is turned into a `Solution`."""
+    """The solved graph, before it is turned into a `Solution`; `problem` has the IMU noise that it was solved with."""
 
+    problem: Problem
     values: gtsam.Values
     verdicts: Verdicts
     tree: Any
@@ -71,6 +72,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         if ratio < CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
     return BatchResult(
+        problem=problem,
         values=estimate,
         verdicts=settled.verdicts,
         tree=settled.tree,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from graphloc.berths import BerthTrack
 from graphloc.errors import SolveError
 from graphloc.ledger import Ledger, LedgerRow, Outcome
+from graphloc.offsets import joined
 from graphloc.recording import Recording
 from graphloc.solution import SlowEstimate, Solution, SolveStats
 from graphloc.time import utc_text
@@ -121,6 +122,7 @@ def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Se
         berths=tuple(_join_berths([b for s in solutions for b in s.berths])),
         ledger=Ledger([*rows, *(row for s in solutions for row in s.ledger)]),
         stats=_join_stats([s.stats for s in solutions], warnings),
+        offsets=joined(offsets) if (offsets := [s.offsets for s in solutions if s.offsets is not None]) else None,
     )
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from graphloc import keys
 from graphloc.berths import Berth, BerthTrack, rates, seen_from
@@ -21,14 +20,13 @@ from graphloc.recording import Recording
 from graphloc.solution import Health, SlowEstimate, Solution, SolveStats
 from graphloc.solve._batch import BatchResult, expected_cost
 from graphloc.solve._decide import Verdict
-from graphloc.trajectory import Trajectory
+from graphloc.trajectory import Trajectory, bounds_95
 
 AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
 _FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-weighted
 # Health: DNV asks for 2.5 m at 95 % in port (Digerud); beyond 25 m a pose helps nobody there.
-_GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_RAD = 2.5, 25.0, np.radians(45.0)
+_GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_DEG = 2.5, 25.0, 45.0
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
-_CHI2_95 = float(chi2.ppf(0.95, 2))
 _FAR_OFF = 3.0
 _NEAR_BERTH_M = 60.0
 NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
@@ -221,11 +219,10 @@ def health_of(cov: Array, away_s: Mapping[str, float], misfit: str = "") -> tupl
         cov: (6, 6) as in `Trajectory`. away_s: s to where each absolute sensor agrees.
         misfit: what speaks against all of the run.
     """
-    bound_m = float(np.sqrt(_CHI2_95 * np.linalg.eigvalsh(cov[:2, :2])[-1]))
-    heading = 1.96 * float(np.sqrt(cov[5, 5]))
+    bound_m, _, heading_deg = (float(v) for v in bounds_95(cov[None])[0])
     silent = [name for name, s in away_s.items() if s > _SILENT_S]
-    if bound_m > _LOST_BOUND_M or heading > _LOST_HEADING_RAD:
-        return Health.LOST, f"95 % bound {bound_m:.0f} m, heading {np.degrees(heading):.0f} deg"
+    if bound_m > _LOST_BOUND_M or heading_deg > _LOST_HEADING_DEG:
+        return Health.LOST, f"95 % bound {bound_m:.0f} m, heading {heading_deg:.0f} deg"
     if min(away_s.values(), default=np.inf) > _DEAD_RECKONING_S:
         return Health.DEAD_RECKONING, "no absolute position agrees"
     if bound_m > _GOOD_BOUND_M:

@@ -29,7 +29,9 @@ def linear_update(residual: Residual, terms: Sequence[tuple[int, Any, Array]], d
     """
     kernel = decision.kernel or KernelConfig(kind="none")
     weight = decision.weight * max(kernel.weight(residual.nis()), 1e-6)
-    whiten = np.linalg.inv(np.linalg.cholesky(residual.cov / weight))
+    cov = residual.cov / weight
+    # Most residuals here are of one row (headings, heights), and at every pass: two calls into LAPACK for a root show.
+    whiten = 1.0 / np.sqrt(cov) if len(cov) == 1 else np.linalg.inv(np.linalg.cholesky(cov))
     point = gtsam.Values()
     arguments: list[Any] = []
     for key, value, jacobian in terms:

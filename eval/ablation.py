@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each sensor bought: the run without it, measured, and whether it contradicts the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.eval.consistency import Contradiction
+from graphloc.eval.metrics import Levers, errors, held_out_errors
+from graphloc.frames import Array, wrap_angle
+from graphloc.measurements import GnssPosition
+from graphloc.solution import Solution
+from graphloc.trajectory import Trajectory, bounds_95
+
+CONTRADICTS = 2.0  # sigmas between a sensor and the rest from which on it is said
+
+Basis = str
+"""'truth', 'held' (fixes kept out) or 'full' (the solution with all sensors)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Off:
+    """Distances from the basis over time: stamps (N,), horizontal m, heading deg or None."""
+
+    stamps_ns: NDArray[np.int64]
+    off_m: Array
+    off_deg: Array | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effect:
+    """A run, with all sensors (`without` is '') or without one.
+
+    Attributes:
+        measurements: of the sensor. rmse_m, worst_m, heading_rmse_deg: against the basis. worst_at_s: since the run's begin.
+        bound_m, bound_deg: the solution's own 95 % bounds, median. missing: share of the full track that it lacks.
+        cost_ratio: cost over its expectation. contradiction: of the sensor with this solution, in sigmas
+            (`graphloc.eval.consistency`).
+        fits: of each other sensor, how far what is used of it is from this solution, in its own sigmas.
+        why_not: why there is no run without it.
+    """
+
+    without: str
+    measurements: int
+    rmse_m: float | None = None
+    worst_m: float | None = None
+    worst_at_s: float | None = None
+    heading_rmse_deg: float | None = None
+    bound_m: float | None = None
+    bound_deg: float | None = None
+    missing: float | None = None
+    cost_ratio: float | None = None
+    contradiction: float | None = None
+    apart_m: float | None = None
+    apart_deg: float | None = None
+    fits: Mapping[str, float | None]
+    why_not: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vote:
+    """Two sensors that contradict the rest, and how far each is from what is left without both, in sigmas."""
+
+    one: str
+    other: str
+    one_off: float | None
+    other_off: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ablated:
+    """What an ablation gives: the run with all sensors, without each, over time, and what the rest says of suspects.
+
+    Attributes:
+        basis: what distances are from. matched: sensors whose measurements were made around the run with all.
+    """
+
+    source: str
+    vessel: str
+    basis: Basis
+    full: Effect
+    effects: tuple[Effect, ...]
+    over_time: Mapping[str, Off]
+    votes: tuple[Vote, ...] = ()
+    matched: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def off(solution: Solution, full: Solution, truth: Trajectory | None, held: Sequence[GnssPosition], levers: Levers) -> Off:  # fmt: skip
+    """Compare a solution with truth, else with fixes that were held out, else with the solution with all sensors.
+
+    Raises:
+        NoCommonTimeError: they share no time.
+    """
+    if truth is None and held:
+        stamps, error, _ = held_out_errors(solution.trajectory, held, solution.datum, levers)
+        return Off(stamps_ns=stamps, off_m=np.hypot(error[:, 0], error[:, 1]), off_deg=None)
+    stamps, error, heading, _, _ = errors(solution.trajectory, truth or full.trajectory)
+    return Off(
+        stamps_ns=stamps,
+        off_m=np.hypot(error[:, 0], error[:, 1]),
+        off_deg=np.degrees(np.abs(wrap_angle(heading))),
+    )
+
+
+def effect(
+    without: str, measurements: int, solution: Solution, full: Solution, away: Off,
+    contradicts: Contradiction | None, fits: Mapping[str, float | None],
+) -> Effect:  # fmt: skip
+    """Return what a solution is like."""
+    track, stats = solution.trajectory, solution.stats
+    assert track.cov is not None
+    bounds, worst = np.median(bounds_95(track.cov), axis=0), int(np.argmax(away.off_m))
+    return Effect(
+        without=without,
+        measurements=measurements,
+        rmse_m=float(np.sqrt(np.mean(away.off_m**2))),
+        worst_m=float(away.off_m[worst]),
+        worst_at_s=float((away.stamps_ns[worst] - full.trajectory.stamps_ns[0]) * 1e-9),
+        heading_rmse_deg=None if away.off_deg is None else float(np.sqrt(np.mean(away.off_deg**2))),
+        bound_m=float(bounds[0]),
+        bound_deg=float(bounds[2]),
+        missing=1.0 - float(track.covers(full.trajectory.stamps_ns).mean()),
+        cost_ratio=stats.cost / max(stats.expected_cost, 1.0),
+        contradiction=None if contradicts is None else contradicts.sigmas,
+        apart_m=None if contradicts is None else contradicts.apart_m,
+        apart_deg=None if contradicts is None else contradicts.apart_deg,
+        fits=fits,
+    )
+
+
+def suspects(effects: Sequence[Effect]) -> list[str]:
+    """Return the sensors that contradict what is left without them, most first."""
+    found = [(e.contradiction, e.without) for e in effects if (e.contradiction or 0.0) > CONTRADICTS]
+    return [name for _, name in sorted(found, key=lambda pair: -(pair[0] or 0.0))]

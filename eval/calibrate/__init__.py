@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration aids: levers, stamps, mounts and IMU noise that a run contradicts. Suggested, never applied."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphloc.build import mount_of
+from graphloc.config import VesselConfig
+from graphloc.eval.calibrate._evidence import Estimate, Evidence, Name
+from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
+from graphloc.eval.calibrate._imu import imu_noise
+from graphloc.frames import rpy_from_rotation
+from graphloc.offsets import Offset, Probe
+from graphloc.recording import Recording
+from graphloc.solution import Solution
+
+__all__ = ["PROBE", "Calibration", "Check", "Suggestion", "calibrate"]
+
+PROBE: Probe = {
+    "gnss": ("x", "y", "time"),
+    "gnss_velocity": ("time",),
+    "compass": ("yaw", "time"),
+    "pose": ("yaw", "time"),
+    "aerial": ("time",),
+}
+"""What is looked at, by kind of sensor, those first that are wrong most often; heights, and the lever of a velocity, show
+too little."""
+
+_AXIS: dict[Offset, int] = {"x": 0, "y": 1}
+_UNIT: dict[Offset, tuple[str, float]] = {
+    "x": ("m", 1.0),
+    "y": ("m", 1.0),
+    "yaw": ("deg", 180.0 / np.pi),
+    "time": ("s", 1.0),
+}
+# A sigma from which the run says nothing of use, and what would help.
+_USEFUL: dict[Offset, float] = {"x": 0.15, "y": 0.15, "yaw": float(np.radians(1.0)), "time": 0.05}
+_WOULD_TELL: dict[Offset, str] = {
+    "x": "turns by 90 degrees and more, within a minute or so, would",
+    "y": "turns by 90 degrees and more, within a minute or so, would",
+    "yaw": "a longer run with fixes or matches, at changing speed, would",
+    "time": "turns, and speeding up and down, would",
+}
+_MEANS: dict[Offset, str] = {
+    "x": "its measurements fit the run better from there, whatever the heading",
+    "y": "its measurements fit the run better from there, whatever the heading",
+    "yaw": "its headings are turned against those that the other sensors give",
+    "time": "its measurements fit the motion better when read at another time",
+}
+
+
+def calibrate(recording: Recording, config: VesselConfig, solution: Solution) -> Calibration:
+    """Say what a smoothed run contradicts of its configuration (docs/calibration.md).
+
+    Args:
+        recording, config: as they were smoothed. solution: with `offsets`, as `PROBE` asks for; without, only the IMU's
+            samples are judged.
+    """
+    suggestions, checks = [], []
+    if solution.offsets is not None and len(solution.offsets.names):
+        kinds = list(PROBE)
+        evidence = Evidence(solution.offsets, lambda name: kinds.index(config.sensors[name[0]].kind))
+        wrong = evidence.wrong()
+        estimates = evidence.estimates(wrong)
+        for name in wrong:
+            others = evidence.alternatives(name, wrong)
+            suggestions.append(_suggestion(name, estimates[name], others, recording, config))
+        for name in evidence.names:
+            if name not in wrong:
+                found = evidence.estimates((*wrong, name))[name]
+                checks.append(_check(name, found, recording, config))
+    if recording.imu is not None and recording.imu.sensor in config.sensors:
+        for said in imu_noise(recording.imu, config.sensors[recording.imu.sensor], solution.offsets):
+            (suggestions if isinstance(said, Suggestion) else checks).append(said)  # type: ignore[arg-type]
+    return Calibration(suggestions=tuple(suggestions), checks=tuple(checks))
+
+
+def _configured(name: Name, recording: Recording, config: VesselConfig) -> tuple[str, float]:
+    """Return the key in vessel.yaml and the value there, in the key's unit."""
+    sensor, what = name
+    block = config.sensors[sensor]
+    if what == "time":
+        return f"sensors.{sensor}.time_offset_s", float(block.time_offset_s)
+    t, R = mount_of(sensor, block, recording.mounts)
+    if what == "yaw":
+        return f"sensors.{sensor}.mount.rpy_deg[2]", float(np.degrees(rpy_from_rotation(R))[2])
+    return f"sensors.{sensor}.mount.xyz_m[{_AXIS[what]}]", float(t[_AXIS[what]])
+
+
+def _suggestion(
+    name: Name, found: Estimate, others: dict[Name, Estimate], recording: Recording, config: VesselConfig
+) -> Suggestion:
+    key, configured = _configured(name, recording, config)
+    unit, factor = _UNIT[name[1]]
+    action = "measure it, then set it"
+    if name[1] != "time" and name[0] in recording.mounts:
+        action = (
+            "measure it; its mount comes from /tf_static: correct it there, or set xyz_m and rpy_deg without tf_frame"
+        )
+    if others:
+        either = "; or ".join(_instead(n, e, recording, config) for n, e in others.items())
+        action += f"; this run cannot tell it from {either}"
+    return Suggestion(
+        sensor=name[0], key=key, unit=unit, configured=configured, suggested=configured + factor * found.value,
+        sigma=factor * found.sigma, z=found.z, evidence=_MEANS[name[1]], action=action,
+    )  # fmt: skip
+
+
+def _instead(name: Name, found: Estimate, recording: Recording, config: VesselConfig) -> str:
+    key, configured = _configured(name, recording, config)
+    unit, factor = _UNIT[name[1]]
+    return f"{key} {configured + factor * found.value:.3g} {unit}"
+
+
+def _check(name: Name, found: Estimate, recording: Recording, config: VesselConfig) -> Check:
+    key, configured = _configured(name, recording, config)
+    unit, factor = _UNIT[name[1]]
+    if found.sigma > _USEFUL[name[1]]:
+        said = f"this run cannot tell (1 sigma {factor * found.sigma:.2g} {unit}); {_WOULD_TELL[name[1]]}"
+    else:
+        said = f"fits, within {1.96 * factor * found.sigma:.2g} {unit} (95 %)"
+    return Check(
+        key=key, unit=unit, configured=configured, change=factor * found.value, sigma=factor * found.sigma, said=said
+    )

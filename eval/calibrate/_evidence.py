@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From how the cost of a run changes with its offsets to those that must be wrong.
+
+With H, g of all blocks, those offsets F that are free come out as theta = H_FF^-1 g_F, with covariance H_FF^-1 if the
+noise is as configured. Whether it is, is seen from block to block: the jackknife leaves each block of ten seconds out in
+turn. The larger of the two sigmas counts. GNSS errors that wander for minutes are in H already, as slow states.
+
+Offsets are freed one by one, the clearest first, each with those before it: two that do the same to the run (a lever
+forward and a late stamp, at a steady speed) are never both believed, and each is named as the other's alternative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphloc.frames import Array
+from graphloc.offsets import Offset, Offsets
+
+Name = tuple[str, Offset]
+
+_BLOCK_S = 10.0
+CLEAR = 4.0  # sigmas from which an offset is believed to be wrong: some ten are looked at in each run
+LEAST: dict[Offset, float] = {"x": 0.05, "y": 0.05, "yaw": float(np.radians(0.5)), "time": 0.01}
+_AS_WELL, _EXPLAINS = 0.95, 0.8  # shares of the drop of the cost from which another offset explains the run, too
+_UNSEEN = 1e-9  # a curvature below this is rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """An offset: m, rad or s, its 1 sigma, and how much the cost drops if it is free."""
+
+    value: float
+    sigma: float
+    drop: float
+
+    @property
+    def z(self) -> float:
+        """How many sigmas it is from zero."""
+        return self.value / self.sigma
+
+
+class Evidence:
+    """The sums of a run, in blocks long enough to be nearly independent.
+
+    Args:
+        order: sorts the offsets, those that are wrong most often first; by default as they come.
+    """
+
+    def __init__(self, offsets: Offsets, order: Callable[[Name], int] = lambda _name: 0) -> None:
+        merge = max(1, round(_BLOCK_S / offsets.block_s))
+        starts = np.arange(0, len(offsets.gradient), merge)
+        self._g = np.add.reduceat(offsets.gradient, starts, axis=0)
+        self._H = np.add.reduceat(offsets.curvature, starts, axis=0)
+        seen = np.diagonal(self._H.sum(axis=0)) > _UNSEEN
+        self._all = {name: k for k, name in enumerate(offsets.names)}
+        found = (name for name, s in zip(offsets.names, seen, strict=True) if s)
+        self.names = tuple(sorted(found, key=order))
+
+    def estimates(self, free: tuple[Name, ...]) -> dict[Name, Estimate]:
+        """Return the free offsets, all others as configured."""
+        if not free:
+            return {}
+        own = [self._all[name] for name in free]
+        g, H = self._g[:, own], self._H[:, own][:, :, own]
+        total = H.sum(axis=0)
+        theta = np.linalg.solve(total, g.sum(axis=0))
+        cov = np.linalg.inv(total)
+        sigma = np.sqrt(np.maximum(np.diagonal(cov), _jackknife(g, H)))
+        # What the cost drops by if this one is free, too: theta^2 / its own variance.
+        return {
+            name: Estimate(float(v), float(s), float(v**2 / c))
+            for name, v, s, c in zip(free, theta, sigma, np.diagonal(cov), strict=True)
+        }
+
+    def wrong(self) -> tuple[Name, ...]:
+        """Return the offsets that must be wrong, clearest first."""
+        free: tuple[Name, ...] = ()
+        while len(free) < len(self.names):
+            tried = {name: self.estimates((*free, name)) for name in self.names if name not in free}
+            clear = {n: e[n] for n, e in tried.items() if self._stands(n, e[n]) and _solvable(e)}
+            if not clear:
+                break
+            most = clear[max(clear, key=lambda n: abs(clear[n].z))].drop
+            # Of those that explain the run as well, the likeliest to be wrong.
+            free = (*free, next(name for name in self.names if name in clear and clear[name].drop > _AS_WELL * most))
+        found = self.estimates(free)
+        return tuple(name for name in free if self._stands(name, found[name]))
+
+    def alternatives(self, name: Name, free: tuple[Name, ...]) -> dict[Name, Estimate]:
+        """Return what explains the run about as well as `name`, the others of `free` being free."""
+        rest = tuple(n for n in free if n != name)
+        drop = self.estimates((*rest, name))[name].drop
+        tried = {n: self.estimates((*rest, n))[n] for n in self.names if n not in free}
+        return {n: e for n, e in tried.items() if e.drop > _EXPLAINS * drop}
+
+    @staticmethod
+    def _stands(name: Name, e: Estimate) -> bool:
+        return abs(e.z) > CLEAR and abs(e.value) > LEAST[name[1]]
+
+
+def _solvable(found: dict[Name, Estimate]) -> bool:
+    return all(np.isfinite([e.value, e.sigma]).all() and e.sigma > 0.0 for e in found.values())
+
+
+def _jackknife(g: Array, H: Array) -> Array:
+    """Return variances (k,) of the solution by leaving out each block in turn; zero where a block holds all there is."""
+    n, total, whole = len(g), H.sum(axis=0), g.sum(axis=0)
+    if n < 3:
+        return np.zeros(g.shape[1])
+    left = total - H
+    strong = np.linalg.eigvalsh(left)[:, 0] > 1e-6 * np.linalg.eigvalsh(total)[0]
+    if not strong.all():
+        return np.full(g.shape[1], np.inf)
+    theta = np.linalg.solve(left, (whole - g)[:, :, None])[:, :, 0]
+    return np.asarray((n - 1) / n * ((theta - theta.mean(axis=0)) ** 2).sum(axis=0))

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What calibration aids hand over: values, never changes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from graphloc.eval.metrics import Table
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Suggestion:
+    """A setting that the run contradicts.
+
+    Attributes:
+        sensor: its name. key: where the setting stands in vessel.yaml; unit: of the numbers.
+        configured, suggested: the value now, and the one that fits the run best.
+        sigma: of `suggested`, 1 sigma. z: how many of these the two are apart.
+        evidence: why, in one sentence. action: what to do.
+    """
+
+    sensor: str
+    key: str
+    unit: str
+    configured: float
+    suggested: float
+    sigma: float
+    z: float
+    evidence: str
+    action: str
+
+    def __str__(self) -> str:
+        return (
+            f"{self.key}: {_number(self.suggested)} +- {_number(self.sigma)} {self.unit} instead of "
+            f"{_number(self.configured)}: {self.evidence}; {self.action}"
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """A setting that was looked at.
+
+    Attributes:
+        key, unit, configured: as in `Suggestion`. change, sigma: what the run would add to it, and how sure it is of that.
+        said: what that means, or which manoeuvre would tell.
+    """
+
+    key: str
+    unit: str
+    configured: float
+    change: float
+    sigma: float
+    said: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """What a run says about its own configuration."""
+
+    suggestions: tuple[Suggestion, ...] = ()
+    checks: tuple[Check, ...] = ()
+
+    def table(self) -> Table:
+        """Return all settings that were looked at, with what the run would add to each."""
+        rows = tuple((f"{c.key}, {c.unit}", (c.configured, c.change, c.sigma)) for c in self.checks)
+        note = "change: what the run would add, were this alone wrong; sigma: its 1 sigma. Nothing of it was applied."
+        return Table("Calibration", ("configured", "change", "sigma"), rows, note)
+
+    def lines(self) -> tuple[str, ...]:
+        """Return what to do, and what this run could not tell, a line each."""
+        return (*(str(s) for s in self.suggestions), *(f"{c.key}: {c.said}" for c in self.checks))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data for `calibration.json`."""
+        return {
+            "suggestions": [asdict(s) for s in self.suggestions],
+            "checks": [asdict(c) for c in self.checks],
+            "note": "nothing of this was applied",
+        }
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if abs(value) >= 1000.0 else f"{value:.3g}"

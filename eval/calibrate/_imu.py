@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The IMU's noise: what its samples scatter by, and whether the run needs as much as is configured.
+
+Samples tell the white noise, engine and hull included: third differences take motion out, and those of white noise have
+20 times its variance. A configured noise below that is too small, whatever else holds. A configured noise above it may
+be meant (what shakes slowly does not scatter from sample to sample), so it is called too large only where the solved run
+leaves less misfit at the IMU than so much noise would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
+from graphloc.eval.calibrate._findings import Check, Suggestion
+from graphloc.frames import Array
+from graphloc.measurements import ImuSeries
+from graphloc.offsets import Misfit, Offsets
+
+_BLOCK = 1000  # samples
+_TOO_SMALL, _TOO_LARGE = 1.5, 0.5  # scatter by configured noise
+_LESS = 0.7  # of the configured noise: what the run needs, from which that is too large
+_UG, _MDPS = 1e-6 * STANDARD_GRAVITY_MPS2, float(np.radians(1e-3))
+
+
+def density(stamps_ns: NDArray[np.int64], columns: Array) -> tuple[float, float]:
+    """Return the white-noise density of the worst axis, and its sigma from how it varies along the run.
+
+    Args:
+        stamps_ns: (N,). columns: (N, 3) in some unit; the density is in that per sqrt(Hz).
+    """
+    root_dt = float(np.sqrt(np.median(np.diff(stamps_ns)) * 1e-9))
+    step = np.abs(np.diff(columns, n=3, axis=0))
+    blocks = np.array_split(step, max(len(step) // _BLOCK, 2))
+    scatter = np.array([1.4826 * np.median(b, axis=0) for b in blocks]) / np.sqrt(20.0) * root_dt
+    axis = int(np.argmax(np.median(scatter, axis=0)))
+    found = float(np.median(scatter[:, axis]))
+    spread = 1.4826 * float(np.median(np.abs(scatter[:, axis] - found)))
+    steps = np.diff(np.unique(columns[:, axis]))
+    floor = float(steps.min()) / np.sqrt(12.0) * root_dt if len(steps) else 0.0  # what rounding alone scatters
+    return max(found, floor), max(1.25 * spread / float(np.sqrt(len(blocks))), 0.02 * found)
+
+
+def imu_noise(imu: ImuSeries, config: ImuConfig, offsets: Offsets | None) -> Iterator[Suggestion | Check]:
+    """Yield what is to be said of both noises: a suggestion, or a check."""
+    samples = (
+        (
+            "accel_noise_ug_per_sqrt_hz",
+            "ug/sqrt(Hz)",
+            imu.accel_mps2 / _UG,
+            None if offsets is None else offsets.accelerometer,
+        ),
+        (
+            "gyro_noise_mdps_per_sqrt_hz",
+            "mdeg/s/sqrt(Hz)",
+            imu.gyro_radps / _MDPS,
+            None if offsets is None else offsets.gyroscope,
+        ),
+    )
+    if len(imu) < 2 * _BLOCK:
+        return
+    scale = 1.0 if offsets is None else offsets.noise_scale
+    for key, unit, columns, misfit in samples:
+        yield _judge(imu.sensor, key, unit, float(getattr(config, key)), density(imu.stamps_ns, columns), misfit, scale)
+
+
+def _judge(
+    sensor: str,
+    key: str,
+    unit: str,
+    configured: float,
+    measured: tuple[float, float],
+    misfit: Misfit | None,
+    scale: float,
+) -> Suggestion | Check:
+    scatter, sigma = measured
+    path, z = f"sensors.{sensor}.{key}", (scatter - configured) / max(sigma, 1e-9)
+    if scatter > _TOO_SMALL * configured:
+        return Suggestion(
+            sensor=sensor, key=path, unit=unit, configured=configured, suggested=scatter, sigma=sigma, z=z,
+            evidence="its samples scatter by that from one to the next, engine and hull included",
+            action="set it at least as large",
+        )  # fmt: skip
+    if scatter < _TOO_LARGE * configured and misfit is not None and scale == 1.0 and misfit.needed < _LESS:
+        needed, unsure = configured * misfit.needed, configured * misfit.sigma
+        value, off = (needed, unsure) if needed - scatter > 2.0 * unsure else (scatter, sigma)
+        return Suggestion(
+            sensor=sensor, key=path, unit=unit, configured=configured, suggested=value, sigma=off, z=(value - configured) / off,
+            evidence=f"its samples scatter by {scatter:.3g}, and the run leaves a misfit of {misfit.squares:.0f} where so "
+            f"much noise would leave {misfit.freedom:.0f}",
+            action="set it, no smaller",
+        )  # fmt: skip
+    said = f"its samples scatter by {scatter:.3g} +- {sigma:.2g} {unit}, engine and hull included"
+    if scatter < _TOO_LARGE * configured:
+        said += "; whether the larger noise is needed, a longer run with better fixes would tell"
+    return Check(key=path, unit=unit, configured=configured, change=scatter - configured, sigma=sigma, said=said)

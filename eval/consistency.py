@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Does a sensor agree with a solution that has not seen it?
+
+Of each measurement z, in the solution without its sensor:  r = h(x) - z,  S = R + J P J^T + K Q K^T, with R what it claims
+of itself, P the solution's covariance of the pose, and Q the standing size of the sensor's own slow error (K: d r / d slow).
+r^T S^-1 r is a chi-square of dim r where both are honest about themselves. The measure is
+
+    contradiction = sqrt(median of r^T S^-1 r / median of that chi-square)
+
+in sigmas: 1 where all is well, below 1 where slow errors are smaller than they might be. A median is not moved by the false
+ones; where a sensor owns to a share f of these, the quantile 0.5 (1 - f) stands in: the median of the others.
+Successive residuals share their errors, so no significance is claimed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from scipy.stats import chi2
+
+from graphloc.build import mount_of
+from graphloc.config import VesselConfig
+from graphloc.frames import Array
+from graphloc.graph import Attachment, Residual, Sensor
+from graphloc.ledger import Outcome
+from graphloc.measurements import GnssVelocity, Measurement
+from graphloc.recording import Recording
+from graphloc.solution import Solution
+
+_MOST = 400  # measurements that are looked at
+_STEP = 1e-4  # of slow states, for their Jacobian
+_FEWEST = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _There:
+    """What a solution knows at one stamp."""
+
+    T_world_body: gtsam.Pose3
+    P_tangent: Array  # (6, 6) of the pose, gtsam's body tangent
+    v_world_mps: Array
+    v_cov: Array
+    gyro_radps: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contradiction:
+    """How far a sensor is from a solution without it: in sigmas, and the median in m and deg, where it measures such."""
+
+    sigmas: float
+    apart_m: float | None
+    apart_deg: float | None
+
+
+def contradiction(
+    solution: Solution, recording: Recording, config: VesselConfig, name: str, rows: Sequence[Sensor]
+) -> Contradiction | None:
+    """Return how far a sensor's measurements are from a solution without it; None: too few to tell."""
+    sensor = config.sensors[name]
+    row = next(r for r in rows if r.kind == sensor.kind)
+    own = [m for m in recording.measurements if m.sensor == name]
+    covered = solution.trajectory.covers(np.array([m.stamp_ns for m in own], dtype=np.int64))
+    own = [m for m, inside in zip(own, covered, strict=True) if inside]
+    own = own[:: max(1, -(-len(own) // _MOST))]
+    if len(own) < _FEWEST:
+        return None
+    false = 0.0 if row.false is None else float(np.mean([row.false(m, sensor).probability for m in own]))
+    t, R = mount_of(name, sensor, recording.mounts)
+    judged = [
+        _nis(m, sensor, row, _attachment(solution, there, t, R), there)
+        for m, there in zip(own, _at(solution, own), strict=True)
+    ]
+    quantile = 0.5 * (1.0 - false)
+    scaled = np.array([nis / chi2.median(len(r.raw)) for nis, r in judged])
+
+    def typical(sizes: list[float | None]) -> float | None:
+        known = [size for size in sizes if size is not None]
+        return float(np.quantile(known, quantile)) if known else None
+
+    return Contradiction(
+        sigmas=float(np.sqrt(np.quantile(scaled, quantile))),
+        apart_m=typical([r.size_m for _, r in judged]),
+        apart_deg=typical([r.size_deg for _, r in judged]),
+    )
+
+
+def _at(solution: Solution, measurements: Sequence[Measurement]) -> list[_There]:
+    track, stamps = solution.trajectory, np.array([m.stamp_ns for m in measurements], dtype=np.int64)
+    moments, index = np.unique(stamps, return_inverse=True)
+    there = track.at(moments)
+    nearest = np.abs(track.stamps_ns[None, :] - moments[:, None]).argmin(axis=1)
+    assert there.cov is not None
+    assert there.v_world_mps is not None
+    found = []
+    for i in range(len(moments)):
+        R = there.R_world_body[i]
+        turn = np.zeros((6, 6))  # x, y, z, rotations about the world's axes -> rotation, translation in body axes
+        turn[:3, 3:], turn[3:, :3] = R.T, R.T
+        found.append(
+            _There(
+                T_world_body=gtsam.Pose3(gtsam.Rot3(R), there.p_world_m[i]),
+                P_tangent=turn @ there.cov[i] @ turn.T,
+                v_world_mps=there.v_world_mps[i],
+                v_cov=solution.v_cov[nearest[i]],
+                gyro_radps=solution.gyro_radps[nearest[i]],
+            )
+        )
+    return [found[i] for i in index]
+
+
+def _attachment(solution: Solution, there: _There, t: Array, R: Array) -> Attachment:
+    """A state at the body's origin and at the measurement's stamp, which is no state of the graph."""
+    return Attachment(
+        pose_key=0,
+        velocity_key=0,
+        slow_key=None,
+        leaf_keys=(0, 0),
+        T_world_body=there.T_world_body,
+        v_world_mps=there.v_world_mps,
+        T_state_sensor=gtsam.Pose3(gtsam.Rot3(R), t),
+        dv_world_mps=np.zeros(3),
+        gyro_radps=there.gyro_radps,
+        lever_m=t,
+        slow_value=None,
+        datum=solution.datum,
+    )
+
+
+def _nis(m: Measurement, config: object, row: Sensor, at: Attachment, there: _There) -> tuple[float, Residual]:
+    """Return the smallest normalised square of its hypotheses, and that one."""
+    slow = row.slow(config)
+    if slow is not None:
+        at = replace(at, slow_key=0, slow_value=np.zeros(len(slow.sigma)))
+    found = row.residuals(m, config, at)
+    shared = [r.jacobian() @ there.P_tangent @ r.jacobian().T for r in found]
+    if isinstance(m, GnssVelocity):
+        shared = [s + there.v_cov for s in shared]
+    for k in range(0 if slow is None else len(slow.sigma)):
+        assert slow is not None
+        step = np.zeros(len(slow.sigma))
+        step[k] = _STEP
+        moved = row.residuals(m, config, replace(at, slow_value=step))
+        for i, (r, other) in enumerate(zip(found, moved, strict=True)):
+            column = (other.raw - r.raw) / _STEP * slow.sigma[k]
+            shared[i] = shared[i] + np.outer(column, column)
+    nis = [r.nis(s) for r, s in zip(found, shared, strict=True)]
+    best = int(np.argmin(nis))
+    return nis[best], found[best]
+
+
+def fit(solution: Solution, name: str) -> float | None:
+    """Return how far what is used of a sensor is from a solution with it, in its own sigmas; 1: as it claims."""
+    used = [
+        (row.nis, row.dof)
+        for row in solution.ledger
+        if row.sensor == name and row.outcome is Outcome.USED and row.nis is not None and row.dof
+    ]
+    if len(used) < _FEWEST:
+        return None
+    nis, dof = np.array(used).T
+    return float(np.sqrt(np.median(nis / chi2.median(dof))))

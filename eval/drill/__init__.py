@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drills: harbour failures scripted into a recording, and what estimators make of them."""
+
+from graphloc.eval.drill.failures import Failure, Struck, script
+from graphloc.eval.drill.measure import Measured, Times, judge
+from graphloc.eval.drill.plan import Case, Window, cut, schedule
+
+__all__ = ["Case", "Failure", "Measured", "Struck", "Times", "Window", "cut", "judge", "schedule", "script"]

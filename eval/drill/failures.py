@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Harbour failures, as functions from a recording to a recording. Same seed, same failure.
+
+What a failure takes away stays in the account: a row each, as for fixes that are held out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.eval.simulate.noise import drift_m
+from graphloc.frames import Array, Datum, Geodetic, wrap_angle
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import (
+    CompassHeading,
+    GnssPosition,
+    GnssVelocity,
+    ImuSeries,
+    Measurement,
+    PoseFix,
+    TagSighting,
+)
+from graphloc.recording import Recording
+from graphloc.time import NS_PER_S
+
+OUTAGES_S = (10.0, 30.0, 60.0, 120.0)
+_TAKEN = "taken away by the drill"
+# False matches lie where BL's matcher found its own: 1.5 to 5 m and up to 5 deg off.
+_FALSE_M, _FALSE_DEG = (1.5, 5.0), 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Struck:
+    """A recording that a failure has struck.
+
+    Attributes:
+        recording: with what the sensors then say. late_ns: by arrival number, how much later than usual it arrives.
+    """
+
+    recording: Recording
+    late_ns: Mapping[int, int] = field(default_factory=dict)
+
+
+Strike = Callable[[Recording, int, int, np.random.Generator], Struck]
+"""Of a recording, the failure's first stamp (ns), the one after its last, and a generator: what becomes of it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Failure:
+    """A failure that a script knows.
+
+    Attributes:
+        name: for tables, unique. family: the same for failures that differ in length only; what curves are drawn of.
+        length_s: how long it lasts.
+    """
+
+    name: str
+    family: str
+    length_s: float
+    strike: Strike
+
+    def on(self, recording: Recording, begin_ns: int, seed: int) -> Struck:
+        """Strike a recording from `begin_ns` on."""
+        rng = np.random.default_rng([seed, *self.name.encode()])
+        return self.strike(recording, begin_ns, begin_ns + round(self.length_s * NS_PER_S), rng)
+
+
+def script(recording: Recording) -> tuple[tuple[Failure, ...], tuple[tuple[str, str], ...]]:
+    """Return the failures that a recording's sensors permit, and the names of the others, each with why not."""
+    has = {kind: any(isinstance(m, kind) for m in recording.measurements) for kind in _KINDS}
+    found: list[Failure] = []
+    left: list[tuple[str, str]] = []
+
+    def offer(why_not: str, *failures: Failure) -> None:
+        if why_not:
+            left.extend((name, why_not) for name in dict.fromkeys(f.family for f in failures))
+        else:
+            found.extend(failures)
+
+    no_gnss = "" if has[GnssPosition] else "no GNSS fixes"
+    no_pose = "" if has[PoseFix] else "no matches and no poses"
+    no_compass = "" if has[CompassHeading] else "no compass"
+    alone = has[GnssPosition] + has[PoseFix] + has[TagSighting] < 2
+    tags = [m for m in recording.measurements if isinstance(m, TagSighting)]
+    flips = "" if any(len(m.modes) > 1 for m in tags) else "no sighting with a second pose" if tags else "no tags"
+    offer(no_gnss, *(_timed("GNSS outage", s, partial(_silent, kinds=_GNSS)) for s in OUTAGES_S))
+    nothing = "one sensor alone tells a place: the same as its outage" if alone else ""
+    offer(nothing, *(_timed("no place at all", s, partial(_silent, kinds=_PLACES)) for s in OUTAGES_S[:3]))
+    offer(
+        no_gnss,
+        _timed("GNSS drift of 3 m", 60.0, partial(_drift, rmse_m=3.0)),
+        _timed("GNSS jump of 10 m", 10.0, partial(_jump, size_m=10.0)),
+    )
+    offer(
+        no_compass,
+        _timed("compass silent", 60.0, partial(_silent, kinds=(CompassHeading,))),
+        _timed("compass off by 15 deg", 30.0, partial(_turned, off_deg=15.0)),
+    )
+    offer(
+        no_pose,
+        _timed("70 % of matches false", 30.0, partial(_false, share=0.7, alike=False)),
+        _timed("all matches false alike", 20.0, partial(_false, share=1.0, alike=True)),
+    )
+    offer(flips, _timed("tags flipped", 20.0, _flipped))
+    late = "" if has[PoseFix] or has[TagSighting] else "no matches, poses or tags"
+    offer(late, *(_timed(f"matches late by {s:g} s", 30.0, partial(_late, late_s=s)) for s in (2.0, 12.0)))
+    offer(
+        "" if recording.imu is not None else "no IMU",
+        _timed("IMU gap", 1.0, _imu_gap),
+        _timed("IMU gap", 5.0, _imu_gap),
+    )
+    return tuple(found), tuple(left)
+
+
+_GNSS: tuple[type[Measurement], ...] = (GnssPosition, GnssVelocity)
+_PLACES: tuple[type[Measurement], ...] = (*_GNSS, PoseFix, TagSighting)
+_KINDS = (GnssPosition, CompassHeading, PoseFix, TagSighting)
+
+
+def _timed(family: str, length_s: float, strike: Strike) -> Failure:
+    return Failure(name=f"{family}, {length_s:g} s", family=family, length_s=length_s, strike=strike)
+
+
+def _taken(recording: Recording, m: Measurement) -> LedgerRow:
+    topic = recording.topics.get(m.sensor, "")
+    return LedgerRow(
+        seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=Outcome.HELD_OUT, reason=_TAKEN
+    )
+
+
+def _during(m: Measurement, begin_ns: int, end_ns: int) -> bool:
+    return begin_ns <= m.stamp_ns < end_ns
+
+
+def _silent(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator, *, kinds: tuple[type[Measurement], ...]) -> Struck:  # fmt: skip
+    """Sensors of these kinds say nothing."""
+    gone = [m for m in recording.measurements if isinstance(m, kinds) and _during(m, begin_ns, end_ns)]
+    left = {id(m) for m in gone}
+    return Struck(
+        recording=replace(
+            recording,
+            measurements=tuple(m for m in recording.measurements if id(m) not in left),
+            rows=(*recording.rows, *(_taken(recording, m) for m in gone if m.seq >= 0)),
+        )
+    )
+
+
+def _changed(recording: Recording, change: Callable[[Measurement], Measurement]) -> Struck:
+    return Struck(recording=replace(recording, measurements=tuple(change(m) for m in recording.measurements)))
+
+
+def _moved_fixes(recording: Recording, begin_ns: int, end_ns: int, error_m: Callable[[Array], Array]) -> Struck:
+    """Fixes are off by `error_m` of their times (N,), s since the failure began: (N, 2) east, north."""
+    fixes = [m for m in recording.measurements if isinstance(m, GnssPosition) and _during(m, begin_ns, end_ns)]
+    if not fixes:
+        return Struck(recording=recording)
+    datum = Datum(fixes[0].position)
+    enu = datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T)
+    enu[:, :2] += error_m(np.array([(m.stamp_ns - begin_ns) / NS_PER_S for m in fixes]))
+    moved = {id(m): Geodetic(*g) for m, g in zip(fixes, datum.geodetic_from_enu(enu), strict=True)}
+    return _changed(
+        recording, lambda m: replace(m, position=moved[id(m)]) if isinstance(m, GnssPosition) and id(m) in moved else m
+    )
+
+
+def _drift(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Generator, *, rmse_m: float) -> Struck:
+    """Multipath that grows, levels out, turns slowly and fades, as in the simulator (BL section 3.1.5)."""
+    length_s = (end_ns - begin_ns) / NS_PER_S
+
+    def error_m(t: Array) -> Array:
+        grid = np.linspace(0.0, length_s, 601)
+        drawn = drift_m(rng, grid, rmse_m) * np.clip((length_s - grid) / (0.1 * length_s), 0.0, 1.0)[:, None]
+        return np.column_stack([np.interp(t, grid, drawn[:, k]) for k in range(2)])
+
+    return _moved_fixes(recording, begin_ns, end_ns, error_m)
+
+
+def _jump(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Generator, *, size_m: float) -> Struck:
+    """All fixes are off by the same, and then at once no more."""
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    return _moved_fixes(
+        recording, begin_ns, end_ns, lambda t: np.tile(size_m * np.array([np.cos(angle), np.sin(angle)]), (len(t), 1))
+    )
+
+
+def _turned(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Generator, *, off_deg: float) -> Struck:
+    """The compass is off by the same angle: iron, or a current."""
+    off = float(np.radians(off_deg) * rng.choice([-1.0, 1.0]))
+
+    def change(m: Measurement) -> Measurement:
+        if isinstance(m, CompassHeading) and _during(m, begin_ns, end_ns):
+            return replace(m, yaw_rad=float(wrap_angle(m.yaw_rad + off)))
+        return m
+
+    return _changed(recording, change)
+
+
+def _false(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Generator, *, share: float, alike: bool) -> Struck:  # fmt: skip
+    """A share of the poses is elsewhere: each somewhere else, or all alike, as when a pier is taken for its neighbour."""
+
+    def draw() -> dict[str, float]:
+        size, angle = rng.uniform(*_FALSE_M), rng.uniform(0.0, 2.0 * np.pi)
+        off = np.radians(rng.uniform(-_FALSE_DEG, _FALSE_DEG))
+        return {"x": size * np.cos(angle), "y": size * np.sin(angle), "yaw": float(off)}
+
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    fixed = {"x": 4.0 * np.cos(angle), "y": 4.0 * np.sin(angle)}
+
+    def change(m: Measurement) -> Measurement:
+        if not (isinstance(m, PoseFix) and _during(m, begin_ns, end_ns) and rng.uniform() < share):
+            return m
+        offsets = fixed if alike else draw()
+        off = np.array([offsets.get(axis, 0.0) for axis in m.axes])
+        return replace(m, modes=tuple(replace(mode, value=mode.value + off) for mode in m.modes))
+
+    return _changed(recording, change)
+
+
+def _flipped(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator) -> Struck:
+    """The wrong one of a tag's poses fits the image best: probabilities change places."""
+
+    def change(m: Measurement) -> Measurement:
+        if not (isinstance(m, TagSighting) and _during(m, begin_ns, end_ns) and len(m.modes) > 1):
+            return m
+        shares = sorted(mode.probability for mode in m.modes)
+        modes = sorted(m.modes, key=lambda mode: -mode.probability)
+        flipped = [replace(mode, probability=p) for mode, p in zip(modes, shares, strict=True)]
+        return replace(m, modes=tuple(sorted(flipped, key=lambda mode: -mode.probability)))
+
+    return _changed(recording, change)
+
+
+def _late(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator, *, late_s: float) -> Struck:
+    """What takes a computer time comes late; its stamps stay right."""
+    late = [m for m in recording.measurements if isinstance(m, PoseFix | TagSighting) and _during(m, begin_ns, end_ns)]
+    return Struck(recording=recording, late_ns={m.seq: round(late_s * NS_PER_S) for m in late})
+
+
+def _imu_gap(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator) -> Struck:
+    """The IMU says nothing."""
+    imu = recording.imu
+    assert imu is not None  # the script asks for one
+    gone = (imu.stamps_ns >= begin_ns) & (imu.stamps_ns < end_ns)
+    topic = recording.topics.get(imu.sensor, "")
+    rows = (
+        LedgerRow(
+            seq=int(q), stamp_ns=int(s), sensor=imu.sensor, topic=topic, outcome=Outcome.HELD_OUT, reason=_TAKEN
+        )
+        for q, s in zip(imu.seqs[gone], imu.stamps_ns[gone], strict=True)
+    )  # fmt: skip
+    return Struck(recording=replace(recording, imu=imu_where(imu, ~gone), rows=(*recording.rows, *rows)))
+
+
+def imu_where(imu: ImuSeries, kept: NDArray[np.bool_]) -> ImuSeries:
+    """Return the samples where `kept` (N,) is true."""
+    return replace(
+        imu,
+        stamps_ns=imu.stamps_ns[kept],
+        accel_mps2=imu.accel_mps2[kept],
+        gyro_radps=imu.gyro_radps[kept],
+        seqs=imu.seqs[kept],
+    )

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When each failure strikes, and how much of the recording an estimator needs to see for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphloc.eval.drill.failures import Failure, imu_where
+from graphloc.recording import Recording
+from graphloc.time import NS_PER_S
+
+LEAD_S, TAIL_S = 25.0, 25.0  # an estimator has settled before a failure; what comes after it is judged
+WHOLE_S = 600.0  # a longer recording is cut into windows
+WINDOW_LEAD_S, WINDOW_TAIL_S = 60.0, 60.0
+_SETTLED_S = 10.0  # after the online mode's first pose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """A part of the recording that estimators see: its stamps, and whether it is all of it."""
+
+    begin_ns: int
+    end_ns: int
+    whole: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One failure at one time, in a window (its number); `seed` draws what the failure leaves to chance."""
+
+    failure: Failure
+    window: int
+    begin_ns: int
+    seed: int
+
+    @property
+    def end_ns(self) -> int:
+        """The stamp at which the failure is over."""
+        return self.begin_ns + round(self.failure.length_s * NS_PER_S)
+
+
+def windows(recording: Recording, longest_s: float, times: int) -> tuple[Window, ...]:
+    """Return the whole of a recording, or `times` parts of a long one, spread evenly."""
+    assert recording.imu is not None
+    begin, end = int(recording.imu.stamps_ns[0]), int(recording.imu.stamps_ns[-1])
+    if end - begin <= WHOLE_S * NS_PER_S:
+        return (Window(begin_ns=begin, end_ns=end, whole=True),)
+    size = round((WINDOW_LEAD_S + longest_s + WINDOW_TAIL_S) * NS_PER_S)
+    starts = begin + (np.arange(times) + 0.5) / times * (end - begin - size)
+    return tuple(Window(begin_ns=int(s), end_ns=int(s) + size, whole=False) for s in starts)
+
+
+def schedule(
+    failures: Sequence[Failure], parts: Sequence[Window], ready_ns: Sequence[int], times: int, seed: int
+) -> tuple[tuple[Case, ...], tuple[tuple[str, str], ...]]:
+    """Return when each failure strikes, and the failures that do not fit, each with why.
+
+    In a whole recording the times are spread evenly over where the failure fits; in a window it strikes at one time.
+
+    Args:
+        ready_ns: by window, the first pose of the online mode there.
+    """
+    cases: list[Case] = []
+    left: list[tuple[str, str]] = []
+    for failure in failures:
+        own: list[Case] = []
+        for number, (part, ready) in enumerate(zip(parts, ready_ns, strict=True)):
+            first = max(part.begin_ns + round(LEAD_S * NS_PER_S), ready + round(_SETTLED_S * NS_PER_S))
+            last = part.end_ns - round((failure.length_s + TAIL_S) * NS_PER_S)
+            if last < first:
+                continue
+            shares = (np.arange(times) + 0.5) / times if part.whole else np.zeros(1)
+            own += [
+                Case(failure=failure, window=number, begin_ns=first + round(float(share) * (last - first)), seed=seed + k + number)
+                for k, share in enumerate(shares)
+            ]  # fmt: skip
+        if not own:
+            longest = max((p.end_ns - r) / NS_PER_S for p, r in zip(parts, ready_ns, strict=True))
+            wanted = failure.length_s + _SETTLED_S + TAIL_S
+            left.append((failure.name, f"does not fit: needs {wanted:.0f} s with estimates, there are {longest:.0f} s"))
+        cases += own
+    return tuple(cases), tuple(left)
+
+
+def judged_until(case: Case, window: Window) -> Window:
+    """Return the window without what lies more than `WINDOW_TAIL_S` behind the failure: nobody looks there."""
+    end_ns = min(window.end_ns, case.end_ns + round(WINDOW_TAIL_S * NS_PER_S))
+    return replace(window, end_ns=end_ns, whole=window.whole and end_ns == window.end_ns)
+
+
+def cut(recording: Recording, window: Window) -> Recording:
+    """Return the part of a recording that lies in a window; truth stays whole, rows of other messages are left out."""
+    if window.whole or recording.imu is None:
+        return recording
+    inside = (recording.imu.stamps_ns >= window.begin_ns) & (recording.imu.stamps_ns <= window.end_ns)
+    kept = tuple(m for m in recording.measurements if window.begin_ns <= m.stamp_ns <= window.end_ns)
+    return replace(recording, imu=imu_where(recording.imu, inside), measurements=kept, rows=())

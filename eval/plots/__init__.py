@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of a run: what they show, and who draws it (`interactive`; `paper`, which is imported by itself)."""
+
+from graphloc.eval.plots._errors import HEALTH, consistency, coverage, error_over_time, outages
+from graphloc.eval.plots._interactive import interactive
+from graphloc.eval.plots._map import hover, placed, run_map
+from graphloc.eval.plots._marks import (
+    COLOURS,
+    OUTAGE,
+    TRUTH,
+    Band,
+    Figure,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Span,
+    Underlay,
+    peaks,
+    shown_of,
+    thinned,
+)
+from graphloc.eval.plots._states import berths_over_time, residuals_over_time, slow_over_time
+
+__all__ = [
+    "COLOURS",
+    "HEALTH",
+    "OUTAGE",
+    "TRUTH",
+    "Band",
+    "Figure",
+    "Line",
+    "Mark",
+    "Panel",
+    "Points",
+    "Span",
+    "Underlay",
+    "berths_over_time",
+    "consistency",
+    "coverage",
+    "error_over_time",
+    "hover",
+    "interactive",
+    "outages",
+    "peaks",
+    "placed",
+    "residuals_over_time",
+    "run_map",
+    "shown_of",
+    "slow_over_time",
+    "thinned",
+]

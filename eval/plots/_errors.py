@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far off an estimate is over time, and whether its bounds are honest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from graphloc.eval.ekf import FilterResult
+from graphloc.eval.metrics import Levers, errors, held_out_errors, squared_over_covariance
+from graphloc.eval.plots._marks import (
+    COLOURS,
+    OUTAGE,
+    TRUTH,
+    Band,
+    Figure,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Span,
+    peaks,
+    thinned,
+)
+from graphloc.frames import Array
+from graphloc.measurements import GnssPosition
+from graphloc.recording import Recording
+from graphloc.solution import Health, Solution
+from graphloc.time import seconds_since
+from graphloc.trajectory import Trajectory, bounds_95
+
+HEALTH = {Health.DEGRADED: COLOURS[4], Health.DEAD_RECKONING: COLOURS[1], Health.LOST: "#780000"}
+_LOST, _SHOWN = 4.0, 1.2  # times the next larger error: who is beyond, and what is shown then
+_OUTAGE_S, _OUTAGE_STEPS = 3.0, 5.0
+_SPANS = 300  # shades in a figure, the longest ones
+_SHARES = np.array([0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99])
+
+
+def _named(solution: Solution, filters: Sequence[FilterResult]) -> list[tuple[str, Trajectory, str]]:
+    tracks = [(solution.name, solution.trajectory), *((f.name, f.trajectory) for f in filters)]
+    return [(name, track, COLOURS[i % len(COLOURS)]) for i, (name, track) in enumerate(tracks)]
+
+
+def error_over_time(
+    recording: Recording,
+    solution: Solution,
+    filters: Sequence[FilterResult],
+    held: Sequence[GnssPosition],
+    levers_m: Levers,
+) -> Figure:
+    """Position and heading error where truth or held-out fixes exist, 95 % bounds, and when something was missing."""
+    track = solution.trajectory
+    assert track.cov is not None
+    start = int(track.stamps_ns[0])
+    some = thinned(len(track))
+    bound, t = bounds_95(track.cov[some]), seconds_since(start, track.stamps_ns[some])
+    name = f"95 % bound of {solution.name}"
+    position: list[Mark] = [*spans(recording, solution)]
+    heading: list[Mark] = [*position]
+    for marks, k in ((position, 0), (heading, 2)):
+        marks.append(
+            Band(name=name, x=t, low=np.zeros(len(t)), high=bound[:, k], colour=COLOURS[0], listed=marks is position)
+        )
+    largest_m: dict[str, float] = {}
+    for who, estimate, colour in reversed(_named(solution, filters)):  # ours last, on top
+        if recording.truth is not None:
+            stamps, error, turned, _, _ = errors(estimate, recording.truth)
+            size = np.hypot(error[:, 0], error[:, 1])
+            largest_m[who] = float(size.max())
+            width = 2.0 if who == solution.name else 1.3
+            for marks, value in ((position, size), (heading, np.degrees(np.abs(turned)))):
+                at = peaks(value)
+                s = seconds_since(start, stamps[at])
+                marks.append(Line(name=who, x=s, y=value[at], colour=colour, width=width))
+        elif held:
+            stamps, error, _ = held_out_errors(estimate, held, solution.datum, levers_m)
+            size = np.hypot(error[:, 0], error[:, 1])
+            largest_m[who] = float(size.max())
+            at = peaks(size)
+            where = seconds_since(start, stamps[at])
+            position.append(Points(name=f"{who}, held-out", x=where, y=size[at], colour=colour))
+    title, limit = _zoomed(largest_m)
+    panels = (
+        Panel(
+            title=title, y="m", marks=tuple(position), from_zero=True,
+            range_y=limit,
+        ),
+        Panel(title="heading error" if recording.truth else "heading, 95 % bound", y="deg", marks=tuple(heading), from_zero=True),
+    )  # fmt: skip
+    return Figure(name="errors", x="time, s", panels=panels, height=540)
+
+
+def _zoomed(largest_m: Mapping[str, float]) -> tuple[str, tuple[float, float] | None]:
+    """Title and range of the position error: one that is lost would press the others flat; a double click shows all."""
+    *_, second, first = [0.0, 0.0, *sorted(largest_m.values())]
+    if not first > _LOST * second > 0.0:
+        return "position error", None
+    beyond = max(largest_m, key=lambda name: largest_m[name])
+    return f"position error; {beyond} is beyond, to {first:.1f} m", (0.0, _SHOWN * second)
+
+
+def spans(recording: Recording, solution: Solution) -> Iterator[Span]:
+    """Yield when no fix came, and when the estimate says that it is not good; of too many the longest."""
+    start, found = int(solution.trajectory.stamps_ns[0]), []
+    for a, b in outages(recording):
+        found.append(Span(name="no GNSS fix", start=(a - start) / 1e9, stop=(b - start) / 1e9, colour=OUTAGE))
+    t = seconds_since(start, solution.trajectory.stamps_ns)
+    for health, group in groupby(range(len(t)), key=lambda k: solution.health[k]):
+        inside = list(group)
+        if health in HEALTH:
+            stop = float(t[min(inside[-1] + 1, len(t) - 1)])
+            said = health.value.replace("_", " ")
+            found.append(Span(name=said, start=float(t[inside[0]]), stop=stop, colour=HEALTH[health]))
+    longest = sorted(found, key=lambda s: s.start - s.stop)[:_SPANS]
+    yield from sorted(longest, key=lambda s: s.start)
+
+
+def outages(recording: Recording) -> list[tuple[int, int]]:
+    """Return stamps (ns) between which no GNSS position came for 3 s, and for five times what is usual.
+
+    The time before the first and after the last one counts, too, as far as there is an IMU.
+    """
+    stamps = np.unique([m.stamp_ns for m in recording.measurements if isinstance(m, GnssPosition)])
+    if len(stamps) < 3:
+        return []
+    usual_ns = float(np.median(np.diff(stamps)))
+    if recording.imu is not None:
+        stamps = np.unique([*stamps, *recording.imu.stamps_ns[[0, -1]]])
+    longer = np.flatnonzero(np.diff(stamps) > max(_OUTAGE_S * 1e9, _OUTAGE_STEPS * usual_ns))
+    return [(int(stamps[k]), int(stamps[k + 1])) for k in longer]
+
+
+def consistency(recording: Recording, solution: Solution, filters: Sequence[FilterResult]) -> Figure | None:
+    """NEES of the horizontal position over time with the band that 95 % of it should lie in; None without truth."""
+    if recording.truth is None:
+        return None
+    start = int(solution.trajectory.stamps_ns[0])
+    low, high = float(chi2.ppf(0.025, 2)), float(chi2.ppf(0.975, 2))
+    marks: list[Mark] = []
+    ends, highest = [], 10.0
+    for name, estimate, colour in reversed(_named(solution, filters)):
+        found = _nees(estimate, recording.truth)
+        if found is not None:
+            stamps, nees = found
+            at = peaks(nees)
+            t = seconds_since(start, stamps[at])
+            ends += [float(t[0]), float(t[-1])]
+            highest = max(highest, float(nees.max()))
+            marks.append(Line(name=name, x=t, y=np.maximum(nees[at], 1e-3), colour=colour, width=1.0))
+    if not marks:
+        return None
+    x = np.array([min(ends), max(ends)])
+    band = Band(
+        name="95 % of an honest one", x=x, low=np.full(2, low), high=np.full(2, high), colour="#000000", listed=True
+    )
+    mean = Line(name="its mean, 2", x=x, y=np.full(2, 2.0), colour=TRUTH, dash="dot", width=1.0)
+    panel = Panel(title="NEES, horizontal", y="", marks=(band, *marks, mean), log_y=True, range_y=(1e-2, 2.0 * highest))
+    return Figure(name="nees", x="time, s", panels=(panel,), height=340)
+
+
+def coverage(recording: Recording, solution: Solution, filters: Sequence[FilterResult]) -> Figure | None:
+    """How often the stated region of p % held the truth, for all p: on the diagonal where it is honest."""
+    if recording.truth is None:
+        return None
+    wanted = 100.0 * _SHARES
+    marks: list[Mark] = [Line(name="honest", x=wanted, y=wanted, colour=TRUTH, dash="dot", width=1.0)]
+    for name, estimate, colour in reversed(_named(solution, filters)):
+        found = _nees(estimate, recording.truth)
+        if found is not None:
+            held = np.array([100.0 * float(np.mean(found[1] <= limit)) for limit in chi2.ppf(_SHARES, 2)])
+            marks.append(Line(name=name, x=wanted, y=held, colour=colour))
+    panel = Panel(title="coverage, horizontal", y="% of the time inside", marks=tuple(marks), range_y=(0.0, 101.0))
+    return Figure(name="coverage", x="stated region, %", panels=(panel,), height=380)
+
+
+def _nees(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], Array] | None:
+    stamps, error, _, there, _ = errors(estimate, truth)
+    return None if there.cov is None else (stamps, squared_over_covariance(error, there.cov))

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of the report: plotly, interactive, in the page itself."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+from plotly.subplots import make_subplots
+
+from graphloc.eval.plots._marks import Band, Figure, Line, Mark, Panel, Points, Span
+from graphloc.frames import Array
+
+_GAP_PX, _ABOVE_PX, _LEGEND_PX, _BELOW_PX = 42, 26, 38, 46
+_WEIGHTS = {"colorscale": "Cividis", "cmin": 0, "cmax": 1}
+
+
+def interactive(figure: Figure) -> go.Figure:
+    """Return a figure for plotly; names in the legend switch what they name on and off."""
+    n = len(figure.panels)
+    named = any(not isinstance(m, Span) and m.listed and not p.keyed for p in figure.panels for m in p.marks)
+    above_px = _ABOVE_PX + _LEGEND_PX * named
+    drawn = make_subplots(
+        rows=n, cols=1, shared_xaxes=True, subplot_titles=[_title(p) for p in figure.panels],
+        vertical_spacing=min(_GAP_PX / max(figure.height - above_px - _BELOW_PX, 1), 0.9 / n),
+    )  # fmt: skip
+    listed: set[str] = set()
+    shades: list[dict[str, Any]] = []
+    for row, panel in enumerate(figure.panels, start=1):
+        for mark in panel.marks:
+            if isinstance(mark, Span):
+                shades.append(_shade(mark, row))
+                continue
+            trace = _trace(mark)
+            in_legend = mark.listed and not panel.keyed and mark.name not in listed
+            trace.update(legendgroup=mark.name, showlegend=in_legend)
+            listed |= {mark.name} if in_legend else set()
+            drawn.add_trace(trace, row=row, col=1)
+        axis: dict[str, Any] = {"title": {"text": panel.y, "standoff": 4}}
+        if panel.from_zero:
+            axis["rangemode"] = "tozero"
+        if panel.log_y:
+            axis |= {"type": "log", "dtick": 1}
+        if panel.range_y is not None:
+            axis["range"] = list(np.log10(panel.range_y)) if panel.log_y else list(panel.range_y)
+        drawn.update_yaxes(**axis, row=row, col=1)
+    drawn.update_xaxes(title=figure.x, row=n, col=1)
+    drawn.update_layout(
+        template="plotly_white", shapes=shades, height=figure.height, font={"size": 12}, hoverlabel={"align": "left"},
+        margin={"l": 52, "r": 12, "t": above_px, "b": _BELOW_PX},
+        legend={"orientation": "h", "y": 1, "yref": "container", "yanchor": "top", "x": 0, "traceorder": "reversed"},
+    )  # fmt: skip
+    drawn.update_annotations(font_size=13, x=0, xanchor="left")
+    if figure.is_map:
+        _as_map(drawn, figure)
+    return drawn
+
+
+def _shade(span: Span, row: int) -> dict[str, Any]:
+    """A rectangle over the height of a panel; all are given to plotly at once, one by one they take seconds."""
+    axis = str(row) if row > 1 else ""
+    return {
+        "type": "rect", "xref": f"x{axis}", "yref": f"y{axis} domain", "x0": span.start, "x1": span.stop, "y0": 0, "y1": 1,
+        "fillcolor": span.colour, "opacity": span.opacity, "line": {"width": 0}, "layer": "below",
+    }  # fmt: skip
+
+
+def _title(panel: Panel) -> str:
+    """The title, with the names of the lines in their colours where the panel says them itself."""
+    names = [f'<span style="color:{m.colour}">{m.name}</span>' for m in panel.marks if isinstance(m, Line)]
+    return f"{panel.title} ({', '.join(names)})" if panel.keyed else panel.title
+
+
+def _light(values: Array) -> NDArray[np.float32]:
+    """Half the page for digits that cannot be seen."""
+    return np.asarray(values, dtype=np.float32)
+
+
+def _trace(mark: Mark) -> Any:
+    assert not isinstance(mark, Span)
+    x = _light(mark.x)
+    if isinstance(mark, Line):
+        line = {"color": mark.colour, "dash": mark.dash, "width": mark.width}
+        return go.Scatter(x=x, y=_light(mark.y), mode="lines", line=line, name=mark.name)
+    if isinstance(mark, Band):
+        return go.Scatter(
+            x=np.concatenate([x, x[::-1]]), y=np.concatenate([_light(mark.high), _light(mark.low)[::-1]]),
+            fill="toself", mode="none", fillcolor=mark.colour, opacity=mark.opacity, hoverinfo="skip", name=mark.name,
+        )  # fmt: skip
+    assert isinstance(mark, Points)
+    marker: dict[str, Any] = {"size": mark.size, "symbol": mark.shape, "color": mark.colour}
+    if mark.weight is not None:
+        marker |= {"color": np.round(mark.weight, 2).astype(np.float32), **_WEIGHTS, "opacity": 0.8}
+    hover = {"text": list(mark.text), "hoverinfo": "text"} if len(mark.text) else {}
+    return go.Scatter(x=x, y=_light(mark.y), mode="markers", marker=marker, name=mark.name, **hover)
+
+
+def _as_map(drawn: go.Figure, figure: Figure) -> None:
+    drawn.update_yaxes(scaleanchor="x", scaleratio=1, zeroline=False)
+    drawn.update_xaxes(zeroline=False)
+    weighed = [t for t in drawn.data if t.mode == "markers" and t.marker.cmax is not None]
+    if weighed:
+        weighed[0].marker.update(showscale=True, colorbar={"title": "weight", "thickness": 10, "len": 0.6, "x": 1.0})
+    picture = figure.underlay
+    if picture is None:
+        return
+    drawn.add_layout_image(
+        source=f"data:image/jpeg;base64,{base64.b64encode(picture.jpeg).decode()}", xref="x", yref="y", layer="below",
+        x=picture.west_m, y=picture.north_m, sizex=picture.east_m - picture.west_m,
+        sizey=picture.north_m - picture.south_m, sizing="stretch", opacity=0.9,
+    )  # fmt: skip
+    drawn.update_xaxes(range=[picture.west_m, picture.east_m], showgrid=False, constrain="domain")
+    drawn.update_yaxes(range=[picture.south_m, picture.north_m], showgrid=False, constrain="domain")

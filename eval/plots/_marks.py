@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a figure shows, apart from who draws it: `interactive` draws it for the report, `paper` as PNG and SVG.
+
+Colours are those of Okabe and Ito, safe for colour-blind eyes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+
+COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
+TRUTH, OUTAGE = "#000000", "#777777"
+MOST = 2000  # points a trace: more cannot be seen and make a heavy page
+
+Dash = Literal["solid", "dash", "dot"]
+Shape = Literal["circle", "diamond", "square", "x"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Line:
+    """A line through x, y (N,). `listed`: whether the legend names it; NaN in y breaks it."""
+
+    name: str
+    x: Array
+    y: Array
+    colour: str
+    dash: Dash = "solid"
+    width: float = 2.0
+    listed: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Points:
+    """Points x, y (N,), all of one colour, or coloured by `weight` (N,) in [0, 1]; `text` (N,) is shown on hover."""
+
+    name: str
+    x: Array
+    y: Array
+    colour: str = TRUTH
+    weight: Array | None = None
+    text: Sequence[str] = ()
+    shape: Shape = "circle"
+    size: float = 5.0
+    listed: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Band:
+    """The area between `low` and `high` (N,) over x (N,)."""
+
+    name: str
+    x: Array
+    low: Array
+    high: Array
+    colour: str
+    opacity: float = 0.18
+    listed: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Span:
+    """A stretch of x shaded over the whole height, behind everything."""
+
+    name: str
+    start: float
+    stop: float
+    colour: str
+    opacity: float = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Underlay:
+    """A picture that lies under a map, north up.
+
+    Attributes:
+        jpeg: the picture. west_m, south_m, east_m, north_m: its edges in world.
+    """
+
+    jpeg: bytes
+    west_m: float
+    south_m: float
+    east_m: float
+    north_m: float
+
+
+Mark = Line | Points | Band | Span
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Panel:
+    """One pair of axes.
+
+    Attributes:
+        title: above it; may be empty. y: label of the axis. marks: drawn in this order.
+        range_y: what of the axis is shown at first; None: all.
+        from_zero: the axis begins at zero. log_y: it is logarithmic.
+        keyed: its lines are named in itself, not in the legend of the figure.
+    """
+
+    title: str
+    y: str
+    marks: tuple[Mark, ...]
+    range_y: tuple[float, float] | None = None
+    from_zero: bool = False
+    log_y: bool = False
+    keyed: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Figure:
+    """Panels above each other with one x axis.
+
+    Attributes:
+        name: of its files, and in the page. x: label of the axis. height: of the whole, px.
+        is_map: x and y have the same scale; underlay: what lies below.
+    """
+
+    name: str
+    x: str
+    panels: tuple[Panel, ...]
+    height: int
+    is_map: bool = False
+    underlay: Underlay | None = None
+
+
+def thinned(n: int, most: int = MOST) -> NDArray[np.int64]:
+    """Indices of at most `most` of n things, evenly, the first and last among them."""
+    if n <= most:
+        return np.arange(n)
+    return np.unique(np.linspace(0, n - 1, most).round().astype(np.int64))
+
+
+def peaks(values: Array, most: int = MOST) -> NDArray[np.int64]:
+    """Indices of at most `most` of n values in order: of each stretch the largest, so that no spike is lost."""
+    n = len(values)
+    if n <= most:
+        return np.arange(n)
+    edges = np.linspace(0, n, most + 1).round().astype(np.int64)
+    return np.array([a + int(np.argmax(values[a:b])) for a, b in pairwise(edges)], dtype=np.int64)
+
+
+def shown_of(weight: Array, most: int = MOST) -> NDArray[np.int64]:
+    """Indices of at most `most` measurements: of those not fully believed as many as of the others, or more."""
+    odd, even = np.flatnonzero(weight < 0.5), np.flatnonzero(weight >= 0.5)
+    of_odd = min(len(odd), max(most // 2, most - len(even)))
+    return np.sort(np.concatenate([odd[thinned(len(odd), of_odd)], even[thinned(len(even), most - of_odd)]]))

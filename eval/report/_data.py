@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a report shows, before anything is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from graphloc.config import VesselConfig
+from graphloc.eval import plots
+from graphloc.eval.calibrate import Calibration
+from graphloc.eval.ekf import FilterResult
+from graphloc.eval.metrics import Levers, Table
+from graphloc.measurements import GnssPosition
+from graphloc.recording import Recording
+from graphloc.solution import Solution
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReportData:
+    """What a report shows.
+
+    Attributes:
+        truth_statement: says plainly what the numbers were measured against. pictures: captions and JPEGs of matches.
+        underlay: the aerial image under the map. calibration: what the run says of mounts and stamps; offline.
+        command: that made the run.
+    """
+
+    title: str
+    solution: Solution
+    recording: Recording
+    config: VesselConfig
+    filters: Sequence[FilterResult]
+    held: Sequence[GnssPosition]
+    levers_m: Levers
+    tables: Sequence[Table]
+    truth_statement: str
+    pictures: Sequence[tuple[str, bytes]] = ()
+    underlay: plots.Underlay | None = None
+    calibration: Calibration | None = None
+    command: str = ""
+
+
+def figures(data: ReportData) -> dict[str, plots.Figure]:
+    """Return the figures of a run by name; those that it has no data for are left out."""
+    recording, solution, filters = data.recording, data.solution, data.filters
+    found = (
+        plots.run_map(recording, solution, filters, data.held, data.underlay),
+        plots.error_over_time(recording, solution, filters, data.held, data.levers_m),
+        plots.consistency(recording, solution, filters),
+        plots.coverage(recording, solution, filters),
+        plots.berths_over_time(solution),
+        plots.residuals_over_time(solution),
+        plots.slow_over_time(solution),
+    )
+    return {figure.name: figure for figure in found if figure is not None}

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of the report that are words, tables and pictures; figures come of `graphloc.eval.plots`."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+
+from graphloc.eval.metrics import Table
+from graphloc.eval.pieces import note, number, table
+from graphloc.eval.plots import HEALTH, OUTAGE
+from graphloc.eval.report._data import ReportData
+from graphloc.eval.report._verdict import Trust, Verdict, main_table, times
+from graphloc.solution import Solution
+
+_REASONS = 60
+_WHOLE = "{name} knows the whole run; the others, at each time, only what came before."
+_CLASS = {Trust.YES: "", Trust.WITH_CARE: "care", Trust.NO: "no"}
+# What the first table says of each estimate, where a run has it: column, heading, digits.
+_KEY = (
+    ("position_rmse_m", "RMSE, m", 2), ("horizontal_rmse_m", "RMSE, m", 2), ("position_p95_m", "95 %, m", 2),
+    ("horizontal_p95_m", "95 %, m", 2), ("position_max_m", "worst, m", 2), ("horizontal_max_m", "worst, m", 2),
+    ("outage_drift_m", "drift in gaps, m", 2), ("heading_rmse_deg", "heading RMSE, °", 2),
+)  # fmt: skip
+_SHARES = (("coverage_95", "in 95 % bounds"), ("matched", "covered"))
+_WIDE = ("95 %, m", "worst, m", "covered")  # a phone does without
+
+
+def first_screen(data: ReportData, verdict: Verdict) -> str:
+    """How good, compared with the filters, whether to trust it, and what was truth."""
+    reasons = "".join(f'<li class="{_CLASS[r.trust]}">{escape(r.text)}</li>' for r in verdict.reasons)
+    return (
+        f'<div class="verdict" style="--trust:{verdict.trust.value}"><b>{verdict.trust.said.capitalize()}.</b> '
+        f"{escape(verdict.accuracy)}</div>"
+        f"{_key_numbers(data)}"
+        f'<p><b>What it is measured against.</b> {escape(data.truth_statement)}</p><ul class="reasons">{reasons}</ul>'
+    )
+
+
+def _key_numbers(data: ReportData) -> str:
+    """Ours against each filter: an estimate a row, so that it fits a phone."""
+    found = main_table(data)
+    if found is None:
+        return ""
+    whole, key = found
+    values = whole.as_dict()
+    mine = values[data.solution.name][key]
+    columns = [(c, said, digits) for c, said, digits in _KEY if c in whole.columns]
+    columns = [c for c in columns if any(v[c[0]] is not None for v in values.values())]
+    shares = [(c, said) for c, said in _SHARES if c in whole.columns]
+    head = ["", columns[0][1], "to ours", *(c[1] for c in columns[1:]), *(said for _, said in shares)]
+    rows = []
+    for name, row in values.items():
+        first = row[key]
+        ratio = "" if name == data.solution.name or not mine or first is None else times(first, mine)
+        first_of, *rest = (number(row[c], digits) for c, _, digits in columns)
+        rows.append([name, first_of, ratio, *rest, *(_percent(row[c]) for c, _ in shares)])
+    wide = [k for k, said in enumerate(head) if said in _WIDE]
+    said = "" if data.solution.stats.online or len(values) < 2 else _WHOLE.format(name=data.solution.name)
+    return table(
+        head, rows, ["ours" if name == data.solution.name else "" for name in values], wide=wide, kind="key"
+    ) + note(said)
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0%}"
+
+
+def warnings_list(data: ReportData) -> str:
+    """Return what was said on the way."""
+    lines = (*data.recording.warnings, *data.solution.stats.warnings)
+    items = "".join(f'<li class="warning">{escape(line)}</li>' for line in lines)
+    return f'<h2 id="warnings">Warnings</h2><ul class="warnings">{items}</ul>' if lines else ""
+
+
+def numbers(given: Table) -> str:
+    """Return a whole table, estimates as columns, numbers as rows: it fits a phone."""
+    head = ["", *(name for name, _ in given.rows)]
+    rows = [[column, *(number(values[k]) for _, values in given.rows)] for k, column in enumerate(given.columns)]
+    return f"<h3>{escape(given.title)}</h3>{table(head, rows)}{note(given.note)}"
+
+
+def shades() -> str:
+    """Return what the shades of a time axis mean."""
+    said = {"no GNSS fix": OUTAGE, **{health.value.replace("_", " "): colour for health, colour in HEALTH.items()}}
+    keys = "".join(f'<i style="background:{colour}55"></i>{name}' for name, colour in said.items())
+    return f'<p class="note shades">Shades:{keys}. Blue: the bound that the estimate states.</p>'
+
+
+def ledger(solution: Solution) -> str:
+    """Return what became of every message, and why."""
+    counts = solution.ledger.counts()
+    outcomes = sorted({o for c in counts.values() for o in c})
+    head = ["", *(o.replace("_", " ") for o in outcomes)]
+    rows = [[name, *(str(c.get(o, 0)) for o in outcomes)] for name, c in counts.items()]
+    whole = list(solution.ledger.reasons().items())
+    why = [[name, outcome.replace("_", " "), str(n), reason] for (name, outcome, reason), n in whole[:_REASONS]]
+    more = f" {len(whole) - _REASONS} more reasons are in it." if len(whole) > _REASONS else ""
+    said = note(f"{len(solution.ledger)} messages in all; ledger.csv has a row for each.{more}")
+    return table(head, rows) + said + (table(["", "", "messages", "why"], why, text=(3,)) if why else "")
+
+
+def matches(data: ReportData) -> str:
+    """Return pictures of matches."""
+    if not data.pictures:
+        return ""
+    said = (
+        "Scan on the map: faces red, first returns green, where the best mode has them. Arrows and ellipses (95 %): modes; "
+        "light blue: the prior. Right: the score of each place, at its best heading."
+    )
+    shown = "".join(
+        f'<p>{escape(caption)}</p><img alt="{escape(caption)}" '
+        f'src="data:image/jpeg;base64,{base64.b64encode(coded).decode()}">'
+        for caption, coded in data.pictures
+    )
+    return note(said) + shown
+
+
+def calibration(data: ReportData) -> str:
+    """Return what the run says of levers, mounts, stamps and IMU noise."""
+    found = data.calibration
+    if found is None or not found.checks + found.suggestions:
+        return ""
+    wrong = "".join(f'<li class="warning">{escape(str(s))}</li>' for s in found.suggestions)
+    rows = "".join(
+        f"<tr><td>{escape(c.key)}</td><td>{c.configured:.3g}</td><td>{c.change:+.3g}</td><td>{c.sigma:.2g} {escape(c.unit)}"
+        f"</td><td>{escape(c.said)}</td></tr>"
+        for c in found.checks
+    )
+    head = "<tr><th></th><th>configured</th><th>change</th><th>1 sigma</th><th></th></tr>"
+    return (
+        note("What the run says of levers, mounts, stamps and IMU noise. Nothing of it was applied.")
+        + f'<ul>{wrong}</ul><div class="scroll"><table class="reason">{head}{rows}</table></div>'
+    )
+
+
+def solver(solution: Solution) -> str:
+    """Return how the solver fared."""
+    s = solution.stats
+    if s.online:
+        events = "".join(f"<li>{escape(event)}</li>" for event in s.events)
+        return f"<p>Online: {s.states} poses, each as it was known at its time.</p><ul>{events}</ul>"
+    return (
+        f"<p>{s.states} states, {s.factors} factors, {s.passes} passes, {s.iterations} iterations; "
+        f"{'converged' if s.converged else 'NOT converged'}. Cost {s.cost:.0f}, expected {s.expected_cost:.0f} "
+        f"(ratio {s.cost / max(s.expected_cost, 1.0):.2f}; near 1 where the noise is configured right).</p>"
+    )

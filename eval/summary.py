@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several finished runs in one summary: each run, the mean, the worst; as HTML, Markdown and CSV."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import groupby
+from pathlib import Path
+from urllib.parse import quote
+
+from graphloc.errors import InputError
+from graphloc.eval import markdown, pieces
+from graphloc.outputs import MARK, fresh_folder
+
+SUMMARY = "summary.csv"  # a folder with this file is ours to replace
+_MOST_BYTES = 50_000_000  # of a run.json; of twelve hours it is some kB
+# What is shown of each table; summary.csv has every number. Of other tables the first four.
+_SHOWN = {
+    "Against truth": ("position_rmse_m", "position_max_m", "heading_rmse_deg", "coverage_95"),
+    "Against held-out fixes": ("horizontal_rmse_m", "horizontal_max_m", "outage_drift_m"),
+    "Docking": ("sighted_rmse_m", "berth_p95_m", "lost", "wrong_side", "dnv_met"),
+    "Forward speed": ("mean_mps", "std_mps"),
+}
+_LOWEST_IS_WORST = ("coverage_95", "heading_coverage_95", "matched", "dnv_met", "fixes")
+
+Numbers = Mapping[str, Mapping[str, Mapping[str, float | None]]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinishedRun:
+    """What a run folder says of itself.
+
+    Attributes:
+        name: its folder, as short as tells it from the others. tables: title -> estimate -> number -> value.
+        warnings: how many. converged: whether the solver did.
+    """
+
+    name: str
+    folder: Path
+    tables: Numbers
+    warnings: int
+    converged: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Block:
+    """One number of all runs: a row each, a column for each estimate; then mean and worst."""
+
+    title: str
+    metric: str
+    estimates: tuple[str, ...]
+    rows: tuple[tuple[str, tuple[float | None, ...]], ...]
+    mean: tuple[float | None, ...]
+    worst: tuple[float | None, ...]
+
+
+def is_run(folder: Path) -> bool:
+    """Return whether a folder is that of a finished run."""
+    return (folder / MARK).is_file()
+
+
+def read_runs(folders: Sequence[Path]) -> tuple[FinishedRun, ...]:
+    """Read what run folders say.
+
+    Raises:
+        InputError: a folder is given twice, or its run.json is not that of a run.
+    """
+    whole = [folder.resolve() for folder in folders]
+    twice = next((folder for k, folder in enumerate(whole) if folder in whole[:k]), None)
+    if twice is not None:
+        raise InputError(f"{twice}: given twice, so it would count twice")
+    short = [folder.name for folder in whole]
+    names = [name if short.count(name) == 1 else str(folder) for name, folder in zip(short, folders, strict=True)]
+    return tuple(_read(folder, name) for folder, name in zip(folders, names, strict=True))
+
+
+def _read(folder: Path, name: str) -> FinishedRun:
+    path = folder / MARK
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError("it is too large")
+        run = json.loads(path.read_text(encoding="utf-8"))
+        tables = {
+            str(title): {
+                str(estimate): {str(k): None if v is None else float(v) for k, v in values.items()}
+                for estimate, values in rows.items()
+            }
+            for title, rows in run["metrics"].items()
+        }
+        converged, warnings = bool(run["stats"]["converged"]), len(run["warnings"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        said = error.strerror if isinstance(error, OSError) else str(error)[:80]
+        raise InputError(f"{path}: is not that of a run ({said}); make the run again") from None
+    return FinishedRun(name=name, folder=folder, tables=tables, warnings=warnings, converged=converged)
+
+
+def blocks(runs: Sequence[FinishedRun], *, shown_only: bool = True) -> list[Block]:
+    """Return each number of each table that a run has; `shown_only`: those that a reader looks for first."""
+    found = []
+    for title in dict.fromkeys(t for run in runs for t in run.tables):
+        having = [run for run in runs if title in run.tables]
+        estimates = tuple(dict.fromkeys(e for run in having for e in run.tables[title]))
+        metrics = list(dict.fromkeys(m for run in having for row in run.tables[title].values() for m in row))
+        for metric in _shown(title, metrics) if shown_only else metrics:
+            rows = tuple(
+                (run.name, tuple(run.tables[title].get(e, {}).get(metric) for e in estimates)) for run in having
+            )
+            columns = [[v for v in column if v is not None] for column in zip(*(v for _, v in rows), strict=True)]
+            found.append(
+                Block(
+                    title=title, metric=metric, estimates=estimates, rows=rows,
+                    mean=tuple(sum(c) / len(c) if c else None for c in columns),
+                    worst=tuple(_worst(metric, c) for c in columns),
+                )
+            )  # fmt: skip
+    return found
+
+
+def _shown(title: str, metrics: Sequence[str]) -> Sequence[str]:
+    return [m for m in _SHOWN[title] if m in metrics] if title in _SHOWN else metrics[:4]
+
+
+def _worst(metric: str, values: Sequence[float]) -> float | None:
+    if not values:
+        return None
+    return min(values) if metric in _LOWEST_IS_WORST else max(values, key=abs)
+
+
+def write_summary(folder: Path, runs: Sequence[FinishedRun], *, overwrite: bool) -> Path:
+    """Write `summary.html`, `.md` and `.csv` into a folder; return the path of the page.
+
+    Raises:
+        OutputError: the folder exists and may not be replaced, or the disk refuses.
+    """
+    found = blocks(runs)
+    with fresh_folder(folder, overwrite=overwrite, mark=SUMMARY) as fresh:
+        with (fresh / SUMMARY).open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(("run", "table", "number", "estimate", "value"))
+            writer.writerows(_csv_rows(runs))
+        (fresh / "summary.md").write_text(as_markdown(runs, found), encoding="utf-8")
+        (fresh / "summary.html").write_text(_page(runs, found, folder), encoding="utf-8")
+    return folder / "summary.html"
+
+
+def _csv_rows(runs: Sequence[FinishedRun]) -> Iterator[tuple[str, ...]]:
+    """Every number of every run; mean and worst as two more runs, whose names no folder has."""
+    for block in blocks(runs, shown_only=False):
+        for run, values in (*block.rows, ("(mean)", block.mean), ("(worst)", block.worst)):
+            for estimate, value in zip(block.estimates, values, strict=True):
+                if value is not None:
+                    yield run, block.title, block.metric, estimate, f"{value:.6g}"
+
+
+def _lines(block: Block) -> list[tuple[str, ...]]:
+    """The rows of a block as text, at the end how many times as large as the first estimate's the others' are."""
+    rows = [*block.rows, ("mean", block.mean), ("worst", block.worst)]
+    lines = [(name, *(pieces.number(v) for v in values)) for name, values in rows]
+    if len(block.estimates) > 1 and block.metric.endswith(("_m", "_deg", "std_mps")):
+        over = (_over_first([values for _, values in block.rows], k) for k in range(1, len(block.estimates)))
+        ratios = ("-" if ratio is None else f"{ratio:.1f} x" for ratio in over)
+        lines.append((f"mean to that of {block.estimates[0]}", "", *ratios))
+    return lines
+
+
+def _over_first(rows: Sequence[Sequence[float | None]], k: int) -> float | None:
+    """The mean of column k over that of the first, both over the runs that have both."""
+    both = [(a, b) for row in rows if (a := row[0]) is not None and (b := row[k]) is not None]
+    mine = sum(a for a, _ in both)
+    return sum(b for _, b in both) / mine if mine else None
+
+
+def as_markdown(runs: Sequence[FinishedRun], found: Sequence[Block]) -> str:
+    """Return the summary as Markdown."""
+    text = [f"# {_title(runs)}", "", *_remarks(runs), ""]
+    for block in found:
+        head = ["", *block.estimates]
+        text += [f"## {block.title}: {block.metric}", ""]
+        text += [markdown.row(head), "|---|" + "---:|" * len(block.estimates)]
+        text += [markdown.row(line) for line in _lines(block)]
+        text.append("")
+    return "\n".join(text)
+
+
+def _title(runs: Sequence[FinishedRun]) -> str:
+    return f"{len(runs)} run{'s' * (len(runs) != 1)}"
+
+
+def _remarks(runs: Sequence[FinishedRun]) -> list[str]:
+    """What a mean does not say."""
+    said = [f"- {run.name}: the solver did not converge" for run in runs if not run.converged]
+    said += [f"- {run.name}: warnings ({run.warnings}), see its report" for run in runs if run.warnings]
+    said += [f"- {run.name}: nothing to compare it with" for run in runs if not run.tables]
+    return said
+
+
+def _page(runs: Sequence[FinishedRun], found: Sequence[Block], folder: Path) -> str:
+    links = " ".join(
+        f'<a href="{quote(Path(os.path.relpath(run.folder / "report.html", folder)).as_posix())}">{escape(run.name)}</a>'
+        for run in runs
+    )
+    remarks = "".join(f'<li class="warning">{escape(line[2:])}</li>' for line in _remarks(runs))
+    body = [f'<ul class="warnings">{remarks}</ul>'] if remarks else []
+    for title, group in groupby(found, key=lambda b: b.title):
+        body.append(f"<h2>{escape(title)}</h2>")
+        for block in group:
+            lines = _lines(block)
+            classes = [""] * len(block.rows) + ["part ours", "ours"]
+            head = ("", *block.estimates)
+            body.append(f"<h3>{escape(block.metric)}</h3>{pieces.table(head, lines, classes)}")
+    note = pieces.note(
+        "Mean and worst are over the runs that have the number; summary.csv has every number of every run."
+    )
+    return pieces.page(_title(runs), f"<h1>{_title(runs)}</h1><nav>{links}</nav>{note}{''.join(body)}")

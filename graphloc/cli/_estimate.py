@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a bag to a track: inspect, smooth, replay, stream, match."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from graphloc.cli._shared import (
+    BagArgument,
+    ConfigOption,
+    FiguresOption,
+    HoldOutOption,
+    JsonOption,
+    OutOption,
+    OverwriteOption,
+    RerunOption,
+    check_rerun,
+    print_run,
+    progress,
+    smooth_bags,
+    status_line,
+    write_rerun,
+)
+
+
+def inspect(
+    bag: BagArgument,
+    config: Annotated[Path, typer.Option("--write", "-w", "-o", help="Where to write the first vessel.yaml.")] = Path(
+        "vessel.yaml"
+    ),
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Print what a bag holds and write a first vessel.yaml, every guess marked."""
+    from graphloc.errors import OutputError
+    from graphloc.frontends import inspect as inspection
+
+    found = inspection.inspect_bag(bag)
+    typer.echo(json.dumps(found.as_dict(), indent=2) if as_json else inspection.render(found))
+    if config.exists() and not overwrite:
+        raise OutputError(f"{config}: exists already; give --write another name, or --overwrite")
+    try:
+        config.write_text(inspection.draft_config(found), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{config}: cannot be written ({error.strerror})") from None
+    typer.echo(f"wrote {config}: look at each line marked 'guess'", err=True)
+
+
+def smooth(
+    bag: BagArgument,
+    config: ConfigOption,
+    out: OutOption,
+    hold_out: HoldOutOption = None,
+    figures: FiguresOption = False,
+    rerun: RerunOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Smooth a whole run and write the run folder with its report."""
+    smooth_bags(bag, config, out, hold_out, overwrite, as_json, compare=False, figures=figures, rerun=rerun)
+
+
+def replay(
+    bag: BagArgument,
+    config: ConfigOption,
+    out: OutOption,
+    rate: Annotated[
+        float | None, typer.Option(min=0.01, help="Times the run's own time, as 1; by default as fast as it can.")
+    ] = None,
+    lag: Annotated[float, typer.Option(min=1.0, help="How long measurements are re-judged, s.")] = 10.0,
+    figures: FiguresOption = False,
+    rerun: RerunOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a bag through the online mode, as a vessel would have, and write the run folder."""
+    from graphloc import app as application
+    from graphloc import outputs
+
+    outputs.check_folder(out, overwrite=overwrite)
+    check_rerun(rerun, overwrite)
+    recording, vessel = application.load(bag, config, progress())
+    scans = application.Scans(tuple(bag), config.parent)
+    run = application.replay_recording(recording, vessel, scans=scans, rate=rate, lag_s=lag, status=status_line())
+    if sys.stderr.isatty():
+        sys.stderr.write("\r\033[K")
+    command = " ".join(sys.argv[1:])
+    report = application.write(run, out, inputs=bag, command=command, overwrite=overwrite, figures=figures)
+    write_rerun(rerun, run, bag, config)
+    print_run(run, report, as_json)
+
+
+def stream(
+    config: ConfigOption,
+    rate: Annotated[
+        float | None, typer.Option("--rate", min=0.001, max=1000.0, help="Estimates a second; default: each new state.")
+    ] = None,
+    ledger: Annotated[bool, typer.Option("--ledger", help="Write rows of the ledger, too.")] = False,
+    lag: Annotated[float, typer.Option("--lag", min=1.0, help="How long measurements are re-judged, s.")] = 10.0,
+    snapshot: Annotated[Path | None, typer.Option("--snapshot", help="File to resume from after a restart.")] = None,
+) -> None:
+    """Read measurements from standard input, write estimates to standard output: lines of JSON (docs/online-stream.md)."""
+    from graphloc.stream import serve
+
+    serve(config, rate_hz=rate, ledger=ledger, lag_s=lag, snapshot=snapshot)
+
+
+def match(
+    bag: BagArgument,
+    config: ConfigOption,
+    at: Annotated[float, typer.Option("--at", help="Time since the start of the run, s.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("match.png"),
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Match one scan to the aerial image, and draw it: scan on image, score, modes."""
+    import numpy as np
+
+    from graphloc import app as application
+    from graphloc.errors import OutputError
+    from graphloc.eval.match_picture import write_picture
+    from graphloc.frames import heading_deg_from_yaw
+
+    if out.exists() and not overwrite:
+        raise OutputError(f"{out}: exists already; give another --out, or --overwrite")
+    show = progress()
+    recording, vessel = application.load(bag, config, show)
+    found, _ = application.match_at(recording, vessel, application.Scans(tuple(bag), config.parent), at, show)
+    east, north, yaw = found.prior.pose
+    typer.echo(
+        f"prior: {east:.2f} m east, {north:.2f} m north, heading {float(heading_deg_from_yaw(yaw)):.1f} deg; 1 sigma "
+        f"{found.prior.sigma[:2].max():.2f} m, {np.degrees(found.prior.sigma[2]):.1f} deg"
+    )
+    for mode in found.modes:
+        east, north, yaw = mode.pose
+        sigma = np.sqrt(np.diagonal(mode.cov))
+        typer.echo(
+            f"{mode.probability:.2f}: {east:.2f} m east, {north:.2f} m north, heading {float(heading_deg_from_yaw(yaw)):.1f} deg; "
+            f"1 sigma {sigma[0]:.2f} m, {sigma[1]:.2f} m, {np.degrees(sigma[2]):.1f} deg"
+        )
+    typer.echo(f"{found.none:.2f}: none of them" + (f": {found.why_not}" if found.why_not else ""))
+    if found.score is None and found.modes:
+        return  # BL's matcher scores no pose but its own
+    write_picture(found, out)
+    typer.echo(str(out))

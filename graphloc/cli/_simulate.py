@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs that are made up: simulate, demo."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from graphloc.cli._shared import OutOption, OverwriteOption, progress, smooth_bags
+
+
+def pairs(changes: list[str]) -> dict[str, str]:
+    from graphloc.errors import ConfigError
+
+    pairs = [change.partition("=") for change in changes]
+    for change, (key, equals, value) in zip(changes, pairs, strict=True):
+        if not (key and equals and value):
+            raise ConfigError(f"--set {change}: write KEY=VALUE, as in --set camera_hz=15")
+    return {key: value for key, _, value in pairs}
+
+
+def simulate(
+    scenario: Annotated[str, typer.Argument(help="bl1-drift, dock-fixed-fog, ...: a wrong name lists them.")],
+    out: OutOption,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same run.")] = 0,
+    ros: Annotated[int, typer.Option(min=1, max=2, help="ROS version of the bag.")] = 2,
+    storage: Annotated[str, typer.Option(help="mcap or sqlite3, of a ROS 2 bag.")] = "",
+    harbour: Annotated[str, typer.Option(help="Another harbour than the scenario's: a name or a file.")] = "",
+    rig: Annotated[str, typer.Option(help="Other sensors than the scenario's: a name or a file.")] = "",
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", help="Change the scenario, as in --set camera_hz=15 --set lidar_hz=0.")
+    ] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Write a simulated harbour run: bag, vessel.yaml, aerial image, tag survey, and what only a simulator knows."""
+    from graphloc import outputs
+    from graphloc.errors import ConfigError
+    from graphloc.eval.simulate import find_scenario
+    from graphloc.eval.simulate import simulate as run_simulation
+    from graphloc.eval.simulate.bag import TRUTH, write_bag
+
+    if storage not in ("", "mcap", "sqlite3") or (storage and ros == 1):
+        raise ConfigError(f"--storage {storage}: choose mcap or sqlite3, and ROS 2")
+    outputs.check_folder(out, overwrite=overwrite, mark=TRUTH)
+    named = {key: value for key, value in (("harbour", harbour), ("rig", rig)) if value}
+    run = run_simulation(find_scenario(scenario, {**named, **pairs(changes or [])}), seed)
+    bag, config = write_bag(run, out, ros=ros, storage=storage or "mcap", overwrite=overwrite, progress=progress())
+    typer.echo(f"{bag}\n{config}")
+
+
+def demo(
+    out: OutOption = Path("runs/demo"), seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated run.")] = 0
+) -> None:
+    """Simulate a harbour run with drifting GNSS and 40 % false matches, smooth it from its bag, and compare."""
+    from graphloc.eval.simulate import harbour_scenarios
+    from graphloc.eval.simulate import simulate as run_simulation
+    from graphloc.eval.simulate.bag import write_bag
+
+    run = run_simulation(replace(harbour_scenarios()["bl1-drift"], lidar_hz=0.0), seed)  # its matches are made up
+    bag, config = write_bag(run, out.parent / f"{out.name}-bag", ros=2, overwrite=True, progress=progress())
+    smooth_bags([bag], config, out, None, True, False, compare=True)

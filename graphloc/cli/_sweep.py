@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many runs: sweep."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from graphloc.cli._shared import HoldOutOption, OutOption, OverwriteOption, progress
+
+
+class _Mode(StrEnum):
+    offline = "offline"
+    online = "online"
+    compare = "compare"
+
+
+def seeds_of(text: str) -> list[int]:
+    """Read `0:50` (the second is not among them), `7`, or `1,2,5`."""
+    from graphloc.errors import ConfigError
+
+    try:
+        found: list[int] = []
+        for part in text.split(","):
+            first, colon, end = part.partition(":")
+            found += range(int(first), int(end) if colon else int(first) + 1)
+    except ValueError:
+        found = []
+    if not found or min(found) < 0 or len(found) > 1_000_000:
+        raise ConfigError(f"--seeds {text}: write FIRST:END, as 0:50 for the seeds 0 to 49, or 1,2,5")
+    return list(dict.fromkeys(found))
+
+
+def sweep(
+    scenarios: Annotated[list[str] | None, typer.Argument(help="Scenarios of the simulator, as bl1-drift.")] = None,
+    out: OutOption = Path("runs/sweep"),
+    seeds: Annotated[str | None, typer.Option(help="0:50 for the seeds 0 to 49, or 1,2,5; by default 0.")] = None,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", help="Vary the scenario, as in --set gnss_hz=1,10.")
+    ] = None,
+    config_changes: Annotated[
+        list[str] | None,
+        typer.Option("--config-set", help="Vary the configuration, as in --config-set sensors.gnss.sigma_scale=1,2."),
+    ] = None,
+    bag: Annotated[
+        list[Path] | None, typer.Option(help="Recordings instead of scenarios; all with one --config.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="The vessel.yaml of the recordings.")] = None,
+    hold_out: HoldOutOption = None,
+    mode: Annotated[
+        _Mode, typer.Option(help="offline smooths, online replays, compare does both and more.")
+    ] = _Mode.offline,
+    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes on this machine.")] = 1,
+    scheduler: Annotated[str, typer.Option(help="A Dask scheduler instead, as tcp://host:8786.")] = "",
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Run scenarios over seeds, or bags, with parameters varied, and write one table of results."""
+    from graphloc.errors import ConfigError, InputError
+    from graphloc.eval.sweep_table import summary
+    from graphloc.job import Job, variations
+    from graphloc.sweep import sweep as run_sweep
+
+    if scenarios and bag:
+        raise ConfigError("scenarios and --bag: give one of them, each is a sweep of its own")
+    if bag and config is None:
+        raise ConfigError("--bag: give its vessel.yaml, too: --config")
+    if (changes or seeds) and not scenarios:
+        raise ConfigError("--set and --seeds are of a scenario, and none is named; for a configuration: --config-set")
+    if config is not None and not bag:
+        raise ConfigError("--config goes with --bag; what a scenario's configuration says, --config-set changes")
+    plain = Job(mode=mode.value, hold_out=hold_out or "")
+    jobs = [replace(plain, bag=str(path.absolute()), config=str(config and config.absolute())) for path in bag or ()]
+    for name, which in itertools.product(scenarios or (), variations(changes or (), "--set")):
+        jobs.append(replace(plain, scenario=name, changes=which))
+    every = variations(config_changes or (), "--config-set")
+    jobs = [replace(job, config_changes=which) for job in jobs for which in every]
+    jobs = [replace(job, seed=seed) for job in jobs for seed in (seeds_of(seeds or "0") if scenarios else (0,))]
+    try:
+        table = run_sweep(jobs, out, workers=workers, scheduler=scheduler, overwrite=overwrite, progress=progress())
+    except KeyboardInterrupt:
+        typer.echo(f"{out}: keeps the runs that are done; the same command goes on from there", err=True)
+        raise
+    typer.echo(summary(table))
+    typer.echo(str(out / "table.parquet"))
+    if all(row["error"] for row in table):
+        raise InputError(f"{out}: every run failed: see summary.md; the same command tries them again")

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drills: a recording with scripted harbour failures, for the smoother, its online mode and the filters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from graphloc import app
+from graphloc.config import VesselConfig
+from graphloc.errors import ConfigError, InputError, SolveError
+from graphloc.eval import ekf
+from graphloc.eval.drill import Case, Failure, Measured, Struck, Times, Window, cut, judge, schedule, script
+from graphloc.eval.drill.measure import Drilled, compared
+from graphloc.eval.drill.plan import judged_until, windows
+from graphloc.eval.parallel import beside
+from graphloc.factors import INERTIAL, SENSORS
+from graphloc.frames import Datum, heading_deg_from_yaw
+from graphloc.measurements import CompassHeading
+from graphloc.recording import Progress, Recording, quiet
+from graphloc.replay import replay
+from graphloc.solve import smooth
+from graphloc.trajectory import Trajectory, bounds_95
+
+ESTIMATORS = ("graphloc", "graphloc online", "honest EKF", "BL EKF")
+Tracks = dict[str, tuple[Trajectory | None, str]]
+"""By estimator, its track, or why there is none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Job:
+    """What a worker needs: a window of the recording, how to start there, and the failure or None."""
+
+    part: Recording
+    config: VesselConfig
+    datum: Datum
+    window: int
+    case: Case | None
+
+
+def drill(
+    recording: Recording,
+    config: VesselConfig,
+    *,
+    scans: app.Scans | None = None,
+    times: int = 2,
+    seed: int = 0,
+    only: Sequence[str] = (),
+    jobs: int = 1,
+    progress: Progress = quiet,
+) -> Drilled:
+    """Strike a recording with failures, and measure what each estimator makes of them.
+
+    Scans are matched once, around the undisturbed run; these matches are the measurements of every drill.
+
+    Args:
+        times: how often each failure strikes. only: parts of the names of those wanted; none: all.
+        jobs: processes beside each other.
+
+    Raises:
+        ConfigError: `only` names none. InputError: no failure fits the recording.
+    """
+    _refuse_unknown(recording, only)
+    run = app.smooth_recording(recording, config, scans=scans, progress=progress)
+    recording, datum = run.recording, run.solution.datum
+    failures, left = script(recording)
+    failures = _wanted(failures, only)
+    parts = windows(recording, max(f.length_s for f in failures), times)
+    pieces = [cut(recording, part) for part in parts]
+    configs = [_started_there(config, recording, part, run.solution.trajectory) for part in parts]
+
+    def job(window: int, case: Case | None) -> _Job:
+        part = pieces[window] if case is None else cut(pieces[window], judged_until(case, parts[window]))
+        return _Job(part=part, config=configs[window], datum=datum, window=window, case=case)
+
+    undisturbed = dict(beside(_tracks, [job(k, None) for k in range(len(parts))], jobs, "undisturbed", progress))
+    normal = [undisturbed[k] for k in range(len(parts))]
+    ready_ns = [_first_ns(tracks, part) for tracks, part in zip(normal, parts, strict=True)]
+    cases, too_long = schedule(failures, parts, ready_ns, times, seed)
+    if not cases:
+        raise InputError(f"{recording.source}: no failure fits: {'; '.join(f'{n}: {why}' for n, why in too_long[:2])}")
+    reference = recording.truth or run.solution.trajectory
+    sure, origin_ns = recording.truth is not None, parts[0].begin_ns if parts[0].whole else int(_stamps(recording)[0])
+
+    def against(tracks: Tracks, window: int) -> dict[str, Times]:
+        return {name: compared(t, reference, parts[window], sure=sure) for name, (t, _) in tracks.items()}
+
+    usual = [against(tracks, k) for k, tracks in enumerate(normal)]
+    measured: dict[int, list[Measured]] = {}
+    shown: dict[int, dict[str, Times]] = {}
+    for number, tracks in beside(_tracks, [job(c.window, c) for c in cases], jobs, "drills", progress):
+        case = cases[number]
+        tracks = {**normal[case.window], **tracks}
+        struck = against(tracks, case.window)
+        shown[number] = struck
+        measured[number] = [
+            judge(case, name, struck[name], usual[case.window][name], origin_ns, tracks[name][1]) for name in ESTIMATORS
+        ]
+    return Drilled(
+        source=recording.source,
+        vessel=config.vessel,
+        truth=sure,
+        bound_m=_typical_bound_m(run.solution.trajectory),
+        measured=tuple(m for k in sorted(measured) for m in measured[k]),
+        shown=tuple((cases[k], shown[k]) for k in sorted(shown)),
+        left=(*left, *too_long),
+        windows=parts,
+        warnings=run.recording.warnings,
+    )
+
+
+def _refuse_unknown(recording: Recording, only: Sequence[str]) -> None:
+    """A name that no drill has is said before the run is smoothed."""
+    found, left = script(recording)
+    names = [*(f.name for f in found), *(name for name, _ in left)]
+    for part in only:
+        if not any(part.lower() in name.lower() for name in names):
+            families = ", ".join(dict.fromkeys([*(f.family for f in found), *(name for name, _ in left)]))
+            raise ConfigError(f"--set {part}: no such drill; there are: {families}")
+
+
+def _wanted(failures: Sequence[Failure], only: Sequence[str]) -> tuple[Failure, ...]:
+    found = tuple(f for f in failures if not only or any(part.lower() in f.name.lower() for part in only))
+    if not found:
+        names = ", ".join(dict.fromkeys(f.family for f in failures))
+        raise ConfigError(f"--set {', '.join(only)}: the recording does not permit it; it permits: {names}")
+    return found
+
+
+def _stamps(recording: Recording) -> np.ndarray:
+    assert recording.imu is not None  # it was smoothed
+    return recording.imu.stamps_ns
+
+
+def _first_ns(tracks: Tracks, part: Window) -> int:
+    online, _ = tracks["graphloc online"]
+    return part.begin_ns if online is None else int(online.stamps_ns[0])
+
+
+def _typical_bound_m(track: Trajectory) -> float:
+    assert track.cov is not None
+    return float(np.median(bounds_95(track.cov)[:, 0]))
+
+
+def _started_there(config: VesselConfig, recording: Recording, part: Window, track: Trajectory) -> VesselConfig:
+    """Where no sensor tells the heading, a window begins with the one that the run had come to."""
+    told = any(isinstance(m, CompassHeading) for m in recording.measurements)
+    at = np.array([max(part.begin_ns, int(track.stamps_ns[0]))])
+    if part.whole or told or not track.covers(at)[0]:
+        return config
+    heading_deg = float(heading_deg_from_yaw(track.at(at).yaw_rad)[0])
+    return config.model_copy(update={"start": config.start.model_copy(update={"heading_deg": heading_deg})})
+
+
+def _tracks(job: _Job) -> Tracks:
+    """Run every estimator on a window, struck or not."""
+    struck = Struck(recording=job.part)
+    if job.case is not None:
+        struck = job.case.failure.on(job.part, job.case.begin_ns, job.case.seed)
+    recording, late_ns = struck.recording, struck.late_ns
+    tracks: Tracks = {}
+    if job.case is None or recording is not job.part:  # what only comes late is nothing to the smoother
+        tracks["graphloc"] = _or_why_not(partial(_smoothed, recording, job))
+    tracks["graphloc online"] = _or_why_not(partial(_replayed, recording, job, late_ns))
+    known = as_it_comes(recording, late_ns)
+    for name, filtered in (("honest EKF", ekf.run_honest), ("BL EKF", ekf.run_bl)):
+        tracks[name] = _or_why_not(partial(_filtered, filtered, known, job))
+    return tracks
+
+
+def _smoothed(recording: Recording, job: _Job) -> Trajectory:
+    config = app.seen_frames(job.config, recording)
+    return smooth(recording, config, job.datum, rows=SENSORS, inertial=INERTIAL).trajectory
+
+
+def _replayed(recording: Recording, job: _Job, late_ns: Mapping[int, int]) -> Trajectory:
+    return replay(recording, job.config, datum=job.datum, late_ns=late_ns).solution.trajectory
+
+
+def _filtered(run: Callable[..., ekf.FilterResult], known: Recording, job: _Job) -> Trajectory:
+    return run(known, job.config, job.datum).trajectory
+
+
+def _or_why_not(solve: Callable[[], Trajectory]) -> tuple[Trajectory | None, str]:
+    try:
+        return solve(), ""
+    except (SolveError, InputError, np.linalg.LinAlgError) as error:  # a filter that a failure broke is a result, too
+        return None, str(error)
+
+
+def as_it_comes(recording: Recording, late_ns: Mapping[int, int]) -> Recording:
+    """Return what a filter that knows no delays takes a late measurement for: one of when it comes."""
+    if not late_ns:
+        return recording
+    moved = [replace(m, stamp_ns=m.stamp_ns + late_ns.get(m.seq, 0)) for m in recording.measurements]
+    return replace(recording, measurements=tuple(sorted(moved, key=lambda m: (m.stamp_ns, m.seq))))

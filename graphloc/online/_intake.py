@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which IMU samples are taken, and in what order: clocks leap and are set back, samples come late, units are mistaken."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphloc.measurements import ImuSample
+
+_BACK = 50  # samples in a row before the newest: their clock was set back
+_LATE_S = 3.0  # of samples, before the start
+_HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing
+_FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # what an IMU aboard can say; in g, or deg/s of a turn, it says other
+_PERIODS = 1000  # that the IMU's own is told from
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Taken:
+    """What becomes of the samples that one brought to an end.
+
+    Attributes:
+        accepted: in order, each after the newest. dropped: with the reason.
+        late: the sample itself, of a stamp before the newest. hole: the stamps (ns) that it lies between; None
+            before the first.
+        absurd: why it cannot be a vessel's.
+        set_back_s: so far was the IMU's clock set back; all before is of another clock.
+    """
+
+    accepted: tuple[ImuSample, ...] = ()
+    dropped: tuple[tuple[ImuSample, str], ...] = ()
+    late: ImuSample | None = None
+    hole: tuple[int, int] | None = None
+    absurd: str = ""
+    set_back_s: float = 0.0
+
+
+class ImuIntake:
+    """Samples in the order in which they come.
+
+    Args:
+        gap_s: a longer step is no step: the next sample tells whether the stamp leapt. floats: the accelerometer
+            feels gravity, so that little force is absurd.
+    """
+
+    def __init__(self, gap_s: float, floats: bool) -> None:
+        self._gap_ns, self._floats = gap_s * 1e9, floats
+        self.newest: ImuSample | None = None
+        self.leap: ImuSample | None = None  # waits until others follow it, so that one bad stamp does not cut the run
+        self._leap_age = self._behind = 0
+        self._stamps: list[int] = []  # in order, as far back as a late one may lie
+
+    def accept(self, m: ImuSample) -> float:
+        """Make a sample the newest; return how long (s) there was none before it."""
+        before, self.newest = self.newest, m
+        self._behind = 0
+        self._stamps.append(m.stamp_ns)
+        return 0.0 if before is None else (m.stamp_ns - before.stamp_ns) * 1e-9
+
+    def restart(self, stamps_ns: list[int]) -> None:
+        """Remember these stamps alone."""
+        self._stamps = stamps_ns
+
+    def forget(self, before_ns: int) -> None:
+        """Forget older stamps."""
+        del self._stamps[: bisect_left(self._stamps, before_ns)]
+
+    def take(self, m: ImuSample, *, started: bool) -> Taken:
+        """Say what becomes of a sample, and of one that waited for it. `started`: there are states."""
+        if absurd := self._absurd(m):
+            return Taken(dropped=((m, absurd),), absurd=absurd)
+        newest, leap = self.newest, self.leap
+        if newest is None:
+            return Taken(accepted=(m,))
+        if m.stamp_ns <= newest.stamp_ns:
+            return self._before(m, newest, started)
+        if leap is not None and 0 < abs(m.stamp_ns - leap.stamp_ns) <= self._gap_ns:
+            self.leap = None  # the clock went on from there
+            return Taken(accepted=(leap, m) if leap.stamp_ns < m.stamp_ns else (m, leap))
+        lost = () if leap is None else ((leap, "its stamp leaps, and those after it do not follow"),)
+        if m.stamp_ns - newest.stamp_ns > self._gap_ns:
+            self.leap, self._leap_age = m, 0
+            return Taken(dropped=lost)
+        if leap is None:
+            return Taken(accepted=(m,))
+        self._leap_age += 1
+        if self._leap_age < _BACK:
+            return Taken(accepted=(m,))
+        self.leap = None
+        return Taken(accepted=(m,), dropped=lost)
+
+    def _absurd(self, m: ImuSample) -> str:
+        """Why a sample cannot be a vessel's; empty where it can."""
+        force, rate = float(np.linalg.norm(m.accel_mps2)), float(np.linalg.norm(m.gyro_radps))
+        if (self._floats and force < _FORCE_MPS2[0]) or force > _FORCE_MPS2[1]:
+            return f"a specific force of {force:.3g} m/s^2: another unit?"
+        return f"a rate of {rate:.3g} rad/s: another unit?" if rate > _RATE_RADPS else ""
+
+    def _before(self, m: ImuSample, newest: ImuSample, started: bool) -> Taken:
+        """A sample before the newest: it is late where one is missing; else its clock is not to be trusted."""
+        stamps = self._stamps
+        n = bisect_left(stamps, m.stamp_ns)
+        period_ns = float(np.quantile(np.diff(stamps[-_PERIODS:]), 0.1)) if len(stamps) > 2 else np.inf
+        apart_ns = min((abs(m.stamp_ns - stamp) for stamp in stamps[max(n - 1, 0) : n + 1]), default=0)
+        new = apart_ns > 0 and newest.stamp_ns - m.stamp_ns < _LATE_S * 1e9  # before the start no period is known
+        if (n > 0 and apart_ns >= _HOLE * period_ns) or (not started and new):
+            hole = (stamps[n - 1], stamps[n]) if n > 0 else None
+            stamps.insert(n, m.stamp_ns)
+            return Taken(late=m, hole=hole)
+        self._behind += newest.stamp_ns - m.stamp_ns > self._gap_ns  # less is caught up with, and bridged
+        if self._behind < _BACK:
+            return Taken(dropped=((m, "its stamp does not increase"),))
+        self.newest = None
+        return Taken(accepted=(m,), set_back_s=(newest.stamp_ns - m.stamp_ns) * 1e-9)

@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the cost of a solved run would change, were a lever, a mount or a stamp other than configured.
+
+The solution has bent to what it was told, so residuals alone say too little: here everything follows. The graph is
+linearised at the solution, J dx = b in whitened rows, with one column B for each offset theta. A sensor that sits
+elsewhere, or is read at another time, sees what it would see were the body elsewhere, e(T Exp(xi theta)), so
+
+    B = J_pose xi + J_velocity eta
+
+with (rotation, translation; body axes) xi = (0, e) for a lever along e, (z, -z x l) for a yaw of the mount at l,
+(w, R'v) for a stamp; and eta = R (w x e), 0, a: what the velocity of the lever's end gains. What is left of B when all
+states have followed, B~ = B - J argmin |J X - B|, is what tells of theta: H = B~'B~, g = B~'b.
+
+Losses are re-weighed with the offsets free: or what a wrong lever does in a turn would go for a jump of the GNSS error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import splu
+from scipy.stats import chi2
+
+from graphloc import keys
+from graphloc.build import JUMP, Problem, Stream, build_graph
+from graphloc.config import KernelConfig
+from graphloc.frames import Array
+from graphloc.graph import Attachment, Decision
+from graphloc.offsets import Misfit, Offset, Offsets, Probe
+from graphloc.solve._batch import BatchResult
+
+BLOCK_S = 2.0
+# Rounds of choosing weights; they need not be chosen anew where they change little at once, or (in sigmas) theta does.
+_ROUNDS, _SAME_WEIGHT, _SAME = 6, 0.2, 0.1
+# How far an offset may be off while weights are chosen, 1 sigma: m, rad, s.
+_FREE: dict[Offset, float] = {"x": 3.0, "y": 3.0, "yaw": 0.5, "time": 1.0}
+_LEAST_WEIGHT = 1e-6
+_DRAWS = 16  # random vectors that a trace is estimated with
+_NOISE_ROUNDS, _LEAST_FREEDOM, _UNLIKELY = 5, 3.0, 1e-4
+
+
+_Solved = tuple[Any, Array, Callable[[Array], Array]]
+"""J, weighted; residuals (rows,); and the solution of J'J x = y."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Rows:
+    """The run in whitened rows, J dx = b, without losses.
+
+    Attributes:
+        J: (rows, columns), sparse. b: (rows,). states: poses, whose columns come last; before them their velocities.
+        starts: first row of each factor, and of the end. stamps_ns: (rows,) when each row is.
+        made: factors of each measurement. kernels: factors that share a loss, and the loss.
+    """
+
+    J: Any
+    b: Array
+    states: int
+    starts: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
+    made: dict[tuple[int, int], range]
+    kernels: list[tuple[range, KernelConfig]]
+
+
+def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
+    """Return what a solved run says of the offsets of its sensors; None where it has none to look at.
+
+    Raises:
+        RuntimeError, numpy.linalg.LinAlgError: something is not determined.
+    """
+    problem, values = _with_offsets_free(result)
+    rows = _linearised(problem, values, result)
+    names: list[tuple[str, Offset]] = []
+    columns: list[Array] = []
+    for stream in problem.streams:
+        wanted = tuple(probe.get(stream.config.kind, ()))
+        if wanted:
+            names += [(stream.name, what) for what in wanted]
+            columns.append(_columns(problem, stream, rows, values, result, wanted))
+    if not names:
+        return None
+    B = np.hstack(columns)
+    weak = np.array([1.0 / _FREE[what] for _, what in names])
+    fresh = _root_weights(rows, -rows.b)
+    theta = np.zeros(len(names))
+    for n in range(_ROUNDS):
+        root, before = fresh, theta
+        J, b, own = diags_array(root) @ rows.J, root * rows.b, root[:, None] * B
+        solve = _normal_solver(J)
+        left = own - J @ solve(J.T @ own)
+        r = b - J @ solve(J.T @ b)
+        cov = np.linalg.inv(left.T @ left + np.diag(weak**2))
+        theta = cov @ (left.T @ r)
+        r_free = r - left @ theta
+        fresh = _root_weights(rows, r_free / root)
+        moved = float((np.abs(theta - before) / np.sqrt(np.diagonal(cov))).max())
+        if moved < _SAME if n else np.abs(fresh**2 - root**2).max() < _SAME_WEIGHT:
+            break
+    gradient, curvature = _in_blocks(rows, left, r)
+    gyroscope, accelerometer = _imu_misfit(rows, root, rows.b - B @ theta, (J, r_free, solve))
+    return Offsets(
+        names=tuple(names),
+        block_s=BLOCK_S,
+        gradient=gradient,
+        curvature=curvature,
+        gyroscope=gyroscope,
+        accelerometer=accelerometer,
+        noise_scale=problem.noise_scale,
+    )
+
+
+def _in_blocks(rows: _Rows, left: Array, r: Array) -> tuple[Array, Array]:
+    """Return left'r (n, k) and left'left (n, k, k) of each block of time."""
+    block = (rows.stamps_ns - rows.stamps_ns.min()) // round(BLOCK_S * 1e9)
+    order = np.argsort(block, kind="stable")
+    edges = np.searchsorted(block[order], np.arange(int(block.max()) + 2))
+    parts = [order[a:b] for a, b in pairwise(edges)]
+    return np.array([left[p].T @ r[p] for p in parts]), np.array([left[p].T @ left[p] for p in parts])
+
+
+def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values]:
+    """Return the problem without mount offsets that are states already, and with the slow errors that were left out."""
+    problem, values = result.problem, gtsam.Values(result.values)
+    streams = []
+    for stream in problem.streams:
+        slow, left_out = stream.slow, stream.left_out
+        if slow is not None and slow.axes == ("yaw",) and not np.isfinite(slow.time_constant_s).any():
+            slow = None
+        if left_out is not None:
+            slow = left_out
+            for j in range(len(problem.timeline.slow_stamps_ns)):
+                values.insert(keys.slow(stream.number, j), np.zeros(len(slow.sigma)))
+        streams.append(replace(stream, slow=slow, left_out=None))
+    return replace(problem, streams=tuple(streams)), values
+
+
+def _linearised(problem: Problem, values: gtsam.Values, result: BatchResult) -> _Rows:
+    last, made, decided = len(problem.timeline) - 1, dict[tuple[int, int], range](), {}
+    streams = {s.number: s for s in problem.streams}
+    for key, verdict in result.verdicts.items():
+        if verdict.decision is not None:
+            plain = Decision(mode=verdict.decision.mode, weight=verdict.decision.weight)
+            decided[key] = (plain, _attached(problem, streams[key[0]], key[1], verdict.at))
+    graph, guess = build_graph(problem, values, decided, 0, last, result.prior, jumps=False, made=made)
+    kernels = [
+        (factors, kernel)
+        for key, factors in made.items()
+        if (decision := result.verdicts[key].decision) and (kernel := decision.kernel) and kernel.kind != "none"
+    ]
+    held = [graph.at(f).keys() for f in range(graph.size())]
+    kernels += [(range(f, f + 1), JUMP) for f in _jumps(problem, held)]
+    row, column, entry = np.asarray(graph.linearize(guess).sparseJacobian_())
+    row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
+    starts = np.concatenate([[0], np.cumsum([graph.at(f).dim() for f in range(graph.size())])])
+    width = int(column.max())  # the last column is b
+    right = column == width
+    b = np.zeros(int(starts[-1]))
+    b[row[right]] = entry[right]
+    J = csr_array((entry[~right], (row[~right], column[~right])), shape=(len(b), width))
+    stamps = np.repeat(_stamps_ns(problem, held), np.diff(starts))
+    return _Rows(J=J, b=b, states=last + 1, starts=starts, stamps_ns=stamps, made=made, kernels=kernels)
+
+
+def _attached(problem: Problem, stream: Stream, i: int, at: Attachment) -> Attachment:
+    """An attachment of the solution, to the slow states that the stream has here."""
+    if stream.slow is None:
+        return replace(at, slow_key=None, slow_value=None, slow_next=None)
+    if at.slow_key is None:
+        key = keys.slow(stream.number, int(problem.timeline.slow_of[stream.state[i]]))
+        return replace(at, slow_key=key, slow_value=np.zeros(len(stream.slow.sigma)))
+    return at
+
+
+def _jumps(problem: Problem, held: list[Any]) -> list[int]:
+    """Factors that are steps of slow states which may jump."""
+    nodes = range(len(problem.timeline.slow_stamps_ns))
+    slow = {keys.slow(s.number, j) for s in problem.streams if s.slow is not None and s.slow.jumps for j in nodes}
+    return [f for f, own in enumerate(held) if len(own) == 2 and own[0] in slow and own[1] in slow]
+
+
+def _stamps_ns(problem: Problem, held: list[Any]) -> NDArray[np.int64]:
+    """When each factor is: at the first of its states. A leaf's own prior stands before the factor that ties it."""
+    nodes = problem.timeline.slow_stamps_ns.tolist()
+    at = {key(k): n for key in (keys.pose, keys.velocity) for k, n in enumerate(problem.timeline.stamps_ns.tolist())}
+    at |= {keys.bias(j): n for j, n in enumerate(nodes)}
+    at |= {keys.slow(s.number, j): n for s in problem.streams if s.slow is not None for j, n in enumerate(nodes)}
+    stamps, after = np.zeros(len(held), dtype=np.int64), nodes[0]
+    for f in range(len(held) - 1, -1, -1):
+        after = stamps[f] = min((at[key] for key in held[f] if key in at), default=after)
+    return stamps
+
+
+def _columns(
+    problem: Problem,
+    stream: Stream,
+    rows: _Rows,
+    values: gtsam.Values,
+    result: BatchResult,
+    wanted: tuple[Offset, ...],
+) -> Array:
+    """B (rows, wanted) of one sensor."""
+    B = np.zeros((len(rows.b), len(wanted)))
+    used = [i for i in range(len(stream.measurements)) if (stream.number, i) in rows.made]
+    if not used:
+        return B
+    met = [result.verdicts[(stream.number, i)].at for i in used]
+    state = stream.state[used]
+    R = np.array([at.T_world_body.rotation().matrix() for at in met])
+    w = np.array([at.gyro_radps for at in met])
+    v = np.array([at.v_world_mps + at.dv_world_mps for at in met])
+    every = np.array([values.atVector(keys.velocity(k)) for k in range(rows.states)])
+    t = (problem.timeline.stamps_ns - problem.timeline.stamps_ns[0]) * 1e-9
+    gain = np.gradient(every, t, axis=0)[state]
+    lever = np.asarray(stream.mount.translation())
+    shift = np.zeros((len(used), 9, len(wanted)))  # rotation, translation, velocity
+    for c, what in enumerate(wanted):
+        if what == "time":
+            shift[:, :, c] = np.hstack([w, np.einsum("nji,nj->ni", R, v), gain])
+        elif what == "yaw":
+            up = np.array([0.0, 0.0, 1.0])
+            shift[:, :6, c] = np.concatenate([up, -np.cross(up, lever)])
+        else:
+            along = np.eye(3)["xy".index(what)]
+            shift[:, 3:6, c] = along
+            shift[:, 6:, c] = np.einsum("nij,nj->ni", R, np.cross(w, along))
+    spans = [rows.made[(stream.number, i)] for i in used]
+    begin, end = rows.starts[[s.start for s in spans]], rows.starts[[s.stop for s in spans]]
+    of = np.repeat(np.arange(len(used)), end - begin)
+    own = np.concatenate([np.arange(a, b) for a, b in zip(begin, end, strict=True)])
+    part = rows.J[own].tocoo()
+    poses = rows.J.shape[1] - 6 * rows.states  # keys are sorted by letter: x, the poses, comes last, v before it
+    for width, first, at_shift in ((6, poses, 0), (3, poses - 3 * rows.states, 6)):
+        place = part.col - (first + width * state[of[part.row]])
+        hit = (place >= 0) & (place < width)
+        np.add.at(B, own[part.row[hit]], part.data[hit, None] * shift[of[part.row[hit]], place[hit] + at_shift])
+    return B
+
+
+def _root_weights(rows: _Rows, misfit: Array) -> Array:
+    """Root of each row's weight, by the losses."""
+    total, root = np.concatenate([[0.0], np.cumsum(misfit**2)]), np.ones(len(misfit))
+    for factors, kernel in rows.kernels:
+        a, b = rows.starts[factors.start], rows.starts[factors.stop]
+        root[a:b] = np.sqrt(max(kernel.weight(float(total[b] - total[a])), _LEAST_WEIGHT))
+    return root
+
+
+def _normal_solver(J: Any) -> Callable[[Array], Array]:
+    """Return the solution of J'J x = y as a function of y."""
+    N = (J.T @ J).tocsc()
+    scale = 1.0 / np.sqrt(N.diagonal())
+    scaled = (diags_array(scale) @ N @ diags_array(scale)).tocsc()
+    factor = splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+
+    def solve(y: Array) -> Array:
+        by = scale if y.ndim == 1 else scale[:, None]
+        return np.asarray(by * factor.solve(np.asarray(by * y)))
+
+    return solve
+
+
+def _imu_misfit(rows: _Rows, root: Array, b: Array, solved: _Solved) -> tuple[Misfit, Misfit]:
+    """Misfit of gyroscope and accelerometer, and how much less noise would explain it.
+
+    The links come first, nine rows each: attitude (the gyroscope's), place, velocity. With less noise the other sensors
+    have more to say there, so that how much less is found in some rounds (variance components, Helmert).
+
+    Args:
+        root: (rows,) of the weights. b: (rows,) of `rows`, the offsets taken out. solved: the run with these.
+    """
+    links = np.arange(9 * (rows.states - 1)).reshape(-1, 9)
+    own, needed = (links[:, :3].ravel(), links[:, 3:].ravel()), np.ones(2)
+    squares, freedom = first = _squares_and_freedom(solved, own)
+    low = [f > _LEAST_FREEDOM and chi2.cdf(s, f) < _UNLIKELY for s, f in zip(squares, freedom, strict=True)]
+    for _ in range(_NOISE_ROUNDS if any(low) else 0):
+        needed[low] *= np.clip(np.sqrt(squares / np.maximum(freedom, 1e-9)), 0.3, 1.2)[low]
+        scaled = root.copy()
+        for part, times in zip(own, needed, strict=True):
+            scaled[part] /= times
+        J = diags_array(scaled) @ rows.J
+        solve = _normal_solver(J)
+        squares, freedom = _squares_and_freedom((J, scaled * b - J @ solve(J.T @ (scaled * b)), solve), own)
+    sigma = needed / np.sqrt(2.0 * np.maximum(freedom, 1.0))
+    gyroscope, accelerometer = (
+        Misfit(squares=float(first[0][k]), freedom=float(first[1][k]), needed=float(needed[k]), sigma=float(sigma[k]))
+        for k in range(2)
+    )
+    return gyroscope, accelerometer
+
+
+def _squares_and_freedom(solved: _Solved, parts: tuple[NDArray[np.intp], ...]) -> tuple[Array, Array]:
+    """Squared residuals of parts of the rows, and the trace of 1 - J (J'J)^-1 J' over each (Hutchinson, random signs)."""
+    rng, (J, r, solve) = np.random.default_rng(0), solved
+    signs = [rng.choice(np.array([-1.0, 1.0]), (len(part), _DRAWS)) for part in parts]
+    back = np.hstack([J[part].T @ s for part, s in zip(parts, signs, strict=True)])
+    explained = (back * solve(back)).sum(axis=0).reshape(len(parts), _DRAWS).mean(axis=1)
+    squares = np.array([(r[part] ** 2).sum() for part in parts])
+    return squares, np.maximum(np.array([len(part) for part in parts]) - explained, 0.0)

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The run without each sensor in turn: what each bought, and which contradicts the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+from graphloc import app
+from graphloc.config import VesselConfig
+from graphloc.errors import GraphlocError, InputError
+from graphloc.eval.ablation import Ablated, Effect, Off, Vote, effect, off, suspects
+from graphloc.eval.consistency import contradiction, fit
+from graphloc.eval.holdout import HoldOut
+from graphloc.eval.metrics import NoCommonTimeError
+from graphloc.eval.parallel import beside
+from graphloc.factors import INERTIAL, SENSORS
+from graphloc.frames import Datum
+from graphloc.recording import Progress, Recording, quiet
+from graphloc.solution import Solution
+from graphloc.solve import smooth
+
+_VOTED = 3  # suspects that are set against each other, two by two
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Job:
+    """A run without some of its sensors."""
+
+    recording: Recording
+    config: VesselConfig
+    datum: Datum
+    without: tuple[str, ...]
+
+
+def ablate(
+    recording: Recording,
+    config: VesselConfig,
+    *,
+    scans: app.Scans | None = None,
+    hold_out: HoldOut | None = None,
+    jobs: int = 1,
+    progress: Progress = quiet,
+) -> Ablated:
+    """Smooth a run without each sensor in turn.
+
+    A sensor is left out as if it were switched off: what only it could tell from motion is then not modelled. Where
+    several contradict the rest, the run is smoothed without each two of them, to hear what is left.
+
+    Args:
+        hold_out: fixes to predict, where there is no truth. jobs: processes beside each other.
+
+    Raises:
+        InputError: no sensor has measurements.
+    """
+    run = app.smooth_recording(recording, config, hold_out=hold_out, scans=scans, progress=progress)
+    names = _with_measurements(run)
+    if not names:
+        raise InputError(f"{recording.source}: no sensor beside the IMU has measurements: nothing to leave out")
+    solved = _solve(run, [(name,) for name in names], jobs, "without each sensor", progress)
+    over_time: dict[str, Off] = {}
+    effects = [_effect(run, name, names, solved[(name,)], over_time) for name in ("", *names)]
+    doubted = suspects(effects[1:])[:_VOTED]
+    pairs = list(combinations(doubted, 2))
+    without_both = _solve(run, pairs, jobs, "without two suspects", progress) if pairs else {}
+    imu = next((n for n, s in config.sensors.items() if s.kind == INERTIAL.kind and s.enabled), "imu")
+    carries = "the states hang on it: it carries the motion between all other measurements"
+    return Ablated(
+        source=recording.source,
+        vessel=config.vessel,
+        basis="truth" if run.recording.truth is not None else "held" if run.held else "full",
+        full=effects[0],
+        effects=(*effects[1:], Effect(without=imu, measurements=_samples(recording), fits={}, why_not=carries)),
+        over_time=over_time,
+        votes=tuple(_vote(run, *pair, without_both[pair]) for pair in pairs),
+        matched=tuple(n for n in names if n in config.of_kind("aerial")),
+        warnings=(*run.recording.warnings, *run.solution.stats.warnings),
+    )
+
+
+def _samples(recording: Recording) -> int:
+    return 0 if recording.imu is None else len(recording.imu)
+
+
+def _with_measurements(run: app.Run) -> list[str]:
+    measured = {m.sensor for m in run.recording.measurements}
+    return [name for name, sensor in run.config.sensors.items() if sensor.enabled and name in measured]
+
+
+def _solve(
+    run: app.Run, without: Sequence[tuple[str, ...]], workers: int, stage: str, progress: Progress
+) -> dict[tuple[str, ...], Solution | str]:
+    """Return the solution without some sensors, or why there is none."""
+    jobs = [
+        _Job(recording=run.recording, config=run.config, datum=run.solution.datum, without=names) for names in without
+    ]
+    done = dict(beside(_smoothed, jobs, workers, stage, progress))
+    return {names: done[k] for k, names in enumerate(without)} | {("",): run.solution}
+
+
+def _smoothed(job: _Job) -> Solution | str:
+    off = {name: job.config.sensors[name].model_copy(update={"enabled": False}) for name in job.without}
+    config = job.config.model_copy(update={"sensors": {**job.config.sensors, **off}})
+    try:
+        seen = app.seen_frames(config, job.recording)
+        return smooth(job.recording, seen, job.datum, rows=SENSORS, inertial=INERTIAL)
+    except GraphlocError as error:
+        return str(error)
+
+
+def _effect(run: app.Run, name: str, names: list[str], solved: Solution | str, over_time: dict[str, Off]) -> Effect:
+    count = sum(m.sensor == name for m in run.recording.measurements)
+    if isinstance(solved, str):
+        return Effect(without=name, measurements=count, fits={}, why_not=solved)
+    try:
+        away = off(solved, run.solution, run.recording.truth, run.held, app.levers_m(run))
+    except NoCommonTimeError as error:
+        return Effect(without=name, measurements=count, fits={}, why_not=str(error))
+    if name or run.recording.truth is not None or run.held:
+        over_time[name] = away
+    contradicts = contradiction(solved, run.recording, run.config, name, SENSORS) if name else None
+    fits: Mapping[str, float | None] = {other: fit(solved, other) for other in names if other != name}
+    return effect(name, count, solved, run.solution, away, contradicts, fits)
+
+
+def _vote(run: app.Run, one: str, other: str, solved: Solution | str) -> Vote:
+    if isinstance(solved, str):
+        return Vote(one=one, other=other, one_off=None, other_off=None)
+    by = [contradiction(solved, run.recording, run.config, name, SENSORS) for name in (one, other)]
+    first, second = (None if found is None else found.sigmas for found in by)
+    return Vote(one=one, other=other, one_off=first, other_off=second)

@@ -1,0 +1,89 @@
+"""Which IMU samples are taken: leaps, clocks that are set back, late ones; and that none is lost or taken twice."""
+
+import numpy as np
+
+from graphloc.measurements import ImuSample
+from graphloc.online._intake import ImuIntake, Taken
+
+MS = 1_000_000
+GRAVITY = np.array([0.0, 0.0, 9.81])
+
+
+def sample(at_ms: float, seq: int = 0) -> ImuSample:
+    return ImuSample(
+        stamp_ns=round(at_ms * MS), sensor="imu", seq=seq, accel_mps2=GRAVITY, gyro_radps=np.zeros(3)
+    )  # fmt: skip
+
+
+def fed(intake: ImuIntake, at_ms: float, *, started: bool = True, seq: int = 0) -> Taken:
+    taken = intake.take(sample(at_ms, seq), started=started)
+    for m in taken.accepted:
+        intake.accept(m)
+    return taken
+
+
+def running() -> ImuIntake:
+    """100 samples, 10 ms apart, until 990 ms; more than 200 ms are a leap."""
+    intake = ImuIntake(0.2, floats=True)
+    for k in range(100):
+        assert len(fed(intake, 10.0 * k).accepted) == 1
+    return intake
+
+
+def test_a_lone_leap_waits_for_fifty_that_do_not_follow_it() -> None:
+    intake = running()
+    assert fed(intake, 60_000.0) == Taken()
+    for k in range(49):
+        assert not fed(intake, 1000.0 + 10.0 * k).dropped
+    ((lost, why),) = fed(intake, 1490.0).dropped
+    assert lost.stamp_ns == 60_000 * MS
+    assert "leaps" in why
+    assert intake.leap is None
+
+
+def test_a_gap_is_no_leap_once_another_follows() -> None:
+    intake = running()
+    assert not fed(intake, 5000.0).accepted
+    assert [m.stamp_ns // MS for m in fed(intake, 4990.0).accepted] == [4990, 5000]
+    assert intake.newest is not None
+    assert intake.newest.stamp_ns == 5000 * MS
+
+
+def test_a_late_one_is_taken_where_one_is_missing_alone() -> None:
+    intake = running()
+    for k in (100, 101, 103, 104):
+        fed(intake, 10.0 * k)
+    found = fed(intake, 1020.0)
+    assert found.late is not None
+    assert found.hole == (1010 * MS, 1030 * MS)
+    assert fed(intake, 1020.0).dropped  # twice
+    assert fed(intake, 1015.0).dropped  # between two that are there
+    assert fed(intake, -10.0).dropped  # before all that is remembered
+
+
+def test_a_clock_that_is_set_back_is_believed_after_fifty() -> None:
+    intake = running()
+    for k in range(49):
+        assert fed(intake, -9000.0 + 10.0 * k).dropped
+    found = fed(intake, -8510.0)
+    assert found.set_back_s == (990.0 + 8510.0) / 1e3
+    assert len(found.accepted) == 1
+
+
+def test_none_is_lost_and_none_taken_twice() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        intake, now_ms, started, out = ImuIntake(0.2, floats=True), 0.0, False, []
+        for seq in range(300):
+            now_ms += 10.0 + rng.choice([0.0, -4000.0, 4000.0], p=[0.99, 0.005, 0.005])
+            off_ms = rng.choice([0.0, -2500.0, 1500.0], p=[0.93, 0.05, 0.02]) * rng.uniform()
+            taken = fed(intake, now_ms + off_ms, started=started, seq=seq)
+            late = () if taken.late is None else (taken.late,)
+            out += [m.seq for m in (*taken.accepted, *late, *(m for m, _ in taken.dropped))]
+            assert not (late and started and taken.hole is None)
+            if taken.set_back_s:
+                intake.restart([])
+                started = False
+            started |= bool(rng.uniform() < 0.05)
+        out += [intake.leap.seq] if intake.leap else []
+        assert sorted(out) == list(range(300))

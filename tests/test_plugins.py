@@ -1,0 +1,100 @@
+"""Sensors of other packages: the worked example, installed and read from a bag, and packages that are broken."""
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from graphloc.config import load_config
+from graphloc.errors import ConfigError
+from graphloc.eval.simulate import Scenario, simulate
+from graphloc.eval.simulate.bag import write_bag as write_simulated
+from graphloc.factors import KINDS
+from tests.bagfactory import Messages, write_bag
+
+EXAMPLE = Path(__file__).parent.parent / "examples/range_beacon"
+Points = dict[str, dict[str, str]]
+
+
+def installed(site: Path, points: Points, *modules: Path) -> dict[str, str]:
+    """What pip would do: modules on the path, and metadata that names entry points. Returns the environment."""
+    info = site / "some_package-1.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: some-package\nVersion: 1\n")
+    text = [f"[{group}]\n" + "\n".join(f"{k} = {v}" for k, v in named.items()) for group, named in points.items()]
+    (info / "entry_points.txt").write_text("\n".join(text))
+    for module in modules:
+        (site / module.name).write_text(module.read_text())
+    return {**os.environ, "PYTHONPATH": str(site)}
+
+
+def graphloc(env: dict[str, str], *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "graphloc", *map(str, arguments)]
+    return subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+
+
+def test_the_example_is_read_from_a_bag_and_used(tmp_path: Path) -> None:
+    """Ranges to two beacons, one of them in the wrong place by 20 m: it is found out by the rest of the run."""
+    run = simulate(Scenario(duration_s=16.0, noise="clean", false_fraction=0.0), 4)
+    bag, config = write_simulated(run, tmp_path / "bag", ros=2)
+    make, right, wrong = Messages(2), np.array([-70.0, 90.0, 5.0]), np.array([60.0, 80.0, 5.0])
+    items: list[Any] = []
+    for k in range(0, len(run.truth), 50):
+        at_ns = int(run.truth.stamps_ns[k])
+        for topic, place in (("/right", right), ("/wrong", wrong)):
+            away_m = float(np.linalg.norm(run.truth.p_world_m[k] - place)) if k != 50 else 0.0
+            msg = make.t["sensor_msgs/msg/Range"](
+                header=make.header(at_ns),
+                radiation_type=0,
+                field_of_view=0.0,
+                min_range=1.0,
+                max_range=500.0,
+                range=away_m,
+            )
+            items.append((topic, at_ns + 1000, msg))
+    ranges = write_bag(tmp_path / "ranges", make, items, kind="mcap")
+    raw = YAML(typ="safe", pure=True).load(config.read_text())
+    for name, place in (("right", right), ("wrong", wrong - [20.0, 0.0, 0.0])):
+        raw["sensors"][name] = {"kind": "range_beacon", "topic": f"/{name}", "beacon_m": [float(v) for v in place]}
+    with config.open("w") as stream:
+        YAML(typ="safe", pure=True).dump(raw, stream)
+
+    points = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]["entry-points"]
+    env = installed(tmp_path / "site", points, EXAMPLE / "graphloc_range_beacon.py")
+    done = graphloc(env, "smooth", bag, ranges, "-c", config, "-o", tmp_path / "run", "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout[: done.stdout.rindex("}") + 1])
+    count = len(items) // 2
+    assert said["ledger"]["right"] == {"malformed": 1, "used": count - 1}
+    assert said["ledger"]["wrong"] == {"malformed": 1, "rejected": count - 1}
+    assert said["Against truth"]["graphloc"]["position_rmse_m"] < 0.3
+    assert "not within 1 to 500 m" in (tmp_path / "run/ledger.csv").read_text()
+
+    with pytest.raises(ConfigError, match="unknown kind 'range_beacon'"):
+        load_config(config, KINDS)  # here it is not installed
+
+
+GOOD = "graphloc_range_beacon:ROW"
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        ({"graphloc.sensors": {"broken": "nowhere:ROW"}}, "'broken' of some-package: cannot be loaded"),
+        ({"graphloc.sensors": {"number": "math:pi"}}, "'number': is a float, no Sensor"),
+        ({"graphloc.sensors": {"other": GOOD}}, "'other': its row is of kind 'range_beacon'"),
+    ],
+)
+def test_a_broken_package_is_one_line(tmp_path: Path, points: Points, said: str) -> None:
+    done = graphloc(installed(tmp_path / "site", points, EXAMPLE / "graphloc_range_beacon.py"), "sensors")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert said in done.stderr
+    assert "uninstall" in done.stderr
