@@ -18,7 +18,7 @@ from graphloc.config import AerialConfig
 from graphloc.factors import pose
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
-from graphloc.linear import linear_update
+from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import PoseFix, PoseMode
 
 
@@ -45,9 +45,9 @@ def factors(m: PoseFix, config: AerialConfig, at: Attachment, decision: Decision
     if at.slow_key is None:
         return pose.factors(m, config, at, decision)
     residual = residuals(m, config, at)[decision.mode]
-    terms: list[tuple[int, Any, Array]] = [
-        (at.pose_key, at.T_world_body, residual.jacobian()),
-        (at.slow_key, np.array(at.slow_value), _shown_off(m.axes)),
+    terms = [
+        pose_term(at, residual.jacobian()),
+        Term(at.slow_key, np.array(at.slow_value), _shown_off(m.axes)),
     ]
     return linear_update(residual, terms, decision)
 

@@ -31,7 +31,7 @@ from graphloc.berths import Berth
 from graphloc.config import AprilTagConfig
 from graphloc.frames import Array, Datum, pinhole, skew
 from graphloc.graph import Attachment, Constant, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import linear_update
+from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import TagMode, TagSighting
 from graphloc.survey import WORLD, DockConfig, Survey
 
@@ -176,13 +176,15 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
         corners = Residual(
             raw=raw[own], cov=m.cov[own, own], jacobian=lambda: np.zeros((8, 6)), prior=1.0, size_m=None, size_deg=None
         )
-        terms: list[tuple[int, Any, Array]] = [(at.pose_key, at.T_world_body, by_body[own])]
+        terms = [pose_term(at, by_body[own])]
         if tie is not None:
-            terms.append((at.leaf_keys[0], seen.moved, by_dock[own]))
+            terms.append(Term(at.leaf_keys[0], seen.moved, by_dock[own]))
         if constant is not None:
             at_rest = by_point[4 * k : 4 * k + 4] @ seen.turn
             turned = at_rest @ np.array([-skew(arm) for arm in seen.within[k]])
-            terms.append((constant[0], np.array(constant[1]), np.concatenate([at_rest, turned], axis=2).reshape(8, 6)))
+            terms.append(
+                Term(constant[0], np.array(constant[1]), np.concatenate([at_rest, turned], axis=2).reshape(8, 6))
+            )
         found += linear_update(corners, terms, decision).factors
     return GraphUpdate(factors=tuple(found), guesses=() if tie is None else tie.guesses)
 
@@ -201,18 +203,19 @@ def _tie(seen: _Seen, dock: DockConfig, at: Attachment) -> GraphUpdate:
         raw=np.zeros(6), cov=np.diag(np.maximum(bridge, _TIE) ** 2), jacobian=lambda: np.zeros((6, 6)), prior=1.0,
         size_m=None, size_deg=None,
     )  # fmt: skip
-    terms: list[tuple[int, Any, Array]] = [
-        (at.leaf_keys[0], seen.moved, np.eye(6)), (at.slow_key, np.array(at.slow_value), -(1.0 - share) * picked)
-    ]  # fmt: skip
+    terms = [
+        Term(at.leaf_keys[0], seen.moved, np.eye(6)),
+        Term(at.slow_key, np.array(at.slow_value), -(1.0 - share) * picked),
+    ]
     if at.slow_next is not None:
-        terms.append((at.slow_next[0], np.array(at.slow_next[1]), -share * picked))
+        terms.append(Term(at.slow_next[0], np.array(at.slow_next[1]), -share * picked))
     return GraphUpdate(linear_update(residual, terms, Decision()).factors, ((at.leaf_keys[0], seen.moved),))
 
 
-def _terms(at: Attachment, jacobian: Array, slow_jacobian: Any) -> list[tuple[int, Any, Array]]:
-    terms: list[tuple[int, Any, Array]] = [(at.pose_key, at.T_world_body, jacobian)]
+def _terms(at: Attachment, jacobian: Array, slow_jacobian: Any) -> list[Term]:
+    terms = [pose_term(at, jacobian)]
     if at.slow_key is not None:
-        terms.append((at.slow_key, np.array(at.slow_value), slow_jacobian()))
+        terms.append(Term(at.slow_key, np.array(at.slow_value), slow_jacobian()))
     return terms
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from graphloc.config import CompassConfig
 from graphloc.frames import Array, Datum, skew, wrap_angle
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import linear_update
+from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import CompassHeading
 
 _FLOOR_RAD = np.radians(0.05)  # no compass is better, whatever it says
@@ -57,9 +57,9 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
 def factors(m: CompassHeading, config: CompassConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one heading."""
     residual = residuals(m, config, at)[0]
-    terms = [(at.pose_key, at.T_world_body, residual.jacobian())]
+    terms = [pose_term(at, residual.jacobian())]
     if at.slow_key is not None:
-        terms.append((at.slow_key, np.array(at.slow_value), np.eye(1)))
+        terms.append(Term(at.slow_key, np.array(at.slow_value), np.eye(1)))
     return linear_update(residual, terms, decision)
 
 

@@ -20,7 +20,7 @@ from graphloc.config import HeightConfig
 from graphloc.factors._noise import robust
 from graphloc.frames import Array, Datum
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import linear_update
+from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import HeightPrior
 from graphloc.time import duration_ns
 
@@ -63,8 +63,8 @@ def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Deci
     if at.slow_key is not None:
         (residual,) = residuals(m, config, at)
         terms = [
-            (at.pose_key, at.T_world_body, residual.jacobian()),
-            (at.slow_key, np.array(at.slow_value), -np.eye(1)),
+            pose_term(at, residual.jacobian()),
+            Term(at.slow_key, np.array(at.slow_value), -np.eye(1)),
         ]
         return linear_update(residual, terms, decision)
     sigmas = np.array([_WIDE_M, _WIDE_M, m.sigma_m / np.sqrt(decision.weight)])

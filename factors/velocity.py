@@ -18,7 +18,7 @@ from graphloc.config import VelocityConfig
 from graphloc.factors._noise import with_floors
 from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor
-from graphloc.linear import linear_update
+from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import GnssVelocity
 
 
@@ -51,8 +51,8 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
 def factors(m: GnssVelocity, config: VelocityConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one velocity."""
     residual = residuals(m, config, at)[0]
-    swing = (at.pose_key, at.T_world_body, residual.jacobian())
-    return linear_update(residual, [swing, (at.velocity_key, at.v_world_mps, np.eye(3))], decision)
+    swing = pose_term(at, residual.jacobian())
+    return linear_update(residual, [swing, Term(at.velocity_key, at.v_world_mps, np.eye(3))], decision)
 
 
 def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:

@@ -18,6 +18,11 @@ def pose(k: int) -> int:
     return _X + k
 
 
+def is_pose(key: int) -> bool:
+    """Whether a key is that of a pose."""
+    return key >> 56 == ord("x")
+
+
 def velocity(k: int) -> int:
     """Key of the velocity of state `k`."""
     return _V + k

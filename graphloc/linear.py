@@ -7,24 +7,53 @@ Measured: a `CustomFactor` calls back into Python at every linearisation, 25 tim
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import Decision, GraphUpdate, Residual
+from graphloc.graph import Attachment, Decision, GraphUpdate, Residual
 
 
-def linear_update(residual: Residual, terms: Sequence[tuple[int, Any, Array]], decision: Decision) -> GraphUpdate:
+class Term(NamedTuple):
+    """A state of a linear factor.
+
+    Attributes:
+        key: of the state. point: the value whose tangent the factor is written in. jacobian: (k, dim) d raw / d tangent.
+        offset: (dim,) the estimate's coordinates in that tangent; None: the point is the estimate.
+    """
+
+    key: int
+    point: Any
+    jacobian: Array
+    offset: Array | None = None
+
+
+def pose_term(at: Attachment, jacobian: Array) -> Term:
+    """Return the pose's term; jacobian: (k, 6) d raw / d body tangent, at the estimate.
+
+    A solver that goes on from an older linearisation applies a factor's Jacobian in *that* tangent, whatever point the
+    factor was written at. The same shift of the world is then R^T d for one and R'^T d for the other, and what only
+    relates two places (a vessel and the dock that it sees, to 3 mm) seems to know where both are: turned by 5 mrad, to
+    3 mm / 5 mrad = 0.6 m, again with each sighting. So the factor is written in the solver's own tangent.
+    """
+    if at.T_solver is None:
+        return Term(at.pose_key, at.T_world_body, jacobian)
+    turn = at.T_world_body.rotation().matrix().T @ at.T_solver.rotation().matrix()
+    carried = np.hstack([jacobian[:, :3] @ turn, jacobian[:, 3:] @ turn])
+    return Term(at.pose_key, at.T_solver, carried, at.T_solver.localCoordinates(at.T_world_body))
+
+
+def linear_update(residual: Residual, terms: Sequence[Term], decision: Decision) -> GraphUpdate:
     """Return the factor of a residual that is linear in some states.
 
     A linear factor carries no kernel: the weight that the kernel gives the residual stands in.
 
     Args:
         residual: raw (k,) and its covariance, at the estimate.
-        terms: of each state its key, its value in the estimate, and d raw / d tangent (k, dim).
+        terms: the states; of the pose, `pose_term`.
         decision: of this pass.
     """
     kernel = decision.kernel or KernelConfig(kind="none")
@@ -32,12 +61,14 @@ def linear_update(residual: Residual, terms: Sequence[tuple[int, Any, Array]], d
     cov = residual.cov / weight
     # Most residuals here are of one row (headings, heights), and at every pass: two calls into LAPACK for a root show.
     whiten = 1.0 / np.sqrt(cov) if len(cov) == 1 else np.linalg.inv(np.linalg.cholesky(cov))
-    point = gtsam.Values()
+    point, raw = gtsam.Values(), residual.raw
     arguments: list[Any] = []
-    for key, value, jacobian in terms:
-        point.insert(key, value)
-        arguments += [key, whiten @ jacobian]
-    model = gtsam.noiseModel.Unit.Create(len(residual.raw))
+    for term in terms:
+        point.insert(term.key, term.point)
+        arguments += [term.key, whiten @ term.jacobian]
+        if term.offset is not None:
+            raw = raw - term.jacobian @ term.offset
+    model = gtsam.noiseModel.Unit.Create(len(raw))
     make: Any = gtsam.JacobianFactor  # the stubs know one overload per number of states
-    linear = make(*arguments, -whiten @ residual.raw, model)
+    linear = make(*arguments, -whiten @ raw, model)
     return GraphUpdate(factors=(gtsam.LinearContainerFactor(linear, point),))

@@ -45,6 +45,10 @@ from graphloc.solve._solution import AGREES, row_of
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
 _CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
+_STALE_RAD = (
+    3e-3,
+    1e-3,
+)  # between the tangent that a factor is written in and the solver's; where it leaves, and stays so
 _PAGE_S = 1.0  # states leave together by so much
 _LEAF_S, _SURE = 1.0, 0.9  # how often an older chapter is judged again; a weight that needs no second look
 _STEP_COST = (
@@ -67,6 +71,7 @@ class _Entry:
     index: int
     verdict: Verdict
     held: Held | None = None
+    written: Any = None  # the pose whose tangent its factors are written in
     opened: bool = False  # its kernel bends later than configured
     judged: bool = False  # as a hypothesis, once at least
 
@@ -146,6 +151,7 @@ class Lag:
                     self._known[key] = anchor.constants[(stream.name, k)]
         window.commit()
         self._committed = 0  # the last state that the solver has
+        self._page_s = 0.0
         self._newest = self._read_newest()
 
     @property
@@ -227,6 +233,10 @@ class Lag:
         """Estimate anew, and let go what has left."""
         timeline, window = self.problem.timeline, self._window
         pose, now_s = keys.pose(timeline.last), self._page(timeline.stamps_ns[timeline.last])
+        if now_s > self._page_s:  # just before a page leaves, which re-eliminates everything as well
+            self._page_s = now_s
+            if window.relinearise():
+                self._write_anew(leaving_s=now_s - self._lag_s + _PAGE_S)
         self._keep_constants(now_s)
         before = window.values.atPose3(pose).translation()
         window.commit()
@@ -239,6 +249,18 @@ class Lag:
         self._committed = timeline.last
         self._let_go()
         self._newest = self._read_newest()
+
+    def _write_anew(self, leaving_s: float) -> None:
+        """Stage the factors anew that are written in tangents which the solver has left (see `graphloc.linear.pose_term`)."""
+        window, first = self._window, self.problem.timeline.first
+        for entry in self._entries.values():
+            if entry.stream.row.false is None or entry.held is None or not entry.reaches(first):
+                continue  # only sensors with hypotheses see to centimetres
+            now = window.linearised_at(entry.verdict.at.pose_key)
+            leaves = self._seconds(entry.measurement.stamp_ns) <= leaving_s
+            if np.abs(entry.written.rotation().localCoordinates(now.rotation())).max() > _STALE_RAD[leaves]:
+                at = attach(self.problem, entry.stream, entry.index, window.values)
+                self._change(entry, replace(entry.verdict, at=at))
 
     def _read_newest(self) -> Newest:
         timeline, values = self.problem.timeline, self._window.values
@@ -544,13 +566,14 @@ class Lag:
         if verdict.decision is None or verdict.decision.weight <= NEGLIGIBLE:
             return
         window, t = self._window, self._page(self.problem.timeline.stamps_ns[entry.state])
-        update = stream.row.factors(m, stream.config, verdict.at, verdict.decision)
+        at = replace(verdict.at, T_solver=window.linearised_at(verdict.at.pose_key))
+        update = stream.row.factors(m, stream.config, at, verdict.decision)
         for key, value in update.guesses:
             if not window.values.exists(key):
                 window.guess(key, value, t)
         used = {key for factor in update.factors for key in keys_of(factor)}
         self._use_constants(stream, used)
-        entry.held = window.add(update.factors)
+        entry.held, entry.written = window.add(update.factors), at.T_solver
 
     # Constants of a sensor: in the graph while they are seen, remembered when they are not
 

@@ -7,7 +7,9 @@ an exception: from then on it is thrown away, and the caller builds another.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,9 +18,11 @@ import numpy as np
 
 from graphloc.errors import SolveError
 from graphloc.frames import Array
+from graphloc.keys import is_pose
 
 _RELINEARIZE = 0.02  # of any tangent: m, rad, m/s; the gap to the batch is millimetres
-_FREE_EVERY = 10  # updates between relinearisations: as accurate as every one
+_TURNED_RAD = 0.02  # of the oldest pose: then it is linearised anew all the same
+_NEVER = 1_000_000_000  # updates
 
 
 def keys_of(factor: Any) -> list[int]:
@@ -43,12 +47,13 @@ class Window:
         params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         params.setFactorization("QR")  # Cholesky gives up on slow biases
         params.findUnusedFactorSlots = True  # else slots grow without end
-        params.relinearizeSkip = _FREE_EVERY
+        params.relinearizeSkip = _NEVER  # but see `relinearise`
         params.setRelinearizeThreshold(_RELINEARIZE)
         self.lag_s = lag_s
         self._smoother = gtsam.IncrementalFixedLagSmoother(lag_s, params)
         self.values = gtsam.Values()
         self._alive: dict[int, float] = {}  # keys in the smoother, and when each was last touched
+        self._linearised = gtsam.Values()  # the point of each key that the solver's tangents are those of
         self._clear()
 
     def _clear(self) -> None:
@@ -61,6 +66,7 @@ class Window:
         """Stage a new key."""
         self._guess.insert(key, value)
         self.values.insert(key, value)
+        self._linearised.insert_or_assign(key, value)
         self._stamps[key] = t_s
 
     def touch(self, key: int, t_s: float) -> None:
@@ -95,52 +101,87 @@ class Window:
         held.slots = []
         return True
 
+    def linearised_at(self, key: int) -> Any:
+        """Return the value that the solver's tangent of a key is that of."""
+        return self._linearised.atPose3(key)
+
     def commit(self) -> None:
         """Take in what is staged, and estimate anew.
 
         Raises:
             SolveError: the linear algebra failed; this window is of no use from now on.
         """
-        try:
+        with self._solving():
             self._smoother.update(self._graph, self._guess, self._stamps, self._remove)  # type: ignore[arg-type]
             slots = list(self._smoother.getISAM2Result().getNewFactorsIndices())
             self.values = self._smoother.calculateEstimate()
-        except (RuntimeError, IndexError, ValueError, MemoryError) as error:
-            raise SolveError(f"the solver failed: {' '.join(str(error).split())[:200]}") from error
         for held in self._added:
             held.slots, slots = slots[: held.count], slots[held.count :]
         self._alive |= self._stamps
         self._clear()
         if min(self._alive.values(), default=0.0) < max(self._alive.values(), default=0.0) - self.lag_s:
             self._alive = self._smoother.timestamps()  # some have left; asked for each time it is a tenth of an update
+            self._linearised = gtsam.Values(self._smoother.getLinearizationPoint())
+
+    def relinearise(self) -> bool:
+        """Linearise anew where the estimate has moved away, but for the oldest pose; tell whether anything was.
+
+        What has left is known as a linear factor on that, and the solver applies it in the tangent of today: turned by
+        what has been learnt since, it would know where the vessel is (see `graphloc.linear.pose_term`).
+        """
+        oldest = min((key for key in self._alive if is_pose(key)), default=None)
+        held = gtsam.KeyList()
+        if oldest is not None and np.abs(self._smoother.getDelta().at(oldest)[:3]).max() < _TURNED_RAD:
+            held.push_back(oldest)
+        with self._solving():
+            solver = self._smoother.getISAM2()  # the smoother's own, not a copy
+            if not solver.update(noRelinKeys=held, force_relinearize=True).getVariablesRelinearized():
+                return False
+            self.values = self._smoother.calculateEstimate()
+            self._linearised = gtsam.Values(self._smoother.getLinearizationPoint())
+        for values in (self.values, self._linearised):
+            values.insert(self._guess)
+        return True
 
     def settle(self, steps: int = 1) -> None:
-        """Relinearise at once, with what is staged or nothing new, `steps` times."""
-        params = self._smoother.params()  # the smoother's own, not a copy
-        params.relinearizeSkip = 1
+        """Take in what is staged, if anything is, and relinearise `steps` times."""
+        if self._added or self._remove:
+            self.commit()
+        for _ in range(steps):
+            self.relinearise()
+
+    @staticmethod
+    @contextmanager
+    def _solving() -> Iterator[None]:
         try:
-            for _ in range(steps):
-                self.commit()
-        finally:
-            params.relinearizeSkip = _FREE_EVERY
+            yield
+        except (RuntimeError, IndexError, ValueError, MemoryError) as error:
+            raise SolveError(f"the solver failed: {' '.join(str(error).split())[:200]}") from error
 
     def leaving(self, keys: Iterable[int], now_s: float) -> list[int]:
         """Return those of the keys that the next commit at `now_s` lets go."""
         return [key for key in keys if self.values.exists(key) and self.stamp_of(key) < now_s - self.lag_s]
 
     def covariance(self, keys: Sequence[int]) -> Array:
-        """Return the joint covariance of keys that were committed, in their order.
+        """Return the joint covariance of keys that were committed, in their order, poses first; of a pose in the tangent of its estimate.
 
         Raises:
             SolveError: it could not be computed.
         """
         try:
             if len(keys) == 1:
-                return np.atleast_2d(self._smoother.marginalCovariance(keys[0]))
-            joint = self._smoother.getISAM2().jointMarginalCovariance(list(keys))
-            return np.asarray(joint.fullMatrix())
+                cov = np.atleast_2d(self._smoother.marginalCovariance(keys[0]))
+            else:
+                cov = np.asarray(self._smoother.getISAM2().jointMarginalCovariance(list(keys)).fullMatrix())
         except (RuntimeError, IndexError, ValueError) as error:
             raise SolveError(f"the covariance could not be computed: {' '.join(str(error).split())[:200]}") from error
+        # Poses first, by the signature: the solver's own tangents are those of its linearisation.
+        for n, key in enumerate(itertools.takewhile(is_pose, keys)):
+            turn = self.values.atPose3(key).rotation().matrix().T @ self.linearised_at(key).rotation().matrix()
+            for rows in (slice(6 * n, 6 * n + 3), slice(6 * n + 3, 6 * n + 6)):
+                cov[rows] = turn @ cov[rows]
+                cov[:, rows] = cov[:, rows] @ turn.T
+        return cov
 
     def error(self, without: Iterable[Held] = ()) -> float:
         """Return the cost of the graph at the estimate (half of the weighted squares), less that of some factors."""
