@@ -10,7 +10,6 @@ linearised anew at every pass (`_linear`).
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 

@@ -16,7 +16,7 @@ from graphloc.factors.apriltag import ROW
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.tags.pose import modes_of, poses_of
 from graphloc.graph import Attachment, Decision
-from graphloc.linear import linear_update
+from graphloc.linear import Term, linear_update
 from graphloc.measurements import TagSighting
 from graphloc.survey import Survey
 from tests.tagfactory import AHEAD, FACES_SOUTH, SIGMA, SIZE_M, UNIT, degrees_between, nearest_mode, rays_of
@@ -345,7 +345,7 @@ def heading_off_deg(seed: int, count: int, gaussian: bool, bearing_deg: float = 
             found = ROW.residuals(m, FIXED, at)
             mode = int(np.argmax([r.log_density() for r in found]))
             if gaussian:
-                made += linear_update(found[mode], [(1, T, found[mode].jacobian())], Decision(mode=mode)).factors
+                made += linear_update(found[mode], [Term(1, T, found[mode].jacobian())], Decision(mode=mode)).factors
             else:
                 made += ROW.factors(m, FIXED, at, Decision(mode=mode)).factors
         values = gtsam.Values()

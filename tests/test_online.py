@@ -146,7 +146,9 @@ def test_everything_late_from_the_first_message_on() -> None:
     fed, lag = whole(drift(), arrivals)
     assert complaints(arrivals, fed) == []
     assert all(row.outcome is Outcome.USED for row in fed.rows if row.sensor == "imu")
-    assert apart_m(lag, in_order()[1]).max() < 0.02
+    apart = apart_m(lag, in_order()[1])
+    assert apart[:-30].max() < 0.01
+    assert apart.max() < 0.03  # 3 s of dead reckoning later: what GNSS weighs depends on what it scattered by then
 
 
 def test_a_step_is_integrated_anew_when_its_samples_come_late() -> None:
