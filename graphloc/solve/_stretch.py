@@ -12,6 +12,7 @@ from graphloc import keys
 from graphloc.build import Decisions, Problem, StartPrior, build_graph, constant_keys, nav_state
 from graphloc.frames import Array
 from graphloc.solve._optimize import bayes_tree, optimize
+from graphloc.solve._ordering import along_nodes, nodes_last
 
 
 class StretchStep(NamedTuple):
@@ -34,10 +35,15 @@ def solve_stretch(
     *,
     jumps: bool = True,
     tol: float = 3e-3,
+    thin: bool = True,
 ) -> StretchStep:
-    """Optimise states first..last in place, roughly: what it leaves, the passes over the whole run take up."""
+    """Optimise states first..last in place, roughly: what it leaves, the passes over the whole run take up.
+
+    `thin`: sensors are thinned (`weigh`), which another order of elimination suits.
+    """
     graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps)
-    solved = optimize(graph, guess, 15, tol)
+    order = along_nodes(guess, problem.timeline.slow_of) if thin else None
+    solved = optimize(graph, guess, 15, tol, order)
     moved_m = moved(guess, solved.values, first, last)
     update_states(problem, values, solved.values, first, last)
     return StretchStep(solved.values, graph, solved.iterations, solved.error, moved_m)
@@ -126,9 +132,14 @@ def weak_prior(problem: Problem, values: gtsam.Values, k: int) -> StartPrior:
     )
 
 
+def thin_tree(problem: Problem, step: StretchStep) -> gtsam.ISAM2:
+    """The covariances of a thinned stretch."""
+    return bayes_tree(step.graph, step.values, nodes_last(step.values, problem.timeline.slow_of))
+
+
 def prior_at(problem: Problem, step: StretchStep, k: int) -> StartPrior:
     """The marginals at state `k` as a prior; cross terms are left out, which only loosens it."""
-    tree, values = bayes_tree(step.graph, step.values), step.values
+    tree, values = thin_tree(problem, step), step.values
     j = int(problem.timeline.slow_of[k])
     cov = {key: np.asarray(tree.marginalCovariance(key)) for key in (keys.pose(k), keys.velocity(k), keys.bias(j))}
     slow = {}
