@@ -7,6 +7,7 @@ Measured: a `CustomFactor` calls back into Python at every linearisation, 25 tim
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import gtsam
@@ -15,6 +16,11 @@ import numpy as np
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Decision, GraphUpdate, Residual
+
+
+@cache
+def _unit(rows: int) -> Any:
+    return gtsam.noiseModel.Unit.Create(rows)
 
 
 def linear_update(residual: Residual, terms: Sequence[tuple[int, Any, Array]], decision: Decision) -> GraphUpdate:
@@ -31,13 +37,13 @@ def linear_update(residual: Residual, terms: Sequence[tuple[int, Any, Array]], d
     weight = decision.weight * max(kernel.weight(residual.nis()), 1e-6)
     cov = residual.cov / weight
     # Most residuals here are of one row (headings, heights), and at every pass: two calls into LAPACK for a root show.
-    whiten = 1.0 / np.sqrt(cov) if len(cov) == 1 else np.linalg.inv(np.linalg.cholesky(cov))
+    single = len(cov) == 1
+    whiten = 1.0 / np.sqrt(cov) if single else np.linalg.inv(np.linalg.cholesky(cov))
     point = gtsam.Values()
     arguments: list[Any] = []
     for key, value, jacobian in terms:
         point.insert(key, value)
-        arguments += [key, whiten @ jacobian]
-    model = gtsam.noiseModel.Unit.Create(len(residual.raw))
+        arguments += [key, whiten * jacobian if single else whiten @ jacobian]
     make: Any = gtsam.JacobianFactor  # the stubs know one overload per number of states
-    linear = make(*arguments, -whiten @ residual.raw, model)
+    linear = make(*arguments, -whiten @ residual.raw, _unit(len(residual.raw)))
     return GraphUpdate(factors=(gtsam.LinearContainerFactor(linear, point),))

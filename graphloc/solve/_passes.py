@@ -35,7 +35,7 @@ def optimise_run(
     last = len(problem.timeline) - 1
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps)
     solved = optimize(graph, guess, 12, 1e-3)
-    return Step(solved.values, graph, solved.iterations, moved(guess, solved.values, 0, last))
+    return Step(solved.values, graph, solved.iterations, moved(guess, solved.values))
 
 
 def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Step:
@@ -43,7 +43,7 @@ def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, pri
     last = len(problem.timeline) - 1
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
     values = full_step(graph, guess)
-    return Step(values, graph, 1, moved(guess, values, 0, last))
+    return Step(values, graph, 1, moved(guess, values))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
