@@ -51,6 +51,10 @@ class BatchResult:
     headings: int  # that explained the start as well as the one that was taken, and this one
     notes: tuple[str, ...]
 
+    def lightened(self) -> BatchResult:
+        """The same without tree and graph, which are gigabytes of a run of hours."""
+        return replace(self, tree=gtsam.ISAM2(), graph=gtsam.NonlinearFactorGraph())
+
 
 def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     """Solve a whole run.

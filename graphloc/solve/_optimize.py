@@ -61,6 +61,7 @@ def optimize(
             if abs(last - error) <= enough or abs(last - error - promised) <= _AS_PROMISED * enough:
                 break
             last = error
+            del linear, delta  # before the next ones are made
     except RuntimeError:
         pass  # a full step led to where nothing is determined: the damped method stays near
     if lowest < initial or (used == 1 and abs(lowest - initial) <= relative_tol * initial + _ABSOLUTE_TOL):
