@@ -41,11 +41,14 @@ def _placed(
     """Return the keys, when each goes (level), and where on the run it stands (a count of states)."""
     names = list(guess.keys())
     letter, index = keys.parts(np.array(names, dtype=np.uint64))
-    first = np.searchsorted(slow_of, np.arange(slow_of[-1] + 1))  # state of each node
     state, node = np.isin(letter, list(keys.STATES)), np.isin(letter, list(keys.NODES))
+    low, high = int(slow_of[index[state].min()]), int(slow_of[index[state].max()])
+    first = np.searchsorted(
+        slow_of, np.arange(low, high + 1)
+    )  # state of each node: of these alone, a run has thousands
     level, at = np.full(len(names), _AT_NODES), np.full(len(names), np.inf)
     at[state] = index[state]
-    at[node] = first[index[node]] + 0.5
-    level[state] = np.where(first[slow_of[index[state]]] == index[state], _AT_NODES, _BETWEEN)
+    at[node] = first[index[node] - low] + 0.5
+    level[state] = np.where(first[slow_of[index[state]] - low] == index[state], _AT_NODES, _BETWEEN)
     level[np.isin(letter, list(keys.LEAVES))] = _LEAVES
     return names, level, at
