@@ -23,8 +23,8 @@ _PERIOD_S, _RUNS = 0.002, 5
 # The innermost of these functions that is on the stack has the sample.
 _STEPS = {
     "optimize": "GTSAM's steps (QR, all windows and passes)",
-    "bayes_tree": "GTSAM's trees (QR, the last passes; for covariances)",
-    "full_step": "GTSAM's trees (QR, the last passes; for covariances)",
+    "bayes_tree": "GTSAM's trees (QR; for covariances)",
+    "full_step": "GTSAM's steps (QR, all windows and passes)",
     "predicted_covariance": "covariances of predictions (GTSAM)",
     "build_graph": "graphs built of the measurements (Python, GTSAM's constructors)",
     "attach": "measurements attached (Python)",

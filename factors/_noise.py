@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import gtsam
@@ -30,12 +31,18 @@ def with_floors(cov: Array, floors: Array | float) -> Array:
 
 def noise_model(cov: Array, decision: Decision) -> Any:
     """Return a noise model of covariance (k, k) / weight, under the decision's kernel."""
-    scaled = np.asarray(cov) / decision.weight
-    if np.count_nonzero(scaled - np.diag(np.diagonal(scaled))) == 0:
-        base: Any = gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(np.diagonal(scaled)))
+    scaled = np.asarray(cov, dtype=float) / decision.weight
+    return _shared(scaled.tobytes(), len(scaled), decision.kernel)
+
+
+@lru_cache(maxsize=256)  # a receiver often says the same of all its fixes, and factors can share what does not change
+def _shared(scaled: bytes, size: int, kernel: KernelConfig | None) -> Any:
+    cov = np.frombuffer(scaled).reshape(size, size)
+    if np.count_nonzero(cov - np.diag(np.diagonal(cov))) == 0:
+        base: Any = gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(np.diagonal(cov)))
     else:
-        base = gtsam.noiseModel.Gaussian.Covariance(scaled)
-    return robust(base, decision.kernel)
+        base = gtsam.noiseModel.Gaussian.Covariance(cov)
+    return robust(base, kernel)
 
 
 def robust(base: Any, kernel: KernelConfig | None) -> Any:

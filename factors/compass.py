@@ -28,10 +28,11 @@ def _yaw_jacobian(R: Array, R_state_sensor: Array) -> Array:
     """Derivative (6,) of yaw(R Exp(theta) R_state_sensor) by the body tangent (theta, rho)."""
     x_body = R_state_sensor[:, 0]  # the sensor's x axis in body
     x_world = R @ x_body
-    # d(R Exp(theta) x)/d theta = -R [x]_x ; yaw = atan2(y, x)
-    d_world = -R @ skew(x_body)
+    # d(R Exp(theta) x)/d theta = -R [x]_x, of which a row r of R gives x x r; yaw = atan2(y, x)
     horizontal = x_world[0] ** 2 + x_world[1] ** 2
-    return np.concatenate([(x_world[0] * d_world[1] - x_world[1] * d_world[0]) / horizontal, np.zeros(3)])
+    jacobian = np.zeros(6)
+    jacobian[:3] = skew(x_body) @ ((x_world[0] * R[1] - x_world[1] * R[0]) / horizontal)
+    return jacobian
 
 
 def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple[Residual, ...]:

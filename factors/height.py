@@ -18,7 +18,7 @@ import numpy as np
 
 from graphloc.config import HeightConfig
 from graphloc.factors._noise import robust
-from graphloc.frames import Array, Datum
+from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import HeightPrior
@@ -43,7 +43,7 @@ def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Res
 
     def jacobian() -> Array:
         up = at.T_world_body.rotation().matrix()[2]
-        return np.concatenate([np.cross(lever, up), up])[None, :]
+        return np.concatenate([skew(lever) @ up, up])[None, :]
 
     return (
         Residual(

@@ -474,19 +474,16 @@ def build_graph(
     `jumps` lets slow states jump where their process may. Not while the estimate is far off: a GNSS error
     that may jump explains a dead-reckoned track that is 300 m off better than the track's own correction.
     """
-    graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    timeline = problem.timeline
-    for k in range(first, last + 1):
-        guess.insert(keys.pose(k), values.atPose3(keys.pose(k)))
-        guess.insert(keys.velocity(k), values.atVector(keys.velocity(k)))
+    graph, guess = gtsam.NonlinearFactorGraph(), values.extract(state_keys(problem, first, last))
     for k in range(first, last):
         graph.add(problem.inertial[k])
-    nodes = range(int(timeline.slow_of[first]), int(timeline.slow_of[last]) + 1)
-    _add_bias_chain(graph, guess, problem, values, nodes)
+    nodes = nodes_of(problem, first, last)
+    for j in nodes[:-1]:
+        graph.add(bias_step(problem.links, j, _node_dt_s(problem, j)))
     _add_start(graph, prior, first, nodes[0])
     for stream in problem.streams:
         if stream.slow is not None:
-            _add_slow_chain(graph, guess, problem, stream, stream.slow, values, nodes, prior, jumps)
+            _add_slow_chain(graph, problem, stream, stream.slow, values, nodes, prior, jumps)
         for i in stream.between(first, last):
             decided = decisions.get((stream.number, i))
             if decided is None:
@@ -503,6 +500,20 @@ def build_graph(
                 guess.insert(key, value)
         _add_constants(graph, guess, stream, values, prior)
     return graph, guess
+
+
+def nodes_of(problem: Problem, first: int, last: int) -> range:
+    """Return the slow nodes of states first..last."""
+    slow_of = problem.timeline.slow_of
+    return range(int(slow_of[first]), int(slow_of[last]) + 1)
+
+
+def state_keys(problem: Problem, first: int, last: int) -> list[int]:
+    """Return the keys of states first..last and of their slow nodes."""
+    nodes = nodes_of(problem, first, last)
+    names = [key(k) for key in (keys.pose, keys.velocity) for k in range(first, last + 1)]
+    names += [keys.bias(j) for j in nodes]
+    return names + [keys.slow(s.number, j) for s in problem.streams if s.slow is not None for j in nodes]
 
 
 def _add_constants(
@@ -527,15 +538,6 @@ def _node_dt_s(problem: Problem, j: int) -> float:
     return float((stamps[j + 1] - stamps[j]) * 1e-9)
 
 
-def _add_bias_chain(
-    graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values, problem: Problem, values: gtsam.Values, nodes: range
-) -> None:
-    for j in nodes:
-        guess.insert(keys.bias(j), values.atConstantBias(keys.bias(j)))
-    for j in nodes[:-1]:
-        graph.add(bias_step(problem.links, j, _node_dt_s(problem, j)))
-
-
 def bias_step(links: InertialLink, j: int, dt_s: float) -> Any:
     """Return the factor of the bias walk from slow node `j` to the next."""
     model = gtsam.noiseModel.Diagonal.Sigmas(links.bias_steps(dt_s))
@@ -551,7 +553,6 @@ def _add_start(graph: gtsam.NonlinearFactorGraph, prior: StartPrior, first: int,
 
 def _add_slow_chain(
     graph: gtsam.NonlinearFactorGraph,
-    guess: gtsam.Values,
     problem: Problem,
     stream: Stream,
     slow: SlowProcess,
@@ -561,8 +562,6 @@ def _add_slow_chain(
     jumps: bool,
 ) -> None:
     key = [keys.slow(stream.number, j) for j in nodes]
-    for name in key:
-        guess.insert(name, np.atleast_1d(values.atVector(name)))
     given = prior.slow.get(stream.number)
     if given is not None:
         graph.add(gtsam.PriorFactorVector(key[0], given[0], gtsam.noiseModel.Gaussian.Covariance(given[1])))

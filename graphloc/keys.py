@@ -8,6 +8,11 @@ measurement.
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
+STATES, NODES, LEAVES = "xv", "bs", "al"  # letters of what there is for each state, slow node and measurement
+
 # GTSAM's layout of `symbol` and `LabeledSymbol`, held by a test: a run asks for keys so often that calls into it show.
 _X, _V, _B, _A, _L, _S, _C = (ord(letter) << 56 for letter in "xvbalsc")
 _FIRST_LABEL = ord("A")
@@ -46,3 +51,9 @@ def constant(sensor_number: int, k: int) -> int:
 def leaves(seq: int) -> tuple[int, int]:
     """Keys of the two leaves (antenna in world, lever arm) of measurement number `seq`."""
     return _A + seq, _L + seq
+
+
+def parts(keys: NDArray[np.uint64]) -> tuple[NDArray[np.str_], NDArray[np.int64]]:
+    """Return the letters (N,) and the numbers (N,) of the state, node, constant or measurement of N keys."""
+    letter = (keys >> np.uint64(56)).astype(np.uint32).view("U1")
+    return letter, (keys & np.uint64((1 << 48) - 1)).astype(np.int64)

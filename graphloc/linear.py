@@ -7,6 +7,7 @@ Measured: a `CustomFactor` calls back into Python at every linearisation, 25 tim
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import gtsam
@@ -15,6 +16,11 @@ import numpy as np
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual
+
+
+@cache
+def _unit(rows: int) -> Any:
+    return gtsam.noiseModel.Unit.Create(rows)
 
 
 class Term(NamedTuple):
@@ -60,15 +66,15 @@ def linear_update(residual: Residual, terms: Sequence[Term], decision: Decision)
     weight = decision.weight * max(kernel.weight(residual.nis()), 1e-6)
     cov = residual.cov / weight
     # Most residuals here are of one row (headings, heights), and at every pass: two calls into LAPACK for a root show.
-    whiten = 1.0 / np.sqrt(cov) if len(cov) == 1 else np.linalg.inv(np.linalg.cholesky(cov))
+    single = len(cov) == 1
+    whiten = 1.0 / np.sqrt(cov) if single else np.linalg.inv(np.linalg.cholesky(cov))
     point, raw = gtsam.Values(), residual.raw
     arguments: list[Any] = []
     for term in terms:
         point.insert(term.key, term.point)
-        arguments += [term.key, whiten @ term.jacobian]
+        arguments += [term.key, whiten * term.jacobian if single else whiten @ term.jacobian]
         if term.offset is not None:
             raw = raw - term.jacobian @ term.offset
-    model = gtsam.noiseModel.Unit.Create(len(raw))
     make: Any = gtsam.JacobianFactor  # the stubs know one overload per number of states
-    linear = make(*arguments, -whiten @ raw, model)
+    linear = make(*arguments, -whiten @ raw, _unit(len(raw)))
     return GraphUpdate(factors=(gtsam.LinearContainerFactor(linear, point),))

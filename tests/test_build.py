@@ -152,3 +152,7 @@ def test_keys_are_those_of_gtsam() -> None:
         for number in (0, 5, 30):
             assert keys.slow(number, k) == gtsam.LabeledSymbol(ord("s"), ord("A") + number, k).key()
             assert keys.constant(number, k) == gtsam.LabeledSymbol(ord("c"), ord("A") + number, k).key()
+    names = [keys.pose(3), keys.velocity(4), keys.bias(5), keys.slow(30, 6), keys.constant(7, 8), keys.leaves(9)[1]]
+    letters, numbers = keys.parts(np.array(names, dtype=np.uint64))
+    assert letters.tolist() == list("xvbscl")
+    assert numbers.tolist() == [3, 4, 5, 6, 8, 9]

@@ -4,9 +4,12 @@ import gtsam
 import numpy as np
 import pytest
 
+from graphloc import keys
 from graphloc.errors import SolveError
 from graphloc.solve import _on_deep_stack
-from graphloc.solve._optimize import full_step, optimize
+from graphloc.solve._optimize import bayes_tree, full_step, optimize
+from graphloc.solve._ordering import along_nodes, nodes_last
+from graphloc.solve._stretch import moved
 
 
 def loop(heading_sigma_rad: float) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -51,9 +54,68 @@ def test_full_step_solves_a_linear_problem_and_gives_its_covariance() -> None:
     graph.add(gtsam.PriorFactorVector(0, np.array([1.0, 2.0]), gtsam.noiseModel.Isotropic.Sigma(2, 0.5)))
     graph.add(gtsam.PriorFactorVector(0, np.array([3.0, 2.0]), gtsam.noiseModel.Isotropic.Sigma(2, 0.5)))
     guess.insert(0, np.array([100.0, -50.0]))
-    values, tree = full_step(graph, guess)
-    np.testing.assert_allclose(values.atVector(0), [2.0, 2.0], atol=1e-9)
-    np.testing.assert_allclose(tree.marginalCovariance(0), np.eye(2) * 0.125, atol=1e-12)
+    np.testing.assert_allclose(full_step(graph, guess).atVector(0), [2.0, 2.0], atol=1e-9)
+    np.testing.assert_allclose(bayes_tree(graph, guess).marginalCovariance(0), np.eye(2) * 0.125, atol=1e-12)
+
+
+def test_a_step_that_came_out_as_promised_is_the_last() -> None:
+    graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.PriorFactorVector(0, np.array([1.0, 2.0]), gtsam.noiseModel.Isotropic.Sigma(2, 0.5)))
+    guess.insert(0, np.array([100.0, -50.0]))
+    linear = optimize(graph, guess, 20)
+    assert linear.iterations == 1
+    np.testing.assert_allclose(linear.values.atVector(0), [1.0, 2.0], atol=1e-9)
+    # A fix 4 sigmas off under a loss: the weight that the first step is made with is not the one where it ends.
+    loss = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Cauchy.Create(1.0), gtsam.noiseModel.Isotropic.Sigma(2, 0.5)
+    )
+    graph.add(gtsam.PriorFactorVector(0, np.array([3.0, 2.0]), loss))
+    bent = optimize(graph, guess, 20)
+    assert bent.iterations > 2
+    for way in (-0.02, 0.02):
+        near = gtsam.Values()
+        near.insert(0, bent.values.atVector(0) + np.array([way, 0.0]))
+        assert graph.error(near) > bent.error
+
+
+def test_the_order_along_nodes_finds_the_same() -> None:
+    """The last three of five slow nodes of four states, positions measured at two states; a leaf at one of them."""
+    slow_of, first = np.repeat(np.arange(5), 4), 8
+    graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    unit = gtsam.noiseModel.Unit.Create(3)
+    for k, j in list(enumerate(slow_of.tolist()))[first:]:
+        guess.insert(keys.pose(k), np.full(3, 0.1 * k))
+        graph.add(gtsam.BetweenFactorVector(keys.bias(j), keys.pose(k), np.ones(3), unit))
+        if k > first:
+            graph.add(gtsam.BetweenFactorVector(keys.pose(k - 1), keys.pose(k), np.full(3, 0.7), unit))
+    for j in range(2, 5):
+        guess.insert(keys.bias(j), np.zeros(3))
+    leaf = keys.leaves(13)[0]
+    guess.insert(leaf, np.zeros(3))
+    graph.add(gtsam.BetweenFactorVector(keys.pose(13), leaf, np.zeros(3), unit))
+    for key in (leaf, keys.pose(10)):
+        graph.add(gtsam.PriorFactorVector(key, np.array([4.0, 5.0, 6.0]), unit))
+    order = along_nodes(guess, slow_of)
+    names = [order.at(n) for n in range(order.size())]
+    assert sorted(names) == sorted(guess.keys())
+    between = [keys.pose(k) for k in range(first, 20) if k % 4]
+    assert names[:10] == [leaf, *between]
+    ours, theirs = (optimize(graph, guess, 5, order=o).values for o in (order, None))
+    for name in names:
+        np.testing.assert_allclose(ours.atVector(name), theirs.atVector(name), atol=1e-9)
+    cov = bayes_tree(graph, guess).marginalCovariance(keys.pose(15))
+    np.testing.assert_allclose(
+        bayes_tree(graph, guess, nodes_last(guess, slow_of)).marginalCovariance(keys.pose(15)), cov, atol=1e-12
+    )
+
+
+def test_moved_counts_a_radian_as_ten_metres() -> None:
+    old, new = gtsam.Values(), gtsam.Values()
+    for k, (turn, way) in enumerate([(0.0, 0.2), (0.05, 0.3), (-0.04, 0.0)]):
+        pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 3.0), np.array([1.0, 2.0, 3.0]))
+        old.insert(keys.pose(k), pose)
+        new.insert(keys.pose(k), pose.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), np.array([0.0, way, 0.0]))))
+    assert moved(old, new) == pytest.approx(0.3 + 10.0 * 0.05)
 
 
 def test_deep_stack_hands_on_results_and_errors() -> None:

@@ -18,6 +18,7 @@ from graphloc.offsets import Probe
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 from graphloc.solve._batch import BatchResult, solve_batch
+from graphloc.solve._memory import give_back_memory
 from graphloc.solve._offsets import offsets_of
 from graphloc.solve._parts import solve_parts
 from graphloc.solve._solution import make_solution
@@ -54,7 +55,11 @@ def smooth(
         problem = make_problem(part, config, datum, rows, inertial)
         result = solve_batch(problem, progress)
         solution = make_solution(problem, part, result)
-        return solution if probe is None else _with_offsets(solution, result, probe)
+        if probe is None:
+            return solution
+        result = result.lightened()  # the offsets take a graph of their own
+        give_back_memory()
+        return _with_offsets(solution, result, probe)
 
     imu = config.of_kind(inertial.kind).values()
     bridge_s = min((sensor.max_bridge_s for sensor in imu), default=np.inf)

@@ -6,7 +6,7 @@
    are new in a window are judged by the prediction without them, with its covariance (`_grow`).
 3. Passes over the whole run: modes and weights re-chosen until they stand (`_passes`).
 4. Look for other choices that are more probable (`_choices`), and pass again where there are any.
-5. The last step's Bayes tree gives the covariances of every state.
+5. A Bayes tree of the last graph gives the covariances of every state.
 
 An inertial sensor that contradicts the rest gets more noise, and 3 and 4 are done again, from gentle losses on.
 """
@@ -25,6 +25,7 @@ from graphloc.solve._align import align
 from graphloc.solve._choices import by_best_chains, judged_by_the_rest, take_more_probable
 from graphloc.solve._decide import Verdicts, weigh
 from graphloc.solve._grow import grow, solve_start
+from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import Settled, expected_cost, open_passes, settle
 
 _MAX_NOISE_ROUNDS = 5
@@ -49,6 +50,10 @@ class BatchResult:
     prior: StartPrior
     headings: int  # that explained the start as well as the one that was taken, and this one
     notes: tuple[str, ...]
+
+    def lightened(self) -> BatchResult:
+        """The same without tree and graph, which are gigabytes of a run of hours."""
+        return replace(self, tree=gtsam.ISAM2(), graph=gtsam.NonlinearFactorGraph())
 
 
 def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
@@ -75,7 +80,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         problem=problem,
         values=estimate,
         verdicts=settled.verdicts,
-        tree=settled.tree,
+        tree=bayes_tree(settled.graph, estimate),
         graph=settled.graph,
         passes=passes,
         iterations=iterations,
@@ -106,6 +111,6 @@ def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, p
     if settled.converged and not changed:
         return replace(settled, iterations=iterations)
     values, verdicts, passes = settled.values, settled.verdicts, settled.passes
-    del settled  # and its tree, before the next one is made
+    del settled  # and its graph, before the next one is made
     again = settle(problem, values, verdicts, prior, progress, _LAST_PASSES)
     return replace(again, iterations=iterations + again.iterations, passes=passes + again.passes)

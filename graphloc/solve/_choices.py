@@ -25,7 +25,9 @@ from graphloc.solve._decide import (
     thinned,
     weigh,
 )
-from graphloc.solve._passes import SETTLED_M, SETTLED_WEIGHT, Settled, changed, refine_run
+from graphloc.solve._optimize import bayes_tree
+from graphloc.solve._ordering import nodes_last
+from graphloc.solve._passes import SETTLED_M, SETTLED_WEIGHT, Settled, changed
 from graphloc.solve._stretch import copy_states, solve_stretch, update_states, weak_prior
 
 # A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
@@ -63,7 +65,7 @@ def judged_by_the_rest(problem: Problem, settled: Settled, prior: StartPrior) ->
         }
         if not own or len(around) == len(at_s):  # nothing to judge, or nothing to judge it by
             continue
-        rest = refine_run(problem, settled.values, everything, prior, without=around)
+        rest = _without(problem, settled.values, everything, prior, around)
         fresh = weigh(
             problem,
             rest.values,
@@ -74,9 +76,26 @@ def judged_by_the_rest(problem: Problem, settled: Settled, prior: StartPrior) ->
             only=own,
         )
         judged.update({key: _decisive(v) for key, v in fresh.items()})
-        iterations += rest.iterations
+        iterations += 1
         del rest  # and its tree, before the next one is made
     return judged, iterations
+
+
+class _Rest(NamedTuple):
+    """The run without some measurements: values, and the tree that gives their covariances."""
+
+    values: gtsam.Values
+    tree: gtsam.ISAM2
+
+
+def _without(
+    problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior, left_out: set[tuple[int, int]]
+) -> _Rest:
+    """One step of the whole run, thinned, without what is left out."""
+    decided, last = decisions(verdicts, left_out), len(problem.timeline) - 1
+    graph, guess = build_graph(problem, estimate, decided, 0, last, prior)
+    tree = bayes_tree(graph, guess, nodes_last(guess, problem.timeline.slow_of))
+    return _Rest(gtsam.Values(tree.calculateBestEstimate()), tree)
 
 
 def _decisive(verdict: Verdict) -> Verdict:
@@ -145,7 +164,7 @@ def _solve_around(
 ) -> _Around:
     local = copy_states(problem, values, max(first - 1, 0), min(last + 1, len(problem.timeline) - 1))
     for _ in range(_AROUND_PASSES):
-        step = solve_stretch(problem, local, first, last, prior, decisions(verdicts), tol=1e-3)
+        step = solve_stretch(problem, local, first, last, prior, decisions(verdicts), tol=1e-3, thin=False)
         used, verdicts = verdicts, weigh(problem, local, first=first, last=last, stage="final")
         if step.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
             break

@@ -17,8 +17,7 @@ from graphloc.frames import wrap_angle
 from graphloc.recording import Progress
 from graphloc.solve._align import Start, start_pose
 from graphloc.solve._decide import PredictedCovariance, Verdicts, decisions, predicted_covariance, weigh
-from graphloc.solve._optimize import bayes_tree
-from graphloc.solve._stretch import StretchStep, dead_reckon, fill_slow, prior_at, solve_stretch
+from graphloc.solve._stretch import StretchStep, dead_reckon, fill_slow, prior_at, solve_stretch, thin_tree
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
 _SETTLED_M = 0.5
@@ -191,7 +190,7 @@ def _solve_grown(
             break
     if not fresh:
         return iterations, step, verdicts
-    predicted = predicted_covariance(bayes_tree(step.graph, step.values))
+    predicted = predicted_covariance(thin_tree(problem, step))
     covariance: PredictedCovariance = lambda k, key: predicted(k, key) if k > known else None
     for _ in range(2):
         verdicts = weigh(problem, values, first=first, last=last, stage="final", covariance=covariance, sparse=True)

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gtsam
 
 from graphloc.errors import SolveError
 
 _ABSOLUTE_TOL = 1e-3
+_AS_PROMISED = 0.1  # of the tolerance
 _HOPELESS = 1e6  # times the initial cost: from there no full step comes back
 
 
@@ -22,7 +23,11 @@ class Optimized(NamedTuple):
 
 
 def optimize(
-    graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values, max_iterations: int, relative_tol: float = 1e-4
+    graph: gtsam.NonlinearFactorGraph,
+    guess: gtsam.Values,
+    max_iterations: int,
+    relative_tol: float = 1e-4,
+    order: gtsam.Ordering | None = None,
 ) -> Optimized:
     """Minimise with Gauss-Newton, and with Levenberg-Marquardt where that does not come down.
 
@@ -30,30 +35,42 @@ def optimize(
     lands; a method that takes no uphill step creeps along the valley instead (measured: 3 against 48
     iterations, docs/decisions). QR: Cholesky stops early and unconverged on slow biases.
 
+    Args:
+        relative_tol: of the error; done where a step brings less than this, or where it brought what its linear model
+            said to a tenth of it: there is no curvature then that another step could make good.
+        order: of elimination; by default GTSAM's.
+
     Raises:
         SolveError: the linear algebra failed (a state that nothing holds, or a value that is not finite).
     """
-    params = gtsam.GaussNewtonParams()
-    params.setLinearSolverType("MULTIFRONTAL_QR")
-    optimizer = gtsam.GaussNewtonOptimizer(graph, guess, params)
-    initial = last = optimizer.error()
-    best, lowest, used = guess, initial, 0
+    order = graph.orderingCOLAMD() if order is None else order
+    initial = last = float(graph.error(guess))
+    values, best, lowest, used = guess, guess, initial, 0
     try:
         while used < max_iterations:
-            optimizer.iterate()
-            error, used = optimizer.error(), used + 1
+            linear = graph.linearize(values)
+            delta = _solved(linear, order)
+            promised = linear.error(values.zeroVectors()) - linear.error(delta)
+            values = values.retract(delta)
+            error, used = float(graph.error(values)), used + 1
             if not error < _HOPELESS * (initial + 1.0):  # also where it is not a number
                 break
             if error < lowest:
-                best, lowest = gtsam.Values(optimizer.values()), error  # a copy: the reference dies with the step
-            if abs(last - error) <= relative_tol * error + _ABSOLUTE_TOL:
+                best, lowest = values, error
+            enough = relative_tol * error + _ABSOLUTE_TOL
+            if abs(last - error) <= enough or abs(last - error - promised) <= _AS_PROMISED * enough:
                 break
             last = error
+            del linear, delta  # before the next ones are made
     except RuntimeError:
         pass  # a full step led to where nothing is determined: the damped method stays near
     if lowest < initial or (used == 1 and abs(lowest - initial) <= relative_tol * initial + _ABSOLUTE_TOL):
         return Optimized(best, used, lowest)
     return _levenberg_marquardt(graph, guess, max_iterations, relative_tol, used)
+
+
+def _solved(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering) -> gtsam.VectorValues:
+    return linear.eliminateMultifrontal(order, gtsam.EliminateQR).optimize()
 
 
 def _levenberg_marquardt(
@@ -72,27 +89,35 @@ def _levenberg_marquardt(
     return Optimized(values, used + optimizer.iterations(), optimizer.error())
 
 
-def full_step(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> tuple[gtsam.Values, Any]:
-    """Return the result of one full step from near the solution, and the tree that it took, for covariances.
+def full_step(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> gtsam.Values:
+    """Return the result of one full step from near the solution.
 
     Raises:
         SolveError: a state is not determined.
     """
-    tree = bayes_tree(graph, guess)
-    return gtsam.Values(tree.calculateBestEstimate()), tree
+    try:
+        return guess.retract(_solved(graph.linearize(guess), graph.orderingCOLAMD()))
+    except RuntimeError as error:
+        raise SolveError(f"the solver failed: {' '.join(str(error).split())[:200]}") from error
 
 
-def bayes_tree(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Any:
+def bayes_tree(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: gtsam.KeyGroupMap | None = None
+) -> gtsam.ISAM2:
     """Return an ISAM2 that holds the graph linearised at `values`, for covariances (`Marginals` has no QR).
+
+    Args:
+        last: which keys are eliminated after the others (group 0, then 1); by default as GTSAM chooses.
 
     Raises:
         SolveError: a state is not determined.
     """
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
+    params.cacheLinearizedFactors = False  # nothing is updated a second time
     tree = gtsam.ISAM2(params)
     try:
-        tree.update(graph, values)
+        tree.update(graph, values, constrainedKeys=last)
     except RuntimeError as error:
         raise SolveError(f"the covariance could not be computed: {' '.join(str(error).split())[:200]}") from error
     return tree

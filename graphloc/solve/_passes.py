@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
 from dataclasses import dataclass, replace
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -22,13 +20,12 @@ _MAX_OPEN_PASSES, _OPEN_SETTLED_M = 4, 0.5
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One optimisation of the whole run: what came out, and how far any pose moved."""
+    """One optimisation of the whole run: what came out of which graph, and how far any pose moved."""
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
     iterations: int
     moved_m: float
-    tree: Any = None
 
 
 def optimise_run(
@@ -38,31 +35,23 @@ def optimise_run(
     last = len(problem.timeline) - 1
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps)
     solved = optimize(graph, guess, 12, 1e-3)
-    return Step(solved.values, graph, solved.iterations, moved(guess, solved.values, 0, last))
+    return Step(solved.values, graph, solved.iterations, moved(guess, solved.values))
 
 
-def refine_run(
-    problem: Problem,
-    estimate: gtsam.Values,
-    verdicts: Verdicts,
-    prior: StartPrior,
-    *,
-    without: Container[tuple[int, int]] = (),
-) -> Step:
-    """One step of the whole run, with the tree that gives its covariances; `without` is left out."""
+def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Step:
+    """One step of the whole run."""
     last = len(problem.timeline) - 1
-    graph, guess = build_graph(problem, estimate, decisions(verdicts, without), 0, last, prior)
-    values, tree = full_step(graph, guess)
-    return Step(values, graph, 1, moved(guess, values, 0, last), tree)
+    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
+    values = full_step(graph, guess)
+    return Step(values, graph, 1, moved(guess, values))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settled:
-    """A solution of the whole run; `tree` holds `graph` linearised within the last step of `values`."""
+    """A solution of the whole run, and the graph whose last step led there."""
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
-    tree: Any
     verdicts: Verdicts
     passes: int
     iterations: int
@@ -81,7 +70,7 @@ def settle(
     last, iterations = len(problem.timeline) - 1, 0
     done: Step | None = None
     for n in range(most):
-        done = None  # frees its tree before the next one is made: gigabytes on a run of hours
+        done = None  # frees its graph before the next one is made: gigabytes on a run of hours
         # The first pass takes out the seams of the windows; from then on one step at a time is enough.
         done = (optimise_run if n == 0 else refine_run)(problem, estimate, verdicts, prior)
         estimate, iterations = done.values, iterations + done.iterations
@@ -94,7 +83,6 @@ def settle(
     return Settled(
         values=estimate,
         graph=done.graph,
-        tree=done.tree,
         verdicts=verdicts,
         passes=n + 1,
         iterations=iterations,

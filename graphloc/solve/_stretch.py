@@ -9,9 +9,10 @@ import gtsam
 import numpy as np
 
 from graphloc import keys
-from graphloc.build import Decisions, Problem, StartPrior, build_graph, constant_keys, nav_state
+from graphloc.build import Decisions, Problem, StartPrior, build_graph, constant_keys, nav_state, state_keys
 from graphloc.frames import Array
 from graphloc.solve._optimize import bayes_tree, optimize
+from graphloc.solve._ordering import along_nodes, nodes_last
 
 
 class StretchStep(NamedTuple):
@@ -34,35 +35,33 @@ def solve_stretch(
     *,
     jumps: bool = True,
     tol: float = 3e-3,
+    thin: bool = True,
 ) -> StretchStep:
-    """Optimise states first..last in place, roughly: what it leaves, the passes over the whole run take up."""
+    """Optimise states first..last in place, roughly: what it leaves, the passes over the whole run take up.
+
+    `thin`: sensors are thinned (`weigh`), which another order of elimination suits.
+    """
     graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps)
-    solved = optimize(graph, guess, 15, tol)
-    moved_m = moved(guess, solved.values, first, last)
+    order = along_nodes(guess, problem.timeline.slow_of) if thin else None
+    solved = optimize(graph, guess, 15, tol, order)
+    moved_m = moved(guess, solved.values)
     update_states(problem, values, solved.values, first, last)
     return StretchStep(solved.values, graph, solved.iterations, solved.error, moved_m)
 
 
-def moved(old: gtsam.Values, new: gtsam.Values, first: int, last: int) -> float:
+def moved(old: gtsam.Values, new: gtsam.Values) -> float:
     """How far any pose moved, m (1 rad counts as 10 m)."""
     # Of a graph that measurements contradict grossly the first steps go anywhere: no number is far enough then.
-    pairs = ((old.atPose3(key), new.atPose3(key)) for key in map(keys.pose, range(first, last + 1)))
-    steps = np.array([a.localCoordinates(b) for a, b in pairs])
     with np.errstate(over="ignore"):
-        return float((np.linalg.norm(steps[:, 3:], axis=1) + 10.0 * np.linalg.norm(steps[:, :3], axis=1)).max())
+        apart = gtsam.utilities.extractPose3(new) - gtsam.utilities.extractPose3(old)  # (poses, 9 of R and 3)
+        # Two rotations by an angle a apart differ by 2 sqrt(2) sin(a / 2), squares of all nine summed.
+        angle = 2.0 * np.arcsin(np.minimum(np.linalg.norm(apart[:, :9], axis=1) / np.sqrt(8.0), 1.0))
+        return float((np.linalg.norm(apart[:, 9:], axis=1) + 10.0 * angle).max())
 
 
 def update_states(problem: Problem, values: gtsam.Values, new: gtsam.Values, first: int, last: int) -> None:
     """Write the states first..last of `new` into `values` (in place: a copy each would be quadratic)."""
-    for k in range(first, last + 1):
-        values.update(keys.pose(k), new.atPose3(keys.pose(k)))
-        values.update(keys.velocity(k), new.atVector(keys.velocity(k)))
-    for j in range(int(problem.timeline.slow_of[first]), int(problem.timeline.slow_of[last]) + 1):
-        values.update(keys.bias(j), new.atConstantBias(keys.bias(j)))
-        for stream in problem.streams:
-            if stream.slow is not None:
-                key = keys.slow(stream.number, j)
-                values.update(key, np.atleast_1d(new.atVector(key)))
+    values.update(new.extract(state_keys(problem, first, last)))
     for key in _constants(problem):
         if new.exists(key):
             values.insert_or_assign(key, np.atleast_1d(new.atVector(key)))
@@ -70,16 +69,8 @@ def update_states(problem: Problem, values: gtsam.Values, new: gtsam.Values, fir
 
 def copy_states(problem: Problem, values: gtsam.Values, first: int, last: int) -> gtsam.Values:
     """The states first..last and their slow states."""
-    copy = gtsam.Values()
-    for k in range(first, last + 1):
-        copy.insert(keys.pose(k), values.atPose3(keys.pose(k)))
-        copy.insert(keys.velocity(k), values.atVector(keys.velocity(k)))
-    for j in range(int(problem.timeline.slow_of[first]), int(problem.timeline.slow_of[last]) + 1):
-        fill_slow(problem, copy, j, values.atConstantBias(keys.bias(j)), slow_at(problem, values, j))
-    for key in _constants(problem):
-        if values.exists(key):
-            copy.insert(key, np.atleast_1d(values.atVector(key)))
-    return copy
+    constants = [key for key in _constants(problem) if values.exists(key)]
+    return values.extract(state_keys(problem, first, last) + constants)
 
 
 def _constants(problem: Problem) -> list[int]:
@@ -126,9 +117,14 @@ def weak_prior(problem: Problem, values: gtsam.Values, k: int) -> StartPrior:
     )
 
 
+def thin_tree(problem: Problem, step: StretchStep) -> gtsam.ISAM2:
+    """The covariances of a thinned stretch."""
+    return bayes_tree(step.graph, step.values, nodes_last(step.values, problem.timeline.slow_of))
+
+
 def prior_at(problem: Problem, step: StretchStep, k: int) -> StartPrior:
     """The marginals at state `k` as a prior; cross terms are left out, which only loosens it."""
-    tree, values = bayes_tree(step.graph, step.values), step.values
+    tree, values = thin_tree(problem, step), step.values
     j = int(problem.timeline.slow_of[k])
     cov = {key: np.asarray(tree.marginalCovariance(key)) for key in (keys.pose(k), keys.velocity(k), keys.bias(j))}
     slow = {}
