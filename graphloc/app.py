@@ -55,10 +55,16 @@ class Run:
     solution: Solution
     held: tuple[GnssPosition, ...] = ()
     filters: tuple[ekf.FilterResult, ...] = ()
+    online: Solution | None = None  # of the same measurements, beside an offline run that is compared
     pictures: tuple[tuple[str, bytes], ...] = ()  # of matches: caption, JPEG
     tags: tuple[TagConfig, ...] = ()  # that are not surveyed, where the run puts them
     underlay: Underlay | None = None  # the aerial image under the report's map
     calibration: calibrate.Calibration | None = None  # offline
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All that was said on the way."""
+        return report.said_on_the_way(self.recording, self.solution, self.online)
 
 
 def load(
@@ -93,18 +99,24 @@ def smooth_recording(
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
     matched = scans is not None and bool(config.of_kind("aerial"))
-    solution = _solved(recording, config, datum, progress, None if matched else calibrate.PROBE)
+    solution = solve(recording, config, datum, probe=None if matched else calibrate.PROBE, progress=progress)
     gallery = Gallery()
     if scans is not None and matched:
         recording = with_matches(recording, config, datum, solution, scans, progress, gallery)
-        solution = _solved(recording, config, datum, progress, calibrate.PROBE)
+        solution = solve(recording, config, datum, probe=calibrate.PROBE, progress=progress)
     filters: tuple[ekf.FilterResult, ...] = ()
+    online, never = None, ""
     if compare:
-        filters = _causal(recording, config, datum, progress)
+        filters = _filters(recording, config, datum, progress)
+        online, never = _online(recording, config, datum, progress)
+    if online is not None:
+        beside = ekf.FilterResult(name=online.name, trajectory=online.trajectory, ledger=online.ledger)
+        filters = (beside, *filters)
     tags, said = _about_tags(recording, config, solution)
+    said += [never] if never else []
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
-        filters=filters, pictures=tuple(gallery.pictures()), tags=tags,
+        filters=filters, online=online, pictures=tuple(gallery.pictures()), tags=tags,
         calibration=calibrate.calibrate(recording, config, solution),
     )  # fmt: skip
     return _comparable(_with_underlay(run, scans))
@@ -119,21 +131,26 @@ def _with_underlay(run: Run, scans: Scans | None) -> Run:
     return replace(run, recording=replace(run.recording, warnings=said), underlay=picture)
 
 
-def _causal(
+def _filters(
     recording: Recording, config: VesselConfig, datum: Datum, progress: Progress
 ) -> tuple[ekf.FilterResult, ...]:
-    """What can be had at the time: the online mode, and the filters."""
     progress("filters", 0, 1)
     filters = ekf.run_all(recording, config, datum)
     his = run_digerud(recording, config, datum)
     filters += (his,) if his is not None else ()
     progress("filters", 1, 1)
+    return filters
+
+
+def _online(
+    recording: Recording, config: VesselConfig, datum: Datum, progress: Progress
+) -> tuple[Solution | None, str]:
+    """Return what the online mode makes of it, or why it made nothing."""
     status = lambda at_s, whole_s, *_: progress("online", int(at_s), int(whole_s))
     try:
-        online = replay(recording, config, datum=datum, status=status).solution
-    except SolveError:
-        return filters  # what it waited for is what `graphloc replay` says
-    return (ekf.FilterResult(name="graphloc online", trajectory=online.trajectory, ledger=online.ledger), *filters)
+        return replay(recording, config, datum=datum, status=status).solution, ""
+    except SolveError as error:
+        return None, f"graphloc online is not compared: {error}"
 
 
 def replay_recording(
@@ -185,9 +202,22 @@ def _riding(recording: Recording, surveys: Mapping[str, Survey], solution: Solut
     return found
 
 
-def _solved(
-    recording: Recording, config: VesselConfig, datum: Datum, progress: Progress, probe: Probe | None = None
+def solve(
+    recording: Recording,
+    config: VesselConfig,
+    datum: Datum,
+    *,
+    probe: Probe | None = None,
+    progress: Progress = quiet,
 ) -> Solution:
+    """Smooth what is in a recording as it is: nothing is matched, held out or compared.
+
+    Args:
+        datum: origin of world. probe: what to ask of offsets (see `eval.calibrate`).
+
+    Raises:
+        SolveError: it cannot be started or solved.
+    """
     config = seen_frames(config, recording)
     return smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, probe=probe, progress=progress)
 
@@ -219,7 +249,7 @@ def match_at(
     (sensor, *_) = sensors.values()
     datum = choose_datum(recording, config)
     whole = with_synthetic(recording, config, datum)
-    track = _solved(whole, config, datum, progress).trajectory
+    track = solve(whole, config, datum, progress=progress).trajectory
     span_s = (int(track.stamps_ns[-1]) - int(track.stamps_ns[0])) / 1e9
     if not 0.0 <= at_s <= span_s:
         raise InputError(f"{recording.source}: --at {at_s:g}: the run is from 0 to {span_s:.1f} s")
@@ -260,8 +290,11 @@ def _comparable(run: Run) -> Run:
         )
 
     filters = tuple(f for f in run.filters if fits(f))
+    online = run.online
+    if online is not None and not comparable(metrics.errors, online.trajectory, track):
+        online = None
     recording = replace(run.recording, truth=truth, check_speed=speed, warnings=(*run.recording.warnings, *said))
-    return replace(run, recording=recording, held=held, filters=filters)
+    return replace(run, recording=recording, held=held, filters=filters, online=online)
 
 
 def levers_m(run: Run) -> dict[str, Array]:
@@ -347,6 +380,7 @@ def report_data(run: Run, command: str = "") -> report.ReportData:
         pictures=run.pictures,
         underlay=run.underlay,
         calibration=run.calibration,
+        online=run.online,
         command=command,
     )
 
@@ -364,7 +398,7 @@ def write(
             inputs={str(p): sha256(p) for p in inputs},
             command=command,
             metrics={t.title: t.as_dict() for t in data.tables},
-            warnings=(*run.recording.warnings, *run.solution.stats.warnings),
+            warnings=run.warnings,
         )
         if run.tags:
             _write_tags(run, fresh / _FOUND_TAGS)
@@ -415,6 +449,7 @@ __all__ = [
     "sha256",
     "simulated",
     "smooth_recording",
+    "solve",
     "tables",
     "truth_statement",
     "with_matches",

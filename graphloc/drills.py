@@ -17,12 +17,10 @@ from graphloc.eval.drill import Case, Failure, Measured, Struck, Times, Window, 
 from graphloc.eval.drill.measure import Drilled, compared
 from graphloc.eval.drill.plan import judged_until, windows
 from graphloc.eval.parallel import beside
-from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum, heading_deg_from_yaw
 from graphloc.measurements import CompassHeading
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.replay import replay
-from graphloc.solve import smooth
 from graphloc.trajectory import Trajectory, bounds_95
 
 ESTIMATORS = ("graphloc", "graphloc online", "honest EKF", "BL EKF")
@@ -172,8 +170,7 @@ def _tracks(job: _Job) -> Tracks:
 
 
 def _smoothed(recording: Recording, job: _Job) -> Trajectory:
-    config = app.seen_frames(job.config, recording)
-    return smooth(recording, config, job.datum, rows=SENSORS, inertial=INERTIAL).trajectory
+    return app.solve(recording, job.config, job.datum).trajectory
 
 
 def _replayed(recording: Recording, job: _Job, late_ns: Mapping[int, int]) -> Trajectory:

@@ -92,7 +92,7 @@ def replay(
     command = " ".join(sys.argv[1:])
     report = application.write(run, out, inputs=bag, command=command, overwrite=overwrite, figures=figures)
     write_rerun(rerun, run, bag, config)
-    print_run(run, report, as_json)
+    print_run(run, report, as_json, rerun)
 
 
 def stream(

@@ -70,12 +70,13 @@ def status_line() -> Callable[[float, float, object, str], None]:
     return show
 
 
-def print_run(run: object, report: Path, as_json: bool) -> None:
+def print_run(run: object, page: Path, as_json: bool, rerun: Path | None = None) -> None:
     from graphloc import app as application
+    from graphloc.eval import report
 
     assert isinstance(run, application.Run)
-    found = application.tables(run)
-    warnings = (*run.recording.warnings, *run.solution.stats.warnings)
+    data = application.report_data(run)
+    found, warnings = data.tables, data.warnings
     if as_json:
         numbers = {t.title: t.as_dict() for t in found}
         told = {"ledger": run.solution.ledger.counts(), "converged": run.solution.stats.converged, "warnings": warnings}
@@ -87,13 +88,20 @@ def print_run(run: object, report: Path, as_json: bool) -> None:
             typer.echo(application.truth_statement(run))
         for table in found:
             typer.echo(table.as_text())
+        for track in report.verdict(data).tracks:
+            typer.echo(f"{track.name}: {track.trust.said}. {track.accuracy}")
+            for reason in track.reasons:
+                if reason.trust is not report.Trust.YES:
+                    typer.echo(f"  {reason.text}")
         for name, counts in run.solution.ledger.counts().items():
             typer.echo(f"  {name}: " + ", ".join(f"{n} {outcome}" for outcome, n in counts.items()))
         for warning in warnings:
             typer.echo(f"warning: {warning}", err=True)
         for suggestion in run.calibration.suggestions if run.calibration is not None else ():
             typer.echo(f"calibration: {suggestion}", err=True)
-    typer.echo(str(report))
+    typer.echo(str(page))
+    if rerun is not None:
+        typer.echo(str(rerun))
 
 
 def check_rerun(path: Path | None, overwrite: bool) -> None:
@@ -147,4 +155,4 @@ def smooth_bags(
     command = " ".join(sys.argv[1:])
     report = application.write(run, out, inputs=bag, command=command, overwrite=overwrite, figures=figures)
     write_rerun(rerun, run, bag, config)
-    print_run(run, report, as_json)
+    print_run(run, report, as_json, rerun)
