@@ -329,7 +329,8 @@ def tables(run: Run) -> tuple[metrics.Table, ...]:
         found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, levers_m(run)))
     if run.recording.check_speed is not None:
         found.append(metrics.speed_table(estimates, run.recording.check_speed))
-    return tuple(found)
+    whys = [f"{f.name}: {f.why}." for f in run.filters if f.why]
+    return (replace(found[0], note="\n".join([found[0].note, *whys])), *found[1:]) if found else ()
 
 
 def _docking_tables(

@@ -76,7 +76,7 @@ def said_of(solution: Solution) -> str:
 def cure(health: Health, reason: str) -> str:
     """Say what would end a state that is less than good."""
     if "heading is a guess" in reason:
-        return "a sensor of the heading (compass, two antennas), or start.heading_deg; a way with turns tells it better"
+        return "a sensor of the heading (compass, two antennas), or start.heading_deg"
     if health is Health.LOST:
         return "a fix, match or tag that agrees, and for a heading a compass or a way of some metres"
     if health is Health.DEAD_RECKONING:

@@ -69,10 +69,13 @@ def _key_numbers(data: ReportData) -> str:
         first_of, *rest = (number(row[c], digits) for c, _, digits in columns)
         rows.append([name, first_of, ratio, *rest, *(_percent(row[c]) for c, _ in shares)])
     wide = [k for k, said in enumerate(head) if said in _WIDE]
+    whys = "".join(note(f"{f.name}: {f.why}.") for f in data.filters if f.why and f.name in values)
     said = "" if data.solution.stats.online or len(values) < 2 else _WHOLE.format(name=data.solution.name)
-    return table(
-        head, rows, ["ours" if name == data.solution.name else "" for name in values], wide=wide, kind="key"
-    ) + note(said)
+    return (
+        table(head, rows, ["ours" if name == data.solution.name else "" for name in values], wide=wide, kind="key")
+        + note(said)
+        + whys
+    )
 
 
 def _percent(value: float | None) -> str:
