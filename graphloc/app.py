@@ -67,6 +67,17 @@ class Run:
         return report.said_on_the_way(self.recording, self.solution, self.online)
 
 
+def configured(config_path: Path, changes: Mapping[str, object] = MappingProxyType({})) -> VesselConfig:
+    """Read a vessel.yaml with the surveys that it names, some of its keys changed (`config.with_changes`).
+
+    Raises:
+        ConfigError: it or a survey cannot be used.
+    """
+    config = with_surveys(load_config(config_path, KINDS, changes), config_path.parent)
+    origin.refuse_world_without_datum(config, str(config_path), SENSORS)
+    return config
+
+
 def load(
     bags: Sequence[Path],
     config_path: Path,
@@ -74,8 +85,7 @@ def load(
     changes: Mapping[str, object] = MappingProxyType({}),
 ) -> tuple[Recording, VesselConfig]:
     """Read a vessel.yaml, some of its keys changed (`config.with_changes`), and the bag that it describes."""
-    config = with_surveys(load_config(config_path, KINDS, changes), config_path.parent)
-    origin.refuse_world_without_datum(config, str(config_path), SENSORS)
+    config = configured(config_path, changes)
     recording = read_recording(bags, config, progress)
     return with_sightings(recording, config, bags, progress), config
 
@@ -442,6 +452,7 @@ __all__ = [
     "Run",
     "Scans",
     "choose_datum",
+    "configured",
     "load",
     "match_at",
     "replay_recording",
