@@ -114,7 +114,7 @@ def grids(ablated: Ablated) -> list[Grid]:
             f"{_BASIS[ablated.basis]}{' The antenna is compared, so headings are not.' if held else ''} Bounds: the solution's own, "
             "median. Contradiction: how far the sensor's measurements are from the run without it, in sigmas of both together; "
             f"1 or less where all is well, above {CONTRADICTS:g} something is wrong with it or with what is left. A bad "
-            "sensor: without it errors or the cost fall."
+            "sensor: without it errors or the cost fall. Without a count: the configuration makes its measurements."
         ),
     )  # fmt: skip
     names = [e.without for e in ablated.effects if any(other.fits.get(e.without) for other in every)]
@@ -139,16 +139,21 @@ def _number(value: float | None, unit: str, digits: int = 2) -> Cell:
     return Cell(text="-" if value is None else f"{value:.{digits}f}{unit}")
 
 
+def _count(e: Effect) -> Cell:
+    """The height prior has none in the recording: the configuration makes it."""
+    return Cell(text=str(e.measurements) if e.measurements else "-")
+
+
 def _row(e: Effect) -> tuple[Cell, ...]:
     bad = "bad" if (e.contradiction or 0.0) > CONTRADICTS else ""
     name = e.without if e.without else "(with all)"
     if e.why_not:
         return (
-            Cell(text=f"{name} (cannot be left out)", mark="doubt"), Cell(text=str(e.measurements)), *[Cell(text="-")] * 8
+            Cell(text=f"{name} (cannot be left out)", mark="doubt"), _count(e), *[Cell(text="-")] * 8
         )  # fmt: skip
     return (
         Cell(text=name),
-        Cell(text=str(e.measurements) if e.without else "-"),
+        _count(e),
         _number(e.rmse_m, " m"),
         _number(e.worst_m, " m"),
         _number(e.worst_at_s, " s", 0),

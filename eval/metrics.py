@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from graphloc.chi2 import CHI2_95
 from graphloc.errors import InputError
+from graphloc.eval.words import number
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.measurements import GnssPosition
 from graphloc.recording import SpeedSeries
@@ -42,7 +43,7 @@ class Table:
 
     def as_text(self) -> str:
         """Return the table as aligned text, estimates as columns: it fits a terminal."""
-        numbers = [["-" if vs[k] is None else f"{vs[k]:.3f}" for _, vs in self.rows] for k in range(len(self.columns))]
+        numbers = [[number(vs[k]) for _, vs in self.rows] for k in range(len(self.columns))]
         cells = [["", *(name for name, _ in self.rows)]]
         cells += [[column, *values] for column, values in zip(self.columns, numbers, strict=True)]
         widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]

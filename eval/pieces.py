@@ -91,8 +91,3 @@ def figure_html(figure: go.Figure, name: str) -> str:
         config={"displaylogo": False, "responsive": True, "displayModeBar": False},
     )
     return f'<div class="figure">{html}</div>'
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """Return a number for a table; a dash where there is none."""
-    return "-" if value is None else str(value) if isinstance(value, int) else f"{value:.{digits}f}"

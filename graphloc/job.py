@@ -17,7 +17,7 @@ from ruamel.yaml.error import YAMLError
 
 from graphloc import app
 from graphloc.config import VesselConfig, effective, parse_config, with_changes
-from graphloc.errors import ConfigError, GraphlocError
+from graphloc.errors import ConfigError, in_one_line
 from graphloc.eval import sweep_table
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
@@ -152,17 +152,11 @@ def run_job(job: Job) -> list[Row]:
             run = _estimated(job, Path(folder))
         rows = sweep_table.rows_of(run.solution, app.tables(run), len(run.recording.warnings))
     except Exception as error:  # noqa: BLE001 - whatever it is, the other runs go on
-        rows = [{"estimate": "", "error": said(error)}]
+        rows = [{"estimate": "", "error": in_one_line(error)}]
     finally:
         numba.set_num_threads(threads)
     took_s = time.perf_counter() - begun
     return [{**job.row, **row, "took_s": took_s} for row in rows]
-
-
-def said(error: BaseException) -> str:
-    """Return an error as one line."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, GraphlocError) else f"{type(error).__name__}: {text}"
 
 
 def _estimated(job: Job, folder: Path) -> app.Run:

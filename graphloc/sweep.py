@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any
 
 from graphloc import app, outputs
-from graphloc.errors import InputError, OutputError
+from graphloc.errors import InputError, OutputError, in_one_line
 from graphloc.eval import sweep_table
 from graphloc.extras import need
-from graphloc.job import Job, Row, check, run_job, said
+from graphloc.job import Job, Row, check, run_job
 from graphloc.plain import plain
 from graphloc.recording import Progress, quiet
 
@@ -153,7 +153,9 @@ def _on_dask(jobs: Sequence[Job], workers: int, client: Any, stack: ExitStack) -
     of = dict(zip(futures, jobs, strict=True))
     for future in need("distributed", "sweep").as_completed(futures):
         job, error = of.pop(future), future.exception()
-        failed = [] if error is None else [{**job.row, "estimate": "", "error": f"its worker died: {said(error)}"}]
+        failed = (
+            [] if error is None else [{**job.row, "estimate": "", "error": f"its worker died: {in_one_line(error)}"}]
+        )
         yield job, failed or future.result()
         future.release()
 
@@ -190,11 +192,11 @@ def _remote(address: str, stack: ExitStack) -> Any:
         client = stack.enter_context(need("distributed", "sweep").Client(address, timeout=_CONNECT_S))
         client.wait_for_workers(1, timeout=_CONNECT_S)
     except (OSError, TimeoutError, ValueError) as error:
-        raise InputError(f"{address}: no Dask scheduler with a worker answers there ({said(error)})") from None
+        raise InputError(f"{address}: no Dask scheduler with a worker answers there ({in_one_line(error)})") from None
     try:
         found = client.run(_versions)
     except Exception as error:  # noqa: BLE001 - whatever a worker without graphloc raises
-        raise InputError(f"{address}: a worker cannot run graphloc ({said(error)})") from None
+        raise InputError(f"{address}: a worker cannot run graphloc ({in_one_line(error)})") from None
     for worker, versions in found.items():
         if versions != _versions():
             raise InputError(f"{address}: worker {worker} has {versions}, and here is {_versions()}: install the same")

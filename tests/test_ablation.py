@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from graphloc import app
+from graphloc.errors import SolveError
 from graphloc.eval import ablation_page as page
 from graphloc.eval.ablation import Ablated, Effect, Off, Vote, suspects
 from graphloc.eval.consistency import contradiction
@@ -24,7 +25,7 @@ from graphloc.frames import Array
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix, PoseMode
 from graphloc.solution import Solution
-from graphloc.whatif import ablate
+from graphloc.whatif import _Job, _smoothed, ablate
 
 OFF_DEG = 12.0
 
@@ -69,6 +70,7 @@ def test_each_sensor_is_left_out_but_the_imu(bad: tuple[SimulatedRun, Ablated]) 
     assert {e.without for e in found.effects} == {name for name, s in run.config.sensors.items() if s.enabled}
     assert "states hang on it" in of(found, "imu").why_not
     assert of(found, "gnss").measurements == sum(isinstance(m, GnssPosition) for m in run.recording.measurements)
+    assert of(found, "height").measurements == 0  # the recording has none: the configuration makes it
     assert of(found, "compass").fits.keys() == {"gnss", "aerial", "height"}
     assert of(found, "aerial").bound_m > found.full.bound_m  # type: ignore[operator]
     assert "cannot be left out" in page.grids(found)[0].as_text()
@@ -105,6 +107,36 @@ def test_held_out_fixes_stand_in_for_truth_and_what_starts_all_cannot_go(tmp_pat
     assert told["basis"] == "held"
     assert len((tmp_path / "ablation.csv").read_text().splitlines()) == 1 + len(told["runs"])
     assert "| gnss |" in (tmp_path / "ablation.md").read_text()
+
+
+@pytest.mark.parametrize("wrapped", [True, False])
+def test_whatever_the_solver_says_is_a_row_in_the_users_words(monkeypatch: pytest.MonkeyPatch, wrapped: bool) -> None:
+    """What is not ours, and what is ours around the solver's text; an error of our own words is kept."""
+    run = made()
+    deep = RuntimeError("Indeterminant linear system near variable 8646911284551352320")
+
+    def fails(*_: object, **__: object) -> None:
+        if not wrapped:
+            raise deep
+        raise SolveError(f"the solver failed: {deep}") from deep
+
+    job = _Job(
+        recording=run.recording,
+        config=run.config,
+        datum=app.choose_datum(run.recording, run.config),
+        without=("height",),
+    )
+    monkeypatch.setattr(app, "solve", fails)
+    said = _smoothed(job)
+    assert isinstance(said, str)
+    assert "8646911284551352320" not in said
+    assert said.startswith("what is left does not tell")
+
+    def ours(*_: object, **__: object) -> None:
+        raise SolveError("no place: no fix")
+
+    monkeypatch.setattr(app, "solve", ours)
+    assert _smoothed(job) == "no place: no fix"
 
 
 def test_with_one_sensor_alone_there_is_nothing_to_draw(tmp_path: Path) -> None:

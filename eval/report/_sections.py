@@ -7,11 +7,12 @@ import base64
 from html import escape
 
 from graphloc.eval.metrics import Table
-from graphloc.eval.pieces import note, number, table
+from graphloc.eval.pieces import note, table
 from graphloc.eval.plots import HEALTH, OUTAGE
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._judged import Trust, main_table, times
 from graphloc.eval.report._verdict import Verdict
+from graphloc.eval.words import number
 from graphloc.solution import Solution
 
 _REASONS = 60
