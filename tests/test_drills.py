@@ -336,7 +336,9 @@ def test_failures_strike_where_they_fit(recording: Recording) -> None:
     parts = windows(recording, 120.0, 3)
     assert parts == (Window(begin_ns=first, end_ns=last, whole=True),)
     cases, left = schedule(failures, parts, [first + 20 * S], 3, 0)
-    assert [name for name, _ in left] == ["GNSS outage, 120 s"]
+    ((name, why),) = left
+    assert name == "GNSS outage, 120 s"
+    assert why.endswith(f"{np.ceil(30 + 120 + 25 - (last - first) / S):.0f} s too short")
     for case in cases:
         assert case.begin_ns >= first + 30 * S  # 10 s after the online mode's first pose
         assert case.end_ns <= last - 25 * S

@@ -279,6 +279,7 @@ def test_a_sweep_that_was_broken_off_or_failed_throughout_says_how_to_go_on(
         told = capsys.readouterr()
         assert end.value.code == code
         assert said in told.err
+        assert len(told.err.strip().splitlines()) == 1
         assert rows is None or "1 run, 1 failed" in told.out
         assert rows is None or "- my.bag: is none" in told.out
 

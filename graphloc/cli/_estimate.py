@@ -30,7 +30,7 @@ from graphloc.cli._shared import (
 
 def inspect(
     bag: BagArgument,
-    config: Annotated[Path, typer.Option("--write", "-w", "-o", help="Where to write the first vessel.yaml.")] = Path(
+    config: Annotated[Path, typer.Option("--write", "-o", help="Where to write the first vessel.yaml.")] = Path(
         "vessel.yaml"
     ),
     overwrite: OverwriteOption = False,

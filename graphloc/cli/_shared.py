@@ -11,6 +11,13 @@ from typing import Annotated
 
 import typer
 
+from graphloc.errors import GraphlocError
+
+
+class Stopped(GraphlocError):
+    """Ctrl-C, and what became of the work so far."""
+
+
 BagArgument = Annotated[list[Path], typer.Argument(help="A ROS 1 or ROS 2 bag; several for the parts of a split one.")]
 ConfigOption = Annotated[Path, typer.Option("--config", "-c", help="The vessel.yaml.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")]
