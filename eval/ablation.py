@@ -76,12 +76,13 @@ class Ablated:
     """What an ablation gives: the run with all sensors, without each, over time, and what the rest says of suspects.
 
     Attributes:
-        basis: what distances are from. matched: sensors whose measurements were made around the run with all.
+        basis: what distances are from. begin_ns: of the track with all, from which on times count. matched: sensors whose measurements were made around the run with all.
     """
 
     source: str
     vessel: str
     basis: Basis
+    begin_ns: int
     full: Effect
     effects: tuple[Effect, ...]
     over_time: Mapping[str, Off]

@@ -72,6 +72,7 @@ def ablate(
         source=recording.source,
         vessel=config.vessel,
         basis="truth" if run.recording.truth is not None else "held" if run.held else "full",
+        begin_ns=int(run.solution.trajectory.stamps_ns[0]),
         full=effects[0],
         effects=(*effects[1:], Effect(without=imu, measurements=_samples(recording), fits={}, why_not=carries)),
         over_time=over_time,

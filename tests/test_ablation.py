@@ -18,6 +18,7 @@ from graphloc.eval.ablation import Ablated, Effect, Off, Vote, suspects
 from graphloc.eval.consistency import contradiction
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.page import Cell, Grid
+from graphloc.eval.plots import Line
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import SENSORS
 from graphloc.factors.velocity import VelocityConfig
@@ -157,7 +158,9 @@ def test_no_spike_is_lost_over_time(bad: tuple[SimulatedRun, Ablated]) -> None:
     off_m = np.full(50_000, 0.1)
     off_m[33_333] = 7.0
     away = Off(stamps_ns=np.arange(50_000) * 100_000_000, off_m=off_m, off_deg=None)
-    (line,) = page.over_time(replace(bad[1], over_time={"gnss": away})).data
+    (line,) = page.over_time(replace(bad[1], over_time={"gnss": away}, begin_ns=-2_000_000_000)).panels[0].marks
+    assert isinstance(line, Line)
+    assert line.x[0] == 2.0  # from the begin of the track, as the table's times
     assert len(line.y) < 5_000
     assert max(line.y) == 7.0
 

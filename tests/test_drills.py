@@ -16,7 +16,7 @@ from graphloc.drills import _or_why_not, _started_there, as_it_comes, drill
 from graphloc.eval.drill import Case, Failure, Times, Window, cut, figures, judge, page, schedule, script
 from graphloc.eval.drill.measure import Drilled, Measured, State, compared, summed
 from graphloc.eval.drill.plan import judged_until, windows
-from graphloc.eval.plots import COLOURS
+from graphloc.eval.plots import COLOURS, Line, Points
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, rotation_from_rpy_deg
 from graphloc.ledger import Outcome
@@ -399,7 +399,8 @@ def test_an_estimator_has_the_colour_that_it_has_in_the_report(drilled: tuple[Si
     _, found = drilled
     report = ["graphloc", "graphloc online", "BL EKF", "honest EKF"]
     for figure in (figures.all_failures(found), figures.over_time(found)):
-        colours = {t.name: (t.line.color or t.marker.color) for t in figure.data if t.name}
+        marks = [m for panel in figure.panels for m in panel.marks]
+        colours = {m.name: m.colour for m in marks if isinstance(m, Line | Points)}
         assert [colours[name] for name in report] == list(COLOURS[:4])
 
 

@@ -171,6 +171,8 @@ def _compared(data: ReportData, solution: Solution) -> Iterator[Reason]:
     """What there was to hold it against."""
     if main_table(data) is None:
         text = "Nothing here measures how far off it is: there is neither truth nor a fix that was kept out."
+        if solution.stats.online and data.online is None:
+            text += " `graphloc compare` holds it against the offline track, which knows more."
         yield Reason(trust=Trust.WITH_CARE, text=text)
         return
     matched = of(data, solution.name, "matched")
