@@ -160,5 +160,4 @@ def fit(solution: Solution, name: str) -> float | None:
     ]
     if len(used) < _FEWEST:
         return None
-    nis, dof = np.array(used).T
-    return float(np.sqrt(np.median(nis / chi2_median(dof))))
+    return float(np.sqrt(np.median([nis / chi2_median(dof) for nis, dof in used])))

@@ -97,6 +97,7 @@ def test_scans_are_matched_around_its_own_prediction(bag: Path, tmp_path: Path) 
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout[: done.stdout.rindex("}") + 1])
     assert told["Against truth"]["graphloc online"]["position_rmse_m"] < 0.8
+    assert told["verdict"]["graphloc online"]["said"] in ("can be trusted", "use with care", "do not rely on it")
     aerial = told["ledger"]["aerial"]
     assert aerial["used"] > 8
     text = (tmp_path / "out/ledger.csv").read_text()

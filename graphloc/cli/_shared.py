@@ -96,7 +96,15 @@ def print_run(run: Run, page: Path, as_json: bool, rerun: Path | None = None) ->
     found, warnings = data.tables, data.warnings
     if as_json:
         numbers = {t.title: t.as_dict() for t in found}
-        told = {"ledger": run.solution.ledger.counts(), "converged": run.solution.stats.converged, "warnings": warnings}
+        verdicts = {
+            t.name: {"said": t.trust.said, "why": [r.text for r in t.reasons]} for t in report.verdict(data).tracks
+        }
+        told: dict[str, object] = {
+            "verdict": verdicts,
+            "ledger": run.solution.ledger.counts(),
+            "converged": run.solution.stats.converged,
+            "warnings": warnings,
+        }
         if run.calibration is not None:
             told["calibration"] = run.calibration.as_dict()
         typer.echo(json.dumps({**numbers, **told}, indent=2))
