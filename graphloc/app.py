@@ -14,9 +14,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from ruamel.yaml import YAML
 
-from graphloc import origin, outputs
+from graphloc import found_tags, origin, outputs
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig, load_config
 from graphloc.errors import InputError, SolveError
@@ -26,13 +25,11 @@ from graphloc.eval.docking import docking_table
 from graphloc.eval.match_picture import Gallery
 from graphloc.eval.plots import Underlay
 from graphloc.eval.simulate import SimulatedRun
-from graphloc.eval.tag_check import suspect_tags
 from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Array, Datum
 from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.tags.unsurveyed import Riding, estimate_tags, only_beside
 from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.offsets import Probe
@@ -40,10 +37,8 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.replay import Status, replay, silent
 from graphloc.solution import Solution
 from graphloc.solve import smooth
-from graphloc.survey import WORLD, Survey, TagConfig
+from graphloc.survey import TagConfig
 from graphloc.trajectory import Trajectory
-
-_FOUND_TAGS = "tags.found.yaml"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -122,7 +117,7 @@ def smooth_recording(
     if online is not None:
         beside = ekf.FilterResult(name=online.name, trajectory=online.trajectory, ledger=online.ledger)
         filters = (beside, *filters)
-    tags, said = _about_tags(recording, config, solution)
+    tags, said = found_tags.about_tags(recording, config, solution)
     said += [never] if never else []
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
@@ -176,40 +171,6 @@ def replay_recording(
     replayed = replay(recording, config, scans=scans, rate=rate, lag_s=lag_s, stoppable=True, status=status)
     run = Run(recording=replayed.recording, config=config, solution=replayed.solution)
     return _comparable(_with_underlay(run, scans))
-
-
-def _about_tags(
-    recording: Recording, config: VesselConfig, solution: Solution
-) -> tuple[tuple[TagConfig, ...], list[str]]:
-    """Return tags that the run tells the place of, and what it says against the survey."""
-    said = suspect_tags(recording, config, solution)
-    if not recording.tag_views:
-        return (), said
-    surveys = {name: sensor.surveyed for name, sensor in config.of_kind("apriltag").items()}
-    size_m = next((s.other_size_m for s in surveys.values() if s.other_size_m), None)
-    riding = _riding(recording, surveys, solution)
-    found, left = estimate_tags(recording.tag_views, solution.trajectory, size_m, riding)
-    every = Survey.model_construct(tags=(*found, *(tag for s in surveys.values() for tag in s.tags)))
-    for frame in sorted({tag.frame for tag in found}):
-        names = ", ".join(every.called(tag.family, tag.id) for tag in found if tag.frame == frame)
-        where = (
-            "where the run puts it is" if frame == WORLD else f"seen only beside tags of {frame}, as if it rode on that"
-        )
-        said.append(f"{names}: not in the survey; {where} in {_FOUND_TAGS}")
-    return tuple(found), [*said, *left]
-
-
-def _riding(recording: Recording, surveys: Mapping[str, Survey], solution: Solution) -> dict[tuple[str, int], Riding]:
-    """How the docks moved that tags which are not surveyed seem to ride on."""
-    seen = [m for m in recording.measurements if isinstance(m, TagSighting)]
-    found = {}
-    for tag, (sensor, frame) in only_beside(recording.tag_views, seen).items():
-        dock, slow = surveys[sensor].dock(frame), solution.slow[sensor]
-        assert dock is not None  # sightings are of a frame of the survey
-        first = slow.axes.index(f"{frame} east")
-        moved = slow.value[:, first : first + 6] * np.repeat([1.0, np.pi / 180.0], 3)
-        found[tag] = Riding(dock, slow.stamps_ns, moved)
-    return found
 
 
 def solve(
@@ -412,7 +373,7 @@ def write(
             warnings=run.warnings,
         )
         if run.tags:
-            _write_tags(run, fresh / _FOUND_TAGS)
+            found_tags.write(fresh / found_tags.FILE, run.tags, run.config)
         if run.calibration is not None:
             text = json.dumps(run.calibration.as_dict(), indent=1)
             (fresh / "calibration.json").write_text(text + "\n", encoding="utf-8")
@@ -423,18 +384,6 @@ def write(
             (fresh / "figures").mkdir()
             write_figures(tuple(report.figures(data).values()), fresh / "figures")
     return folder / "report.html"
-
-
-def _write_tags(run: Run, path: Path) -> None:
-    """Write the surveys with the tags that were found, as one survey that can be read again."""
-    surveys = [sensor.surveyed for sensor in run.config.of_kind("apriltag").values()]
-    tags = {(tag.family, tag.id): tag for tag in (*run.tags, *(tag for s in surveys for tag in s.tags))}
-    docks = {dock.name: dock for s in surveys for dock in s.docks}
-    whole = Survey(
-        tags=tuple(tags.values()), docks=tuple(docks.values()), berths=tuple(b for s in surveys for b in s.berths)
-    )
-    with path.open("w", encoding="utf-8") as stream:
-        YAML(typ="safe", pure=True).dump(whole.model_dump(mode="json", exclude_none=True), stream)
 
 
 def sha256(path: Path) -> str:
