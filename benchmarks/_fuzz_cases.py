@@ -340,7 +340,7 @@ def _command(case: Case) -> Callable[[], None]:
     elif way == 3:
         _put_hostile(case, base.tree, config)
     verb = ("smooth", "compare", "replay", "inspect", "inspect")[int(rng.integers(5))]
-    options = ["-w", "out.yaml"] if verb == "inspect" else ["-c", str(config), "-o", str(case.room / "out")]
+    options = ["-o", "out.yaml"] if verb == "inspect" else ["-c", str(config), "-o", str(case.room / "out")]
     arguments = [verb, str(bag), *options, *(["--json"] if rng.random() < 0.3 else [])]
 
     def go() -> None:

@@ -36,7 +36,7 @@ class Effect:
     """A run, with all sensors (`without` is '') or without one.
 
     Attributes:
-        measurements: of the sensor. rmse_m, worst_m, heading_rmse_deg: against the basis. worst_at_s: since the run's begin.
+        measurements: of the sensor, in the recording (0: the configuration makes them). rmse_m, worst_m, heading_rmse_deg: against the basis. worst_at_s: since the run's begin.
         bound_m, bound_deg: the solution's own 95 % bounds, median. missing: share of the full track that it lacks.
         cost_ratio: cost over its expectation. contradiction: of the sensor with this solution, in sigmas
             (`graphloc.eval.consistency`).
@@ -76,12 +76,13 @@ class Ablated:
     """What an ablation gives: the run with all sensors, without each, over time, and what the rest says of suspects.
 
     Attributes:
-        basis: what distances are from. matched: sensors whose measurements were made around the run with all.
+        basis: what distances are from. begin_ns: of the track with all, from which on times count. matched: sensors whose measurements were made around the run with all.
     """
 
     source: str
     vessel: str
     basis: Basis
+    begin_ns: int
     full: Effect
     effects: tuple[Effect, ...]
     over_time: Mapping[str, Off]

@@ -8,16 +8,17 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-import plotly.graph_objects as go
 
 from graphloc.eval.ablation import CONTRADICTS, Ablated, Effect, Vote, suspects
 from graphloc.eval.page import Cell, Grid, write_csv, write_markdown, write_page
-from graphloc.eval.pieces import figure_html
-from graphloc.eval.plots import COLOURS, TRUTH, peaks
+from graphloc.eval.pieces import drawing
+from graphloc.eval.plots import COLOURS, TRUTH, Figure, Line, Mark, Panel, Points, peaks
+from graphloc.time import seconds_since
 
 MARK = "ablation.json"  # a folder with this file is ours to replace
 _BETTER = 0.9  # an error without a sensor that is smaller than so many times that with it
 _LEANS, _LEANS_TIMES = 1.3, 3.0  # sigmas, and times the other's, from which on what is left leans against a suspect
+_LEAST_M = 1e-3  # lower end of a logarithmic axis
 _DIFFERENT_M = 0.02  # differences below are not worth a word
 
 _BASIS = {
@@ -114,7 +115,7 @@ def grids(ablated: Ablated) -> list[Grid]:
             f"{_BASIS[ablated.basis]}{' The antenna is compared, so headings are not.' if held else ''} Bounds: the solution's own, "
             "median. Contradiction: how far the sensor's measurements are from the run without it, in sigmas of both together; "
             f"1 or less where all is well, above {CONTRADICTS:g} something is wrong with it or with what is left. A bad "
-            "sensor: without it errors or the cost fall."
+            "sensor: without it errors or the cost fall. Without a count: the configuration makes its measurements."
         ),
     )  # fmt: skip
     names = [e.without for e in ablated.effects if any(other.fits.get(e.without) for other in every)]
@@ -139,16 +140,21 @@ def _number(value: float | None, unit: str, digits: int = 2) -> Cell:
     return Cell(text="-" if value is None else f"{value:.{digits}f}{unit}")
 
 
+def _count(e: Effect) -> Cell:
+    """The height prior has none in the recording: the configuration makes it."""
+    return Cell(text=str(e.measurements) if e.measurements else "-")
+
+
 def _row(e: Effect) -> tuple[Cell, ...]:
     bad = "bad" if (e.contradiction or 0.0) > CONTRADICTS else ""
     name = e.without if e.without else "(with all)"
     if e.why_not:
         return (
-            Cell(text=f"{name} (cannot be left out)", mark="doubt"), Cell(text=str(e.measurements)), *[Cell(text="-")] * 8
+            Cell(text=f"{name} (cannot be left out)", mark="doubt"), _count(e), *[Cell(text="-")] * 8
         )  # fmt: skip
     return (
         Cell(text=name),
-        Cell(text=str(e.measurements) if e.without else "-"),
+        _count(e),
         _number(e.rmse_m, " m"),
         _number(e.worst_m, " m"),
         _number(e.worst_at_s, " s", 0),
@@ -160,32 +166,20 @@ def _row(e: Effect) -> tuple[Cell, ...]:
     )
 
 
-def over_time(ablated: Ablated) -> go.Figure:
-    """Distances over time, a line for the run without each sensor."""
-    figure = go.Figure()
-    begin = min(int(o.stamps_ns[0]) for o in ablated.over_time.values())
+def over_time(ablated: Ablated) -> Figure:
+    """Distances over time, a line for the run without each sensor; time as in the table, from the begin of the track."""
+    marks: list[Mark] = []
     for k, (name, away) in enumerate(ablated.over_time.items()):
         step = peaks(away.off_m)
-        colour = COLOURS[(k - 1) % len(COLOURS)] if name else TRUTH
-        figure.add_scatter(
-            x=np.round((away.stamps_ns[step] - begin) * 1e-9, 1),
-            y=np.round(np.maximum(away.off_m[step], 1e-3), 4),
-            mode="lines" if ablated.basis != "held" else "markers",
-            line={"color": colour, "width": 1.8},
-            marker={"color": colour, "size": 5},
-            name=f"without {name}" if name else "with all",
-        )
-    figure.update_layout(
-        template="plotly_white", height=420, margin={"l": 60, "r": 15, "t": 50, "b": 50}, font={"size": 13},
-        legend={"orientation": "h", "y": 1.0, "yref": "container", "yanchor": "top", "x": 0},
-    )  # fmt: skip
-    figure.update_xaxes(title="time, s")
-    ticks = [0.01, 0.1, 1.0, 10.0, 100.0, 1000.0]
-    figure.update_yaxes(
-        title="distance, m" if ablated.basis == "full" else "error, m", type="log", tickvals=ticks,
-        ticktext=[f"{t:g}" for t in ticks],
-    )  # fmt: skip
-    return figure
+        said, colour = f"without {name}" if name else "with all", COLOURS[(k - 1) % len(COLOURS)] if name else TRUTH
+        x, y = seconds_since(ablated.begin_ns, away.stamps_ns[step]), np.maximum(away.off_m[step], _LEAST_M)
+        if ablated.basis == "held":
+            marks.append(Points(name=said, x=x, y=y, colour=colour))
+        else:
+            marks.append(Line(name=said, x=x, y=y, colour=colour, width=1.8))
+    y_said = "distance, m" if ablated.basis == "full" else "error, m"
+    panel = Panel(title="", y=y_said, marks=tuple(reversed(marks)), log_y=True)
+    return Figure(name="time", x="time, s", panels=(panel,), height=420)
 
 
 def write(ablated: Ablated, folder: Path, command: str) -> None:
@@ -194,7 +188,7 @@ def write(ablated: Ablated, folder: Path, command: str) -> None:
     lines, tables = said(ablated), grids(ablated)
     parts = [tables[0].as_html()]
     if ablated.over_time:  # with one sensor there is no other run to draw
-        parts += ["<h2>Over time</h2>", figure_html(over_time(ablated), "time")]
+        parts += ["<h2>Over time</h2>", drawing(over_time(ablated))]
     parts.append(tables[1].as_html())
     write_page(folder / "ablation.html", title, lines, parts)
     write_markdown(folder / "ablation.md", title, lines, tables)

@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from graphloc.build import mount_of
+from graphloc.chi2 import chi2_median
 from graphloc.config import VesselConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Residual, Sensor
@@ -74,7 +74,7 @@ def contradiction(
         for m, there in zip(own, _at(solution, own), strict=True)
     ]
     quantile = 0.5 * (1.0 - false)
-    scaled = np.array([nis / chi2.median(len(r.raw)) for nis, r in judged])
+    scaled = np.array([nis / chi2_median(len(r.raw)) for nis, r in judged])
 
     def typical(sizes: list[float | None]) -> float | None:
         known = [size for size in sizes if size is not None]
@@ -160,5 +160,4 @@ def fit(solution: Solution, name: str) -> float | None:
     ]
     if len(used) < _FEWEST:
         return None
-    nis, dof = np.array(used).T
-    return float(np.sqrt(np.median(nis / chi2.median(dof))))
+    return float(np.sqrt(np.median([nis / chi2_median(dof) for nis, dof in used])))

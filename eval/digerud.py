@@ -23,7 +23,9 @@ Here both are found and the lower one is taken: at 5-25 m and 0.3 px it is the f
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import groupby
 
 import cv2
 import numpy as np
@@ -33,7 +35,7 @@ from graphloc.eval.docking import END_S, LOST_M
 from graphloc.eval.ekf import FilterResult, filter_row
 from graphloc.eval.metrics import errors
 from graphloc.frames import Array, Datum
-from graphloc.ledger import Ledger
+from graphloc.ledger import Ledger, Outcome
 from graphloc.measurements import TagSighting
 from graphloc.recording import Recording
 from graphloc.time import NS_PER_S, seconds_between
@@ -89,6 +91,7 @@ def run_digerud(
     chosen = seen.most_common(1)[0][0]
     his = chosen[2]
     ledger = Ledger()
+    off_m: dict[int, float] = {}
     out: dict[int, tuple[_State, Array]] = {}
     state: _State | None = None
     for m in sightings:
@@ -108,10 +111,45 @@ def run_digerud(
         state, nis = _filtered(state, m.stamp_ns, p_world_camera, R_world_body if taken else None, o)
         refused = "" if taken else f"outside the {o.gate_m:g} m gate"
         ledger.add(filter_row(m, recording, nis, refused, away_m))
+        off_m[m.seq] = _off_m(p_world_camera, m, recording.truth)
         out[m.stamp_ns] = (state, m.t_body_camera_m)  # two at one stamp: the later has both
     if len(out) < 2:
         return None
-    return FilterResult(name="Digerud KF", trajectory=_track(out, timed=o.dt_s is None), ledger=ledger)
+    return FilterResult(
+        name="Digerud KF", trajectory=_track(out, timed=o.dt_s is None), ledger=ledger, why=_why(ledger, off_m, o)
+    )
+
+
+def _off_m(p_world_camera: Array, m: TagSighting, truth: Trajectory | None) -> float:
+    """How far a pose puts the camera from where it is: by truth, else by the likeliest pose of all tags in the image."""
+    there, at = m.modes[0].p_world_camera_m, np.array([m.stamp_ns])
+    if truth is not None and truth.covers(at)[0]:
+        true = truth.at(at)
+        there = true.p_world_m[0] + true.R_world_body[0] @ m.t_body_camera_m
+    return float(np.linalg.norm(p_world_camera - there))
+
+
+def _why(ledger: Ledger, off_m: Mapping[int, float], o: DigerudConfig) -> str:
+    """Say what the gate did: how many it dropped, for how long on end, how many of them right, and what it started on.
+
+    Args:
+        off_m: by arrival number, how far off the pose was (`_off_m`).
+    """
+    tried = [row for row in ledger if row.seq in off_m]
+    dropped = [row for row in tried if row.outcome is Outcome.REJECTED]
+    if not dropped:
+        return ""
+    shut = [list(rows) for refused, rows in groupby(tried, key=lambda row: row.outcome is Outcome.REJECTED) if refused]
+    longest = max(shut, key=lambda rows: rows[-1].stamp_ns - rows[0].stamp_ns)
+    lasted_s = seconds_between(longest[0].stamp_ns, longest[-1].stamp_ns)
+    right = sum(off_m[row.seq] < o.gate_m for row in dropped)
+    wrong = sum(off_m[row.seq] >= o.gate_m for row in tried if row.outcome is Outcome.USED)
+    return (
+        f"it started on a pose {off_m[tried[0].seq]:.1f} m off, and its gate takes only what is within {o.gate_m:g} m of where it "
+        f"already is: {len(dropped)} of {len(tried)} sightings of its one tag were dropped, {right} of them right to {o.gate_m:g} m, "
+        f"for up to {lasted_s:.0f} s on end; of the {len(tried) - len(dropped)} that it took {wrong} were farther off than that, as "
+        "the flipped pose of a tag is"
+    )
 
 
 def single_tag_pose(m: TagSighting, tag: tuple[str, int]) -> tuple[Array, Array] | None:

@@ -80,7 +80,7 @@ def docking_table(
         error = np.linalg.norm(off, axis=1)
         covered = np.isfinite(error)
         of_sighted, at_end = error[seen & covered], end & covered
-        lost = float(np.median(error[at_end]) > LOST_M) if at_end.any() else None
+        lost = int(np.median(error[at_end]) > LOST_M) if at_end.any() else None
         wrong = _wrong_side(off[at_end], truth.p_world_m[at_end], survey)
         values = (
             *(_p95(error[band & covered]) for band in bands.values()),
@@ -88,7 +88,7 @@ def docking_table(
             _p95(error[at_end]),
             lost,
             wrong if wrong or not lost else None,
-            float(np.mean(error[within] <= DNV_M) >= 0.95) if (within & covered).any() else None,
+            int(np.mean(error[within] <= DNV_M) >= 0.95) if (within & covered).any() else None,
             float(covered[seen].mean()) if seen.any() else None,
         )
         rows.append((name, values))
@@ -135,8 +135,8 @@ def _off(estimate: Trajectory, truth: Trajectory) -> Array:
     return off
 
 
-def _wrong_side(off: Array, true: Array, survey: Survey) -> float | None:
-    """1.0 where estimate and truth lie, on the mean, on two sides of the nearest tag's face or middle, > 1 m apart.
+def _wrong_side(off: Array, true: Array, survey: Survey) -> int | None:
+    """1 where estimate and truth lie, on the mean, on two sides of the nearest tag's face or middle, > 1 m apart.
 
     Args:
         off: (M, 2) estimate less truth in world. true: (M, 2 or 3) truth in world.
@@ -149,7 +149,7 @@ def _wrong_side(off: Array, true: Array, survey: Survey) -> float | None:
     sideways_out = axes[nearest][:2, [0, 2]]  # the print's x and the face's normal, in world's horizontal plane
     of_truth = (there - middles[nearest, :2]) @ sideways_out
     shift = off.mean(axis=0) @ sideways_out
-    return float((((of_truth + shift) * of_truth < 0.0) & (np.abs(shift) > _SIDE_M)).any())
+    return int((((of_truth + shift) * of_truth < 0.0) & (np.abs(shift) > _SIDE_M)).any())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -70,11 +70,17 @@ class BlConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilterResult:
-    """What a filter gives: its name, trajectory with covariance, and ledger of absolute measurements."""
+    """What a filter gives.
+
+    Attributes:
+        name: of the filter. trajectory: with covariance. ledger: of absolute measurements.
+        why: what explains how far off it is, where that takes a word.
+    """
 
     name: str
     trajectory: Trajectory
     ledger: Ledger
+    why: str = ""
 
 
 def run_all(

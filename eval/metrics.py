@@ -12,9 +12,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from graphloc.chi2 import CHI2_95
 from graphloc.errors import InputError
+from graphloc.eval.words import number
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.measurements import GnssPosition
 from graphloc.recording import SpeedSeries
@@ -42,7 +43,7 @@ class Table:
 
     def as_text(self) -> str:
         """Return the table as aligned text, estimates as columns: it fits a terminal."""
-        numbers = [["-" if vs[k] is None else f"{vs[k]:.3f}" for _, vs in self.rows] for k in range(len(self.columns))]
+        numbers = [[number(vs[k]) for _, vs in self.rows] for k in range(len(self.columns))]
         cells = [["", *(name for name, _ in self.rows)]]
         cells += [[column, *values] for column, values in zip(self.columns, numbers, strict=True)]
         widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
@@ -103,8 +104,8 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
     nees = coverage = heading_coverage = None
     if there.cov is not None:
         squared = squared_over_covariance(error, there.cov)
-        nees, coverage = float(squared.mean()), float((squared <= chi2.ppf(0.95, 2)).mean())
-        heading_coverage = float((heading**2 <= chi2.ppf(0.95, 1) * there.cov[:, 5, 5]).mean())
+        nees, coverage = float(squared.mean()), float((squared <= CHI2_95[2]).mean())
+        heading_coverage = float((heading**2 <= CHI2_95[1] * there.cov[:, 5, 5]).mean())
     return TruthMetrics(
         position_rmse_m=_rms(horizontal),
         position_p50_m=float(np.percentile(horizontal, 50)),

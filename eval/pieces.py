@@ -18,7 +18,7 @@ h1{font-size:1.4rem;margin:.2rem 0 .6rem;overflow-wrap:anywhere}
 h2{font-size:1.15rem;margin:1.8rem 0 .4rem;border-bottom:1px solid #ccc;break-after:avoid}
 h3{font-size:1rem;margin:1rem 0 .2rem;break-after:avoid}p{margin:.4rem 0}
 .verdict{border-left:8px solid var(--trust);background:#f6f6f6;padding:.5rem .8rem;font-size:1.05rem}
-.verdict b{font-size:1.15rem}.reasons{list-style:none;padding:0;margin:.5rem 0}
+.verdict+.verdict{margin-top:.4rem}.verdict b{font-size:1.15rem}.reasons{list-style:none;padding:0;margin:.5rem 0}
 .reasons li{padding-left:1.5rem;text-indent:-1.5rem}.reasons li::before{display:inline-block;width:1.5rem;text-indent:0;content:"\\2713";color:#009E73}
 .reasons li.care::before{content:"!";color:#B06F00;font-weight:700;padding-left:.3rem}.reasons li.no::before{content:"\\2717";color:#D55E00}
 nav{font-size:.9rem;margin:.8rem 0}nav a{margin-right:.9rem;white-space:nowrap}
@@ -91,8 +91,3 @@ def figure_html(figure: go.Figure, name: str) -> str:
         config={"displaylogo": False, "responsive": True, "displayModeBar": False},
     )
     return f'<div class="figure">{html}</div>'
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """Return a number for a table; a dash where there is none."""
-    return "-" if value is None else str(value) if isinstance(value, int) else f"{value:.{digits}f}"

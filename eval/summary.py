@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 from graphloc.errors import InputError
 from graphloc.eval import markdown, pieces
+from graphloc.eval.words import LABELS, number
 from graphloc.outputs import MARK, fresh_folder
 
 SUMMARY = "summary.csv"  # a folder with this file is ours to replace
@@ -37,13 +38,13 @@ class FinishedRun:
 
     Attributes:
         name: its folder, as short as tells it from the others. tables: title -> estimate -> number -> value.
-        warnings: how many. converged: whether the solver did.
+        warnings: what was said. converged: whether the solver did.
     """
 
     name: str
     folder: Path
     tables: Numbers
-    warnings: int
+    warnings: tuple[str, ...]
     converged: bool
 
 
@@ -87,16 +88,20 @@ def _read(folder: Path, name: str) -> FinishedRun:
         run = json.loads(path.read_text(encoding="utf-8"))
         tables = {
             str(title): {
-                str(estimate): {str(k): None if v is None else float(v) for k, v in values.items()}
-                for estimate, values in rows.items()
+                str(estimate): {str(k): _number(v) for k, v in values.items()} for estimate, values in rows.items()
             }
             for title, rows in run["metrics"].items()
         }
-        converged, warnings = bool(run["stats"]["converged"]), len(run["warnings"])
+        converged, warnings = bool(run["stats"]["converged"]), tuple(map(str, run["warnings"]))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         said = error.strerror if isinstance(error, OSError) else str(error)[:80]
         raise InputError(f"{path}: is not that of a run ({said}); make the run again") from None
     return FinishedRun(name=name, folder=folder, tables=tables, warnings=warnings, converged=converged)
+
+
+def _number(value: object) -> float | None:
+    """A count stays one."""
+    return value if value is None or type(value) is int else float(value)  # type: ignore[arg-type]
 
 
 def blocks(runs: Sequence[FinishedRun], *, shown_only: bool = True) -> list[Block]:
@@ -159,13 +164,19 @@ def _csv_rows(runs: Sequence[FinishedRun]) -> Iterator[tuple[str, ...]]:
 
 def _lines(block: Block) -> list[tuple[str, ...]]:
     """The rows of a block as text, at the end how many times as large as the first estimate's the others' are."""
-    rows = [*block.rows, ("mean", block.mean), ("worst", block.worst)]
-    lines = [(name, *(pieces.number(v) for v in values)) for name, values in rows]
+    rows = [*block.rows, ("mean of the runs", block.mean), ("worst of the runs", block.worst)]
+    whole = all(v is None or isinstance(v, int) for _, values in block.rows for v in values)
+    digits = 1 if whole else 3  # a mean of counts
+    lines = [(name, *(number(v, digits) for v in values)) for name, values in rows]
     if len(block.estimates) > 1 and block.metric.endswith(("_m", "_deg", "std_mps")):
         over = (_over_first([values for _, values in block.rows], k) for k in range(1, len(block.estimates)))
         ratios = ("-" if ratio is None else f"{ratio:.1f} x" for ratio in over)
-        lines.append((f"mean to that of {block.estimates[0]}", "", *ratios))
+        lines.append((f"times the mean of {block.estimates[0]}", "", *ratios))
     return lines
+
+
+def _words(metric: str) -> str:
+    return f"{LABELS[metric]} ({metric})" if metric in LABELS else metric
 
 
 def _over_first(rows: Sequence[Sequence[float | None]], k: int) -> float | None:
@@ -180,7 +191,7 @@ def as_markdown(runs: Sequence[FinishedRun], found: Sequence[Block]) -> str:
     text = [f"# {_title(runs)}", "", *_remarks(runs), ""]
     for block in found:
         head = ["", *block.estimates]
-        text += [f"## {block.title}: {block.metric}", ""]
+        text += [f"## {block.title}: {_words(block.metric)}", ""]
         text += [markdown.row(head), "|---|" + "---:|" * len(block.estimates)]
         text += [markdown.row(line) for line in _lines(block)]
         text.append("")
@@ -194,7 +205,7 @@ def _title(runs: Sequence[FinishedRun]) -> str:
 def _remarks(runs: Sequence[FinishedRun]) -> list[str]:
     """What a mean does not say."""
     said = [f"- {run.name}: the solver did not converge" for run in runs if not run.converged]
-    said += [f"- {run.name}: warnings ({run.warnings}), see its report" for run in runs if run.warnings]
+    said += [f"- {run.name}: warning: {line}" for run in runs for line in run.warnings]
     said += [f"- {run.name}: nothing to compare it with" for run in runs if not run.tables]
     return said
 
@@ -212,7 +223,7 @@ def _page(runs: Sequence[FinishedRun], found: Sequence[Block], folder: Path) -> 
             lines = _lines(block)
             classes = [""] * len(block.rows) + ["part ours", "ours"]
             head = ("", *block.estimates)
-            body.append(f"<h3>{escape(block.metric)}</h3>{pieces.table(head, lines, classes)}")
+            body.append(f"<h3>{escape(_words(block.metric))}</h3>{pieces.table(head, lines, classes)}")
     note = pieces.note(
         "Mean and worst are over the runs that have the number; summary.csv has every number of every run."
     )

@@ -48,6 +48,16 @@ from graphloc.time import duration_ns, utc_text
 _REPORT_EVERY = 2000  # messages between two calls of `progress`
 
 
+def check_bag(paths: Path | str | Sequence[Path | str], config: VesselConfig) -> None:
+    """Open a bag and look for the topics that the configuration names, without reading it.
+
+    Raises:
+        InputError: no readable bag, or a topic that is not there or has another type.
+    """
+    with Bag(paths) as bag:
+        _asked_for(config, bag)
+
+
 def read_recording(
     paths: Path | str | Sequence[Path | str], config: VesselConfig, progress: Progress | None = None
 ) -> Recording:
@@ -67,9 +77,7 @@ def read_recording(
     """
     with Bag(paths) as bag:
         topics = bag.topics
-        sensors = _subscriptions(config, topics, bag.name)
-        truth = _beside(config.truth_topic, "truth_topic", "truth, never fused", topics, bag.name)
-        check = _beside(config.check_speed_topic, "check_speed_topic", "check, never fused", topics, bag.name)
+        sensors, truth, check = _asked_for(config, bag)
         tree = StaticTree() if any(s.enabled and s.mount.tf_frame for s in config.sensors.values()) else None
         rows = _Reader(bag, topics, sensors, [b for b in (truth, check) if b], tree).read(progress)
         warnings = list(bag.warnings)
@@ -98,6 +106,14 @@ def read_recording(
         check_speed=check_speed(check) if check else None,
         warnings=tuple(warnings),
     )
+
+
+def _asked_for(config: VesselConfig, bag: Bag) -> tuple[list[Readings], Beside | None, Beside | None]:
+    """What is read of a bag: for each sensor, for the truth, and for the speed to check with."""
+    sensors = _subscriptions(config, bag.topics, bag.name)
+    truth = _beside(config.truth_topic, "truth_topic", "truth, never fused", bag.topics, bag.name)
+    check = _beside(config.check_speed_topic, "check_speed_topic", "check, never fused", bag.topics, bag.name)
+    return sensors, truth, check
 
 
 class _Reader:
@@ -205,10 +221,10 @@ class _Reader:
                 add(topic, summary.messages, Outcome.IGNORED, reason)
                 continue
             for item in self._beside.get(topic, ()):
-                add(topic, item.count - item.broken, Outcome.IGNORED, item.reason)
+                add(topic, item.count - item.broken, Outcome.READ, item.reason)
                 add(topic, item.broken, Outcome.MALFORMED, "cannot be decoded")
             if topic == TF_STATIC:
-                add(topic, read[topic] - self._broken_mounts, Outcome.IGNORED, "read for mounts")
+                add(topic, read[topic] - self._broken_mounts, Outcome.READ, "read for mounts")
                 add(topic, self._broken_mounts, Outcome.MALFORMED, "cannot be decoded")
             missing = summary.messages - read[topic]
             add(topic, missing, Outcome.MALFORMED, "announced by the bag's index, but cannot be read")

@@ -250,6 +250,14 @@ def render(inspection: Inspection) -> str:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
         lines += ["", f"{item.topic}: suggested as {item.role}", f"  {item.why}; {item.world}"]
+    counts = {t.topic: t.count for t in inspection.topics}
+    for what, kind, mounted, need in (
+        ("scans", "aerial", inspection.lidars, "a map"),
+        ("images", "apriltag", inspection.cameras, "a survey of tags"),
+    ):
+        if mounted:
+            lines += ["", *(f"{m.topic}: {counts[m.topic]} {what}" for m in mounted)]
+            lines.append(f"  read by a sensor of kind {kind}, which the draft has switched off until there is {need}")
     if inspection.tf_frames:
         lines += ["", f"/tf_static knows: {', '.join(inspection.tf_frames)}"]
     lines += [f"warning: {w}" for w in inspection.warnings]

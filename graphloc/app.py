@@ -14,9 +14,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from ruamel.yaml import YAML
 
-from graphloc import origin, outputs
+from graphloc import found_tags, origin, outputs
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig, load_config
 from graphloc.errors import InputError, SolveError
@@ -26,13 +25,11 @@ from graphloc.eval.docking import docking_table
 from graphloc.eval.match_picture import Gallery
 from graphloc.eval.plots import Underlay
 from graphloc.eval.simulate import SimulatedRun
-from graphloc.eval.tag_check import suspect_tags
 from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Array, Datum
 from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.tags.unsurveyed import Riding, estimate_tags, only_beside
 from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.offsets import Probe
@@ -40,10 +37,8 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.replay import Status, replay, silent
 from graphloc.solution import Solution
 from graphloc.solve import smooth
-from graphloc.survey import WORLD, Survey, TagConfig
+from graphloc.survey import TagConfig
 from graphloc.trajectory import Trajectory
-
-_FOUND_TAGS = "tags.found.yaml"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,10 +50,27 @@ class Run:
     solution: Solution
     held: tuple[GnssPosition, ...] = ()
     filters: tuple[ekf.FilterResult, ...] = ()
+    online: Solution | None = None  # of the same measurements, beside an offline run that is compared
     pictures: tuple[tuple[str, bytes], ...] = ()  # of matches: caption, JPEG
     tags: tuple[TagConfig, ...] = ()  # that are not surveyed, where the run puts them
     underlay: Underlay | None = None  # the aerial image under the report's map
     calibration: calibrate.Calibration | None = None  # offline
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All that was said on the way."""
+        return report.said_on_the_way(self.recording, self.solution, self.online)
+
+
+def configured(config_path: Path, changes: Mapping[str, object] = MappingProxyType({})) -> VesselConfig:
+    """Read a vessel.yaml with the surveys that it names, some of its keys changed (`config.with_changes`).
+
+    Raises:
+        ConfigError: it or a survey cannot be used.
+    """
+    config = with_surveys(load_config(config_path, KINDS, changes), config_path.parent)
+    origin.refuse_world_without_datum(config, str(config_path), SENSORS)
+    return config
 
 
 def load(
@@ -68,8 +80,7 @@ def load(
     changes: Mapping[str, object] = MappingProxyType({}),
 ) -> tuple[Recording, VesselConfig]:
     """Read a vessel.yaml, some of its keys changed (`config.with_changes`), and the bag that it describes."""
-    config = with_surveys(load_config(config_path, KINDS, changes), config_path.parent)
-    origin.refuse_world_without_datum(config, str(config_path), SENSORS)
+    config = configured(config_path, changes)
     recording = read_recording(bags, config, progress)
     return with_sightings(recording, config, bags, progress), config
 
@@ -93,18 +104,24 @@ def smooth_recording(
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
     matched = scans is not None and bool(config.of_kind("aerial"))
-    solution = _solved(recording, config, datum, progress, None if matched else calibrate.PROBE)
+    solution = solve(recording, config, datum, probe=None if matched else calibrate.PROBE, progress=progress)
     gallery = Gallery()
     if scans is not None and matched:
         recording = with_matches(recording, config, datum, solution, scans, progress, gallery)
-        solution = _solved(recording, config, datum, progress, calibrate.PROBE)
+        solution = solve(recording, config, datum, probe=calibrate.PROBE, progress=progress)
     filters: tuple[ekf.FilterResult, ...] = ()
+    online, never = None, ""
     if compare:
-        filters = _causal(recording, config, datum, progress)
-    tags, said = _about_tags(recording, config, solution)
+        filters = _filters(recording, config, datum, progress)
+        online, never = _online(recording, config, datum, progress)
+    if online is not None:
+        beside = ekf.FilterResult(name=online.name, trajectory=online.trajectory, ledger=online.ledger)
+        filters = (beside, *filters)
+    tags, said = found_tags.about_tags(recording, config, solution)
+    said += [never] if never else []
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
-        filters=filters, pictures=tuple(gallery.pictures()), tags=tags,
+        filters=filters, online=online, pictures=tuple(gallery.pictures()), tags=tags,
         calibration=calibrate.calibrate(recording, config, solution),
     )  # fmt: skip
     return _comparable(_with_underlay(run, scans))
@@ -119,21 +136,26 @@ def _with_underlay(run: Run, scans: Scans | None) -> Run:
     return replace(run, recording=replace(run.recording, warnings=said), underlay=picture)
 
 
-def _causal(
+def _filters(
     recording: Recording, config: VesselConfig, datum: Datum, progress: Progress
 ) -> tuple[ekf.FilterResult, ...]:
-    """What can be had at the time: the online mode, and the filters."""
     progress("filters", 0, 1)
     filters = ekf.run_all(recording, config, datum)
     his = run_digerud(recording, config, datum)
     filters += (his,) if his is not None else ()
     progress("filters", 1, 1)
+    return filters
+
+
+def _online(
+    recording: Recording, config: VesselConfig, datum: Datum, progress: Progress
+) -> tuple[Solution | None, str]:
+    """Return what the online mode makes of it, or why it made nothing."""
     status = lambda at_s, whole_s, *_: progress("online", int(at_s), int(whole_s))
     try:
-        online = replay(recording, config, datum=datum, status=status).solution
-    except SolveError:
-        return filters  # what it waited for is what `graphloc replay` says
-    return (ekf.FilterResult(name="graphloc online", trajectory=online.trajectory, ledger=online.ledger), *filters)
+        return replay(recording, config, datum=datum, status=status).solution, ""
+    except SolveError as error:
+        return None, f"graphloc online is not compared: {error}"
 
 
 def replay_recording(
@@ -151,43 +173,22 @@ def replay_recording(
     return _comparable(_with_underlay(run, scans))
 
 
-def _about_tags(
-    recording: Recording, config: VesselConfig, solution: Solution
-) -> tuple[tuple[TagConfig, ...], list[str]]:
-    """Return tags that the run tells the place of, and what it says against the survey."""
-    said = suspect_tags(recording, config, solution)
-    if not recording.tag_views:
-        return (), said
-    surveys = {name: sensor.surveyed for name, sensor in config.of_kind("apriltag").items()}
-    size_m = next((s.other_size_m for s in surveys.values() if s.other_size_m), None)
-    riding = _riding(recording, surveys, solution)
-    found, left = estimate_tags(recording.tag_views, solution.trajectory, size_m, riding)
-    every = Survey.model_construct(tags=(*found, *(tag for s in surveys.values() for tag in s.tags)))
-    for frame in sorted({tag.frame for tag in found}):
-        names = ", ".join(every.called(tag.family, tag.id) for tag in found if tag.frame == frame)
-        where = (
-            "where the run puts it is" if frame == WORLD else f"seen only beside tags of {frame}, as if it rode on that"
-        )
-        said.append(f"{names}: not in the survey; {where} in {_FOUND_TAGS}")
-    return tuple(found), [*said, *left]
-
-
-def _riding(recording: Recording, surveys: Mapping[str, Survey], solution: Solution) -> dict[tuple[str, int], Riding]:
-    """How the docks moved that tags which are not surveyed seem to ride on."""
-    seen = [m for m in recording.measurements if isinstance(m, TagSighting)]
-    found = {}
-    for tag, (sensor, frame) in only_beside(recording.tag_views, seen).items():
-        dock, slow = surveys[sensor].dock(frame), solution.slow[sensor]
-        assert dock is not None  # sightings are of a frame of the survey
-        first = slow.axes.index(f"{frame} east")
-        moved = slow.value[:, first : first + 6] * np.repeat([1.0, np.pi / 180.0], 3)
-        found[tag] = Riding(dock, slow.stamps_ns, moved)
-    return found
-
-
-def _solved(
-    recording: Recording, config: VesselConfig, datum: Datum, progress: Progress, probe: Probe | None = None
+def solve(
+    recording: Recording,
+    config: VesselConfig,
+    datum: Datum,
+    *,
+    probe: Probe | None = None,
+    progress: Progress = quiet,
 ) -> Solution:
+    """Smooth what is in a recording as it is: nothing is matched, held out or compared.
+
+    Args:
+        datum: origin of world. probe: what to ask of offsets (see `eval.calibrate`).
+
+    Raises:
+        SolveError: it cannot be started or solved.
+    """
     config = seen_frames(config, recording)
     return smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, probe=probe, progress=progress)
 
@@ -219,7 +220,7 @@ def match_at(
     (sensor, *_) = sensors.values()
     datum = choose_datum(recording, config)
     whole = with_synthetic(recording, config, datum)
-    track = _solved(whole, config, datum, progress).trajectory
+    track = solve(whole, config, datum, progress=progress).trajectory
     span_s = (int(track.stamps_ns[-1]) - int(track.stamps_ns[0])) / 1e9
     if not 0.0 <= at_s <= span_s:
         raise InputError(f"{recording.source}: --at {at_s:g}: the run is from 0 to {span_s:.1f} s")
@@ -260,8 +261,11 @@ def _comparable(run: Run) -> Run:
         )
 
     filters = tuple(f for f in run.filters if fits(f))
+    online = run.online
+    if online is not None and not comparable(metrics.errors, online.trajectory, track):
+        online = None
     recording = replace(run.recording, truth=truth, check_speed=speed, warnings=(*run.recording.warnings, *said))
-    return replace(run, recording=recording, held=held, filters=filters)
+    return replace(run, recording=recording, held=held, filters=filters, online=online)
 
 
 def levers_m(run: Run) -> dict[str, Array]:
@@ -296,7 +300,8 @@ def tables(run: Run) -> tuple[metrics.Table, ...]:
         found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, levers_m(run)))
     if run.recording.check_speed is not None:
         found.append(metrics.speed_table(estimates, run.recording.check_speed))
-    return tuple(found)
+    whys = [f"{f.name}: {f.why}." for f in run.filters if f.why]
+    return (replace(found[0], note="\n".join([found[0].note, *whys])), *found[1:]) if found else ()
 
 
 def _docking_tables(
@@ -347,6 +352,7 @@ def report_data(run: Run, command: str = "") -> report.ReportData:
         pictures=run.pictures,
         underlay=run.underlay,
         calibration=run.calibration,
+        online=run.online,
         command=command,
     )
 
@@ -364,10 +370,10 @@ def write(
             inputs={str(p): sha256(p) for p in inputs},
             command=command,
             metrics={t.title: t.as_dict() for t in data.tables},
-            warnings=(*run.recording.warnings, *run.solution.stats.warnings),
+            warnings=run.warnings,
         )
         if run.tags:
-            _write_tags(run, fresh / _FOUND_TAGS)
+            found_tags.write(fresh / found_tags.FILE, run.tags, run.config)
         if run.calibration is not None:
             text = json.dumps(run.calibration.as_dict(), indent=1)
             (fresh / "calibration.json").write_text(text + "\n", encoding="utf-8")
@@ -378,18 +384,6 @@ def write(
             (fresh / "figures").mkdir()
             write_figures(tuple(report.figures(data).values()), fresh / "figures")
     return folder / "report.html"
-
-
-def _write_tags(run: Run, path: Path) -> None:
-    """Write the surveys with the tags that were found, as one survey that can be read again."""
-    surveys = [sensor.surveyed for sensor in run.config.of_kind("apriltag").values()]
-    tags = {(tag.family, tag.id): tag for tag in (*run.tags, *(tag for s in surveys for tag in s.tags))}
-    docks = {dock.name: dock for s in surveys for dock in s.docks}
-    whole = Survey(
-        tags=tuple(tags.values()), docks=tuple(docks.values()), berths=tuple(b for s in surveys for b in s.berths)
-    )
-    with path.open("w", encoding="utf-8") as stream:
-        YAML(typ="safe", pure=True).dump(whole.model_dump(mode="json", exclude_none=True), stream)
 
 
 def sha256(path: Path) -> str:
@@ -407,6 +401,7 @@ __all__ = [
     "Run",
     "Scans",
     "choose_datum",
+    "configured",
     "load",
     "match_at",
     "replay_recording",
@@ -415,6 +410,7 @@ __all__ = [
     "sha256",
     "simulated",
     "smooth_recording",
+    "solve",
     "tables",
     "truth_statement",
     "with_matches",

@@ -17,12 +17,10 @@ from graphloc.eval.drill import Case, Failure, Measured, Struck, Times, Window, 
 from graphloc.eval.drill.measure import Drilled, compared
 from graphloc.eval.drill.plan import judged_until, windows
 from graphloc.eval.parallel import beside
-from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum, heading_deg_from_yaw
 from graphloc.measurements import CompassHeading
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.replay import replay
-from graphloc.solve import smooth
 from graphloc.trajectory import Trajectory, bounds_95
 
 ESTIMATORS = ("graphloc", "graphloc online", "honest EKF", "BL EKF")
@@ -106,7 +104,7 @@ def drill(
         bound_m=_typical_bound_m(run.solution.trajectory),
         measured=tuple(m for k in sorted(measured) for m in measured[k]),
         shown=tuple((cases[k], shown[k]) for k in sorted(shown)),
-        left=(*left, *too_long),
+        left=tuple((name, why) for name, why in (*left, *too_long) if _asked_for(name, only)),
         windows=parts,
         warnings=run.recording.warnings,
     )
@@ -117,13 +115,17 @@ def _refuse_unknown(recording: Recording, only: Sequence[str]) -> None:
     found, left = script(recording)
     names = [*(f.name for f in found), *(name for name, _ in left)]
     for part in only:
-        if not any(part.lower() in name.lower() for name in names):
+        if not any(_asked_for(name, [part]) for name in names):
             families = ", ".join(dict.fromkeys([*(f.family for f in found), *(name for name, _ in left)]))
             raise ConfigError(f"--set {part}: no such drill; there are: {families}")
 
 
+def _asked_for(name: str, only: Sequence[str]) -> bool:
+    return not only or any(part.lower() in name.lower() for part in only)
+
+
 def _wanted(failures: Sequence[Failure], only: Sequence[str]) -> tuple[Failure, ...]:
-    found = tuple(f for f in failures if not only or any(part.lower() in f.name.lower() for part in only))
+    found = tuple(f for f in failures if _asked_for(f.name, only))
     if not found:
         names = ", ".join(dict.fromkeys(f.family for f in failures))
         raise ConfigError(f"--set {', '.join(only)}: the recording does not permit it; it permits: {names}")
@@ -172,8 +174,7 @@ def _tracks(job: _Job) -> Tracks:
 
 
 def _smoothed(recording: Recording, job: _Job) -> Trajectory:
-    config = app.seen_frames(job.config, recording)
-    return smooth(recording, config, job.datum, rows=SENSORS, inertial=INERTIAL).trajectory
+    return app.solve(recording, job.config, job.datum).trajectory
 
 
 def _replayed(recording: Recording, job: _Job, late_ns: Mapping[int, int]) -> Trajectory:

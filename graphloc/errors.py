@@ -18,6 +18,12 @@ class GraphlocError(Exception):
         super().__init__(line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}")
 
 
+def in_one_line(error: BaseException) -> str:
+    """Return any error as one line; those that are not ours with their type."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, GraphlocError) else f"{type(error).__name__}: {text}"
+
+
 class ConfigError(GraphlocError):
     """A `vessel.yaml` that cannot be used."""
 

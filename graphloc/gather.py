@@ -57,7 +57,13 @@ class Gathering:
         """A sensor that gathers, and what its topics, which no decoder reads, are read for."""
         self._topics[name] = f"({name})"
         self.rows = [
-            replace(r, reason=read[r.topic]) if r.topic in read and r.outcome is Outcome.IGNORED else r
+            replace(
+                r,
+                outcome=Outcome.READ,
+                reason=read[r.topic] if r.outcome is Outcome.IGNORED else f"{r.reason}; {read[r.topic]}",
+            )
+            if r.topic in read and r.outcome in (Outcome.IGNORED, Outcome.READ)
+            else r
             for r in self.rows
         ]
 

@@ -16,13 +16,14 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from graphloc import app
-from graphloc.config import VesselConfig, effective, load_config, parse_config, with_changes
-from graphloc.errors import ConfigError, GraphlocError, InputError
+from graphloc.config import VesselConfig, effective, parse_config, with_changes
+from graphloc.errors import ConfigError, in_one_line
 from graphloc.eval import sweep_table
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.factors import KINDS
+from graphloc.frontends.bag import check_bag
 from graphloc.recording import Recording
 
 Mode = Literal["offline", "online", "compare"]
@@ -113,9 +114,8 @@ def check(jobs: Sequence[Job]) -> None:
                 examples[job.scenario] = simulate(scenario, job.seed)
             _simulated_config(examples[job.scenario], job)
             continue
-        config = load_config(Path(job.config), KINDS, _values(job.config_changes))
-        if not Path(job.bag).exists():
-            raise InputError(f"{job.bag}: there is no such file or folder")
+        config = app.configured(Path(job.config), _values(job.config_changes))
+        check_bag([Path(job.bag)], config)
         if not (config.truth_topic or config.check_speed_topic or job.hold_out):
             raise ConfigError(
                 f"{job.config}: no truth_topic, so nothing would be measured: give --hold-out, as gaps:8x10"
@@ -152,17 +152,11 @@ def run_job(job: Job) -> list[Row]:
             run = _estimated(job, Path(folder))
         rows = sweep_table.rows_of(run.solution, app.tables(run), len(run.recording.warnings))
     except Exception as error:  # noqa: BLE001 - whatever it is, the other runs go on
-        rows = [{"estimate": "", "error": said(error)}]
+        rows = [{"estimate": "", "error": in_one_line(error)}]
     finally:
         numba.set_num_threads(threads)
     took_s = time.perf_counter() - begun
     return [{**job.row, **row, "took_s": took_s} for row in rows]
-
-
-def said(error: BaseException) -> str:
-    """Return an error as one line."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, GraphlocError) else f"{type(error).__name__}: {text}"
 
 
 def _estimated(job: Job, folder: Path) -> app.Run:

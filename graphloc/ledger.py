@@ -20,12 +20,13 @@ class Outcome(enum.StrEnum):
     HELD_OUT = "held_out"  # kept out of the graph to test it
     LATE = "late"
     MALFORMED = "malformed"  # reason says file, topic, stamp
+    READ = "read"  # by a front-end (images, scans), or beside the sensors (truth, mounts); reason says for what
     IGNORED = "ignored"  # no sensor of the configuration asks for this topic or type
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LedgerRow:
-    """One message (or, for ignored topics only, `count` messages).
+    """One message (or, for topics that are ignored or read beside the sensors, `count` messages).
 
     Attributes:
         seq: arrival number; -1 for a row that stands for a whole topic.

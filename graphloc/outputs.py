@@ -30,6 +30,7 @@ from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
 from graphloc.berths import BerthTrack
+from graphloc.chi2 import SIGMAS_95
 from graphloc.config import VesselConfig, effective
 from graphloc.errors import OutputError
 from graphloc.frames import Array, heading_deg_from_yaw
@@ -292,7 +293,7 @@ def _berth_files(solution: Solution) -> dict[str, BerthTrack]:
 
 def _berth_rows(track: BerthTrack) -> Iterator[list[object]]:
     assert track.cov is not None
-    bound = 1.96 * np.sqrt(np.diagonal(track.cov, axis1=1, axis2=2))
+    bound = SIGMAS_95 * np.sqrt(np.diagonal(track.cov, axis1=1, axis2=2))
     to_deg = np.array([1.0, 1.0, 180.0 / np.pi])
     columns = np.hstack([track.value * to_deg, track.rate * to_deg, bound * to_deg])
     for stamp, row in zip(track.stamps_ns.tolist(), columns, strict=True):

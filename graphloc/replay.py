@@ -36,7 +36,8 @@ Status = Callable[[float, float, Estimate | None, str], None]
 """Called with s of the run, its whole length, the newest estimate, and what the start waits for."""
 
 
-_WARNS = ("anew", "rebuilt", "interrupted", "no second sensor", "a guess")  # of events, that a reader must see
+_GUESS = "the heading is a guess"
+_WARNS = ("anew", "rebuilt", "interrupted", "no second sensor", _GUESS)  # of events, that a reader must see
 _BUSY = "not tried: the scan before it was still being matched"
 
 
@@ -200,7 +201,7 @@ def replay(
     estimates: list[Estimate] = []
     took_s: list[float] = []
     rows: list[LedgerRow] = []
-    said: list[str] = []
+    said: list[tuple[int, str]] = []  # when, in the IMU's time, and what
     cut = False
     imu = recording.imu
     first_ns, last_ns = (int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])) if imu is not None and len(imu) else (0, 0)
@@ -214,7 +215,7 @@ def replay(
             estimates.append(estimate)
             status((estimate.stamp_ns - first_ns) / 1e9, (last_ns - first_ns) / 1e9, estimate, "")
         rows.extend(smoother.rows())
-        said.extend(smoother.events())
+        said.extend((m.stamp_ns, event) for event in smoother.events())
 
     with ExitStack() as stack:
         pool = None if rate is None else stack.enter_context(ThreadPoolExecutor(1))
@@ -248,13 +249,14 @@ def replay(
                 feed(match)
     waiting = smoother.waiting_for
     rows += smoother.finish()
-    said += smoother.events()
+    said += [(last_ns, event) for event in smoother.events()]
     if not estimates:
         raise SolveError(f"{recording.source}: never started: it waited for {waiting or 'IMU data'}")
     recording = gathering.recording()
+    told_of = _timed(said, estimates)
     if len(took_s) > 1:
         p50, p99, most = (1e3 * float(np.quantile(took_s[1:], q)) for q in (0.5, 0.99, 1.0))
-        said.append(
+        told_of.append(
             f"an update took {p50:.1f} ms (median), {p99:.0f} ms (99 %), {most:.0f} ms at most; the start {1e3 * took_s[0]:.0f} ms"
         )
     behind = sum(row.reason == _BUSY for row in recording.rows)
@@ -265,7 +267,7 @@ def replay(
     told = {row.seq for row in rows}
     rows += [row for row in recording.rows if row.seq not in told or row.seq < 0]
     if cut:
-        said.append(
+        told_of.append(
             f"interrupted at {(estimates[-1].stamp_ns - first_ns) / 1e9:.1f} s: the run goes on, this track does not"
         )
         rows += [
@@ -273,8 +275,30 @@ def replay(
                       outcome=Outcome.IGNORED, reason="the replay was interrupted before")
             for m in arrivals(recording) if m.seq >= 0 and m.seq not in told
         ]  # fmt: skip
-    solution = _solution(estimates, Ledger(rows), smoother, said)
+    solution = _solution(estimates, Ledger(rows), smoother, told_of)
     return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=np.array(took_s))
+
+
+def _timed(said: Sequence[tuple[int, str]], estimates: Sequence[Estimate]) -> list[str]:
+    """Return events with their times, s since the first pose; of a guessed heading also until when, and what ends it."""
+    begin_ns = estimates[0].stamp_ns
+    lines = []
+    for stamp_ns, event in said:
+        line = f"at {max(stamp_ns - begin_ns, 0) / 1e9:.0f} s: {event}"
+        if _GUESS in event:
+            held = [e.stamp_ns for e in estimates if e.stamp_ns >= stamp_ns and event in e.reason]
+            last_ns = max(held, default=stamp_ns)
+            until = (
+                "to the end of the run"
+                if last_ns >= estimates[-1].stamp_ns
+                else f"until {(last_ns - begin_ns) / 1e9:.0f} s"
+            )
+            line += (
+                f"; so it stayed {until}, for {(last_ns - max(stamp_ns, begin_ns)) / 1e9:.0f} s in which it is never called good; a "
+                "compass, two antennas or start.heading_deg end it"
+            )
+        lines.append(line)
+    return lines
 
 
 def _solution(estimates: Sequence[Estimate], ledger: Ledger, smoother: OnlineSmoother, said: Sequence[str]) -> Solution:

@@ -14,17 +14,17 @@ import os
 import shutil
 import signal
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from graphloc import app, outputs
-from graphloc.errors import InputError, OutputError
+from graphloc.errors import InputError, OutputError, in_one_line
 from graphloc.eval import sweep_table
 from graphloc.extras import need
-from graphloc.job import Job, Row, check, run_job, said
+from graphloc.job import Job, Row, check, run_job
 from graphloc.plain import plain
 from graphloc.recording import Progress, quiet
 
@@ -61,17 +61,19 @@ def sweep(
     need("distributed", "sweep")
     need("pyarrow", "sweep")
     check(jobs)
-    _begin(jobs, folder, overwrite)
+    hashes = _inputs(jobs, folder, overwrite)
     wanted = {job.key: job for job in jobs}
     done = {
         key: rows
-        for key, rows in _finished(folder / _RUNS).items()
+        for key, rows in ({} if overwrite else _finished(folder / _RUNS)).items()
         if key in wanted and rows and not rows[0].get("error")
     }
     todo = [job for key, job in wanted.items() if key not in done]
-    progress("runs", len(done), len(wanted))
     with ExitStack() as stack:
-        for job, rows in _on_dask(todo, workers, scheduler, stack) if todo else ():
+        client = _remote(scheduler, stack) if todo and scheduler else None  # before there is a folder
+        _begin(folder, hashes, overwrite)
+        progress("runs", len(done), len(wanted))
+        for job, rows in _on_dask(todo, workers, client, stack) if todo else ():
             done[job.key] = json.loads(line := json.dumps(plain({"job": job.key, "rows": rows})))["rows"]
             _append(folder / _RUNS, line)
             progress("runs", len(done), len(wanted))
@@ -80,8 +82,8 @@ def sweep(
     return table
 
 
-def _begin(jobs: Sequence[Job], folder: Path, overwrite: bool) -> None:
-    """Make the folder, or see whether it is one to go on with."""
+def _inputs(jobs: Sequence[Job], folder: Path, overwrite: bool) -> dict[str, str]:
+    """Return the hashes of all inputs, those of a sweep that is gone on with among them; refuse a folder that is not to be used."""
     paths = sorted({path for job in jobs for path in (job.bag, job.config) if path})
     hashes = {path: app.sha256(Path(path)) for path in paths}
     mark = folder / MARK
@@ -93,15 +95,22 @@ def _begin(jobs: Sequence[Job], folder: Path, overwrite: bool) -> None:
             raise OutputError(f"{mark}: cannot be read: give another --out, or --overwrite") from None
         if versions != _versions() or any(known.get(p, h) != h for p, h in hashes.items()):
             raise OutputError(f"{folder}: was begun with other versions or inputs: give another --out, or --overwrite")
-        hashes = known | hashes
-    else:
-        outputs.check_folder(folder, overwrite=overwrite, mark=MARK)
-        if folder.exists():
-            shutil.rmtree(folder)
+        return known | hashes
+    outputs.check_folder(folder, overwrite=overwrite, mark=MARK)
+    return hashes
+
+
+def _begin(folder: Path, hashes: Mapping[str, str], overwrite: bool) -> None:
+    """Make the folder, or say in it what it goes on with."""
+    mark = folder / MARK
     try:
+        if folder.exists() and (overwrite or not mark.exists()):
+            shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)
         fresh = mark.with_suffix(".new")
-        fresh.write_text(json.dumps({"versions": _versions(), "inputs_sha256": hashes}, indent=2), encoding="utf-8")
+        fresh.write_text(
+            json.dumps({"versions": _versions(), "inputs_sha256": dict(hashes)}, indent=2), encoding="utf-8"
+        )
         fresh.replace(mark)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written ({error.strerror})") from None
@@ -137,14 +146,16 @@ def _finished(path: Path) -> dict[str, list[Row]]:
     return found
 
 
-def _on_dask(jobs: Sequence[Job], workers: int, scheduler: str, stack: ExitStack) -> Iterator[tuple[Job, list[Row]]]:
-    """Yield the rows of each job as it ends. The cluster lives as long as the stack."""
-    client = _remote(scheduler, stack) if scheduler else _local(min(workers, len(jobs)), stack)
+def _on_dask(jobs: Sequence[Job], workers: int, client: Any, stack: ExitStack) -> Iterator[tuple[Job, list[Row]]]:
+    """Yield the rows of each job as it ends, on a cluster of others (`client`) or one that lives as long as the stack."""
+    client = client or _local(min(workers, len(jobs)), stack)
     futures = client.map(run_job, jobs, pure=False, retries=0)
     of = dict(zip(futures, jobs, strict=True))
     for future in need("distributed", "sweep").as_completed(futures):
         job, error = of.pop(future), future.exception()
-        failed = [] if error is None else [{**job.row, "estimate": "", "error": f"its worker died: {said(error)}"}]
+        failed = (
+            [] if error is None else [{**job.row, "estimate": "", "error": f"its worker died: {in_one_line(error)}"}]
+        )
         yield job, failed or future.result()
         future.release()
 
@@ -181,11 +192,11 @@ def _remote(address: str, stack: ExitStack) -> Any:
         client = stack.enter_context(need("distributed", "sweep").Client(address, timeout=_CONNECT_S))
         client.wait_for_workers(1, timeout=_CONNECT_S)
     except (OSError, TimeoutError, ValueError) as error:
-        raise InputError(f"{address}: no Dask scheduler with a worker answers there ({said(error)})") from None
+        raise InputError(f"{address}: no Dask scheduler with a worker answers there ({in_one_line(error)})") from None
     try:
         found = client.run(_versions)
     except Exception as error:  # noqa: BLE001 - whatever a worker without graphloc raises
-        raise InputError(f"{address}: a worker cannot run graphloc ({said(error)})") from None
+        raise InputError(f"{address}: a worker cannot run graphloc ({in_one_line(error)})") from None
     for worker, versions in found.items():
         if versions != _versions():
             raise InputError(f"{address}: worker {worker} has {versions}, and here is {_versions()}: install the same")

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
-from scipy.stats import chi2
 
+from graphloc.chi2 import CHI2_95, SIGMAS_95
 from graphloc.frames import Array, rpy_from_rotation
 from graphloc.time import seconds_since
-
-_CHI2_95 = tuple(float(chi2.ppf(0.95, dof)) for dof in (1, 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,6 +108,7 @@ def bounds_95(cov: Array) -> Array:
 
     The radius is the semi-major axis of the 95 % ellipse; so it holds at least 95 %.
     """
-    one, two = _CHI2_95
     major = np.linalg.eigvalsh(cov[:, :2, :2])[:, -1]
-    return np.column_stack([np.sqrt(two * major), np.sqrt(one * cov[:, 2, 2]), np.degrees(np.sqrt(one * cov[:, 5, 5]))])
+    return np.column_stack(
+        [np.sqrt(CHI2_95[2] * major), SIGMAS_95 * np.sqrt(cov[:, 2, 2]), SIGMAS_95 * np.degrees(np.sqrt(cov[:, 5, 5]))]
+    )

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 from graphloc import app
 from graphloc.config import VesselConfig
-from graphloc.errors import GraphlocError, InputError
+from graphloc.errors import GraphlocError, InputError, in_one_line
 from graphloc.eval.ablation import Ablated, Effect, Off, Vote, effect, off, suspects
 from graphloc.eval.consistency import contradiction, fit
 from graphloc.eval.holdout import HoldOut
@@ -19,8 +20,9 @@ from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
-from graphloc.solve import smooth
 
+log = logging.getLogger(__name__)
+_OPEN = "what is left does not tell the place, the height and the heading of all of the run"
 _VOTED = 3  # suspects that are set against each other, two by two
 
 
@@ -70,6 +72,7 @@ def ablate(
         source=recording.source,
         vessel=config.vessel,
         basis="truth" if run.recording.truth is not None else "held" if run.held else "full",
+        begin_ns=int(run.solution.trajectory.stamps_ns[0]),
         full=effects[0],
         effects=(*effects[1:], Effect(without=imu, measurements=_samples(recording), fits={}, why_not=carries)),
         over_time=over_time,
@@ -100,17 +103,20 @@ def _solve(
 
 
 def _smoothed(job: _Job) -> Solution | str:
+    """Solve a run without some sensors; whatever that raises is a row that says why."""
     off = {name: job.config.sensors[name].model_copy(update={"enabled": False}) for name in job.without}
     config = job.config.model_copy(update={"sensors": {**job.config.sensors, **off}})
     try:
-        seen = app.seen_frames(config, job.recording)
-        return smooth(job.recording, seen, job.datum, rows=SENSORS, inertial=INERTIAL)
-    except GraphlocError as error:
-        return str(error)
+        return app.solve(job.recording, config, job.datum)
+    except Exception as error:  # noqa: BLE001 - what is left may be anything; the other runs go on
+        log.info("without %s: %s", ", ".join(job.without), in_one_line(error))
+        if isinstance(error, GraphlocError) and error.__cause__ is None:
+            return str(error)  # in the user's words; what wraps another's error has the solver's
+        return _OPEN
 
 
 def _effect(run: app.Run, name: str, names: list[str], solved: Solution | str, over_time: dict[str, Off]) -> Effect:
-    count = sum(m.sensor == name for m in run.recording.measurements)
+    count = sum(m.sensor == name and m.seq >= 0 for m in run.recording.measurements)  # not what the configuration makes
     if isinstance(solved, str):
         return Effect(without=name, measurements=count, fits={}, why_not=solved)
     try:

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from graphloc import app
+from graphloc.errors import SolveError
 from graphloc.eval import ablation_page as page
 from graphloc.eval.ablation import Ablated, Effect, Off, Vote, suspects
 from graphloc.eval.consistency import contradiction
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.page import Cell, Grid
+from graphloc.eval.plots import Line
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import SENSORS
 from graphloc.factors.velocity import VelocityConfig
@@ -24,7 +26,7 @@ from graphloc.frames import Array
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix, PoseMode
 from graphloc.solution import Solution
-from graphloc.whatif import ablate
+from graphloc.whatif import _Job, _smoothed, ablate
 
 OFF_DEG = 12.0
 
@@ -69,6 +71,7 @@ def test_each_sensor_is_left_out_but_the_imu(bad: tuple[SimulatedRun, Ablated]) 
     assert {e.without for e in found.effects} == {name for name, s in run.config.sensors.items() if s.enabled}
     assert "states hang on it" in of(found, "imu").why_not
     assert of(found, "gnss").measurements == sum(isinstance(m, GnssPosition) for m in run.recording.measurements)
+    assert of(found, "height").measurements == 0  # the recording has none: the configuration makes it
     assert of(found, "compass").fits.keys() == {"gnss", "aerial", "height"}
     assert of(found, "aerial").bound_m > found.full.bound_m  # type: ignore[operator]
     assert "cannot be left out" in page.grids(found)[0].as_text()
@@ -107,6 +110,36 @@ def test_held_out_fixes_stand_in_for_truth_and_what_starts_all_cannot_go(tmp_pat
     assert "| gnss |" in (tmp_path / "ablation.md").read_text()
 
 
+@pytest.mark.parametrize("wrapped", [True, False])
+def test_whatever_the_solver_says_is_a_row_in_the_users_words(monkeypatch: pytest.MonkeyPatch, wrapped: bool) -> None:
+    """What is not ours, and what is ours around the solver's text; an error of our own words is kept."""
+    run = made()
+    deep = RuntimeError("Indeterminant linear system near variable 8646911284551352320")
+
+    def fails(*_: object, **__: object) -> None:
+        if not wrapped:
+            raise deep
+        raise SolveError(f"the solver failed: {deep}") from deep
+
+    job = _Job(
+        recording=run.recording,
+        config=run.config,
+        datum=app.choose_datum(run.recording, run.config),
+        without=("height",),
+    )
+    monkeypatch.setattr(app, "solve", fails)
+    said = _smoothed(job)
+    assert isinstance(said, str)
+    assert "8646911284551352320" not in said
+    assert said.startswith("what is left does not tell")
+
+    def ours(*_: object, **__: object) -> None:
+        raise SolveError("no place: no fix")
+
+    monkeypatch.setattr(app, "solve", ours)
+    assert _smoothed(job) == "no place: no fix"
+
+
 def test_with_one_sensor_alone_there_is_nothing_to_draw(tmp_path: Path) -> None:
     run = made(compass_hz=0.0, pose_hz=0.0)
     alone = {name: s for name, s in run.config.sensors.items() if s.kind in ("imu", "gnss")}
@@ -125,7 +158,9 @@ def test_no_spike_is_lost_over_time(bad: tuple[SimulatedRun, Ablated]) -> None:
     off_m = np.full(50_000, 0.1)
     off_m[33_333] = 7.0
     away = Off(stamps_ns=np.arange(50_000) * 100_000_000, off_m=off_m, off_deg=None)
-    (line,) = page.over_time(replace(bad[1], over_time={"gnss": away})).data
+    (line,) = page.over_time(replace(bad[1], over_time={"gnss": away}, begin_ns=-2_000_000_000)).panels[0].marks
+    assert isinstance(line, Line)
+    assert line.x[0] == 2.0  # from the begin of the track, as the table's times
     assert len(line.y) < 5_000
     assert max(line.y) == 7.0
 

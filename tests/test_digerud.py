@@ -1,5 +1,6 @@
 """Digerud's filter against a scalar one written here, and his pose of one tag against synthetic sightings."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -59,14 +60,21 @@ def sighting(
 
 
 def run(
-    sightings: Sequence[TagSighting], options: DigerudConfig | None = None, *, enabled: bool = True
+    sightings: Sequence[TagSighting],
+    options: DigerudConfig | None = None,
+    *,
+    enabled: bool = True,
+    truth: Trajectory | None = None,
 ) -> FilterResult | None:
     config = VesselConfig(sensors={"tags": AprilTagConfig(enabled=enabled)})
-    return run_digerud(Recording(source="(test)", imu=None, measurements=tuple(sightings)), config, DATUM, options)
+    recording = Recording(source="(test)", imu=None, measurements=tuple(sightings), truth=truth)
+    return run_digerud(recording, config, DATUM, options)
 
 
-def ran(sightings: Sequence[TagSighting], options: DigerudConfig | None = None) -> FilterResult:
-    result = run(sightings, options)
+def ran(
+    sightings: Sequence[TagSighting], options: DigerudConfig | None = None, truth: Trajectory | None = None
+) -> FilterResult:
+    result = run(sightings, options, truth=truth)
     assert result is not None
     return result
 
@@ -292,9 +300,9 @@ def _approach(first: str) -> tuple[FilterResult, Trajectory]:
     if first == "flipped":
         seen[0] *= [-1.0, 1.0, 1.0]
     noise = rng.normal(0.0, 0.02 / 1069.38, (len(t), 4, 2))
-    result = ran([sighting(k, t[k], seen[k], noise=noise[k]) for k in range(len(t))])
     R = np.array([looking(q, AIM) @ R_BODY_CAMERA.T for q in p])
-    return result, Trajectory(stamps_ns=np.rint(t * 1e9).astype(np.int64), p_world_m=p - R @ LEVER, R_world_body=R)
+    truth = Trajectory(stamps_ns=np.rint(t * 1e9).astype(np.int64), p_world_m=p - R @ LEVER, R_world_body=R)
+    return ran([sighting(k, t[k], seen[k], noise=noise[k]) for k in range(len(t))], truth=truth), truth
 
 
 def test_flipped_start_locks_the_truth_out_for_ever() -> None:
@@ -306,6 +314,14 @@ def test_flipped_start_locks_the_truth_out_for_ever() -> None:
     assert found.at_end
     assert found.lost_s == pytest.approx(20.0)
     assert found.covered_s == pytest.approx(20.0)
+    # 6 m east mirrored at the tag: 12 m off, to what 0.02 px do. Sightings every 1/15 s: the second to the 300th are 298 steps apart.
+    begun = re.match(r"it started on a pose (\d+\.\d) m off", result.why)
+    assert begun is not None
+    assert float(begun[1]) == pytest.approx(12.0, abs=0.3)
+    dropped = re.search(r"299 of 300 sightings of its one tag were dropped, (\d+) of them right to 2 m", result.why)
+    assert dropped is not None
+    assert int(dropped[1]) > 250  # 0.02 px: nearly all are
+    assert "for up to 20 s on end; of the 1 that it took 1 were farther off" in result.why
 
 
 def test_right_start_keeps_it() -> None:

@@ -1,5 +1,6 @@
 """What README and docs point to is there: links, anchors, commands and their options."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,16 @@ def test_links_lead_somewhere(page: Path) -> None:
         if not file.exists() or (anchor and anchor not in anchors(file)):
             broken.append(target)
     assert broken == []
+
+
+def test_the_example_of_calibration_has_the_numbers_of_its_rows() -> None:
+    rows = {row["name"]: row["value"] for row in json.loads((ROOT / "docs/results.json").read_text())["figures"]}
+    said = re.search(r"time_offset_s: ([\d.]+) \+- ([\d.]+) s", (ROOT / "docs/calibration.md").read_text())
+    assert said is not None
+    suggested, sigma = (
+        rows[f"KITTI as it is: {what}"] for what in ("gnss.time_offset_s that it suggests", "its sigma")
+    )
+    assert (float(said[1]), float(said[2])) == (suggested, sigma)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))

@@ -283,6 +283,7 @@ def test_an_imu_noisier_than_configured_is_scaled_up() -> None:
     )
     said = app.smooth_recording(run.recording, with_sensors(run, imu=imu)).solution.stats.warnings
     assert any("IMU noise scaled up" in w for w in said)
+    assert not any("tags" in w for w in said)  # there are none
     held = with_sensors(run, imu=imu.model_copy(update={"adapt_noise": False}))
     assert not any(
         "IMU noise scaled up" in w for w in app.smooth_recording(run.recording, held).solution.stats.warnings

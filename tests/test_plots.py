@@ -101,6 +101,32 @@ def test_an_outage_at_the_beginning_or_the_end_counts(data: ReportData) -> None:
     assert found[-1][0] == pytest.approx(last - 4e9, abs=0.25e9)
 
 
+def test_panels_beside_each_other() -> None:
+    """Three in two columns: the last cell stays empty; two panels are the last of their columns. Named ticks, logarithmic x."""
+    x = np.array([0.1, 1.0, 10.0])
+    marks = (
+        plots.Span(name="s", start=0.2, stop=0.5, colour="#000000"),
+        plots.Points(name="p", x=x, y=x, colour="#123456", shape="circle-open"),
+        plots.Points(name="q", x=x, y=x, colour="#123456", shape="x"),
+    )
+    panel = plots.Panel(title="t", y="m", marks=marks, ticks_y=("one", "two"))
+    figure = plots.Figure(
+        name="f", x="m", panels=(panel,) * 3, height=400, columns=2, log_x=True, range_x=(0.01, 100.0)
+    )
+    page = plots.interactive(figure).layout
+    assert (page.xaxis.type, tuple(page.xaxis3.range)) == ("log", (-2.0, 2.0))
+    assert "xaxis4" not in page
+    assert [axis.title.text for axis in (page.xaxis, page.xaxis2, page.xaxis3)] == [None, "m", "m"]
+    assert page.xaxis.domain[1] < page.xaxis2.domain[0]
+    assert tuple(page.yaxis2.ticktext) == ("one", "two")
+    assert [shape.xref for shape in page.shapes] == ["x", "x2", "x3"]
+    axes = on_paper(figure).axes
+    assert len(axes) == 3
+    assert [a.get_xlabel() for a in axes] == ["", "m", "m"]
+    assert axes[2].get_xscale() == "log"
+    assert [t.get_text() for t in axes[1].get_yticklabels()] == ["one", "two"]
+
+
 def test_of_many_points_those_not_believed_stay() -> None:
     weight = np.ones(10_000)
     weight[777] = weight[778] = 0.1

@@ -18,7 +18,7 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.measurements import GnssPosition, ImuSample
-from graphloc.replay import arrivals, replay
+from graphloc.replay import _timed, arrivals, replay
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +97,7 @@ def test_scans_are_matched_around_its_own_prediction(bag: Path, tmp_path: Path) 
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout[: done.stdout.rindex("}") + 1])
     assert told["Against truth"]["graphloc online"]["position_rmse_m"] < 0.8
+    assert told["verdict"]["graphloc online"]["said"] in ("can be trusted", "use with care", "do not rely on it")
     aerial = told["ledger"]["aerial"]
     assert aerial["used"] > 8
     text = (tmp_path / "out/ledger.csv").read_text()
@@ -138,3 +139,17 @@ def test_compare_has_it_beside_the_filters(run: SimulatedRun) -> None:
     assert offline is not None
     assert online is not None
     assert offline <= online + 0.05
+
+
+def test_a_guessed_heading_is_said_with_its_times(run: SimulatedRun) -> None:
+    """Doubted in the first 51 of the estimates, 10 a second: for 5 s."""
+    estimates = replay(run.recording, run.config).estimates
+    doubt = "the heading is a guess: 2 explain the way so far"
+    first_ns = estimates[0].stamp_ns
+    some = [replace(e, reason=f"95 % bound 3 m; {doubt}" if k <= 50 else "") for k, e in enumerate(estimates)]
+    (line,) = _timed([(first_ns, doubt)], some)
+    assert line.startswith(f"at 0 s: {doubt}; so it stayed until 5 s, for 5 s")
+    assert "start.heading_deg" in line
+    every = [replace(e, reason=doubt) for e in estimates]
+    assert "to the end of the run" in _timed([(first_ns, doubt)], every)[0]
+    assert _timed([(first_ns + 2_000_000_000, "rebuilt")], some) == ["at 2 s: rebuilt"]

@@ -55,7 +55,7 @@ def test_verdict_names_the_numbers(data: ReportData) -> None:
     said = verdict(replace(data, solution=solution, tables=covered(0.95)))
     text = " ".join(reason.text for reason in said.reasons)
     assert "95 % bound of 1.00 m" in text
-    assert said.accuracy == "Horizontal RMSE 0.12 m; beside it: BL EKF 1.50 m (12 x)."  # 1.5 / 0.1234 = 12.2
+    assert said.tracks[0].accuracy == "Horizontal RMSE 0.12 m; beside it: BL EKF 1.50 m (12 x)."  # 1.5 / 0.1234 = 12.2
     assert "held the truth for 95% of the time" in text
     assert said.trust is Trust.YES
 
@@ -86,7 +86,7 @@ def test_a_run_that_nothing_measures_is_not_vouched_for(data: ReportData) -> Non
     solution = replace(data.solution, stats=replace(data.solution.stats, warnings=()))
     said = verdict(replace(data, recording=recording, solution=solution, tables=()))
     assert said.trust is Trust.WITH_CARE
-    assert said.accuracy == "How good it is cannot be said."
+    assert said.tracks[0].accuracy == "How good it is cannot be said."
     assert any("Nothing here measures" in r.text for r in said.reasons)
 
 

@@ -51,9 +51,10 @@ def test_the_ratio_is_over_runs_that_both_have(three: list[Path]) -> None:
     """The EKF has a and b: 2.4 there, ours 0.4 there: 6 times, not 1.2 / 0.3 = 4."""
     runs = read_runs(three)
     text = as_markdown(runs, blocks(runs))
-    assert "| mean to that of graphloc |  | 6.0 x |" in text
+    assert "| times the mean of graphloc |  | 6.0 x |" in text
     assert "| b\\|<c> | 0.300 | 1.400 |" in text
-    assert "- b|<c>: warnings (2), see its report" in text
+    assert text.count("- b|<c>: warning: w") == 2
+    assert "horizontal error, RMSE, m (position_rmse_m)" in text
     assert "- d: the solver did not converge" in text
 
 
@@ -63,6 +64,18 @@ def test_the_worst_of_a_number_with_a_sign_is_the_farthest_from_zero(tmp_path: P
     ]
     (block,) = blocks(read_runs(runs))
     assert block.worst == (-0.5,)
+
+
+def test_counts_are_no_decimals(tmp_path: Path) -> None:
+    runs = [
+        run_folder(tmp_path, n, {"Other": {"graphloc": {"fixes": v, "some_m": 0.5}}})
+        for n, v in (("a", 100), ("b", 101))
+    ]
+    text = as_markdown(read := read_runs(runs), blocks(read))
+    assert "| a | 100 |" in text
+    assert "| mean of the runs | 100.5 |" in text
+    assert "| worst of the runs | 100 |" in text  # of fixes the fewest
+    assert "| a | 0.500 |" in text
 
 
 def test_links_lead_to_folders_of_any_name(tmp_path: Path) -> None:

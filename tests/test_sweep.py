@@ -140,6 +140,7 @@ def test_a_scheduler_by_address_and_one_that_is_not_there(tmp_path: Path, monkey
     monkeypatch.setattr(sweep, "_CONNECT_S", 0.5)
     with pytest.raises(InputError, match="no Dask scheduler"):
         sweep.sweep([BROKEN], tmp_path / "a", scheduler="tcp://127.0.0.1:9")
+    assert not (tmp_path / "a").exists()
     with LocalCluster(  # type: ignore[no-untyped-call]
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
     ) as cluster:
@@ -212,6 +213,15 @@ def test_a_bag_with_its_configuration_varied(tmp_path: Path, monkeypatch: pytest
     config.write_text(config.read_text().replace("truth_topic: /truth", ""))
     with pytest.raises(ConfigError, match="give --hold-out"):
         check(jobs)
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(b"no bag at all")
+    with pytest.raises(InputError, match=r"broken\.mcap"):
+        check([replace(job, bag=str(broken), hold_out="every:5")])
+    text = config.read_text()
+    config.write_text(text.replace("/gnss/fix", "/gnss/fax"))
+    with pytest.raises(InputError, match="'/gnss/fax' is not in the bag"):
+        check([replace(job, hold_out="every:5")])
+    config.write_text(text)
     (held,) = run_job(replace(job, hold_out="every:5"))
     assert 0.0 < held["held_out_horizontal_rmse_m"] < 2.0
 
@@ -269,6 +279,7 @@ def test_a_sweep_that_was_broken_off_or_failed_throughout_says_how_to_go_on(
         told = capsys.readouterr()
         assert end.value.code == code
         assert said in told.err
+        assert len(told.err.strip().splitlines()) == 1
         assert rows is None or "1 run, 1 failed" in told.out
         assert rows is None or "- my.bag: is none" in told.out
 

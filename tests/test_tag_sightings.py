@@ -611,7 +611,7 @@ def test_the_ledger_adds_up(tmp_path: Path) -> None:
     ]  # fmt: skip
     (topic,) = [row for row in recording.rows if row.topic == IMAGE]
     assert (topic.count, topic.outcome, topic.reason) == (
-        6, Outcome.IGNORED, "read by tags; 4 of 6 show no tag that can be used"
+        6, Outcome.READ, "read by tags; 4 of 6 show no tag that can be used"
     )  # fmt: skip
     assert [view.number for view in recording.tag_views] == [3]
     assert "tags: tag 3 (36h11) is not in the survey (1 times)" in recording.warnings

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphloc.build import mount_of
+from graphloc.chi2 import SIGMAS_95
 from graphloc.config import VesselConfig
 from graphloc.eval.calibrate._evidence import Estimate, Evidence, Name
 from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
@@ -119,7 +120,7 @@ def _check(name: Name, found: Estimate, recording: Recording, config: VesselConf
     if found.sigma > _USEFUL[name[1]]:
         said = f"this run cannot tell (1 sigma {factor * found.sigma:.2g} {unit}); {_WOULD_TELL[name[1]]}"
     else:
-        said = f"fits, within {1.96 * factor * found.sigma:.2g} {unit} (95 %)"
+        said = f"fits, within {SIGMAS_95 * factor * found.sigma:.2g} {unit} (95 %)"
     return Check(
         key=key, unit=unit, configured=configured, change=factor * found.value, sigma=factor * found.sigma, said=said
     )

@@ -3,138 +3,114 @@
 
 from __future__ import annotations
 
-import numpy as np
-import plotly.graph_objects as go
-from plotly.subplots import make_subplots
+from collections.abc import Sequence
 
-from graphloc.eval.drill.measure import Drilled, Times, summed
+import numpy as np
+
+from graphloc.eval.drill.measure import Drilled, Row, Times, summed
 from graphloc.eval.drill.plan import TAIL_S, Case
-from graphloc.eval.plots import COLOURS
+from graphloc.eval.plots import COLOURS, Figure, Line, Mark, Panel, Points, Shape, Span
 
 # As the report has them, whatever the order of the tables here.
 _COLOUR = dict(zip(("graphloc", "graphloc online", "BL EKF", "honest EKF"), COLOURS, strict=False))
 _SHOWN_S = 10.0  # of an error over time, before the failure
 _FEWEST_M = 0.05  # lower end of logarithmic axes
+_PANEL_PX, _BESIDE_PX = 190, 100
 
 
-def _layout(figure: go.Figure, height: int) -> go.Figure:
-    figure.update_layout(
-        template="plotly_white",
-        height=height,
-        margin={"l": 60, "r": 15, "t": 50, "b": 50},
-        legend={"orientation": "h", "y": 1.0, "yref": "container", "yanchor": "top", "x": 0},
-        font={"size": 13},
-    )
-    return figure
+def _range_m(most_m: float) -> tuple[float, float]:
+    """What an axis of m shows, the same wherever it is used."""
+    return 0.8 * _FEWEST_M, 1.4 * max(most_m, 1.0)
 
 
-def _logarithmic(most: float) -> dict[str, object]:
-    """An axis of m, the same wherever it is used."""
-    ticks = [0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0]
-    span = [float(np.log10(0.8 * _FEWEST_M)), float(np.log10(1.4 * max(most, 1.0)))]
-    return {"type": "log", "tickvals": ticks, "ticktext": [f"{t:g}" for t in ticks], "range": span}
-
-
-def against_length(drilled: Drilled) -> go.Figure | None:
-    """Farthest off against the length of an outage, a panel for each kind."""
+def against_length(drilled: Drilled) -> Figure | None:
+    """Farthest off against the length of an outage, a panel for each kind; a cross where it never came back."""
     rows = summed(drilled.measured)
     families = [
         f for f in dict.fromkeys(r.family for r in rows) if len({r.length_s for r in rows if r.family == f}) > 1
     ]
     if not families:
         return None
-    figure = make_subplots(rows=1, cols=len(families), subplot_titles=families, shared_yaxes=True)
-    for name in drilled.estimators:
-        for col, family in enumerate(families, start=1):
+    shown = _range_m(max(r.off_m or 1.0 for r in rows))
+    panels: list[Panel] = []
+    for family in families:
+        marks: list[Mark] = []
+        for name in reversed(drilled.estimators):  # ours last, on top
             own = sorted(
                 (r for r in rows if r.family == family and r.estimator == name and r.off_m is not None),
                 key=lambda r: r.length_s,
             )
-            figure.add_scatter(
-                x=[r.length_s for r in own],
-                y=[max(r.off_m or 0.0, _FEWEST_M) for r in own],
-                mode="lines+markers",
-                line={"color": _COLOUR[name]},
-                marker={"symbol": ["x" if r.lost or r.none else "circle" for r in own], "size": 9},
-                name=name,
-                legendgroup=name,
-                showlegend=col == 1,
-                row=1,
-                col=col,
-            )
-    figure.update_xaxes(title="length, s", rangemode="tozero")
-    figure.update_yaxes(_logarithmic(max(r.off_m or 1.0 for r in rows)))
-    figure.update_yaxes(title="farthest off, m", col=1)
-    return _layout(figure, 380)
+            length_s = np.array([r.length_s for r in own])
+            marks.append(Line(name=name, x=length_s, y=_off_m(own), colour=_COLOUR[name]))
+            marks += _points(own, name, length_s, _off_m(own), size=9.0, listed=False)
+        y = "farthest off, m" if not panels else ""
+        panels.append(Panel(title=family, y=y, marks=tuple(marks), log_y=True, range_y=shown))
+    longest_s = max(r.length_s for r in rows if r.family in families)
+    return Figure(
+        name="lengths", x="length, s", panels=tuple(panels), height=380, columns=len(panels), range_x=(0.0, 1.05 * longest_s)
+    )  # fmt: skip
 
 
-def all_failures(drilled: Drilled) -> go.Figure:
+def _off_m(rows: Sequence[Row]) -> np.ndarray:
+    return np.array([max(r.off_m or 0.0, _FEWEST_M) for r in rows])
+
+
+def _points(rows: Sequence[Row], name: str, x: np.ndarray, y: np.ndarray, size: float, *, listed: bool) -> list[Mark]:
+    """A circle for each, a cross where it never came back."""
+    never = np.array([bool(r.lost or r.none) for r in rows], dtype=bool)
+    shapes: tuple[tuple[Shape, np.ndarray], ...] = (("circle", ~never), ("x", never))
+    text = [f"{r.failure}<br>{name}: {r.off_m:.2f} m" for r in rows]
+    return [
+        Points(
+            name=name, x=x[some], y=y[some], colour=_COLOUR[name], shape=shape, size=size, listed=listed,
+            text=[t for t, there in zip(text, some, strict=True) if there],
+        )
+        for shape, some in shapes
+        if some.any()
+    ]  # fmt: skip
+
+
+def all_failures(drilled: Drilled) -> Figure:
     """Farthest off in each failure: a mark an estimator, a cross where it never came back; hollow: undisturbed."""
     rows = summed(drilled.measured)
     names = list(dict.fromkeys(r.failure for r in rows))[::-1]
-    figure = go.Figure()
-    for i, name in enumerate(drilled.estimators):
-        own = {r.failure: r for r in rows if r.estimator == name and r.off_m is not None}
-        shift = 0.16 * (1.5 - i)
-        y = [names.index(f) + shift for f in own]
-        figure.add_scatter(
-            x=[max(r.normal_m or 0.0, _FEWEST_M) for r in own.values()],
-            y=y,
-            mode="markers",
-            marker={"color": _COLOUR[name], "symbol": "circle-open", "size": 7},
-            showlegend=False,
-            hoverinfo="skip",
+    marks: list[Mark] = []
+    for i, name in reversed(list(enumerate(drilled.estimators))):
+        own = [r for r in rows if r.estimator == name and r.off_m is not None]
+        y = np.array([names.index(r.failure) for r in own]) + 0.16 * (1.5 - i)
+        usual_m = np.array([max(r.normal_m or 0.0, _FEWEST_M) for r in own])
+        marks.append(
+            Points(name=name, x=usual_m, y=y, colour=_COLOUR[name], shape="circle-open", size=7.0, listed=False)
         )
-        figure.add_scatter(
-            x=[max(r.off_m or 0.0, _FEWEST_M) for r in own.values()],
-            y=y,
-            mode="markers",
-            marker={
-                "color": _COLOUR[name],
-                "size": 10,
-                "symbol": ["x" if r.lost or r.none else "circle" for r in own.values()],
-            },
-            text=[f"{r.failure}<br>{name}: {r.off_m:.2f} m" for r in own.values()],
-            hoverinfo="text",
-            name=name,
-        )
-    figure.update_xaxes(_logarithmic(max(r.off_m or 1.0 for r in rows)))
-    figure.update_xaxes(title="farthest off, m (hollow: undisturbed; cross: never back)")
-    figure.update_yaxes(tickvals=list(range(len(names))), ticktext=names, range=[-0.6, len(names) - 0.4])
-    return _layout(figure, 130 + 34 * len(names))
+        marks += _points(own, name, _off_m(own), y, size=10.0, listed=True)
+    panel = Panel(title="", y="", marks=tuple(marks), range_y=(-0.6, len(names) - 0.4), ticks_y=tuple(names))
+    return Figure(
+        name="failures", x="farthest off, m (hollow: undisturbed; cross: never back)", panels=(panel,),
+        height=130 + 34 * len(names), log_x=True, range_x=_range_m(max(r.off_m or 1.0 for r in rows)),
+    )  # fmt: skip
 
 
-def over_time(drilled: Drilled) -> go.Figure:
+def over_time(drilled: Drilled) -> Figure:
     """How far off each estimator is over time: the first time of each failure, which is shaded."""
     first: dict[str, tuple[Case, dict[str, Times]]] = {}
     for case, times in drilled.shown:
         first.setdefault(case.failure.name, (case, times))
-    columns, count = 2, len(first)
-    lines = -(-count // columns)
-    figure = make_subplots(
-        rows=lines,
-        cols=columns,
-        subplot_titles=list(first),
-        vertical_spacing=0.32 / max(lines, 1),
-        horizontal_spacing=0.07,
-    )
-    for n, (case, times) in enumerate(first.values()):
-        place = {"row": n // columns + 1, "col": n % columns + 1}
-        for name, t in times.items():
+    shown = _range_m(max(float(np.nanmax(t.off_m, initial=1.0)) for _, times in first.values() for t in times.values()))
+    panels: list[Panel] = []
+    for name, (case, times) in first.items():
+        marks: list[Mark] = [Span(name="failure", start=0.0, stop=case.failure.length_s, colour="#000000", opacity=0.1)]
+        for estimator, t in reversed(times.items()):
             at_s = (t.stamps_ns - case.begin_ns) * 1e-9
             near = (at_s >= -_SHOWN_S) & (at_s <= case.failure.length_s + TAIL_S)
-            figure.add_scatter(
-                x=np.round(at_s[near], 1),
-                y=np.round(np.maximum(t.off_m[near], _FEWEST_M), 3),
-                line={"color": _COLOUR[name], "width": 1.8},
-                name=name,
-                legendgroup=name,
-                showlegend=n == 0,
-                **place,
+            off_m = np.maximum(t.off_m[near], _FEWEST_M)
+            marks.append(
+                Line(
+                    name=estimator, x=np.asarray(at_s[near], dtype=float), y=off_m, colour=_COLOUR[estimator], width=1.8
+                )
             )
-        figure.add_vrect(x0=0.0, x1=case.failure.length_s, fillcolor="rgba(0,0,0,0.10)", line_width=0, **place)
-    most_m = max(float(np.nanmax(t.off_m, initial=1.0)) for _, times in first.values() for t in times.values())
-    figure.update_yaxes(_logarithmic(most_m))
-    figure.update_yaxes(title="m", col=1)
-    figure.update_xaxes(title="s since the failure begins", row=lines)
-    return _layout(figure, 100 + 190 * lines)
+        y = "m" if len(panels) % 2 == 0 else ""
+        panels.append(Panel(title=name, y=y, marks=tuple(marks), log_y=True, range_y=shown))
+    return Figure(
+        name="time", x="s since the failure begins", panels=tuple(panels), columns=2,
+        height=_BESIDE_PX + _PANEL_PX * -(-len(panels) // 2),
+    )  # fmt: skip

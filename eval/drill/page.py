@@ -12,7 +12,7 @@ from graphloc.eval.drill.figures import against_length, all_failures, over_time
 from graphloc.eval.drill.measure import HELD, HOLDS_S, NEAR_M, NORMAL_TIMES, Drilled, Row, State, summed
 from graphloc.eval.drill.plan import TAIL_S, WINDOW_TAIL_S
 from graphloc.eval.page import Cell, Grid, write_csv, write_markdown, write_page
-from graphloc.eval.pieces import figure_html
+from graphloc.eval.pieces import drawing
 
 MARK = "drill.json"  # a folder with this file is ours to replace
 
@@ -135,11 +135,11 @@ def write(drilled: Drilled, folder: Path, command: str) -> None:
     lengths = against_length(drilled)
     parts = [tables[0].as_html()]
     if lengths is not None:
-        parts += ["<h2>Outages by length</h2>", figure_html(lengths, "lengths")]
-    parts += ["<h2>All failures</h2>", figure_html(all_failures(drilled), "failures")]
+        parts += ["<h2>Outages by length</h2>", drawing(lengths)]
+    parts += ["<h2>All failures</h2>", drawing(all_failures(drilled))]
     parts += [
         "<h2>Over time</h2><p class='note'>Horizontal distance from the reference; grey: the failure; its first time.</p>",
-        figure_html(over_time(drilled), "time"),
+        drawing(over_time(drilled)),
     ]
     parts += [grid.as_html() for grid in tables[1:]]
     write_page(folder / "drill.html", title, lines, parts)

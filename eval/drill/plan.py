@@ -67,10 +67,12 @@ def schedule(
     left: list[tuple[str, str]] = []
     for failure in failures:
         own: list[Case] = []
+        short_s: list[float] = []
         for number, (part, ready) in enumerate(zip(parts, ready_ns, strict=True)):
             first = max(part.begin_ns + round(LEAD_S * NS_PER_S), ready + round(_SETTLED_S * NS_PER_S))
             last = part.end_ns - round((failure.length_s + TAIL_S) * NS_PER_S)
             if last < first:
+                short_s.append((first - last) / NS_PER_S)
                 continue
             shares = (np.arange(times) + 0.5) / times if part.whole else np.zeros(1)
             own += [
@@ -78,9 +80,8 @@ def schedule(
                 for k, share in enumerate(shares)
             ]  # fmt: skip
         if not own:
-            longest = max((p.end_ns - r) / NS_PER_S for p, r in zip(parts, ready_ns, strict=True))
-            wanted = failure.length_s + _SETTLED_S + TAIL_S
-            left.append((failure.name, f"does not fit: needs {wanted:.0f} s with estimates, there are {longest:.0f} s"))
+            said = f"does not fit, with {TAIL_S:g} s after it: the recording is {np.ceil(min(short_s)):.0f} s too short"
+            left.append((failure.name, said))
         cases += own
     return tuple(cases), tuple(left)
 

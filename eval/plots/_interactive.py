@@ -15,30 +15,36 @@ from graphloc.eval.plots._marks import Band, Figure, Line, Mark, Panel, Points, 
 from graphloc.frames import Array
 
 _GAP_PX, _ABOVE_PX, _LEGEND_PX, _BELOW_PX = 42, 26, 38, 46
+_TICKS_PX, _BESIDE = 22, 0.07  # room for ticks between panels; share of the width between columns
 _WEIGHTS = {"colorscale": "Cividis", "cmin": 0, "cmax": 1}
 
 
 def interactive(figure: Figure) -> go.Figure:
     """Return a figure for plotly; names in the legend switch what they name on and off."""
-    n = len(figure.panels)
+    n, columns = len(figure.panels), figure.columns
+    rows = -(-n // columns)
     named = any(not isinstance(m, Span) and m.listed and not p.keyed for p in figure.panels for m in p.marks)
     above_px = _ABOVE_PX + _LEGEND_PX * named
+    gap_px = _GAP_PX + (_TICKS_PX if columns > 1 else 0)  # beside each other, each has its own axis
     drawn = make_subplots(
-        rows=n, cols=1, shared_xaxes=True, subplot_titles=[_title(p) for p in figure.panels],
-        vertical_spacing=min(_GAP_PX / max(figure.height - above_px - _BELOW_PX, 1), 0.9 / n),
+        rows=rows, cols=columns, shared_xaxes=columns == 1, subplot_titles=[_title(p) for p in figure.panels],
+        vertical_spacing=min(gap_px / max(figure.height - above_px - _BELOW_PX, 1), 0.9 / rows),
+        horizontal_spacing=_BESIDE if columns > 1 else None,
+        specs=[[{} if row * columns + col < n else None for col in range(columns)] for row in range(rows)],
     )  # fmt: skip
     listed: set[str] = set()
     shades: list[dict[str, Any]] = []
-    for row, panel in enumerate(figure.panels, start=1):
+    for number, panel in enumerate(figure.panels):
+        place = {"row": number // columns + 1, "col": number % columns + 1}
         for mark in panel.marks:
             if isinstance(mark, Span):
-                shades.append(_shade(mark, row))
+                shades.append(_shade(mark, number + 1))
                 continue
             trace = _trace(mark)
             in_legend = mark.listed and not panel.keyed and mark.name not in listed
             trace.update(legendgroup=mark.name, showlegend=in_legend)
             listed |= {mark.name} if in_legend else set()
-            drawn.add_trace(trace, row=row, col=1)
+            drawn.add_trace(trace, **place)
         axis: dict[str, Any] = {"title": {"text": panel.y, "standoff": 4}}
         if panel.from_zero:
             axis["rangemode"] = "tozero"
@@ -46,22 +52,29 @@ def interactive(figure: Figure) -> go.Figure:
             axis |= {"type": "log", "dtick": 1}
         if panel.range_y is not None:
             axis["range"] = list(np.log10(panel.range_y)) if panel.log_y else list(panel.range_y)
-        drawn.update_yaxes(**axis, row=row, col=1)
-    drawn.update_xaxes(title=figure.x, row=n, col=1)
+        if panel.ticks_y:
+            axis |= {"tickvals": list(range(len(panel.ticks_y))), "ticktext": list(panel.ticks_y)}
+        drawn.update_yaxes(**axis, **place)
+        if number >= n - columns:  # the last of its column
+            drawn.update_xaxes(title=figure.x, **place)
+    if figure.log_x:
+        drawn.update_xaxes(type="log", dtick=1)
+    if figure.range_x is not None:
+        drawn.update_xaxes(range=list(np.log10(figure.range_x)) if figure.log_x else list(figure.range_x))
     drawn.update_layout(
         template="plotly_white", shapes=shades, height=figure.height, font={"size": 12}, hoverlabel={"align": "left"},
         margin={"l": 52, "r": 12, "t": above_px, "b": _BELOW_PX},
         legend={"orientation": "h", "y": 1, "yref": "container", "yanchor": "top", "x": 0, "traceorder": "reversed"},
     )  # fmt: skip
-    drawn.update_annotations(font_size=13, x=0, xanchor="left")
+    drawn.update_annotations(font_size=13, **({"x": 0, "xanchor": "left"} if columns == 1 else {}))
     if figure.is_map:
         _as_map(drawn, figure)
     return drawn
 
 
-def _shade(span: Span, row: int) -> dict[str, Any]:
+def _shade(span: Span, number: int) -> dict[str, Any]:
     """A rectangle over the height of a panel; all are given to plotly at once, one by one they take seconds."""
-    axis = str(row) if row > 1 else ""
+    axis = str(number) if number > 1 else ""
     return {
         "type": "rect", "xref": f"x{axis}", "yref": f"y{axis} domain", "x0": span.start, "x1": span.stop, "y0": 0, "y1": 1,
         "fillcolor": span.colour, "opacity": span.opacity, "line": {"width": 0}, "layer": "below",

@@ -21,7 +21,7 @@ TRUTH, OUTAGE = "#000000", "#777777"
 MOST = 2000  # points a trace: more cannot be seen and make a heavy page
 
 Dash = Literal["solid", "dash", "dot"]
-Shape = Literal["circle", "diamond", "square", "x"]
+Shape = Literal["circle", "circle-open", "diamond", "square", "x"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,6 +103,7 @@ class Panel:
         range_y: what of the axis is shown at first; None: all.
         from_zero: the axis begins at zero. log_y: it is logarithmic.
         keyed: its lines are named in itself, not in the legend of the figure.
+        ticks_y: names of 0, 1, 2, ... on the axis, instead of numbers.
     """
 
     title: str
@@ -112,14 +113,17 @@ class Panel:
     from_zero: bool = False
     log_y: bool = False
     keyed: bool = False
+    ticks_y: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Figure:
-    """Panels above each other with one x axis.
+    """Panels above each other with one x axis, or beside each other, in `columns`, with one each.
 
     Attributes:
         name: of its files, and in the page. x: label of the axis. height: of the whole, px.
+        columns: panels beside each other, row by row. log_x: the x axes are logarithmic.
+        range_x: what of them is shown at first; None: all.
         is_map: x and y have the same scale; underlay: what lies below.
     """
 
@@ -127,6 +131,9 @@ class Figure:
     x: str
     panels: tuple[Panel, ...]
     height: int
+    columns: int = 1
+    log_x: bool = False
+    range_x: tuple[float, float] | None = None
     is_map: bool = False
     underlay: Underlay | None = None
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc.chi2 import SIGMAS_95
 from graphloc.eval.plots._map import hover
 from graphloc.eval.plots._marks import COLOURS, Band, Figure, Line, Mark, Panel, Points, shown_of, thinned
 from graphloc.frames import Array
@@ -16,7 +17,6 @@ from graphloc.ledger import LedgerRow
 from graphloc.solution import SlowEstimate, Solution
 from graphloc.time import seconds_since
 
-_TWO_SIDED = 1.96  # sigmas, 95 %
 _PANEL_PX, _BESIDE_PX = 170, 120
 _SEEN_SIGMAS = 8.0  # of residuals at first; a double click shows all
 
@@ -54,7 +54,7 @@ def _banded(
     for k, name in enumerate(names):
         colour, v = COLOURS[first_colour + k], value[some, k]
         if sigma is not None:
-            wide = _TWO_SIDED * sigma[some, k]
+            wide = SIGMAS_95 * sigma[some, k]
             marks.append(Band(name=name, x=t, low=v - wide, high=v + wide, colour=colour))
         marks.append(Line(name=name, x=t, y=v, colour=colour))
     return tuple(marks)

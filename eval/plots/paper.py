@@ -21,7 +21,7 @@ from graphloc.eval.plots._marks import Band, Figure, Line, Panel, Points, Span, 
 
 _WIDTH_IN, _PX_PER_IN, _DPI = 7.0, 110.0, 200
 _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
-_SHAPES = {"circle": "o", "diamond": "D", "square": "s", "x": "x"}
+_SHAPES = {"circle": "o", "circle-open": "o", "diamond": "D", "square": "s", "x": "x"}
 _STYLE: Any = {
     "font.size": 9, "axes.grid": True, "grid.color": "#e5e5e5", "axes.axisbelow": True, "legend.frameon": False,
     "svg.fonttype": "none", "svg.hashsalt": "graphloc",
@@ -42,10 +42,19 @@ def drawn(figure: Figure) -> Sheet:
     height_in = _map_height_in(figure.underlay) if figure.is_map else figure.height / _PX_PER_IN
     sheet = Sheet(figsize=(_WIDTH_IN, height_in), layout="constrained")
     FigureCanvasAgg(sheet)
-    every = sheet.subplots(len(figure.panels), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, panel in zip(every, figure.panels, strict=True):
+    n, columns = len(figure.panels), figure.columns
+    every = sheet.subplots(-(-n // columns), columns, sharex=columns == 1, squeeze=False).ravel()
+    for unused in every[n:]:
+        unused.remove()
+    every = every[:n]
+    for number, (axes, panel) in enumerate(zip(every, figure.panels, strict=True)):
         _panel(axes, panel)
-    every[-1].set_xlabel(figure.x)
+        if figure.log_x:
+            axes.set_xscale("log")
+        if figure.range_x is not None:
+            axes.set_xlim(*figure.range_x)
+        if number >= n - columns:
+            axes.set_xlabel(figure.x)
     if figure.is_map:
         every[0].set_aspect("equal", adjustable="datalim" if figure.underlay is None else "box")
         _under(every[0], figure.underlay)
@@ -71,6 +80,8 @@ def _map_height_in(picture: Underlay | None) -> float:
 def _panel(axes: Axes, panel: Panel) -> None:
     axes.set_title(panel.title, loc="left", fontsize=9)
     axes.set_ylabel(panel.y)
+    if panel.ticks_y:
+        axes.set_yticks(range(len(panel.ticks_y)), panel.ticks_y)
     spans: dict[str, Patch] = {}
     for mark in panel.marks:
         if isinstance(mark, Span):
@@ -97,7 +108,12 @@ def _panel(axes: Axes, panel: Panel) -> None:
 def _points(axes: Axes, mark: Points, label: str) -> None:
     shape, size = _SHAPES[mark.shape], 0.35 * mark.size**2
     if mark.weight is None:
-        axes.scatter(mark.x, mark.y, s=size, c=mark.colour, marker=shape, label=label, rasterized=len(mark.x) > 500)
+        points = axes.scatter(
+            mark.x, mark.y, s=size, c=mark.colour, marker=shape, label=label, rasterized=len(mark.x) > 500
+        )
+        if mark.shape == "circle-open":
+            points.set_facecolor("none")
+            points.set_edgecolor(mark.colour)
     else:
         axes.scatter(
             mark.x, mark.y, s=size, c=mark.weight, cmap="cividis", vmin=0, vmax=1, marker=shape, label=label, lw=0,

@@ -23,7 +23,7 @@ class ReportData:
     Attributes:
         truth_statement: says plainly what the numbers were measured against. pictures: captions and JPEGs of matches.
         underlay: the aerial image under the map. calibration: what the run says of mounts and stamps; offline.
-        command: that made the run.
+        online: of the same measurements, where it is beside an offline run. command: that made the run.
     """
 
     title: str
@@ -38,7 +38,29 @@ class ReportData:
     pictures: Sequence[tuple[str, bytes]] = ()
     underlay: plots.Underlay | None = None
     calibration: Calibration | None = None
+    online: Solution | None = None
     command: str = ""
+
+    @property
+    def solutions(self) -> tuple[Solution, ...]:
+        """The run's own, and that of the online mode beside it."""
+        return (self.solution,) if self.online is None else (self.solution, self.online)
+
+    @property
+    def begin_ns(self) -> int:
+        """Where time begins in figures and words: at the first pose of the run's own track."""
+        return int(self.solution.trajectory.stamps_ns[0])
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All that was said on the way."""
+        return said_on_the_way(self.recording, self.solution, self.online)
+
+
+def said_on_the_way(recording: Recording, solution: Solution, online: Solution | None) -> tuple[str, ...]:
+    """Return the warnings of a run, those of the online mode beside it with its name."""
+    beside = () if online is None else tuple(f"{online.name}: {line}" for line in online.stats.warnings)
+    return (*recording.warnings, *solution.stats.warnings, *beside)
 
 
 def figures(data: ReportData) -> dict[str, plots.Figure]:

@@ -15,6 +15,7 @@ from graphloc.config import effective
 from graphloc.errors import OutputError
 from graphloc.eval import pieces, plots
 from graphloc.eval.pieces import drawing, note
+from graphloc.eval.report import _health as health
 from graphloc.eval.report import _sections as sections
 from graphloc.eval.report._data import ReportData, figures
 from graphloc.eval.report._theses import theses_section
@@ -81,6 +82,7 @@ def _parts(data: ReportData, drawn: Mapping[str, plots.Figure]) -> list[tuple[st
     parts = (
         ("where", "Map", show("map", note(_MAP))),
         ("off", "Errors and 95 % bounds", show("errors", sections.shades())),
+        ("health", "When was it less than good?", health.section(data.solutions, data.begin_ns)),
         ("honest", "Are the bounds honest?", show("nees", note(_NEES)) + show("coverage")),
         ("numbers", "All numbers", "".join(sections.numbers(t) for t in data.tables)),
         ("theses", "The tables of the theses", theses_section(data)),

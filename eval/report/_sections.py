@@ -7,14 +7,20 @@ import base64
 from html import escape
 
 from graphloc.eval.metrics import Table
-from graphloc.eval.pieces import note, number, table
+from graphloc.eval.pieces import note, table
 from graphloc.eval.plots import HEALTH, OUTAGE
 from graphloc.eval.report._data import ReportData
-from graphloc.eval.report._verdict import Trust, Verdict, main_table, times
+from graphloc.eval.report._judged import Trust, main_table, times
+from graphloc.eval.report._verdict import Verdict
+from graphloc.eval.words import number
 from graphloc.solution import Solution
 
 _REASONS = 60
 _WHOLE = "{name} knows the whole run; the others, at each time, only what came before."
+_KNOWS = {
+    "graphloc": "The whole run (graphloc, offline)",
+    "graphloc online": "At the time (graphloc online)",
+}
 _CLASS = {Trust.YES: "", Trust.WITH_CARE: "care", Trust.NO: "no"}
 # What the first table says of each estimate, where a run has it: column, heading, digits.
 _KEY = (
@@ -27,13 +33,21 @@ _WIDE = ("95 %, m", "worst, m", "covered")  # a phone does without
 
 
 def first_screen(data: ReportData, verdict: Verdict) -> str:
-    """How good, compared with the filters, whether to trust it, and what was truth."""
-    reasons = "".join(f'<li class="{_CLASS[r.trust]}">{escape(r.text)}</li>' for r in verdict.reasons)
+    """How good, compared with the filters, whether to trust it, and what was truth; each track by itself."""
+    several = len(verdict.tracks) > 1
+    boxes, lists = [], []
+    for track in verdict.tracks:
+        said = track.trust.said
+        named = f"{_KNOWS[track.name]}: {said}" if several else said.capitalize()
+        boxes.append(
+            f'<div class="verdict" style="--trust:{track.trust.value}"><b>{escape(named)}.</b> {escape(track.accuracy)}</div>'
+        )
+        reasons = "".join(f'<li class="{_CLASS[r.trust]}">{escape(r.text)}</li>' for r in track.reasons)
+        head = f"<h3>{escape(track.name)}: why</h3>" if several else ""
+        lists.append(f'{head}<ul class="reasons">{reasons}</ul>')
     return (
-        f'<div class="verdict" style="--trust:{verdict.trust.value}"><b>{verdict.trust.said.capitalize()}.</b> '
-        f"{escape(verdict.accuracy)}</div>"
-        f"{_key_numbers(data)}"
-        f'<p><b>What it is measured against.</b> {escape(data.truth_statement)}</p><ul class="reasons">{reasons}</ul>'
+        f"{''.join(boxes)}{_key_numbers(data)}"
+        f"<p><b>What it is measured against.</b> {escape(data.truth_statement)}</p>{''.join(lists)}"
     )
 
 
@@ -56,10 +70,13 @@ def _key_numbers(data: ReportData) -> str:
         first_of, *rest = (number(row[c], digits) for c, _, digits in columns)
         rows.append([name, first_of, ratio, *rest, *(_percent(row[c]) for c, _ in shares)])
     wide = [k for k, said in enumerate(head) if said in _WIDE]
+    whys = "".join(note(f"{f.name}: {f.why}.") for f in data.filters if f.why and f.name in values)
     said = "" if data.solution.stats.online or len(values) < 2 else _WHOLE.format(name=data.solution.name)
-    return table(
-        head, rows, ["ours" if name == data.solution.name else "" for name in values], wide=wide, kind="key"
-    ) + note(said)
+    return (
+        table(head, rows, ["ours" if name == data.solution.name else "" for name in values], wide=wide, kind="key")
+        + note(said)
+        + whys
+    )
 
 
 def _percent(value: float | None) -> str:
@@ -68,9 +85,8 @@ def _percent(value: float | None) -> str:
 
 def warnings_list(data: ReportData) -> str:
     """Return what was said on the way."""
-    lines = (*data.recording.warnings, *data.solution.stats.warnings)
-    items = "".join(f'<li class="warning">{escape(line)}</li>' for line in lines)
-    return f'<h2 id="warnings">Warnings</h2><ul class="warnings">{items}</ul>' if lines else ""
+    items = "".join(f'<li class="warning">{escape(line)}</li>' for line in data.warnings)
+    return f'<h2 id="warnings">Warnings</h2><ul class="warnings">{items}</ul>' if items else ""
 
 
 def numbers(given: Table) -> str:

@@ -10,9 +10,10 @@ import numpy as np
 from graphloc.build import mount_of
 from graphloc.eval.docking import accurate_within_m
 from graphloc.eval.metrics import NoCommonTimeError, compare_to_truth, held_out_errors
-from graphloc.eval.pieces import note, number, table
+from graphloc.eval.pieces import note, table
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._printed import BL_RUNS, DIGERUD_RUNS
+from graphloc.eval.words import number
 from graphloc.measurements import GnssPosition, PoseFix, TagSighting
 from graphloc.trajectory import Trajectory
 

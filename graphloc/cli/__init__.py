@@ -6,12 +6,13 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from graphloc import __version__
 from graphloc.cli import _about, _estimate, _evidence, _simulate, _sweep, _whatif
+from graphloc.cli._shared import Stopped
 from graphloc.errors import GraphlocError
 
 app = typer.Typer(
@@ -53,17 +54,36 @@ def _root(
 
 
 _INTERRUPTED = 130  # what typer makes of Ctrl-C, as shells do
+_USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException: that of click, or of typer's own, by typer's version
 
 
 def main() -> None:
-    """Run the command line; known errors become one line and exit 2."""
+    """Run the command line; known errors, wrong options among them, become one line and exit 2."""
     try:
-        app()
+        code = app(standalone_mode=False)
+    except Stopped as error:
+        _interrupted(str(error))
     except GraphlocError as error:
-        print(f"graphloc: {error}", file=sys.stderr)
-        sys.exit(2)
-    except SystemExit as end:
-        if end.code != _INTERRUPTED:
-            raise
-        print("graphloc: interrupted; nothing was left half-written", file=sys.stderr, flush=True)
-        os._exit(_INTERRUPTED)  # at once: the solver's thread may be deep in a step that cannot be stopped
+        _fail(str(error))
+    except _USAGE as error:
+        text = " ".join(error.format_message().split())
+        if not text:  # nothing was asked for: the help was printed
+            sys.exit(error.exit_code)
+        path = error.ctx.command_path if getattr(error, "ctx", None) else "graphloc"
+        _fail(f"{text.rstrip('.')}; see {path} --help")
+    except typer.Abort:
+        _fail("given up: nothing was done")
+    if code == _INTERRUPTED:
+        _interrupted("nothing was left half-written")
+    sys.exit(code or 0)
+
+
+def _fail(text: str) -> NoReturn:
+    print(f"graphloc: {text}", file=sys.stderr)
+    sys.exit(2)
+
+
+def _interrupted(said: str) -> NoReturn:
+    bar = "\r\033[K" if sys.stderr.isatty() else ""  # what a progress bar left in the line
+    print(f"{bar}graphloc: interrupted; {said}", file=sys.stderr, flush=True)
+    os._exit(_INTERRUPTED)  # at once: the solver's thread may be deep in a step that cannot be stopped

@@ -16,21 +16,20 @@ from graphloc.cli._shared import (
     FiguresOption,
     HoldOutOption,
     JsonOption,
+    LagOption,
     OutOption,
     OverwriteOption,
     RerunOption,
-    check_rerun,
-    print_run,
+    Wanted,
     progress,
     smooth_bags,
     status_line,
-    write_rerun,
 )
 
 
 def inspect(
     bag: BagArgument,
-    config: Annotated[Path, typer.Option("--write", "-w", "-o", help="Where to write the first vessel.yaml.")] = Path(
+    config: Annotated[Path, typer.Option("--write", "-o", help="Where to write the first vessel.yaml.")] = Path(
         "vessel.yaml"
     ),
     overwrite: OverwriteOption = False,
@@ -62,7 +61,8 @@ def smooth(
     as_json: JsonOption = False,
 ) -> None:
     """Smooth a whole run and write the run folder with its report."""
-    smooth_bags(bag, config, out, hold_out, overwrite, as_json, compare=False, figures=figures, rerun=rerun)
+    wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun)
+    smooth_bags(wanted, hold_out, compare=False)
 
 
 def replay(
@@ -72,7 +72,7 @@ def replay(
     rate: Annotated[
         float | None, typer.Option(min=0.01, help="Times the run's own time, as 1; by default as fast as it can.")
     ] = None,
-    lag: Annotated[float, typer.Option(min=1.0, help="How long measurements are re-judged, s.")] = 10.0,
+    lag: LagOption = 10.0,
     figures: FiguresOption = False,
     rerun: RerunOption = None,
     overwrite: OverwriteOption = False,
@@ -80,19 +80,14 @@ def replay(
 ) -> None:
     """Run a bag through the online mode, as a vessel would have, and write the run folder."""
     from graphloc import app as application
-    from graphloc import outputs
 
-    outputs.check_folder(out, overwrite=overwrite)
-    check_rerun(rerun, overwrite)
-    recording, vessel = application.load(bag, config, progress())
-    scans = application.Scans(tuple(bag), config.parent)
+    wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun)
+    wanted.check()
+    recording, vessel, scans = wanted.load(progress())
     run = application.replay_recording(recording, vessel, scans=scans, rate=rate, lag_s=lag, status=status_line())
     if sys.stderr.isatty():
         sys.stderr.write("\r\033[K")
-    command = " ".join(sys.argv[1:])
-    report = application.write(run, out, inputs=bag, command=command, overwrite=overwrite, figures=figures)
-    write_rerun(rerun, run, bag, config)
-    print_run(run, report, as_json)
+    wanted.write(run)
 
 
 def stream(
@@ -101,7 +96,7 @@ def stream(
         float | None, typer.Option("--rate", min=0.001, max=1000.0, help="Estimates a second; default: each new state.")
     ] = None,
     ledger: Annotated[bool, typer.Option("--ledger", help="Write rows of the ledger, too.")] = False,
-    lag: Annotated[float, typer.Option("--lag", min=1.0, help="How long measurements are re-judged, s.")] = 10.0,
+    lag: LagOption = 10.0,
     snapshot: Annotated[Path | None, typer.Option("--snapshot", help="File to resume from after a restart.")] = None,
 ) -> None:
     """Read measurements from standard input, write estimates to standard output: lines of JSON (docs/online-stream.md)."""

@@ -16,6 +16,7 @@ from graphloc.cli._shared import (
     OutOption,
     OverwriteOption,
     RerunOption,
+    Wanted,
     smooth_bags,
 )
 
@@ -48,7 +49,10 @@ def compare(
     if not runs:
         if config is None:
             raise ConfigError(f"{bag[0]}: a bag needs its vessel.yaml: give --config")
-        smooth_bags(bag, config, out, hold_out, overwrite, as_json, compare=True, figures=figures, rerun=rerun)
+        wanted = Wanted(
+            bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun
+        )
+        smooth_bags(wanted, hold_out, compare=True)
         return
     other = next((path for path in bag if path not in runs), None)
     if other is not None:

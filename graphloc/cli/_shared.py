@@ -6,10 +6,23 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from graphloc.errors import GraphlocError
+
+if TYPE_CHECKING:  # heavy: they wait until a command runs
+    from graphloc.app import Run, Scans
+    from graphloc.config import VesselConfig
+    from graphloc.recording import Recording
+
+
+class Stopped(GraphlocError):
+    """Ctrl-C, and what became of the work so far."""
+
 
 BagArgument = Annotated[list[Path], typer.Argument(help="A ROS 1 or ROS 2 bag; several for the parts of a split one.")]
 ConfigOption = Annotated[Path, typer.Option("--config", "-c", help="The vessel.yaml.")]
@@ -22,6 +35,11 @@ FiguresOption = Annotated[bool, typer.Option("--figures", help="Write the figure
 RerunOption = Annotated[
     Path | None, typer.Option("--rerun", help="Write the run for the rerun viewer, too: out.rrd (docs/rerun.md).")
 ]
+LagOption = Annotated[float, typer.Option("--lag", min=1.0, help="How long measurements are re-judged, s.")]
+JobsOption = Annotated[
+    int | None, typer.Option("--jobs", min=1, help="Processes beside each other; by default one a core.")
+]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Same seed, same run.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the numbers as JSON.")]
 
 
@@ -70,15 +88,23 @@ def status_line() -> Callable[[float, float, object, str], None]:
     return show
 
 
-def print_run(run: object, report: Path, as_json: bool) -> None:
+def print_run(run: Run, page: Path, as_json: bool, rerun: Path | None = None) -> None:
     from graphloc import app as application
+    from graphloc.eval import report
 
-    assert isinstance(run, application.Run)
-    found = application.tables(run)
-    warnings = (*run.recording.warnings, *run.solution.stats.warnings)
+    data = application.report_data(run)
+    found, warnings = data.tables, data.warnings
     if as_json:
         numbers = {t.title: t.as_dict() for t in found}
-        told = {"ledger": run.solution.ledger.counts(), "converged": run.solution.stats.converged, "warnings": warnings}
+        verdicts = {
+            t.name: {"said": t.trust.said, "why": [r.text for r in t.reasons]} for t in report.verdict(data).tracks
+        }
+        told: dict[str, object] = {
+            "verdict": verdicts,
+            "ledger": run.solution.ledger.counts(),
+            "converged": run.solution.stats.converged,
+            "warnings": warnings,
+        }
         if run.calibration is not None:
             told["calibration"] = run.calibration.as_dict()
         typer.echo(json.dumps({**numbers, **told}, indent=2))
@@ -87,13 +113,20 @@ def print_run(run: object, report: Path, as_json: bool) -> None:
             typer.echo(application.truth_statement(run))
         for table in found:
             typer.echo(table.as_text())
+        for track in report.verdict(data).tracks:
+            typer.echo(f"{track.name}: {track.trust.said}. {track.accuracy}")
+            for reason in track.reasons:
+                if reason.trust is not report.Trust.YES:
+                    typer.echo(f"  {reason.text}")
         for name, counts in run.solution.ledger.counts().items():
             typer.echo(f"  {name}: " + ", ".join(f"{n} {outcome}" for outcome, n in counts.items()))
         for warning in warnings:
             typer.echo(f"warning: {warning}", err=True)
         for suggestion in run.calibration.suggestions if run.calibration is not None else ():
             typer.echo(f"calibration: {suggestion}", err=True)
-    typer.echo(str(report))
+    typer.echo(str(page))
+    if rerun is not None:
+        typer.echo(str(rerun))
 
 
 def check_rerun(path: Path | None, overwrite: bool) -> None:
@@ -112,39 +145,59 @@ def check_rerun(path: Path | None, overwrite: bool) -> None:
     check_writable(path)
 
 
-def write_rerun(path: Path | None, run: object, bag: list[Path], config: Path) -> None:
-    from graphloc import app as application
+def write_rerun(path: Path | None, run: Run, bag: list[Path], config: Path) -> None:
     from graphloc.eval import rerun_log
 
     if path is not None:
-        assert isinstance(run, application.Run)
         told = (run.solution, run.recording, run.config, run.filters)
         rerun_log.write_rerun(path, *told, bags=bag, folder=config.parent)
 
 
-def smooth_bags(
-    bag: list[Path],
-    config: Path,
-    out: Path,
-    hold_out: str | None,
-    overwrite: bool,
-    as_json: bool,
-    compare: bool,
-    figures: bool = False,
-    rerun: Path | None = None,
-) -> None:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wanted:
+    """What a command is to read and write: as its options have it."""
+
+    bag: list[Path]
+    config: Path
+    out: Path
+    overwrite: bool
+    as_json: bool
+    figures: bool = False
+    rerun: Path | None = None
+
+    def check(self, mark: str = "") -> None:
+        """Refuse before the work what could not be written after it; `mark`: the file by which a folder is known as ours."""
+        from graphloc import outputs
+
+        outputs.check_folder(self.out, overwrite=self.overwrite, mark=mark or outputs.MARK)
+        check_rerun(self.rerun, self.overwrite)
+
+    def load(self, show: Callable[[str, int, int], None]) -> tuple[Recording, VesselConfig, Scans]:
+        """Read the bag and its vessel.yaml."""
+        from graphloc import app as application
+
+        recording, vessel = application.load(self.bag, self.config, show)
+        return recording, vessel, application.Scans(tuple(self.bag), self.config.parent)
+
+    def write(self, run: Run) -> None:
+        """Write the run folder, and tell of it."""
+        from graphloc import app as application
+
+        command = " ".join(sys.argv[1:])
+        page = application.write(
+            run, self.out, inputs=self.bag, command=command, overwrite=self.overwrite, figures=self.figures
+        )
+        write_rerun(self.rerun, run, self.bag, self.config)
+        print_run(run, page, self.as_json, self.rerun)
+
+
+def smooth_bags(wanted: Wanted, hold_out: str | None = None, *, compare: bool) -> None:
     from graphloc import app as application
-    from graphloc import outputs
     from graphloc.eval.holdout import HoldOut
 
     held = None if hold_out is None else HoldOut.parse(hold_out)
-    outputs.check_folder(out, overwrite=overwrite)
-    check_rerun(rerun, overwrite)
+    wanted.check()
     show = progress()
-    recording, vessel = application.load(bag, config, show)
-    scans = application.Scans(tuple(bag), config.parent)
+    recording, vessel, scans = wanted.load(show)
     run = application.smooth_recording(recording, vessel, hold_out=held, compare=compare, scans=scans, progress=show)
-    command = " ".join(sys.argv[1:])
-    report = application.write(run, out, inputs=bag, command=command, overwrite=overwrite, figures=figures)
-    write_rerun(rerun, run, bag, config)
-    print_run(run, report, as_json)
+    wanted.write(run)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from graphloc.cli._shared import OutOption, OverwriteOption, progress, smooth_bags
+from graphloc.cli._shared import OutOption, OverwriteOption, SeedOption, Wanted, progress, smooth_bags
 
 
 def pairs(changes: list[str]) -> dict[str, str]:
@@ -25,7 +25,7 @@ def pairs(changes: list[str]) -> dict[str, str]:
 def simulate(
     scenario: Annotated[str, typer.Argument(help="bl1-drift, dock-fixed-fog, ...: a wrong name lists them.")],
     out: OutOption,
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same run.")] = 0,
+    seed: SeedOption = 0,
     ros: Annotated[int, typer.Option(min=1, max=2, help="ROS version of the bag.")] = 2,
     storage: Annotated[str, typer.Option(help="mcap or sqlite3, of a ROS 2 bag.")] = "",
     harbour: Annotated[str, typer.Option(help="Another harbour than the scenario's: a name or a file.")] = "",
@@ -52,7 +52,8 @@ def simulate(
 
 
 def demo(
-    out: OutOption = Path("runs/demo"), seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated run.")] = 0
+    out: OutOption = Path("runs/demo"),
+    seed: SeedOption = 0,
 ) -> None:
     """Simulate a harbour run with drifting GNSS and 40 % false matches, smooth it from its bag, and compare."""
     from graphloc.eval.simulate import harbour_scenarios
@@ -61,4 +62,4 @@ def demo(
 
     run = run_simulation(replace(harbour_scenarios()["bl1-drift"], lidar_hz=0.0), seed)  # its matches are made up
     bag, config = write_bag(run, out.parent / f"{out.name}-bag", ros=2, overwrite=True, progress=progress())
-    smooth_bags([bag], config, out, None, True, False, compare=True)
+    smooth_bags(Wanted(bag=[bag], config=config, out=out, overwrite=True, as_json=False), compare=True)

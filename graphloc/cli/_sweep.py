@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from graphloc.cli._shared import HoldOutOption, OutOption, OverwriteOption, progress
+from graphloc.cli._shared import HoldOutOption, OutOption, OverwriteOption, Stopped, progress
 
 
 class _Mode(StrEnum):
@@ -83,8 +83,7 @@ def sweep(
     try:
         table = run_sweep(jobs, out, workers=workers, scheduler=scheduler, overwrite=overwrite, progress=progress())
     except KeyboardInterrupt:
-        typer.echo(f"{out}: keeps the runs that are done; the same command goes on from there", err=True)
-        raise
+        raise Stopped(f"{out} keeps the runs that are done; the same command goes on from there") from None
     typer.echo(summary(table))
     typer.echo(str(out / "table.parquet"))
     if all(row["error"] for row in table):

@@ -13,13 +13,14 @@ from graphloc.cli._shared import (
     BagArgument,
     ConfigOption,
     HoldOutOption,
+    JobsOption,
     JsonOption,
     OutOption,
     OverwriteOption,
+    SeedOption,
+    Wanted,
     progress,
 )
-
-_JobsOption = Annotated[int | None, typer.Option(min=1, help="Processes beside each other; by default one a core.")]
 
 
 def ablate(
@@ -27,21 +28,20 @@ def ablate(
     config: ConfigOption,
     out: OutOption,
     hold_out: HoldOutOption = None,
-    jobs: _JobsOption = None,
+    jobs: JobsOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Smooth a run without each sensor in turn: what each is worth, and whether one contradicts the rest."""
-    from graphloc import app as application
     from graphloc import outputs, whatif
     from graphloc.eval import ablation_page as page
     from graphloc.eval.holdout import HoldOut
 
     held = None if hold_out is None else HoldOut.parse(hold_out)
-    outputs.check_folder(out, overwrite=overwrite, mark=page.MARK)
+    wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json)
+    wanted.check(page.MARK)
     show = progress()
-    recording, vessel = application.load(bag, config, show)
-    scans = application.Scans(tuple(bag), config.parent)
+    recording, vessel, scans = wanted.load(show)
     found = whatif.ablate(
         recording, vessel, scans=scans, hold_out=held, jobs=jobs or os.cpu_count() or 1, progress=show
     )
@@ -64,20 +64,19 @@ def drill(
         list[str] | None,
         typer.Option("--set", help="Part of the names of the drills wanted, as outage; again for more."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same failures.")] = 0,
-    jobs: _JobsOption = None,
+    seed: SeedOption = 0,
+    jobs: JobsOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Strike a run with harbour failures: what smoother, online mode and EKFs make of them."""
-    from graphloc import app as application
     from graphloc import drills, outputs
     from graphloc.eval.drill import page
 
-    outputs.check_folder(out, overwrite=overwrite, mark=page.MARK)
+    wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json)
+    wanted.check(page.MARK)
     show = progress()
-    recording, vessel = application.load(bag, config, show)
-    scans = application.Scans(tuple(bag), config.parent)
+    recording, vessel, scans = wanted.load(show)
     found = drills.drill(
         recording,
         vessel,

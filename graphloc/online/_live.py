@@ -7,14 +7,13 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, Generic, TypeVar
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from graphloc.build import Carry, Mounts, company_of, mount_of
+from graphloc.chi2 import chi2_median
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProcess
@@ -25,11 +24,6 @@ T = TypeVar("T")
 # Residuals that say how wide a sensor scatters: with 50, a compass that is 100 deg off for 7 s is then taken for a wide one,
 # and turns the vessel.
 _REMEMBERED = 300
-
-
-@cache
-def _chi2_median(dof: int) -> float:
-    return float(chi2.median(dof))
 
 
 class Tape(Generic[T]):
@@ -141,7 +135,7 @@ class LiveStream:
         """Remember a squared normalised residual; `spread` is how many times wider than configured they are, at least 1."""
         self.scatter.append(nis)
         if len(self.scatter) >= dof + 4:
-            self.spread = max(1.0, float(np.sqrt(np.median(self.scatter) / _chi2_median(dof))))
+            self.spread = max(1.0, float(np.sqrt(np.median(self.scatter) / chi2_median(dof))))
 
 
 @dataclass(slots=True, eq=False)

@@ -299,9 +299,10 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
             cure = "no IMU is that noisy: look for a wrong mount, unit, axis convention, time offset or sensor"
         else:
             cure = (
-                "set accel_noise_ug_per_sqrt_hz and gyro_noise_mdps_per_sqrt_hz accordingly, or look for a wrong mount, or "
-                "for tags that are surveyed as fixed and float"
+                "set accel_noise_ug_per_sqrt_hz and gyro_noise_mdps_per_sqrt_hz accordingly, or look for a wrong mount"
             )
+            if any(stream.constants for stream in problem.streams):
+                cure += ", or for tags that are surveyed as fixed and float"
         warnings.append(f"{said}; {cure}")
     cost = 2.0 * float(result.graph.error(result.values))
     if expected > 0 and cost > _NO_FIT * expected:

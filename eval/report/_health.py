@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an estimate says of itself over time: how long it was good, and when not, why, and what would end that."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from graphloc.eval.pieces import note, table
+from graphloc.frames import Array
+from graphloc.solution import Health, Solution
+from graphloc.time import seconds_since
+
+_LONGEST = 12  # stretches that a table has
+_STEP_S = 1.0  # between two poses: beyond, there was no estimate (as `Trajectory.covers` has it)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stretch:
+    """A time in which an estimate says the same of itself, s since the begin of the run's track; `reason`: its first."""
+
+    health: Health
+    reason: str
+    begin_s: float
+    end_s: float
+
+
+def _lasting_s(solution: Solution) -> Array:
+    """How long (N,) s each pose stands for: until the next, but not over a hole."""
+    t = seconds_since(int(solution.trajectory.stamps_ns[0]), solution.trajectory.stamps_ns)
+    step = np.diff(t, append=t[-1])
+    return np.asarray(np.where(step <= _STEP_S, step, 0.0))
+
+
+def durations_s(solution: Solution) -> dict[Health, float]:
+    """Return how long an estimate calls itself what, s; only of what it has been."""
+    lasting = _lasting_s(solution)
+    called = np.array([h.value for h in solution.health])
+    return {health: float(lasting[called == health.value].sum()) for health in Health if health.value in called}
+
+
+def shares(solution: Solution) -> dict[Health, float]:
+    """Return the share of its poses that an estimate calls good and so on; only of what it has been."""
+    return {h: solution.health.count(h) / len(solution.health) for h in Health if h in solution.health}
+
+
+def stretches(solution: Solution, begin_ns: int) -> list[Stretch]:
+    """Return when it was not good. Reasons that differ in numbers alone are one."""
+    t = seconds_since(begin_ns, solution.trajectory.stamps_ns)
+    ends = t + _lasting_s(solution)
+
+    def kind(k: int) -> tuple[Health, str]:
+        return solution.health[k], re.sub(r"\d[\d.]*", "#", solution.health_reason[k])
+
+    found = []
+    for (health, _), group in groupby(range(len(t)), key=kind):
+        inside = list(group)
+        if health is not Health.GOOD:
+            first, last = inside[0], inside[-1]
+            reason = solution.health_reason[first]
+            found.append(Stretch(health=health, reason=reason, begin_s=float(t[first]), end_s=float(ends[last])))
+    return found
+
+
+def said_of(solution: Solution) -> str:
+    """Return the states with their shares and durations, as 'good for 80% (64 s), degraded for 20% (16 s)'."""
+    lasting = durations_s(solution)
+    told = [f"{_words(h)} for {share:.0%} ({_seconds(lasting[h])})" for h, share in shares(solution).items()]
+    return ", ".join(told)
+
+
+def cure(health: Health, reason: str) -> str:
+    """Say what would end a state that is less than good."""
+    if "heading is a guess" in reason:
+        return "a sensor of the heading (compass, two antennas), or start.heading_deg"
+    if health is Health.LOST:
+        return "a fix, match or tag that agrees, and for a heading a compass or a way of some metres"
+    if health is Health.DEAD_RECKONING:
+        return "a fix, match or tag that agrees"
+    if "missing or not agreeing" in reason:
+        sensors = reason.split(" missing or not agreeing")[0]
+        return f"{sensors} back and in agreement; the ledger says what became of its measurements"
+    if "95 % bound" in reason:
+        return "a better fix, or a second sensor of the place (match, tag)"
+    return "what the warnings name: noise, mounts, stamps"
+
+
+def section(solutions: Sequence[Solution], begin_ns: int) -> str:
+    """Return when each estimate was less than good, the longest times first, as HTML; empty where all are good."""
+    parts = []
+    for solution in solutions:
+        every = stretches(solution, begin_ns)
+        longest = sorted(every, key=lambda s: s.begin_s - s.end_s)[:_LONGEST]
+        rows = [
+            [f"{_words(s.health)}", f"{s.begin_s:.0f} to {s.end_s:.0f}", _seconds(s.end_s - s.begin_s), s.reason,
+             cure(s.health, s.reason)]
+            for s in longest
+        ]  # fmt: skip
+        if rows:
+            left = (
+                f" The {_LONGEST} longest of {len(every)} times; solution.csv has all." if len(every) > _LONGEST else ""
+            )
+            head = ("", "s of the track", "for", "why", "what ends it")
+            parts.append(
+                f"<h3>{solution.name}: {said_of(solution)}</h3>{table(head, rows, text=(3, 4))}{note(left.strip())}"
+            )
+    return "".join(parts)
+
+
+def _words(health: Health) -> str:
+    return health.value.replace("_", " ")
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.0f} s" if value >= 9.95 else f"{value:.1f} s"

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far a track can be relied on, one reason at a time: the offline one and the online one are asked the same."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphloc.chi2 import CHI2_95
+from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_covariance
+from graphloc.eval.report._data import ReportData
+from graphloc.eval.report._health import said_of, shares
+from graphloc.frames import Array
+from graphloc.solution import Health, Solution
+from graphloc.trajectory import Trajectory, bounds_95
+
+# Shares of the run: called good, called lost, covered by the 95 % bounds, compared at all; beyond, a reader has to look closer.
+_MOSTLY, _LOST, _COVERED, _NOT_COVERED, _MATCHED, _STARTED = 0.5, 0.05, 0.85, 0.5, 0.95, 0.8
+_FAR_OFF = 3.0  # cost over its expectation; `degraded` from there on
+_TOO_SURE = 4.0  # NEES: errors are 1.4 times what the covariance says
+# Of the time in which online's 95 % bounds hold the offline position: that one is better informed, so honest ones do for 95 %.
+_HOLDS_OFFLINE = 0.9
+_WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
+
+
+class Trust(enum.StrEnum):
+    """How far the report says that a run can be relied on; the value is its colour."""
+
+    YES = "#009E73"
+    WITH_CARE = "#E69F00"
+    NO = "#D55E00"
+
+    @property
+    def said(self) -> str:
+        """In words."""
+        return {Trust.YES: "can be trusted", Trust.WITH_CARE: "use with care", Trust.NO: "do not rely on it"}[self]
+
+
+_ORDER = (Trust.YES, Trust.WITH_CARE, Trust.NO)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reason:
+    """A sentence, and how far it alone lets a track be trusted."""
+
+    trust: Trust
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """What a report says first of a track.
+
+    Attributes:
+        name: of the track. accuracy: how good, in a sentence; says so where nothing measures it.
+        reasons: why to trust it, and why not.
+    """
+
+    name: str
+    accuracy: str
+    reasons: tuple[Reason, ...]
+
+    @property
+    def trust(self) -> Trust:
+        """That of the worst reason."""
+        return worst(r.trust for r in self.reasons)
+
+
+def worst(of: Iterator[Trust]) -> Trust:
+    """Return the least of some."""
+    return max(of, key=_ORDER.index, default=Trust.YES)
+
+
+def judged(data: ReportData, solution: Solution) -> Judged:
+    """Judge a track of a run."""
+    reasons = (
+        *_bounds(data, solution), *_beside(data, solution), *_from_offline(data, solution), *_compared(data, solution),
+        *_solved(data, solution),
+    )  # fmt: skip
+    return Judged(name=solution.name, accuracy=_accuracy(data, solution.name), reasons=reasons)
+
+
+def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """What the estimate says of itself, and whether that was so."""
+    assert solution.trajectory.cov is not None
+    bound = float(np.percentile(bounds_95(solution.trajectory.cov)[:, 0], 95))
+    called = shares(solution)
+    doubtful = called.get(Health.GOOD, 0.0) < _MOSTLY or called.get(Health.LOST, 0.0) > _LOST
+    yield Reason(
+        trust=Trust.WITH_CARE if doubtful else Trust.YES,
+        text=f"It states a 95 % bound of {bound:.2f} m or better for 95 % of the run, and calls itself {said_of(solution)}.",
+    )
+    covered, headed, nees = (
+        of(data, solution.name, column) for column in ("coverage_95", "heading_coverage_95", "nees")
+    )
+    if covered is not None:
+        too_sure = nees is not None and nees > _TOO_SURE
+        trust = Trust.NO if covered < _NOT_COVERED else Trust.WITH_CARE if covered < _COVERED or too_sure else Trust.YES
+        why = ". The bounds are far too small: a mount, the datum or a noise is wrong" if trust is Trust.NO else ""
+        why = why or ("; they are too small" if trust is Trust.WITH_CARE else "")
+        beside = "" if nees is None else f" (NEES {nees:.1f}; 2 where they are honest)"
+        yield Reason(trust=trust, text=f"Its 95 % bounds held the truth for {covered:.0%} of the time{beside}{why}.")
+    if headed is not None:
+        trust = Trust.WITH_CARE if headed < _COVERED else Trust.YES
+        yield Reason(trust=trust, text=f"Its heading bounds held the truth for {headed:.0%} of the time.")
+
+
+def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """The filters that are nearer the truth, or the fixes that were kept out, over the time that both tracks cover."""
+    for filtered in data.filters:
+        if filtered.name == (data.online.name if data.online else ""):
+            continue
+        both = _errors_of_both(data, solution.trajectory, filtered.trajectory)
+        if both is not None and _rms(both[0]) > _WORSE * _rms(both[1]):
+            ours, theirs = both
+            yield Reason(
+                trust=Trust.WITH_CARE,
+                text=f"{filtered.name} is nearer: RMSE {_rms(theirs):.2f} m, worst {theirs.max():.2f} m, beside "
+                f"{_rms(ours):.2f} m, worst {ours.max():.2f} m, over the time that both cover.",
+            )
+
+
+def _errors_of_both(data: ReportData, ours: Trajectory, theirs: Trajectory) -> tuple[Array, Array] | None:
+    """Horizontal errors (M,) m of two tracks at the stamps that both cover; None where there are none."""
+    truth = data.recording.truth
+    if truth is not None:
+        stamps = truth.stamps_ns[ours.covers(truth.stamps_ns) & theirs.covers(truth.stamps_ns)]
+        if not len(stamps):
+            return None
+        true = truth.at(stamps).p_world_m[:, :2]
+        return _away(ours.at(stamps).p_world_m[:, :2] - true), _away(theirs.at(stamps).p_world_m[:, :2] - true)
+    at = np.array([m.stamp_ns for m in data.held], dtype=np.int64)
+    held = [m for m, both in zip(data.held, ours.covers(at) & theirs.covers(at), strict=True) if both]
+    if not held:
+        return None
+    first, second = (held_out_errors(t, held, data.solution.datum, data.levers_m)[1] for t in (ours, theirs))
+    return _away(first), _away(second)
+
+
+def _away(error: Array) -> Array:
+    return np.asarray(np.hypot(error[:, 0], error[:, 1]))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """Where there is no truth, the online track against the offline one, which knows more."""
+    if solution is not data.online or data.recording.truth is not None:
+        return
+    _, error, turned, there, _ = errors(solution.trajectory, data.solution.trajectory)
+    assert there.cov is not None
+    off = _away(error)
+    placed = float(np.mean(squared_over_covariance(error, there.cov) <= CHI2_95[2]))
+    headed = float(np.mean(turned**2 <= CHI2_95[1] * there.cov[:, 5, 5]))
+    short = min(placed, headed) < _HOLDS_OFFLINE
+    trust = Trust.NO if placed < _NOT_COVERED else Trust.WITH_CARE if short else Trust.YES
+    said = "; honest ones hold it for 95 % or more, as offline knows more: they are too small" if short else ""
+    yield Reason(
+        trust=trust,
+        text=f"It is {_rms(off):.2f} m from the offline track (RMS), {off.max():.2f} m at most; its own 95 % bounds hold the "
+        f"offline position for {placed:.0%} of the time, the offline heading for {headed:.0%}{said}.",
+    )
+
+
+def _compared(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """What there was to hold it against."""
+    if main_table(data) is None:
+        text = "Nothing here measures how far off it is: there is neither truth nor a fix that was kept out."
+        if solution.stats.online and data.online is None:
+            text += " `graphloc compare` holds it against the offline track, which knows more."
+        yield Reason(trust=Trust.WITH_CARE, text=text)
+        return
+    matched = of(data, solution.name, "matched")
+    if matched is None or matched >= _MATCHED:
+        return
+    if solution.stats.online and matched >= _STARTED:
+        text = f"It covers {matched:.0%} of what it is compared with: it begins when place and heading can be told."
+        yield Reason(trust=Trust.YES, text=text)
+        return
+    text = f"It covers only {matched:.0%} of what it is compared with; the filters may cover more."
+    yield Reason(trust=Trust.WITH_CARE, text=text)
+
+
+def _solved(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """How the solver fared, and what was said on the way."""
+    stats = solution.stats
+    if stats.online:
+        yield Reason(trust=Trust.YES, text="Online: each pose is as it was known at its time.")
+    elif not stats.converged:
+        yield Reason(trust=Trust.NO, text="The solver did not converge: do not rely on this run.")
+    else:
+        ratio = stats.cost / max(stats.expected_cost, 1.0)
+        trust = Trust.WITH_CARE if ratio > _FAR_OFF else Trust.YES
+        text = (
+            f"The solver converged; the measurements disagree with it {ratio:.2f} times as much as they say they may."
+        )
+        yield Reason(trust=trust, text=text)
+    about_all = len(data.recording.warnings) if solution is data.solution else 0
+    warnings = about_all + len(stats.warnings)
+    if warnings:
+        text = f"There {'are' if warnings > 1 else 'is'} {warnings} warning{'s' if warnings > 1 else ''}, below."
+        yield Reason(trust=Trust.WITH_CARE, text=text)
+
+
+def of(data: ReportData, name: str, column: str) -> float | None:
+    """An estimate's number in the first table that has such a column."""
+    return next((t.as_dict()[name][column] for t in data.tables if column in t.columns and name in t.as_dict()), None)
+
+
+def main_table(data: ReportData) -> tuple[Table, str] | None:
+    """The table that says how far off the estimates are, and its column that says it shortest."""
+    for table in data.tables:
+        key = next((k for k in ("position_rmse_m", "horizontal_rmse_m") if k in table.columns), None)
+        if key is not None:
+            return table, key
+    return None
+
+
+def _accuracy(data: ReportData, name: str) -> str:
+    found = main_table(data)
+    values = {} if found is None else found[0].as_dict()
+    key = "" if found is None else found[1]
+    mine = values.get(name, {}).get(key)
+    if mine is None:
+        return "How good it is cannot be said."
+    most = values[name].get(key.replace("rmse", "max"))
+    said = f"Horizontal RMSE {mine:.2f} m" + ("" if most is None else f", worst {most:.2f} m")
+    others = {n: v for n, row in values.items() if n != name and (v := row[key]) is not None}
+    if name != data.solution.name:  # the offline track is no rival: it knows what came later
+        others.pop(data.solution.name, None)
+    beside = ", ".join(
+        f"{n} {value:.2f} m" + (f" ({times(value, mine)})" if mine > 0.0 else "") for n, value in others.items()
+    )
+    return f"{said}; beside it: {beside}." if beside else f"{said}."
+
+
+def times(value: float, mine: float) -> str:
+    """Say how many times as large as ours a number is."""
+    ratio = value / mine
+    return f"{ratio:.0f} x" if ratio >= 9.95 else f"{ratio:.1f} x" if ratio >= 0.095 else f"{ratio:.2f} x"

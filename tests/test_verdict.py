@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict answers for the online track as for the offline one; and when an estimate was less than good."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.eval.ekf import FilterResult
+from graphloc.eval.metrics import Table
+from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verdict
+from graphloc.eval.report._health import cure, section
+from graphloc.eval.simulate import Scenario, simulate
+from graphloc.ledger import Ledger
+from graphloc.solution import Health, Solution
+from graphloc.trajectory import Trajectory
+
+
+@pytest.fixture(scope="module")
+def data() -> ReportData:
+    """A run whose offline and online tracks are the truth, with 1 m of sigma, and no filter beside them."""
+    found = app.report_data(app.simulated(simulate(Scenario(duration_s=20.0), 3), compare=True))
+    truth, online = found.recording.truth, found.online
+    assert truth is not None
+    assert online is not None
+
+    def perfect(solution: Solution) -> Solution:
+        stamps = solution.trajectory.stamps_ns[truth.covers(solution.trajectory.stamps_ns)]
+        track = replace(truth.at(stamps), cov=np.tile(np.eye(6), (len(stamps), 1, 1)))
+        n = len(stamps)
+        good = replace(solution, trajectory=track, health=(Health.GOOD,) * n, health_reason=("",) * n)
+        return replace(good, stats=replace(solution.stats, warnings=(), converged=True))
+
+    recording = replace(found.recording, warnings=())
+    return replace(
+        found, recording=recording, solution=perfect(found.solution), online=perfect(online), filters=(),
+        tables=table(0.95, 2.0),
+    )  # fmt: skip
+
+
+def table(covered: float, nees: float) -> tuple[Table, ...]:
+    """Numbers against truth, those of the online mode as given."""
+    columns = ("position_rmse_m", "position_max_m", "coverage_95", "nees")
+    return (
+        Table("Against truth", columns, (("graphloc", (0.1, 0.2, 0.95, 2.0)), ("graphloc online", (0.24, 0.9, covered, nees)))),
+    )  # fmt: skip
+
+
+def moved(track: Trajectory, share: float, by_m: float) -> Trajectory:
+    """Shift the first share of a track to the east; its covariance says 1 m."""
+    p = track.p_world_m.copy()
+    p[: round(share * len(p)), 0] += by_m
+    return replace(track, p_world_m=p, v_world_mps=None)
+
+
+@pytest.mark.parametrize(
+    ("covered", "nees", "expected"),
+    [(0.95, 2.0, Trust.YES), (0.75, 2.0, Trust.WITH_CARE), (0.9, 5.5, Trust.WITH_CARE), (0.3, 20.0, Trust.NO)],
+)
+def test_the_online_track_is_judged_by_its_own_numbers(
+    data: ReportData, covered: float, nees: float, expected: Trust
+) -> None:
+    said = verdict(replace(data, tables=table(covered, nees)))
+    offline, online = said.tracks
+    assert (offline.name, online.name) == ("graphloc", "graphloc online")
+    assert offline.trust is Trust.YES
+    assert online.trust is said.trust is expected
+    assert online.accuracy == "Horizontal RMSE 0.24 m, worst 0.90 m."  # not beside the offline one, which knows more
+    assert any(f"held the truth for {covered:.0%}" in r.text and f"NEES {nees:.1f}" in r.text for r in online.reasons)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.02, Trust.YES), (0.2, Trust.WITH_CARE), (0.7, Trust.NO)])
+def test_without_truth_online_is_held_against_offline(data: ReportData, share: float, expected: Trust) -> None:
+    """3 m off with 1 m of sigma is outside the 95 % region, whose radius is 2.45 m; elsewhere it is on the offline track."""
+    assert data.online is not None
+    online = replace(data.online, trajectory=moved(data.online.trajectory, share, 3.0))
+    said = verdict(
+        replace(data, recording=replace(data.recording, truth=None), online=online, tables=(held_table(),))
+    ).tracks[1]
+    assert said.trust is expected
+    (text,) = (r.text for r in said.reasons if "from the offline track" in r.text)
+    assert float(text.split()[2]) == pytest.approx(3.0 * np.sqrt(share), rel=0.1)  # RMS of 3 m over that share
+    assert "3.00 m at most" in text
+    assert ("too small" in text) == (expected is not Trust.YES)
+
+
+def held_table() -> Table:
+    rows = (("graphloc", (0.1,)), ("graphloc online", (0.2,)))
+    return Table("Against held-out fixes", ("horizontal_rmse_m",), rows)
+
+
+def test_a_filter_that_is_nearer_is_said(data: ReportData) -> None:
+    """A filter that is 0.1 m off beside tracks that are 0 and 0.2 m off: nearer than one of them."""
+    assert data.online is not None
+    track = data.solution.trajectory
+    filtered = FilterResult(name="some EKF", trajectory=moved(track, 1.0, 0.1), ledger=Ledger())
+    online = replace(data.online, trajectory=moved(data.online.trajectory, 1.0, 0.2))
+    offline, judged = verdict(replace(data, filters=(filtered,), online=online)).tracks
+    assert not any("nearer" in r.text for r in offline.reasons)
+    (found,) = (r for r in judged.reasons if "nearer" in r.text)
+    assert found.trust is Trust.WITH_CARE
+    assert found.text.startswith("some EKF is nearer: RMSE 0.10 m, worst 0.10 m, beside 0.20 m, worst 0.20 m")
+
+
+def test_when_it_was_less_than_good(data: ReportData) -> None:
+    """States at 10 Hz: dead reckoning from 2 s, numbers in its reason changing, good again from 5 s, degraded to the end."""
+    stamps = np.arange(0, 10_000_000_000, 100_000_000, dtype=np.int64)
+    n = len(stamps)
+    track = Trajectory(stamps_ns=stamps, p_world_m=np.zeros((n, 3)), R_world_body=np.tile(np.eye(3), (n, 1, 1)))
+    health = [Health.GOOD] * n
+    why = [""] * n
+    for k in range(20, 50):
+        health[k], why[k] = Health.DEAD_RECKONING, f"no position for {k / 10:.1f} s"
+    for k in range(80, n):
+        health[k], why[k] = Health.DEGRADED, "compass missing or not agreeing"
+    solution = replace(data.solution, trajectory=track, health=tuple(health), health_reason=tuple(why))
+    first, second = stretches(solution, 0)
+    assert first.health is Health.DEAD_RECKONING
+    assert (first.begin_s, first.end_s) == pytest.approx((2.0, 5.0))
+    assert first.reason == "no position for 2.0 s"
+    assert second.health is Health.DEGRADED
+    assert (second.begin_s, second.end_s) == pytest.approx((8.0, 9.9))
+    lasting = durations_s(solution)
+    assert lasting[Health.DEAD_RECKONING] == pytest.approx(3.0)
+    assert lasting[Health.GOOD] == pytest.approx(5.0)
+    page = section([solution], 0)
+    assert "<td>2 to 5</td><td>3.0 s</td>" in page
+    assert "good for 50% (5.0 s), degraded for 20% (1.9 s), dead reckoning for 30% (3.0 s)" in page
+    assert section([data.solution], 0) == ""  # all good
+    hole = np.concatenate([stamps[:50], stamps[50:] + 60_000_000_000])
+    with_hole = replace(solution, trajectory=replace(track, stamps_ns=hole))
+    assert durations_s(with_hole)[Health.DEAD_RECKONING] == pytest.approx(2.9)  # a minute without an estimate is none
+
+
+def test_what_would_end_it_is_said_of_the_cause() -> None:
+    assert cure(Health.DEGRADED, "compass, gnss missing or not agreeing").startswith("compass, gnss back")
+    assert "start.heading_deg" in cure(Health.LOST, "95 % bound 3 m, heading 60 deg; the heading is a guess: 2 explain")
+    assert "fix" in cure(Health.DEAD_RECKONING, "no absolute position agrees")
