@@ -25,6 +25,7 @@ from graphloc.eval.digerud import run_digerud
 from graphloc.eval.docking import docking_table
 from graphloc.eval.match_picture import Gallery
 from graphloc.eval.plots import Underlay
+from graphloc.eval.posture import posture_warnings
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.tag_check import suspect_tags
 from graphloc.eval.underlay import underlay
@@ -102,6 +103,7 @@ def smooth_recording(
     if compare:
         filters = _causal(recording, config, datum, progress)
     tags, said = _about_tags(recording, config, solution)
+    said += posture_warnings(solution.trajectory, recording, config)
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
         filters=filters, pictures=tuple(gallery.pictures()), tags=tags,
