@@ -20,6 +20,8 @@ from graphloc.frontends._reports import (
 )
 from graphloc.frontends.decode import IMU
 
+_LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
+_COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
 
@@ -217,9 +219,12 @@ def _compass_block(name: str, compass: CompassReport) -> list[str]:
     ]
     if compass.offset_deg is not None and abs(compass.offset_deg) > 10.0:
         quarter = 90.0 * round(compass.offset_deg / 90.0)
-        yaw = quarter if abs(compass.offset_deg - quarter) < 15.0 else round(compass.offset_deg)
+        rest = abs(compass.offset_deg - quarter)
+        yaw, sigma = (quarter, rest) if rest < 15.0 else (round(compass.offset_deg), _LEEWAY_DEG)
         lines.append(f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course")
-    elif compass.offset_deg is not None and abs(compass.offset_deg) > 2.0:
+        if sigma > _COMPASS_SIGMA_DEG:
+            lines.append(f"  mount_offset_sigma_deg: {sigma:.1f}  # guess: a course is no heading, and tells no more")
+    elif compass.offset_deg is not None and abs(compass.offset_deg) > _COMPASS_SIGMA_DEG:
         lines.append(
             f"  mount_offset_sigma_deg: {abs(compass.offset_deg):.1f}  # guess: as far as it is off the GNSS course"
         )

@@ -101,8 +101,9 @@ class ImuConfig(SensorConfig):
     """Unit of `linear_acceleration` in the bag (REP 103 says m/s^2; some drivers write g)."""
     gyro_unit: Literal["rad/s", "deg/s"] = "rad/s"
     """Unit of `angular_velocity` in the bag."""
-    gravity: Literal["included", "removed"] = "included"
-    """Whether `linear_acceleration` holds gravity (+g upwards at rest, the standard) or the driver removed it."""
+    gravity: Literal["included", "removed", "inverted"] = "included"
+    """Whether `linear_acceleration` holds gravity (+g upwards at rest, the standard), or the driver removed it; `inverted`:
+    the driver writes accelerations with the opposite sign (-g upwards at rest), while its gyroscope is right."""
     accel_noise_ug_per_sqrt_hz: Positive = 3000.0
     """Accelerometer white noise, ug/sqrt(Hz). The default allows for hull vibration."""
     gyro_noise_mdps_per_sqrt_hz: Positive = 20.0
