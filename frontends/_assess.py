@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import _clock
+from graphloc.frontends._fixes import scatter_m
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
@@ -94,9 +95,9 @@ def track(fixes: Stream) -> tuple[NDArray[np.int64], Array, Array]:
     return fixes.stamps_ns[keep], datum.enu_from_geodetic(rows[:, 0], rows[:, 1], rows[:, 2]), rows
 
 
-def courses_of(stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float) -> Courses:
+def courses_of(stamps_ns: NDArray[np.int64], p_m: Array, noise_m: float) -> Courses:
     """Return the direction of chords of the track long enough that its noise does not turn them."""
-    reach = max(3.0, 8.0 * scatter_m)
+    reach = max(3.0, 8.0 * noise_m)
     at, course = [], []
     j = 0
     for i in range(len(stamps_ns)):
@@ -141,6 +142,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         extent_m=(float(np.ptp(p[:, 0])), float(np.ptp(p[:, 1]))),
         travelled_m=float(np.hypot(chords[:, 0], chords[:, 1]).sum()),
         first=vec(rows[0, :3]),
+        white_m=scatter_m(stamps, p[:, :2]),
         slow_error=not precise,
         why=why,
         tf_frame=tf_frame,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from graphloc.config import ImuConfig, SlowErrorConfig
 from graphloc.frontends._clock import EPOCH_LIMIT_S
+from graphloc.frontends._fixes import SCATTERS
 from graphloc.frontends._reports import (
     CompassReport,
     GnssReport,
@@ -182,6 +183,13 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # /tf_static knows it")
     else:
         lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
+    if gnss.white_m is not None and gnss.reported_sigma_m is not None:
+        claimed = max(gnss.reported_sigma_m[:2])
+        if gnss.white_m > SCATTERS * claimed:
+            lines.append(
+                f"  sigma_scale: {gnss.white_m / claimed:.1f}  # guess: fixes scatter by {gnss.white_m:.2f} m from one to the "
+                f"next, and claim {claimed:.2f} m"
+            )
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
     if wanders:
         lines.append(f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m")

@@ -23,6 +23,7 @@ from graphloc.frontends._readings import (
     Readings,
     clock_warnings,
     imu_series,
+    judge_fixes,
     reject_far,
     reject_jumps,
     reject_repeats,
@@ -84,7 +85,7 @@ def read_recording(
             imu, more = imu_series(readings, warnings)
             rows += more
         else:
-            rows += reject_repeats(readings) + reject_far(readings, config, warnings)
+            rows += reject_repeats(readings) + reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
             measurements += [v for v in readings.values if isinstance(v, Measurement)]
     if imu is not None:
         warnings += _turn_warnings(imu, sensors)
