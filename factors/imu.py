@@ -43,7 +43,7 @@ class Links:
         self._max_gap_ns = int(config.max_gap_s * 1e9)
         mount = gtsam.Pose3(gtsam.Rot3(R_body_imu), np.zeros(3))
         self._noise_scale = noise_scale
-        self._gravity_mps2 = gravity_mps2 if config.gravity == "included" else 0.0
+        self._gravity_mps2 = gravity_mps2 if config.gravity != "removed" else 0.0
         self._params = self._make_params(
             config.accel_noise_mps2 * noise_scale, config.gyro_noise_radps * noise_scale, mount
         )

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import _clock
+from graphloc.frontends._fixes import scatter_m
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
@@ -94,9 +95,9 @@ def track(fixes: Stream) -> tuple[NDArray[np.int64], Array, Array]:
     return fixes.stamps_ns[keep], datum.enu_from_geodetic(rows[:, 0], rows[:, 1], rows[:, 2]), rows
 
 
-def courses_of(stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float) -> Courses:
+def courses_of(stamps_ns: NDArray[np.int64], p_m: Array, noise_m: float) -> Courses:
     """Return the direction of chords of the track long enough that its noise does not turn them."""
-    reach = max(3.0, 8.0 * scatter_m)
+    reach = max(3.0, 8.0 * noise_m)
     at, course = [], []
     j = 0
     for i in range(len(stamps_ns)):
@@ -141,6 +142,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         extent_m=(float(np.ptp(p[:, 0])), float(np.ptp(p[:, 1]))),
         travelled_m=float(np.hypot(chords[:, 0], chords[:, 1]).sum()),
         first=vec(rows[0, :3]),
+        white_m=scatter_m(stamps, p[:, :2]),
         slow_error=not precise,
         why=why,
         tf_frame=tf_frame,
@@ -183,21 +185,27 @@ class Turning:
     turned_rad: Array
 
 
-def _against_turning(turning: Turning | None, at_ns: NDArray[np.int64], angle: Array) -> int:
-    """Return +1 where an angle grows as the craft turns to port, -1 where it falls, 0 where nothing tells."""
+def against_turning(
+    turning: Turning | None, at_ns: NDArray[np.int64], angle: Array, over_s: float = 2.0, clear: float = 0.5
+) -> int:
+    """Return +1 where an angle grows as the craft turns to port, -1 where it falls, 0 where nothing tells.
+
+    Args:
+        at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: time over which changes are compared: a gyro's bias
+            must be small beside them, and the angle's noise average out. clear: correlation that is believed.
+    """
     if turning is None:
         return 0
     at = (at_ns - turning.origin_ns) / NS_PER_S
     inside = (at > turning.t_s[0]) & (at < turning.t_s[-1])
     if inside.sum() < 20:
         return 0
-    # Changes over 2 s: a gyro's bias is small beside them, a compass's noise averages out.
-    step = max(1, round(2.0 / max(float(np.median(np.diff(at[inside]))), 1e-3)))
+    step = max(1, round(over_s / max(float(np.median(np.diff(at[inside]))), 1e-3)))
     turned = np.interp(at[inside], turning.t_s, turning.turned_rad)
     a, b = (v[step:] - v[:-step] for v in (angle[inside], turned))
     power = float(np.sqrt((a**2).sum() * (b**2).sum()))
     together = float((a * b).sum()) / power if power > 0.0 else 0.0
-    return int(np.sign(together)) if abs(together) > 0.5 else 0
+    return int(np.sign(together)) if abs(together) > clear else 0
 
 
 def _quaternions(stream: Stream, rows: Array) -> Array:
@@ -231,7 +239,7 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
         )
     angle = np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
     named = stream.msgtype != IMU  # a topic of bare headings is meant as a compass
-    sense = _against_turning(turning, stream.stamps_ns[keep][good], angle)
+    sense = against_turning(turning, stream.stamps_ns[keep][good], angle)
     by_gyro = {1: "enu", -1: "ned"}.get(sense)
     if courses is None or len(courses.stamps_ns) < 20:
         why = "no GNSS course in motion to check it by" + (", the convention by the gyro" if by_gyro else "")

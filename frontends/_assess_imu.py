@@ -3,20 +3,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
-from graphloc.frontends._assess import Motion, Turning, sane, vec
+from graphloc.frontends._assess import Courses, Motion, Turning, against_turning, sane, vec
 from graphloc.frontends._reports import ImuReport, MountGuess
-from graphloc.frontends._sanity import NEVER_STILL_RADPS
+from graphloc.frontends._sanity import NEVER_STILL_RADPS, without_gravity
 from graphloc.frontends._streams import Stream
 from graphloc.frontends._tf import StaticTree
 from graphloc.time import NS_PER_S
 
 _WINDOW_S = 1.0
+# Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
+_COURSE_S, _COURSE_CLEAR = 12.0, 0.6
+_UPSIDE_DOWN_DEG = 150.0
 _MIN_COHERENCE = 0.25  # and 4 / sqrt(windows), four times what chance gives
 
 
@@ -115,7 +120,66 @@ def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> T
     return Turning(origin, t, turned)
 
 
-def imu_report(imu: Stream, motion: Motion | None, tree: StaticTree, body: str) -> ImuReport | None:
+def _against_courses(imu: Stream, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str) -> int:
+    """Return +1 where the gyro turns as the course of the fixes does, -1 where the other way round, 0 where nothing tells."""
+    if courses is None or len(courses.stamps_ns) < 20:
+        return 0
+    turning, course = turning_of(imu, report, tree, body), np.unwrap(courses.course_rad)
+    return against_turning(turning, courses.stamps_ns, course, _COURSE_S, _COURSE_CLEAR)
+
+
+def _righted(
+    report: ImuReport,
+    imu: Stream,
+    samples: tuple[Array, Array],
+    motion: Motion | None,
+    courses: Courses | None,
+    tree: StaticTree,
+    body: str,
+) -> ImuReport:
+    """Return the report, its accelerations taken with the opposite sign where that alone fits the courses.
+
+    Levelled by accelerations of the wrong sign, a sensor lies on its back, and its gyroscope turns the wrong way.
+    Where /tf_static knows the mount, the gyroscope turns rightly, and gravity points down.
+
+    Args:
+        samples: acceleration (N, 3) m/s^2 and rate (N, 3) rad/s of the `sane` samples.
+    """
+    sense = _against_courses(imu, report, courses, tree, body)
+    accel, gyro = samples
+    if sense == 0:
+        return report
+    pose = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
+    against = "its gyro turns against the courses of the fixes"
+    if pose is None and sense < 0 and report.gravity == "removed":
+        mount = MountGuess(
+            rpy_deg=(180.0, 0.0, 0.0),
+            tf_frame=None,
+            evidence=f"{against}: taken as lying on its back; no gravity to tell",
+        )
+        return replace(report, mount=mount)
+    if pose is None and sense < 0:
+        why = f"{against}: its accelerations look inverted, or its axes are left-handed; check the sensor"
+        mount = mount_guess(imu, -accel, gyro, motion, tree, body)
+        mount = replace(mount, evidence=f"with accelerations inverted, {mount.evidence}")
+        return replace(report, gravity="inverted", mount=mount, why=(*report.why, why))
+    if pose is None:
+        return report
+    up = np.asarray(pose[1]) @ np.median(accel, axis=0)
+    upside_down = float(up[2]) < np.cos(np.radians(_UPSIDE_DOWN_DEG)) * float(np.linalg.norm(up))
+    if sense < 0:
+        why = f"{against}: the mount in /tf_static is upside down, or its axes are left-handed; check both"
+        return replace(report, why=(*report.why, why))
+    if upside_down and report.gravity == "included":
+        why = "with the mount in /tf_static its gyro turns as the fixes do, but gravity points down: accelerations look inverted"
+        mount = replace(report.mount, evidence="/tf_static knows it")
+        return replace(report, gravity="inverted", mount=mount, why=(*report.why, why))
+    return report
+
+
+def imu_report(
+    imu: Stream, motion: Motion | None, courses: Courses | None, tree: StaticTree, body: str
+) -> ImuReport | None:
     """Return units, gravity, standstill, noise and mount of an IMU."""
     keep = sane(imu)
     rows = imu.rows[keep] if len(keep) else np.zeros((0, 13))
@@ -127,8 +191,8 @@ def imu_report(imu: Stream, motion: Motion | None, tree: StaticTree, body: str) 
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     rate = float(np.median(np.linalg.norm(gyro, axis=1)))
     why = []
-    accel_unit = "g" if 0.9 < size < 1.1 else "m/s^2"
-    gravity = "removed" if size < 0.5 else "included"
+    gravity = "removed" if without_gravity(accel) else "included"
+    accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
     gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS else "rad/s"
     if accel_unit == "g":
         why.append(f"median acceleration is {size:.2f}: looks like g")
@@ -156,7 +220,7 @@ def imu_report(imu: Stream, motion: Motion | None, tree: StaticTree, body: str) 
         return float(np.sqrt(variance)) * root_dt / unit if np.isfinite(variance) and variance > 0.0 else None
 
     ug, mdps = 1e-6 * STANDARD_GRAVITY_MPS2, np.radians(1e-3)
-    return ImuReport(
+    report = ImuReport(
         topic=imu.topic,
         gravity_size=size,
         gravity_axis=vec(up / max(float(np.linalg.norm(up)), 1e-9)),
@@ -172,6 +236,7 @@ def imu_report(imu: Stream, motion: Motion | None, tree: StaticTree, body: str) 
         reported_gyro_mdps=reported(11, mdps),
         mount=mount_guess(imu, accel, gyro, motion, tree, body),
     )
+    return _righted(report, imu, (accel, gyro), motion, courses, tree, body)
 
 
 def _standstill(stamps: NDArray[np.int64], accel: Array, gyro: Array, motion: Motion | None) -> NDArray[np.bool_]:

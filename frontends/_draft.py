@@ -9,6 +9,7 @@ from pathlib import Path
 
 from graphloc.config import ImuConfig, SlowErrorConfig
 from graphloc.frontends._clock import EPOCH_LIMIT_S
+from graphloc.frontends._fixes import SCATTERS
 from graphloc.frontends._reports import (
     CompassReport,
     GnssReport,
@@ -20,6 +21,8 @@ from graphloc.frontends._reports import (
 )
 from graphloc.frontends.decode import IMU
 
+_LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
+_COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
 
@@ -180,6 +183,13 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # /tf_static knows it")
     else:
         lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
+    if gnss.white_m is not None and gnss.reported_sigma_m is not None:
+        claimed = max(gnss.reported_sigma_m[:2])
+        if gnss.white_m > SCATTERS * claimed:
+            lines.append(
+                f"  sigma_scale: {gnss.white_m / claimed:.1f}  # guess: fixes scatter by {gnss.white_m:.2f} m from one to the "
+                f"next, and claim {claimed:.2f} m"
+            )
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
     if wanders:
         lines.append(f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m")
@@ -217,9 +227,12 @@ def _compass_block(name: str, compass: CompassReport) -> list[str]:
     ]
     if compass.offset_deg is not None and abs(compass.offset_deg) > 10.0:
         quarter = 90.0 * round(compass.offset_deg / 90.0)
-        yaw = quarter if abs(compass.offset_deg - quarter) < 15.0 else round(compass.offset_deg)
+        rest = abs(compass.offset_deg - quarter)
+        yaw, sigma = (quarter, rest) if rest < 15.0 else (round(compass.offset_deg), _LEEWAY_DEG)
         lines.append(f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course")
-    elif compass.offset_deg is not None and abs(compass.offset_deg) > 2.0:
+        if sigma > _COMPASS_SIGMA_DEG:
+            lines.append(f"  mount_offset_sigma_deg: {sigma:.1f}  # guess: a course is no heading, and tells no more")
+    elif compass.offset_deg is not None and abs(compass.offset_deg) > _COMPASS_SIGMA_DEG:
         lines.append(
             f"  mount_offset_sigma_deg: {abs(compass.offset_deg):.1f}  # guess: as far as it is off the GNSS course"
         )

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.config import ImuConfig, SensorConfig, VesselConfig
-from graphloc.frontends import _clock, _sanity
+from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SensorConfig, VelocityConfig, VesselConfig
+from graphloc.frontends import _clock, _fixes, _sanity
 from graphloc.frontends.decode import Decoded, ImuSample, Rejection, rejected
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
@@ -136,6 +136,20 @@ def reject_repeats(readings: Readings) -> list[LedgerRow]:
         bad[i] = key in seen
         seen.add(key)
     return readings.drop(bad, rejected("repeated message: same stamp, same value"))
+
+
+def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
+    """Drop fixes that a driver only repeats; say so, and where stamps are cut or the claimed noise is far too small."""
+    if isinstance(readings.config, (GnssConfig, CompassConfig, VelocityConfig)):
+        warnings += _fixes.stamp_warning(readings.sensor, readings.stamps())
+    if not isinstance(readings.config, GnssConfig):
+        return []
+    bad = _fixes.held([v for v in readings.values if isinstance(v, GnssPosition)])
+    warnings += _fixes.held_warning(readings.sensor, bad)
+    rows = readings.drop(bad, rejected("repeats the place of the fix before under a new stamp: no new evidence"))
+    fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
+    warnings += _fixes.scatter_warning(readings.sensor, fixes, readings.config)
+    return rows
 
 
 def _content(value: Decoded) -> object:

@@ -81,6 +81,7 @@ class GnssReport:
     Attributes:
         statuses: fixes by status name; known_covariance: share of fixes that report one.
         reported_sigma_m: median sigma east, north, up; scatter_m: the white part seen in the data, the same.
+        white_m: the horizontal scatter, where fixes come so fast that no motion is in it.
         height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
 
@@ -97,6 +98,7 @@ class GnssReport:
     slow_error: bool
     why: str
     tf_frame: str | None = None
+    white_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

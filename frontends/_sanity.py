@@ -18,6 +18,13 @@ NEVER_STILL_RADPS = 0.5
 """Median rate that no vessel keeps up for a whole run (29 deg/s)."""
 
 
+def without_gravity(accel: Array) -> bool:
+    """Return whether accelerations (N, 3), m/s^2 or g, lack gravity: small, and without a direction that stays."""
+    size = float(np.median(np.linalg.norm(accel, axis=1)))
+    steady = float(np.linalg.norm(np.median(accel, axis=0)))
+    return size < 0.5 or (size < 2.0 and steady < 0.5 * size)
+
+
 def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> list[str]:
     """Return lines on units and gravity of samples (N, 3), (N, 3) as the configuration reads them."""
     if len(accel_mps2) < 10:
@@ -26,8 +33,8 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
     rate = float(np.median(np.linalg.norm(gyro_radps, axis=1)))
     lines = []
     said = f"{sensor}: median acceleration is {g:.2f} m/s^2"
-    if config.gravity == "included" and not 8.5 < g < 11.5:
-        if config.accel_unit == "m/s^2" and 0.9 < g < 1.1:
+    if config.gravity != "removed" and not 8.5 < g < 11.5:
+        if config.accel_unit == "m/s^2" and 0.9 < g < 1.1 and not without_gravity(accel_mps2):
             lines.append(f"{said}: looks like g; set accel_unit: g")
         elif config.accel_unit == "g" and 85.0 < g < 115.0:
             lines.append(f"{said}: looks like m/s^2 already; set accel_unit: m/s^2")

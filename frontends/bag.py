@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from graphloc.config import VesselConfig
+from graphloc.config import CompassConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends._beside import Beside, check_speed, true_trajectory
@@ -23,12 +23,14 @@ from graphloc.frontends._readings import (
     Readings,
     clock_warnings,
     imu_series,
+    judge_fixes,
     reject_far,
     reject_jumps,
     reject_repeats,
 )
 from graphloc.frontends._source import LATEST_NS, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._turns import turn_warnings
 from graphloc.frontends.decode import (
     ODOMETRY,
     POSE,
@@ -41,7 +43,7 @@ from graphloc.frontends.decode import (
     supported_types,
 )
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import ImuSeries, Measurement
+from graphloc.measurements import CompassHeading, ImuSeries, Measurement
 from graphloc.recording import Progress, Recording
 from graphloc.time import duration_ns, utc_text
 
@@ -91,8 +93,10 @@ def read_recording(
             imu, more = imu_series(readings, warnings)
             rows += more
         else:
-            rows += reject_repeats(readings) + reject_far(readings, config, warnings)
+            rows += reject_repeats(readings) + reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
             measurements += [v for v in readings.values if isinstance(v, Measurement)]
+    if imu is not None:
+        warnings += _turn_warnings(imu, sensors)
     warnings += _silent(sensors, rows, topics)
     return Recording(
         source=bag.name,
@@ -275,6 +279,15 @@ def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str
         for name, sensor in config.sensors.items()
         if sensor.enabled and sensor.mount.tf_frame
     }
+
+
+def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
+    lines = []
+    for readings in sensors:
+        if isinstance(readings.config, CompassConfig):
+            headings = [v for v in readings.values if isinstance(v, CompassHeading)]
+            lines += turn_warnings(imu, readings.sensor, headings, readings.config.convention)
+    return lines
 
 
 def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary]) -> list[str]:

@@ -149,6 +149,7 @@ def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -
         if not any(values) and cov[0] == -1.0:
             return malformed(f"the driver says that {name} is absent ({name}_covariance[0] = -1)")
     k = STANDARD_GRAVITY_MPS2 if config.accel_unit == "g" else 1.0
+    k = -k if config.gravity == "inverted" else k
     r = pi / 180.0 if config.gyro_unit == "deg/s" else 1.0
     return ImuSample((k * accel[0], k * accel[1], k * accel[2]), (r * gyro[0], r * gyro[1], r * gyro[2]))
 

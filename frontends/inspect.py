@@ -93,13 +93,13 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     # The best first: what they say is what the others are judged by.
     found_gnss = [g for s in fixes if (g := gnss_report(s, _known(s, tree, body)))]
     found_gnss.sort(key=lambda g: -g.fixes)
-    found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, tree, body))]
-    found_imus.sort(key=lambda i: i.gyro_noise_mdps)
     stamps, p_m, scatter_m, first = _best_track(by_topic, found_gnss)
     frame = found_gnss[0].tf_frame if found_gnss else None
     mount = tree.resolve(body, frame) if frame else None
     antenna = None if mount is None else mount[0]
     courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
+    found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, courses, tree, body))]
+    found_imus.sort(key=lambda i: i.gyro_noise_mdps)
     turning = turning_of(by_topic[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
     candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU)]
     return Inspection(

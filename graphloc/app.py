@@ -24,6 +24,7 @@ from graphloc.eval.digerud import run_digerud
 from graphloc.eval.docking import docking_table
 from graphloc.eval.match_picture import Gallery
 from graphloc.eval.plots import Underlay
+from graphloc.eval.posture import posture_warnings
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
@@ -118,7 +119,7 @@ def smooth_recording(
         beside = ekf.FilterResult(name=online.name, trajectory=online.trajectory, ledger=online.ledger)
         filters = (beside, *filters)
     tags, said = found_tags.about_tags(recording, config, solution)
-    said += [never] if never else []
+    said += [*posture_warnings(solution.trajectory, recording, config), *([never] if never else [])]
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
         filters=filters, online=online, pictures=tuple(gallery.pictures()), tags=tags,

@@ -74,6 +74,20 @@ class KernelConfig(Block):
             return 1.0 / (1.0 + u2) ** 2
         return (1.0 - u2) ** 2 if u2 < 1.0 else 0.0
 
+    def cost(self, nis: float) -> float:
+        """Return what a residual costs under the loss: `nis` where that is small, less beyond the bend."""
+        c2 = self.scale**2
+        u2 = nis / c2
+        if self.kind == "none":
+            return nis
+        if self.kind == "huber":
+            return nis if u2 <= 1.0 else c2 * (2.0 * math.sqrt(u2) - 1.0)
+        if self.kind == "cauchy":
+            return c2 * math.log1p(u2)
+        if self.kind == "geman_mcclure":
+            return c2 * u2 / (1.0 + u2)
+        return c2 / 3.0 * (1.0 - (1.0 - u2) ** 3 if u2 < 1.0 else 1.0)
+
 
 class SensorConfig(Block):
     """What every sensor has."""
@@ -101,8 +115,9 @@ class ImuConfig(SensorConfig):
     """Unit of `linear_acceleration` in the bag (REP 103 says m/s^2; some drivers write g)."""
     gyro_unit: Literal["rad/s", "deg/s"] = "rad/s"
     """Unit of `angular_velocity` in the bag."""
-    gravity: Literal["included", "removed"] = "included"
-    """Whether `linear_acceleration` holds gravity (+g upwards at rest, the standard) or the driver removed it."""
+    gravity: Literal["included", "removed", "inverted"] = "included"
+    """Whether `linear_acceleration` holds gravity (+g upwards at rest, the standard), or the driver removed it; `inverted`:
+    the driver writes accelerations with the opposite sign (-g upwards at rest), while its gyroscope is right."""
     accel_noise_ug_per_sqrt_hz: Positive = 3000.0
     """Accelerometer white noise, ug/sqrt(Hz). The default allows for hull vibration."""
     gyro_noise_mdps_per_sqrt_hz: Positive = 20.0

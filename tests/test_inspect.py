@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from graphloc.config import ImuConfig, VesselConfig, load_config
+from graphloc.config import CompassConfig, ImuConfig, VesselConfig, load_config
 from graphloc.frames import Datum, Geodetic
 from graphloc.frontends._source import Bag, RawMessage
 from graphloc.frontends.bag import read_recording
@@ -136,14 +136,54 @@ def test_wrong_units_are_found(tmp_path: Path) -> None:
     assert read_recording(tmp_path / "run", config).warnings == ()
 
 
-def test_removed_gravity_is_found(tmp_path: Path) -> None:
+@pytest.mark.parametrize("z_down", [False, True], ids=["z up", "z down"])
+def test_accelerations_of_the_wrong_sign_are_found(z_down: bool, tmp_path: Path) -> None:
+    """Levelled by them, the sensor would lie on its back and turn against the fixes."""
     make = Messages(2)
-    items = [
-        (t, at, make.imu(at, (0.05, 0.02, 0.03), (0, 0, 0)) if t == "/imu" else m)
-        for t, at, m in drive(make, seconds=30)
-    ]
-    _, config, _ = look(tmp_path, items, make)
-    assert config.sensors["imu"].gravity == "removed"
+    R = np.diag([1.0, -1.0, -1.0]) if z_down else np.eye(3)
+    _, config, text = look(tmp_path, drive(make, R, accel_scale=-1.0), make)
+    imu = config.sensors["imu"]
+    assert isinstance(imu, ImuConfig)
+    assert imu.gravity == "inverted"
+    np.testing.assert_allclose(imu.mount.R_body_sensor, R, atol=1e-6)
+    assert "turns against the courses" in text
+    assert config.sensors["compass"].convention == "ned"
+    series = read_recording(tmp_path / "run", config).imu
+    assert series is not None
+    np.testing.assert_allclose(np.median(series.accel_mps2, axis=0) @ R.T, (0.0, 0.0, G), atol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("accel", "gyro", "gravity", "words"),
+    [
+        (1.0, 1.0, "included", ""),
+        (-1.0, 1.0, "inverted", "accelerations look inverted"),
+        (1.0, -1.0, "included", "left-handed"),
+    ],
+)
+def test_wrong_signs_with_a_known_mount(accel: float, gyro: float, gravity: str, words: str, tmp_path: Path) -> None:
+    make = Messages(2)
+    edges = [("base_link", "imu_link", (0.0, 0.0, 0.5), (0.0, 0.0, 0.0, 1.0))]
+    items = [*drive(make, accel_scale=accel, gyro_scale=gyro), ("/tf_static", START_NS, make.transforms(edges))]
+    found, config, _ = look(tmp_path, items, make)
+    imu = config.sensors["imu"]
+    assert isinstance(imu, ImuConfig)
+    assert imu.gravity == gravity
+    assert imu.mount.tf_frame == "imu_link"
+    said = " ".join(found.imus[0].why)
+    assert words in said
+    assert bool(words) == bool(said)
+
+
+def test_without_gravity_the_turns_tell_up_from_down(tmp_path: Path) -> None:
+    make = Messages(2)
+    items = drive(make, np.diag([1.0, -1.0, -1.0]))
+    for topic, _, message in items:
+        if topic == "/imu":
+            message.linear_acceleration.z += G
+    found, config, _ = look(tmp_path, items, make)
+    assert found.imus[0].gravity == "removed"
+    np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, np.diag([1.0, -1.0, -1.0]), atol=1e-6)
 
 
 def test_standard_receiver_gets_a_slow_error(tmp_path: Path) -> None:
@@ -154,9 +194,19 @@ def test_standard_receiver_gets_a_slow_error(tmp_path: Path) -> None:
     assert max(found.gnss[0].scatter_m or (1.0,)) < 0.02  # the data are smooth, whatever they claim
 
 
-@pytest.mark.parametrize(("offset_deg", "scatter_deg", "usable"), [(90.0, 2.0, True), (0.0, 60.0, False)])
-def test_imu_orientation_as_compass(tmp_path: Path, offset_deg: float, scatter_deg: float, usable: bool) -> None:
-    """Constant offset to the course: a mount. Wide scatter: only relative, left out, and said."""
+@pytest.mark.parametrize(
+    ("offset_deg", "scatter_deg", "usable", "mount_deg", "sigma_deg"),
+    [
+        (90.0, 2.0, True, 90.0, 1.0),
+        (98.0, 2.0, True, 90.0, 8.0),
+        (40.0, 2.0, True, 40.0, 5.0),
+        (0.0, 60.0, False, 0.0, 0.0),
+    ],
+)
+def test_imu_orientation_as_compass(
+    tmp_path: Path, offset_deg: float, scatter_deg: float, usable: bool, mount_deg: float, sigma_deg: float
+) -> None:
+    """Constant offset to the course: a mount, known as well as a course is a heading. Wide scatter: left out, and said."""
     make = Messages(2)
     rng = np.random.default_rng(0)
     items: list[Item] = []
@@ -172,7 +222,11 @@ def test_imu_orientation_as_compass(tmp_path: Path, offset_deg: float, scatter_d
     (report,) = found.compasses
     assert report.usable is usable
     if usable:
-        assert (report.convention, config.sensors["compass"].mount.rpy_deg) == ("enu", (0.0, 0.0, offset_deg))
+        compass = config.sensors["compass"]
+        assert isinstance(compass, CompassConfig)
+        assert report.convention == "enu"
+        assert compass.mount.rpy_deg == pytest.approx((0.0, 0.0, mount_deg), abs=1.0)
+        assert compass.mount_offset_sigma_deg == pytest.approx(sigma_deg, abs=1.0)
     else:
         assert "compass" not in config.sensors
         assert "orientation of /ahrs: left out as a compass" in text

@@ -94,7 +94,7 @@ class OnlineSmoother:
         self._doubt = ""
         self._noise_scale = 1.0  # of the IMU
         self._fit_ns, self._misfits = 0, 0
-        self._intake = ImuIntake(self._gap_s, bool(imu) and imu[self._imu_name].gravity == "included")
+        self._intake = ImuIntake(self._gap_s, bool(imu) and imu[self._imu_name].gravity != "removed")
         self._unwritable = False
         self._resumable = self._read_snapshot()
         self._buffer: deque[Measurement] = deque()  # while it waits

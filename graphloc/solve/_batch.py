@@ -26,7 +26,7 @@ from graphloc.solve._choices import by_best_chains, judged_by_the_rest, take_mor
 from graphloc.solve._decide import Verdicts, weigh
 from graphloc.solve._grow import grow, solve_start
 from graphloc.solve._optimize import bayes_tree
-from graphloc.solve._passes import Settled, expected_cost, open_passes, settle
+from graphloc.solve._passes import Settled, expected_cost, open_passes, outliers_cost, settle
 
 _MAX_NOISE_ROUNDS = 5
 # Before other choices are tried, the passes need not stand: what creeps on is a choice that confirms itself.
@@ -73,7 +73,8 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
             passes, iterations = passes + passed, iterations + used
         settled = _final_passes(problem, estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
-        ratio = 2.0 * float(settled.graph.error(estimate)) / max(expected_cost(problem, settled.verdicts), 1.0)
+        cost = 2.0 * float(settled.graph.error(estimate)) - outliers_cost(settled.verdicts)
+        ratio = cost / max(expected_cost(problem, settled.verdicts), 1.0)
         if ratio < CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
     return BatchResult(

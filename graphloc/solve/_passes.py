@@ -16,6 +16,7 @@ from graphloc.solve._stretch import moved
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
 _MAX_OPEN_PASSES, _OPEN_SETTLED_M = 4, 0.5
+_OUTLIER = 0.1  # weight under its own kernel below which a measurement is an outlier
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +121,18 @@ def open_passes(
             if done.moved_m < _OPEN_SETTLED_M:
                 break
     return estimate, iterations, passes
+
+
+def outliers_cost(verdicts: Verdicts) -> float:
+    """What measurements that the sensor's own kernel has judged outliers are to 2 x the cost.
+
+    The kernel bends where the sensor's median says, so they are few and far off. No noise of another sensor explains them.
+    """
+    return sum(
+        v.decision.kernel.cost(v.residual.nis())
+        for v in verdicts.values()
+        if v.weight < _OUTLIER and v.decision is not None and v.decision.kernel is not None
+    )
 
 
 def expected_cost(problem: Problem, verdicts: Verdicts) -> float:

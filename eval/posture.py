@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Does a solved track move and float as craft do? Upside down, or sideways all the way, it is a mount that is wrong.
+
+Measurements can agree with such a track: a body is any frame that moves with the craft, so a mount of the IMU that is turned
+by a quarter turns the body with it, and where fixes alone tell the place, nothing else speaks against it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphloc.build import mount_of
+from graphloc.config import VesselConfig
+from graphloc.frames import rpy_from_rotation, wrap_angle
+from graphloc.recording import Recording
+from graphloc.trajectory import Trajectory, bounds_95
+
+_MOVES_MPS = 1.0  # below, a vessel may well drift sideways
+_WAY_M, _MOST = 30.0, 0.6  # least way to judge by; share of it
+_SIDEWAYS_DEG, _TILTED_DEG = 45.0, 45.0
+_KNOWN_DEG = 20.0  # 95 % bound of a heading that is claimed to be known
+_STEADY = 0.8  # length of the mean direction: 1 where the angle is the same all the way
+
+
+def posture_warnings(track: Trajectory, recording: Recording, config: VesselConfig) -> list[str]:
+    """Return lines on a track that goes sideways or astern for most of its way, or lies on its side or back."""
+    found = (_tilted(track), _sideways(track, recording, config))
+    return [line for line in found if line]
+
+
+def _tilted(track: Trajectory) -> str:
+    tilt_deg = (
+        float(np.degrees(np.median(np.arccos(np.clip(track.R_world_body[:, 2, 2], -1.0, 1.0))))) if len(track) else 0.0
+    )
+    if tilt_deg < _TILTED_DEG or track.planar:
+        return ""
+    return (
+        f"the craft is tilted by {tilt_deg:.0f} deg for most of the run: as configured, the IMU lies so; check its "
+        "mount.rpy_deg, and the sign of its accelerations"
+    )
+
+
+def _sideways(track: Trajectory, recording: Recording, config: VesselConfig) -> str:
+    if track.v_world_mps is None or track.cov is None or len(track) < 2:
+        return ""
+    v, step_s = track.v_world_mps, np.diff(track.stamps_ns, append=track.stamps_ns[-1]) / 1e9
+    speed = np.hypot(v[:, 0], v[:, 1])
+    judged = (speed > _MOVES_MPS) & (bounds_95(track.cov)[:, 2] < _KNOWN_DEG) & (step_s < 1.0)
+    way_m = (speed * step_s)[judged]
+    if way_m.sum() < _WAY_M:
+        return ""
+    off = np.asarray(wrap_angle(np.arctan2(v[judged, 1], v[judged, 0]) - track.yaw_rad[judged]))
+    share = float(way_m[np.abs(off) > np.radians(_SIDEWAYS_DEG)].sum() / way_m.sum())
+    if share < _MOST:
+        return ""
+    said = (
+        f"the course is more than {_SIDEWAYS_DEG:.0f} deg off the solved heading for {share:.0%} of the {way_m.sum():.0f} m "
+        f"made above {_MOVES_MPS:.0f} m/s: unless the craft goes sideways or astern"
+    )
+    mean = complex((way_m * np.exp(1j * off)).sum() / way_m.sum())
+    if abs(mean) < _STEADY or recording.imu is None or recording.imu.sensor not in config.sensors:
+        return f"{said}, the heading is wrong: check the IMU's axes (mount, signs of its rates and accelerations), and compasses"
+    _, R_body_imu = mount_of(recording.imu.sensor, config.sensors[recording.imu.sensor], recording.mounts)
+    yaw_deg = float(np.degrees(rpy_from_rotation(R_body_imu)[2]))
+    turned = float(np.degrees(wrap_angle(np.radians(yaw_deg) - np.angle(mean))))
+    return (
+        f"{said}, {recording.imu.sensor}.mount.rpy_deg[2] is about {turned:.0f} instead of {yaw_deg:.0f}, or the heading that "
+        "a compass, a pose sensor or start.heading_deg gives is turned by as much"
+    )

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixes that tell less than they say: places that a driver repeats, stamps that it cuts, noise that a receiver hides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.config import GnssConfig
+from graphloc.frames import Array, Datum
+from graphloc.measurements import GnssPosition
+from graphloc.time import NS_PER_S
+
+_HELD_S = 2.5
+"""A place that is repeated for less, and then changes, was held by a driver; for longer, the receiver itself stands still."""
+_OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp again, from which a line is due
+_FAST_S, _EVEN, _FEWEST = 0.25, 0.2, 100  # steps over which motion hides in no third difference, and how many tell
+SCATTERS = 2.0
+"""Scatter over the claim from which the claim is not believed."""
+
+
+def held(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
+    """Return (N,) which fixes only repeat, under a new stamp, the place of the one before, which then moves on.
+
+    None where that is no habit: at rest a receiver's filter may well say the same twice.
+    """
+    bad = np.zeros(len(fixes), dtype=bool)
+    order = sorted(range(len(fixes)), key=lambda i: (fixes[i].stamp_ns, fixes[i].seq))
+    first = 0
+    for k in range(1, len(order)):
+        if fixes[order[k]].position != fixes[order[first]].position:
+            if fixes[order[k]].stamp_ns - fixes[order[first]].stamp_ns <= _HELD_S * NS_PER_S:
+                bad[order[first + 1 : k]] = True
+            first = k
+    return bad if len(bad) and bad.mean() >= _OFTEN else np.zeros_like(bad)
+
+
+def held_warning(sensor: str, bad: NDArray[np.bool_]) -> list[str]:
+    """Return a line where a driver repeats places, as `held` found."""
+    if not bad.any():
+        return []
+    said = f"{sensor}: {int(bad.sum())} of {len(bad)} fixes repeat the place of the one before under a new stamp, as drivers do "
+    return [f"{said}that publish faster than the receiver measures: each place counts once, at its first stamp"]
+
+
+def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
+    """Return a line where stamps (N,) of different measurements are often the same: a driver cuts them."""
+    moments = np.unique(stamps_ns)
+    if len(moments) < 3 or 1.0 - len(moments) / len(stamps_ns) < _CUT:
+        return []
+    step_s = float(np.median(np.diff(moments))) / NS_PER_S
+    said = (
+        f"{sensor}: {len(stamps_ns)} measurements have {len(moments)} stamps, {step_s:g} s apart: the driver cuts them"
+    )
+    return [
+        f"{said}; times are off by up to that, places by that times the speed, and no bound knows of it: mend the driver"
+    ]
+
+
+def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConfig) -> list[str]:
+    """Return a line where fixes scatter from one to the next by far more than they claim."""
+    if len(fixes) < _FEWEST:
+        return []
+    ordered = sorted(fixes, key=lambda m: (m.stamp_ns, m.seq))
+    lla = np.array([m.position for m in ordered])
+    places = Datum(ordered[0].position).enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])[:, :2]
+    found = scatter_m(np.array([m.stamp_ns for m in ordered], dtype=np.int64), places)
+    variances = np.array([np.diagonal(m.cov_enu_m2)[:2] for m in ordered])
+    claimed = max(
+        config.sigma_scale * float(np.sqrt(np.median(variances, axis=0).max())), config.min_horizontal_sigma_m
+    )
+    if found is None or found < SCATTERS * claimed:
+        return []
+    said = f"{sensor}: its fixes scatter by {found:.2f} m from one to the next, and count as good to {claimed:.2f} m"
+    return [f"{said}: set sigma_scale: {config.sigma_scale * found / claimed:.1f}"]
+
+
+def scatter_m(stamps_ns: NDArray[np.int64], p_m: Array) -> float | None:
+    """Return the white part of the noise of places (N, 2), m, of the worst axis; None where motion could be in it.
+
+    Third differences remove motion where steps are short and even; those of white noise have 20 times its variance.
+    """
+    steps = np.diff(stamps_ns) / NS_PER_S
+    if len(steps) < _FEWEST:
+        return None
+    usual = float(np.median(steps))
+    even = np.abs(steps - usual) < _EVEN * usual
+    good = even[:-2] & even[1:-1] & even[2:]
+    if usual > _FAST_S or good.sum() < _FEWEST:
+        return None
+    third = np.abs(np.diff(p_m, n=3, axis=0))[good]
+    return float(1.4826 * np.median(third, axis=0).max() / np.sqrt(20.0))

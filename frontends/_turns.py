@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Do headings turn as the gyroscope does? The solver, which holds both for true, would blame the IMU's noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array, wrap_angle
+from graphloc.measurements import CompassHeading, ImuSeries
+from graphloc.time import NS_PER_S
+
+_BLOCK_S = 120.0  # within it a gyro's bias and a compass's offset are steady
+_HOLE_S, _STEP_S = 0.5, 2.0
+_TURNS_DEG = 5.0  # RMS of the turns in 2 s, or all in all, from which they tell
+_CLEAR = 0.5  # correlation
+_PART_DEG, _PART = 3.0, 3.0  # least RMS that is said; times the sigma that is claimed
+
+
+def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading], convention: str) -> list[str]:
+    """Return a line where headings turn against the gyroscope, or part from it by far more than they claim.
+
+    The vertical is that of the median acceleration, so no mount is asked; an IMU without gravity tells nothing.
+
+    Args:
+        headings: of one compass, as the configuration reads them. convention: by which it does.
+    """
+    together, power, apart, turns = 0.0, 0.0, [], []
+    for turned, yaw, at_s in _blocks(imu, headings):
+        step = max(1, round(_STEP_S / max(float(np.median(np.diff(at_s))), 1e-3)))
+        if len(at_s) < 20 or step >= len(at_s):
+            continue
+        by_gyro, by_compass = turned[step:] - turned[:-step], wrap_angle(yaw[step:] - yaw[:-step])
+        together += float((by_gyro * by_compass).sum())
+        power += float(np.sqrt((by_gyro**2).sum() * (by_compass**2).sum()))
+        line = np.column_stack([np.ones(len(at_s)), at_s - at_s.mean()])
+        rest = np.unwrap(yaw - turned)
+        apart.append(rest - line @ np.linalg.lstsq(line, rest, rcond=None)[0])
+        turns.append(turned - line @ np.linalg.lstsq(line, turned, rcond=None)[0])
+    if not apart or np.degrees(_rms(turns)) < _TURNS_DEG:
+        return []
+    if together < -_CLEAR * power:
+        other = "enu" if convention == "ned" else "ned"
+        said = f"{sensor}: its headings turn the other way than {imu.sensor}, levelled by its own gravity: set convention: "
+        return [f"{said}{other}; or the signs of {imu.sensor} are wrong (gravity: inverted)"]
+    claimed, part = float(np.degrees(np.median([m.sigma_rad for m in headings]))), float(np.degrees(_rms(apart)))
+    if part < max(_PART_DEG, _PART * claimed):
+        return []
+    said = f"{sensor}: its headings part by {part:.0f} deg (RMS) from the turns of {imu.sensor}, and claim {claimed:.1f} deg: "
+    return [
+        f"{said}magnetic deviation, headings that stick or come late (enabled: false may be better); or the unit of {imu.sensor}'s rates"
+    ]
+
+
+def _blocks(imu: ImuSeries, headings: Sequence[CompassHeading]) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield turned angle by the gyroscope, yaw, and time (s), at the headings of each block without a hole in the IMU."""
+    up = np.median(imu.accel_mps2, axis=0) if len(imu.stamps_ns) else np.zeros(3)
+    size = float(np.linalg.norm(up))
+    if size < 5.0 or len(headings) < 20:  # m/s^2: no gravity in it
+        return
+    t = (imu.stamps_ns - imu.stamps_ns[0]) / NS_PER_S
+    rate = imu.gyro_radps @ (up / size)
+    turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
+    holes: NDArray[np.intp] = np.flatnonzero(np.diff(t) > _HOLE_S)
+    stamps = np.array([m.stamp_ns for m in headings], dtype=np.int64)
+    order = np.argsort(stamps, kind="stable")
+    at = (stamps[order] - imu.stamps_ns[0]) / NS_PER_S
+    yaw = np.array([m.yaw_rad for m in headings])[order]
+    # A block ends where the next hole begins, and after two minutes.
+    part = np.searchsorted(t[holes], at)
+    block = part * (1 + int(t[-1] / _BLOCK_S)) + np.clip(at // _BLOCK_S, 0, t[-1] // _BLOCK_S).astype(int)
+    after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
+    inside = (at >= t[0]) & (at <= t[-1]) & (t[after] - t[after - 1] <= _HOLE_S)
+    for k in np.unique(block[inside]):
+        own = inside & (block == k)
+        yield np.interp(at[own], t, turned), yaw[own], at[own]
+
+
+def _rms(parts: Sequence[Array]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tracks that no craft makes are said: sideways all the way, upside down; and none else."""
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from graphloc import app
+from graphloc.eval.posture import posture_warnings
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.trajectory import Trajectory
+
+QUICK = Scenario(path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, gnss_sigma_m=0.1)
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    return simulate(QUICK, 77)
+
+
+def turned(track: Trajectory, axis: str, degrees: float, heading_sigma_deg: float = 1.0) -> Trajectory:
+    """The track of a body that is turned in the craft."""
+    cov = np.tile(np.eye(6) * np.radians(heading_sigma_deg) ** 2, (len(track), 1, 1))
+    R = track.R_world_body @ Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    return replace(track, R_world_body=R, cov=cov)
+
+
+@pytest.mark.parametrize("degrees", [-120.0, 70.0, 180.0])
+def test_the_mount_that_would_fit_is_named(degrees: float, run: SimulatedRun) -> None:
+    """The simulator's IMU is mounted at a yaw of 90 deg of a body that is turned by b in the craft: at 90 + b of that."""
+    (line,) = posture_warnings(turned(run.truth, "z", degrees), run.recording, run.config)
+    named = re.search(r"imu.mount.rpy_deg\[2\] is about (-?\d+) instead of 90", line)
+    assert named
+    assert (float(named[1]) - (90.0 + degrees) + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=10.0)
+
+
+@pytest.mark.parametrize(("degrees", "sigma_deg"), [(0.0, 1.0), (30.0, 1.0), (90.0, 15.0)])
+def test_nothing_is_said_of(degrees: float, sigma_deg: float, run: SimulatedRun) -> None:
+    """A craft that goes ahead, one that leads by a current, and a heading that is not claimed to be known."""
+    assert posture_warnings(turned(run.truth, "z", degrees, sigma_deg), run.recording, run.config) == []
+
+
+@pytest.mark.parametrize(("axis", "degrees"), [("x", 180.0), ("y", 90.0)])
+def test_a_craft_on_its_back_or_end_is_said(axis: str, degrees: float, run: SimulatedRun) -> None:
+    said = posture_warnings(turned(run.truth, axis, degrees), run.recording, run.config)
+    named = re.search(r"tilted by (\d+) deg", said[0])
+    assert named
+    assert float(named[1]) == pytest.approx(degrees, abs=3.0)
+
+
+def test_a_heading_that_spins_blames_no_mount_by_number(run: SimulatedRun) -> None:
+    spin = Rotation.from_euler("z", np.linspace(0.0, 40.0, len(run.truth))[:, None]).as_matrix()
+    track = replace(turned(run.truth, "z", 0.0), R_world_body=run.truth.R_world_body @ spin)
+    (line,) = posture_warnings(track, run.recording, run.config)
+    assert "the heading is wrong" in line
+    assert "instead of" not in line
+
+
+def test_a_track_that_lies_still_says_nothing(run: SimulatedRun) -> None:
+    still = replace(turned(run.truth, "z", 180.0), v_world_mps=0.1 * np.asarray(run.truth.v_world_mps))
+    assert posture_warnings(still, run.recording, run.config) == []
+
+
+def test_an_imu_turned_in_the_file_is_said_in_the_report(run: SimulatedRun) -> None:
+    """No sensor speaks against it but the compass, whose offset is blamed; the course names the mount."""
+    imu: Any = run.config.sensors["imu"]
+    wrong = imu.model_copy(update={"mount": imu.mount.model_copy(update={"rpy_deg": (2.0, -1.0, 0.0)})})
+    config = run.config.model_copy(update={"sensors": {**run.config.sensors, "imu": wrong}})
+    said = app.smooth_recording(run.recording, config).recording.warnings
+    assert any("unless the craft goes sideways" in line for line in said)
+    assert app.smooth_recording(run.recording, run.config).recording.warnings == run.recording.warnings

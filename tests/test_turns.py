@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Headings against the gyroscope: the other convention, iron, stuck headings; and what must not be said."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.frames import Array
+from graphloc.frontends._turns import turn_warnings
+from graphloc.frontends.bag import read_recording
+from graphloc.measurements import CompassHeading, ImuSeries
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.test_bag_bad_input import vessel
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    """Four minutes of turns, a gyroscope with a bias of 0.5 deg/s."""
+    return simulate(Scenario(path="loops", duration_s=240.0, noise="clean", pose_hz=0.0, gyro_bias_radps=0.01), 31)
+
+
+def of(run: SimulatedRun) -> tuple[ImuSeries, list[CompassHeading]]:
+    assert run.recording.imu is not None
+    return run.recording.imu, [m for m in run.recording.measurements if isinstance(m, CompassHeading)]
+
+
+def changed(headings: list[CompassHeading], change: Callable[[float], float]) -> list[CompassHeading]:
+    return [replace(m, yaw_rad=change(m.yaw_rad)) for m in headings]
+
+
+def turned(imu: ImuSeries, R: Array) -> ImuSeries:
+    return replace(imu, accel_mps2=imu.accel_mps2 @ R.T, gyro_radps=imu.gyro_radps @ R.T)
+
+
+@pytest.mark.parametrize("offset", [0.0, 2.5])
+@pytest.mark.parametrize("axes", ["as it is", "on its back", "on its side"])
+def test_good_headings_are_left_alone(offset: float, axes: str, run: SimulatedRun) -> None:
+    """Whatever the mount of the IMU, which is not asked, and that of the compass."""
+    imu, headings = of(run)
+    R = Rotation.from_euler("x", {"as it is": 0.0, "on its back": 180.0, "on its side": 90.0}[axes], degrees=True)
+    headings = changed(headings, lambda yaw: yaw + offset)
+    assert turn_warnings(turned(imu, R.as_matrix()), "compass", headings, "enu") == []
+
+
+@pytest.mark.parametrize(("convention", "other"), [("enu", "ned"), ("ned", "enu")])
+def test_the_other_convention_is_named(convention: str, other: str, run: SimulatedRun) -> None:
+    imu, headings = of(run)
+    (line,) = turn_warnings(imu, "compass", changed(headings, lambda yaw: np.pi / 2.0 - yaw), convention)
+    assert f"convention: {other}" in line
+
+
+def test_accelerations_of_the_wrong_sign_are_among_the_suspects(run: SimulatedRun) -> None:
+    imu, headings = of(run)
+    (line,) = turn_warnings(replace(imu, accel_mps2=-imu.accel_mps2), "compass", headings, "enu")
+    assert "gravity: inverted" in line
+
+
+def test_iron_that_turns_with_the_vessel_is_said(run: SimulatedRun) -> None:
+    """10 deg x sin(yaw): 7 deg RMS on headings all around."""
+    imu, headings = of(run)
+    (line,) = turn_warnings(imu, "compass", changed(headings, lambda yaw: yaw + np.radians(10.0) * np.sin(yaw)), "enu")
+    assert "magnetic deviation" in line
+    assert turn_warnings(imu, "compass", changed(headings, lambda y: y + np.radians(2.0) * np.sin(y)), "enu") == []
+
+
+def test_headings_that_stick_are_said(run: SimulatedRun) -> None:
+    imu, headings = of(run)
+    stuck = [m if k % 600 < 300 else replace(m, yaw_rad=headings[k - k % 300].yaw_rad) for k, m in enumerate(headings)]
+    (line,) = turn_warnings(imu, "compass", stuck, "enu")
+    assert "stick" in line
+
+
+def test_a_hole_in_the_imu_is_no_turn(run: SimulatedRun) -> None:
+    """What the vessel turned while the IMU was silent, the gyroscope does not know."""
+    imu, headings = of(run)
+    t_s = (imu.stamps_ns - imu.stamps_ns[0]) / 1e9
+    keep = (t_s < 70.0) | (t_s > 85.0)
+    columns = {name: getattr(imu, name)[keep] for name in ("stamps_ns", "accel_mps2", "gyro_radps", "seqs")}
+    cut = replace(imu, **columns)
+    assert turn_warnings(cut, "compass", headings, "enu") == []
+
+
+def test_without_turns_or_gravity_nothing_is_said(run: SimulatedRun) -> None:
+    imu, headings = of(run)
+    wrong = changed(headings, lambda yaw: -yaw)
+    assert turn_warnings(replace(imu, gyro_radps=0.0 * imu.gyro_radps), "compass", wrong, "enu") == []
+    level = replace(imu, accel_mps2=imu.accel_mps2 - np.median(imu.accel_mps2, axis=0))
+    assert turn_warnings(level, "compass", wrong, "enu") == []
+
+
+def test_a_bag_is_looked_at(tmp_path: object) -> None:
+    """0.2 rad/s to port, headings that go to starboard."""
+    make = Messages(2)
+    items: list[Item] = []
+    for k in range(1500):
+        stamp = START_NS + k * S // 50
+        rate = 0.2 * np.sin(0.2 * k / 50.0)
+        items.append(("/imu", stamp, make.imu(stamp, accel=(0, 0, 9.8), gyro=(0, 0, rate))))
+        if k % 5 == 0:
+            half = -0.5 * (1.0 - np.cos(0.2 * k / 50.0))
+            items.append(("/compass", stamp, make.compass(stamp, (0, 0, np.sin(half), np.cos(half)))))
+    path = write_bag(tmp_path / "run", make, items, "mcap")  # type: ignore[operator]
+    for convention, said in (("enu", 1), ("ned", 0)):
+        config = vessel(gnss=None, imu={"topic": "/imu"}, compass={"topic": "/compass", "convention": convention})
+        found = [w for w in read_recording(path, config).warnings if "turn the other way" in w]
+        assert len(found) == said
