@@ -52,7 +52,8 @@ class SolveStats:
         passes: outer passes (re-linearised carries, weights, modes) over the whole run.
         iterations: iterations of the non-linear solver, all passes and windows together.
         states: poses in the graph; factors: factors in the graph.
-        cost: 2 x final weighted cost (a chi-square if the model holds); expected_cost: its degrees of freedom.
+        cost: 2 x final weighted cost, less that of outliers (a chi-square if the model holds); expected_cost: its degrees of
+            freedom.
         converged: whether the last pass moved no state noticeably.
         warnings: one line each, for the report.
         online: each pose is as it was known then; passes, factors and cost say nothing.

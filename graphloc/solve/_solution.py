@@ -20,6 +20,7 @@ from graphloc.recording import Recording
 from graphloc.solution import Health, SlowEstimate, Solution, SolveStats
 from graphloc.solve._batch import BatchResult, expected_cost
 from graphloc.solve._decide import Verdict
+from graphloc.solve._passes import outliers_cost
 from graphloc.trajectory import Trajectory, bounds_95
 
 AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
@@ -304,7 +305,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
             if any(stream.constants for stream in problem.streams):
                 cure += ", or for tags that are surveyed as fixed and float"
         warnings.append(f"{said}; {cure}")
-    cost = 2.0 * float(result.graph.error(result.values))
+    cost = 2.0 * float(result.graph.error(result.values)) - outliers_cost(result.verdicts)
     if expected > 0 and cost > _NO_FIT * expected:
         warnings.append(
             f"the cost is {cost / expected:.1f} times its expectation: noise is configured too small, or a "
