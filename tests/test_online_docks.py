@@ -8,6 +8,7 @@ import pytest
 
 from graphloc import app
 from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
+from graphloc.frames import Array
 from graphloc.replay import replay
 from graphloc.trajectory import Trajectory
 from tests import tagfactory
@@ -22,7 +23,8 @@ def docking() -> SimulatedRun:
     return replace(run, recording=replace(run.recording, measurements=kept))
 
 
-def sigmas_m(track: Trajectory, k: int) -> np.ndarray:
+def sigmas_m(track: Trajectory, k: int) -> Array:
+    assert track.cov is not None
     return np.sqrt(np.diagonal(track.cov[k])[:3])
 
 
