@@ -226,3 +226,29 @@ def test_hints_say_what_the_state_says(row: Sensor) -> None:
         np.testing.assert_allclose(hint.v_world_mps, at.v_world_mps, atol=1e-9)
     says = {"gnss": told.all(), "pose": np.isfinite(hint.yaw_rad), "compass": np.isfinite(hint.yaw_rad)}
     assert says.get(row.kind, True)
+
+
+def test_a_factor_in_the_solvers_tangent_says_nothing_of_where_vessel_and_dock_are() -> None:
+    """Shifted together, a vessel and the dock that it sees look the same - also to a solver that turns shifts otherwise."""
+    row = next(r for r in SENSORS if r.kind == "apriltag")
+    config = config_of(row)
+    at = attachment(row, config)
+    turned = at.T_world_body.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, -0.03, 0.05), np.array([0.3, -0.2, 0.1])))
+    seen = row.ideal(at, config)
+    plain, written = (row.factors(seen, config, a, Decision()) for a in (at, replace(at, T_solver=turned)))
+    here = values_of(at, plain.guesses)
+    for one, other in zip(plain.factors, written.factors, strict=True):
+        assert other.error(here) == pytest.approx(one.error(here), abs=1e-6)
+    there = gtsam.Values(here)
+    there.update(at.pose_key, turned)
+    east = np.array([1.0, 0.0, 0.0])
+    shift = {
+        at.pose_key: np.concatenate([np.zeros(3), turned.rotation().matrix().T @ east]),
+        3: np.concatenate([east, np.zeros(3)]),
+        at.leaf_keys[0]: np.concatenate([east, np.zeros(3)]),
+    }
+    moved = [np.hstack([shift[key] for key in map(int, f.keys())]) for f in written.factors]
+    for factor, step in zip(written.factors, moved, strict=True):
+        assert np.abs(factor.linearize(there).jacobian()[0] @ step).max() < 1e-6
+    stale = [np.abs(f.linearize(there).jacobian()[0] @ s).max() for f, s in zip(plain.factors, moved, strict=True)]
+    assert max(stale) > 1.0  # sigmas a metre, of each sighting

@@ -25,7 +25,7 @@ def docking() -> SimulatedRun:
 
 def sigmas_m(track: Trajectory, k: int) -> Array:
     assert track.cov is not None
-    return np.sqrt(np.diagonal(track.cov[k])[:3])
+    return np.asarray(np.sqrt(np.diagonal(track.cov[k])[:3]))
 
 
 def test_the_last_pose_is_known_as_well_as_to_the_batch_and_no_better() -> None:
