@@ -8,8 +8,12 @@ import pytest
 
 from graphloc import app
 from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
-from graphloc.replay import replay
+from graphloc.online import OnlineSmoother
+from graphloc.online._anchor import without_prior
+from graphloc.online._lag import Lag
+from graphloc.replay import arrivals, replay
 from graphloc.trajectory import Trajectory
 from tests import tagfactory
 
@@ -39,3 +43,44 @@ def test_the_last_pose_is_known_as_well_as_to_the_batch_and_no_better() -> None:
     assert sigmas_m(online, -1) == pytest.approx(sigmas_m(offline, k), rel=0.05)
     assert (np.abs(online.p_world_m[-1] - offline.p_world_m[k]) < 0.5 * sigmas_m(offline, k)).all()
     assert sigmas_m(online, -1)[2] > 0.3  # a tide and a dock of 0.5 m each
+
+
+def test_a_rebuild_does_not_make_it_surer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What closes the chains of dock and tide is no news a second time."""
+    run = docking()
+    recording = app.with_synthetic(run.recording, run.config, app.choose_datum(run.recording, run.config))
+    whole = Lag.commit
+
+    def once(self: Lag) -> None:
+        monkeypatch.setattr(Lag, "commit", whole)
+        raise RuntimeError("planted")
+
+    ends, said = [], []
+    for breaks in (False, True):
+        online = OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, mounts=recording.mounts)
+        for m in arrivals(recording):
+            estimate = online.feed(m)
+            since_s = (m.stamp_ns - run.truth.stamps_ns[0]) * 1e-9
+            if breaks and since_s > 38.0:
+                monkeypatch.setattr(Lag, "commit", once)
+                breaks = False
+            if estimate is not None and since_s > 40.0:
+                ends.append(np.sqrt(np.diagonal(estimate.cov)[:3]))
+                break
+        said = online.events()
+    assert any("rebuilt" in line for line in said)
+    assert ends[1] == pytest.approx(ends[0], rel=0.05)
+
+
+def test_a_prior_that_is_taken_out_was_never_there() -> None:
+    rng = np.random.default_rng(1)
+    half = rng.normal(size=(6, 6))
+    info, pull = np.asarray(half @ half.T + np.eye(6)), rng.normal(size=6)
+    rows, variance = np.array([2, 4]), np.array([0.5, 2.0])
+    closed = info.copy()
+    closed[rows, rows] += 1.0 / variance
+    mean, cov = without_prior(
+        np.asarray(np.linalg.solve(closed, pull)), np.asarray(np.linalg.inv(closed)), rows, variance
+    )
+    assert mean == pytest.approx(np.linalg.solve(info, pull))
+    assert cov == pytest.approx(np.linalg.inv(info))

@@ -118,6 +118,15 @@ def beside(value: Array, joint: Array) -> Beside:
     )
 
 
+def without_prior(mean: Array, cov: Array, rows: Array, variance: Array) -> tuple[Array, Array]:
+    """Return mean (n,) and covariance (n, n) as they would be without a prior on some rows (k,), of mean 0 and variance (k,).
+
+    That is what closes a slow chain: kept in what it goes on from, it would count again at each of its ends.
+    """
+    gain = np.linalg.solve(np.diag(variance) - cov[np.ix_(rows, rows)], cov[rows]).T
+    return mean + gain @ mean[rows], cov + gain @ cov[rows]
+
+
 def sound(cov: Array) -> Array:
     """Return the covariance, symmetric, and positive where rounding took that away."""
     whole = 0.5 * (cov + cov.T)

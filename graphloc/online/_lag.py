@@ -35,7 +35,7 @@ from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
-from graphloc.online._anchor import Anchor, Beside, beside
+from graphloc.online._anchor import Anchor, Beside, beside, without_prior
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window, keys_of
 from graphloc.solve._decide import NEGLIGIBLE, Verdict, by_hypotheses
@@ -144,8 +144,7 @@ class Lag:
                 window.guess(key, np.zeros(len(stream.slow.sigma)) if known is None else known.value, 0.0)
                 window.add([slow_begin(stream.slow, key, np.zeros(len(stream.slow.sigma)))]
                            if known is None else [anchor.beside(known, state[0], key)])  # fmt: skip
-                if known is None:
-                    self._ends[stream.name] = window.add(slow_end(stream.slow, key))
+                self._ends[stream.name] = window.add(slow_end(stream.slow, key))
             for k, key in enumerate(constant_keys(stream)):
                 if (stream.name, k) in anchor.constants:
                     self._known[key] = anchor.constants[(stream.name, k)]
@@ -623,7 +622,7 @@ class Lag:
         return 2.0 * self._window.error() / max(expected, 1.0)
 
     def anchor(self) -> Anchor:
-        """Return what is known at the newest state."""
+        """Return what is known at the newest state, but for what closes the slow chains: they go on from here."""
         timeline, window = self.problem.timeline, self._window
         k = timeline.last
         j = timeline.slow_of[k]
@@ -633,25 +632,31 @@ class Lag:
         kept = {(s.name, n): self._known[key] for s, n, key in self._constants() if key in self._known}
         every = [*core, *slow.values(), *constants.values()]
         joint = window.covariance(every)
-        size = [6, 3, 6, *(len(np.atleast_1d(window.values.atVector(key))) for key in every[3:])]
+        vectors = [np.atleast_1d(window.values.atVector(key)) for key in every[3:]]
+        size = [6, 3, 6, *map(len, vectors)]
         start = dict(zip(every, np.cumsum([0, *size[:-1]]).tolist(), strict=True))
+        bias = window.values.atConstantBias(core[2])
+        mean = np.concatenate([np.zeros(15), *vectors])  # of the state as steps from the estimate
+        for name, key in slow.items():
+            process = self.problem.streams[name].slow
+            assert process is not None
+            closed = np.flatnonzero(np.isfinite(process.time_constant_s))
+            mean, joint = without_prior(mean, joint, start[key] + closed, 2.0 * process.sigma[closed] ** 2)
 
         def known(key: int) -> Beside:
-            value = np.atleast_1d(window.values.atVector(key))
-            picked = [*range(6), *range(start[key], start[key] + len(value))]
-            return beside(value, joint[np.ix_(picked, picked)])
+            own = np.arange(start[key], start[key] + size[every.index(key)])
+            picked = np.concatenate([np.arange(6), own])
+            return beside(mean[own], joint[np.ix_(picked, picked)])
 
         def alone(key: int) -> Beside:  # not given the pose: its prior, when it is seen again, does not have that
-            value = np.atleast_1d(window.values.atVector(key))
-            own = range(start[key], start[key] + len(value))
-            return Beside(value=value, gain=np.zeros((len(value), 6)), cov=joint[np.ix_(own, own)])
+            own = np.arange(start[key], start[key] + size[every.index(key)])
+            return Beside(value=mean[own], gain=np.zeros((len(own), 6)), cov=joint[np.ix_(own, own)])
 
-        bias = window.values.atConstantBias(core[2])
         return Anchor(
             stamp_ns=timeline.stamps_ns[k],
-            pose=window.values.atPose3(core[0]),
-            velocity=np.asarray(window.values.atVector(core[1])),
-            bias=np.concatenate([bias.accelerometer(), bias.gyroscope()]),
+            pose=window.values.atPose3(core[0]).retract(mean[:6]),
+            velocity=np.asarray(window.values.atVector(core[1])) + mean[6:9],
+            bias=np.concatenate([bias.accelerometer(), bias.gyroscope()]) + mean[9:15],
             cov=joint[:15, :15],
             slow={name: known(key) for name, key in slow.items()},
             constants={**kept, **{name: alone(key) for name, key in constants.items()}},

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from graphloc.config import VesselConfig
-from graphloc.errors import GraphlocError
+from graphloc.errors import in_one_line
 from graphloc.estimate import Estimate
 from graphloc.frames import Array, Datum
 from graphloc.graph import UNKNOWN_MPS2, UNKNOWN_RADPS, InertialRow, Sensor
@@ -282,7 +282,7 @@ class OnlineSmoother:
         try:
             return self._estimate(self._lag, stamp_ns)
         except Exception as error:  # noqa: BLE001 - as in `_advance`
-            log.warning("online: %s", _line(error))
+            log.warning("online: %s", in_one_line(error))
             return None
 
     def _step(self, lag: Lag) -> None:
@@ -306,7 +306,7 @@ class OnlineSmoother:
                 try:
                     lag.take(m)
                 except Exception as error:  # noqa: BLE001 - as in `_advance`; nothing of it is staged yet
-                    self._drop(m, Outcome.REJECTED, f"it could not be used: {_line(error)}")
+                    self._drop(m, Outcome.REJECTED, f"it could not be used: {in_one_line(error)}")
             lag.judge()
             self._go(lag, before.stamp_ns, reached)
             lag.commit()
@@ -490,14 +490,14 @@ class OnlineSmoother:
                 self._at_start, self._rows, self._inertial, self._mounts, _series(samples), others, self._datum
             )
         except Exception as error:  # noqa: BLE001 - as in `_advance`
-            started = f"a start that can be solved: {_line(error)}"
+            started = f"a start that can be solved: {in_one_line(error)}"
         if isinstance(started, str):
             self._waiting = started
             return None
         try:
             self._take_over(started, samples, [m for m in self._buffer if not isinstance(m, ImuSample)])
         except Exception as error:  # noqa: BLE001 - as in `_advance`
-            self._restart(f"the start failed ({_line(error)})")
+            self._restart(f"the start failed ({in_one_line(error)})")
             return None
         return self._try_estimate()
 
@@ -584,7 +584,7 @@ class OnlineSmoother:
 
         An anchor holds what was known when its state was the newest, so what was measured since can be taken again.
         """
-        why = error if isinstance(error, str) else f"the solver failed ({_line(error)})"
+        why = error if isinstance(error, str) else f"the solver failed ({in_one_line(error)})"
         log.warning("online: %s", why)
         assert self._lag is not None
         old = self._lag
@@ -603,7 +603,7 @@ class OnlineSmoother:
                 self._step(fresh)
                 fresh.settle()
             except Exception as another:  # noqa: BLE001 - as in `_advance`
-                why, self._settled, self._done = f"the solver failed ({_line(another)})", settled, done
+                why, self._settled, self._done = f"the solver failed ({in_one_line(another)})", settled, done
                 continue
             if without:
                 for m in others:
@@ -692,7 +692,7 @@ class OnlineSmoother:
             if self._datum is not None and not np.allclose(found.datum.origin, self._datum.origin, rtol=0.0, atol=1e-9):
                 raise ValueError("its origin of world is another one")
         except Exception as error:  # noqa: BLE001 - a file that anything may have written
-            self._events.append(f"{path}: the snapshot cannot be used ({_line(error)}): starts anew")
+            self._events.append(f"{path}: the snapshot cannot be used ({in_one_line(error)}): starts anew")
             return None
         return found
 
@@ -712,7 +712,7 @@ class OnlineSmoother:
             self._begin(anchor, [last, newest])
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             self._lag, self._datum, self._noise_scale = None, before, 1.0
-            self._events.append(f"the snapshot cannot be used ({_line(error)}): starts anew")
+            self._events.append(f"the snapshot cannot be used ({in_one_line(error)}): starts anew")
             return
         self._agreed_ns = dict(found.agreed_ns)
         self._heights_m = {n: h for n, h in found.heights_m.items() if n in self._asked}
@@ -753,8 +753,3 @@ def _turned(cov: Array, R: Array) -> Array:
     """A covariance (6, 6) of the body tangent, in turned axes."""
     both = np.kron(np.eye(2), R)
     return np.asarray(both @ cov @ both.T)
-
-
-def _line(error: BaseException) -> str:
-    said = " ".join(str(error).split())[:160]
-    return said if isinstance(error, GraphlocError) else f"{type(error).__name__}: {said}"
