@@ -21,7 +21,6 @@ from graphloc.frames import Array
 from graphloc.keys import is_pose
 
 _RELINEARIZE = 0.02  # of any tangent: m, rad, m/s; the gap to the batch is millimetres
-_TURNED_RAD = 0.02  # of the oldest pose: then it is linearised anew all the same
 _NEVER = 1_000_000_000  # updates
 
 
@@ -124,18 +123,10 @@ class Window:
             self._linearised = gtsam.Values(self._smoother.getLinearizationPoint())
 
     def relinearise(self) -> bool:
-        """Linearise anew where the estimate has moved away, but for the oldest pose; tell whether anything was.
-
-        What has left is known as a linear factor on that, and the solver applies it in the tangent of today: turned by
-        what has been learnt since, it would know where the vessel is (see `graphloc.linear.pose_term`).
-        """
-        oldest = min((key for key in self._alive if is_pose(key)), default=None)
-        held = gtsam.KeyList()
-        if oldest is not None and np.abs(self._smoother.getDelta().at(oldest)[:3]).max() < _TURNED_RAD:
-            held.push_back(oldest)
+        """Linearise anew where the estimate has moved away; tell whether anything was."""
         with self._solving():
             solver = self._smoother.getISAM2()  # the smoother's own, not a copy
-            if not solver.update(noRelinKeys=held, force_relinearize=True).getVariablesRelinearized():
+            if not solver.update(force_relinearize=True).getVariablesRelinearized():
                 return False
             self.values = self._smoother.calculateEstimate()
             self._linearised = gtsam.Values(self._smoother.getLinearizationPoint())
