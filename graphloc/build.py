@@ -37,6 +37,7 @@ from graphloc.timeline import Timeline, make_timeline
 JUMP = KernelConfig(kind="cauchy", scale=2.0)
 CONSTANT_TAILS = 9.0  # of a constant's prior: squared sigmas that double its variance
 _NOTHING = 1e6  # sigmas: a prior that says nothing
+CHAIN_END = 2.0  # times its variance: the prior at either end of a slow chain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -586,7 +587,7 @@ def slow_begin(slow: SlowProcess, key: int, known: Array) -> Any:
     tails = float(
         np.sqrt(1.0 + float(((known / slow.sigma)[constant] ** 2).sum()) / CONSTANT_TAILS)
     )  # see `_add_constants`
-    ends = slow.sigma * np.where(constant, tails, np.sqrt(2.0))
+    ends = slow.sigma * np.where(constant, tails, np.sqrt(CHAIN_END))
     return gtsam.PriorFactorVector(key, np.zeros(len(ends)), gtsam.noiseModel.Diagonal.Sigmas(ends))
 
 
@@ -608,5 +609,5 @@ def slow_end(slow: SlowProcess, key: int) -> Iterator[Any]:
     """Yield what closes a chain at its last node."""
     constant = ~np.isfinite(slow.time_constant_s)
     if not constant.all():
-        last = np.where(constant, _NOTHING, np.sqrt(2.0)) * slow.sigma
+        last = np.where(constant, _NOTHING, np.sqrt(CHAIN_END)) * slow.sigma
         yield gtsam.PriorFactorVector(key, np.zeros(len(last)), gtsam.noiseModel.Diagonal.Sigmas(last))

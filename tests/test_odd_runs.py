@@ -12,13 +12,14 @@ from graphloc import app
 from graphloc.build import make_problem
 from graphloc.config import DatumConfig, GnssConfig, HeightConfig, MountConfig, PoseConfig, VesselConfig
 from graphloc.errors import InputError
+from graphloc.eval.drill.failures import imu_where
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum, Geodetic
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import GnssPosition, HeightPrior, ImuSeries, Measurement
+from graphloc.measurements import GnssPosition, HeightPrior, Measurement
 from graphloc.recording import Recording
 from graphloc.solve._align import align
 from graphloc.solve._parts import _join_stats
@@ -31,16 +32,6 @@ def only(recording: Recording, keep: tuple[Measurement, ...]) -> Recording:
     imu = recording.imu
     assert imu is not None
     return replace(recording, measurements=keep, message_count=len(imu) + len(keep))
-
-
-def cut(imu: ImuSeries, keep: np.ndarray) -> ImuSeries:
-    return replace(
-        imu,
-        stamps_ns=imu.stamps_ns[keep],
-        accel_mps2=imu.accel_mps2[keep],
-        gyro_radps=imu.gyro_radps[keep],
-        seqs=imu.seqs[keep],
-    )
 
 
 def with_sensors(run: SimulatedRun, **sensors: object) -> VesselConfig:
@@ -105,7 +96,7 @@ def test_a_recorder_pause_cuts_the_run() -> None:
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
     silent = (int(imu.stamps_ns[0]) + 40 * 10**9, int(imu.stamps_ns[0]) + 100 * 10**9)
     kept = tuple(m for m in run.recording.measurements if not silent[0] < m.stamp_ns < silent[1])
-    paused = replace(only(run.recording, kept), imu=cut(imu, (t < 40.0) | (t > 100.0)))
+    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 40.0) | (t > 100.0)))
     paused = replace(paused, message_count=len(paused.imu or ()) + len(kept))
     solved = app.smooth_recording(paused, run.config).solution
     track = solved.trajectory
@@ -126,7 +117,7 @@ def test_a_part_that_cannot_be_solved_is_left_out() -> None:
     assert imu is not None
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
     kept = tuple(m for m in run.recording.measurements if m.stamp_ns < imu.stamps_ns[0] + 30 * 10**9)
-    paused = replace(only(run.recording, kept), imu=cut(imu, (t < 40.0) | (t > 80.0)))
+    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 40.0) | (t > 80.0)))
     solved = app.smooth_recording(paused, run.config).solution
     assert (solved.trajectory.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 < 41.0
     assert any("left out" in w and "no position" in w for w in solved.stats.warnings)
@@ -137,7 +128,7 @@ def test_an_imu_that_ends_early_is_said() -> None:
     run = simulate(BASE, 1)
     imu = run.recording.imu
     assert imu is not None
-    early = replace(run.recording, imu=cut(imu, imu.stamps_ns < imu.stamps_ns[0] + 10 * 10**9))
+    early = replace(run.recording, imu=imu_where(imu, imu.stamps_ns < imu.stamps_ns[0] + 10 * 10**9))
     warnings = app.smooth_recording(early, run.config).solution.stats.warnings
     assert any(w.startswith("gnss: 300 of 400 measurements lie outside the IMU's span") for w in warnings)
 
@@ -302,7 +293,7 @@ def test_parts_that_lack_a_sensor_and_do_not_converge() -> None:
         for m in run.recording.measurements
         if not 25 * 10**9 < m.stamp_ns - t0 < 55 * 10**9 and not (m.sensor == "aerial" and m.stamp_ns > t0 + 40 * 10**9)
     )
-    paused = replace(only(run.recording, kept), imu=cut(imu, (t < 25.0) | (t > 55.0)))
+    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 25.0) | (t > 55.0)))
     solved = app.smooth_recording(paused, run.config).solution
     seconds = (solved.trajectory.stamps_ns - t0) * 1e-9
     assert np.isinf(solved.since_agreed_s["aerial"][seconds > 50.0]).all()

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build import (
+    CHAIN_END,
     CONSTANT_TAILS,
     attach,
     bias_step,
@@ -45,10 +46,10 @@ from graphloc.solve._solution import AGREES, row_of
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
 _CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
-_STALE_RAD = (
+_STALE_RAD, _LEFT_STALE_RAD = (
     3e-3,
     1e-3,
-)  # between the tangent that a factor is written in and the solver's; where it leaves, and stays so
+)  # between a factor's tangent and the solver's; of one that leaves, and stays so
 _PAGE_S = 1.0  # states leave together by so much
 _LEAF_S, _SURE = 1.0, 0.9  # how often an older chapter is judged again; a weight that needs no second look
 _STEP_COST = (
@@ -256,8 +257,8 @@ class Lag:
             if entry.stream.row.false is None or entry.held is None or not entry.reaches(first):
                 continue  # only sensors with hypotheses see to centimetres
             now = window.linearised_at(entry.verdict.at.pose_key)
-            leaves = self._seconds(entry.measurement.stamp_ns) <= leaving_s
-            if np.abs(entry.written.rotation().localCoordinates(now.rotation())).max() > _STALE_RAD[leaves]:
+            stale = _LEFT_STALE_RAD if self._seconds(entry.measurement.stamp_ns) <= leaving_s else _STALE_RAD
+            if np.abs(entry.written.rotation().localCoordinates(now.rotation())).max() > stale:
                 at = attach(self.problem, entry.stream, entry.index, window.values)
                 self._change(entry, replace(entry.verdict, at=at))
 
@@ -633,23 +634,23 @@ class Lag:
         every = [*core, *slow.values(), *constants.values()]
         joint = window.covariance(every)
         vectors = [np.atleast_1d(window.values.atVector(key)) for key in every[3:]]
-        size = [6, 3, 6, *map(len, vectors)]
-        start = dict(zip(every, np.cumsum([0, *size[:-1]]).tolist(), strict=True))
+        ends = np.cumsum([6, 3, 6, *map(len, vectors)])
+        rows = {key: np.arange(a, b) for key, a, b in zip(every, [0, *ends], ends, strict=False)}
         bias = window.values.atConstantBias(core[2])
         mean = np.concatenate([np.zeros(15), *vectors])  # of the state as steps from the estimate
         for name, key in slow.items():
             process = self.problem.streams[name].slow
             assert process is not None
             closed = np.flatnonzero(np.isfinite(process.time_constant_s))
-            mean, joint = without_prior(mean, joint, start[key] + closed, 2.0 * process.sigma[closed] ** 2)
+            mean, joint = without_prior(mean, joint, rows[key][closed], CHAIN_END * process.sigma[closed] ** 2)
 
         def known(key: int) -> Beside:
-            own = np.arange(start[key], start[key] + size[every.index(key)])
-            picked = np.concatenate([np.arange(6), own])
+            own = rows[key]
+            picked = np.concatenate([rows[core[0]], own])
             return beside(mean[own], joint[np.ix_(picked, picked)])
 
         def alone(key: int) -> Beside:  # not given the pose: its prior, when it is seen again, does not have that
-            own = np.arange(start[key], start[key] + size[every.index(key)])
+            own = rows[key]
             return Beside(value=mean[own], gain=np.zeros((len(own), 6)), cov=joint[np.ix_(own, own)])
 
         return Anchor(
