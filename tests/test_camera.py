@@ -17,7 +17,7 @@ from rosbags.highlevel import AnyReader
 from ruamel.yaml import YAML
 
 from graphloc import cli
-from graphloc.config import MountConfig
+from graphloc.blocks import MountConfig
 from graphloc.errors import ConfigError
 from graphloc.eval.simulate import SimulatedRun, find_scenario, harbour_scenarios, simulate
 from graphloc.eval.simulate._lens import digitise, exposure, through_lens
