@@ -16,7 +16,7 @@ from graphloc.drills import _or_why_not, _started_there, as_it_comes, drill
 from graphloc.eval.drill import Case, Failure, Times, Window, cut, figures, judge, page, schedule, script
 from graphloc.eval.drill.measure import Drilled, Measured, State, compared, summed
 from graphloc.eval.drill.plan import judged_until, windows
-from graphloc.eval.plots import COLOURS, Line, Points
+from graphloc.eval.plots import Line, Points, colour_of
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, rotation_from_rpy_deg
 from graphloc.ledger import Outcome
@@ -397,11 +397,10 @@ def test_a_drill_from_recording_to_page(drilled: tuple[SimulatedRun, Drilled], t
 
 def test_an_estimator_has_the_colour_that_it_has_in_the_report(drilled: tuple[SimulatedRun, Drilled]) -> None:
     _, found = drilled
-    report = ["graphloc", "graphloc online", "BL EKF", "honest EKF"]
     for figure in (figures.all_failures(found), figures.over_time(found)):
         marks = [m for panel in figure.panels for m in panel.marks]
         colours = {m.name: m.colour for m in marks if isinstance(m, Line | Points)}
-        assert [colours[name] for name in report] == list(COLOURS[:4])
+        assert all(colours[name] == colour_of(name) for name in found.estimators)
 
 
 def test_the_command_prints_its_table_and_replaces_nothing_unasked(

@@ -15,6 +15,7 @@ from graphloc import app, cli
 from graphloc.config import AerialConfig, AprilTagConfig
 from graphloc.errors import ExtraError, OutputError
 from graphloc.eval import rerun_log
+from graphloc.eval.plots import colour_of
 from graphloc.eval.rerun_log import write_rerun
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
@@ -63,6 +64,10 @@ def test_tracks_weights_and_health_are_those_of_the_run(run: app.Run, tmp_path: 
     radius = [np.sqrt(5.991 * np.linalg.eigvalsh(cov[:2, :2])[-1]) for cov in track.cov]
     np.testing.assert_allclose(np.array(said["/bound_95_m/graphloc"]["scalars"])[:, 0], radius, rtol=1e-3)
     np.testing.assert_allclose(said["/world/truth/track"]["strips"][0][0], truth.p_world_m, atol=1e-4)
+
+    for name in ("graphloc", *(f.name for f in run.filters)):
+        (rgba,) = np.ravel(said[f"/world/{name.replace(' ', '_')}/track"]["colors"])
+        assert f"#{int(rgba) >> 8:06X}" == colour_of(name)  # as in the report
 
     rows = [row for row in run.solution.ledger if row.sensor == "aerial"]
     stamps = {m.seq: m.stamp_ns for m in run.recording.measurements}
