@@ -123,8 +123,8 @@ def _pixels(size: float) -> Any:
 
 
 def _entity(name: str) -> str:
-    """A name as a part of an entity path, which knows no blanks."""
-    return "".join(c if c.isalnum() or c in "-." else "_" for c in name)
+    """A name as a part of an entity path, of its own whatever other names there are: what a path cannot hold is escaped."""
+    return str(need("rerun", "rerun").escape_entity_path_part(name))
 
 
 def _columns(stream: Any, entity: str, stamps_ns: Any, columns: Any) -> None:

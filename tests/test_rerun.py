@@ -21,6 +21,9 @@ from graphloc.eval.simulate import Scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.frontends.aerial.cloud import Cloud
 from graphloc.frontends.aerial.live import Turn
+from graphloc.ledger import Ledger
+
+BLANK = r"\ "  # in an entity path
 
 
 def read(path: Path) -> dict[str, dict[str, list[Any]]]:
@@ -53,7 +56,7 @@ def test_tracks_weights_and_health_are_those_of_the_run(run: app.Run, tmp_path: 
     track, truth = run.solution.trajectory, run.recording.truth
     assert truth is not None
     names = {name.split("/")[2] for name in said if name.startswith("/world/") and name.endswith("/body")}
-    assert names == {"graphloc", "graphloc_online", "truth", *(f.name.replace(" ", "_") for f in run.filters[1:])}
+    assert names == {"graphloc", r"graphloc\ online", "truth", *(f.name.replace(" ", BLANK) for f in run.filters[1:])}
 
     body = said["/world/graphloc/body"]
     assert body["stamp"] == track.stamps_ns.tolist()
@@ -66,7 +69,7 @@ def test_tracks_weights_and_health_are_those_of_the_run(run: app.Run, tmp_path: 
     np.testing.assert_allclose(said["/world/truth/track"]["strips"][0][0], truth.p_world_m, atol=1e-4)
 
     for name in ("graphloc", *(f.name for f in run.filters)):
-        (rgba,) = np.ravel(said[f"/world/{name.replace(' ', '_')}/track"]["colors"])
+        (rgba,) = np.ravel(said[f"/world/{name.replace(' ', BLANK)}/track"]["colors"])
         assert f"#{int(rgba) >> 8:06X}" == colour_of(name)  # as in the report
 
     rows = [row for row in run.solution.ledger if row.sensor == "aerial"]
@@ -97,6 +100,28 @@ def test_measurements_lie_where_they_say_red_where_they_are_not_believed(run: ap
     assert 1.0 < np.median(antenna[:, 2] - np.array(said["/world/truth/track"]["strips"][0][0])[0, 2]) < 6.0
     assert "/world/measured/compass" not in said  # says no place
     assert len(said["/weights/compass"]["stamp"]) == 140
+
+
+def test_sensors_of_like_names_are_told_apart(run: app.Run, tmp_path: Path) -> None:
+    """Matches as `my fix`, fixes as `my_fix`: each has its own stamps and weights, and nobody else's."""
+    names = {"aerial": "my fix", "gnss": "my_fix", "compass": "my/fix"}
+    measurements = tuple(replace(m, sensor=names.get(m.sensor, m.sensor)) for m in run.recording.measurements)
+    ledger = Ledger()
+    for row in run.solution.ledger:
+        ledger.add(replace(row, sensor=names.get(row.sensor, row.sensor)))
+    said = write(
+        replace(
+            run,
+            recording=replace(run.recording, measurements=measurements),
+            solution=replace(run.solution, ledger=ledger),
+        ),
+        tmp_path / "run.rrd",
+    )
+    for name, escaped in (("my fix", rf"my{BLANK}fix"), ("my_fix", "my_fix"), ("my/fix", r"my\/fix")):
+        stamps = [m.stamp_ns for m in measurements if m.sensor == name]
+        assert said[f"/weights/{escaped}"]["stamp"] == stamps, name
+        if name != "my/fix":  # a heading says no place
+            assert said[f"/world/measured/{escaped}"]["stamp"] == stamps, name
 
 
 def test_scans_the_image_and_tags_lie_in_world(run: app.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,7 +192,7 @@ def test_the_commands_write_it(
             return int(end.code or 0)
         return 0
 
-    for command, name in (("smooth", "graphloc"), ("replay", "graphloc_online")):
+    for command, name in (("smooth", "graphloc"), ("replay", r"graphloc\ online")):
         path = tmp_path / f"{command}.rrd"
         assert call(command, bag, "-c", config, "-o", tmp_path / command, "--rerun", path) == 0
         assert len(read(path)[f"/world/{name}/body"]["stamp"]) > 50
