@@ -13,7 +13,7 @@ import rasterio
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from graphloc import app, cli
+from graphloc import app
 from graphloc.config import AerialConfig, LidarConfig
 from graphloc.errors import InputError
 from graphloc.eval.metrics import compare_to_truth
@@ -43,6 +43,7 @@ from graphloc.frontends.aerial.scans import Matched
 from graphloc.frontends.aerial.vector import VectorMap
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.trajectory import Trajectory
+from tests.commands import called
 
 DATUM = Datum(Geodetic(57.7, 14.5, 30.0))
 S = 10**9
@@ -382,10 +383,7 @@ def test_one_match_is_drawn(
 ) -> None:
     arguments = ["match", str(bag / "run"), "-c", str(bag / "vessel.yaml"), "--at", "20", "-o", str(tmp_path / "m.png")]
     for code, said in ((0, "none of them"), (2, "exists already")):
-        monkeypatch.setattr("sys.argv", ["graphloc", *arguments])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        assert end.value.code == code
+        assert called(monkeypatch, *arguments) == code
         streams = capsys.readouterr()
         assert said in streams.out + streams.err
     drawn = np.asarray(cv2.imread(str(tmp_path / "m.png")))

@@ -15,45 +15,13 @@ VOCABULARY = {
 }  # fmt: skip
 DOOR = {"__main__", "app", "cli", "drills", "found_tags", "gather", "replay", "stream", "job", "sweep", "whatif"}
 GRAPH = {"graph", "linear", "keys", "timeline", "build", "solve", "online", "origin", "outputs"}
+_AT_THE_DOOR = {f"graphloc.{name}" for name in ("app", "cli", "gather", "replay", "stream", "job", "sweep")}
 FORBIDDEN = {
     "vocabulary": {"graphloc.factors", "graphloc.frontends", "graphloc.eval", "gtsam"},
     "graph": {"graphloc.factors", "graphloc.frontends", "graphloc.eval"},
-    "factors": {
-        "graphloc.frontends",
-        "graphloc.eval",
-        "graphloc.app",
-        "graphloc.cli",
-        "graphloc.gather",
-        "graphloc.replay",
-        "graphloc.stream",
-        "graphloc.job",
-        "graphloc.sweep",
-        "graphloc.solve",
-    },
-    "frontends": {
-        "graphloc.factors",
-        "graphloc.eval",
-        "graphloc.app",
-        "graphloc.cli",
-        "graphloc.gather",
-        "graphloc.replay",
-        "graphloc.stream",
-        "graphloc.job",
-        "graphloc.sweep",
-        "graphloc.solve",
-        "gtsam",
-    },
-    "eval": {
-        "graphloc.app",
-        "graphloc.cli",
-        "graphloc.drills",
-        "graphloc.gather",
-        "graphloc.replay",
-        "graphloc.stream",
-        "graphloc.job",
-        "graphloc.sweep",
-        "graphloc.whatif",
-    },
+    "factors": {"graphloc.frontends", "graphloc.eval", "graphloc.solve", *_AT_THE_DOOR},
+    "frontends": {"graphloc.factors", "graphloc.eval", "graphloc.solve", "gtsam", *_AT_THE_DOOR},
+    "eval": {"graphloc.drills", "graphloc.whatif", *_AT_THE_DOOR},
     "door": set(),
 }
 

@@ -16,7 +16,6 @@ from pupil_apriltags import Detector
 from rosbags.highlevel import AnyReader
 from ruamel.yaml import YAML
 
-from graphloc import cli
 from graphloc.blocks import MountConfig
 from graphloc.errors import ConfigError
 from graphloc.eval.simulate import SimulatedRun, find_scenario, harbour_scenarios, simulate
@@ -32,6 +31,7 @@ from graphloc.eval.simulate.rig import CameraConfig, HullConfig, RigConfig, load
 from graphloc.eval.simulate.scene import Scene, scene_of
 from graphloc.frames import Array
 from graphloc.measurements import GnssPosition
+from tests.commands import called
 
 LINEAR = np.rint(255.0 * (np.arange(256) / 255.0) ** 2.2).astype(np.uint8)  # undoes the camera's gamma
 HALF = 0.206
@@ -627,10 +627,7 @@ def test_another_rig_sees_with_its_own_eyes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["dock-fixed-optimal", "--rig", "launch", "--set", "duration_s=12", "--set", "camera_hz=0.5"]
-    monkeypatch.setattr("sys.argv", ["graphloc", "simulate", *arguments, "-o", str(tmp_path / "out")])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == 0
+    assert called(monkeypatch, "simulate", *arguments, "-o", tmp_path / "out") == 0
     with AnyReader([Path(capsys.readouterr().out.split("\n")[0])]) as reader:
         counts = {c.topic: c.msgcount for c in reader.connections}
     assert counts["/mast/points"] == 11

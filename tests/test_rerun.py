@@ -1,6 +1,5 @@
 """What is written for the rerun viewer, read back with its own reader: what is there, when, and where."""
 
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from graphloc import app, cli
+from graphloc import app
 from graphloc.config import AerialConfig, AprilTagConfig
 from graphloc.errors import ExtraError, OutputError
 from graphloc.eval import rerun_log
@@ -22,6 +21,7 @@ from graphloc.eval.simulate.bag import write_bag
 from graphloc.frontends.aerial.cloud import Cloud
 from graphloc.frontends.aerial.live import Turn
 from graphloc.ledger import Ledger
+from tests.commands import called
 
 BLANK = r"\ "  # in an entity path
 
@@ -184,26 +184,18 @@ def test_the_commands_write_it(
 ) -> None:
     bag, config = write_bag(simulate(Scenario(duration_s=14.0), 3), tmp_path / "bag", ros=2)
 
-    def call(*arguments: object) -> int:
-        monkeypatch.setattr(sys, "argv", ["graphloc", *map(str, arguments)])
-        try:
-            cli.main()
-        except SystemExit as end:
-            return int(end.code or 0)
-        return 0
-
     for command, name in (("smooth", "graphloc"), ("replay", r"graphloc\ online")):
         path = tmp_path / f"{command}.rrd"
-        assert call(command, bag, "-c", config, "-o", tmp_path / command, "--rerun", path) == 0
+        assert called(monkeypatch, command, bag, "-c", config, "-o", tmp_path / command, "--rerun", path) == 0
         assert len(read(path)[f"/world/{name}/body"]["stamp"]) > 50
     capsys.readouterr()
     monkeypatch.setattr("graphloc.app.load", lambda *_: pytest.fail("refused only after the bag was read"))
-    assert call("compare", bag, "-c", config, "-o", tmp_path / "x", "--rerun", path) == 2
+    assert called(monkeypatch, "compare", bag, "-c", config, "-o", tmp_path / "x", "--rerun", path) == 2
     assert "--overwrite" in capsys.readouterr().err
 
     def missing(*_: object) -> None:
         raise ExtraError("rerun is not installed: pip install 'graphloc[rerun]'")
 
     monkeypatch.setattr("graphloc.extras.need", missing)  # before anything else
-    assert call("smooth", bag, "-c", config, "-o", tmp_path / "y", "--rerun", tmp_path / "y.rrd") == 2
+    assert called(monkeypatch, "smooth", bag, "-c", config, "-o", tmp_path / "y", "--rerun", tmp_path / "y.rrd") == 2
     assert capsys.readouterr().err.strip() == "graphloc: rerun is not installed: pip install 'graphloc[rerun]'"
