@@ -23,7 +23,7 @@ from graphloc.frames import Datum
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition
 from graphloc.solution import Health
-from tests.test_maps import SQUARE, SWEDEN, drawn, framed, write
+from tests.mapfactory import SQUARE, SWEDEN, drawn, framed, write
 
 
 @pytest.fixture(scope="module")
