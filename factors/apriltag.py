@@ -3,11 +3,14 @@
 
     z_i = pi(R' (P_i - p)) + w_i,   w_i ~ N(0, C),   pi(x, y, z) = (x, y) / z
     P_i = c + d + Exp(w) (Q_i - c),   Q_i = S_i + e_k + f_k x (S_i - m_k)
+    seen further out from its tag's middle, by b px at each edge
 
 p, R: camera in world; S_i: a corner as surveyed, its frame at rest; e_k, f_k: what the survey errs about tag k, its middle
 m_k, a constant of the run; d, w: motion and small turn about c of the floating dock that the tag rides on, a slow state
-(D has neither). Taken for noise of each sighting instead, the survey's errors average out over hundreds of them, and the
-bounds are too small: three tags that hang 0.2 deg forward lift a vessel 20 m away by 7 cm in every image.
+(D has neither); b: what detector, light, print and focal length make tags seem wider than they are, a slow state as well.
+Taken for noise of each sighting instead, such errors average out over hundreds of them, and the bounds are too small:
+three tags that hang 0.2 deg forward lift a vessel 20 m away by 7 cm in every image; tags 12 px wide whose edges are
+off by 0.04 px hold one 35 m away 0.2 m too near.
 
 Four coplanar corners have two poses, and beyond some 20 tag widths these run into each other: one pose's Gaussian is
 then no likelihood, and hundreds of sightings of which each is drawn to its nearer mode bend the heading (measured:
@@ -45,8 +48,9 @@ _BY_A_MODE_RAD = float(np.radians(20.0))
 _FREEDOM = ("east", "north", "up", "roll", "pitch", "yaw")
 _LEAST_M, _LEAST_RAD = 1e-3, float(np.radians(0.01))
 _LEAST = np.repeat([_LEAST_M, _LEAST_RAD], 3)
-_TIE = np.repeat([1e-4, 1e-5], 3)  # where a sighting stands on a node: m, rad
+_TIE = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4])  # where a sighting stands on a node: m, rad, px
 _TIDE_S = 3600.0
+_EDGE_S = 30.0  # range and light change in about that
 
 
 class _Seen:
@@ -55,6 +59,8 @@ class _Seen:
     Attributes:
         R, p: camera in world. points_m: (n, 3) corners where their frame is now. middle_m: of these.
         body: (6, 6) d (place, rotation about the world's axes) of the camera / d tangent of the state.
+        own: rows of the slow state that it knows of: its dock's six, that of the edges. slow: their values; moved: (6,) of
+            the dock; edge_px: b.
     """
 
     def __init__(self, m: TagSighting, config: AprilTagConfig, at: Attachment) -> None:
@@ -65,9 +71,15 @@ class _Seen:
         self.body = np.vstack([self.R @ adjoint[3:], self.R @ adjoint[:3]])
         docks, self.slow_size = _docks(config.surveyed), 0 if at.slow_value is None else len(at.slow_value)
         self.first = 6 * docks.index(m.frame) if self.slow_size and m.frame in docks else None
-        self.moved = moved = np.zeros(6)
-        if at.slow_value is not None and self.first is not None:
-            self.moved = moved = _between(at)[self.first : self.first + 6]
+        self.own = list(range(self.first, self.first + 6)) if self.first is not None else []
+        self.own += range(6 * len(docks), self.slow_size)
+        self.slow = np.zeros(0)
+        if (
+            at.slow_value is not None
+        ):  # the edges of tags that stand still: those of the node before, no leaf in between
+            self.slow = (_between(at) if self.first is not None else np.asarray(at.slow_value))[self.own]
+        self.moved = moved = self.slow[:6] if self.first is not None else np.zeros(6)
+        self.edge_px = float(self.slow[-1]) if len(self.own) % 6 else 0.0
         self.turn = gtsam.Rot3.Expmap(moved[3:]).matrix()
         self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-moved[3:]))  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
         self.constants = _constants_of(m, config, at)
@@ -80,11 +92,10 @@ class _Seen:
         self.points_m = m.pivot_m + moved[:3] + self.arms
         self.middle_m = m.pivot_m + moved[:3] + (m.points_m.mean(axis=0) - m.pivot_m) @ self.turn.T
 
-    def placed(self, per_dock: Array) -> Array:
-        """Put d / d slow state of the dock (k, 6) where it stands among those of all docks (k, n)."""
-        whole = np.zeros((len(per_dock), self.slow_size))
-        if self.first is not None:
-            whole[:, self.first : self.first + 6] = per_dock
+    def placed(self, per_own: Array) -> Array:
+        """Put d / d its own rows of the slow state (k, len(own)), or the first of them, where these stand (k, n)."""
+        whole = np.zeros((len(per_own), self.slow_size))
+        whole[:, self.own[: per_own.shape[1]]] = per_own
         return whole
 
 
@@ -139,7 +150,7 @@ def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode)
         raw=raw,
         cov=_turned(seen.R) @ mode.cov @ _turned(seen.R).T + np.diag(_TO_DECIDE**2),
         jacobian=jacobian,
-        slow_jacobian=slow_jacobian if seen.slow_size else None,
+        slow_jacobian=slow_jacobian if seen.first is not None else None,  # edges are no matter where modes are chosen
         prior=mode.probability * (1.0 - config.false_fraction),
         size_m=float(np.hypot(raw[0], raw[1])),
         size_deg=float(np.degrees(np.linalg.norm(rotation))),
@@ -167,9 +178,12 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
     camera = np.concatenate([-by_point, by_point @ rotation], axis=2).reshape(-1, 6)
     swing = np.array([-skew(arm) for arm in seen.arms]) @ seen.by_turn
     by_dock = np.concatenate([by_point, by_point @ swing], axis=2).reshape(-1, 6)
-    raw, by_body = (flat - m.rays).ravel(), camera @ seen.body
+    by_edge = m.px * _outwards(flat)  # not of the rays: their noise would tell edges from distance
+    raw, by_body = (flat + by_edge * seen.edge_px - m.rays).ravel(), camera @ seen.body
+    by_slow = np.hstack([by_dock if seen.first is not None else np.zeros((len(raw), 0)), by_edge.reshape(-1, 1)])
+    by_slow = by_slow[:, : len(seen.own)]
     dock = config.surveyed.dock(m.frame) if seen.first is not None else None
-    tie = None if dock is None else _tie(seen, dock, at)
+    tie = None if dock is None else _tie(seen, dock, config, at)
     found: list[Any] = [] if tie is None else list(tie.factors)
     for k, constant in enumerate(seen.constants):  # GTSAM's linear factors have at most three keys: one for each tag
         own = slice(8 * k, 8 * k + 8)
@@ -178,7 +192,9 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
         )
         terms = [pose_term(at, by_body[own])]
         if tie is not None:
-            terms.append(Term(at.leaf_keys[0], seen.moved, by_dock[own]))
+            terms.append(Term(at.leaf_keys[0], seen.slow, by_slow[own]))
+        elif seen.own and at.slow_key is not None:
+            terms.append(Term(at.slow_key, np.array(at.slow_value), seen.placed(by_slow[own])))
         if constant is not None:
             at_rest = by_point[4 * k : 4 * k + 4] @ seen.turn
             turned = at_rest @ np.array([-skew(arm) for arm in seen.within[k]])
@@ -189,32 +205,44 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
     return GraphUpdate(factors=tuple(found), guesses=() if tie is None else tie.guesses)
 
 
-def _tie(seen: _Seen, dock: DockConfig, at: Attachment) -> GraphUpdate:
+def _tie(seen: _Seen, dock: DockConfig, config: AprilTagConfig, at: Attachment) -> GraphUpdate:
     """Where the dock is at the sighting, a leaf: between two nodes of its Markov process, as far off as a bridge is.
 
     Held fast from node to node instead, a dock that swings by 0.3 m is off by 4 cm, 16 px at 2.6 m.
     """
     assert at.slow_key is not None
-    picked = seen.placed(np.eye(6))
+    n = len(seen.own)
+    picked = seen.placed(np.eye(n))
     share, dt_s = (0.0, 1.0) if at.slow_next is None else at.slow_next[2:]
-    sigma, time_s = _swing(dock)
+    sigma, time_s = (np.append(a, b)[:n] for a, b in zip(_swing(dock), (config.edge_sigma_px, _EDGE_S), strict=True))
     bridge = sigma * np.sqrt(2.0 * dt_s / time_s * share * (1.0 - share))
     residual = Residual(
-        raw=np.zeros(6), cov=np.diag(np.maximum(bridge, _TIE) ** 2), jacobian=lambda: np.zeros((6, 6)), prior=1.0,
+        raw=np.zeros(n), cov=np.diag(np.maximum(bridge, _TIE[:n]) ** 2), jacobian=lambda: np.zeros((n, 6)), prior=1.0,
         size_m=None, size_deg=None,
     )  # fmt: skip
     terms = [
-        Term(at.leaf_keys[0], seen.moved, np.eye(6)),
+        Term(at.leaf_keys[0], seen.slow, np.eye(n)),
         Term(at.slow_key, np.array(at.slow_value), -(1.0 - share) * picked),
     ]
     if at.slow_next is not None:
         terms.append(Term(at.slow_next[0], np.array(at.slow_next[1]), -share * picked))
-    return GraphUpdate(linear_update(residual, terms, Decision()).factors, ((at.leaf_keys[0], seen.moved),))
+    return GraphUpdate(linear_update(residual, terms, Decision()).factors, ((at.leaf_keys[0], seen.slow),))
+
+
+def _outwards(rays: Array) -> Array:
+    """How corners (n, 2) move when each edge of their tags moves out by 1: where the edges meet then."""
+    tags = rays.reshape(-1, 4, 2)
+    along = np.roll(tags, -1, axis=1) - tags
+    along /= np.maximum(np.linalg.norm(along, axis=2, keepdims=True), 1e-12)
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)  # clockwise in an image whose y looks down: outwards
+    before = np.roll(normal, 1, axis=1)
+    opened = 1.0 + (before * normal).sum(axis=-1, keepdims=True)  # -1 where an edge turns back on the one before
+    return np.asarray(((before + normal) / np.maximum(opened, 0.1)).reshape(-1, 2))
 
 
 def _terms(at: Attachment, jacobian: Array, slow_jacobian: Any) -> list[Term]:
     terms = [pose_term(at, jacobian)]
-    if at.slow_key is not None:
+    if at.slow_key is not None and slow_jacobian is not None:
         terms.append(Term(at.slow_key, np.array(at.slow_value), slow_jacobian()))
     return terms
 
@@ -250,22 +278,23 @@ def constants(config: AprilTagConfig) -> tuple[Constant, ...]:
 
 
 def slow(config: AprilTagConfig) -> SlowProcess | None:
-    """Return how the docks that carry tags move.
+    """Return how the docks that carry tags move, and how far out edges are seen.
 
-    One that swings with period T and RMS s moves at 2 pi s / T; the Markov process that steps as far in 1 s has a time
+    A dock that swings with period T and RMS s moves at 2 pi s / T; the Markov process that steps as far in 1 s has a time
     constant of T^2 / 2 pi^2. How far it wanders is taken for two sigmas.
     """
     docks = [dock for name in _docks(config.surveyed) if (dock := config.surveyed.dock(name)) is not None]
-    if not docks:
+    edges = [config.edge_sigma_px] if config.edge_sigma_px and config.surveyed.tags else []
+    if not docks and not edges:
         return None
     swings = [_swing(dock) for dock in docks]
     return SlowProcess(
-        name="docks moved",
-        axes=tuple(f"{dock.name} {axis}" for dock in docks for axis in _FREEDOM),
-        units=("m", "m", "m", "deg", "deg", "deg") * len(docks),
-        scale=np.tile(np.repeat([1.0, 180.0 / np.pi], 3), len(docks)),
-        sigma=np.concatenate([sigma for sigma, _ in swings]),
-        time_constant_s=np.concatenate([time_s for _, time_s in swings]),
+        name=" and ".join(["docks moved"] * bool(docks) + ["edges seen"] * bool(edges)),
+        axes=(*(f"{dock.name} {axis}" for dock in docks for axis in _FREEDOM), *["outwards"] * len(edges)),
+        units=(*("m", "m", "m", "deg", "deg", "deg") * len(docks), *["px"] * len(edges)),
+        scale=np.append(np.tile(np.repeat([1.0, 180.0 / np.pi], 3), len(docks)), np.ones(len(edges))),
+        sigma=np.concatenate([*(sigma for sigma, _ in swings), edges]),
+        time_constant_s=np.concatenate([*(time_s for _, time_s in swings), [_EDGE_S] * len(edges)]),
     )
 
 
@@ -288,7 +317,7 @@ def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:
     R, p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
     corners = np.array([(-0.2, -0.2, 4.1), (0.2, -0.2, 3.9), (0.2, 0.2, 3.9), (-0.2, 0.2, 4.1)])
     now = p + corners @ R.T
-    dock = at.slow_value is not None
+    dock = at.slow_value is not None and bool(_docks(survey))
     moved = np.asarray(at.slow_value)[:6] if dock else np.zeros(6)
     pivot = now.mean(axis=0) + np.array([2.0, -1.0, 0.5])
     back = np.asarray(Rotation.from_rotvec(-moved[3:]).as_matrix())

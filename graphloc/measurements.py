@@ -175,6 +175,7 @@ class TagSighting(Measurement):
             does not know in it, too.
         t_body_camera_m, R_body_camera: (3,), (3, 3) the camera's mount.
         modes: poses that explain it, likeliest first; probabilities sum to 1.
+        px: a pixel of the image as a ray (1 / focal length); 0: not known.
     """
 
     camera: str
@@ -188,6 +189,7 @@ class TagSighting(Measurement):
     t_body_camera_m: Array
     R_body_camera: Array
     modes: tuple[TagMode, ...]
+    px: float = 0.0
 
     def __post_init__(self) -> None:
         n = 4 * len(self.numbers)

@@ -296,9 +296,9 @@ def test_slow_states_and_constants() -> None:
     config = AprilTagConfig(survey=Survey.model_validate({"tags": tags, "docks": [dock]}))
     process = ROW.slow(config)
     assert process is not None
-    assert process.axes == tuple(f"pier {a}" for a in ("east", "north", "up", "roll", "pitch", "yaw"))
-    assert process.units == ("m", "m", "m", "deg", "deg", "deg")
-    np.testing.assert_allclose(process.scale * process.sigma, [0.3, 0.3, 1.0, 0.5, 0.5, 1.5])
+    assert process.axes == (*(f"pier {a}" for a in ("east", "north", "up", "roll", "pitch", "yaw")), "outwards")
+    assert process.units == ("m", "m", "m", "deg", "deg", "deg", "px")
+    np.testing.assert_allclose(process.scale * process.sigma, [0.3, 0.3, 1.0, 0.5, 0.5, 1.5, config.edge_sigma_px])
     assert process.time_constant_s[2] > 1000.0  # the tide
     first, second = ROW.constants(config)
     np.testing.assert_allclose(first.sigma, [0.03] * 3 + [np.radians(0.5)] * 3)
@@ -307,7 +307,10 @@ def test_slow_states_and_constants() -> None:
     assert [c.name for c in ROW.constants(config)] == ["tag 7", "tag 8"]
     twins = AprilTagConfig(survey=Survey.model_validate({"tags": [TAG, {**TAG, "family": "25h9"}]}))
     assert [c.name for c in ROW.constants(twins)] == ["tag 7 (36h11)", "tag 7 (25h9)"]
-    assert ROW.slow(quay) is None
+    alone = ROW.slow(quay)
+    assert alone is not None
+    assert alone.axes == ("outwards",)
+    assert ROW.slow(quay.model_copy(update={"edge_sigma_px": 0.0})) is None
     assert ROW.slow(AprilTagConfig()) is None
 
 
@@ -361,6 +364,81 @@ def test_many_sightings_of_a_far_tag_do_not_bend_the_heading() -> None:
     assert np.abs(by_corners).max() < 0.5
     assert abs(np.mean(by_corners)) < 0.3
     assert abs(np.mean(by_modes)) > 0.5
+
+
+PX = 1.0 / 1000.0
+
+
+def wider(m: TagSighting, by_px: float) -> TagSighting:
+    """The sighting with the edges of its tag further out: where the shifted lines through its corners meet."""
+    corners = np.column_stack([m.rays, np.ones(4)])
+    lines = np.cross(corners, np.roll(corners, -1, axis=0))
+    lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    inside = np.append(m.rays.mean(axis=0), 1.0)
+    lines[:, 2] -= by_px * PX * np.sign(lines @ inside) * -1.0
+    meet = np.cross(np.roll(lines, 1, axis=0), lines)
+    return replace(m, rays=meet[:, :2] / meet[:, 2:], px=PX)
+
+
+@pytest.mark.parametrize("on_a_dock", [False, True])
+def test_edges_that_are_seen_too_far_out_explain_a_tag_that_looks_too_large(on_a_dock: bool) -> None:
+    near = vessel(9.0, 40.0, roll_pitch_deg=(3.0, -2.0))
+    true = gtsam.Pose3(near.rotation(), near.translation() + PIER_M) if on_a_dock else near
+    config, docks = (DOCKED, MOTION) if on_a_dock else (FIXED, np.zeros(0))
+    m = wider(moved_sighting(MOTION, true) if on_a_dock else sighting(true), 0.3)
+    slow = np.append(docks, 0.0)
+    assert np.abs(m.rays - sighting(true).rays).max() > 0.2 * PX or on_a_dock
+    for _ in range(3):
+        at = attached(true, slow)
+        update = ROW.factors(m, config, at, Decision(mode=nearest_mode(m.modes, true.rotation().matrix() @ AHEAD)))
+        values = gtsam.Values()
+        values.insert(1, true)
+        values.insert(3, slow)
+        for key, value in update.guesses:
+            values.insert(key, value)
+        known = gtsam.PriorFactorPose3(1, true, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
+        sigmas = np.append(np.full(len(docks), 1e-7), 30.0)
+        loose = gtsam.PriorFactorVector(3, np.append(docks, 0.0), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+        leaf = [key for key, _ in update.guesses]
+        slow = step([*update.factors, known, loose], values, (1, 3, *leaf)).atVector(3)
+    assert slow[-1] == pytest.approx(0.3, rel=1e-3)
+
+
+def test_many_sightings_of_a_far_tag_do_not_make_its_distance_surer_than_its_edges_are() -> None:
+    """40 m off it is 10 px wide; 0.05 px at each edge are 1 % of that, and of the distance."""
+    rng, true = np.random.default_rng(4), vessel(40.0, 5.0)
+    seen = [wider(sighting(true, rng), 0.05) for _ in range(200)]
+    nearer = [Decision(mode=nearest_mode(m.modes, true.rotation().matrix() @ AHEAD)) for m in seen]
+    attitude = gtsam.PriorFactorPose3(1, true, gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-4] * 3 + [30.0] * 3)))
+    edges = gtsam.PriorFactorVector(3, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, FIXED.edge_sigma_px))
+    off, sigma = {}, {}
+    for slow in (None, np.zeros(1)):
+        T, modelled = true, slow is not None
+        for _ in range(4):
+            values = gtsam.Values()
+            values.insert(1, T)
+            made = [
+                f for m, decision in zip(seen, nearer, strict=True) for f in ROW.factors(m, FIXED, attached(T, slow), decision).factors
+            ]  # fmt: skip
+            if slow is not None:
+                values.insert(3, slow)
+            now = step([*made, attitude, *[edges] * modelled], values, (1, 3) if modelled else (1,))
+            T, slow = now.atPose3(1), now.atVector(3) if modelled else None
+        graph, ordering = gtsam.NonlinearFactorGraph(), gtsam.Ordering()
+        for factor in [*made, attitude, *[edges] * modelled]:
+            graph.add(factor)
+        for key in (1, 3) if modelled else (1,):
+            ordering.push_back(key)
+        A = graph.linearize(values).jacobian(ordering)[0]
+        cov = np.linalg.inv(A.T @ A)[3:6, 3:6]
+        away = true.rotation().matrix().T @ (CORNERS_M.mean(axis=0) - true.translation())
+        away /= np.linalg.norm(away)
+        off[modelled] = abs(float(away @ true.rotation().matrix().T @ (T.translation() - true.translation())))
+        sigma[modelled] = float(np.sqrt(away @ cov @ away))
+    assert off[False] > 0.005 * 40.0
+    assert off[False] > 3.0 * sigma[False]
+    assert sigma[True] == pytest.approx(2.0 * FIXED.edge_sigma_px * PX * 40.0**2 / SIZE_M, rel=0.3)
+    assert off[True] < 2.0 * sigma[True]
 
 
 def test_a_sighting_says_what_it_is() -> None:

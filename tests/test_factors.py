@@ -244,8 +244,8 @@ def test_a_factor_in_the_solvers_tangent_says_nothing_of_where_vessel_and_dock_a
     east = np.array([1.0, 0.0, 0.0])
     shift = {
         at.pose_key: np.concatenate([np.zeros(3), turned.rotation().matrix().T @ east]),
-        3: np.concatenate([east, np.zeros(3)]),
-        at.leaf_keys[0]: np.concatenate([east, np.zeros(3)]),
+        3: np.concatenate([east, np.zeros(4)]),
+        at.leaf_keys[0]: np.concatenate([east, np.zeros(4)]),
     }
     moved = [np.hstack([shift[key] for key in map(int, f.keys())]) for f in written.factors]
     for factor, step in zip(written.factors, moved, strict=True):

@@ -37,7 +37,7 @@ class SeenTag:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeing:
-    """Who sees, and when; floor: least noise of a ray, each axis, 1 sigma."""
+    """Who sees, and when; floor: least noise of a ray, each axis, 1 sigma; px: a pixel as a ray."""
 
     stamp_ns: int
     sensor: str
@@ -45,6 +45,7 @@ class Seeing:
     t_body_camera_m: Array
     R_body_camera: Array
     floor: float = 0.0
+    px: float = 0.0
 
 
 def sightings_of(seen: Sequence[SeenTag], survey: Survey, seeing: Seeing) -> tuple[list[TagSighting], list[int]]:
@@ -144,4 +145,5 @@ def _sighting(bundle: Bundle, survey: Survey, frame: str, seeing: Seeing) -> Tag
         modes=modes_of(
             bundle.poses, bundle.points_m, bundle.rays, bundle.cov, blind=any(s.fitted for s in bundle.group)
         ),
+        px=seeing.px,
     )  # fmt: skip

@@ -281,8 +281,8 @@ def _sorted_out(shown: _Raw, stamp_ns: int, eye: _Eye, sensor: str, config: Apri
             )
         else:
             seen.append(SeenTag(tag, rays, cov, fitted))
-    focal_px = _NO_FOCAL_PX if eye.lens is None else float(eye.lens.K[0, 0])
-    seeing = Seeing(stamp_ns, sensor, eye.name, *eye.mount, floor=config.min_corner_sigma_px / focal_px)
+    px = 1.0 / (_NO_FOCAL_PX if eye.lens is None else float(eye.lens.K[0, 0]))
+    seeing = Seeing(stamp_ns, sensor, eye.name, *eye.mount, floor=config.min_corner_sigma_px * px, px=px)
     sightings, lost = sightings_of(seen, survey, seeing)
     troubles += [f"tag {number}: no pose explains its corners" for number in lost]
     lines = (tuple(dict.fromkeys(each)) for each in (troubles, shown.doubtful))
