@@ -21,7 +21,7 @@ from graphloc.eval.ablation_page import said as ablation_said
 from graphloc.eval.drill import page
 from graphloc.eval.drill.measure import Drilled, State, summed
 from graphloc.eval.page import Grid
-from graphloc.eval.plots import COLOURS
+from graphloc.eval.plots import colour_of
 from graphloc.eval.simulate import SimulatedRun, harbour_scenarios, simulate
 from graphloc.whatif import ablate
 
@@ -104,15 +104,15 @@ def picture(drilled: Drilled, out: Path) -> None:
         own = {r.failure: r for r in rows if r.estimator == name and r.off_m is not None}
         for axes, family in zip(lengths, outages, strict=True):
             curve = sorted((r.length_s, max(r.off_m or 0.0, _LEAST_M)) for r in own.values() if r.family == family)
-            axes.plot(*np.array(curve).T, "o-", color=COLOURS[i], markersize=4)
+            axes.plot(*np.array(curve).T, "o-", color=colour_of(name), markersize=4)
             axes.set(yscale="log", title=family, ylabel="farthest off, m")
         y = np.array([names.index(f) for f in own]) + 0.16 * (1.5 - i)
         off = np.array([max(r.off_m or 0.0, _LEAST_M) for r in own.values()])
         lost = np.array([bool(r.lost or r.none) for r in own.values()])
-        every.plot(off[~lost], y[~lost], "o", color=COLOURS[i], markersize=5, label=name)
-        every.plot(off[lost], y[lost], "X", color=COLOURS[i], markersize=7)
+        every.plot(off[~lost], y[~lost], "o", color=colour_of(name), markersize=5, label=name)
+        every.plot(off[lost], y[lost], "X", color=colour_of(name), markersize=7)
         usual = [max(r.normal_m or 0.0, _LEAST_M) for r in own.values()]
-        every.plot(usual, y, "o", color=COLOURS[i], markersize=4, fillstyle="none", alpha=0.5)
+        every.plot(usual, y, "o", color=colour_of(name), markersize=4, fillstyle="none", alpha=0.5)
     for axis in (*(axes.yaxis for axes in lengths), every.xaxis):
         axis.set_major_formatter("{x:g}")
     lengths[-1].set(xlabel="length, s")

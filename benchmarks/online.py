@@ -24,7 +24,7 @@ import soak
 from _rows import ROOT, Row, row
 from ruamel.yaml import YAML
 from scipy.stats import chi2
-from smoothing import loss_ns
+from smoothing import hard_start, loss_ns
 
 from graphloc import app
 from graphloc.config import effective
@@ -169,13 +169,8 @@ def latency(pool: ProcessPoolExecutor, times: int = 3, soak_hours: float = 2.0) 
 
 
 def _start(seed: int) -> tuple[float, float, float, float] | None:
-    """The run of smoothing._start: s to the first estimate, its errors in m and deg, the largest in deg at the end."""
-    rng = np.random.default_rng(seed)
-    scenario = replace(
-        bl_scenario(1 + seed % 2, "drift"), duration_s=60.0, gyro_bias_radps=float(rng.uniform(0.02, 0.05)),
-        start_heading_error_deg=float(rng.choice([-1, 1]) * rng.uniform(5.0, 15.0)), compass_until_s=0.0 if seed % 4 == 3 else 1e9,
-    )  # fmt: skip
-    run = simulate(scenario, seed)
+    """S to the first estimate, its errors in m and deg, the largest in deg at the end."""
+    run = hard_start(seed)
     try:
         found = replay(run.recording, run.config)
     except SolveError:

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from graphloc import app
-from graphloc.eval import ekf
+from graphloc.eval.ekf import _honest, run_honest
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, bl_scenario, simulate
 from graphloc.trajectory import Trajectory
@@ -41,8 +41,8 @@ def run(job: tuple[Scenario, int]) -> list[float]:
     datum = app.choose_datum(simulated.recording, simulated.config)
     errors = []
     for choice in CHOICES:
-        ekf._HONEST_ACCEL, ekf._HONEST_GATE, ekf._HONEST_PATIENCE_S = choice  # noqa: SLF001
-        track = ekf.run_honest(simulated.recording, simulated.config, datum).trajectory
+        _honest._ACCEL, _honest._GATE, _honest._PATIENCE_S = choice  # noqa: SLF001
+        track = run_honest(simulated.recording, simulated.config, datum).trajectory
         truth = simulated.truth
         back = truth.stamps_ns >= truth.stamps_ns[-1] - 30 * 10**9 if job[0].outage_s else slice(None)
         judged = Trajectory(

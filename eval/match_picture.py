@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from graphloc.chi2 import CHI2_95
+from graphloc.chi2 import chi2_95
 from graphloc.errors import OutputError
 from graphloc.frames import Array
 from graphloc.frontends.aerial import Match
@@ -150,7 +150,7 @@ def _ellipse(
 ) -> None:
     """95 % of a mode."""
     angle = np.linspace(0.0, 2.0 * np.pi, 60)
-    ring = np.column_stack([np.cos(angle), np.sin(angle)]) @ np.linalg.cholesky(CHI2_95[2] * cov).T + pose[:2]
+    ring = np.column_stack([np.cos(angle), np.sin(angle)]) @ np.linalg.cholesky(chi2_95(2) * cov).T + pose[:2]
     cv2.polylines(canvas, [_pixels(match, ring, corner).astype(np.int32)], True, colour, 2, cv2.LINE_AA)
 
 

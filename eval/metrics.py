@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.chi2 import CHI2_95
+from graphloc.chi2 import chi2_95
 from graphloc.errors import InputError
 from graphloc.eval.words import number
 from graphloc.frames import Array, Datum, wrap_angle
@@ -104,8 +104,8 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
     nees = coverage = heading_coverage = None
     if there.cov is not None:
         squared = squared_over_covariance(error, there.cov)
-        nees, coverage = float(squared.mean()), float((squared <= CHI2_95[2]).mean())
-        heading_coverage = float((heading**2 <= CHI2_95[1] * there.cov[:, 5, 5]).mean())
+        nees, coverage = float(squared.mean()), float((squared <= chi2_95(2)).mean())
+        heading_coverage = float((heading**2 <= chi2_95(1) * there.cov[:, 5, 5]).mean())
     return TruthMetrics(
         position_rmse_m=_rms(horizontal),
         position_p50_m=float(np.percentile(horizontal, 50)),

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import AerialConfig, VesselConfig
 from graphloc.errors import InputError, OutputError
 from graphloc.eval.ekf import FilterResult, as_pose
-from graphloc.eval.plots import COLOURS
+from graphloc.eval.plots import colour_of
 from graphloc.extras import need
 from graphloc.frames import Array, Datum
 from graphloc.frontends._source import Bag
@@ -75,8 +75,8 @@ def write_rerun(
         stream.send_recording_start_time_nanos(int(solution.trajectory.stamps_ns[0]))
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         tracks = {solution.name: solution.trajectory, **{f.name: f.trajectory for f in filters}}
-        for colour, (name, track) in zip(_cycle(len(tracks)), tracks.items(), strict=True):
-            _log_track(stream, name, track, colour, config)
+        for name, track in tracks.items():
+            _log_track(stream, name, track, colour_of(name), config)
         if recording.truth is not None:
             _log_track(stream, "truth", recording.truth, _TRUTH, config)
         _log_health(stream, solution)
@@ -122,13 +122,9 @@ def _pixels(size: float) -> Any:
     return need("rerun", "rerun").Radius.ui_points(size)
 
 
-def _cycle(count: int) -> list[str]:
-    return [COLOURS[k % len(COLOURS)] for k in range(count)]
-
-
 def _entity(name: str) -> str:
-    """A name as a part of an entity path, which knows no blanks."""
-    return "".join(c if c.isalnum() or c in "-." else "_" for c in name)
+    """A name as a part of an entity path, of its own whatever other names there are: what a path cannot hold is escaped."""
+    return str(need("rerun", "rerun").escape_entity_path_part(name))
 
 
 def _columns(stream: Any, entity: str, stamps_ns: Any, columns: Any) -> None:

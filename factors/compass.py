@@ -24,10 +24,8 @@ from graphloc.measurements import CompassHeading
 _FLOOR_RAD = np.radians(0.05)  # no compass is better, whatever it says
 
 
-def _yaw_jacobian(R: Array, R_state_sensor: Array) -> Array:
-    """Derivative (6,) of yaw(R Exp(theta) R_state_sensor) by the body tangent (theta, rho)."""
-    x_body = R_state_sensor[:, 0]  # the sensor's x axis in body
-    x_world = R @ x_body
+def _yaw_jacobian(R: Array, x_body: Array, x_world: Array) -> Array:
+    """Derivative (6,) of yaw(R Exp(theta) R_state_sensor) by the body tangent (theta, rho); x_*: the sensor's x axis."""
     # d(R Exp(theta) x)/d theta = -R [x]_x, of which a row r of R gives x x r; yaw = atan2(y, x)
     horizontal = x_world[0] ** 2 + x_world[1] ** 2
     jacobian = np.zeros(6)
@@ -35,10 +33,15 @@ def _yaw_jacobian(R: Array, R_state_sensor: Array) -> Array:
     return jacobian
 
 
+def _axis(at: Attachment) -> tuple[Array, Array, Array]:
+    """The attitude (3, 3), and the sensor's x axis in body and in world."""
+    R, x_body = at.T_world_body.rotation().matrix(), at.T_state_sensor.rotation().matrix()[:, 0]
+    return R, x_body, R @ x_body
+
+
 def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual predicted - measured (1,) in rad."""
-    R = at.T_world_body.rotation().matrix()
-    x = R @ at.T_state_sensor.rotation().matrix()[:, 0]
+    R, x_body, x = _axis(at)
     offset = 0.0 if at.slow_value is None else float(at.slow_value[0])
     raw = np.array([math.remainder(math.atan2(x[1], x[0]) + offset - m.yaw_rad, math.tau)])
     sigma = max(m.sigma_rad, _FLOOR_RAD)
@@ -46,7 +49,7 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
         Residual(
             raw=raw,
             cov=np.array([[sigma**2]]),
-            jacobian=lambda: _yaw_jacobian(R, at.T_state_sensor.rotation().matrix())[None, :],
+            jacobian=lambda: _yaw_jacobian(R, x_body, x)[None, :],
             slow_jacobian=lambda: np.eye(1),
             prior=1.0,
             size_m=None,
@@ -80,7 +83,7 @@ def slow(config: CompassConfig) -> SlowProcess | None:
 
 def ideal(at: Attachment, config: CompassConfig) -> CompassHeading:
     """Return the heading that the attachment's estimate would give."""
-    x = at.T_world_body.rotation().matrix() @ at.T_state_sensor.rotation().matrix()[:, 0]
+    _, _, x = _axis(at)
     offset = 0.0 if at.slow_value is None else float(at.slow_value[0])
     yaw = float(wrap_angle(np.arctan2(x[1], x[0]) + offset))
     return CompassHeading(stamp_ns=0, sensor="compass", seq=0, yaw_rad=yaw, sigma_rad=np.radians(config.sigma_deg))

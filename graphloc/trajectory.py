@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from graphloc.chi2 import CHI2_95, SIGMAS_95
+from graphloc.chi2 import SIGMAS_95, chi2_95
 from graphloc.frames import Array, rpy_from_rotation
 from graphloc.time import seconds_since
 
@@ -110,5 +110,5 @@ def bounds_95(cov: Array) -> Array:
     """
     major = np.linalg.eigvalsh(cov[:, :2, :2])[:, -1]
     return np.column_stack(
-        [np.sqrt(CHI2_95[2] * major), SIGMAS_95 * np.sqrt(cov[:, 2, 2]), SIGMAS_95 * np.degrees(np.sqrt(cov[:, 5, 5]))]
+        [np.sqrt(chi2_95(2) * major), SIGMAS_95 * np.sqrt(cov[:, 2, 2]), SIGMAS_95 * np.degrees(np.sqrt(cov[:, 5, 5]))]
     )

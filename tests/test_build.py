@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from graphloc import app, keys
+from graphloc.blocks import MountConfig
 from graphloc.build import Problem, StartPrior, attach, build_graph, make_problem
-from graphloc.config import GnssConfig, MountConfig, VelocityConfig
+from graphloc.config import GnssConfig, VelocityConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.graph import SlowProcess

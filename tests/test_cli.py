@@ -13,24 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphloc import cli, outputs
+from graphloc import outputs
 from graphloc.eval import report
 from graphloc.eval.simulate import Scenario, bl_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
+from tests.commands import called
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return write_bag(simulate(Scenario(duration_s=25.0), 3), tmp_path_factory.mktemp("cli") / "bag", ros=2)
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["graphloc", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
 
 
 def edited(config: Path, folder: Path, old: str, new: str) -> Path:
@@ -45,7 +37,7 @@ def test_smooth_writes_a_run_folder_and_does_not_replace_it_unasked(
     bag: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out, "--json", "--figures") == 0
+    assert called(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out, "--json", "--figures") == 0
     assert {"map.png", "map.svg", "errors.png", "nees.svg"} <= {p.name for p in (out / "figures").iterdir()}
     printed = capsys.readouterr().out
     numbers = json.loads(printed[: printed.rindex("}") + 1])
@@ -54,7 +46,7 @@ def test_smooth_writes_a_run_folder_and_does_not_replace_it_unasked(
     before = (out / "solution.csv").read_bytes()
 
     monkeypatch.setattr("graphloc.app.load", lambda *_: pytest.fail("refused only after the bag was read"))
-    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out) == 2
+    assert called(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert (out / "solution.csv").read_bytes() == before
 
@@ -68,9 +60,9 @@ def test_a_draft_from_inspect_gives_a_track(
     """
     where, _ = write_bag(simulate(bl_scenario(1, "clean"), 1), tmp_path / "bag", ros=1)
     draft = tmp_path / "vessel.yaml"
-    assert run(monkeypatch, "inspect", where, "--write", draft) == 0
+    assert called(monkeypatch, "inspect", where, "--write", draft) == 0
     assert "guess" in draft.read_text()
-    assert run(monkeypatch, "smooth", where, "-c", draft, "-o", tmp_path / "run", "--json") == 0
+    assert called(monkeypatch, "smooth", where, "-c", draft, "-o", tmp_path / "run", "--json") == 0
     printed = capsys.readouterr().out
     truth = json.loads(printed[printed.index('{\n  "Against') : printed.rindex("}") + 1])["Against truth"]["graphloc"]
     assert truth["position_rmse_m"] < 3.0
@@ -101,7 +93,7 @@ def test_a_bad_vessel_yaml_is_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     config = edited(bag[1], tmp_path, old, new)
-    assert run(monkeypatch, "smooth", bag[0], "-c", config, "-o", tmp_path / "run") == 2
+    assert called(monkeypatch, "smooth", bag[0], "-c", config, "-o", tmp_path / "run") == 2
     line = capsys.readouterr().err.strip().splitlines()
     assert len(line) == 1
     assert line[0].startswith("graphloc: ")
@@ -137,7 +129,7 @@ def test_bad_arguments_are_one_line(
         (["replay", *good[1:], "--rate", "fast"], "--rate"),
         (["sweep", "bl1-drift", "--mode", "x"], "--mode"),
     ):
-        assert run(monkeypatch, *arguments) == 2, arguments
+        assert called(monkeypatch, *arguments) == 2, arguments
         lines = capsys.readouterr().err.strip().splitlines()
         assert len(lines) == 1, lines
         assert said in lines[0]
@@ -157,7 +149,7 @@ def test_a_place_that_may_not_be_written_to_is_refused_before_the_work(
         *([command, bag[0], *good] for command in ("smooth", "compare", "replay", "ablate", "drill")),
         ["smooth", bag[0], *good[:3], tmp_path / "run", "--rerun", tmp_path / "shut/run.rrd"],
     ):
-        assert run(monkeypatch, *arguments) == 2, arguments
+        assert called(monkeypatch, *arguments) == 2, arguments
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert "Permission denied" in line
         assert str(tmp_path / "shut") in line
@@ -170,7 +162,7 @@ def test_a_full_disk_leaves_nothing(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(outputs, "_tum", full)
-    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", tmp_path / "run") == 2
+    assert called(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", tmp_path / "run") == 2
     assert "No space left" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -190,7 +182,7 @@ def test_an_interrupt_while_writing_leaves_nothing_and_keeps_the_old_run(
 
     monkeypatch.setattr(report, "write_report", interrupted)
     monkeypatch.setattr(os, "_exit", end)
-    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out, "--overwrite") == 130
+    assert called(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out, "--overwrite") == 130
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
     assert (out / outputs.MARK).read_text() == "{}"
 
@@ -228,7 +220,7 @@ def test_the_written_bag_holds_the_track(
     from rosbags.highlevel import AnyReader
 
     out = tmp_path / "run"
-    assert run(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out) == 0
+    assert called(monkeypatch, "smooth", bag[0], "-c", bag[1], "-o", out) == 0
     table = np.genfromtxt(out / "solution.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     with AnyReader([out / "solution_bag"]) as reader:
         odometry = [c for c in reader.connections if c.topic == "/graphloc/odometry"]
@@ -240,9 +232,9 @@ def test_the_written_bag_holds_the_track(
 
 
 def test_sensors_and_config_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, "sensors") == 0
+    assert called(monkeypatch, "sensors") == 0
     assert {"imu", "gnss", "compass", "pose"} <= {line.split()[0] for line in capsys.readouterr().out.splitlines()}
-    assert run(monkeypatch, "config", "--docs") == 0
+    assert called(monkeypatch, "config", "--docs") == 0
     written = (Path(__file__).parent.parent / "docs/configuration.md").read_text()
     assert capsys.readouterr().out == written, (
         "docs/configuration.md: run `graphloc config --docs > docs/configuration.md`"

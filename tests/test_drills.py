@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphloc import cli
 from graphloc.drills import _or_why_not, _started_there, as_it_comes, drill
 from graphloc.eval.drill import Case, Failure, Times, Window, cut, figures, judge, page, schedule, script
 from graphloc.eval.drill.measure import Drilled, Measured, State, compared, summed
 from graphloc.eval.drill.plan import judged_until, windows
-from graphloc.eval.plots import COLOURS, Line, Points
+from graphloc.eval.plots import Line, Points, colour_of
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, rotation_from_rpy_deg
 from graphloc.ledger import Outcome
@@ -24,6 +22,7 @@ from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, Measu
 from graphloc.recording import Recording
 from graphloc.replay import arrivals
 from graphloc.trajectory import Trajectory
+from tests.commands import called
 
 S = 1_000_000_000
 BEGIN_S = 30.0
@@ -397,11 +396,10 @@ def test_a_drill_from_recording_to_page(drilled: tuple[SimulatedRun, Drilled], t
 
 def test_an_estimator_has_the_colour_that_it_has_in_the_report(drilled: tuple[SimulatedRun, Drilled]) -> None:
     _, found = drilled
-    report = ["graphloc", "graphloc online", "BL EKF", "honest EKF"]
     for figure in (figures.all_failures(found), figures.over_time(found)):
         marks = [m for panel in figure.panels for m in panel.marks]
         colours = {m.name: m.colour for m in marks if isinstance(m, Line | Points)}
-        assert [colours[name] for name in report] == list(COLOURS[:4])
+        assert all(colours[name] == colour_of(name) for name in found.estimators)
 
 
 def test_the_command_prints_its_table_and_replaces_nothing_unasked(
@@ -419,25 +417,19 @@ def test_the_command_prints_its_table_and_replaces_nothing_unasked(
 
     monkeypatch.setattr("graphloc.app.load", lambda *_: (run.recording, run.config))
     out = tmp_path / "out"
-    arguments = ["graphloc", "drill", "my.bag", "-c", "vessel.yaml", "-o", str(out), "--set", "gap", "--times", "3"]
-    monkeypatch.setattr(sys, "argv", arguments)
+    arguments = ["drill", "my.bag", "-c", "vessel.yaml", "-o", str(out), "--set", "gap", "--times", "3"]
     with monkeypatch.context() as patch:
         patch.setattr("graphloc.drills.drill", drill_instead)
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-    assert not end.value.code
+        assert called(patch, *arguments) == 0
     assert (asked["only"], asked["times"]) == (["gap"], 3)
     printed = capsys.readouterr().out
     assert "IMU gap, 1 s" in printed
     assert printed.rstrip().endswith("drill.html")
     for changed, said in (
         (arguments, "--overwrite"),
-        ([*arguments[:6], str(out / "x"), "--set", "meteor"], "no such drill"),
+        ([*arguments[:5], str(out / "x"), "--set", "meteor"], "no such drill"),
     ):
-        monkeypatch.setattr(sys, "argv", changed)
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        assert end.value.code == 2
+        assert called(monkeypatch, *changed) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert said in line
     assert not (out / "x").exists()

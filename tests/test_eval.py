@@ -10,7 +10,8 @@ from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
 from graphloc import app
-from graphloc.config import MountConfig, VelocityConfig, VesselConfig
+from graphloc.blocks import MountConfig
+from graphloc.config import VelocityConfig, VesselConfig
 from graphloc.errors import ConfigError
 from graphloc.eval import ekf, metrics
 from graphloc.eval.holdout import HoldOut

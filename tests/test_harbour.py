@@ -2,7 +2,6 @@
 """The simulated harbour: its file, its image, its LiDARs, and the recording that comes of them."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from rosbags.highlevel import AnyReader
 from ruamel.yaml import YAML
 from scipy.spatial import cKDTree
 
-from graphloc import app, cli
+from graphloc import app
 from graphloc.errors import ConfigError, OutputError
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, find_scenario, harbour_scenarios, simulate
@@ -30,6 +29,7 @@ from graphloc.eval.simulate.rig import load_rig
 from graphloc.eval.simulate.scene import Scene, extrude, scene_of
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition
+from tests.commands import called
 
 SHORT = replace(harbour_scenarios()["bl1-drift"], duration_s=60.0)
 
@@ -115,10 +115,7 @@ def test_bad_scenarios_are_one_line(
     # Its reference point ends 4 m before the quay: the bow does not.
     Path("berth.yaml").write_text(json.dumps(block(routes={"dock_fixed": [[-60, 5], [-4, 5]]})))
     Path("crash.yaml").write_text(json.dumps(block(routes={"entry": [[-20, 5], [40, 5]]})))
-    monkeypatch.setattr(sys, "argv", ["graphloc", "simulate", *arguments, "-o", "out"])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == 2
+    assert called(monkeypatch, "simulate", *arguments, "-o", "out") == 2
     err = capsys.readouterr().err
     assert said in err
     assert err.count("\n") == 1 or "Usage" in err

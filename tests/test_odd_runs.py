@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from graphloc import app
+from graphloc.blocks import MountConfig
 from graphloc.build import make_problem
-from graphloc.config import DatumConfig, GnssConfig, HeightConfig, MountConfig, PoseConfig, VesselConfig
+from graphloc.config import DatumConfig, GnssConfig, HeightConfig, PoseConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.eval.drill.failures import imu_where
 from graphloc.eval.holdout import HoldOut

@@ -2,6 +2,7 @@
 """What figures show, from numbers made by hand; both who draw them draw all of it."""
 
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,6 +13,7 @@ import pytest
 from graphloc import app
 from graphloc.config import OutputConfig, VesselConfig
 from graphloc.eval import plots
+from graphloc.eval.ekf import FilterResult
 from graphloc.eval.plots.paper import drawn as on_paper
 from graphloc.eval.plots.paper import write_figures
 from graphloc.eval.report import ReportData, figures
@@ -21,7 +23,7 @@ from graphloc.frames import Datum
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition
 from graphloc.solution import Health
-from tests.test_maps import SQUARE, SWEDEN, drawn, framed, write
+from tests.mapfactory import SQUARE, SWEDEN, drawn, framed, write
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +101,29 @@ def test_an_outage_at_the_beginning_or_the_end_counts(data: ReportData) -> None:
     assert found[0][1] == pytest.approx(first + 5e9, abs=0.25e9)
     assert found[-1][1] == last
     assert found[-1][0] == pytest.approx(last - 4e9, abs=0.25e9)
+
+
+def test_a_track_has_one_colour_in_every_figure_whoever_is_beside_it(data: ReportData) -> None:
+    names = ("graphloc online", "BL EKF", "honest EKF", "Digerud KF")
+    track = data.solution.trajectory
+    seen: dict[str, set[str]] = {}
+    for beside in (*permutations(names, 2), names, ()):
+        filters = [FilterResult(name=name, trajectory=track, ledger=Ledger()) for name in beside]
+        found = (
+            plots.run_map(data.recording, data.solution, filters),
+            plots.error_over_time(data.recording, data.solution, filters, (), {}),
+            plots.consistency(data.recording, data.solution, filters),
+            plots.coverage(data.recording, data.solution, filters),
+        )
+        for figure in found:
+            assert figure is not None
+            lines = [mark for panel in figure.panels for mark in panel.marks if isinstance(mark, plots.Line)]
+            own = [line for line in lines if line.name in ("graphloc", *beside)]
+            assert {line.name for line in own} == {"graphloc", *beside}
+            for line in own:
+                seen.setdefault(line.name, set()).add(line.colour)
+    assert seen == {name: {plots.colour_of(name)} for name in ("graphloc", *names)}
+    assert len(set.union(*seen.values(), {plots.TRUTH})) == 2 + len(names)
 
 
 def test_panels_beside_each_other() -> None:

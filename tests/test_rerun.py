@@ -1,6 +1,5 @@
 """What is written for the rerun viewer, read back with its own reader: what is there, when, and where."""
 
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,15 +10,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from graphloc import app, cli
+from graphloc import app
 from graphloc.config import AerialConfig, AprilTagConfig
 from graphloc.errors import ExtraError, OutputError
 from graphloc.eval import rerun_log
+from graphloc.eval.plots import colour_of
 from graphloc.eval.rerun_log import write_rerun
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.frontends.aerial.cloud import Cloud
 from graphloc.frontends.aerial.live import Turn
+from graphloc.ledger import Ledger
+from tests.commands import called
+
+BLANK = r"\ "  # in an entity path
 
 
 def read(path: Path) -> dict[str, dict[str, list[Any]]]:
@@ -52,7 +56,7 @@ def test_tracks_weights_and_health_are_those_of_the_run(run: app.Run, tmp_path: 
     track, truth = run.solution.trajectory, run.recording.truth
     assert truth is not None
     names = {name.split("/")[2] for name in said if name.startswith("/world/") and name.endswith("/body")}
-    assert names == {"graphloc", "graphloc_online", "truth", *(f.name.replace(" ", "_") for f in run.filters[1:])}
+    assert names == {"graphloc", r"graphloc\ online", "truth", *(f.name.replace(" ", BLANK) for f in run.filters[1:])}
 
     body = said["/world/graphloc/body"]
     assert body["stamp"] == track.stamps_ns.tolist()
@@ -63,6 +67,10 @@ def test_tracks_weights_and_health_are_those_of_the_run(run: app.Run, tmp_path: 
     radius = [np.sqrt(5.991 * np.linalg.eigvalsh(cov[:2, :2])[-1]) for cov in track.cov]
     np.testing.assert_allclose(np.array(said["/bound_95_m/graphloc"]["scalars"])[:, 0], radius, rtol=1e-3)
     np.testing.assert_allclose(said["/world/truth/track"]["strips"][0][0], truth.p_world_m, atol=1e-4)
+
+    for name in ("graphloc", *(f.name for f in run.filters)):
+        (rgba,) = np.ravel(said[f"/world/{name.replace(' ', BLANK)}/track"]["colors"])
+        assert f"#{int(rgba) >> 8:06X}" == colour_of(name)  # as in the report
 
     rows = [row for row in run.solution.ledger if row.sensor == "aerial"]
     stamps = {m.seq: m.stamp_ns for m in run.recording.measurements}
@@ -92,6 +100,28 @@ def test_measurements_lie_where_they_say_red_where_they_are_not_believed(run: ap
     assert 1.0 < np.median(antenna[:, 2] - np.array(said["/world/truth/track"]["strips"][0][0])[0, 2]) < 6.0
     assert "/world/measured/compass" not in said  # says no place
     assert len(said["/weights/compass"]["stamp"]) == 140
+
+
+def test_sensors_of_like_names_are_told_apart(run: app.Run, tmp_path: Path) -> None:
+    """Matches as `my fix`, fixes as `my_fix`: each has its own stamps and weights, and nobody else's."""
+    names = {"aerial": "my fix", "gnss": "my_fix", "compass": "my/fix"}
+    measurements = tuple(replace(m, sensor=names.get(m.sensor, m.sensor)) for m in run.recording.measurements)
+    ledger = Ledger()
+    for row in run.solution.ledger:
+        ledger.add(replace(row, sensor=names.get(row.sensor, row.sensor)))
+    said = write(
+        replace(
+            run,
+            recording=replace(run.recording, measurements=measurements),
+            solution=replace(run.solution, ledger=ledger),
+        ),
+        tmp_path / "run.rrd",
+    )
+    for name, escaped in (("my fix", rf"my{BLANK}fix"), ("my_fix", "my_fix"), ("my/fix", r"my\/fix")):
+        stamps = [m.stamp_ns for m in measurements if m.sensor == name]
+        assert said[f"/weights/{escaped}"]["stamp"] == stamps, name
+        if name != "my/fix":  # a heading says no place
+            assert said[f"/world/measured/{escaped}"]["stamp"] == stamps, name
 
 
 def test_scans_the_image_and_tags_lie_in_world(run: app.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,26 +184,18 @@ def test_the_commands_write_it(
 ) -> None:
     bag, config = write_bag(simulate(Scenario(duration_s=14.0), 3), tmp_path / "bag", ros=2)
 
-    def call(*arguments: object) -> int:
-        monkeypatch.setattr(sys, "argv", ["graphloc", *map(str, arguments)])
-        try:
-            cli.main()
-        except SystemExit as end:
-            return int(end.code or 0)
-        return 0
-
-    for command, name in (("smooth", "graphloc"), ("replay", "graphloc_online")):
+    for command, name in (("smooth", "graphloc"), ("replay", r"graphloc\ online")):
         path = tmp_path / f"{command}.rrd"
-        assert call(command, bag, "-c", config, "-o", tmp_path / command, "--rerun", path) == 0
+        assert called(monkeypatch, command, bag, "-c", config, "-o", tmp_path / command, "--rerun", path) == 0
         assert len(read(path)[f"/world/{name}/body"]["stamp"]) > 50
     capsys.readouterr()
     monkeypatch.setattr("graphloc.app.load", lambda *_: pytest.fail("refused only after the bag was read"))
-    assert call("compare", bag, "-c", config, "-o", tmp_path / "x", "--rerun", path) == 2
+    assert called(monkeypatch, "compare", bag, "-c", config, "-o", tmp_path / "x", "--rerun", path) == 2
     assert "--overwrite" in capsys.readouterr().err
 
     def missing(*_: object) -> None:
         raise ExtraError("rerun is not installed: pip install 'graphloc[rerun]'")
 
     monkeypatch.setattr("graphloc.extras.need", missing)  # before anything else
-    assert call("smooth", bag, "-c", config, "-o", tmp_path / "y", "--rerun", tmp_path / "y.rrd") == 2
+    assert called(monkeypatch, "smooth", bag, "-c", config, "-o", tmp_path / "y", "--rerun", tmp_path / "y.rrd") == 2
     assert capsys.readouterr().err.strip() == "graphloc: rerun is not installed: pip install 'graphloc[rerun]'"

@@ -3,14 +3,13 @@
 
 import csv
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from graphloc import cli
 from graphloc.eval.summary import as_markdown, blocks, read_runs, write_summary
+from tests.commands import called
 
 
 def run_folder(parent: Path, name: str, tables: Any, *, converged: bool = True, warnings: int = 0) -> Path:
@@ -103,26 +102,17 @@ def test_runs_of_one_name_are_told_apart(tmp_path: Path) -> None:
     assert [run.name for run in read_runs(folders)] == [str(f) for f in folders]
 
 
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["graphloc", "compare", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
-
-
 def test_compare_of_run_folders(
     three: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "sum"
-    assert command(monkeypatch, *three, "-o", out, "--json") == 0
+    assert called(monkeypatch, "compare", *three, "-o", out, "--json") == 0
     printed = capsys.readouterr().out
     told = json.loads(printed[: printed.rindex("}") + 1])
     assert told["Against truth: position_rmse_m"]["worst"] == {"graphloc": 0.5, "BL EKF": 1.4}
-    assert command(monkeypatch, *three, "-o", out) == 2
+    assert called(monkeypatch, "compare", *three, "-o", out) == 2
     assert "--overwrite" in capsys.readouterr().err
-    assert command(monkeypatch, *three, "-o", out, "--overwrite") == 0
+    assert called(monkeypatch, "compare", *three, "-o", out, "--overwrite") == 0
 
 
 @pytest.mark.parametrize(
@@ -140,7 +130,7 @@ def test_a_broken_run_is_one_line(
     broken: str, said: str,
 ) -> None:  # fmt: skip
     (three[1] / "run.json").write_text(broken)
-    assert command(monkeypatch, *three, "-o", tmp_path / "sum") == 2
+    assert called(monkeypatch, "compare", *three, "-o", tmp_path / "sum") == 2
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
@@ -157,7 +147,7 @@ def test_what_does_not_go_together_is_one_line(
         ((three[0], three[1], "-c", "vessel.yaml"), "are for bags"),
         ((tmp_path / "bag",), "give --config"),
     ):
-        assert command(monkeypatch, *arguments, "-o", tmp_path / "sum") == 2
+        assert called(monkeypatch, "compare", *arguments, "-o", tmp_path / "sum") == 2
         error = capsys.readouterr().err
         assert said in error
         assert error.count("\n") == 1

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphloc import app
 from graphloc.config import AprilTagConfig, CompassConfig, VesselConfig
 from graphloc.errors import ConfigError
 from graphloc.frames import Array
+from graphloc.gather import with_surveys
 from graphloc.survey import Survey, TagConfig, load_survey
 
 
@@ -205,18 +205,18 @@ def test_surveys_are_read_beside_the_vessel_file(tmp_path: Path) -> None:
     (tmp_path / "harbour").mkdir()
     (tmp_path / "harbour" / "tags.yaml").write_text(entry())
     compass = CompassConfig(topic="/heading")
-    read = app.with_surveys(vessel(tags=AprilTagConfig(survey="harbour/tags.yaml"), compass=compass), tmp_path)
+    read = with_surveys(vessel(tags=AprilTagConfig(survey="harbour/tags.yaml"), compass=compass), tmp_path)
     tags = read.sensors["tags"]
     assert isinstance(tags, AprilTagConfig)
     assert [tag.id for tag in tags.surveyed.tags] == [3]
     assert read.sensors["compass"] == compass
-    again = app.with_surveys(read, Path("/nowhere"))  # what is read is not read again
+    again = with_surveys(read, Path("/nowhere"))  # what is read is not read again
     assert again.sensors["tags"] == tags
 
 
 def test_an_absolute_path_is_taken_as_it_is(tmp_path: Path) -> None:
     path = written(tmp_path, entry())
-    read = app.with_surveys(vessel(tags=AprilTagConfig(survey=str(path))), Path("/nowhere"))
+    read = with_surveys(vessel(tags=AprilTagConfig(survey=str(path))), Path("/nowhere"))
     tags = read.sensors["tags"]
     assert isinstance(tags, AprilTagConfig)
     assert len(tags.surveyed.tags) == 1
@@ -224,9 +224,9 @@ def test_an_absolute_path_is_taken_as_it_is(tmp_path: Path) -> None:
 
 def test_a_sensor_without_a_survey_says_what_it_needs(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"sensors\.bow\.survey: name the tags\.yaml"):
-        app.with_surveys(vessel(bow=AprilTagConfig()), tmp_path)
+        with_surveys(vessel(bow=AprilTagConfig()), tmp_path)
     with pytest.raises(ConfigError, match=r"tags\.yaml: cannot be read"):
-        app.with_surveys(vessel(bow=AprilTagConfig(survey="tags.yaml")), tmp_path)
+        with_surveys(vessel(bow=AprilTagConfig(survey="tags.yaml")), tmp_path)
 
 
 def test_before_it_is_read_a_survey_is_empty() -> None:

@@ -11,9 +11,14 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 
 
+def _not_source(folder: str, names: list[str]) -> set[str]:
+    built = {"build", "runs"} if Path(folder) == ROOT else set()
+    return built | shutil.ignore_patterns(".*", "*.egg-info", "__pycache__")(folder, names)
+
+
 def test_the_wheel_works_elsewhere(tmp_path: Path) -> None:
     source = tmp_path / "source"  # a copy: building leaves folders behind
-    shutil.copytree(ROOT, source, symlinks=True, ignore=shutil.ignore_patterns(".*", "runs", "build", "*.egg-info"))
+    shutil.copytree(ROOT, source, symlinks=True, ignore=_not_source)
     pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
     subprocess.run([*pip, "--wheel-dir", str(tmp_path), str(source)], check=True, capture_output=True)
     (wheel,) = tmp_path.glob("graphloc-*.whl")

@@ -9,10 +9,8 @@ import numpy as np
 
 from graphloc.eval.drill.measure import Drilled, Row, Times, summed
 from graphloc.eval.drill.plan import TAIL_S, Case
-from graphloc.eval.plots import COLOURS, Figure, Line, Mark, Panel, Points, Shape, Span
+from graphloc.eval.plots import Figure, Line, Mark, Panel, Points, Shape, Span, colour_of
 
-# As the report has them, whatever the order of the tables here.
-_COLOUR = dict(zip(("graphloc", "graphloc online", "BL EKF", "honest EKF"), COLOURS, strict=False))
 _SHOWN_S = 10.0  # of an error over time, before the failure
 _FEWEST_M = 0.05  # lower end of logarithmic axes
 _PANEL_PX, _BESIDE_PX = 190, 100
@@ -41,7 +39,7 @@ def against_length(drilled: Drilled) -> Figure | None:
                 key=lambda r: r.length_s,
             )
             length_s = np.array([r.length_s for r in own])
-            marks.append(Line(name=name, x=length_s, y=_off_m(own), colour=_COLOUR[name]))
+            marks.append(Line(name=name, x=length_s, y=_off_m(own), colour=colour_of(name)))
             marks += _points(own, name, length_s, _off_m(own), size=9.0, listed=False)
         y = "farthest off, m" if not panels else ""
         panels.append(Panel(title=family, y=y, marks=tuple(marks), log_y=True, range_y=shown))
@@ -62,7 +60,7 @@ def _points(rows: Sequence[Row], name: str, x: np.ndarray, y: np.ndarray, size: 
     text = [f"{r.failure}<br>{name}: {r.off_m:.2f} m" for r in rows]
     return [
         Points(
-            name=name, x=x[some], y=y[some], colour=_COLOUR[name], shape=shape, size=size, listed=listed,
+            name=name, x=x[some], y=y[some], colour=colour_of(name), shape=shape, size=size, listed=listed,
             text=[t for t, there in zip(text, some, strict=True) if there],
         )
         for shape, some in shapes
@@ -80,7 +78,7 @@ def all_failures(drilled: Drilled) -> Figure:
         y = np.array([names.index(r.failure) for r in own]) + 0.16 * (1.5 - i)
         usual_m = np.array([max(r.normal_m or 0.0, _FEWEST_M) for r in own])
         marks.append(
-            Points(name=name, x=usual_m, y=y, colour=_COLOUR[name], shape="circle-open", size=7.0, listed=False)
+            Points(name=name, x=usual_m, y=y, colour=colour_of(name), shape="circle-open", size=7.0, listed=False)
         )
         marks += _points(own, name, _off_m(own), y, size=10.0, listed=True)
     panel = Panel(title="", y="", marks=tuple(marks), range_y=(-0.6, len(names) - 0.4), ticks_y=tuple(names))
@@ -105,7 +103,11 @@ def over_time(drilled: Drilled) -> Figure:
             off_m = np.maximum(t.off_m[near], _FEWEST_M)
             marks.append(
                 Line(
-                    name=estimator, x=np.asarray(at_s[near], dtype=float), y=off_m, colour=_COLOUR[estimator], width=1.8
+                    name=estimator,
+                    x=np.asarray(at_s[near], dtype=float),
+                    y=off_m,
+                    colour=colour_of(estimator),
+                    width=1.8,
                 )
             )
         y = "m" if len(panels) % 2 == 0 else ""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.chi2 import CHI2_95
+from graphloc.chi2 import chi2_95
 from graphloc.eval.drill.plan import TAIL_S, Case, Window
 from graphloc.eval.metrics import squared_over_covariance
 from graphloc.frames import Array, wrap_angle
@@ -92,7 +92,7 @@ def compared(track: Trajectory | None, reference: Trajectory, window: Window, *,
         cov = ours.cov[:, :2, :2] + (0.0 if sure or true.cov is None else true.cov[:, :2, :2])
         off_m[there] = np.hypot(*error.T)
         off_deg[there] = np.degrees(np.abs(wrap_angle(ours.yaw_rad - true.yaw_rad)))
-        held[there] = squared_over_covariance(error, cov) <= CHI2_95[2]
+        held[there] = squared_over_covariance(error, cov) <= chi2_95(2)
     return Times(stamps_ns=stamps, there=there, off_m=off_m, off_deg=off_deg, held=held)
 
 

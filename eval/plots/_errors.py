@@ -23,6 +23,7 @@ from graphloc.eval.plots._marks import (
     Panel,
     Points,
     Span,
+    colour_of,
     peaks,
     thinned,
 )
@@ -42,7 +43,7 @@ _SHARES = np.array([0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.9
 
 def _named(solution: Solution, filters: Sequence[FilterResult]) -> list[tuple[str, Trajectory, str]]:
     tracks = [(solution.name, solution.trajectory), *((f.name, f.trajectory) for f in filters)]
-    return [(name, track, COLOURS[i % len(COLOURS)]) for i, (name, track) in enumerate(tracks)]
+    return [(name, track, colour_of(name)) for name, track in tracks]
 
 
 def error_over_time(
@@ -63,7 +64,14 @@ def error_over_time(
     heading: list[Mark] = [*position]
     for marks, k in ((position, 0), (heading, 2)):
         marks.append(
-            Band(name=name, x=t, low=np.zeros(len(t)), high=bound[:, k], colour=COLOURS[0], listed=marks is position)
+            Band(
+                name=name,
+                x=t,
+                low=np.zeros(len(t)),
+                high=bound[:, k],
+                colour=colour_of(solution.name),
+                listed=marks is position,
+            )
         )
     largest_m: dict[str, float] = {}
     for who, estimate, colour in reversed(_named(solution, filters)):  # ours last, on top

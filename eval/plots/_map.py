@@ -11,7 +11,6 @@ import numpy as np
 
 from graphloc.eval.ekf import FilterResult, as_pose
 from graphloc.eval.plots._marks import (
-    COLOURS,
     TRUTH,
     Dash,
     Figure,
@@ -21,6 +20,7 @@ from graphloc.eval.plots._marks import (
     Points,
     Shape,
     Underlay,
+    colour_of,
     shown_of,
     thinned,
 )
@@ -91,11 +91,11 @@ def run_map(
     if held:
         p = solution.datum.enu_from_geodetic(*np.array([m.position for m in held]).T)[thinned(len(held))]
         marks.append(Points(name="held-out fixes", x=p[:, 0], y=p[:, 1], shape="x", size=4.0))
-    for i, f in enumerate(filters):
-        marks.append(_track(f.name, f.trajectory, COLOURS[1 + i % (len(COLOURS) - 1)], "dash"))
+    for f in filters:
+        marks.append(_track(f.name, f.trajectory, colour_of(f.name), "dash"))
     if recording.truth is not None:
         marks.append(_track("truth", recording.truth, TRUTH, "dot"))
-    marks.append(_track(solution.name, solution.trajectory, COLOURS[0], "solid"))
+    marks.append(_track(solution.name, solution.trajectory, colour_of(solution.name), "solid"))
     panel = Panel(title="", y="north, m", marks=tuple(marks))
     return Figure(name="map", x="east, m", panels=(panel,), height=_HEIGHT_PX, is_map=True, underlay=underlay)
 

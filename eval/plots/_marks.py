@@ -18,6 +18,7 @@ from graphloc.frames import Array
 
 COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
 TRUTH, OUTAGE = "#000000", "#777777"
+_TRACKS = dict(zip(("graphloc", "graphloc online", "BL EKF", "honest EKF", "Digerud KF"), COLOURS, strict=False))
 MOST = 2000  # points a trace: more cannot be seen and make a heavy page
 
 Dash = Literal["solid", "dash", "dot"]
@@ -136,6 +137,11 @@ class Figure:
     range_x: tuple[float, float] | None = None
     is_map: bool = False
     underlay: Underlay | None = None
+
+
+def colour_of(name: str) -> str:
+    """Return the colour of an estimator's track, the same in every figure, whoever else is there."""
+    return _TRACKS.get(name, COLOURS[-1])
 
 
 def thinned(n: int, most: int = MOST) -> NDArray[np.int64]:

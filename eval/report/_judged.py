@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphloc.chi2 import CHI2_95
+from graphloc.chi2 import chi2_95
 from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
@@ -155,8 +155,8 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
     _, error, turned, there, _ = errors(solution.trajectory, data.solution.trajectory)
     assert there.cov is not None
     off = _away(error)
-    placed = float(np.mean(squared_over_covariance(error, there.cov) <= CHI2_95[2]))
-    headed = float(np.mean(turned**2 <= CHI2_95[1] * there.cov[:, 5, 5]))
+    placed = float(np.mean(squared_over_covariance(error, there.cov) <= chi2_95(2)))
+    headed = float(np.mean(turned**2 <= chi2_95(1) * there.cov[:, 5, 5]))
     short = min(placed, headed) < _HOLDS_OFFLINE
     trust = Trust.NO if placed < _NOT_COVERED else Trust.WITH_CARE if short else Trust.YES
     said = "; honest ones hold it for 95 % or more, as offline knows more: they are too small" if short else ""

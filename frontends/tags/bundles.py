@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2
 
+from graphloc.chi2 import chi2_95
 from graphloc.frames import Array, pinhole, skew
 from graphloc.frontends.tags.pose import KEPT, PoseOfCamera, modes_of, poses_of
 from graphloc.measurements import TagSighting
@@ -107,7 +107,7 @@ class Bundle:
 
         Which minima are none is judged only now: with the noise that was claimed for blurred corners, all but one are.
         """
-        if self.excess > chi2.ppf(0.95, self.dof) / self.dof:
+        if self.excess > chi2_95(self.dof) / self.dof:
             self.cov, self.seen_cov = self.cov * self.excess, self.seen_cov * self.excess
             self.poses = self._again()
         if len(self.group) > 1:

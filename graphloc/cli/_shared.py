@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -189,6 +189,19 @@ class Wanted:
         )
         write_rerun(self.rerun, run, self.bag, self.config)
         print_run(run, page, self.as_json, self.rerun)
+
+    def write_page(self, page: str, mark: str, write: Callable[[Path, str], None], said: Sequence[str]) -> None:
+        """Write a folder with a page, and tell of it: its `mark`, which is JSON, or the lines `said`."""
+        from graphloc import outputs
+
+        with outputs.fresh_folder(self.out, overwrite=self.overwrite, mark=mark) as fresh:
+            write(fresh, " ".join(sys.argv[1:]))
+        if self.as_json:
+            typer.echo((self.out / mark).read_text(encoding="utf-8"), nl=False)
+        else:
+            for line in said:
+                typer.echo(line)
+            typer.echo(str(self.out / page))
 
 
 def smooth_bags(wanted: Wanted, hold_out: str | None = None, *, compare: bool) -> None:

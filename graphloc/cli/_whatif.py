@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-import sys
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -33,7 +33,7 @@ def ablate(
     as_json: JsonOption = False,
 ) -> None:
     """Smooth a run without each sensor in turn: what each is worth, and whether one contradicts the rest."""
-    from graphloc import outputs, whatif
+    from graphloc import whatif
     from graphloc.eval import ablation_page as page
     from graphloc.eval.holdout import HoldOut
 
@@ -45,14 +45,8 @@ def ablate(
     found = whatif.ablate(
         recording, vessel, scans=scans, hold_out=held, jobs=jobs or os.cpu_count() or 1, progress=show
     )
-    with outputs.fresh_folder(out, overwrite=overwrite, mark=page.MARK) as fresh:
-        page.write(found, fresh, " ".join(sys.argv[1:]))
-    if as_json:
-        typer.echo((out / page.MARK).read_text(encoding="utf-8"), nl=False)
-    else:
-        for line in (*page.said(found), *(grid.as_text() for grid in page.grids(found))):
-            typer.echo(line)
-        typer.echo(str(out / "ablation.html"))
+    said = (*page.said(found), *(grid.as_text() for grid in page.grids(found)))
+    wanted.write_page("ablation.html", page.MARK, partial(page.write, found), said)
 
 
 def drill(
@@ -70,7 +64,7 @@ def drill(
     as_json: JsonOption = False,
 ) -> None:
     """Strike a run with harbour failures: what smoother, online mode and EKFs make of them."""
-    from graphloc import drills, outputs
+    from graphloc import drills
     from graphloc.eval.drill import page
 
     wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json)
@@ -87,11 +81,5 @@ def drill(
         jobs=jobs or os.cpu_count() or 1,
         progress=show,
     )
-    with outputs.fresh_folder(out, overwrite=overwrite, mark=page.MARK) as fresh:
-        page.write(found, fresh, " ".join(sys.argv[1:]))
-    if as_json:
-        typer.echo((out / page.MARK).read_text(encoding="utf-8"), nl=False)
-    else:
-        for line in (*page.said(found), *(grid.as_text() for grid in page.brief(found))):
-            typer.echo(line)
-        typer.echo(str(out / "drill.html"))
+    said = (*page.said(found), *(grid.as_text() for grid in page.brief(found)))
+    wanted.write_page("drill.html", page.MARK, partial(page.write, found), said)

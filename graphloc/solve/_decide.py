@@ -17,9 +17,9 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from graphloc.build import Decisions, Judged, Problem, Stream, attach
+from graphloc.chi2 import chi2_median
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
@@ -165,7 +165,7 @@ def _spread(nis: list[float], dof: int) -> float:
     re-weighting then creeps; one that bends too early for noise that is configured too small rejects a
     good sensor (measured on KITTI: 97 % of the fixes lost, 23 m off). So the bend follows the median.
     """
-    return max(1.0, float(np.sqrt(np.median(nis) / chi2.median(dof)))) if nis else 1.0
+    return max(1.0, float(np.sqrt(np.median(nis) / chi2_median(dof)))) if nis else 1.0
 
 
 def by_hypotheses(

@@ -1,34 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The application: the one place, beside the CLI, where all rooms meet.
-
-`bag -> frontend -> measurements -> rows -> graph -> solution -> outputs and report`, in that order.
-"""
+"""From a bag to a run: read, smoothed or replayed, its scans matched, the filters beside it."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
-import numpy as np
-
-from graphloc import found_tags, origin, outputs
-from graphloc.build import mount_of
+from graphloc import found_tags, origin
+from graphloc.app._run import Run, made_comparable
 from graphloc.config import VesselConfig, load_config
 from graphloc.errors import InputError, SolveError
-from graphloc.eval import calibrate, ekf, holdout, metrics, report
+from graphloc.eval import calibrate, ekf, holdout
 from graphloc.eval.digerud import run_digerud
-from graphloc.eval.docking import docking_table
 from graphloc.eval.match_picture import Gallery
-from graphloc.eval.plots import Underlay
 from graphloc.eval.posture import posture_warnings
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
-from graphloc.frames import Array, Datum
+from graphloc.frames import Datum
 from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
 from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
@@ -38,29 +29,6 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.replay import Status, replay, silent
 from graphloc.solution import Solution
 from graphloc.solve import smooth
-from graphloc.survey import TagConfig
-from graphloc.trajectory import Trajectory
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Run:
-    """A smoothed run and what it is compared with."""
-
-    recording: Recording
-    config: VesselConfig
-    solution: Solution
-    held: tuple[GnssPosition, ...] = ()
-    filters: tuple[ekf.FilterResult, ...] = ()
-    online: Solution | None = None  # of the same measurements, beside an offline run that is compared
-    pictures: tuple[tuple[str, bytes], ...] = ()  # of matches: caption, JPEG
-    tags: tuple[TagConfig, ...] = ()  # that are not surveyed, where the run puts them
-    underlay: Underlay | None = None  # the aerial image under the report's map
-    calibration: calibrate.Calibration | None = None  # offline
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """All that was said on the way."""
-        return report.said_on_the_way(self.recording, self.solution, self.online)
 
 
 def configured(config_path: Path, changes: Mapping[str, object] = MappingProxyType({})) -> VesselConfig:
@@ -125,7 +93,7 @@ def smooth_recording(
         filters=filters, online=online, pictures=tuple(gallery.pictures()), tags=tags,
         calibration=calibrate.calibrate(recording, config, solution),
     )  # fmt: skip
-    return _comparable(_with_underlay(run, scans))
+    return made_comparable(_with_underlay(run, scans))
 
 
 def _with_underlay(run: Run, scans: Scans | None) -> Run:
@@ -171,7 +139,7 @@ def replay_recording(
     """Run a recording through the online mode (see `graphloc.replay`)."""
     replayed = replay(recording, config, scans=scans, rate=rate, lag_s=lag_s, stoppable=True, status=status)
     run = Run(recording=replayed.recording, config=config, solution=replayed.solution)
-    return _comparable(_with_underlay(run, scans))
+    return made_comparable(_with_underlay(run, scans))
 
 
 def solve(
@@ -235,46 +203,6 @@ def match_at(
     return item.match, item.stamp_ns
 
 
-def _comparable(run: Run) -> Run:
-    """Drop what shares no time with the track, and say so."""
-    truth, speed, held, track = run.recording.truth, run.recording.check_speed, run.held, run.solution.trajectory
-    said: list[str] = []
-
-    def comparable(compare: Callable[..., object], *arguments: object) -> bool:
-        try:
-            compare(*arguments)
-        except metrics.NoCommonTimeError as error:
-            said.append(str(error))
-            return False
-        return True
-
-    if truth is not None and not comparable(metrics.errors, track, truth):
-        truth = None
-    if speed is not None and not comparable(metrics.compare_speed, track, speed):
-        speed = None
-    if held and not comparable(metrics.held_out_errors, track, held, run.solution.datum, levers_m(run)):
-        held = ()
-
-    def fits(filtered: ekf.FilterResult) -> bool:
-        return (truth is None or comparable(metrics.errors, filtered.trajectory, truth)) and (
-            not held
-            or comparable(metrics.held_out_errors, filtered.trajectory, held, run.solution.datum, levers_m(run))
-        )
-
-    filters = tuple(f for f in run.filters if fits(f))
-    online = run.online
-    if online is not None and not comparable(metrics.errors, online.trajectory, track):
-        online = None
-    recording = replace(run.recording, truth=truth, check_speed=speed, warnings=(*run.recording.warnings, *said))
-    return replace(run, recording=recording, held=held, filters=filters, online=online)
-
-
-def levers_m(run: Run) -> dict[str, Array]:
-    """Return the antenna of each receiver that fixes were held out of, in body."""
-    names = dict.fromkeys(m.sensor for m in run.held)
-    return {name: mount_of(name, run.config.sensors[name], run.recording.mounts)[0] for name in names}
-
-
 def simulated(run: SimulatedRun, *, compare: bool = False, progress: Progress = quiet) -> Run:
     """Smooth a simulated run."""
     return smooth_recording(run.recording, run.config, compare=compare, progress=progress)
@@ -288,135 +216,3 @@ def choose_datum(recording: Recording, config: VesselConfig) -> Datum:
 def with_synthetic(recording: Recording, config: VesselConfig, datum: Datum) -> Recording:
     """Add the measurements that the configuration makes itself (the height prior)."""
     return origin.with_synthetic(recording, config, datum, SENSORS)
-
-
-def tables(run: Run) -> tuple[metrics.Table, ...]:
-    """Return the numbers of a run: against truth, held-out fixes, and the speed check."""
-    found: list[metrics.Table] = []
-    estimates = [(run.solution.name, run.solution.trajectory), *((f.name, f.trajectory) for f in run.filters)]
-    if run.recording.truth is not None:
-        found.append(metrics.truth_table(estimates, run.recording.truth))
-        found += _docking_tables(run, estimates, run.recording.truth)
-    if run.held:
-        found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, levers_m(run)))
-    if run.recording.check_speed is not None:
-        found.append(metrics.speed_table(estimates, run.recording.check_speed))
-    whys = [f"{f.name}: {f.why}." for f in run.filters if f.why]
-    return (replace(found[0], note="\n".join([found[0].note, *whys])), *found[1:]) if found else ()
-
-
-def _docking_tables(
-    run: Run, estimates: Sequence[tuple[str, Trajectory]], truth: Trajectory
-) -> Iterator[metrics.Table]:
-    """A table for each tag sensor that saw a tag."""
-    sensors = run.config.of_kind("apriltag")
-    for name, sensor in sensors.items():
-        seen = [m for m in run.recording.measurements if isinstance(m, TagSighting) and m.sensor == name]
-        if seen:
-            stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
-            table = docking_table(estimates, truth, sensor.surveyed, stamps, seen[0].t_body_camera_m)
-            yield replace(table, title=table.title if len(sensors) == 1 else f"{table.title}: {name}")
-
-
-def truth_statement(run: Run) -> str:
-    """Say plainly what the numbers were measured against."""
-    if run.recording.truth is not None:
-        truth = run.recording.truth
-        span_s = (int(truth.stamps_ns[-1]) - int(truth.stamps_ns[0])) / 1e9
-        named = run.config.truth_topic or "given with the recording"
-        imu = run.recording.imu
-        begun = bool(run.filters) and imu is not None and bool(truth.covers(imu.stamps_ns[:1]).all())
-        started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
-        return f"Truth: {named}, {len(truth)} poses over {span_s:.0f} s; it was not fused.{started}"
-    if run.held:
-        return (
-            f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
-            "of the error. The track in this folder lacks them: for the best track run again without --hold-out."
-        )
-    return (
-        "No truth and no held-out fixes: nothing here measures accuracy. `graphloc compare --hold-out gaps:8x10` does."
-    )
-
-
-def report_data(run: Run, command: str = "") -> report.ReportData:
-    """Return what the report of a run shows."""
-    return report.ReportData(
-        title=f"{run.config.vessel}: {Path(run.recording.source).name}",
-        solution=run.solution,
-        recording=run.recording,
-        config=run.config,
-        filters=run.filters,
-        held=run.held,
-        levers_m=levers_m(run),
-        tables=tables(run),
-        truth_statement=truth_statement(run),
-        pictures=run.pictures,
-        underlay=run.underlay,
-        calibration=run.calibration,
-        online=run.online,
-        command=command,
-    )
-
-
-def write(
-    run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overwrite: bool, figures: bool = False
-) -> Path:
-    """Write the run folder with its report, and its figures as PNG and SVG if asked; return the report's path."""
-    data = report_data(run, command)
-    with outputs.fresh_folder(folder, overwrite=overwrite) as fresh:
-        outputs.write_run(
-            fresh,
-            run.solution,
-            run.config,
-            inputs={str(p): sha256(p) for p in inputs},
-            command=command,
-            metrics={t.title: t.as_dict() for t in data.tables},
-            warnings=run.warnings,
-        )
-        if run.tags:
-            found_tags.write(fresh / found_tags.FILE, run.tags, run.config)
-        if run.calibration is not None:
-            text = json.dumps(run.calibration.as_dict(), indent=1)
-            (fresh / "calibration.json").write_text(text + "\n", encoding="utf-8")
-        report.write_report(fresh / "report.html", data)
-        if figures:
-            from graphloc.eval.plots.paper import write_figures
-
-            (fresh / "figures").mkdir()
-            write_figures(tuple(report.figures(data).values()), fresh / "figures")
-    return folder / "report.html"
-
-
-def sha256(path: Path) -> str:
-    """Return the hash of a file, or of all files of a folder in name order."""
-    digest = hashlib.sha256()
-    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
-    for file in files:
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()
-
-
-__all__ = [
-    "Run",
-    "Scans",
-    "choose_datum",
-    "configured",
-    "load",
-    "match_at",
-    "replay_recording",
-    "report_data",
-    "seen_frames",
-    "sha256",
-    "simulated",
-    "smooth_recording",
-    "solve",
-    "tables",
-    "truth_statement",
-    "with_matches",
-    "with_sightings",
-    "with_surveys",
-    "with_synthetic",
-    "write",
-]

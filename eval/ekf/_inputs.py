@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the filters are fed: the IMU step by step, measurements with their mounts, where to start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphloc.build import mount_of
+from graphloc.config import VesselConfig
+from graphloc.errors import SolveError
+from graphloc.frames import Array, Datum, skew
+from graphloc.measurements import (
+    CompassHeading,
+    GnssPosition,
+    GnssVelocity,
+    Measurement,
+    PoseFix,
+    PoseMode,
+    TagSighting,
+)
+from graphloc.recording import Recording
+from graphloc.survey import Survey
+from graphloc.time import NS_PER_S, seconds_since
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """What the IMU says between two filter steps: means in body axes, and whether it was silent."""
+
+    stop_ns: int
+    accel: Array  # (2,) surge, sway, with what tilt leaves of gravity
+    leak: Array  # (2,) their mean over the last 20 s: a planar filter knows no attitude, and takes it for that
+    rate: float
+    silent: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A measurement with its mount."""
+
+    m: Measurement
+    lever: Array
+    mount_yaw: float
+
+
+def intervals_of(recording: Recording, config: VesselConfig, rate_hz: float) -> list[Interval]:
+    imu = recording.imu
+    if imu is None:
+        raise SolveError(f"{recording.source}: no IMU data for the filter")
+    imu_config = config.sensors[imu.sensor]
+    _, R = mount_of(imu.sensor, imu_config, recording.mounts)
+    samples = np.hstack([imu.accel_mps2 @ R.T, imu.gyro_radps @ R.T])
+    t = seconds_since(int(imu.stamps_ns[0]), imu.stamps_ns)
+    edges = np.arange(0.0, t[-1], 1.0 / rate_hz)
+    total = np.vstack([np.zeros(6), np.cumsum(0.5 * (samples[1:] + samples[:-1]) * np.diff(t)[:, None], axis=0)])
+    there = np.column_stack([np.interp(edges, t, total[:, i]) for i in range(6)])
+    mean = np.diff(there, axis=0) * rate_hz
+    count = np.arange(1, len(mean) + 1)
+    width = np.minimum(count, round(20.0 * rate_hz))
+    leak = (there[count, :2] - there[count - width, :2]) * rate_hz / width[:, None]
+    right = np.clip(np.searchsorted(t, edges[1:]), 1, len(t) - 1)
+    silent = t[right] - t[right - 1] > imu_config.max_gap_s
+    stops = imu.stamps_ns[0] + np.rint(edges[1:] * NS_PER_S).astype(np.int64)
+    return [
+        Interval(int(stop), m[:2], g, float(m[5]), bool(hole))
+        for stop, m, g, hole in zip(stops, mean, leak, silent, strict=True)
+    ]
+
+
+def events_of(recording: Recording, config: VesselConfig) -> list[Event]:
+    events = []
+    for m in recording.measurements:
+        sensor = config.sensors.get(m.sensor)
+        if isinstance(m, TagSighting) and sensor:
+            m = as_pose(m, sensor.surveyed)
+        if isinstance(m, GnssPosition | GnssVelocity | CompassHeading | PoseFix) and sensor and sensor.enabled:
+            t, R = mount_of(m.sensor, sensor, recording.mounts)
+            events.append(Event(m, t, float(np.arctan2(R[1, 0], R[0, 0]))))
+    return events
+
+
+def as_pose(m: TagSighting, survey: Survey) -> PoseFix:
+    """Return the planar poses of the body that a sighting of tags gives, likeliest first.
+
+    With t from the camera to the tags' middle, the place is c - t: what its own error and that of the attitude make of
+    it. A dock is as likely here as there within what it wanders.
+    """
+    modes, dock = [], survey.dock(m.frame)
+    for mode in m.modes:
+        R = mode.R_world_camera @ m.R_body_camera.T
+        arm = R @ m.t_body_camera_m + m.points_m.mean(axis=0) - mode.p_world_camera_m  # from the body to the tags
+        J = np.zeros((3, 6))
+        J[:2, :3] = -mode.R_world_camera[:2]
+        J[:2, 3:], J[2, 3:] = (skew(arm) @ mode.R_world_camera)[:2], mode.R_world_camera[2]
+        cov = J @ mode.cov @ J.T + np.diag([1e-4, 1e-4, 1e-6])
+        if dock is not None:
+            cov += np.diag([dock.moves_m**2 / 4.0] * 2 + [np.radians(dock.moves_deg) ** 2 / 4.0])
+        p = mode.p_world_camera_m - R @ m.t_body_camera_m
+        yaw = float(np.arctan2(R[1, 0], R[0, 0]))
+        modes.append(PoseMode(value=np.array([p[0], p[1], yaw]), cov=cov, probability=mode.probability))
+    return PoseFix(stamp_ns=m.stamp_ns, sensor=m.sensor, seq=m.seq, axes=("x", "y", "yaw"), modes=tuple(modes))
+
+
+def start_of(events: list[Event], recording: Recording, datum: Datum) -> Array:
+    """Start as BL does: at the true pose where there is truth, else by the first fixes and heading."""
+    truth, imu = recording.truth, recording.imu
+    if truth is not None and imu is not None and truth.covers(imu.stamps_ns[:1]).all():
+        there = truth.at(imu.stamps_ns[:1])
+        v = there.R_world_body[0].T @ there.v_world_mps[0] if there.v_world_mps is not None else np.zeros(3)
+        return np.array([*there.p_world_m[0, :2], v[0], v[1], there.yaw_rad[0]])
+    fixes = [e.m for e in events if isinstance(e.m, GnssPosition)]
+    poses = [e.m for e in events if isinstance(e.m, PoseFix) and e.m.axes[:2] == ("x", "y")]
+    heading = next((e for e in events if isinstance(e.m, CompassHeading)), None)
+    track = datum.enu_from_geodetic(*np.array([f.position for f in fixes]).T)[:, :2] if fixes else np.zeros((1, 2))
+    p = track[0] if fixes or not poses else poses[0].modes[0].value[:2]
+    psi = 0.0
+    if heading is not None:
+        assert isinstance(heading.m, CompassHeading)
+        psi = heading.m.yaw_rad - heading.mount_yaw
+    else:
+        far = np.flatnonzero(np.hypot(*(track - track[0]).T) > 5.0)
+        if len(far):
+            psi = float(np.arctan2(*(track[far[0]] - track[0])[::-1]))
+    v = _first_velocity(fixes, track)
+    c, s = np.cos(psi), np.sin(psi)
+    return np.array([*p, c * v[0] + s * v[1], -s * v[0] + c * v[1], psi])
+
+
+def _first_velocity(fixes: list[GnssPosition], track: Array) -> Array:
+    """Velocity (2,) of the first 5 seconds of fixes, by their slope."""
+    t = np.array([(f.stamp_ns - fixes[0].stamp_ns) / NS_PER_S for f in fixes[:100]])
+    soon = t < 5.0
+    if soon.sum() < 3 or np.ptp(t[soon]) < 1.0:
+        return np.zeros(2)
+    return np.array([np.polyfit(t[soon], track[:100][soon, k], 1)[0] for k in range(2)])

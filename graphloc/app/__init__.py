@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The application: the one place, beside the CLI, where all rooms meet.
+
+`bag -> frontend -> measurements -> rows -> graph -> solution -> outputs and report`, in that order.
+"""
+
+from graphloc.app._estimate import (
+    choose_datum,
+    configured,
+    load,
+    match_at,
+    replay_recording,
+    seen_frames,
+    simulated,
+    smooth_recording,
+    solve,
+    with_synthetic,
+)
+from graphloc.app._run import Run, levers_m
+from graphloc.app._written import report_data, sha256, tables, truth_statement, write
+from graphloc.gather import Scans
+
+__all__ = [
+    "Run",
+    "Scans",
+    "choose_datum",
+    "configured",
+    "levers_m",
+    "load",
+    "match_at",
+    "replay_recording",
+    "report_data",
+    "seen_frames",
+    "sha256",
+    "simulated",
+    "smooth_recording",
+    "solve",
+    "tables",
+    "truth_statement",
+    "with_synthetic",
+    "write",
+]

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A smoothed run, and what it can be compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from graphloc.build import mount_of
+from graphloc.config import VesselConfig
+from graphloc.eval import calibrate, ekf, metrics, report
+from graphloc.eval.plots import Underlay
+from graphloc.frames import Array
+from graphloc.measurements import GnssPosition
+from graphloc.recording import Recording
+from graphloc.solution import Solution
+from graphloc.survey import TagConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Run:
+    """A smoothed run and what it is compared with."""
+
+    recording: Recording
+    config: VesselConfig
+    solution: Solution
+    held: tuple[GnssPosition, ...] = ()
+    filters: tuple[ekf.FilterResult, ...] = ()
+    online: Solution | None = None  # of the same measurements, beside an offline run that is compared
+    pictures: tuple[tuple[str, bytes], ...] = ()  # of matches: caption, JPEG
+    tags: tuple[TagConfig, ...] = ()  # that are not surveyed, where the run puts them
+    underlay: Underlay | None = None  # the aerial image under the report's map
+    calibration: calibrate.Calibration | None = None  # offline
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All that was said on the way."""
+        return report.said_on_the_way(self.recording, self.solution, self.online)
+
+
+def made_comparable(run: Run) -> Run:
+    """Drop what shares no time with the track, and say so."""
+    truth, speed, held, track = run.recording.truth, run.recording.check_speed, run.held, run.solution.trajectory
+    said: list[str] = []
+
+    def comparable(compare: Callable[..., object], *arguments: object) -> bool:
+        try:
+            compare(*arguments)
+        except metrics.NoCommonTimeError as error:
+            said.append(str(error))
+            return False
+        return True
+
+    if truth is not None and not comparable(metrics.errors, track, truth):
+        truth = None
+    if speed is not None and not comparable(metrics.compare_speed, track, speed):
+        speed = None
+    if held and not comparable(metrics.held_out_errors, track, held, run.solution.datum, levers_m(run)):
+        held = ()
+
+    def fits(filtered: ekf.FilterResult) -> bool:
+        return (truth is None or comparable(metrics.errors, filtered.trajectory, truth)) and (
+            not held
+            or comparable(metrics.held_out_errors, filtered.trajectory, held, run.solution.datum, levers_m(run))
+        )
+
+    filters = tuple(f for f in run.filters if fits(f))
+    online = run.online
+    if online is not None and not comparable(metrics.errors, online.trajectory, track):
+        online = None
+    recording = replace(run.recording, truth=truth, check_speed=speed, warnings=(*run.recording.warnings, *said))
+    return replace(run, recording=recording, held=held, filters=filters, online=online)
+
+
+def levers_m(run: Run) -> dict[str, Array]:
+    """Return the antenna of each receiver that fixes were held out of, in body."""
+    names = dict.fromkeys(m.sensor for m in run.held)
+    return {name: mount_of(name, run.config.sensors[name], run.recording.mounts)[0] for name in names}

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is said of a run: its tables, its report, its folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from graphloc import found_tags, outputs
+from graphloc.app._run import Run, levers_m
+from graphloc.eval import metrics, report
+from graphloc.eval.docking import docking_table
+from graphloc.measurements import TagSighting
+from graphloc.trajectory import Trajectory
+
+
+def tables(run: Run) -> tuple[metrics.Table, ...]:
+    """Return the numbers of a run: against truth, held-out fixes, and the speed check."""
+    found: list[metrics.Table] = []
+    estimates = [(run.solution.name, run.solution.trajectory), *((f.name, f.trajectory) for f in run.filters)]
+    if run.recording.truth is not None:
+        found.append(metrics.truth_table(estimates, run.recording.truth))
+        found += _docking_tables(run, estimates, run.recording.truth)
+    if run.held:
+        found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, levers_m(run)))
+    if run.recording.check_speed is not None:
+        found.append(metrics.speed_table(estimates, run.recording.check_speed))
+    whys = [f"{f.name}: {f.why}." for f in run.filters if f.why]
+    return (replace(found[0], note="\n".join([found[0].note, *whys])), *found[1:]) if found else ()
+
+
+def _docking_tables(
+    run: Run, estimates: Sequence[tuple[str, Trajectory]], truth: Trajectory
+) -> Iterator[metrics.Table]:
+    """A table for each tag sensor that saw a tag."""
+    sensors = run.config.of_kind("apriltag")
+    for name, sensor in sensors.items():
+        seen = [m for m in run.recording.measurements if isinstance(m, TagSighting) and m.sensor == name]
+        if seen:
+            stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
+            table = docking_table(estimates, truth, sensor.surveyed, stamps, seen[0].t_body_camera_m)
+            yield replace(table, title=table.title if len(sensors) == 1 else f"{table.title}: {name}")
+
+
+def truth_statement(run: Run) -> str:
+    """Say plainly what the numbers were measured against."""
+    if run.recording.truth is not None:
+        truth = run.recording.truth
+        span_s = (int(truth.stamps_ns[-1]) - int(truth.stamps_ns[0])) / 1e9
+        named = run.config.truth_topic or "given with the recording"
+        imu = run.recording.imu
+        begun = bool(run.filters) and imu is not None and bool(truth.covers(imu.stamps_ns[:1]).all())
+        started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
+        return f"Truth: {named}, {len(truth)} poses over {span_s:.0f} s; it was not fused.{started}"
+    if run.held:
+        return (
+            f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
+            "of the error. The track in this folder lacks them: for the best track run again without --hold-out."
+        )
+    return (
+        "No truth and no held-out fixes: nothing here measures accuracy. `graphloc compare --hold-out gaps:8x10` does."
+    )
+
+
+def report_data(run: Run, command: str = "") -> report.ReportData:
+    """Return what the report of a run shows."""
+    return report.ReportData(
+        title=f"{run.config.vessel}: {Path(run.recording.source).name}",
+        solution=run.solution,
+        recording=run.recording,
+        config=run.config,
+        filters=run.filters,
+        held=run.held,
+        levers_m=levers_m(run),
+        tables=tables(run),
+        truth_statement=truth_statement(run),
+        pictures=run.pictures,
+        underlay=run.underlay,
+        calibration=run.calibration,
+        online=run.online,
+        command=command,
+    )
+
+
+def write(
+    run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overwrite: bool, figures: bool = False
+) -> Path:
+    """Write the run folder with its report, and its figures as PNG and SVG if asked; return the report's path."""
+    data = report_data(run, command)
+    with outputs.fresh_folder(folder, overwrite=overwrite) as fresh:
+        outputs.write_run(
+            fresh,
+            run.solution,
+            run.config,
+            inputs={str(p): sha256(p) for p in inputs},
+            command=command,
+            metrics={t.title: t.as_dict() for t in data.tables},
+            warnings=run.warnings,
+        )
+        if run.tags:
+            found_tags.write(fresh / found_tags.FILE, run.tags, run.config)
+        if run.calibration is not None:
+            text = json.dumps(run.calibration.as_dict(), indent=1)
+            (fresh / "calibration.json").write_text(text + "\n", encoding="utf-8")
+        report.write_report(fresh / "report.html", data)
+        if figures:
+            from graphloc.eval.plots.paper import write_figures
+
+            (fresh / "figures").mkdir()
+            write_figures(tuple(report.figures(data).values()), fresh / "figures")
+    return folder / "report.html"
+
+
+def sha256(path: Path) -> str:
+    """Return the hash of a file, or of all files of a folder in name order."""
+    digest = hashlib.sha256()
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    for file in files:
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()

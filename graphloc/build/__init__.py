@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a recording to the graph of any stretch of it.
+
+A `Problem` holds what does not change while solving: timeline, preintegrated links, and per sensor a
+`Stream` of measurements with the state that each attaches to. `build_graph` turns a stretch of it into
+factors, at the current estimate and with the current decisions. It knows sensors only as rows.
+
+The states stand where the IMU stands, with the axes of the body: inertial data then need no lever arm,
+whose Euler term GTSAM's preintegration leaves out. Every other mount is taken from there, and the
+solution is moved to the body's origin at the end (`graphloc.solve`).
+"""
+
+from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state
+from graphloc.build._chains import CHAIN_END, CONSTANT_TAILS, JUMP, bias_step, slow_begin, slow_end, slow_step
+from graphloc.build._graph import Decisions, StartPrior, build_graph, state_keys
+from graphloc.build._problem import Mounts, Problem, Stream, company_of, make_problem, mount_of, with_noise_scale
+
+__all__ = [
+    "CHAIN_END",
+    "CONSTANT_TAILS",
+    "JUMP",
+    "Carry",
+    "Decisions",
+    "Judged",
+    "Mounts",
+    "Problem",
+    "StartPrior",
+    "Stream",
+    "attach",
+    "bias_step",
+    "build_graph",
+    "company_of",
+    "constant_keys",
+    "make_problem",
+    "mount_of",
+    "nav_state",
+    "slow_begin",
+    "slow_end",
+    "slow_step",
+    "state_keys",
+    "with_noise_scale",
+]

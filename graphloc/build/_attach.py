@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a measurement meets the states at the current estimate, of a recorded run or of a live one."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import gtsam
+import numpy as np
+
+from graphloc import keys
+from graphloc.frames import Array, Datum
+from graphloc.graph import Attachment, Constant, Sensor, SlowProcess
+
+Carry = tuple[int, Any]
+"""A state, and the motion preintegrated from there."""
+
+
+class OnTimeline(Protocol):
+    """What `attach` needs to know of a timeline (`Timeline`, or a live one)."""
+
+    @property
+    def slow_of(self) -> Any:
+        """Slow node of each state."""
+        ...
+
+    @property
+    def slow_stamps_ns(self) -> Any:
+        """Stamp of each slow node."""
+        ...
+
+
+class Sited(Protocol):
+    """What `attach` needs to know of a problem."""
+
+    @property
+    def timeline(self) -> OnTimeline:
+        """Where the states stand."""
+        ...
+
+    @property
+    def R_body_imu(self) -> Array:
+        """The IMU's axes."""
+        ...
+
+    @property
+    def datum(self) -> Datum:
+        """Origin of world."""
+        ...
+
+
+class Attaching(Protocol):
+    """What `attach` needs to know of a stream (`Stream`, or a live one)."""
+
+    @property
+    def number(self) -> int:
+        """Of the sensor, for keys."""
+        ...
+
+    @property
+    def mount(self) -> Any:
+        """Pose of the sensor from the IMU's place."""
+        ...
+
+    @property
+    def slow(self) -> SlowProcess | None:
+        """Its slow state."""
+        ...
+
+    @property
+    def constants(self) -> tuple[Constant, ...]:
+        """What its measurements may share."""
+        ...
+
+    @property
+    def measurements(self) -> Any:
+        """By index."""
+        ...
+
+    @property
+    def state(self) -> Any:
+        """State of each."""
+        ...
+
+    @property
+    def carry(self) -> Any:
+        """Motion to each from the state before it."""
+        ...
+
+    @property
+    def gyro_radps(self) -> Any:
+        """Raw rate at each."""
+        ...
+
+
+class Judged(Attaching, Protocol):
+    """What judging needs to know of a stream."""
+
+    @property
+    def name(self) -> str:
+        """Of the sensor."""
+        ...
+
+    @property
+    def row(self) -> Sensor:
+        """Of the table."""
+        ...
+
+    @property
+    def config(self) -> Any:
+        """Of the sensor."""
+        ...
+
+
+def nav_state(values: gtsam.Values, k: int) -> Any:
+    """Return the NavState of state k."""
+    return gtsam.NavState(values.atPose3(keys.pose(k)), values.atVector(keys.velocity(k)))
+
+
+def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> Attachment:
+    """Return how measurement `i` of a stream meets the graph at the current estimate."""
+    k = int(stream.state[i])
+    j = int(problem.timeline.slow_of[k])
+    T = values.atPose3(keys.pose(k))
+    v = values.atVector(keys.velocity(k))
+    bias = values.atConstantBias(keys.bias(j))
+    T_state_sensor, dv = stream.mount, np.zeros(3)
+    carried = stream.carry[i]
+    if carried is not None:
+        floor, pim = carried
+        there = pim.predict(nav_state(values, floor), bias)
+        T_state_sensor = T.between(there.pose()).compose(stream.mount)
+        dv = np.asarray(there.velocity()) - v
+    slow_key = None if stream.slow is None else keys.slow(stream.number, j)
+    return Attachment(
+        pose_key=keys.pose(k),
+        velocity_key=keys.velocity(k),
+        slow_key=slow_key,
+        leaf_keys=keys.leaves(stream.number * 100_000_000 + i),
+        T_world_body=T,
+        v_world_mps=v,
+        T_state_sensor=T_state_sensor,
+        dv_world_mps=dv,
+        gyro_radps=stream.gyro_radps[i] - problem.R_body_imu @ bias.gyroscope(),
+        lever_m=np.asarray(stream.mount.translation()),
+        slow_value=None if slow_key is None else np.atleast_1d(values.atVector(slow_key)),
+        datum=problem.datum,
+        slow_next=None if slow_key is None else _next_slow(problem, stream, j, stream.measurements[i].stamp_ns, values),
+        constants=constants_of(stream, values),
+    )
+
+
+def _next_slow(
+    problem: Sited, stream: Attaching, j: int, stamp_ns: int, values: gtsam.Values
+) -> tuple[int, Array, float, float] | None:
+    stamps, key = problem.timeline.slow_stamps_ns, keys.slow(stream.number, j + 1)
+    if j + 1 >= len(stamps) or not values.exists(key):
+        return None
+    apart = int(stamps[j + 1] - stamps[j])
+    share = min(max((stamp_ns - int(stamps[j])) / apart, 0.0), 1.0)
+    return key, np.atleast_1d(values.atVector(key)), share, apart * 1e-9
+
+
+def constants_of(stream: Attaching, values: gtsam.Values) -> tuple[tuple[int, Array], ...]:
+    """Keys and estimates; what no factor had yet is zero."""
+    return tuple(
+        (key, np.atleast_1d(values.atVector(key)) if values.exists(key) else np.zeros(len(constant.sigma)))
+        for key, constant in zip(constant_keys(stream), stream.constants, strict=True)
+    )
+
+
+def constant_keys(stream: Attaching) -> list[int]:
+    """Return the keys of a sensor's constants."""
+    return [keys.constant(stream.number, k) for k in range(len(stream.constants))]

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What does not change while solving: timeline, preintegrated motion, and where each measurement attaches."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.config import SensorConfig, VesselConfig
+from graphloc.errors import SolveError
+from graphloc.frames import Array, Datum
+from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import ImuSeries, Measurement
+from graphloc.recording import Recording
+from graphloc.time import utc_text
+from graphloc.timeline import Timeline, make_timeline
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stream:
+    """The measurements of one sensor and where they attach.
+
+    Attributes:
+        number: of the sensor, for keys. name, row, config: the sensor.
+        slow: its slow state, or None. left_out: the slow state that it would have in company.
+        constants: what its measurements may share.
+        mount: pose of the sensor from the IMU's place, body axes.
+        measurements: M of them by stamp. state: (M,) nearest state. carry: per measurement the
+            preintegrated motion from the state before it, or None where it stands on a state.
+        gyro_radps: (M, 3) raw rate at each measurement, body axes.
+        sparse: (M,) true for the first measurement at each slow node.
+    """
+
+    number: int
+    name: str
+    row: Sensor
+    config: SensorConfig
+    slow: SlowProcess | None
+    left_out: SlowProcess | None
+    constants: tuple[Constant, ...]
+    mount: Any
+    measurements: tuple[Measurement, ...]
+    state: NDArray[np.int64]
+    carry: tuple[tuple[int, Any] | None, ...]
+    gyro_radps: Array
+    sparse: NDArray[np.bool_]
+
+    def between(self, first: int, last: int) -> range:
+        """Indices of the measurements that attach to states first..last (inclusive)."""
+        lo, hi = np.searchsorted(self.state, [first, last + 1])
+        return range(int(lo), int(hi))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """A run, ready to be solved.
+
+    `preintegrated` and `inertial` have the motion from each state to the next, and the factor of it: neither depends on
+    the estimate, so every graph shares them.
+    """
+
+    config: VesselConfig
+    datum: Datum
+    timeline: Timeline
+    imu: ImuSeries
+    t_body_imu_m: Array
+    R_body_imu: Array
+    relink: Callable[[float], InertialLink]
+    links: InertialLink
+    noise_scale: float
+    preintegrated: tuple[Any, ...]
+    inertial: tuple[Any, ...]
+    streams: tuple[Stream, ...]
+    rejected: tuple[LedgerRow, ...]
+    warnings: tuple[str, ...] = field(default=())
+
+
+Mounts = Mapping[str, tuple[Array, Array]]  # by sensor, from /tf_static: t (3,), R (3, 3) in body
+
+
+def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Array]:
+    """Return (t (3,), R (3, 3)) of a sensor in body: from /tf_static where it was asked for."""
+    return mounts.get(name) or (config.mount.t_body_sensor_m, config.mount.R_body_sensor)
+
+
+def company_of(config: VesselConfig, rows: Sequence[Sensor], seen: Container[str] | None = None) -> int:
+    """Return how many of the sensors (of those in `seen`, if given) can tell each other's slow errors from motion."""
+    able = (name for row in rows if row.company for name in config.of_kind(row.kind))
+    return sum(seen is None or name in seen for name in able)
+
+
+def make_problem(
+    recording: Recording,
+    config: VesselConfig,
+    datum: Datum,
+    rows: Sequence[Sensor],
+    inertial: InertialRow,
+    company: int | None = None,
+) -> Problem:
+    """Lay out the timeline, preintegrate, and attach every measurement.
+
+    `company`: how many sensors can tell each other's slow errors from motion; by default those that the recording has.
+
+    Raises:
+        SolveError: the recording has no usable IMU data.
+    """
+    imu = recording.imu
+    if not any(sensor.kind == inertial.kind and sensor.enabled for sensor in config.sensors.values()):
+        raise SolveError(
+            f"{recording.source}: no enabled sensor of kind {inertial.kind} in vessel.yaml, and it needs one"
+        )
+    if imu is None or len(imu) < 10:
+        raise SolveError(f"{recording.source}: no IMU data (need at least 10 samples); check its topic and stamps")
+    imu_config = config.sensors[imu.sensor]
+    t_body_imu, R = mount_of(imu.sensor, imu_config, recording.mounts)
+
+    def relink(noise_scale: float) -> InertialLink:
+        return inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale)
+
+    links = relink(1.0)
+    by_kind = {row.kind: row for row in rows}
+    inside, rejected, warnings = _sorted_out(recording, config, set(by_kind), imu)
+    start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
+    timeline = make_timeline(start, stop, inside, config.timeline)
+    by_sensor: dict[str, list[Measurement]] = {}
+    for m in inside:
+        by_sensor.setdefault(m.sensor, []).append(m)
+    if company is None:
+        company = company_of(config, rows, by_sensor)
+    streams = []
+    for number, (name, sensor) in enumerate(config.sensors.items()):
+        if name in by_sensor:
+            row = by_kind[sensor.kind]
+            t, R_mount = mount_of(name, sensor, recording.mounts)
+            mount = (t - t_body_imu, R_mount)
+            slow = row.slow(sensor)
+            left_out = slow if slow is not None and slow.needs_company and company < 2 else None
+            slow = slow if left_out is None else None
+            streams.append(_stream(number, name, row, sensor, slow, left_out, mount, by_sensor[name], timeline, links))
+    preintegrated = _preintegrate(timeline, links)
+    warnings += [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
+    return Problem(
+        config=config,
+        datum=datum,
+        timeline=timeline,
+        imu=imu,
+        t_body_imu_m=t_body_imu,
+        R_body_imu=R,
+        relink=relink,
+        links=links,
+        noise_scale=1.0,
+        preintegrated=preintegrated,
+        inertial=_inertial(timeline, links, preintegrated),
+        streams=tuple(streams),
+        rejected=tuple(rejected),
+        warnings=tuple(warnings),
+    )
+
+
+def _sorted_out(
+    recording: Recording, config: VesselConfig, kinds: Container[str], imu: ImuSeries
+) -> tuple[list[Measurement], list[LedgerRow], list[str]]:
+    """Return the measurements that the graph can take, rows for the others, and warnings."""
+    start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
+    asked_for = {name for name, sensor in config.sensors.items() if sensor.kind in kinds and sensor.enabled}
+    inside, rows = [], []
+    outside, every = Counter[str](), Counter[str]()
+    for m in recording.measurements:
+        every[m.sensor] += 1
+        outcome, reason = Outcome.REJECTED, "no IMU data at this stamp"
+        if m.sensor not in asked_for:
+            outcome, reason = Outcome.IGNORED, "its sensor is switched off or not in the configuration"
+        elif start <= m.stamp_ns <= stop:
+            inside.append(m)
+            continue
+        else:
+            outside[m.sensor] += 1
+        if m.seq < 0:  # configuration, not a message
+            outside[m.sensor] = 0
+            continue
+        topic = recording.topics.get(m.sensor, "")
+        rows.append(
+            LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason)
+        )
+    span = f"{utc_text(start)} to {utc_text(stop)}"
+    warnings = [
+        f"{name}: {n} of {every[name]} measurements lie outside the IMU's span ({span}): no track there"
+        for name, n in outside.items()
+        if n > 0.02 * every[name] and n > 5
+    ]
+    return inside, rows, warnings
+
+
+def _preintegrate(timeline: Timeline, links: InertialLink) -> tuple[Any, ...]:
+    zero = gtsam.imuBias.ConstantBias()
+    stamps = [int(s) for s in timeline.stamps_ns]
+    return tuple(links.integrate(a, b, zero) for a, b in pairwise(stamps))
+
+
+def _inertial(timeline: Timeline, links: InertialLink, preintegrated: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(links.factor(k, int(timeline.slow_of[k]), pim) for k, pim in enumerate(preintegrated))
+
+
+def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
+    """Return the problem with the IMU's noise densities scaled."""
+    links = problem.relink(noise_scale)
+    preintegrated = _preintegrate(problem.timeline, links)
+    return replace(
+        problem, links=links, noise_scale=noise_scale, preintegrated=preintegrated,
+        inertial=_inertial(problem.timeline, links, preintegrated),
+    )  # fmt: skip
+
+
+def _stream(
+    number: int,
+    name: str,
+    row: Sensor,
+    config: SensorConfig,
+    slow: SlowProcess | None,
+    left_out: SlowProcess | None,
+    mount: tuple[Array, Array],
+    measurements: list[Measurement],
+    timeline: Timeline,
+    links: InertialLink,
+) -> Stream:
+    zero = gtsam.imuBias.ConstantBias()
+    state, carry = [], []
+    for m in measurements:
+        floor = timeline.floor(m.stamp_ns)
+        state.append(timeline.nearest(m.stamp_ns))
+        at = int(timeline.stamps_ns[floor])
+        carry.append(None if m.stamp_ns <= at else (floor, links.integrate(at, m.stamp_ns, zero)))
+    T_state_sensor = gtsam.Pose3(gtsam.Rot3(mount[1]), mount[0])
+    return Stream(
+        number,
+        name,
+        row,
+        config,
+        slow,
+        left_out,
+        row.constants(config),
+        T_state_sensor,
+        tuple(measurements),
+        np.array(state, dtype=np.int64),
+        tuple(carry),
+        links.gyro_at(np.array([m.stamp_ns for m in measurements])),
+        np.diff(timeline.slow_of[state], prepend=-1) > 0,
+    )

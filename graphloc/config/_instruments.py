@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sensors that say one thing at a time: inertial, GNSS, compass, velocity, height.
+
+Data-sheet units live here only, and become SI in the properties.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from graphloc.blocks import Block, Finite, NonNegative, Positive
+from graphloc.config._sensor import KernelConfig, SensorConfig
+
+STANDARD_GRAVITY_MPS2 = 9.80665
+
+
+class ImuConfig(SensorConfig):
+    """An inertial measurement unit (`sensor_msgs/Imu`)."""
+
+    kind: Literal["imu"] = "imu"
+    """Which row of the sensor table reads this block."""
+    accel_unit: Literal["m/s^2", "g"] = "m/s^2"
+    """Unit of `linear_acceleration` in the bag (REP 103 says m/s^2; some drivers write g)."""
+    gyro_unit: Literal["rad/s", "deg/s"] = "rad/s"
+    """Unit of `angular_velocity` in the bag."""
+    gravity: Literal["included", "removed", "inverted"] = "included"
+    """Whether `linear_acceleration` holds gravity (+g upwards at rest, the standard), or the driver removed it; `inverted`:
+    the driver writes accelerations with the opposite sign (-g upwards at rest), while its gyroscope is right."""
+    accel_noise_ug_per_sqrt_hz: Positive = 3000.0
+    """Accelerometer white noise, ug/sqrt(Hz). The default allows for hull vibration."""
+    gyro_noise_mdps_per_sqrt_hz: Positive = 20.0
+    """Gyroscope white noise, mdeg/s/sqrt(Hz)."""
+    accel_bias_instability_ug: Positive = 100.0
+    """In-run accelerometer bias instability, ug."""
+    gyro_bias_instability_deg_per_h: Positive = 20.0
+    """In-run gyroscope bias instability, deg/h."""
+    bias_correlation_s: Positive = 300.0
+    """Time over which a bias wanders by its instability, s."""
+    accel_bias_sigma_mg: Positive = 10.0
+    """Turn-on accelerometer bias, 1 sigma, mg."""
+    gyro_bias_sigma_dps: Positive = 2.0
+    """Turn-on gyroscope bias, 1 sigma, deg/s, before the start alignment has measured it."""
+    adapt_noise: bool = True
+    """Scale the noise up (never down, and said in the report) where the run contradicts it several times over."""
+    max_gap_s: Positive = 0.5
+    """A longer hole between samples is an IMU gap: bridged by a link with noise that lets a vessel do anything."""
+    max_bridge_s: Positive = 20.0
+    """A longer gap is not bridged: the run is cut there, and its parts are solved one by one."""
+    kernel: KernelConfig = KernelConfig(kind="none")
+    """Robust loss: not used for inertial data."""
+
+    @property
+    def accel_noise_mps2(self) -> float:
+        """White-noise density, m/s^2/sqrt(Hz)."""
+        return self.accel_noise_ug_per_sqrt_hz * 1e-6 * STANDARD_GRAVITY_MPS2
+
+    @property
+    def gyro_noise_radps(self) -> float:
+        """White-noise density, rad/s/sqrt(Hz)."""
+        return float(np.radians(self.gyro_noise_mdps_per_sqrt_hz * 1e-3))
+
+    @property
+    def accel_bias_walk_mps2(self) -> float:
+        """Random-walk density of the accelerometer bias, m/s^2/sqrt(s)."""
+        return self.accel_bias_instability_ug * 1e-6 * STANDARD_GRAVITY_MPS2 / float(np.sqrt(self.bias_correlation_s))
+
+    @property
+    def gyro_bias_walk_radps(self) -> float:
+        """Random-walk density of the gyroscope bias, rad/s/sqrt(s)."""
+        return float(np.radians(self.gyro_bias_instability_deg_per_h / 3600.0) / np.sqrt(self.bias_correlation_s))
+
+    @property
+    def accel_bias_sigma_mps2(self) -> float:
+        """Turn-on bias, 1 sigma, m/s^2."""
+        return self.accel_bias_sigma_mg * 1e-3 * STANDARD_GRAVITY_MPS2
+
+    @property
+    def gyro_bias_sigma_radps(self) -> float:
+        """Turn-on bias, 1 sigma, rad/s."""
+        return float(np.radians(self.gyro_bias_sigma_dps))
+
+
+class SlowErrorConfig(Block):
+    """The slowly varying part of the GNSS error: a first-order Gauss-Markov process per axis."""
+
+    enabled: bool | None = None
+    """Off: the GNSS error is taken as white (right for RTK in the open, wrong in a harbour). Empty: on where
+    a second absolute sensor (matches, tags, another receiver) can tell it from motion, off where GNSS is alone."""
+    horizontal_sigma_m: Positive = 2.0
+    """Standing size of the slow error, each horizontal axis, 1 sigma, m."""
+    vertical_sigma_m: Positive = 5.0
+    """Standing size of the slow error in height, 1 sigma, m."""
+    time_constant_s: Positive = 200.0
+    """Correlation time, s."""
+    jumps: bool = True
+    """Let the slow error jump (a robust loss on its steps), as multipath does."""
+
+
+class GnssConfig(SensorConfig):
+    """GNSS position (`sensor_msgs/NavSatFix`)."""
+
+    kind: Literal["gnss"] = "gnss"
+    """Which row of the sensor table reads this block."""
+    min_status: Literal["fix", "sbas", "gbas"] = "fix"
+    """Fixes below this `NavSatStatus` are rejected. `STATUS_NO_FIX` never counts as a fix."""
+    sigma_scale: Positive = 1.0
+    """Factor on the reported standard deviations, for the white part of the error."""
+    min_horizontal_sigma_m: Positive = 0.02
+    """Floor of the white horizontal sigma, m."""
+    min_vertical_sigma_m: Positive = 0.04
+    """Floor of the white vertical sigma, m."""
+    default_horizontal_sigma_m: Positive = 1.5
+    """Taken where the message reports no covariance (type unknown, zeros or NaN), m."""
+    default_vertical_sigma_m: Positive = 4.0
+    """The same for height, m."""
+    slow_error: SlowErrorConfig = SlowErrorConfig()
+    """The modelled slow error."""
+
+
+class CompassConfig(SensorConfig):
+    """Heading (`geometry_msgs/QuaternionStamped`, or the orientation of a `sensor_msgs/Imu`)."""
+
+    kind: Literal["compass"] = "compass"
+    """Which row of the sensor table reads this block."""
+    convention: Literal["enu", "ned"] = "enu"
+    """Yaw in the message: `enu` from east, counter-clockwise (REP 103); `ned` from north, clockwise."""
+    sigma_deg: Positive = 1.5
+    """Heading noise, 1 sigma, deg. Used where the message carries no covariance."""
+    use_reported_sigma: bool = True
+    """Take the yaw variance of an `Imu` message where it is positive and finite."""
+    mount_offset_sigma_deg: NonNegative = 1.0
+    """Unknown but constant heading offset of the mount, 1 sigma, deg; 0 holds the mount fixed."""
+
+
+class VelocityConfig(SensorConfig):
+    """GNSS velocity in ENU (`geometry_msgs/TwistWithCovarianceStamped` or `TwistStamped`)."""
+
+    kind: Literal["gnss_velocity"] = "gnss_velocity"
+    """Which row of the sensor table reads this block."""
+    min_sigma_mps: Positive = 0.03
+    """Floor of the velocity sigma, m/s."""
+    default_sigma_mps: Positive = 0.3
+    """Taken where the message reports no covariance, m/s."""
+
+
+class HeightConfig(SensorConfig):
+    """Height prior: a vessel floats, so its height is known from waterline and tide."""
+
+    kind: Literal["height"] = "height"
+    """Which row of the sensor table reads this block."""
+    height_m: Finite | None = None
+    """Height of the body origin above the ellipsoid, m; empty: the median of the run's fixes."""
+    sigma_m: Positive = 0.3
+    """Heave around it, 1 sigma, m."""
+    tide_sigma_m: NonNegative = 0.5
+    """How far tide and load may hold the vessel above or below it, for hours, 1 sigma, m; 0: not at all."""
+    period_s: Annotated[float, Field(ge=0.02, le=1e6)] = 1.0
+    """Time between two priors, s."""
+    kernel: KernelConfig = KernelConfig(kind="none")
+    """Robust loss: not used for the waterline."""

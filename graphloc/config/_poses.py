@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sensors that give whole poses: messages, scans laid on a map, tags."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import shapely
+from pydantic import Field, field_validator
+
+from graphloc.blocks import Block, Finite, MountConfig, NonNegative, Positive
+from graphloc.config._sensor import KernelConfig, SensorConfig
+from graphloc.measurements import AXES
+from graphloc.survey import Survey
+
+
+class AnyPoseConfig(SensorConfig):
+    """What every sensor has that gives poses in world, with modes or false ones among them."""
+
+    axes: tuple[Literal["x", "y", "z", "roll", "pitch", "yaw"], ...] = ("x", "y", "yaw")
+    """Which axes of the pose are used."""
+    false_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
+    """Share of poses that are expected to be false where the front-end does not say."""
+    false_repeats: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
+    """Probability that a false pose after a false pose repeats its error (a moored boat stays)."""
+    min_sigma_m: Positive = 0.02
+    """Floor of the position sigma, m."""
+    min_sigma_deg: Positive = 0.1
+    """Floor of the angle sigma, deg."""
+    default_sigma_m: Positive = 0.3
+    """Taken where the message reports no covariance, m."""
+    default_sigma_deg: Positive = 2.0
+    """The same for angles, deg."""
+
+    @field_validator("axes")
+    @classmethod
+    def _ordered(cls, axes: tuple[str, ...]) -> tuple[str, ...]:
+        if not axes:
+            raise ValueError("at least one axis is needed")
+        if ("roll" in axes) != ("pitch" in axes):
+            raise ValueError(
+                "roll and pitch go together: which of the world's axes one of them is, the heading decides"
+            )
+        return tuple(a for a in AXES if a in axes)
+
+
+class PoseConfig(AnyPoseConfig):
+    """Absolute pose in world (`geometry_msgs/PoseWithCovarianceStamped`, `nav_msgs/Odometry`)."""
+
+    kind: Literal["pose"] = "pose"
+    """Which row of the sensor table reads this block."""
+
+
+class LidarConfig(Block):
+    """A LiDAR whose scans are matched."""
+
+    topic: str
+    """Its `sensor_msgs/PointCloud2` topic."""
+    mount: MountConfig = MountConfig()
+    """Where it sits on the vessel."""
+
+
+class AerialConfig(AnyPoseConfig):
+    """LiDAR scans (`sensor_msgs/PointCloud2`) laid on an aerial image, drawn lines, or both."""
+
+    kind: Literal["aerial"] = "aerial"
+    """Which row of the sensor table reads this block."""
+    axes: tuple[Literal["x", "y", "yaw"], ...] = ("x", "y", "yaw")
+    """Which axes of a match are used."""
+    image: str = ""
+    """A georeferenced image that GDAL reads, an MBTiles file, or a folder of tiles z/x/y.png, jpg or webp; a relative
+    path counts from the folder of vessel.yaml."""
+    vector: str = ""
+    """GeoJSON of lines and polygons of quays, piers and shores; a relative path counts as that of the image."""
+    image_sigma_m: NonNegative = 0.3
+    """How far the image as a whole shows things from where they are, east and north, 1 sigma, m."""
+    lidars: dict[str, LidarConfig] = Field(default_factory=dict)
+    """The LiDARs by name."""
+    hull_m: tuple[tuple[Finite, Finite], ...] = ()
+    """Corners of the vessel's outline in body, forward and port, in order, m: points within are its own; none: no
+    point is."""
+    waterline_m: Finite = 0.0
+    """Height of the waterline in body, m."""
+    matcher: Literal["posterior", "bl"] = "posterior"
+    """`bl`: that of Bergman & Lindell as printed (one pose, by a particle swarm), to compare with; it needs an image."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Of the particle swarm."""
+    submap: Annotated[int, Field(ge=1, le=100)] = 1
+    """So many scans are laid on the map together, moved by the vessel's own motion between them."""
+    every_s: Positive = 1.0
+    """Least time between two matches, s."""
+    every_m: NonNegative = 0.5
+    """Least way between two matches, m."""
+    alike_m: NonNegative = 15.0
+    """Matches within this way of each other err alike (the same walls, the same boats), so each tells but a part of
+    news: variances grow by (1 + r) / (1 - r), r = exp(-way / alike_m), or less after a while; 0: each is news, m."""
+    still_s: Positive = 10.0
+    """Time after which there is a match though the vessel has not moved that far, s."""
+    window_m: Annotated[Positive, Field(le=50.0)] = 6.5
+    """Largest half side of the search, at most 50 m; less where the estimate is surer (3 sigma)."""
+    window_deg: Annotated[Positive, Field(le=30.0)] = 5.0
+    """The same for the heading, at most 30 deg."""
+    reach_m: Annotated[Positive, Field(le=300.0)] = 100.0
+    """Points farther off are not used; at most 300 m."""
+
+    @field_validator("topic", "mount")
+    @classmethod
+    def _of_the_lidars(cls, given: str | MountConfig) -> str | MountConfig:
+        if given not in ("", MountConfig()):
+            raise ValueError("not used here, a match is the pose of the body: set it for each of `lidars`")
+        return given
+
+    @field_validator("lidars")
+    @classmethod
+    def _one_topic_each(cls, lidars: dict[str, LidarConfig]) -> dict[str, LidarConfig]:
+        seen: dict[str, str] = {}
+        for name, lidar in lidars.items():
+            if lidar.topic in seen:
+                raise ValueError(f"{seen[lidar.topic]} and {name} have the same topic, {lidar.topic}")
+            seen[lidar.topic] = name
+        return lidars
+
+    @field_validator("hull_m")
+    @classmethod
+    def _outline(cls, corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        if not corners:
+            return corners
+        if len(corners) < 3:
+            raise ValueError("an outline has three corners or more; [] for none")
+        why = shapely.is_valid_reason(shapely.Polygon(corners))
+        if why != "Valid Geometry":
+            raise ValueError(f"the corners, in their order, make no outline: {why}")
+        return corners
+
+
+class CameraConfig(Block):
+    """A camera that sees tags; or a detector that has listed them already."""
+
+    topic: str
+    """Images (`sensor_msgs/Image`, `CompressedImage`), or detections (`apriltag_msgs/AprilTagDetectionArray`, ROS 1's
+    `apriltag_ros/AprilTagDetectionArray`)."""
+    info_topic: str = ""
+    """Its `sensor_msgs/CameraInfo`; empty: `camera_info` beside the images."""
+    rectified: bool | None = None
+    """Whether distortion is removed from the images already (`image_rect`); empty: by the topic's name for images,
+    true for detections, which are made on such images."""
+    mount: MountConfig = MountConfig()
+    """Pose of the optical frame (x right, y down, z forward) in body: looking ahead is `rpy_deg: [-90, 0, -90]`."""
+
+
+class AprilTagConfig(SensorConfig):
+    """AprilTags seen by cameras: the two poses of each sighting are kept, and the graph chooses."""
+
+    kind: Literal["apriltag"] = "apriltag"
+    """Which row of the sensor table reads this block."""
+    survey: str | Survey = ""
+    """Where the tags are: a `tags.yaml` (docs/tags.md); a relative path counts from the folder of vessel.yaml."""
+    cameras: dict[str, CameraConfig] = Field(default_factory=dict)
+    """The cameras by name."""
+    max_hamming: Annotated[int, Field(ge=0, le=3)] = 1
+    """Most bits of a tag that may be read wrong."""
+    min_margin: NonNegative = 1.5
+    """Least decision margin (AprilTag's: how far bits are from the threshold, grey levels)."""
+    min_corner_sigma_px: NonNegative = 0.2
+    """Floor of the corners' noise in the graph, each axis, 1 sigma, px: what calibration and stamps are off (a vessel
+    that turns by 5 deg/s moves corners by 0.5 px in 5 ms at a focal length of 1000 px)."""
+    edge_sigma_px: NonNegative = 0.05
+    """How far the edges of all tags are seen too far out (or in) for half a minute: blur, light, prints, focal length, 1 sigma,
+    px. A tag 12 px wide whose edges are off by 0.05 px is 0.8 % nearer than it seems, in every image; 0: not modelled."""
+    corner_sigma_px: Positive = 0.5
+    """Noise of the corners of listed detections, each axis, 1 sigma, px; our own detector measures it."""
+    false_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02
+    """Share of sightings that are expected to be false: misread, or of a tag that was moved."""
+    false_repeats: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.9
+    """Probability that a false sighting after a false one repeats its error (a moved tag stays moved)."""
+    kernel: KernelConfig = KernelConfig(kind="none")
+    """Robust loss: not used; that a sighting is false is a hypothesis of its own."""
+
+    @field_validator("topic", "mount")
+    @classmethod
+    def _of_the_cameras(cls, given: str | MountConfig) -> str | MountConfig:
+        if given not in ("", MountConfig()):
+            raise ValueError("not used here: set it for each of `cameras`")
+        return given
+
+    @property
+    def surveyed(self) -> Survey:
+        """The survey, once it is read; before that one without tags."""
+        return self.survey if isinstance(self.survey, Survey) else Survey()

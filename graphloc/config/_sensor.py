@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the block of every sensor has."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from graphloc.blocks import Block, MountConfig, Positive
+
+
+class KernelConfig(Block):
+    """Robust loss of a sensor. The last stage of the solver re-weighs by hypotheses where modes exist."""
+
+    kind: Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"] = "cauchy"
+    """Loss. Redescending kinds (geman_mcclure, tukey) are used in the last stage only: before, Cauchy."""
+    scale: Positive = 1.5
+    """Where the loss bends, in standard deviations of the residual."""
+
+    def weight(self, nis: float) -> float:
+        """Weight in [0, 1] that the loss gives a squared normalised residual."""
+        if self.kind == "none":
+            return 1.0
+        u2 = nis / self.scale**2
+        if self.kind == "huber":
+            return 1.0 if u2 <= 1.0 else 1.0 / math.sqrt(u2)
+        if self.kind == "cauchy":
+            return 1.0 / (1.0 + u2)
+        if self.kind == "geman_mcclure":
+            return 1.0 / (1.0 + u2) ** 2
+        return (1.0 - u2) ** 2 if u2 < 1.0 else 0.0
+
+    def cost(self, nis: float) -> float:
+        """Return what a residual costs under the loss: `nis` where that is small, less beyond the bend."""
+        c2 = self.scale**2
+        u2 = nis / c2
+        if self.kind == "none":
+            return nis
+        if self.kind == "huber":
+            return nis if u2 <= 1.0 else c2 * (2.0 * math.sqrt(u2) - 1.0)
+        if self.kind == "cauchy":
+            return c2 * math.log1p(u2)
+        if self.kind == "geman_mcclure":
+            return c2 * u2 / (1.0 + u2)
+        return c2 / 3.0 * (1.0 - (1.0 - u2) ** 3 if u2 < 1.0 else 1.0)
+
+
+class SensorConfig(Block):
+    """What every sensor has."""
+
+    kind: str
+    """Which row of the sensor table reads this block."""
+    topic: str = ""
+    """Topic in the bag; empty for a sensor that needs none."""
+    enabled: bool = True
+    """Switch the sensor off without deleting its block."""
+    mount: MountConfig = MountConfig()
+    """Where the sensor sits on the vessel."""
+    time_offset_s: Annotated[float, Field(ge=-4e9, le=4e9)] = 0.0
+    """Added to the sensor's stamps, s."""
+    kernel: KernelConfig = KernelConfig()
+    """Robust loss."""

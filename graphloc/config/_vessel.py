@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole `vessel.yaml`, and its blocks that are no sensors."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import Field, model_validator
+
+from graphloc.blocks import Block, Finite, Positive
+from graphloc.frames import Geodetic
+
+
+class DatumConfig(Block):
+    """Origin of the world frame; without this block it is the median of the first five fixes."""
+
+    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
+    """Latitude, deg, WGS 84."""
+    longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)]
+    """Longitude, deg, WGS 84."""
+    height_m: Finite = 0.0
+    """Height above the ellipsoid, m."""
+
+    @property
+    def geodetic(self) -> Geodetic:
+        """The origin as a value."""
+        return Geodetic(self.latitude_deg, self.longitude_deg, self.height_m)
+
+
+class TimelineConfig(Block):
+    """The states of the graph."""
+
+    rate_hz: Annotated[float, Field(gt=0.5, le=200.0)] = 10.0
+    """States a second; a state moves onto a measurement's stamp where one is near."""
+    slow_period_s: Annotated[float, Field(ge=0.05, le=1e6)] = 1.0
+    """Time between two states of the slow quantities (IMU bias, GNSS error), s."""
+
+
+class StartConfig(Block):
+    """How the run is started."""
+
+    window_s: Positive = 20.0
+    """Span that the start alignment may look at, s."""
+    heading_deg: Finite | None = None
+    """Compass heading at the start (from true north, clockwise), where no sensor tells, deg."""
+    heading_sigma_deg: Positive = 10.0
+    """Its 1 sigma, deg."""
+
+
+class OutputConfig(Block):
+    """What is written to the run folder."""
+
+    rate_hz: Annotated[float, Field(gt=0.0, le=1e4)] = 10.0
+    """Rows a second in the solution."""
+    bag: bool = True
+    """Write `solution_bag/`, a bag with `nav_msgs/Odometry`."""
+    map_image: str = ""
+    """Georeferenced image under the report's map, a path as that of an aerial sensor; none: that of the first such sensor."""
+
+
+class VesselConfig(Block):
+    """A whole `vessel.yaml`."""
+
+    vessel: str = "vessel"
+    """Name of the vessel, for the report."""
+    body_frame: str = "base_link"
+    """Name of the body frame in `/tf_static` and in the written bag."""
+    datum: DatumConfig | None = None
+    """Origin of the world frame."""
+    sensors: dict[str, Any] = Field(default_factory=dict)
+    """Sensors by name; `kind` in each block picks the row of the sensor table."""
+    truth_topic: str | None = None
+    """Topic with the true body pose in world (`nav_msgs/Odometry`), for comparisons only; never fused."""
+    check_speed_topic: str | None = None
+    """`nav_msgs/Odometry` whose forward speed is compared with the solution's; never fused."""
+    timeline: TimelineConfig = TimelineConfig()
+    """The states of the graph."""
+    start: StartConfig = StartConfig()
+    """How the run is started."""
+    output: OutputConfig = OutputConfig()
+    """What is written."""
+
+    @model_validator(mode="after")
+    def _one_imu(self) -> VesselConfig:
+        if len(self.of_kind("imu")) > 1:
+            raise ValueError(f"sensors: only one imu can be enabled, found {', '.join(self.of_kind('imu'))}")
+        return self
+
+    def of_kind(self, kind: str) -> dict[str, Any]:
+        """Return the enabled sensors of a kind, by name."""
+        return {n: s for n, s in self.sensors.items() if getattr(s, "kind", None) == kind and s.enabled}

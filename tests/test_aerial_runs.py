@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans laid on an aerial image, through a bag: matches, ledger, what cannot work."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from graphloc import app
+from graphloc.config import AerialConfig, LidarConfig
+from graphloc.errors import InputError
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import find_scenario, simulate
+from graphloc.eval.simulate.bag import write_bag
+from graphloc.eval.simulate.harbour import load_harbour
+from graphloc.frames import Datum
+from graphloc.frontends._source import RawMessage
+from graphloc.frontends.aerial import match_bag, scans
+from graphloc.frontends.aerial.cloud import CLOUD, Cloud
+from graphloc.frontends.aerial.scans import Matched
+from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.trajectory import Trajectory
+from tests.bagfactory import S
+from tests.commands import called
+from tests.mapfactory import picture
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("aerial") / "sim"
+    write_bag(simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "40"}), 3), folder, ros=2)
+    return folder
+
+
+def test_from_a_bag_to_the_graph(bag: Path, tmp_path: Path) -> None:
+    """Scans become matches of the second smoothing; the image's offset is estimated; the ledger adds up."""
+    recording, vessel = app.load([bag / "run"], bag / "vessel.yaml")
+    scans = app.Scans((bag / "run",), bag)
+    run = app.smooth_recording(recording, vessel, scans=scans)
+    counts = run.solution.ledger.counts()
+    matches = sum(counts["aerial"].values())
+    assert 25 <= matches <= 39  # one a second, none where the vessel has moved less than half a metre
+    assert counts["aerial"]["used"] > 0.9 * matches
+    assert sum(sum(c.values()) for c in counts.values()) == recording.message_count + matches
+    assert 1 <= len(run.pictures) <= 3
+    assert all(coded[:2] == b"\xff\xd8" and "aerial at " in said for said, coded in run.pictures)  # JPEG
+    page = app.write(run, tmp_path / "out", inputs=[], command="", overwrite=False).read_text()
+    assert page.count('src="data:image/jpeg;base64,') == len(run.pictures)
+    assert [r.reason for r in run.recording.rows if r.topic == "/lidar_1/points"] == ["read by aerial"]
+    assert "aerial" in run.solution.slow
+    alone = app.smooth_recording(recording, vessel)
+    assert recording.truth is not None
+    with_it, without = (compare_to_truth(r.solution.trajectory, recording.truth).heading_rmse_deg for r in (run, alone))
+    assert with_it < max(without, 0.3)
+
+
+def test_one_match_is_drawn(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["match", str(bag / "run"), "-c", str(bag / "vessel.yaml"), "--at", "20", "-o", str(tmp_path / "m.png")]
+    for code, said in ((0, "none of them"), (2, "exists already")):
+        assert called(monkeypatch, *arguments) == code
+        streams = capsys.readouterr()
+        assert said in streams.out + streams.err
+    drawn = np.asarray(cv2.imread(str(tmp_path / "m.png")))
+    assert min(drawn.shape[:2]) > 500
+    assert (np.abs(drawn.astype(int) - (60, 60, 255)).max(axis=2) < 3).sum() > 500  # its faces
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"lidars": {}}, "needs `lidars`"),
+        ({"lidars": {"a": {"topic": "/imu/data"}}}, "holds no PointCloud2; such topics: /lidar_1/points"),
+        ({"lidars": {"a": {"topic": "/lidar_1/points", "mount": {"tf_frame": "nowhere"}}}}, "no chain from 'base_link' to 'nowhere'"),
+        ({"image": "none.tif"}, "not an image"),
+    ],
+)  # fmt: skip
+def test_a_matcher_that_cannot_work_is_one_line(changes: dict[str, Any], said: str, bag: Path) -> None:
+    recording, vessel = app.load([bag / "run"], bag / "vessel.yaml")
+    sensor = AerialConfig.model_validate({**vessel.sensors["aerial"].model_dump(), **changes})
+    vessel = vessel.model_copy(update={"sensors": {**vessel.sensors, "aerial": sensor}})
+    with pytest.raises(InputError) as caught:
+        app.smooth_recording(recording, vessel, scans=app.Scans((bag / "run",), bag))
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_image_of_elsewhere_leaves_rows_in_the_ledger(bag: Path, tmp_path: Path) -> None:
+    picture(tmp_path / "far.tif", 32633, 0.5, np.array([40.0, -60.0, 60.0, -30.0]))
+    recording, vessel = app.load([bag / "run"], bag / "vessel.yaml")
+    sensor = vessel.sensors["aerial"].model_copy(update={"image": str(tmp_path / "far.tif")})
+    vessel = vessel.model_copy(update={"sensors": {**vessel.sensors, "aerial": sensor}})
+    short = replace(recording, truth=None)
+    run = app.smooth_recording(short, vessel, scans=app.Scans((bag / "run",), bag))
+    assert set(run.solution.ledger.counts()["aerial"]) == {"rejected"}
+    assert run.solution.ledger.counts()["aerial"]["rejected"] > 25
+    assert any("does not cover" in row.reason for row in run.solution.ledger if row.sensor == "aerial")
+
+
+def aerial(bag: Path, **changes: Any) -> tuple[AerialConfig, Trajectory]:
+    """The aerial sensor of the bag, changed, and the true track, as sure as a smoother would be."""
+    recording, vessel = app.load([bag / "run"], bag / "vessel.yaml")
+    truth = recording.truth
+    assert truth is not None
+    cov = np.broadcast_to(np.diag([1.0, 1.0, 0.1, 1e-4, 1e-4, 1e-3]), (len(truth), 6, 6))
+    sensor = AerialConfig.model_validate({**vessel.sensors["aerial"].model_dump(), **changes})
+    return sensor, replace(truth, cov=cov)
+
+
+def matched(bag: Path, track: Trajectory, sensor: AerialConfig, **more: Any) -> list[Matched]:
+    datum = app.choose_datum(*app.load([bag / "run"], bag / "vessel.yaml"))
+    return list(match_bag([bag / "run"], sensor, bag, "base_link", track, datum, **more))
+
+
+def test_matches_are_spent_where_they_inform(bag: Path) -> None:
+    sensor, track = aerial(bag, every_m=6.0, still_s=1000.0)
+    stamps = np.array([m.stamp_ns for m in matched(bag, track, sensor)])
+    way = np.diff(track.at(stamps).p_world_m[:, :2], axis=0)
+    assert 4 <= len(stamps) < 15
+    assert np.hypot(*way.T).min() > 5.0  # from the end of a scan, stamped at its middle
+    # The same scans, were the vessel lying still.
+    moored = replace(track, p_world_m=np.zeros_like(track.p_world_m) + track.p_world_m[0])
+    assert [len(matched(bag, moored, aerial(bag, every_m=6.0, still_s=s)[0])) for s in (10.0, 1000.0)] == [4, 1]
+
+
+def test_scans_are_laid_together(bag: Path) -> None:
+    """Five scans of a moving vessel show more places than one, and at the same pose."""
+    poses, faces = [], []
+    for submap in (1, 5):
+        sensor, track = aerial(bag, submap=submap)
+        at_ns = int(track.stamps_ns[0]) + 25 * S
+        (item,) = matched(bag, track, sensor, at_ns=at_ns)
+        assert item.match is not None
+        poses.append(item.match.modes[0].pose)
+        faces.append(len(item.match.found.faces_m))
+    assert faces[1] > 1.15 * faces[0]
+    assert np.hypot(*(poses[1] - poses[0])[:2]) < 0.3
+    assert np.degrees(abs(poses[1][2] - poses[0][2])) < 0.5
+
+
+def test_lines_alone_and_bl_can_be_matched_to(bag: Path, tmp_path: Path) -> None:
+    """What stands still in the harbour, drawn as GeoJSON, without an image; and BL's matcher on the image."""
+    harbour = load_harbour("marina")
+    features = []
+    for kind, tag in (("quays", "quay"), ("pontoons", "pier"), ("buildings", "pier")):
+        for polygon, _ in getattr(harbour, kind):
+            ring = np.array(polygon.exterior.coords)
+            geodetic = harbour.datum.geodetic_from_enu(np.column_stack([ring, np.zeros(len(ring))]))
+            shape = {"type": "Polygon", "coordinates": [geodetic[:, [1, 0]].tolist()]}
+            features.append({"type": "Feature", "properties": {"man_made": tag}, "geometry": shape})
+    (tmp_path / "quays.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    shift = np.array(json.loads((bag / "truth.json").read_text())["image_shows_things_east_north_m"])
+    for changes, off in (
+        ({"image": "", "vector": str(tmp_path / "quays.geojson")}, np.zeros(2)),
+        ({"matcher": "bl"}, shift),
+    ):
+        sensor, track = aerial(bag, **changes)
+        (item,) = matched(bag, track, sensor, at_ns=int(track.stamps_ns[0]) + 10 * S)
+        assert item.match is not None
+        true = track.at(np.array([item.stamp_ns])).p_world_m[0, :2] + off
+        assert np.hypot(*(item.match.modes[0].pose[:2] - true)) < 0.25
+
+
+def test_a_broken_scan_is_a_row_of_the_ledger(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, count = scans.decode_cloud, iter(range(10**6))
+
+    def sometimes(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
+        if next(count) == 52:
+            raise ValueError("a cloud of 5 points with 3 bytes")
+        return whole(msg, stamp_ns, lidar)
+
+    monkeypatch.setattr(scans, "decode_cloud", sometimes)
+    sensor, track = aerial(bag, every_m=30.0)
+    said = [m.why_not for m in matched(bag, track, sensor) if m.match is None]
+    assert len(said) == 1
+    assert "points: a cloud of 5 points with 3 bytes" in said[0]
+
+
+def test_an_image_of_water_alone_gives_nothing(bag: Path, tmp_path: Path) -> None:
+    with rasterio.open(bag / "aerial.tif") as source:
+        profile, shape = source.profile, source.read().shape
+    noise = np.random.default_rng(0).normal(0.0, 3.0, shape)
+    with rasterio.open(tmp_path / "sea.tif", "w", **profile) as target:
+        target.write(np.clip(np.array([38, 62, 72])[:, None, None] + noise, 0, 255).astype(np.uint8))
+    sensor, track = aerial(bag, image=str(tmp_path / "sea.tif"), every_m=30.0)
+    found = matched(bag, track, sensor)
+    assert found
+    assert {m.why_not for m in found} == {"no pose in the window stands out"}
+
+
+def test_a_sensor_without_a_map_is_one_line(bag: Path) -> None:
+    sensor, track = aerial(bag, image="")
+    with pytest.raises(InputError, match="needs an `image`, a `vector` layer, or both"):
+        matched(bag, track, sensor)
+    sensor, track = aerial(bag, image="", vector="x.geojson", matcher="bl")
+    with pytest.raises(InputError, match="matcher: bl needs an `image`"):
+        matched(bag, track, sensor)
+
+
+def test_inspect_drafts_the_lidars(bag: Path, tmp_path: Path) -> None:
+    """The draft works as it stands: the LiDARs with the mounts that /tf_static knows, switched off for want of a map."""
+    found = inspect_bag(bag / "run")
+    assert [(x.topic, x.tf_frame) for x in found.lidars] == [(f"/lidar_{k}/points", f"lidar_{k}") for k in range(1, 6)]
+    (tmp_path / "vessel.yaml").write_text(draft_config(found))
+    _, vessel = app.load([bag / "run"], tmp_path / "vessel.yaml")
+    sensor = vessel.sensors["aerial"]
+    assert not sensor.enabled
+    assert [(x.topic, x.mount.tf_frame) for x in sensor.lidars.values()] == [
+        (x.topic, x.tf_frame) for x in found.lidars
+    ]
+
+
+def test_matches_near_each_other_tell_less(bag: Path) -> None:
+    """Of a first-order Markov process along the way, r = exp(-way / 15 m), a next one tells (1 - r) / (1 + r) of a mean;
+    of a place that inertial sensors carry for 5 s, of a heading for 60 s."""
+    sensor, track = aerial(bag, every_m=0.0, every_s=3.0)
+    found = [m for m in matched(bag, track, sensor) if m.match is not None and m.match.modes]
+    at = np.array([m.match.prior.pose[:2] for m in found if m.match is not None])
+    way = np.hypot(*np.diff(at, axis=0).T) / 15.0
+    waited_s = np.diff([m.stamp_ns for m in found]) * 1e-9
+    for axis, carried_s in ((0, 5.0), (1, 5.0), (2, 60.0)):
+        r = np.exp(-np.maximum(way, waited_s / carried_s))
+        np.testing.assert_allclose([m.news[axis] for m in found], [1.0, *((1.0 - r) / (1.0 + r))], rtol=1e-6)
+    first, second = found[0].match, found[1].match
+    assert first is not None
+    assert second is not None
+    np.testing.assert_allclose(first.fix(0, "a", found[0].news).modes[0].cov, first.modes[0].cov)
+    np.testing.assert_allclose(
+        np.diagonal(second.fix(0, "a", found[1].news).modes[0].cov) * found[1].news, np.diagonal(second.modes[0].cov)
+    )
+
+
+def test_lines_elsewhere_change_nothing(bag: Path, tmp_path: Path) -> None:
+    """One drawn line 130 m away: the image is matched as if it were not there."""
+    datum = Datum(load_harbour("marina").config.datum.geodetic)
+    ends = datum.geodetic_from_enu(np.array([(-20.0, 130.0, 0.0), (0.0, 130.0, 0.0)]))
+    line = {"type": "LineString", "coordinates": ends[:, [1, 0]].tolist()}
+    (tmp_path / "line.geojson").write_text(json.dumps(line))
+    poses = []
+    for vector in ("", str(tmp_path / "line.geojson")):
+        sensor, track = aerial(bag, vector=vector)
+        (item,) = matched(bag, track, sensor, at_ns=int(track.stamps_ns[0]) + 20 * S)
+        assert item.match is not None
+        poses.append(item.match.modes[0].pose)
+    # Layers are kept in 255 parts of the largest weight, which is another one with lines.
+    np.testing.assert_allclose(poses[0][:2], poses[1][:2], atol=0.03)
+
+
+def test_a_prior_that_misses_is_not_followed(bag: Path) -> None:
+    """8 and 20 m beside the truth, and said to be off by 10 m: the window may miss, so nothing in it is sure."""
+    sensor, track = aerial(bag, every_m=6.0)
+    for off in (8.0, 20.0):
+        moved = replace(
+            track, p_world_m=track.p_world_m + np.array([0.6 * off, 0.8 * off, 0.0]), cov=100.0 * np.asarray(track.cov)
+        )  # fmt: skip
+        claims = [m.match.modes[0].probability for m in matched(bag, moved, sensor) if m.match and m.match.modes]
+        assert max(claims, default=0.0) < 0.6
+    claims = [m.match.modes[0].probability for m in matched(bag, track, sensor) if m.match and m.match.modes]
+    assert min(claims) > 0.8
+
+
+def test_one_stamp_of_the_future_costs_one_match(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, count = scans.decode_cloud, iter(range(10**6))
+
+    def sometimes(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
+        return whole(msg, stamp_ns + (3600 * S if next(count) == 52 else 0), lidar)
+
+    sensor, track = aerial(bag, every_m=0.0, still_s=0.5)
+    usual = len(matched(bag, track, sensor))
+    monkeypatch.setattr(scans, "decode_cloud", sometimes)
+    found = matched(bag, track, sensor)
+    (lost,) = [m.why_not for m in found if m.match is None]
+    assert "outside of the track" in lost
+    assert "lidar_3 +36" in lost
+    assert len(found) - 1 >= usual - 1
+
+
+def test_lidar_clocks_can_be_set_right(bag: Path) -> None:
+    sensor, track = aerial(bag, every_m=6.0)
+    later, _ = aerial(bag, every_m=6.0, time_offset_s=0.25)
+    stamps, moved = (next(iter(matched(bag, track, s))).stamp_ns for s in (sensor, later))
+    assert moved - stamps == 250_000_000
+
+
+def test_turns_of_lidars_at_different_rates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One at 3 Hz, one at 1 Hz that falls silent: a turn as soon as there is one of each, else what there is."""
+    fast = [(k / 3.0, "fast") for k in range(15)]
+    slow = [(k + 0.1, "slow") for k in range(3)]
+
+    class Heap:
+        def messages(self, _topics: set[str]) -> list[RawMessage]:
+            return [RawMessage(f"/{n}", CLOUD, b"", int(t * S), "") for t, n in sorted(fast + slow)]  # type: ignore[arg-type]
+
+        def decode(self, raw: RawMessage) -> RawMessage:
+            return raw
+
+    monkeypatch.setattr(scans, "header_stamp_ns", lambda raw: raw.log_ns)
+    monkeypatch.setattr(
+        scans, "decode_cloud",
+        lambda raw, stamp, name: Cloud(name, stamp, np.ones((1, 3)), np.array([stamp], dtype=np.int64)),
+    )  # fmt: skip
+    config = AerialConfig(lidars={n: LidarConfig(topic=f"/{n}") for n in ("fast", "slow")})
+    turns = list(scans._turns(Heap(), config))  # type: ignore[arg-type]  # noqa: SLF001
+    together = [t for t in turns if len(t.clouds) == 2]
+    assert len(together) == 3
+    assert max(abs(t.clouds[0].stamp_ns - t.clouds[1].stamp_ns) for t in together) < 0.4 * S
+    assert turns[-1].stamp_ns > 4.5 * S  # the other one goes on alone

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images of every kind a user may have lie where they are in world."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from numpy.typing import NDArray
+
+from graphloc.errors import InputError
+from graphloc.frames import Datum, Geodetic
+from graphloc.frontends.aerial.image import AerialImage
+from tests.mapfactory import BRIGHT, DARK, NEW_YORK, SWEDEN, Bytes, around, check, colours, drawn, framed, utm, write
+
+
+@pytest.mark.parametrize(
+    ("crs", "pixel", "turn_deg", "datum"),
+    [
+        (32633, 0.2, 30.0, SWEDEN),  # turned
+        (4326, 2.5e-6, 0.0, SWEDEN),  # degrees: a pixel is half as wide as high
+        (2263, 0.5, 0.0, NEW_YORK),  # US survey feet
+        (3857, 0.2, 0.0, SWEDEN),  # metres that are half a metre
+        (5845, 0.2, -100.0, SWEDEN),  # with heights
+        (32633, 0.06, 0.0, SWEDEN),  # read at half its size
+    ],
+)
+def test_an_image_lies_in_world(crs: int, pixel: float, turn_deg: float, datum: Geodetic, tmp_path: Path) -> None:
+    transform, width, height = framed(crs, pixel, datum, turn_deg)
+    image = drawn(crs, transform, width, height, datum)
+    check(around(write(tmp_path / "a.tif", colours(image), crs=f"EPSG:{crs}", transform=transform), datum=datum))
+
+
+def test_an_image_of_half_metres_is_averaged_like_one_of_metres(tmp_path: Path) -> None:
+    """Stripes finer than the grid are grey: 1.87 units of Web Mercator are 1 m at 57.7 deg."""
+    spread = []
+    for crs, unit in ((32633, 1.0), (3857, 1.0 / np.cos(np.radians(57.7)))):
+        transform, width, height = framed(crs, 0.12 * unit)
+        stripes = np.where(np.arange(width) % 4 < 2, 0, 255).astype(np.uint8)
+        bands = np.broadcast_to(stripes, (3, height, width))
+        patch = around(write(tmp_path / "a.tif", bands, crs=f"EPSG:{crs}", transform=transform), 0.4)
+        spread.append(float(patch.pixels.std()))
+    assert spread[0] == pytest.approx(spread[1], abs=1.0)
+    assert max(spread) < 15.0  # of 127
+
+
+def test_a_fine_image_is_read_at_a_part_of_its_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = utm(tmp_path / "a.tif", colours, pixel=0.05)
+    image, shapes = AerialImage(path, Datum(SWEDEN)), []
+    read = AerialImage._read  # noqa: SLF001
+
+    def spy(self: AerialImage, *args: Any) -> Any:
+        shapes.append((found := read(self, *args))[1].shape)
+        return found
+
+    monkeypatch.setattr(AerialImage, "_read", spy)
+    check(image.patch(np.array([15.0, -20.0]), 30.0, 0.5))
+    assert max(shapes[0]) < 500  # of 1200: 10 pixels a cell, by 4
+
+
+def palette(grey: Bytes) -> Bytes:
+    return np.where(grey > 0.5 * (DARK + BRIGHT), 7, np.where(grey > DARK, 9, 3)).astype(np.uint8)[None]
+
+
+def test_pixels_of_every_kind(tmp_path: Path) -> None:
+    check(around(utm(tmp_path / "grey.tif", lambda g: g[None])))
+    check(around(utm(tmp_path / "two.tif", lambda g: np.stack([g, np.full_like(g, 255)]))))
+    turned = utm(
+        tmp_path / "bgr.tif", lambda g: np.stack([np.full_like(g, 9), g, 255 - g, g]), photometric="MINISBLACK"
+    )
+    with rasterio.open(turned, "r+") as f:
+        f.colorinterp = [rasterio.enums.ColorInterp[c] for c in ("undefined", "blue", "green", "red")]
+    patch = around(turned)
+    check(patch)
+    check(patch, 255 - BRIGHT, 255 - DARK, band=1)
+    with pytest.raises(InputError, match=r"c\.tif: no picture in it"):
+        around(utm(tmp_path / "c.tif", lambda g: g[None].astype(np.complex64)))
+
+
+def test_a_palette_is_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = utm(tmp_path / "a.tif", palette, photometric="PALETTE")
+    with rasterio.open(path, "r+") as f:
+        f.write_colormap(1, {3: (DARK, 0, 50, 255), 7: (BRIGHT, 0, 60, 255), 9: (120, 0, 70, 255)})
+    patch = around(path)
+    check(patch, atol_m=0.04)
+    assert set(np.unique(patch.pixels[..., 1])) == {0}
+    check(around(path, cell_m=1.0), atol_m=0.1)
+    monkeypatch.setattr("graphloc.frontends.aerial.image._PALETTE_PX", 1000)  # a whole map would fill the memory
+    with pytest.raises(InputError, match=r"\d+ x \d+ pixels with a palette are too many"):
+        around(path)
+
+
+@pytest.mark.parametrize(("kind", "scale"), [("uint16", 12.0), ("int16", 100.0), ("float32", 0.004)])
+def test_deep_pixels_are_stretched(kind: str, scale: float, tmp_path: Path) -> None:
+    """The bright thing is 330 of 19600 m^2: a second one of the same colour makes 2 % of it, and 98 % the bright."""
+
+    def deep(grey: Bytes) -> NDArray[Any]:
+        grey[-60:] = BRIGHT
+        return np.asarray(colours(grey) * scale).astype(kind)
+
+    path = utm(tmp_path / "a.tif", deep)
+    check(around(path), 255, 0)
+    known = utm(tmp_path / "b.tif", lambda g: np.where(np.arange(g.shape[1]) > 50, deep(g), -9 if kind != "uint16" else 0).astype(kind), nodata=0 if kind == "uint16" else -9)  # fmt: skip
+    check(around(known), 255, 0)  # what is no data does not count
+
+
+def test_no_data_is_said_in_many_ways(tmp_path: Path) -> None:
+    def holed(grey: Bytes) -> Bytes:
+        grey[:, :300] = 0  # 60 of 140 m: 10 m west of the middle
+        return grey
+
+    def alpha(grey: Bytes) -> Bytes:
+        return np.stack([grey, grey, grey, np.where(holed(grey) > 0, 255, 0).astype(np.uint8)])
+
+    ways = {
+        "alpha": utm(tmp_path / "alpha.tif", alpha, photometric="RGB", alpha="YES"),
+        "nodata": utm(tmp_path / "nodata.tif", lambda g: colours(holed(g)), nodata=0),
+        "mask": utm(tmp_path / "mask.tif", colours),
+        "fine": utm(tmp_path / "fine.tif", lambda g: colours(holed(g)), nodata=0),
+    }
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(ways["mask"], "r+") as f:
+        mask = np.full(f.shape, 255, np.uint8)
+        mask[:, :300] = 0
+        f.write_mask(mask)
+    for name, path in ways.items():
+        for cell in (0.25, 1.0):
+            patch = around(path, cell)
+            east = patch.west_m + np.arange(patch.inside.shape[1]) * cell
+            ok = patch.inside[len(patch.inside) // 2]
+            assert not ok[east < 4.0].any(), name
+            assert ok[east > 6.0].all(), name
+        blue = utm(tmp_path / "blue.tif", lambda g: np.stack([g, g, np.zeros_like(g)]), nodata=0)
+        assert around(blue).inside.all()  # no blue is a colour
+    with pytest.raises(InputError, match="does not cover -40 m east"):
+        AerialImage(ways["alpha"], Datum(SWEDEN)).patch(np.array([-40.0, -20.0]), 10.0, 0.25)
+
+
+def test_images_without_a_place_say_what_to_do(tmp_path: Path) -> None:
+    transform, width, height = framed(32633, 0.5)
+    bands = colours(drawn(32633, transform, width, height))
+    gcps = [
+        rasterio.control.GroundControlPoint(r, c, 14.5 + c * 1e-5, 57.7 - r * 1e-5) for r, c in ((0, 0), (0, 9), (9, 0))
+    ]
+
+    def said(path: Path) -> str:
+        with pytest.raises(InputError) as error:
+            AerialImage(path, Datum(SWEDEN))
+        assert str(error.value).startswith(f"{path}: ")
+        assert "\n" not in str(error.value)
+        return str(error.value)
+
+    bare = pytest.warns(rasterio.errors.NotGeoreferencedWarning)
+    with bare:
+        path = write(tmp_path / "crs.tif", bands, crs="EPSG:32633")
+    assert "a CRS but no transform" in said(path)
+    with bare:
+        path = write(tmp_path / "plain.tif", bands)
+    assert "has no georeference" in said(path)
+    with bare:
+        world = write(tmp_path / "world.png", bands, driver="PNG")
+    assert "gdalwarp -t_srs" in said(write(tmp_path / "gcp.tif", bands, gcps=gcps, crs="EPSG:4326"))
+    (tmp_path / "world.png.aux.xml").unlink(missing_ok=True)
+    (tmp_path / "world.pgw").write_text("\n".join(str(transform[k]) for k in (0, 3, 1, 4, 2, 5)))
+    assert "gdal_translate -a_srs EPSG:<its code> world.png" in said(world)
+    local = 'LOCAL_CS["site",UNIT["metre",1]]'
+    assert "its CRS cannot be used" in said(write(tmp_path / "local.tif", bands, crs=local, transform=transform))
+    assert "not an image" in said(tmp_path / "absent.tif")
+
+
+def test_a_loose_tie_to_wgs_84_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """NAD 83 is tied to WGS 84 to 4 m by EPSG's best; SWEREF 99 to 1 m."""
+    for crs, pixel, datum, words in ((2263, 0.5, NEW_YORK, 1), (3006, 0.2, SWEDEN, 0)):
+        caplog.clear()
+        transform, width, height = framed(crs, pixel, datum)
+        write(tmp_path / "a.tif", colours(np.zeros((height, width), np.uint8)), crs=f"EPSG:{crs}", transform=transform)
+        AerialImage(tmp_path / "a.tif", Datum(datum))
+        assert len(caplog.records) == words
+
+
+def test_a_path_that_is_none_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="File name too long"):
+        AerialImage(tmp_path / ("x" * 300), Datum(SWEDEN))
