@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SensorConfig, VelocityConfig, VesselConfig
 from graphloc.frontends import _clock, _fixes, _sanity
 from graphloc.frontends.decode import Decoded, ImuSample, Rejection, rejected
+from graphloc.hangs import WHY, hanging, hanging_warning
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
 from graphloc.time import utc_text
@@ -113,6 +114,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     assert isinstance(readings.config, ImuConfig)
     bad = ~_clock.longest_increasing(readings.stamps())
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
+    rows += _drop_hanging(readings, warnings)
     samples = [v for v in readings.values if isinstance(v, ImuSample)]
     if not samples:
         return None, rows
@@ -125,6 +127,15 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     )
     warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     return series, rows
+
+
+def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
+    """Drop samples that a driver which hangs only repeats: the solver bridges them as it does a gap."""
+    stamps = readings.stamps()
+    samples = np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)])
+    bad = hanging(stamps, samples)
+    warnings += hanging_warning(readings.sensor, stamps, bad)
+    return readings.drop(bad, rejected(WHY))
 
 
 def reject_repeats(readings: Readings) -> list[LedgerRow]:
