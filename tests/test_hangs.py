@@ -56,6 +56,16 @@ def test_all_but_the_first_of_a_stretch_are_none_and_as_they_come_all_from_a_fif
     assert np.flatnonzero(as_it_comes(samples)).tolist() == [*range(220, 301), *range(720, len(STAMPS))]
 
 
+def test_rates_that_hang_alone_are_told_after_a_second() -> None:
+    samples = readings()
+    samples[200:500, 3:] = samples[200, 3:]
+    assert np.flatnonzero(hanging(STAMPS, samples)).tolist() == [*range(201, 500)]
+    assert np.flatnonzero(as_it_comes(samples)).tolist() == [*range(300, 500)]
+    samples[280:500, 3:] = 0.0  # a deadband at rest
+    assert not hanging(STAMPS, samples).any()
+    assert not any(as_it_comes(samples))
+
+
 @pytest.mark.parametrize(
     "case", ["noise", "held by a driver", "one axis moves", "no noise, at rest", "coarse, at rest"]
 )
