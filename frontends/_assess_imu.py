@@ -16,6 +16,7 @@ from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import NEVER_STILL_RADPS, without_gravity
 from graphloc.frontends._streams import Stream
 from graphloc.frontends._tf import StaticTree
+from graphloc.hangs import hanging, hanging_warning
 from graphloc.time import NS_PER_S
 
 _WINDOW_S = 1.0
@@ -23,6 +24,13 @@ _WINDOW_S = 1.0
 _COURSE_S, _COURSE_CLEAR = 12.0, 0.6
 _UPSIDE_DOWN_DEG = 150.0
 _MIN_COHERENCE = 0.25  # and 4 / sqrt(windows), four times what chance gives
+
+
+def samples_of(imu: Stream) -> tuple[NDArray[np.intp], list[str]]:
+    """Return which messages are samples, in order of stamps, and a line where others only repeat one that hangs."""
+    keep = sane(imu)
+    bad = hanging(imu.stamps_ns[keep], imu.rows[keep, :6] if len(keep) else np.zeros((0, 6)))
+    return keep[~bad], hanging_warning(imu.topic, imu.stamps_ns[keep], bad)
 
 
 def mount_guess(
@@ -35,7 +43,7 @@ def mount_guess(
     |sum| / sqrt(sum |a|^2 sum |m|^2) says how far the data support it. Snapped to quarter turns.
 
     Args:
-        accel: (N, 3) m/s^2; gyro: (N, 3) rad/s, of the `sane` samples.
+        accel: (N, 3) m/s^2; gyro: (N, 3) rad/s, of the samples that are kept.
     """
     up = np.median(accel, axis=0)
     size = float(np.linalg.norm(up))
@@ -78,7 +86,7 @@ def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motion: Motion | None) ->
     """Return the quarter turn (deg) that fits the motion, and the evidence; `accel`, `gyro` are levelled."""
     if motion is None:
         return 0.0, "no motion to tell its yaw by: taken as 0"
-    t = (imu.stamps_ns[sane(imu)] - motion.origin_ns) / NS_PER_S
+    t = (imu.stamps_ns[samples_of(imu)[0]] - motion.origin_ns) / NS_PER_S
     edges = np.arange(max(t[0], motion.t_s[0]), min(t[-1], motion.t_s[-1]), _WINDOW_S)
     if len(edges) < 20:
         return 0.0, "too little motion to tell its yaw by: taken as 0"
@@ -106,7 +114,7 @@ def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motion: Motion | None) ->
 
 def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Turning | None:
     """Return how the craft turned, by an IMU whose mount is known or guessed; its gyro bias taken off where found."""
-    keep = sane(imu)
+    keep, _ = samples_of(imu)
     keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)] if len(keep) else keep
     if len(keep) < 20:
         return None
@@ -143,7 +151,7 @@ def _righted(
     Where /tf_static knows the mount, the gyroscope turns rightly, and gravity points down.
 
     Args:
-        samples: acceleration (N, 3) m/s^2 and rate (N, 3) rad/s of the `sane` samples.
+        samples: acceleration (N, 3) m/s^2 and rate (N, 3) rad/s of the samples that are kept.
     """
     sense = _against_courses(imu, report, courses, tree, body)
     accel, gyro = samples
@@ -181,7 +189,7 @@ def imu_report(
     imu: Stream, motion: Motion | None, courses: Courses | None, tree: StaticTree, body: str
 ) -> ImuReport | None:
     """Return units, gravity, standstill, noise and mount of an IMU."""
-    keep = sane(imu)
+    keep, hangs = samples_of(imu)
     rows = imu.rows[keep] if len(keep) else np.zeros((0, 13))
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(rows[:, :6]).all(axis=1))
     if finite.sum() < 20:
@@ -190,7 +198,7 @@ def imu_report(
     accel, gyro = np.where(finite[:, None], rows[:, :3], 0.0), np.where(finite[:, None], rows[:, 3:6], 0.0)
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     rate = float(np.median(np.linalg.norm(gyro, axis=1)))
-    why = []
+    why = hangs
     gravity = "removed" if without_gravity(accel) else "included"
     accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
     gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS else "rad/s"

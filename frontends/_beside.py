@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,15 @@ class Beside:
     count: int = 0
     broken: int = 0
     stamps_ns: list[int] = field(default_factory=list)
+    logs_ns: list[int] = field(default_factory=list)
     messages: list[Any] = field(default_factory=list)
+
+    def keep(self, first_ns: int, last_ns: int) -> None:
+        """Drop what was not recorded between two times."""
+        kept = [first_ns <= log_ns <= last_ns for log_ns in self.logs_ns]
+        columns: tuple[list[Any], ...] = (self.stamps_ns, self.logs_ns, self.messages)
+        for column in columns:
+            column[:] = list(compress(column, kept))
 
 
 def true_trajectory(item: Beside, warnings: list[str]) -> Trajectory | None:

@@ -18,6 +18,9 @@ HOLE_LIMIT_S = 600.0
 EPOCH_LIMIT_S = 1.0
 """Clocks of two sensors that differ by more are said to disagree."""
 
+_SET_BACK_S = 0.5
+_FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
+
 
 def usual_latency_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
     """Return the median of recording time minus header stamp, s."""
@@ -60,6 +63,23 @@ def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
         keep[i] = True
         i = int(before[i])
     return keep
+
+
+def set_backs(stamps_ns: Stamps) -> list[int]:
+    """Return where, in order of arrival, a clock was set back: from there on it goes through times that it said before.
+
+    Samples that were held up on their way come from a hole, which none was said of.
+    """
+    found: list[int] = []
+    tries = np.flatnonzero(np.diff(stamps_ns) < -duration_ns(_SET_BACK_S)) + 1
+    for i in tries[:_MOST_TRIED].tolist():
+        after, before = stamps_ns[i : i + _FOLLOW], stamps_ns[found[-1] if found else 0 : i]
+        if len(after) < _FOLLOW or (np.diff(after) <= 0).any():
+            continue
+        again = int(((before >= after[1]) & (before <= after[-1])).sum())
+        if again >= _FOLLOW // 2:
+            found.append(i)
+    return found
 
 
 def busiest_section(stamps_ns: Stamps, hole_s: float = HOLE_LIMIT_S) -> tuple[int, int]:

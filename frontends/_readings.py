@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SensorConfig, VelocityConfig, VesselConfig
 from graphloc.frontends import _clock, _fixes, _sanity
+from graphloc.frontends._beside import Beside
 from graphloc.frontends.decode import Decoded, ImuSample, Rejection, rejected
+from graphloc.hangs import WHY, hanging, hanging_warning
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
-from graphloc.time import utc_text
+from graphloc.time import NS_PER_S, utc_text
 
 
 @dataclass(slots=True)
@@ -84,6 +86,34 @@ def reject_jumps(sensors: Sequence[Readings], warnings: list[str]) -> list[Ledge
     return rows
 
 
+def reject_set_back(sensors: Sequence[Readings], beside: Sequence[Beside], warnings: list[str]) -> list[LedgerRow]:
+    """Keep the longest part of a run in which the IMU's clock was set back, by recording times; say where that was.
+
+    Two parts that bear the same times would be laid over each other.
+    """
+    for imu in (r for r in sensors if r.config.kind == "imu"):
+        stamps, logs = imu.stamps(), imu.logs()
+        cuts = _clock.set_backs(stamps)
+        if not cuts:
+            continue
+        edges = [0, *cuts, len(stamps)]
+        longest = int(np.argmax(np.diff(edges)))
+        first, last = int(logs[edges[longest]]), int(logs[edges[longest + 1] - 1])
+        first, last = (first if longest else 0), (last if longest < len(cuts) else np.iinfo(np.int64).max)
+        where = ", ".join(
+            f"by {(stamps[k - 1] - stamps[k]) / NS_PER_S:.1f} s at {utc_text(int(logs[k]))}" for k in cuts
+        )
+        why = f"the clock of {imu.sensor} was set back {where}, recording time; only the longest part between is kept: split the bag there to have the others"
+        rows = []
+        for readings in sensors:
+            outside = (readings.logs() < first) | (readings.logs() > last)
+            rows += _drop(readings, outside, rejected(why), warnings)
+        for item in beside:
+            item.keep(first, last)
+        return rows
+    return []
+
+
 def _drop(readings: Readings, bad: NDArray[np.bool_], rejection: Rejection, warnings: list[str]) -> list[LedgerRow]:
     rows = readings.drop(bad, rejection)
     if rows:
@@ -113,6 +143,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     assert isinstance(readings.config, ImuConfig)
     bad = ~_clock.longest_increasing(readings.stamps())
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
+    rows += _drop_hanging(readings, warnings)
     samples = [v for v in readings.values if isinstance(v, ImuSample)]
     if not samples:
         return None, rows
@@ -125,6 +156,15 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     )
     warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     return series, rows
+
+
+def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
+    """Drop samples that a driver which hangs only repeats: the solver bridges them as it does a gap."""
+    stamps = readings.stamps()
+    samples = np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)])
+    bad = hanging(stamps, samples)
+    warnings += hanging_warning(readings.sensor, stamps, bad)
+    return readings.drop(bad, rejected(WHY))
 
 
 def reject_repeats(readings: Readings) -> list[LedgerRow]:

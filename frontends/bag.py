@@ -27,6 +27,7 @@ from graphloc.frontends._readings import (
     reject_far,
     reject_jumps,
     reject_repeats,
+    reject_set_back,
 )
 from graphloc.frontends._source import LATEST_NS, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
@@ -85,6 +86,7 @@ def read_recording(
         warnings = list(bag.warnings)
 
     rows += reject_jumps(sensors, warnings)
+    rows += reject_set_back(sensors, [b for b in (truth, check) if b], warnings)
     warnings += clock_warnings(sensors)
     imu: ImuSeries | None = None
     measurements: list[Measurement] = []
@@ -179,6 +181,7 @@ class _Reader:
             stamp_ns = None if msg is None else header_stamp_ns(msg)
             if stamp_ns is not None:
                 item.stamps_ns.append(stamp_ns)
+                item.logs_ns.append(raw.log_ns)
                 item.messages.append(msg)
         if raw.topic == TF_STATIC and self._tree is not None:
             if msg is not None and raw.msgtype == TF:

@@ -24,7 +24,7 @@ from graphloc.frontends._assess import (
     topic_report,
     track,
 )
-from graphloc.frontends._assess_imu import imu_report, turning_of
+from graphloc.frontends._assess_imu import imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._assess_world import origin_of
 from graphloc.frontends._draft import draft_config
@@ -188,6 +188,8 @@ def _useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
             why += f", {len(stream) - plausible} have a stamp that repeats, runs backwards or is far from the recording time"
         elif stream.msgtype == NAV_SAT_FIX:
             why += f", {int((stream.rows[:, 3] < 0).sum()) if len(stream) else 0} say 'no fix', the others lie at 0, 0 or are NaN"
+        elif len(stream) and (hangs := samples_of(stream)[1]):
+            why = hangs[0].removeprefix(f"{stream.topic}: ")
         total = len(stream) + stream.undecodable + stream.no_stamp
         lines.append(f"{stream.topic}: nothing of its {total} messages can be used: {why}")
     return lines

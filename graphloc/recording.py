@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -61,3 +62,9 @@ class Recording:
     check_speed: SpeedSeries | None = None
     tag_views: tuple[TagView, ...] = ()
     warnings: tuple[str, ...] = ()
+
+    def lost(self, sensors: Container[str]) -> str:
+        """Return a clause on why most of the messages of these sensors that gave nothing gave nothing; empty where none is."""
+        reasons = Counter(row.reason for row in self.rows if row.sensor in sensors)
+        ((reason, count),) = reasons.most_common(1) or (("", 0),)
+        return f"; {count} of its messages gave nothing: {reason}" if count else ""

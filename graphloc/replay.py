@@ -251,7 +251,8 @@ def replay(
     rows += smoother.finish()
     said += [(last_ns, event) for event in smoother.events()]
     if not estimates:
-        raise SolveError(f"{recording.source}: never started: it waited for {waiting or 'IMU data'}")
+        lost = recording.lost(config.of_kind("imu"))
+        raise SolveError(f"{recording.source}: never started: it waited for {waiting or 'IMU data'}{lost}")
     recording = gathering.recording()
     told_of = _timed(said, estimates)
     if len(took_s) > 1:

@@ -13,6 +13,7 @@ from graphloc.app._run import Run, made_comparable
 from graphloc.config import VesselConfig, load_config
 from graphloc.errors import InputError, SolveError
 from graphloc.eval import calibrate, ekf, holdout
+from graphloc.eval.apart import apart_warnings
 from graphloc.eval.digerud import run_digerud
 from graphloc.eval.match_picture import Gallery
 from graphloc.eval.posture import posture_warnings
@@ -87,7 +88,7 @@ def smooth_recording(
         beside = ekf.FilterResult(name=online.name, trajectory=online.trajectory, ledger=online.ledger)
         filters = (beside, *filters)
     tags, said = found_tags.about_tags(recording, config, solution)
-    said += [*posture_warnings(solution.trajectory, recording, config), *([never] if never else [])]
+    said += [*_track_warnings(solution, recording, config), *([never] if never else [])]
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
         filters=filters, online=online, pictures=tuple(gallery.pictures()), tags=tags,
@@ -116,6 +117,12 @@ def _filters(
     return filters
 
 
+def _track_warnings(solution: Solution, recording: Recording, config: VesselConfig) -> list[str]:
+    """What a solved track, offline or online, tells of the configuration."""
+    track = solution.trajectory
+    return posture_warnings(track, recording, config) + apart_warnings(track, solution.datum, recording, config)
+
+
 def _online(
     recording: Recording, config: VesselConfig, datum: Datum, progress: Progress
 ) -> tuple[Solution | None, str]:
@@ -138,7 +145,9 @@ def replay_recording(
 ) -> Run:
     """Run a recording through the online mode (see `graphloc.replay`)."""
     replayed = replay(recording, config, scans=scans, rate=rate, lag_s=lag_s, stoppable=True, status=status)
-    run = Run(recording=replayed.recording, config=config, solution=replayed.solution)
+    recording, solution = replayed.recording, replayed.solution
+    said = _track_warnings(solution, recording, config)
+    run = Run(recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution)
     return made_comparable(_with_underlay(run, scans))
 
 

@@ -118,7 +118,10 @@ def make_problem(
             f"{recording.source}: no enabled sensor of kind {inertial.kind} in vessel.yaml, and it needs one"
         )
     if imu is None or len(imu) < 10:
-        raise SolveError(f"{recording.source}: no IMU data (need at least 10 samples); check its topic and stamps")
+        lost = recording.lost(config.of_kind(inertial.kind))
+        raise SolveError(
+            f"{recording.source}: no IMU data (need at least 10 samples); check its topic and stamps{lost}"
+        )
     imu_config = config.sensors[imu.sensor]
     t_body_imu, R = mount_of(imu.sensor, imu_config, recording.mounts)
 

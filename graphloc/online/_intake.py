@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which IMU samples are taken, and in what order: clocks leap and are set back, samples come late, units are mistaken."""
+"""Which IMU samples are taken, and in what order: clocks leap and are set back, samples come late or again, units are mistaken."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphloc.hangs import WHY, HangWatch
 from graphloc.measurements import ImuSample
 
 _BACK = 50  # samples in a row before the newest: their clock was set back
@@ -25,7 +26,7 @@ class Taken:
         accepted: in order, each after the newest. dropped: with the reason.
         late: the sample itself, of a stamp before the newest. hole: the stamps (ns) that it lies between; None
             before the first.
-        absurd: why it cannot be a vessel's.
+        absurd: why it cannot be a vessel's. hangs: it is the first of those that only repeat the one before.
         set_back_s: so far was the IMU's clock set back; all before is of another clock.
     """
 
@@ -34,6 +35,7 @@ class Taken:
     late: ImuSample | None = None
     hole: tuple[int, int] | None = None
     absurd: str = ""
+    hangs: bool = False
     set_back_s: float = 0.0
 
 
@@ -50,6 +52,7 @@ class ImuIntake:
         self.newest: ImuSample | None = None
         self.leap: ImuSample | None = None  # waits until others follow it, so that one bad stamp does not cut the run
         self._leap_age = self._behind = 0
+        self._hanging = HangWatch()
         self._stamps: list[int] = []  # in order, as far back as a late one may lie
 
     def accept(self, m: ImuSample) -> float:
@@ -71,6 +74,9 @@ class ImuIntake:
         """Say what becomes of a sample, and of one that waited for it. `started`: there are states."""
         if absurd := self._absurd(m):
             return Taken(dropped=((m, absurd),), absurd=absurd)
+        hung = self._hanging.hung
+        if self._hanging.hangs(m):
+            return Taken(dropped=((m, WHY),), absurd=WHY, hangs=not hung)
         newest, leap = self.newest, self.leap
         if newest is None:
             return Taken(accepted=(m,))

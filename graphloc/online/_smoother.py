@@ -22,6 +22,7 @@ from graphloc.errors import in_one_line
 from graphloc.estimate import Estimate
 from graphloc.frames import Array, Datum
 from graphloc.graph import UNKNOWN_MPS2, UNKNOWN_RADPS, InertialRow, Sensor
+from graphloc.hangs import WHY
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor, sound
@@ -199,6 +200,8 @@ class OnlineSmoother:
             self._drop(lost, Outcome.REJECTED, why)
         if taken.absurd and self._lag is None:
             self._waiting = f"IMU data that a vessel can have: {taken.absurd}"
+        if taken.hangs:
+            self._events.append(f"{m.sensor}: {WHY}; silent until it says another")
         if taken.late is not None:
             self._keep_late_imu(taken.late, taken.hole)
         if taken.set_back_s:

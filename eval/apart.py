@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Do GNSS and the other sensors of place stand apart all the while? The slow error takes that up without a word.
+
+A receiver's slow error d is a process of sigma s and time constant T_c that comes and goes. Its mean over a run of length T is
+
+    sigma_mean^2 = 2 s^2 (T_c / T) (1 - (T_c / T) (1 - exp(-T / T_c)))
+
+so that |mean|^2 / sigma_mean^2 of two axes is a chi-square of 2. What lies beyond its 95 %, and hardly moves, is no multipath:
+a map, a survey or the datum lies as far off, or a lever does. Which of them is wrong nothing here tells.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from graphloc.build import mount_of
+from graphloc.config import VesselConfig
+from graphloc.eval.metrics import held_out_errors
+from graphloc.frames import Array, Datum, heading_deg_from_yaw
+from graphloc.measurements import GnssPosition
+from graphloc.recording import Recording
+from graphloc.time import NS_PER_S
+from graphloc.trajectory import Trajectory
+
+_BEYOND = float(chi2.ppf(0.95, 2))
+_STEADY = 0.5  # RMS about the mean, as a share of it
+_BLOCK_S = 10.0
+_PLACES = ("pose", "aerial", "apriltag", "gnss")
+
+
+def apart_warnings(track: Trajectory, datum: Datum, recording: Recording, config: VesselConfig) -> list[str]:
+    """Return a line for each receiver that stands apart from a solved track by more than its slow error explains."""
+    lines = []
+    measured = {m.sensor for m in recording.measurements if m.seq >= 0}
+    for name, sensor in config.of_kind("gnss").items():
+        others = [n for kind in _PLACES for n in config.of_kind(kind) if n != name and n in measured]
+        fixes = [m for m in recording.measurements if isinstance(m, GnssPosition) and m.sensor == name]
+        covered = track.covers(np.array([m.stamp_ns for m in fixes], dtype=np.int64))
+        if not covered.any() or sensor.slow_error.enabled is False or not others:
+            continue
+        lever = {name: mount_of(name, sensor, recording.mounts)[0]}
+        stamps, error, _ = held_out_errors(track, fixes, datum, lever)
+        off = _means(stamps, -error[:, :2])
+        mean, lasts_s = off.mean(axis=0), float(stamps[-1] - stamps[0]) / NS_PER_S
+        size, process = float(np.hypot(*mean)), sensor.slow_error
+        allowed = _mean_variance(process.horizontal_sigma_m, process.time_constant_s, max(lasts_s, _BLOCK_S))
+        moves = float(np.sqrt(((off - mean) ** 2).sum(axis=1).mean()))
+        if size**2 < _BEYOND * allowed or moves > _STEADY * size:
+            continue
+        towards = float(heading_deg_from_yaw(np.arctan2(mean[1], mean[0])))
+        lines.append(
+            f"{name} stands {size:.1f} m (towards {towards:.0f} deg) off what {', '.join(others)} says, all the while; its slow "
+            f"error of {process.horizontal_sigma_m:.1f} m (1 sigma) does not explain that: a map, a survey, the datum or a lever "
+            "is off by as much, or the receiver is; the track follows the others"
+        )
+    return lines
+
+
+def _means(stamps_ns: NDArray[np.int64], off_m: Array) -> Array:
+    """Return the mean of each block, in which white noise goes, of (N, 2)."""
+    _, block = np.unique((stamps_ns - stamps_ns[0]) // int(_BLOCK_S * NS_PER_S), return_inverse=True)
+    count = np.bincount(block)
+    return np.column_stack([np.bincount(block, weights=column) / count for column in off_m.T])
+
+
+def _mean_variance(sigma_m: float, time_constant_s: float, lasts_s: float) -> float:
+    share = time_constant_s / lasts_s
+    return 2.0 * sigma_m**2 * share * (1.0 - share * (1.0 - float(np.exp(-1.0 / share))))

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An IMU that hangs: its driver says the last sample again and again, under stamps that move on.
+
+Believed, it stands still or turns steadily, whatever the vessel does. No noise is the same to the last bit in six axes for
+long, nor in three for longer; a simulated IMU without noise is, but at rest its rates are exactly zero, and it is believed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+from graphloc.measurements import ImuSample
+from graphloc.time import NS_PER_S, utc_text
+
+LEAST_S, FEWEST = 0.2, 10
+"""So long, and so many times in a row, is a sample repeated until it is no sample. Drivers that publish faster than they
+measure, and quantised readings at rest, repeat for less."""
+RATES_LEAST_S, RATES_FEWEST = 1.0, 50
+"""The same of the three rates alone: fewer axes are the same more easily."""
+WHY = "it repeats one sample, or its rates, to the last bit, under stamps that move on: the sensor or its driver hangs"
+
+
+def hanging(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
+    """Return (N,) which samples (N, 6: specific force, rate) at increasing stamps only repeat one that hangs.
+
+    The first of each stretch is a sample as any other.
+    """
+    rates = samples[:, 3:]
+    return _repeats(stamps_ns, samples, ~_at_rest(samples), LEAST_S, FEWEST) | _repeats(
+        stamps_ns, rates, (rates != 0.0).any(axis=1), RATES_LEAST_S, RATES_FEWEST
+    )
+
+
+def _repeats(
+    stamps_ns: NDArray[np.int64], rows: Array, judged: NDArray[np.bool_], least_s: float, fewest: int
+) -> NDArray[np.bool_]:
+    """Return (N,) which rows (N, k) that are `judged` repeat the first of a stretch that is long enough."""
+    if len(stamps_ns) == 0:
+        return np.zeros(0, dtype=bool)
+    first = np.concatenate([[0], np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1])
+    count = np.diff(first, append=len(stamps_ns))
+    lasts_s = (stamps_ns[first + count - 1] - stamps_ns[first]) / NS_PER_S
+    bad = np.repeat((lasts_s >= least_s) & (count > fewest) & judged[first], count)
+    bad[first] = False
+    return bad
+
+
+def hanging_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> list[str]:
+    """Return a line on what `hanging` found."""
+    if not bad.any():
+        return []
+    first = np.flatnonzero(np.diff(bad.astype(int), prepend=0) == 1)
+    last = np.flatnonzero(np.diff(bad.astype(int), append=0) == -1)
+    lasts_s = (stamps_ns[last] - stamps_ns[first - 1]) / NS_PER_S
+    longest = int(np.argmax(lasts_s))
+    where = f"for {lasts_s[longest]:.1f} s from {utc_text(int(stamps_ns[first[longest] - 1]))}"
+    if len(first) > 1:
+        where = f"in {len(first)} stretches, {lasts_s.sum():.1f} s in all, the longest {where}"
+    return [
+        f"{sensor}: {where} {WHY}; {int(bad.sum())} samples are not believed, and nothing is known of the motion there"
+    ]
+
+
+def _at_rest(samples: Array) -> NDArray[np.bool_]:
+    """Return (...) whether samples (..., 6) are what an IMU without noise says at rest: a force, and no rate at all."""
+    return np.asarray((samples[..., 3:] == 0.0).all(axis=-1) & (samples[..., :3] != 0.0).any(axis=-1))
+
+
+class HangWatch:
+    """The same of samples as they come: what came before a stretch is long enough has been believed by then."""
+
+    def __init__(self) -> None:
+        self._all, self._rates = _Stretch(LEAST_S, FEWEST), _Stretch(RATES_LEAST_S, RATES_FEWEST)
+        self.hung = False
+        """The newest sample only repeats one that hangs."""
+
+    def hangs(self, m: ImuSample) -> bool:
+        """Return whether a sample only repeats one that hangs."""
+        row = np.concatenate([m.accel_mps2, m.gyro_radps])
+        by_all = self._all.goes_on(m.stamp_ns, row) and not bool(_at_rest(row))
+        by_rates = self._rates.goes_on(m.stamp_ns, m.gyro_radps) and bool(m.gyro_radps.any())
+        self.hung = by_all or by_rates
+        return self.hung
+
+
+class _Stretch:
+    """Rows that are the same."""
+
+    def __init__(self, least_s: float, fewest: int) -> None:
+        self._least_ns, self._fewest = least_s * NS_PER_S, fewest
+        self._first_ns, self._repeats = 0, 0
+        self._row = np.zeros(0)
+
+    def goes_on(self, stamp_ns: int, row: Array) -> bool:
+        """Return whether a row repeats the first of its stretch, long enough after it."""
+        if stamp_ns < self._first_ns or not np.array_equal(row, self._row):
+            self._first_ns, self._row, self._repeats = stamp_ns, row, 0
+            return False
+        self._repeats += 1
+        return self._repeats >= self._fewest and stamp_ns - self._first_ns >= self._least_ns

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""GNSS that stands apart from poses all the while is said; a slow error that comes and goes is not."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.eval.apart import _mean_variance, apart_warnings
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.frames import Array, Datum, Geodetic
+from graphloc.measurements import GnssPosition, Measurement, PoseFix
+from graphloc.trajectory import Trajectory
+from tests.bagfactory import S
+
+SIGMA_M, LASTING_S = 2.0, 200.0
+DATUM = Datum(Geodetic(57.7, 11.7, 36.0))
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    return simulate(Scenario(path="loops", duration_s=60.0, noise="clean", false_fraction=0.0), 21)
+
+
+def said(run: SimulatedRun, east_north_m: Array) -> list[str]:
+    """What is said of a GNSS error (N, 2) at 1 Hz beside a craft that lies still, with 0.3 m of white noise on it."""
+    off = east_north_m + 0.3 * np.random.default_rng(1).normal(size=east_north_m.shape)
+    n = len(off)
+    stamps = int(run.truth.stamps_ns[0]) + np.arange(n) * S
+    track = Trajectory(stamps_ns=stamps, p_world_m=np.zeros((n, 3)), R_world_body=np.tile(np.eye(3), (n, 1, 1)))
+    lever = run.config.sensors["gnss"].mount.t_body_sensor_m
+    lla = DATUM.geodetic_from_enu(lever + np.column_stack([off, np.zeros(n)]))
+    fixes = tuple(
+        GnssPosition(
+            stamp_ns=int(t), sensor="gnss", seq=k, position=Geodetic(*map(float, lla[k])), cov_enu_m2=np.eye(3)
+        )
+        for k, t in enumerate(stamps)
+    )
+    pose = next(m for m in run.recording.measurements if isinstance(m, PoseFix))
+    return apart_warnings(track, DATUM, replace(run.recording, measurements=(pose, *fixes)), run.config)
+
+
+def process(rng: np.random.Generator, lasts_s: int) -> Array:
+    """(N, 2) m: the slow error that the configuration allows for."""
+    keep = np.exp(-1.0 / LASTING_S)
+    d = [rng.normal(0.0, SIGMA_M, 2)]
+    for _ in range(lasts_s - 1):
+        d.append(keep * d[-1] + rng.normal(0.0, SIGMA_M * np.sqrt(1.0 - keep**2), 2))
+    return np.array(d)
+
+
+@pytest.mark.parametrize("lasts_s", [60, 300, 1200])
+def test_the_process_itself_is_seldom_blamed(lasts_s: int, run: SimulatedRun) -> None:
+    """One run in twenty at most, but for what 200 draws scatter by; and the mean scatters as is said."""
+    rng = np.random.default_rng(lasts_s)
+    drawn = [process(rng, lasts_s) for _ in range(200)]
+    means = np.array([d.mean(axis=0) for d in drawn])
+    assert float((means**2).mean()) == pytest.approx(_mean_variance(SIGMA_M, LASTING_S, lasts_s), rel=0.2)
+    assert np.mean([bool(said(run, d)) for d in drawn]) < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / len(drawn))
+
+
+def test_what_comes_or_jumps_is_an_error_of_the_receiver(run: SimulatedRun) -> None:
+    jumped = np.zeros((300, 2))
+    jumped[100:] = [9.0, 0.0]
+    assert said(run, jumped) == []
+    assert said(run, np.linspace([0.0, 0.0], [14.0, 0.0], 300)) == []
+
+
+def test_poses_all_off_by_five_metres_are_said(run: SimulatedRun) -> None:
+    """3 m east and 4 m north: the receiver is said to stand 5 m off the other way, west and south."""
+    moved: list[Measurement] = []
+    for m in run.recording.measurements:
+        if isinstance(m, PoseFix):
+            modes = tuple(
+                replace(mode, value=np.asarray(mode.value) + np.array([3.0, 4.0, *[0.0] * (len(mode.value) - 2)]))
+                for mode in m.modes
+            )
+            moved.append(replace(m, modes=modes))
+        else:
+            moved.append(m)
+    recording = replace(run.recording, measurements=tuple(moved))
+    for solved in (app.smooth_recording(recording, run.config), app.replay_recording(recording, run.config)):
+        lines = [w for w in solved.recording.warnings if "stands" in w]
+        found = re.search(r"gnss stands (\d\.\d) m \(towards (\d+) deg\) off what aerial says", lines[0])
+        assert found
+        assert float(found[1]) == pytest.approx(5.0, abs=0.3)
+        assert float(found[2]) == pytest.approx(180.0 + np.degrees(np.arctan2(3.0, 4.0)), abs=4.0)
+    assert not [w for w in app.simulated(run).recording.warnings if "stands" in w]

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An IMU that says one sample again and again is named and not believed, from a bag and as it comes; what only looks so is."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.config import DatumConfig
+from graphloc.errors import SolveError
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors import INERTIAL, SENSORS
+from graphloc.frames import Array
+from graphloc.frontends.bag import read_recording
+from graphloc.frontends.inspect import inspect_bag, render
+from graphloc.hangs import HangWatch, hanging
+from graphloc.ledger import Outcome
+from graphloc.measurements import ImuSample
+from graphloc.online import OnlineSmoother
+from graphloc.replay import replay
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.faults import Arrival, Arrivals, arrivals_of, complaints, feed, finish
+from tests.test_bag_bad_input import accounted, rows_of, vessel
+
+MAKE = Messages(2)
+HZ = 100
+STAMPS = START_NS + np.arange(10 * HZ) * (S // HZ)
+
+
+def readings(seed: int = 3) -> Array:
+    """(N, 6) of a craft that turns, with noise."""
+    return np.array([0.1, -0.2, 9.8, 0.01, -0.02, 0.3]) + 0.01 * np.random.default_rng(seed).normal(
+        size=(len(STAMPS), 6)
+    )
+
+
+def hung(samples: Array, first: int, last: int) -> Array:
+    samples = samples.copy()
+    samples[first + 1 : last + 1] = samples[first]
+    return samples
+
+
+def as_it_comes(samples: Array) -> list[bool]:
+    watch = HangWatch()
+    return [
+        watch.hangs(ImuSample(stamp_ns=int(s), sensor="imu", seq=k, accel_mps2=row[:3], gyro_radps=row[3:]))
+        for k, (s, row) in enumerate(zip(STAMPS, samples, strict=True))
+    ]
+
+
+def test_all_but_the_first_of_a_stretch_are_none_and_as_they_come_all_from_a_fifth_of_a_second_on() -> None:
+    samples = hung(hung(readings(), 200, 300), 700, len(STAMPS) - 1)
+    assert np.flatnonzero(hanging(STAMPS, samples)).tolist() == [*range(201, 301), *range(701, len(STAMPS))]
+    assert np.flatnonzero(as_it_comes(samples)).tolist() == [*range(220, 301), *range(720, len(STAMPS))]
+
+
+def test_rates_that_hang_alone_are_told_after_a_second() -> None:
+    samples = readings()
+    samples[200:500, 3:] = samples[200, 3:]
+    assert np.flatnonzero(hanging(STAMPS, samples)).tolist() == [*range(201, 500)]
+    assert np.flatnonzero(as_it_comes(samples)).tolist() == [*range(300, 500)]
+    samples[280:500, 3:] = 0.0  # a deadband at rest
+    assert not hanging(STAMPS, samples).any()
+    assert not any(as_it_comes(samples))
+
+
+@pytest.mark.parametrize(
+    "case", ["noise", "held by a driver", "one axis moves", "no noise, at rest", "coarse, at rest"]
+)
+def test_what_only_looks_so_is_believed(case: str) -> None:
+    samples = readings()
+    if case == "held by a driver":  # that publishes at 100 Hz what is measured at 10 Hz
+        samples = np.repeat(samples[::10], 10, axis=0)
+    elif case == "one axis moves":
+        samples[:, :5] = samples[0, :5]
+    elif case == "no noise, at rest":
+        samples = np.tile([0.0, 0.0, 9.81, 0.0, 0.0, 0.0], (len(samples), 1))
+    elif case == "coarse, at rest":  # steps of three times the noise
+        samples = np.round(samples / 0.03) * 0.03
+        assert (samples[1:] == samples[:-1]).all(axis=1).any()
+    assert not hanging(STAMPS, samples).any()
+    assert not any(as_it_comes(samples))
+
+
+def test_a_sensor_that_is_dead_hangs() -> None:
+    samples = np.zeros((len(STAMPS), 6))
+    assert hanging(STAMPS, samples).sum() == len(samples) - 1
+    assert sum(as_it_comes(samples)) == len(samples) - 20
+
+
+def bag(path: Path, samples: Array) -> Path:
+    items: list[Item] = [
+        ("/imu", int(s), MAKE.imu(int(s), row[:3], row[3:])) for s, row in zip(STAMPS, samples, strict=True)
+    ]
+    return write_bag(path, MAKE, items, "mcap")
+
+
+def test_a_bag_says_where_it_hung(tmp_path: Path) -> None:
+    path = bag(tmp_path / "run", hung(readings(), 200, 500))
+    recording = read_recording(path, vessel(gnss=None))
+    assert recording.message_count == accounted(recording)
+    rows = rows_of(recording, "imu")
+    assert len(rows) == 300
+    assert all(r.outcome is Outcome.REJECTED and "hangs" in r.reason for r in rows)
+    (line,) = (w for w in recording.warnings if "hangs" in w)
+    assert "for 3.0 s from 2023-11-14T22:13:22" in line
+    assert "for 3.0 s from 2023-11-14T22:13:22" in render(inspect_bag(path))
+
+
+def test_a_bag_in_which_it_hangs_throughout_is_refused_with_the_cause(tmp_path: Path) -> None:
+    path = bag(tmp_path / "run", hung(readings(), 0, len(STAMPS) - 1))
+    datum = DatumConfig(latitude_deg=57.7, longitude_deg=11.9, height_m=40.0)
+    config = vessel(gnss=None).model_copy(update={"datum": datum})
+    recording = read_recording(path, config)
+    for solve in (app.smooth_recording, replay):
+        with pytest.raises(SolveError, match=r"999 of its messages gave nothing.*hangs"):
+            solve(recording, config)
+    assert any("hangs" in w for w in inspect_bag(path).warnings)
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    return simulate(Scenario(path="loops", duration_s=40.0, noise="clean", false_fraction=0.0), 12)
+
+
+def struck(run: SimulatedRun, begin_s: float, end_s: float) -> Arrivals:
+    """Its IMU hangs between two times."""
+    arrivals: Arrivals = []
+    held: ImuSample | None = None
+    for a in arrivals_of(run):
+        m, at_s = a.m, (a.true_ns - int(run.truth.stamps_ns[0])) * 1e-9
+        if isinstance(m, ImuSample) and begin_s <= at_s < end_s:
+            held = held or m
+            m = replace(m, accel_mps2=held.accel_mps2, gyro_radps=held.gyro_radps)
+        arrivals.append(Arrival(a.true_ns, m))
+    return arrivals
+
+
+def test_online_it_counts_as_silent(run: SimulatedRun) -> None:
+    """Believed, it would carry the craft along a circle for 4 s, metres off, and call that good."""
+    arrivals = struck(run, 20.0, 24.0)
+    online = OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL)
+    fed = finish(online, feed(online, run, arrivals))
+    assert complaints(arrivals, fed) == []
+    (event,) = (e for e in fed.events if "hangs" in e)
+    assert "imu" in event
+    lost = [row for row in fed.rows if "hangs" in row.reason]
+    assert 370 < len(lost) < 400
+    assert fed.worst_m(arrivals[0].true_ns + 10 * S) < 1.0

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A computer's clock that is set back within a bag: two parts bear the same times, and one is kept."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphloc.frontends._clock import set_backs
+from graphloc.frontends.bag import read_recording
+from graphloc.ledger import Outcome
+from graphloc.recording import Recording
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.test_bag_bad_input import accounted, rows_of, vessel
+
+MAKE = Messages(2)
+LATE_NS = 10_000_000
+
+
+def run(tmp_path: Path, at_s: float, back_s: float, seconds: float = 20.0) -> Recording:
+    """A craft that goes north at 1 m/s by /truth; all clocks are set back at a time."""
+    items: list[Item] = []
+    for k in range(round(seconds * 50)):
+        true = START_NS + k * S // 50
+        stamp = true - (round(back_s * S) if k >= at_s * 50 else 0)
+        items.append(("/imu", true + LATE_NS, MAKE.imu(stamp, gyro=(1e-6 * (k % 2), 0.0, 0.0))))
+        if k % 10 == 0:
+            items.append(("/fix", true + LATE_NS, MAKE.fix(stamp, lat=57.7 + k * 1.8e-7)))
+            items.append(("/truth", true + LATE_NS, MAKE.odometry(stamp, xyz=(0.0, k / 50, 0.0))))
+    path = write_bag(tmp_path / "run", MAKE, items, "mcap")
+    recording = read_recording(path, vessel().model_copy(update={"truth_topic": "/truth"}))
+    assert recording.message_count == accounted(recording)
+    return recording
+
+
+@pytest.mark.parametrize(("at_s", "first_s", "last_s"), [(14.0, 0.0, 14.0), (5.0, 5.0, 20.0)])
+def test_the_longer_part_is_kept_of_all(tmp_path: Path, at_s: float, first_s: float, last_s: float) -> None:
+    recording = run(tmp_path, at_s, 3.0)
+    shift_s = 3.0 if first_s else 0.0
+    assert recording.imu is not None
+    assert recording.imu.stamps_ns[0] == START_NS + round((first_s - shift_s) * S)
+    assert len(recording.imu) == (last_s - first_s) * 50
+    assert np.all(np.diff(recording.imu.stamps_ns) == S // 50)
+    assert len(recording.measurements) == (last_s - first_s) * 5
+    lost = rows_of(recording, "imu")
+    assert len(lost) == 1000 - len(recording.imu)
+    assert all(r.outcome is Outcome.REJECTED and "set back by 3.0 s" in r.reason for r in lost)
+    assert any(w.startswith("gnss: ") and "set back by 3.0 s" in w for w in recording.warnings)
+    truth = recording.truth
+    assert truth is not None
+    north = truth.p_world_m[:, 1] - (truth.stamps_ns - START_NS) / S - shift_s
+    assert np.abs(north).max() < 1e-6
+
+
+def test_steady_clocks_late_samples_and_lone_stamps_are_left_alone() -> None:
+    steady = np.arange(1000, dtype=np.int64) * (S // 100)
+    assert set_backs(steady) == []
+    held_up = np.concatenate([steady[:300], steady[500:900], steady[300:500], steady[900:]])
+    assert set_backs(held_up) == []
+    lone = steady.copy()
+    lone[::70] -= 5 * S
+    assert set_backs(lone) == []
+    assert set_backs(np.concatenate([steady[:600], steady[300:]])) == [600]
+    assert set_backs(np.concatenate([steady[:600], steady[300:500], steady[400:]])) == [600, 800]
