@@ -240,14 +240,15 @@ class Lag:
         self._keep_constants(now_s)
         before = window.values.atPose3(pose).translation()
         window.commit()
+        self._let_go()
         for _ in range(_STEPS - 1):
             here = window.values.atPose3(pose).translation()
             if not float(np.linalg.norm(here - before)) >= _STEP_M:
                 break
             before = here
+            self._write_where_it_moved()
             window.settle()
         self._committed = timeline.last
-        self._let_go()
         self._newest = self._read_newest()
 
     def _write_anew(self, leaving_s: float) -> None:
@@ -261,6 +262,15 @@ class Lag:
             if np.abs(entry.written.rotation().localCoordinates(now.rotation())).max() > stale:
                 at = attach(self.problem, entry.stream, entry.index, window.values)
                 self._change(entry, replace(entry.verdict, at=at))
+
+    def _write_where_it_moved(self) -> None:
+        """Stage the factors anew that are linear about a place the estimate has left: judged there, the right ones look false."""
+        first = self.problem.timeline.first
+        for entry in self._entries.values():
+            if entry.stream.row.false is not None and entry.held is not None and entry.reaches(first):
+                at = attach(self.problem, entry.stream, entry.index, self._window.values)
+                if _moved(entry.verdict.at, at):
+                    self._change(entry, replace(entry.verdict, at=at))
 
     def _read_newest(self) -> Newest:
         timeline, values = self.problem.timeline, self._window.values
@@ -542,12 +552,10 @@ class Lag:
             return True
         if verdict.decision is None or old.decision is None:
             return False
-        step = old.at.T_world_body.localCoordinates(verdict.at.T_world_body)
         return (
             verdict.mode != old.mode
             or abs(verdict.decision.weight - old.decision.weight) > _CHANGED
-            or float(np.linalg.norm(step[3:])) > _MOVED_M
-            or float(np.linalg.norm(step[:3])) > _TURNED_RAD
+            or _moved(old.at, verdict.at)
         )
 
     def _change(self, entry: _Entry, verdict: Verdict) -> None:
@@ -679,6 +687,12 @@ class Lag:
     @property
     def factor_slots(self) -> int:
         return self._window.factor_slots
+
+
+def _moved(a: Attachment, b: Attachment) -> bool:
+    """Whether a factor that is linear about the one is another about the other."""
+    step = a.T_world_body.localCoordinates(b.T_world_body)
+    return float(np.linalg.norm(step[3:])) > _MOVED_M or float(np.linalg.norm(step[:3])) > _TURNED_RAD
 
 
 def _credible(stream: LiveStream, at: Attachment) -> bool:
