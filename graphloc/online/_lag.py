@@ -46,10 +46,7 @@ from graphloc.solve._solution import AGREES, row_of
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
 _CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
-_STALE_RAD, _LEFT_STALE_RAD = (
-    3e-3,
-    1e-3,
-)  # between a factor's tangent and the solver's; of one that leaves, and stays so
+_SAME = 1e-9  # m, rad: the solver has linearised a pose anew, or not
 _PAGE_S = 1.0  # states leave together by so much
 _LEAF_S, _SURE = 1.0, 0.9  # how often an older chapter is judged again; a weight that needs no second look
 _STEP_COST = (
@@ -61,7 +58,12 @@ _CHAIN = 2  # measurements that agree with each other, and not with the estimate
 _FAR_M = 20e3  # from the estimate: no place of this run; beyond, the linear algebra fails before a kernel helps
 _CREDIBLE = 6.0  # sigmas of a slow error: beyond, a sensor that agrees does so by an error that it does not have
 _FEW = 8  # measurements of absolute sensors in a row that disagree: not yet a sign
-_STEPS, _STEP_M = 3, 0.3  # of the solver in one commit, while the newest state moves
+_STEPS = 3  # of the solver, where other choices are tried
+_STEP_M, _MOST_STEPS, _STANDS = (
+    0.3,
+    10,
+    0.1,
+)  # a commit that moves the newest state by so much is solved on, to so much of its cost
 
 
 @dataclass(slots=True, eq=False)
@@ -236,32 +238,36 @@ class Lag:
         if now_s > self._page_s:  # just before a page leaves, which re-eliminates everything as well
             self._page_s = now_s
             if window.relinearise():
-                self._write_anew(leaving_s=now_s - self._lag_s + _PAGE_S)
+                self._write_anew()
         self._keep_constants(now_s)
         before = window.values.atPose3(pose).translation()
         window.commit()
         self._let_go()
-        for _ in range(_STEPS - 1):
-            here = window.values.atPose3(pose).translation()
-            if not float(np.linalg.norm(here - before)) >= _STEP_M:
-                break
-            before = here
-            self._write_where_it_moved()
-            window.settle()
+        if not float(np.linalg.norm(window.values.atPose3(pose).translation() - before)) < _STEP_M:
+            self._settle_down()
         self._committed = timeline.last
         self._newest = self._read_newest()
 
-    def _write_anew(self, leaving_s: float) -> None:
+    def _write_anew(self) -> None:
         """Stage the factors anew that are written in tangents which the solver has left (see `graphloc.linear.pose_term`)."""
         window, first = self._window, self.problem.timeline.first
         for entry in self._entries.values():
             if entry.stream.row.false is None or entry.held is None or not entry.reaches(first):
                 continue  # only sensors with hypotheses see to centimetres
             now = window.linearised_at(entry.verdict.at.pose_key)
-            stale = _LEFT_STALE_RAD if self._seconds(entry.measurement.stamp_ns) <= leaving_s else _STALE_RAD
-            if np.abs(entry.written.rotation().localCoordinates(now.rotation())).max() > stale:
+            if not now.equals(entry.written, _SAME):
                 at = attach(self.problem, entry.stream, entry.index, window.values)
                 self._change(entry, replace(entry.verdict, at=at))
+
+    def _settle_down(self) -> None:
+        """Solve again and again, until the cost stands: one step from metres off leaves older states further off than the newest."""
+        cost = self._window.error()
+        for _ in range(_MOST_STEPS):
+            self._write_where_it_moved()
+            self._window.settle()
+            before, cost = cost, self._window.error()
+            if abs(before - cost) <= _STANDS * cost:
+                break
 
     def _write_where_it_moved(self) -> None:
         """Stage the factors anew that are linear about a place the estimate has left: judged there, the right ones look false."""

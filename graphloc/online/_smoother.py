@@ -228,7 +228,6 @@ class OnlineSmoother:
         """Start anew by a clock that was set back."""
         self._restart(f"the IMU's clock was set back by {back_s:.1f} s")
         self._agreed_ns = {}
-        self._fit_ns = self._misfits = 0
         if self._odometry is not None:
             self._odometry.stamp_ns = stamp_ns
 
@@ -524,6 +523,7 @@ class OnlineSmoother:
         self._recent = [*samples, *self._pending]
         self._step(self._lag)
         self._keep_anchor(self._lag)
+        self._fit_ns, self._misfits = self._lag.newest.stamp_ns, 0  # what has just begun has not settled
         self._events.append(f"started at {utc_text(self._lag.newest.stamp_ns)}: {'; '.join(started.notes)}")
         if started.doubt:
             self._events.append(started.doubt)
