@@ -213,9 +213,11 @@ def _tie(seen: _Seen, dock: DockConfig, config: AprilTagConfig, at: Attachment) 
     assert at.slow_key is not None
     n = len(seen.own)
     picked = seen.placed(np.eye(n))
-    share, dt_s = (0.0, 1.0) if at.slow_next is None else at.slow_next[2:]
+    share, dt_s = (0.0, 0.0) if at.slow_next is None else at.slow_next[2:]
     sigma, time_s = (np.append(a, b)[:n] for a, b in zip(_swing(dock), (config.edge_sigma_px, _EDGE_S), strict=True))
-    bridge = sigma * np.sqrt(2.0 * dt_s / time_s * share * (1.0 - share))
+    # Where there is no next node yet, it has gone on by itself.
+    steps_s = at.slow_age_s if at.slow_next is None else dt_s * share * (1.0 - share)
+    bridge = sigma * np.sqrt(2.0 * steps_s / time_s)
     residual = Residual(
         raw=np.zeros(n), cov=np.diag(np.maximum(bridge, _TIE[:n]) ** 2), jacobian=lambda: np.zeros((n, 6)), prior=1.0,
         size_m=None, size_deg=None,

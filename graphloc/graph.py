@@ -50,7 +50,8 @@ class Attachment:
         lever_m: (3,) sensor origin from the IMU, body axes.
         slow_value: estimate of the slow state, or None.
         slow_next: key and estimate of the next node of the slow state, how far from the one to the other the measurement
-            is (share), and how far apart they are in s; None where there is no next.
+            is (share), and how far apart they are in s; None where there is no next (yet).
+        slow_age_s: how long after its node the measurement is, at least 0.
         constants: key and estimate of each of the sensor's constants.
         datum: origin of world.
     """
@@ -68,6 +69,7 @@ class Attachment:
     slow_value: Array | None
     datum: Datum
     slow_next: tuple[int, Array, float, float] | None = None
+    slow_age_s: float = 0.0
     constants: tuple[tuple[int, Array], ...] = ()
     T_solver: Any | None = None
 

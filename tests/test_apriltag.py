@@ -266,6 +266,24 @@ def test_how_far_a_dock_may_be_from_the_line_between_two_nodes() -> None:
     assert tie.error(values) == pytest.approx(0.5 * (0.02 / (0.5 * step_m)) ** 2, rel=1e-6)
 
 
+def test_a_dock_goes_on_while_its_next_node_is_not_there_yet() -> None:
+    """Online a sighting comes before the node after it: the dock may have stepped as far as the process does by then."""
+    near = vessel(6.0, 30.0)
+    true = gtsam.Pose3(near.rotation(), near.translation() + PIER_M)
+    m = moved_sighting(np.zeros(6), true)
+    process = ROW.slow(DOCKED)
+    assert process is not None
+    at = replace(attached(true, np.zeros(6)), slow_age_s=0.8)
+    tie = ROW.factors(m, DOCKED, at, Decision()).factors[0]
+    values = gtsam.Values()
+    values.insert(3, np.zeros(6))
+    values.insert(4, np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    keep = np.exp(-0.8 / process.time_constant_s[0])
+    step_m = float(process.sigma[0] * np.sqrt(1.0 - keep**2))
+    assert set(tie.keys()) == {3, 4}
+    assert tie.error(values) == pytest.approx(0.5 * (0.02 / step_m) ** 2, rel=0.05)
+
+
 def test_what_the_survey_errs_about_a_tag_is_a_constant() -> None:
     """A tag that hangs elsewhere and askew, by its constant: explained, and found where the vessel is known."""
     true = vessel(6.0, 30.0)

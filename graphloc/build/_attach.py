@@ -146,6 +146,7 @@ def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> A
         slow_value=None if slow_key is None else np.atleast_1d(values.atVector(slow_key)),
         datum=problem.datum,
         slow_next=None if slow_key is None else _next_slow(problem, stream, j, stream.measurements[i].stamp_ns, values),
+        slow_age_s=max(int(stream.measurements[i].stamp_ns) - int(problem.timeline.slow_stamps_ns[j]), 0) * 1e-9,
         constants=constants_of(stream, values),
     )
 

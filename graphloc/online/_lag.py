@@ -153,7 +153,7 @@ class Lag:
                     self._known[key] = anchor.constants[(stream.name, k)]
         window.commit()
         self._committed = 0  # the last state that the solver has
-        self._page_s = 0.0
+        self._page_s, self.fresh = 0.0, False  # fresh: linearised anew at the last commit
         self._newest = self._read_newest()
 
     @property
@@ -235,10 +235,11 @@ class Lag:
         """Estimate anew, and let go what has left."""
         timeline, window = self.problem.timeline, self._window
         pose, now_s = keys.pose(timeline.last), self._page(timeline.stamps_ns[timeline.last])
-        if now_s > self._page_s:  # just before a page leaves, which re-eliminates everything as well
+        self.fresh = now_s > self._page_s
+        if self.fresh:  # just before a page leaves, which re-eliminates everything as well
             self._page_s = now_s
-            if window.relinearise():
-                self._write_anew()
+            window.relinearise()
+            self._write_anew()
         self._keep_constants(now_s)
         before = window.values.atPose3(pose).translation()
         window.commit()
@@ -249,13 +250,17 @@ class Lag:
         self._newest = self._read_newest()
 
     def _write_anew(self) -> None:
-        """Stage the factors anew that are written in tangents which the solver has left (see `graphloc.linear.pose_term`)."""
+        """Stage the factors anew that are written in tangents which the solver has left (see `graphloc.linear.pose_term`).
+
+        And those between a slow node and one that has come since.
+        """
         window, first = self._window, self.problem.timeline.first
         for entry in self._entries.values():
             if entry.stream.row.false is None or entry.held is None or not entry.reaches(first):
                 continue  # only sensors with hypotheses see to centimetres
-            now = window.linearised_at(entry.verdict.at.pose_key)
-            if not now.equals(entry.written, _SAME):
+            was = entry.verdict.at
+            loose = was.slow_key is not None and was.slow_next is None
+            if loose or not window.linearised_at(was.pose_key).equals(entry.written, _SAME):
                 at = attach(self.problem, entry.stream, entry.index, window.values)
                 self._change(entry, replace(entry.verdict, at=at))
 
@@ -275,7 +280,7 @@ class Lag:
         for entry in self._entries.values():
             if entry.stream.row.false is not None and entry.held is not None and entry.reaches(first):
                 at = attach(self.problem, entry.stream, entry.index, self._window.values)
-                if _moved(entry.verdict.at, at):
+                if _moved(entry.verdict.at.T_world_body, at.T_world_body):
                     self._change(entry, replace(entry.verdict, at=at))
 
     def _read_newest(self) -> Newest:
@@ -561,7 +566,7 @@ class Lag:
         return (
             verdict.mode != old.mode
             or abs(verdict.decision.weight - old.decision.weight) > _CHANGED
-            or _moved(old.at, verdict.at)
+            or _moved(old.at.T_world_body, verdict.at.T_world_body)
         )
 
     def _change(self, entry: _Entry, verdict: Verdict) -> None:
@@ -695,9 +700,9 @@ class Lag:
         return self._window.factor_slots
 
 
-def _moved(a: Attachment, b: Attachment) -> bool:
-    """Whether a factor that is linear about the one is another about the other."""
-    step = a.T_world_body.localCoordinates(b.T_world_body)
+def _moved(a: Any, b: Any) -> bool:
+    """Whether a factor that is linear about the one pose is another about the other."""
+    step = a.localCoordinates(b)
     return float(np.linalg.norm(step[3:])) > _MOVED_M or float(np.linalg.norm(step[:3])) > _TURNED_RAD
 
 

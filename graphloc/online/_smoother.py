@@ -268,6 +268,8 @@ class OnlineSmoother:
         at_ns = lag.newest.stamp_ns
         if at_ns - self._fit_ns < _FIT_S * 1e9 or not self._config.sensors[self._imu_name].adapt_noise:
             return ""
+        if not lag.fresh:  # steps cost what estimates have moved since they were linearised, up to a second ago
+            return ""
         self._fit_ns = at_ns
         misfit = lag.misfit()
         self._misfits = self._misfits + 1 if misfit > CONTRADICTION else 0

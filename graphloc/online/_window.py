@@ -122,17 +122,16 @@ class Window:
             self._alive = self._smoother.timestamps()  # some have left; asked for each time it is a tenth of an update
             self._linearised = gtsam.Values(self._smoother.getLinearizationPoint())
 
-    def relinearise(self) -> bool:
-        """Linearise anew where the estimate has moved away; tell whether anything was."""
+    def relinearise(self) -> None:
+        """Linearise anew where the estimate has moved away."""
         with self._solving():
             solver = self._smoother.getISAM2()  # the smoother's own, not a copy
             if not solver.update(force_relinearize=True).getVariablesRelinearized():
-                return False
+                return
             self.values = self._smoother.calculateEstimate()
             self._linearised = gtsam.Values(self._smoother.getLinearizationPoint())
         for values in (self.values, self._linearised):
             values.insert(self._guess)
-        return True
 
     def settle(self, steps: int = 1) -> None:
         """Take in what is staged, if anything is, and relinearise `steps` times."""
