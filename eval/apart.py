@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from graphloc.build import mount_of
+from graphloc.chi2 import chi2_95
 from graphloc.config import VesselConfig
 from graphloc.eval.metrics import held_out_errors
 from graphloc.frames import Array, Datum, heading_deg_from_yaw
@@ -24,9 +24,8 @@ from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 
-_BEYOND = float(chi2.ppf(0.95, 2))
 _STEADY = 0.5  # RMS about the mean, as a share of it
-_BLOCK_S = 10.0
+_BLOCK_S, _FEWEST = 10.0, 3  # fewer blocks do not tell what hardly moves
 _PLACES = ("pose", "aerial", "apriltag", "gnss")
 
 
@@ -43,11 +42,13 @@ def apart_warnings(track: Trajectory, datum: Datum, recording: Recording, config
         lever = {name: mount_of(name, sensor, recording.mounts)[0]}
         stamps, error, _ = held_out_errors(track, fixes, datum, lever)
         off = _means(stamps, -error[:, :2])
+        if len(off) < _FEWEST:
+            continue
         mean, lasts_s = off.mean(axis=0), float(stamps[-1] - stamps[0]) / NS_PER_S
         size, process = float(np.hypot(*mean)), sensor.slow_error
-        allowed = _mean_variance(process.horizontal_sigma_m, process.time_constant_s, max(lasts_s, _BLOCK_S))
+        allowed = _mean_variance(process.horizontal_sigma_m, process.time_constant_s, lasts_s)
         moves = float(np.sqrt(((off - mean) ** 2).sum(axis=1).mean()))
-        if size**2 < _BEYOND * allowed or moves > _STEADY * size:
+        if size**2 < chi2_95(2) * allowed or moves > _STEADY * size:
             continue
         towards = float(heading_deg_from_yaw(np.arctan2(mean[1], mean[0])))
         lines.append(

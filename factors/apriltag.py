@@ -74,9 +74,7 @@ class _Seen:
         self.own = list(range(self.first, self.first + 6)) if self.first is not None else []
         self.own += range(6 * len(docks), self.slow_size)
         self.slow = np.zeros(0)
-        if (
-            at.slow_value is not None
-        ):  # the edges of tags that stand still: those of the node before, no leaf in between
+        if at.slow_value is not None:  # of tags that stand still: the edges of the node before, no leaf in between
             self.slow = (_between(at) if self.first is not None else np.asarray(at.slow_value))[self.own]
         self.moved = moved = self.slow[:6] if self.first is not None else np.zeros(6)
         self.edge_px = float(self.slow[-1]) if len(self.own) % 6 else 0.0

@@ -121,7 +121,7 @@ def sighted(
             rays = (px + rng.normal(0.0, noise_px, px.shape) - centre) / focal
             seen.append(SeenTag(listed[tag.number], rays, np.eye(8) * (noise_px / focal[0]) ** 2))
         stamp = int(run.truth.stamps_ns[0]) + round(t * 1e9)
-        seeing = Seeing(stamp, "tags", "camera", t_bc, R_bc)
+        seeing = Seeing(stamp, "tags", "camera", t_bc, R_bc, px=1.0 / float(focal[0]))
         for group in [[s] for s in seen] if alone else [seen]:
             found += [(s, nearest_mode(s.modes, R_c)) for s in sightings_of(group, survey, seeing)[0]]
     first = run.recording.message_count

@@ -29,7 +29,9 @@ def said(run: SimulatedRun, east_north_m: Array) -> list[str]:
     off = east_north_m + 0.3 * np.random.default_rng(1).normal(size=east_north_m.shape)
     n = len(off)
     stamps = int(run.truth.stamps_ns[0]) + np.arange(n) * S
-    track = Trajectory(stamps_ns=stamps, p_world_m=np.zeros((n, 3)), R_world_body=np.tile(np.eye(3), (n, 1, 1)))
+    track = Trajectory(
+        stamps_ns=stamps[0] + np.arange(n + 1) * S, p_world_m=np.zeros((n + 1, 3)), R_world_body=np.tile(np.eye(3), (n + 1, 1, 1))
+    )  # fmt: skip
     lever = run.config.sensors["gnss"].mount.t_body_sensor_m
     lla = DATUM.geodetic_from_enu(lever + np.column_stack([off, np.zeros(n)]))
     fixes = tuple(
@@ -66,6 +68,13 @@ def test_what_comes_or_jumps_is_an_error_of_the_receiver(run: SimulatedRun) -> N
     jumped[100:] = [9.0, 0.0]
     assert said(run, jumped) == []
     assert said(run, np.linspace([0.0, 0.0], [14.0, 0.0], 300)) == []
+
+
+def test_a_fix_or_two_are_no_steady_distance(run: SimulatedRun) -> None:
+    """A mean of one hardly moves, and tells nothing."""
+    assert said(run, np.tile([8.0, 0.0], (1, 1))) == []
+    assert said(run, np.tile([8.0, 0.0], (15, 1))) == []
+    assert len(said(run, np.tile([8.0, 0.0], (60, 1)))) == 1
 
 
 def test_poses_all_off_by_five_metres_are_said(run: SimulatedRun) -> None:

@@ -393,7 +393,7 @@ def wider(m: TagSighting, by_px: float) -> TagSighting:
     lines = np.cross(corners, np.roll(corners, -1, axis=0))
     lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
     inside = np.append(m.rays.mean(axis=0), 1.0)
-    lines[:, 2] -= by_px * PX * np.sign(lines @ inside) * -1.0
+    lines[:, 2] += by_px * PX * np.sign(lines @ inside)
     meet = np.cross(np.roll(lines, 1, axis=0), lines)
     return replace(m, rays=meet[:, :2] / meet[:, 2:], px=PX)
 

@@ -33,10 +33,7 @@ def sigmas_m(track: Trajectory, k: int) -> Array:
 
 
 def test_the_last_pose_is_known_as_well_as_to_the_batch_and_no_better() -> None:
-    """At the end both know the same; on the way it is never lost, and the IMU is not blamed.
-
-    Sigmas within a fifth: a start by two sightings, 13 m off, leaves a trace (0.96, 0.97, 0.85 of the batch's).
-    """
+    """At the end both know the same; on the way it is never lost, and the IMU is not blamed."""
     run = docking()
     datum = app.choose_datum(run.recording, run.config)
     recording = app.with_synthetic(run.recording, run.config, datum)

@@ -59,11 +59,8 @@ _FAR_M = 20e3  # from the estimate: no place of this run; beyond, the linear alg
 _CREDIBLE = 6.0  # sigmas of a slow error: beyond, a sensor that agrees does so by an error that it does not have
 _FEW = 8  # measurements of absolute sensors in a row that disagree: not yet a sign
 _STEPS = 3  # of the solver, where other choices are tried
-_STEP_M, _MOST_STEPS, _STANDS = (
-    0.3,
-    10,
-    0.1,
-)  # a commit that moves the newest state by so much is solved on, to so much of its cost
+_STEP_M = 0.3  # a commit that moves the newest state by so much is solved on
+_MOST_STEPS, _STANDS = 10, 0.1  # at most so often, until a step changes its cost by no more than such a share
 
 
 @dataclass(slots=True, eq=False)
@@ -153,7 +150,9 @@ class Lag:
                     self._known[key] = anchor.constants[(stream.name, k)]
         window.commit()
         self._committed = 0  # the last state that the solver has
-        self._page_s, self.fresh = 0.0, False  # fresh: linearised anew at the last commit
+        self._page_s = 0.0
+        self.fresh = False
+        """The last commit linearised anew what had moved."""
         self._newest = self._read_newest()
 
     @property
