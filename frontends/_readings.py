@@ -103,7 +103,7 @@ def reject_set_back(sensors: Sequence[Readings], beside: Sequence[Beside], warni
         where = ", ".join(
             f"by {(stamps[k - 1] - stamps[k]) / NS_PER_S:.1f} s at {utc_text(int(logs[k]))}" for k in cuts
         )
-        why = f"the clock of {imu.sensor} was set back {where}, recording time; only the longest part between is kept: split the bag there to have the others"
+        why = f"the clock of {imu.sensor} was set back {where}, recording time; only the longest part between is kept, but for scans and images, which are not cut: split the bag there"
         rows = []
         for readings in sensors:
             outside = (readings.logs() < first) | (readings.logs() > last)

@@ -45,7 +45,7 @@ def test_the_last_pose_is_known_as_well_as_to_the_batch_and_no_better() -> None:
     assert (np.abs(online.p_world_m[-1] - offline.p_world_m[k]) < 0.5 * sigmas_m(offline, k)).all()
     assert sigmas_m(online, -1)[2] > 0.3  # a tide and a dock of 0.5 m each
     off_m = np.linalg.norm(online.p_world_m - run.truth.at(online.stamps_ns).p_world_m, axis=1)
-    assert off_m.max() < 5.0
+    assert off_m.max() < 1.5
     assert not any("anew" in line or "contradicts" in line for line in replayed.stats.events)
 
 
