@@ -162,7 +162,7 @@ def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     """Drop samples that a driver which hangs only repeats: the solver bridges them as it does a gap."""
     stamps = readings.stamps()
     samples = np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)])
-    bad = hanging(stamps, samples)
+    bad = hanging(stamps, samples.reshape(-1, 6))  # of none: (0,)
     warnings += hanging_warning(readings.sensor, stamps, bad)
     return readings.drop(bad, rejected(WHY))
 
