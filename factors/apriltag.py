@@ -7,7 +7,8 @@
 
 p, R: camera in world; S_i: a corner as surveyed, its frame at rest; e_k, f_k: what the survey errs about tag k, its middle
 m_k, a constant of the run; d, w: motion and small turn about c of the floating dock that the tag rides on, a slow state
-(D has neither); b: what detector, light, print and focal length make tags seem wider than they are, a slow state as well.
+(D has neither); b: what detector, light, print and focal length make tags seem wider than they are, a slow state as well
+where `edge_sigma_px` is set.
 Taken for noise of each sighting instead, such errors average out over hundreds of them, and the bounds are too small:
 three tags that hang 0.2 deg forward lift a vessel 20 m away by 7 cm in every image; tags 12 px wide whose edges are
 off by 0.04 px hold one 35 m away 0.2 m too near.
@@ -59,8 +60,8 @@ class _Seen:
     Attributes:
         R, p: camera in world. points_m: (n, 3) corners where their frame is now. middle_m: of these.
         body: (6, 6) d (place, rotation about the world's axes) of the camera / d tangent of the state.
-        own: rows of the slow state that it knows of: its dock's six, that of the edges. slow: their values; moved: (6,) of
-            the dock; edge_px: b.
+        edges: whether these are modelled. own: rows of the slow state that it knows of: its dock's six, that of the edges.
+            slow: their values; moved: (6,) of the dock; edge_px: b.
     """
 
     def __init__(self, m: TagSighting, config: AprilTagConfig, at: Attachment) -> None:
@@ -71,13 +72,14 @@ class _Seen:
         self.body = np.vstack([self.R @ adjoint[3:], self.R @ adjoint[:3]])
         docks, self.slow_size = _docks(config.surveyed), 0 if at.slow_value is None else len(at.slow_value)
         self.first = 6 * docks.index(m.frame) if self.slow_size and m.frame in docks else None
+        self.edges = self.slow_size > 6 * len(docks)
         self.own = list(range(self.first, self.first + 6)) if self.first is not None else []
-        self.own += range(6 * len(docks), self.slow_size)
+        self.own += [self.slow_size - 1] * self.edges
         self.slow = np.zeros(0)
         if at.slow_value is not None:  # of tags that stand still: the edges of the node before, no leaf in between
             self.slow = (_between(at) if self.first is not None else np.asarray(at.slow_value))[self.own]
         self.moved = moved = self.slow[:6] if self.first is not None else np.zeros(6)
-        self.edge_px = float(self.slow[-1]) if len(self.own) % 6 else 0.0
+        self.edge_px = float(self.slow[-1]) if self.edges else 0.0
         self.turn = gtsam.Rot3.Expmap(moved[3:]).matrix()
         self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-moved[3:]))  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
         self.constants = _constants_of(m, config, at)
@@ -176,10 +178,13 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
     camera = np.concatenate([-by_point, by_point @ rotation], axis=2).reshape(-1, 6)
     swing = np.array([-skew(arm) for arm in seen.arms]) @ seen.by_turn
     by_dock = np.concatenate([by_point, by_point @ swing], axis=2).reshape(-1, 6)
-    by_edge = m.px * _outwards(flat)  # not of the rays: their noise would tell edges from distance
-    raw, by_body = (flat + by_edge * seen.edge_px - m.rays).ravel(), camera @ seen.body
-    by_slow = np.hstack([by_dock if seen.first is not None else np.zeros((len(raw), 0)), by_edge.reshape(-1, 1)])
-    by_slow = by_slow[:, : len(seen.own)]
+    by_own = [] if seen.first is None else [by_dock]
+    if seen.edges:
+        outwards = m.px * _outwards(flat)  # not of the rays: their noise would tell edges from distance
+        flat = flat + seen.edge_px * outwards
+        by_own.append(outwards.reshape(-1, 1))
+    by_slow = np.hstack(by_own) if by_own else np.zeros((m.rays.size, 0))
+    raw, by_body = (flat - m.rays).ravel(), camera @ seen.body
     dock = config.surveyed.dock(m.frame) if seen.first is not None else None
     tie = None if dock is None else _tie(seen, dock, config, at)
     found: list[Any] = [] if tie is None else list(tie.factors)

@@ -9,7 +9,7 @@ hypotheses is judged as the batch does it, as a sequence, against the prediction
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
@@ -238,7 +238,7 @@ class Lag:
         if self.fresh:  # just before a page leaves, which re-eliminates everything as well
             self._page_s = now_s
             window.relinearise()
-            self._write_anew()
+            self._write_anew(self._left_behind)
         self._keep_constants(now_s)
         before = window.values.atPose3(pose).translation()
         window.commit()
@@ -248,39 +248,36 @@ class Lag:
         self._committed = timeline.last
         self._newest = self._read_newest()
 
-    def _write_anew(self) -> None:
-        """Stage the factors anew that are written in tangents which the solver has left (see `graphloc.linear.pose_term`).
-
-        And those between a slow node and one that has come since.
-        """
-        window, first = self._window, self.problem.timeline.first
+    def _write_anew(self, stale: Callable[[_Entry], bool]) -> None:
+        """Stage anew, at the estimate, the stale ones of the factors that see to centimetres: of sensors with hypotheses."""
+        first = self.problem.timeline.first
         for entry in self._entries.values():
             if entry.stream.row.false is None or entry.held is None or not entry.reaches(first):
-                continue  # only sensors with hypotheses see to centimetres
-            was = entry.verdict.at
-            loose = was.slow_key is not None and was.slow_next is None
-            if loose or not window.linearised_at(was.pose_key).equals(entry.written, _SAME):
-                at = attach(self.problem, entry.stream, entry.index, window.values)
+                continue
+            if stale(entry):
+                at = attach(self.problem, entry.stream, entry.index, self._window.values)
                 self._change(entry, replace(entry.verdict, at=at))
+
+    def _left_behind(self, entry: _Entry) -> bool:
+        """Whether it is written in a tangent that the solver has left (`graphloc.linear.pose_term`), or before its next slow node came."""
+        at = entry.verdict.at
+        loose = at.slow_key is not None and at.slow_next is None
+        return loose or not self._window.linearised_at(at.pose_key).equals(entry.written, _SAME)
+
+    def _elsewhere(self, entry: _Entry) -> bool:
+        """Whether it is linear about a place that the estimate has left: judged there, right ones look false."""
+        at = entry.verdict.at
+        return _moved(at.T_world_body, self._window.values.atPose3(at.pose_key))
 
     def _settle_down(self) -> None:
         """Solve again and again, until the cost stands: one step from metres off leaves older states further off than the newest."""
         cost = self._window.error()
         for _ in range(_MOST_STEPS):
-            self._write_where_it_moved()
+            self._write_anew(self._elsewhere)
             self._window.settle()
             before, cost = cost, self._window.error()
             if abs(before - cost) <= _STANDS * cost:
                 break
-
-    def _write_where_it_moved(self) -> None:
-        """Stage the factors anew that are linear about a place the estimate has left: judged there, the right ones look false."""
-        first = self.problem.timeline.first
-        for entry in self._entries.values():
-            if entry.stream.row.false is not None and entry.held is not None and entry.reaches(first):
-                at = attach(self.problem, entry.stream, entry.index, self._window.values)
-                if _moved(entry.verdict.at.T_world_body, at.T_world_body):
-                    self._change(entry, replace(entry.verdict, at=at))
 
     def _read_newest(self) -> Newest:
         timeline, values = self.problem.timeline, self._window.values
