@@ -7,8 +7,7 @@
 
 p, R: camera in world; S_i: a corner as surveyed, its frame at rest; e_k, f_k: what the survey errs about tag k, its middle
 m_k, a constant of the run; d, w: motion and small turn about c of the floating dock that the tag rides on, a slow state
-(D has neither); b: what detector, light, print and focal length make tags seem wider than they are, a slow state as well
-where `edge_sigma_px` is set.
+(D has neither); b: what detector, light, print and focal length make tags seem wider than they are, a slow state as well.
 Taken for noise of each sighting instead, such errors average out over hundreds of them, and the bounds are too small:
 three tags that hang 0.2 deg forward lift a vessel 20 m away by 7 cm in every image; tags 12 px wide whose edges are
 off by 0.04 px hold one 35 m away 0.2 m too near.

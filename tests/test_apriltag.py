@@ -25,7 +25,7 @@ CAMERA_M = np.array([1.5, 0.2, 2.0])  # of the camera in body
 MIDDLE_M = np.array([0.0, 0.0, 1.5])
 CORNERS_M = MIDDLE_M + SIZE_M * UNIT @ FACES_SOUTH.T
 TAG: dict[str, object] = {"id": 7, "size_m": SIZE_M, "xyz_m": [0.0, 0.0, 1.5], "facing_deg": 180.0}
-FIXED = AprilTagConfig(survey=Survey.model_validate({"tags": [TAG]}), edge_sigma_px=0.05)
+FIXED = AprilTagConfig(survey=Survey.model_validate({"tags": [TAG]}))
 
 
 def vessel(
@@ -177,7 +177,6 @@ DOCKED = AprilTagConfig(
             "docks": [{"name": "pier", "xyz_m": [4.0, 3.0, 0.0]}],
         }
     ),
-    edge_sigma_px=0.05,
 )
 PIER_M = np.array([4.0, 3.0, 0.0])
 AT_REST_M = CORNERS_M + PIER_M
@@ -312,7 +311,7 @@ def test_slow_states_and_constants() -> None:
         {**TAG, "id": 8, "frame": "pier", "sigma_m": 0.0, "sigma_deg": 0.0},
     ]
     dock = {"name": "pier", "moves_m": 0.6, "moves_deg": 3.0, "rises_m": 2.0, "tilts_deg": 1.0, "period_s": 20.0}
-    config = AprilTagConfig(survey=Survey.model_validate({"tags": tags, "docks": [dock]}), edge_sigma_px=0.05)
+    config = AprilTagConfig(survey=Survey.model_validate({"tags": tags, "docks": [dock]}))
     process = ROW.slow(config)
     assert process is not None
     assert process.axes == (*(f"pier {a}" for a in ("east", "north", "up", "roll", "pitch", "yaw")), "outwards")
@@ -322,7 +321,7 @@ def test_slow_states_and_constants() -> None:
     first, second = ROW.constants(config)
     np.testing.assert_allclose(first.sigma, [0.03] * 3 + [np.radians(0.5)] * 3)
     assert (second.sigma > 0.0).all()
-    quay = AprilTagConfig(survey=Survey.model_validate({"tags": tags[:1]}), edge_sigma_px=0.05)
+    quay = AprilTagConfig(survey=Survey.model_validate({"tags": tags[:1]}))
     assert [c.name for c in ROW.constants(config)] == ["tag 7", "tag 8"]
     twins = AprilTagConfig(survey=Survey.model_validate({"tags": [TAG, {**TAG, "family": "25h9"}]}))
     assert [c.name for c in ROW.constants(twins)] == ["tag 7 (36h11)", "tag 7 (25h9)"]

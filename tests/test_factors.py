@@ -25,9 +25,7 @@ def config_of(row: Sensor) -> Any:
         {"id": n, "size_m": 0.4, "frame": frame, "xyz_m": [5.0, n, 1.0], "facing_deg": 180.0}
         for n, frame in enumerate(("pier", "world"))
     ]
-    return row.config.model_validate(
-        {"kind": "apriltag", "edge_sigma_px": 0.05, "survey": {"tags": tags, "docks": [{"name": "pier"}]}}
-    )
+    return row.config.model_validate({"kind": "apriltag", "survey": {"tags": tags, "docks": [{"name": "pier"}]}})
 
 
 def attachment(row: Sensor, config: object, *, tilt: float = 0.1, far_m: float = 50.0, slow: bool = True) -> Attachment:

@@ -13,6 +13,7 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import bl_scenario, simulate
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
+from graphloc.solve._decide import by_hypotheses
 from graphloc.solve._hypotheses import FalseSequence, best_chain
 
 SIGMA_M = 0.2
@@ -67,6 +68,25 @@ def test_the_longest_slow_offset_is_the_right_one() -> None:
     expected = [n not in {*false.tolist(), *range(10, 15)} for n in range(count)]
     found = [mode is not None for mode in best_chain(*stream_of(offsets))]
     assert sum(a != b for a, b in zip(found, expected, strict=True)) <= 1
+
+
+def test_a_loose_prediction_believes_but_one_of_two_that_contradict_each_other() -> None:
+    """Two tags in each image, one of a wrong size: 6 m apart at first and less as the vessel comes in, mostly within bounds."""
+    rng, count = np.random.default_rng(6), 20
+    right = np.column_stack([np.full(count, -1.0), 0.5 - 0.02 * np.arange(count)])  # what the prediction is off
+    wrong = right + np.column_stack([6.0 - 0.25 * np.arange(count), np.zeros(count)])
+    offsets = np.stack([right, wrong], axis=1).reshape(-1, 2) + rng.normal(0.0, SIGMA_M, (2 * count, 2))
+    stream, indices, residuals = stream_of(offsets)
+    for n, m in enumerate(stream.measurements):
+        m.stamp_ns = n // 2 * 1_000_000_000
+    stream.row.one_likelihood = False
+    at: Any = None
+    loose: list[Array | None] = [np.eye(2) * 2.0**2 for _ in offsets]
+    verdicts = by_hypotheses(stream, list(indices), [at] * 2 * count, residuals, loose)
+    weights = np.array([v.weight for v in verdicts]).reshape(-1, 2)
+    assert weights[:, 0].min() > 0.9
+    assert weights[:, 1].max() == 0.0
+    assert all(v.decision is None for v in verdicts[1::2])
 
 
 def test_nothing_but_noise_makes_no_long_chain() -> None:

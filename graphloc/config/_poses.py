@@ -164,10 +164,10 @@ class AprilTagConfig(SensorConfig):
     min_corner_sigma_px: NonNegative = 0.2
     """Floor of the corners' noise in the graph, each axis, 1 sigma, px: what calibration and stamps are off (a vessel
     that turns by 5 deg/s moves corners by 0.5 px in 5 ms at a focal length of 1000 px)."""
-    edge_sigma_px: NonNegative = 0.0
+    edge_sigma_px: NonNegative = 0.05
     """How far the edges of all tags are seen too far out (or in) for half a minute: blur, light, prints, focal length, 1 sigma,
     px. A tag 12 px wide whose edges are seen 0.05 px too far out seems 0.8 % nearer than it is, in every image; 0: not
-    modelled. 0.05 makes bounds 20 m off and more right, where no tag's size is wrong (docs/decisions/0007)."""
+    modelled."""
     corner_sigma_px: Positive = 0.5
     """Noise of the corners of listed detections, each axis, 1 sigma, px; our own detector measures it."""
     false_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02

@@ -175,14 +175,27 @@ def by_hypotheses(
     residuals: list[tuple[Residual, ...]],
     predicted: list[Array | None],
 ) -> list[Verdict]:
-    """Judge measurements of a sensor that can be false, as a sequence (see `sequence_of`)."""
+    """Judge measurements of a sensor that can be false, as a sequence (see `sequence_of`).
+
+    Each by itself, a prediction that is loose believes measurements that contradict each other. Both in the graph bend
+    it to where neither is right, so only the most probable chain of those is believed that agree with each other.
+    """
     posterior = sequence_of(stream, indices, residuals, predicted).posterior()
+    new = {n: P for n, P in enumerate(predicted) if P is not None}
+    chain: dict[int, int | None] = {}
+    if len(new) > 1:
+        chosen = best_chain(stream, [indices[n] for n in new], [residuals[n] for n in new], list(new.values()))
+        chain = dict(zip(new, chosen, strict=True))
     verdicts = []
     for n, found in enumerate(residuals):
         logs = np.array([r.log_density(predicted[n]) for r in found])
         mode = int(np.argmax(logs))
+        weight = float(posterior[n])
+        if n in chain:
+            on = chain[n]
+            mode, weight = (mode, 0.0) if on is None else (on, weight)
         share = float(np.exp(logs[mode] - np.logaddexp.reduce(logs)))
-        weight = float(posterior[n]) * (1.0 if stream.row.one_likelihood else share)
+        weight *= 1.0 if stream.row.one_likelihood else share
         kept = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
         verdicts.append(Verdict(kept, weight, share, found[mode], mode, attached[n]))
     return verdicts

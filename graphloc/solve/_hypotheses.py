@@ -6,7 +6,8 @@ form a chain of two states, and forward-backward gives each posterior exactly: w
 scans that take the same wrong boat for the right one outweigh IMU and GNSS together.
 
 That is local: around an estimate. `best_chain` is global: an estimate in the wrong place still has the
-right shape, so the residuals of the right measurements lie along one slowly moving offset from it.
+right shape, so the residuals of the right measurements lie along one slowly moving offset from it. Where the
+estimate is a prediction, loose enough to believe two measurements that contradict each other, it tells which.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from graphloc.graph import FalseModel, Residual
 # How fast the offset of an estimate in the wrong place may move: a random walk of this share of a false
 # error's size in a second (0.1 m of 5 m).
 _OFFSET_WALK = 0.02
+_PREDICTED_S = 60.0  # in which the error of a prediction becomes another one
 _LOOK_BACK = 64  # candidates for the right one before
 
 
@@ -104,20 +106,31 @@ def _log_false(found: tuple[Residual, ...], model: FalseModel, P: Array | None) 
     return float(np.log(model.probability) + np.logaddexp.reduce(logs))
 
 
-def _log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...]) -> float:
-    """Log density of seeing the error of one measurement again in the next, over pairs of modes."""
+def _log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...], walked: Array | float = 0.0) -> float:
+    """Log density of seeing the error of one measurement again in the next, over pairs of modes.
+
+    `walked`: covariance (k, k) of what the estimate's own error has moved in between.
+    """
     if len(before[0].raw) != len(now[0].raw):
         return -np.inf
     total = np.log(sum(r.prior for r in before) * sum(r.prior for r in now))
-    logs = [np.log(a.prior * b.prior) + _log_gauss(a.raw - b.raw, a.cov + b.cov) for a in before for b in now]
+    logs = [np.log(a.prior * b.prior) + _log_gauss(a.raw - b.raw, a.cov + b.cov + walked) for a in before for b in now]
     return float(np.logaddexp.reduce(logs) - total)
 
 
-def best_chain(stream: Judged, indices: Sequence[int], residuals: Sequence[tuple[Residual, ...]]) -> list[int | None]:
+def best_chain(
+    stream: Judged,
+    indices: Sequence[int],
+    residuals: Sequence[tuple[Residual, ...]],
+    predicted: Sequence[Array] | None = None,
+) -> list[int | None]:
     """Return which mode of each of N measurements of a stream is right on the most probable chain; None: none is.
 
     The longest path: nodes are modes taken for right, and an edge gains what its end gains over being false,
     less what the offset moves from one to the next. False ones between that repeat each other gain too.
+
+    Args:
+        predicted: N covariances of the prediction, which bounds where a chain begins; None: it may lie anywhere.
     """
     assert stream.row.false is not None
     taken = [stream.measurements[i] for i in indices]
@@ -128,13 +141,18 @@ def best_chain(stream: Judged, indices: Sequence[int], residuals: Sequence[tuple
     nothing = np.array(
         [np.log(m.probability) - 0.5 * (np.linalg.slogdet(2.0 * np.pi * m.cov)[1] + dof) for m in models]
     )
+    stamps = np.array([m.stamp_ns for m in taken]) * 1e-9
+    walk = _OFFSET_WALK**2 * np.array([m.cov for m in models])  # in a second
+    if predicted is not None:
+        walk = walk + 2.0 * np.array(predicted) / _PREDICTED_S
     again = np.zeros(count)
     for n in range(1, count):
         repeats = models[n].repeats
-        same = np.log(max(repeats * models[n].probability, 1e-12)) + _log_repeat(residuals[n - 1], residuals[n])
+        walked = (stamps[n] - stamps[n - 1]) * walk[n]
+        same = np.log(max(repeats * models[n].probability, 1e-12))
+        same += _log_repeat(residuals[n - 1], residuals[n], walked)
         again[n] = max(0.0, float(np.logaddexp(np.log1p(-repeats), same - nothing[n])))
     gained = np.concatenate([[0.0], np.cumsum(again)])  # by false ones that repeat, up to and without n
-    stamps = np.array([m.stamp_ns for m in taken]) * 1e-9
     node = [(n, mode) for n, found in enumerate(residuals) for mode in range(len(found))]
     at = np.array([n for n, _ in node])
     raw = np.array([residuals[n][mode].raw for n, mode in node])
@@ -142,15 +160,19 @@ def best_chain(stream: Judged, indices: Sequence[int], residuals: Sequence[tuple
     alone = np.log([residuals[n][mode].prior for n, mode in node]) - nothing[at]
     score, before = np.zeros(len(node)), np.full(len(node), -1)
     for k, n in enumerate(at):
-        anywhere = cov[k] + models[n].cov
-        score[k] = alone[k] + gained[n] - 0.5 * (np.linalg.slogdet(2.0 * np.pi * anywhere)[1] + dof)
+        if predicted is None:
+            nis, begun = float(dof), cov[k] + models[n].cov
+        else:
+            begun = cov[k] + predicted[n]
+            nis = float(raw[k] @ np.linalg.solve(begun, raw[k]))
+        score[k] = alone[k] + gained[n] - 0.5 * (np.linalg.slogdet(2.0 * np.pi * begun)[1] + nis)
         lo, hi = np.searchsorted(at, [n - _LOOK_BACK, n])
         if lo == hi:
             continue
-        walked = (stamps[n] - stamps[at[lo:hi]])[:, None, None] * _OFFSET_WALK**2 * models[n].cov
+        walked = (stamps[n] - stamps[at[lo:hi]])[:, None, None] * walk[n]
         spread, step = cov[lo:hi] + cov[k] + walked, raw[lo:hi] - raw[k]
-        nis = np.einsum("ni,ni->n", step, np.linalg.solve(spread, step[:, :, None])[:, :, 0])
-        path = score[lo:hi] + alone[k] - 0.5 * (nis + np.linalg.slogdet(2.0 * np.pi * spread)[1])
+        off = np.einsum("ni,ni->n", step, np.linalg.solve(spread, step[:, :, None])[:, :, 0])
+        path = score[lo:hi] + alone[k] - 0.5 * (off + np.linalg.slogdet(2.0 * np.pi * spread)[1])
         path += np.maximum(gained[n] - gained[np.minimum(at[lo:hi] + 2, n)], 0.0)
         best = int(np.argmax(path))
         if path[best] > score[k]:
