@@ -34,10 +34,9 @@ def said(run: SimulatedRun, east_north_m: Array) -> list[str]:
     )  # fmt: skip
     lever = run.config.sensors["gnss"].mount.t_body_sensor_m
     lla = DATUM.geodetic_from_enu(lever + np.column_stack([off, np.zeros(n)]))
+    unit = np.eye(3)
     fixes = tuple(
-        GnssPosition(
-            stamp_ns=int(t), sensor="gnss", seq=k, position=Geodetic(*map(float, lla[k])), cov_enu_m2=np.eye(3)
-        )
+        GnssPosition(stamp_ns=int(t), sensor="gnss", seq=k, position=Geodetic(*map(float, lla[k])), cov_enu_m2=unit)
         for k, t in enumerate(stamps)
     )
     pose = next(m for m in run.recording.measurements if isinstance(m, PoseFix))

@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import chi2
 
 from graphloc import app
-from graphloc.config import ImuConfig, PoseConfig
+from graphloc.config import ImuConfig, PoseConfig, TimelineConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.eval.simulate._scenario import harbour_scenarios
 from graphloc.factors import INERTIAL, SENSORS
@@ -236,6 +236,8 @@ def test_starts_from_fix_and_compass() -> None:
 
 def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
     run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0), 0)
+    config = run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)})  # half the time
+    run = replace(run, config=config)
     arrivals = without(arrivals_of(run), lambda a: isinstance(a.m, (PoseFix, CompassHeading)))
     said, fed = said_while_waiting(run, arrivals)
     assert any(s.startswith("a heading") and "m of way" in s for s in said)

@@ -2,11 +2,13 @@
 """What is seen of a moving dock says where the vessel is beside the dock, and nothing of where both are."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 from graphloc import app
+from graphloc.config import TimelineConfig
 from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
@@ -18,13 +20,15 @@ from graphloc.trajectory import Trajectory
 from tests import tagfactory
 
 
+@cache
 def docking() -> SimulatedRun:
     """Without GNSS: place by the dock's tags (which moves by 0.3 m), height by that and the tide."""
     less = {"imu_hz": "50", "gnss_hz": "2", "compass_hz": "4", "lidar_hz": "0", "camera_hz": "0"}
     true = simulate(find_scenario("dock-floating-optimal", {**less, "duration_s": "45", "route_s": "45"}), 1)
     run, _ = tagfactory.sighted(true, rate_hz=4.0)
     kept = tuple(m for m in run.recording.measurements if m.sensor != "gnss")
-    return replace(run, recording=replace(run.recording, measurements=kept))
+    config = run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)})  # half the time
+    return replace(run, recording=replace(run.recording, measurements=kept), config=config)
 
 
 def sigmas_m(track: Trajectory, k: int) -> Array:

@@ -76,6 +76,27 @@ def voyage(kind: str, seed: int = 1) -> SimulatedRun:
     return simulate(find_scenario(f"dock-{kind}-optimal", changes), seed)
 
 
+@cache
+def sighted(
+    kind: str,
+    tag: Callable[[TagConfig], TagConfig | None] | None,
+    alone: bool,
+    only: tuple[int, ...],
+    hidden_s: tuple[float, float],
+) -> tuple[SimulatedRun, list[tuple[TagSighting, int]]]:
+    """See `dock`."""
+    whole = tagfactory.survey_of
+
+    def surveyed(of: SimulatedRun) -> Survey:
+        survey = whole(of)
+        kept = [changed for t in survey.tags if (changed := tag(t) if tag else t) is not None]
+        return survey.model_copy(update={"tags": tuple(kept)})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tagfactory, "survey_of", surveyed)
+        return tagfactory.sighted(voyage(kind), rate_hz=HZ, alone=alone, only=only, hidden_s=hidden_s)
+
+
 def dock(
     kind: str = "fixed",
     *,
@@ -89,16 +110,7 @@ def dock(
 ) -> Docked:
     """Solve a run; `change` of each measurement, `tag` of each in the survey (None: without it)."""
     true = voyage(kind)
-    whole = tagfactory.survey_of
-
-    def surveyed(of: SimulatedRun) -> Survey:
-        survey = whole(of)
-        kept = [changed for t in survey.tags if (changed := tag(t) if tag else t) is not None]
-        return survey.model_copy(update={"tags": tuple(kept)})
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tagfactory, "survey_of", surveyed)
-        seen, numbered = tagfactory.sighted(true, rate_hz=HZ, alone=alone, only=only, hidden_s=hidden_s)
+    seen, numbered = sighted(kind, tag, alone, only, hidden_s)
     kept = (c for m in seen.recording.measurements if (c := change(m) if change else m) is not None)
     ordered = tuple(sorted(kept, key=lambda m: (m.stamp_ns, m.seq)))
     recording = replace(seen.recording, measurements=ordered, tag_views=views)
@@ -152,7 +164,7 @@ def unlisted(run: SimulatedRun, number: int, size_m: float) -> tuple[TagView, ..
     rng, scene, camera = np.random.default_rng(5), scene_of(run), run.rig.cameras["camera"]
     (tag,) = (t for t in run.harbour.config.tags if t.number == number)
     found = []
-    for t in TIMES_S[60:150]:
+    for t in TIMES_S[(TIMES_S > 20.0) & (TIMES_S < 50.0)]:
         p, R, _ = (v[0] for v in run.motion.pose(np.array([t])))
         at, turned = tag_in_world(tag, run.harbour, scene, float(t))
         R_camera = R @ camera.mount.R_body_sensor

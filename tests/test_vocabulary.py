@@ -1,6 +1,7 @@
 """Frames, time, trajectories and the ledger: laws that hold for any input."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from graphloc.frames import (
     yaw_from_heading_deg,
 )
 from graphloc.ledger import Ledger, LedgerRow, Outcome
+from graphloc.measurements import GnssPosition
 from graphloc.time import NS_PER_S, seconds_between, seconds_since, utc_text
 from graphloc.trajectory import Trajectory
 
@@ -159,3 +161,23 @@ def test_the_drawn_frames_are_the_ones_in_the_code() -> None:
     rows = (Path(__file__).parent.parent / "docs/frames.md").read_text().splitlines()
     for frame in FRAMES:
         assert f"| {frame.name} | {frame.axes} | {frame.origin} |" in rows
+
+
+@pytest.mark.parametrize(("off", "refused"), [(0.9e-6, False), (1.2e-6, True), (-1.2e-6, True)])
+def test_a_covariance_is_symmetric_to_a_millionth(off: float, refused: bool) -> None:
+    """Above or below its diagonal, whichever is the larger; digits that a message lost are none."""
+    for row, column in ((0, 2), (2, 0)):
+        cov = np.full((3, 3), 10.0) + 40.0 * np.eye(3)
+        cov[row, column] *= 1.0 + off
+        fix: dict[str, Any] = {
+            "stamp_ns": 1,
+            "sensor": "gnss",
+            "seq": 0,
+            "position": Geodetic(57.7, 11.7, 0.0),
+            "cov_enu_m2": cov,
+        }
+        if refused:
+            with pytest.raises(ValueError, match="not symmetric positive definite"):
+                GnssPosition(**fix)
+        else:
+            GnssPosition(**fix)

@@ -189,11 +189,17 @@ class _Pen:
     def mottle(self, part: Canvas, inside: Mask, noise: float, sizes_m: tuple[float, ...]) -> None:
         """Lay grain of several sizes over some pixels of a part of the canvas, in place."""
         rows, columns = part.shape[:2]
-        for size in sizes_m if inside.any() else ():
+        if not inside.any():
+            return
+        whole = inside.all()  # as water is: then nothing needs to be picked and put back
+        painted = part if whole else part[inside]
+        for size in sizes_m:
             step = max(1, round(size / self.pixel_m / 2))
             coarse = self._rng.normal(0.0, noise, (rows // step + 2, columns // step + 2)).astype(np.float32)
             grain = cv2.resize(coarse, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
-            part[inside] += grain[inside, None] / len(sizes_m)
+            painted += (grain if whole else grain[inside])[..., None] / len(sizes_m)
+        if not whole:
+            part[inside] = painted
 
 
 def _draw(pen: _Pen, harbour: Harbour, season: _Season, rng: np.random.Generator) -> None:
