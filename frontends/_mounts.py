@@ -7,11 +7,9 @@ from collections.abc import Mapping
 
 from graphloc.blocks import MountConfig
 from graphloc.frames import Array
-from graphloc.frontends._source import Bag
+from graphloc.frontends._source import TF_STATIC, Bag
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.decode import TF
-
-TF_STATIC = "/tf_static"
 
 
 def mounts_of(
