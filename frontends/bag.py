@@ -201,8 +201,11 @@ class _Reader:
                 item.logs_ns.append(raw.log_ns)
                 item.messages.append(msg)
         if raw.topic == TF_STATIC and self._tree is not None:
-            if msg is not None and raw.msgtype == TF:
-                self._tree.add(msg)
+            try:
+                if msg is not None and raw.msgtype == TF:
+                    self._tree.add(msg)
+            except AttributeError:  # the bag's definition of it is damaged
+                msg = None
             self._broken_mounts += msg is None
 
     def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:
