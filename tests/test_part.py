@@ -198,15 +198,17 @@ def test_damage_in_the_part_is_counted(tmp_path: Path) -> None:
     assert recording.message_count == accounted(recording) == 55 * 110
 
 
-def test_a_damaged_index_is_done_without(tmp_path: Path) -> None:
-    """The index of one chunk says that it is 7 bytes long; chunks and messages are whole."""
+@pytest.mark.parametrize("more", [7, 16])
+def test_a_damaged_index_is_done_without(tmp_path: Path, more: int) -> None:
+    """The index of one chunk says that it is longer than there is room for; chunks and messages are whole."""
     make = Messages(2)
     path = write_bag(tmp_path / "run", make, run_of(make), "mcap") / "run.mcap"
     content = bytearray(path.read_bytes())
     with Reader(path) as reader:
         assert isinstance(reader.storage, McapReader)
-        at = min(reader.storage.chunks[0].message_index_offsets.values())
-    content[at + 11 : at + 15] = struct.pack("<I", 7)
+        chunk = reader.storage.chunks[0]
+        at, size = min(chunk.message_index_offsets.values()), chunk.message_index_length // 16 * 16 + more
+    content[at + 11 : at + 15] = struct.pack("<I", size)
     path.write_bytes(content)
     recording = read_recording(BagPart((path,), 4.0, 2.0), vessel())
     assert recording.imu is not None
