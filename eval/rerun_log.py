@@ -20,6 +20,7 @@ from graphloc.eval.ekf import FilterResult, as_pose
 from graphloc.eval.plots import colour_of
 from graphloc.extras import need
 from graphloc.frames import Array, Datum
+from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import level
 from graphloc.frontends.aerial.image import AerialImage
@@ -50,7 +51,7 @@ def write_rerun(
     config: VesselConfig,
     filters: Sequence[FilterResult] = (),
     *,
-    bags: Sequence[Path] = (),
+    bags: Bags = (),
     folder: Path = Path(),
 ) -> None:
     """Write `path` (.rrd).
@@ -238,7 +239,7 @@ def _log_image(stream: Any, name: str, sensor: AerialConfig, solution: Solution,
 
 
 def _log_scans(
-    stream: Any, name: str, sensor: AerialConfig, config: VesselConfig, track: Trajectory, bags: Sequence[Path]
+    stream: Any, name: str, sensor: AerialConfig, config: VesselConfig, track: Trajectory, bags: Bags
 ) -> None:
     """Turns of the LiDARs, as often as they may be matched, each from where the track has its LiDARs."""
     rr = need("rerun", "rerun")

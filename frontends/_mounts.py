@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 
 from graphloc.blocks import MountConfig
 from graphloc.frames import Array
-from graphloc.frontends._source import Bag
+from graphloc.frontends._source import TF_STATIC, Bag
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.decode import TF
-
-TF_STATIC = "/tf_static"
 
 
 def mounts_of(
@@ -25,8 +24,9 @@ def mounts_of(
     tree = StaticTree()
     if any(mount.tf_frame for mount in mounts.values()):
         for raw in bag.messages({TF_STATIC}):
-            if raw.msgtype == TF:
-                tree.add(bag.decode(raw))
+            with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; another may be whole
+                if raw.msgtype == TF:
+                    tree.add(bag.decode(raw))
     return {
         name: tree.mount(body_frame, mount.tf_frame, f"{bag.name}: {block}.{name}.mount.tf_frame")
         if mount.tf_frame

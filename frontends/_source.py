@@ -11,13 +11,16 @@ from __future__ import annotations
 import heapq
 import logging
 import warnings
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.interfaces.typing import Typesdict
 from rosbags.rosbag1 import Reader as Reader1
@@ -27,13 +30,17 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from graphloc.errors import InputError
+from graphloc.frontends._part import BagPart, Bags, recording_times
 from graphloc.frontends._recover import Recovered, recover
 from graphloc.frontends._unpack import limit_unpacking
+from graphloc.recording import Span
+from graphloc.time import duration_ns, seconds_between, utc_text
 
 log = logging.getLogger(__name__)
 limit_unpacking()
 LATEST_NS = 2**62 - 1
 """The last time that is worked with (year 2116): a difference of differences still fits 64 bits."""
+TF_STATIC = "/tf_static"
 HINTS = {
     ".bag": "try `rosbag reindex`",
     ".mcap": "try `mcap recover`",
@@ -75,7 +82,7 @@ class RawMessage(NamedTuple):
 
 
 class TopicSummary(NamedTuple):
-    """What the bag's index says about a topic."""
+    """What the bag's index says about a topic: of a part of a bag, how many messages lie in that."""
 
     topic: str
     msgtypes: tuple[str, ...]
@@ -87,11 +94,6 @@ class _Opened(NamedTuple):
     reader: Reader1 | Reader2
 
 
-def as_paths(paths: Path | str | Sequence[Path | str]) -> tuple[Path, ...]:
-    """Return one path or several as a tuple."""
-    return (Path(paths),) if isinstance(paths, str | Path) else tuple(Path(p) for p in paths)
-
-
 class Bag:
     """An open recording. Use as a context manager.
 
@@ -99,16 +101,21 @@ class Bag:
         name: its path(s), for messages.
         warnings: what was wrong with the files; grows while messages are read.
         ros1: whether messages are in ROS 1 serialisation.
+        span: which part of the bag is read, with its topics; None: the whole bag.
     """
 
-    def __init__(self, paths: Path | str | Sequence[Path | str]) -> None:
-        self.paths = as_paths(paths)
+    def __init__(self, bags: Bags) -> None:
+        self._part = bags if isinstance(bags, BagPart) else _whole(bags)
+        self.paths = self._part.paths
         self.name = ", ".join(str(p) for p in self.paths)
         self.warnings: list[str] = []
         self._stack = ExitStack()
         self._opened: list[_Opened] = []
         self._broken: list[str] = []
         self._stores: dict[str, Typestore] = {}
+        self._within: tuple[int | None, int | None] = (None, None)  # ns, as rosbags takes it: the end is not in it
+        self._inside: Counter[str] = Counter()
+        self.span: Span | None = None
 
     def __enter__(self) -> Self:
         if not self.paths:
@@ -127,12 +134,61 @@ class Bag:
         if any(isinstance(o.reader, Reader1) != self.ros1 for o in self._opened):
             self._stack.close()
             raise InputError(f"{self.name}: ROS 1 and ROS 2 bags cannot be read as one run; give one kind")
+        if not self._part.whole:
+            try:
+                self._cut()
+            except BaseException:
+                self._stack.close()
+                raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
+
+    def _cut(self) -> None:
+        """Find out where the part lies, and how many messages of each topic lie in it."""
+        times: dict[str, list[NDArray[np.int64]]] = {}
+        for opened in self._opened:
+            for topic, recorded in self._times(opened):
+                times.setdefault(topic, []).append(np.clip(recorded, 0, LATEST_NS))
+        by_topic = {topic: np.concatenate(pieces) for topic, pieces in times.items()}
+        stamps = np.concatenate([np.empty(0, dtype=np.int64), *by_topic.values()])
+        if not len(stamps):
+            raise InputError(f"{self.name}: no message is in it, so no part of it can be taken")
+        first_ns, last_ns = int(stamps.min()), int(stamps.max())
+        start_s, duration_s, bag_s = self._part.start_s, self._part.duration_s, seconds_between(first_ns, last_ns)
+        if start_s > bag_s:
+            raise InputError(
+                f"{self.name}: --start {start_s:g}: the bag is {bag_s:.1f} s long, from {utc_text(first_ns)} to "
+                f"{utc_text(last_ns)}"
+            )
+        start_ns, end_ns = first_ns + duration_ns(start_s), last_ns + 1
+        if duration_s is not None and duration_s <= bag_s:
+            end_ns = min(start_ns + duration_ns(duration_s), end_ns)
+        self._within = (start_ns if start_s else None, None if end_ns > last_ns else end_ns)
+        for topic, recorded in by_topic.items():
+            self._inside[topic] = int(np.count_nonzero((recorded >= start_ns) & (recorded < end_ns)))
+        self.span = Span(
+            start_s=start_s, end_s=seconds_between(first_ns, min(end_ns, last_ns)), bag_s=bag_s,
+            start_ns=start_ns, end_ns=end_ns,
+            messages=dict(self._inside), left_out={t: len(r) - self._inside[t] for t, r in by_topic.items()},
+        )  # fmt: skip
+
+    def _times(self, opened: _Opened) -> list[tuple[str, NDArray[np.int64]]]:
+        """Topics and recording times of a file, from its index; where that is damaged, from as much as can be read."""
+        try:
+            return list(recording_times(opened.reader))
+        except Exception as error:  # noqa: BLE001 - as below
+            self.warnings.append(
+                f"{opened.path}: its index is damaged ({_text(error)}): its messages were counted instead"
+            )
+        found: list[tuple[str, NDArray[np.int64]]] = []
+        with suppress(Exception):  # where it ends is said when its messages are read
+            for connection, log_ns, _ in _stream(opened, opened.reader.connections, None, None):
+                found.append((connection.topic, np.array([min(max(log_ns, 0), LATEST_NS)])))
+        return found
 
     def _open(self, path: Path) -> None:
         """Open a file, or a folder, or what is readable of it."""
@@ -193,31 +249,46 @@ class Bag:
 
     @property
     def topics(self) -> dict[str, TopicSummary]:
-        """Topics by name, with their types and the number of messages that the index announces."""
+        """Topics by name, with their types and the number of messages that the index announces, of a part in that."""
         found: dict[str, TopicSummary] = {}
         for opened in self._opened:
             for c in opened.reader.connections:
                 have = found.get(c.topic, TopicSummary(c.topic, (), 0))
                 types = have.msgtypes if c.msgtype in have.msgtypes else (*have.msgtypes, c.msgtype)
                 found[c.topic] = TopicSummary(c.topic, types, have.messages + c.msgcount)
+        if self.span is not None:
+            found = {topic: t._replace(messages=self._inside[topic]) for topic, t in found.items()}
         return dict(sorted(found.items()))
 
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+    def messages(self, topics: Collection[str], *, whole: bool = False) -> Iterator[RawMessage]:
         """Yield the raw messages of some topics in order of arrival; others are never unpacked.
 
+        Of a part of a bag those that were recorded in it, after all of /tf_static, which drivers send but once.
         A file that turns out damaged midway ends there, with a line in `warnings`.
+
+        Args:
+            whole: of the whole bag: for what is sent once, or stays as it is.
         """
+        if self.span is None or whole:
+            yield from self._merged(topics, (None, None))
+            return
+        yield from self._merged({TF_STATIC} & set(topics), (None, None))
+        yield from self._merged(set(topics) - {TF_STATIC}, self._within)
+
+    def _merged(self, topics: Collection[str], within: tuple[int | None, int | None]) -> Iterator[RawMessage]:
         streams = []
         for opened in self._opened:
             wanted = [c for c in opened.reader.connections if c.topic in topics]
             if wanted:
-                streams.append(self._until_damage(opened, wanted))
+                streams.append(self._until_damage(opened, wanted, within))
         yield from heapq.merge(*streams, key=lambda m: m.log_ns)
 
-    def _until_damage(self, opened: _Opened, wanted: list[Connection]) -> Iterator[RawMessage]:
+    def _until_damage(
+        self, opened: _Opened, wanted: list[Connection], within: tuple[int | None, int | None]
+    ) -> Iterator[RawMessage]:
         read = 0
         try:
-            for connection, log_ns, data in _stream(opened, wanted):
+            for connection, log_ns, data in _stream(opened, wanted, *within):
                 read += 1
                 at_ns = min(max(log_ns, 0), LATEST_NS)
                 yield RawMessage(connection.topic, connection.msgtype, opened.path.name, at_ns, data)
@@ -253,6 +324,10 @@ class Bag:
         if msgtype in _OTHER_TYPES:
             store.register(get_types_from_msg(_OTHER_TYPES[msgtype], msgtype))
         return store
+
+
+def _whole(paths: Path | str | Sequence[Path | str]) -> BagPart:
+    return BagPart((Path(paths),) if isinstance(paths, str | Path) else tuple(Path(p) for p in paths))
 
 
 def _instead(folder: Path) -> str:
@@ -294,12 +369,15 @@ def _types_from_idl(text: str, _msgtype: str) -> Typesdict:
     return types
 
 
-def _stream(opened: _Opened, wanted: list[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
-    """Messages of a file. MCAP without an index is taken in the order of the file, which need not be that of time."""
+def _stream(
+    opened: _Opened, wanted: list[Connection], start_ns: int | None, end_ns: int | None
+) -> Iterator[tuple[Connection, int, bytes]]:
+    """Messages of a file that were recorded from `start_ns` to before `end_ns`. MCAP without an index is taken in the order of the file, which need not be that of time."""
     if isinstance(opened.reader, Reader2) and isinstance(opened.reader.storage, McapReader):
         storage = opened.reader.storage
-        return storage.messages(wanted) if storage.chunks else storage.messages_scan(wanted)
-    return opened.reader.messages(wanted)
+        read = storage.messages if storage.chunks else storage.messages_scan
+        return read(wanted, start_ns, end_ns)
+    return opened.reader.messages(wanted, start_ns, end_ns)
 
 
 def _text(error: BaseException) -> str:

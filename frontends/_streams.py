@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._source import Bag
+from graphloc.frontends._source import TF_STATIC, Bag
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.decode import (
     IMU,
@@ -115,7 +115,7 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
         if len(t.msgtypes) == 1 and t.msgtypes[0] in ROWS
     }
     tree = StaticTree()
-    statics = {"/tf_static"} & set(bag.topics)
+    statics = {TF_STATIC} & set(bag.topics)
     for raw in bag.messages(set(streams) | statics) if streams or statics else ():
         stream = streams.get(raw.topic)
         try:

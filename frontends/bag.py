@@ -11,14 +11,13 @@ from __future__ import annotations
 import difflib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from graphloc.config import CompassConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends._beside import Beside, check_speed, true_trajectory
-from graphloc.frontends._mounts import TF_STATIC
+from graphloc.frontends._part import Bags
 from graphloc.frontends._readings import (
     Readings,
     clock_warnings,
@@ -29,7 +28,7 @@ from graphloc.frontends._readings import (
     reject_repeats,
     reject_set_back,
 )
-from graphloc.frontends._source import LATEST_NS, Bag, RawMessage, TopicSummary
+from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import turn_warnings
 from graphloc.frontends.decode import (
@@ -45,29 +44,27 @@ from graphloc.frontends.decode import (
 )
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, ImuSeries, Measurement
-from graphloc.recording import Progress, Recording
+from graphloc.recording import Progress, Recording, Span
 from graphloc.time import duration_ns, utc_text
 
 _REPORT_EVERY = 2000  # messages between two calls of `progress`
 
 
-def check_bag(paths: Path | str | Sequence[Path | str], config: VesselConfig) -> None:
+def check_bag(bags: Bags, config: VesselConfig) -> None:
     """Open a bag and look for the topics that the configuration names, without reading it.
 
     Raises:
         InputError: no readable bag, or a topic that is not there or has another type.
     """
-    with Bag(paths) as bag:
+    with Bag(bags) as bag:
         _asked_for(config, bag)
 
 
-def read_recording(
-    paths: Path | str | Sequence[Path | str], config: VesselConfig, progress: Progress | None = None
-) -> Recording:
+def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None = None) -> Recording:
     """Read the topics that the configuration names.
 
     Args:
-        paths: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, or several of one kind (split bags).
+        bags: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, several of one kind (split bags), or a part of them.
         config: which topics belong to which sensors, units, mounts.
         progress: called now and then with the stage, messages done and messages in all.
 
@@ -76,11 +73,13 @@ def read_recording(
         a message that several sensors read counts once for each.
 
     Raises:
-        InputError: no readable bag, a topic that is not there or has another type, a broken mount chain.
+        InputError: no readable bag, a topic that is not there or has another type, a broken mount chain, a part of
+            the bag in which there is nothing.
     """
-    with Bag(paths) as bag:
+    with Bag(bags) as bag:
         topics = bag.topics
         sensors, truth, check = _asked_for(config, bag)
+        span = _span(bag, config)
         tree = StaticTree() if any(s.enabled and s.mount.tf_frame for s in config.sensors.values()) else None
         rows = _Reader(bag, topics, sensors, [b for b in (truth, check) if b], tree).read(progress)
         warnings = list(bag.warnings)
@@ -101,7 +100,7 @@ def read_recording(
         warnings += _turn_warnings(imu, sensors)
     warnings += _silent(sensors, rows, topics)
     return Recording(
-        source=bag.name,
+        source=bag.name if span is None else f"{bag.name}, {span.start_s:g} s to {span.end_s:g} s",
         imu=imu,
         measurements=tuple(sorted(measurements, key=lambda m: (m.stamp_ns, m.seq))),
         rows=tuple(sorted(rows, key=lambda r: (r.seq < 0, r.seq, r.topic))),
@@ -111,7 +110,25 @@ def read_recording(
         truth=true_trajectory(truth, warnings) if truth else None,
         check_speed=check_speed(check) if check else None,
         warnings=tuple(warnings),
+        span=span,
     )
+
+
+def _span(bag: Bag, config: VesselConfig) -> Span | None:
+    """The part of the bag, with counts of the topics that the configuration names."""
+    if bag.span is None:
+        return None
+    sensors = [sensor for sensor in config.sensors.values() if sensor.enabled]
+    named = {config.truth_topic, config.check_speed_topic, *(sensor.topic for sensor in sensors)}
+    named |= {lidar.topic for sensor in config.of_kind("aerial").values() for lidar in sensor.lidars.values()}
+    named |= {camera.topic for sensor in config.of_kind("apriltag").values() for camera in sensor.cameras.values()}
+    span = bag.span.of(named)
+    if not sum(span.messages.values()):
+        raise InputError(
+            f"{bag.name}: no message of a topic that vessel.yaml names was recorded from --start {span.start_s:g} s to "
+            f"{span.end_s:g} s, of {span.bag_s:.1f} s: take another part"
+        )
+    return span
 
 
 def _asked_for(config: VesselConfig, bag: Bag) -> tuple[list[Readings], Beside | None, Beside | None]:
@@ -184,8 +201,11 @@ class _Reader:
                 item.logs_ns.append(raw.log_ns)
                 item.messages.append(msg)
         if raw.topic == TF_STATIC and self._tree is not None:
-            if msg is not None and raw.msgtype == TF:
-                self._tree.add(msg)
+            try:
+                if msg is not None and raw.msgtype == TF:
+                    self._tree.add(msg)
+            except AttributeError:  # the bag's definition of it is damaged
+                msg = None
             self._broken_mounts += msg is None
 
     def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:

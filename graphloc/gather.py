@@ -15,6 +15,7 @@ from graphloc.config import VesselConfig
 from graphloc.errors import ConfigError
 from graphloc.eval.match_picture import Gallery
 from graphloc.frames import Datum
+from graphloc.frontends._part import Bags
 from graphloc.frontends.aerial import match_bag
 from graphloc.frontends.tags.sightings import info_beside, sightings_of_bag
 from graphloc.frontends.tags.sizes import size_factors
@@ -99,9 +100,7 @@ class Gathering:
         )
 
 
-def with_sightings(
-    recording: Recording, config: VesselConfig, bags: Sequence[Path], progress: Progress = quiet
-) -> Recording:
+def with_sightings(recording: Recording, config: VesselConfig, bags: Bags, progress: Progress = quiet) -> Recording:
     """Add what every tag sensor sees; each sighting, and each thing that cannot be used, is a row of the ledger.
 
     Raises:
@@ -165,7 +164,7 @@ def _take_sized(gathered: Gathering, name: str, sightings: Sequence[TagSighting]
 class Scans:
     """Where scans are matched from: the bags, and the folder that relative image paths count from."""
 
-    bags: tuple[Path, ...]
+    bags: Bags
     folder: Path
 
 

@@ -36,6 +36,7 @@ from graphloc.errors import OutputError
 from graphloc.frames import Array, heading_deg_from_yaw
 from graphloc.ledger import LedgerRow
 from graphloc.plain import plain
+from graphloc.recording import Span
 from graphloc.solution import Solution
 from graphloc.time import utc_text
 from graphloc.trajectory import bounds_95
@@ -109,13 +110,14 @@ def write_run(
     command: str,
     metrics: Mapping[str, Any],
     warnings: Sequence[str] = (),
+    span: Span | None = None,
 ) -> None:
     """Write all files of a run but the report into an existing folder.
 
     Args:
         folder: where to. solution: what to write. config: its effective form goes along.
         inputs: SHA-256 of each input. command: the command line. metrics: tables as plain data.
-        warnings: all that the report shows.
+        warnings: all that the report shows. span: which part of the bag it is.
     """
     picked = thinned(solution.trajectory.stamps_ns, config.output.rate_hz)
     _csv(folder / "solution.csv", _solution_columns(solution), _solution_rows(solution, picked))
@@ -129,7 +131,7 @@ def write_run(
         _csv(folder / name, _BERTH_COLUMNS, _berth_rows(berth))
     with (folder / "vessel.effective.yaml").open("w", encoding="utf-8") as stream:
         YAML(typ="safe", pure=True).dump(effective(config), stream)
-    _run_json(folder / MARK, solution, config, inputs, command, metrics, warnings)
+    _run_json(folder / MARK, solution, config, inputs, command, metrics, warnings, span)
 
 
 def thinned(stamps: NDArray[np.int64], rate_hz: float) -> Array:
@@ -308,11 +310,13 @@ def _run_json(
     command: str,
     metrics: Mapping[str, Any],
     warnings: Sequence[str],
+    span: Span | None,
 ) -> None:
     names = ("graphloc", "gtsam", "numpy", "scipy", "rosbags", "pyproj")
     run = {
         "command": command,
         "inputs_sha256": dict(inputs),
+        "part": None if span is None else asdict(span),
         "versions": {"python": platform.python_version(), **{n: importlib.metadata.version(n) for n in names}},
         "datum": solution.datum.origin._asdict(),
         "stats": asdict(solution.stats),

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Container, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement, TagView
+from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory
 
 Progress = Callable[[str, int, int], None]
@@ -32,12 +33,45 @@ class SpeedSeries:
     speed_mps: Array
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Span:
+    """The part of a bag that a recording is, by the times at which messages were recorded.
+
+    Attributes:
+        start_s, end_s: s since the beginning of the bag, which is `bag_s` long.
+        start_ns, end_ns: of the clock of recording; the end is not in it.
+        messages, left_out: how many messages of a topic lie in it, and how many do not: those are no part of the run.
+    """
+
+    start_s: float
+    end_s: float
+    bag_s: float
+    start_ns: int
+    end_ns: int
+    messages: Mapping[str, int]
+    left_out: Mapping[str, int]
+
+    def of(self, topics: Container[str]) -> Span:
+        """Return it with the counts of some topics."""
+        inside, outside = ({t: n for t, n in c.items() if t in topics} for c in (self.messages, self.left_out))
+        return replace(self, messages=inside, left_out=outside)
+
+    def __str__(self) -> str:
+        """As said of a bag: which part, and what of it was taken."""
+        inside = sum(self.messages.values())
+        return (
+            f"{self.start_s:.1f} s to {self.end_s:.1f} s of {self.bag_s:.1f} s, begun at {utc_text(self.start_ns)}: "
+            f"{inside} of {inside + sum(self.left_out.values())} messages on the topics that vessel.yaml names; the "
+            "others are no part of this run"
+        )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recording:
     """What a front-end hands over.
 
     Attributes:
-        source: the bag's path, or '(simulated)'.
+        source: the bag's path, with which part of it, or '(simulated)'.
         imu: the inertial samples, or None where the run has none.
         measurements: everything else, ordered by stamp, then arrival.
         rows: ledger rows of messages that gave no measurement (malformed, rejected, ignored). Together
@@ -49,6 +83,7 @@ class Recording:
         check_speed: forward speed that is compared, not fused.
         tag_views: sightings of tags that are not in the survey.
         warnings: one line each, for the report.
+        span: which part of the bag it is; None: the whole.
     """
 
     source: str
@@ -62,6 +97,7 @@ class Recording:
     check_speed: SpeedSeries | None = None
     tag_views: tuple[TagView, ...] = ()
     warnings: tuple[str, ...] = ()
+    span: Span | None = None
 
     def lost(self, sensors: Container[str]) -> str:
         """Return a clause on why most of the messages of these sensors that gave nothing gave nothing; empty where none is."""

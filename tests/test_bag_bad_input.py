@@ -199,6 +199,20 @@ def test_bytes_that_are_no_message(tmp_path: Path) -> None:
 # values
 
 
+def test_a_definition_of_transforms_that_is_damaged(tmp_path: Path) -> None:
+    """The bytes of a field's name were hit: the message is read, and its transform is not in it."""
+    make = Messages(1)
+    static = make.transforms([("base_link", "gps", (1, 2, 0), (0, 0, 0, 1))])
+    path = write_bag(tmp_path / "run.bag", make, [("/tf_static", START_NS, static), *still_run(make)], "ros1")
+    content = path.read_bytes()
+    assert b"Transform transform" in content
+    path.write_bytes(content.replace(b"Transform transform", b"Transform trXnsform"))
+    with pytest.raises(InputError, match=r"gnss\.mount\.tf_frame: no chain from 'base_link' to 'gps'"):
+        read_recording(path, vessel(gnss={"topic": "/fix", "mount": {"tf_frame": "gps"}}))
+    recording = read_recording(path, vessel())
+    assert recording.message_count == accounted(recording) == 221
+
+
 def test_nan_and_zero_covariance(tmp_path: Path) -> None:
     items = still_run(MAKE)
     stamp = START_NS + 5 * S

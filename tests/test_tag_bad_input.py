@@ -99,6 +99,22 @@ def test_a_camera_info_that_cannot_be_read(tmp_path: Path, shown: NDArray[np.uin
     assert refused(path).endswith("no message can be read")
 
 
+def test_transforms_that_cannot_be_read_are_done_without(tmp_path: Path, shown: NDArray[np.uint8]) -> None:
+    make = Messages(2)
+    static, junk = (
+        make.transforms([("base_link", "lens", (1, 0, 0), (0, 0, 0, 1))]),
+        ("tf2_msgs/msg/TFMessage", b"\x01"),
+    )
+    mounted = tags(cameras={"bow": {"topic": IMAGE, "mount": {"tf_frame": "lens"}}})
+    shot = ((INFO, info(make)), (IMAGE, image(make, shown)))
+    found = look(bag_of(tmp_path, make, ("/tf_static", static), ("/tf_static", junk), *shot), mounted)
+    assert only(found).t_body_camera_m.tolist() == [1.0, 0.0, 0.0]
+    (tmp_path / "none").mkdir()
+    said = refused(bag_of(tmp_path / "none", make, ("/tf_static", static), ("/tf_static", junk), *shot),
+                   tags(cameras={"bow": {"topic": IMAGE, "mount": {"tf_frame": "mast"}}}))  # fmt: skip
+    assert "no chain from 'base_link' to 'mast'" in said
+
+
 def test_a_camera_info_that_changes(tmp_path: Path, shown: NDArray[np.uint8]) -> None:
     make = Messages(2)
     zoomed = info(make, Lens(K=(800.0, 243.0, 156.5)))

@@ -45,8 +45,10 @@ def first_screen(data: ReportData, verdict: Verdict) -> str:
         reasons = "".join(f'<li class="{_CLASS[r.trust]}">{escape(r.text)}</li>' for r in track.reasons)
         head = f"<h3>{escape(track.name)}: why</h3>" if several else ""
         lists.append(f'{head}<ul class="reasons">{reasons}</ul>')
+    span = data.recording.span
+    part = "" if span is None else f"<p><b>Part of the bag.</b> {escape(str(span))}.</p>"
     return (
-        f"{''.join(boxes)}{_key_numbers(data)}"
+        f"{''.join(boxes)}{_key_numbers(data)}{part}"
         f"<p><b>What it is measured against.</b> {escape(data.truth_statement)}</p>{''.join(lists)}"
     )
 

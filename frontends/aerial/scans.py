@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from graphloc.config import AerialConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
 from graphloc.frontends._mounts import mounts_of
+from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, decode_cloud
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn, outside
@@ -43,7 +44,7 @@ class ScanFeed:
 
 
 def match_bag(
-    paths: Sequence[Path],
+    bags: Bags,
     config: AerialConfig,
     folder: Path,
     body_frame: str,
@@ -61,7 +62,7 @@ def match_bag(
     Raises:
         InputError: no LiDAR, a topic that is not there, a mount that no chain leads to, a map that cannot be used.
     """
-    with Bag(paths) as bag:
+    with Bag(bags) as bag:
         feed = ScanFeed(bag, config, body_frame)
         matcher = LiveMatcher(config, folder, datum, feed.mounts)
         if at_ns is None:

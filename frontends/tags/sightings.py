@@ -8,7 +8,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from graphloc.config import AprilTagConfig, CameraConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends._mounts import mounts_of
+from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag, RawMessage
 from graphloc.frontends.decode import header_stamp_ns
 from graphloc.frontends.tags.bundles import Seeing, SeenTag, sightings_of
@@ -78,7 +78,7 @@ class _Raw:
 
 
 def sightings_of_bag(
-    paths: Sequence[Path], sensor: str, config: AprilTagConfig, body_frame: str, *, warn: Callable[[str], None]
+    bags: Bags, sensor: str, config: AprilTagConfig, body_frame: str, *, warn: Callable[[str], None]
 ) -> Iterator[Seen]:
     """Look for tags in all images of a bag, and read all lists.
 
@@ -95,7 +95,7 @@ def sightings_of_bag(
         families, max_hamming=config.max_hamming, min_margin=config.min_margin,
         numbers={"16h5": few_bits} if few_bits else None,
     )  # fmt: skip
-    with Bag(paths) as bag, ThreadPoolExecutor(_cores()) as pool:
+    with Bag(bags) as bag, ThreadPoolExecutor(_cores()) as pool:
         eyes = _eyes(bag, config, body_frame, warn)
         ahead: deque[Future[Seen]] = deque()
         for raw in bag.messages({eye.topic for eye in eyes.values()}):
@@ -143,7 +143,7 @@ def info_beside(topic: str) -> str:
 
 
 def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callable[[str], None]) -> Camera | None:
-    """The camera's calibration, from the first message of its CameraInfo."""
+    """The camera's calibration, from the first message of its CameraInfo, wherever the run begins."""
     topic = config.info_topic
     if not topic and listed:
         return None
@@ -157,7 +157,7 @@ def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callabl
     if rectified is None:
         rectified = listed or "rect" in config.topic.removesuffix("/compressed").rsplit("/", 1)[-1]
     first: Any = None
-    for raw in bag.messages({topic}):
+    for raw in bag.messages({topic}, whole=True):
         try:
             msg: Any = bag.decode(raw)
         except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; the next may be whole

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -21,6 +21,7 @@ from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Datum
+from graphloc.frontends._part import Bags
 from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
 from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
@@ -44,12 +45,12 @@ def configured(config_path: Path, changes: Mapping[str, object] = MappingProxyTy
 
 
 def load(
-    bags: Sequence[Path],
+    bags: Bags,
     config_path: Path,
     progress: Progress = quiet,
     changes: Mapping[str, object] = MappingProxyType({}),
 ) -> tuple[Recording, VesselConfig]:
-    """Read a vessel.yaml, some of its keys changed (`config.with_changes`), and the bag that it describes."""
+    """Read a vessel.yaml, some of its keys changed (`config.with_changes`), and the bag, or the part of it, that it describes."""
     config = configured(config_path, changes)
     recording = read_recording(bags, config, progress)
     return with_sightings(recording, config, bags, progress), config

@@ -101,6 +101,7 @@ def write(
             command=command,
             metrics={t.title: t.as_dict() for t in data.tables},
             warnings=run.warnings,
+            span=run.recording.span,
         )
         if run.tags:
             found_tags.write(fresh / found_tags.FILE, run.tags, run.config)

@@ -13,6 +13,7 @@ import typer
 from graphloc.cli._shared import (
     BagArgument,
     ConfigOption,
+    DurationOption,
     FiguresOption,
     HoldOutOption,
     JsonOption,
@@ -20,6 +21,7 @@ from graphloc.cli._shared import (
     OutOption,
     OverwriteOption,
     RerunOption,
+    StartOption,
     Wanted,
     progress,
     smooth_bags,
@@ -54,14 +56,18 @@ def smooth(
     bag: BagArgument,
     config: ConfigOption,
     out: OutOption,
+    start: StartOption = 0.0,
+    duration: DurationOption = None,
     hold_out: HoldOutOption = None,
     figures: FiguresOption = False,
     rerun: RerunOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Smooth a whole run and write the run folder with its report."""
-    wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun)
+    """Smooth a whole run, or a part of it, and write the run folder with its report."""
+    wanted = Wanted(
+        bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun, start=start, duration=duration
+    )  # fmt: skip
     smooth_bags(wanted, hold_out, compare=False)
 
 
@@ -69,6 +75,8 @@ def replay(
     bag: BagArgument,
     config: ConfigOption,
     out: OutOption,
+    start: StartOption = 0.0,
+    duration: DurationOption = None,
     rate: Annotated[
         float | None, typer.Option(min=0.01, help="Times the run's own time, as 1; by default as fast as it can.")
     ] = None,
@@ -81,7 +89,9 @@ def replay(
     """Run a bag through the online mode, as a vessel would have, and write the run folder."""
     from graphloc import app as application
 
-    wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun)
+    wanted = Wanted(
+        bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun, start=start, duration=duration
+    )  # fmt: skip
     wanted.check()
     recording, vessel, scans = wanted.load(progress())
     run = application.replay_recording(recording, vessel, scans=scans, rate=rate, lag_s=lag, status=status_line())
@@ -110,6 +120,8 @@ def match(
     config: ConfigOption,
     at: Annotated[float, typer.Option("--at", help="Time since the start of the run, s.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("match.png"),
+    start: StartOption = 0.0,
+    duration: DurationOption = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Match one scan to the aerial image, and draw it: scan on image, score, modes."""
@@ -123,8 +135,9 @@ def match(
     if out.exists() and not overwrite:
         raise OutputError(f"{out}: exists already; give another --out, or --overwrite")
     show = progress()
-    recording, vessel = application.load(bag, config, show)
-    found, _ = application.match_at(recording, vessel, application.Scans(tuple(bag), config.parent), at, show)
+    wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=False, start=start, duration=duration)
+    recording, vessel, scans = wanted.load(show)
+    found, _ = application.match_at(recording, vessel, scans, at, show)
     east, north, yaw = found.prior.pose
     typer.echo(
         f"prior: {east:.2f} m east, {north:.2f} m north, heading {float(heading_deg_from_yaw(yaw)):.1f} deg; 1 sigma "

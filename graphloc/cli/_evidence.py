@@ -10,12 +10,14 @@ from typing import Annotated
 import typer
 
 from graphloc.cli._shared import (
+    DurationOption,
     FiguresOption,
     HoldOutOption,
     JsonOption,
     OutOption,
     OverwriteOption,
     RerunOption,
+    StartOption,
     Wanted,
     smooth_bags,
 )
@@ -32,6 +34,8 @@ def compare(
     bag: _BagsOrRuns,
     out: OutOption,
     config: _ConfigIfBag = None,
+    start: StartOption = 0.0,
+    duration: DurationOption = None,
     hold_out: HoldOutOption = None,
     figures: FiguresOption = False,
     rerun: RerunOption = None,
@@ -50,8 +54,8 @@ def compare(
         if config is None:
             raise ConfigError(f"{bag[0]}: a bag needs its vessel.yaml: give --config")
         wanted = Wanted(
-            bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun
-        )
+            bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun, start=start, duration=duration
+        )  # fmt: skip
         smooth_bags(wanted, hold_out, compare=True)
         return
     other = next((path for path in bag if path not in runs), None)
@@ -59,8 +63,10 @@ def compare(
         raise ConfigError(
             f"{other}: is not the folder of a finished run, and {runs[0]} is: give either bags or run folders"
         )
-    if config is not None or hold_out is not None or figures or rerun is not None:
-        raise ConfigError(f"{runs[0]}: is a finished run: --config, --hold-out, --figures and --rerun are for bags")
+    if figures or start or any(given is not None for given in (config, hold_out, rerun, duration)):
+        raise ConfigError(
+            f"{runs[0]}: is a finished run: --config, --start, --duration, --hold-out, --figures and --rerun are for bags"
+        )
     _summarise(runs, out, overwrite=overwrite, as_json=as_json)
 
 

@@ -17,6 +17,7 @@ from graphloc.errors import GraphlocError
 if TYPE_CHECKING:  # heavy: they wait until a command runs
     from graphloc.app import Run, Scans
     from graphloc.config import VesselConfig
+    from graphloc.frontends._part import BagPart
     from graphloc.recording import Recording
 
 
@@ -25,6 +26,12 @@ class Stopped(GraphlocError):
 
 
 BagArgument = Annotated[list[Path], typer.Argument(help="A ROS 1 or ROS 2 bag; several for the parts of a split one.")]
+StartOption = Annotated[
+    float, typer.Option("--start", help="Begin so many seconds after the bag's beginning, by its recording times.")
+]
+DurationOption = Annotated[
+    float | None, typer.Option("--duration", help="Take so many seconds of the bag; by default to its end.")
+]
 ConfigOption = Annotated[Path, typer.Option("--config", "-c", help="The vessel.yaml.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")]
 HoldOutOption = Annotated[
@@ -145,12 +152,12 @@ def check_rerun(path: Path | None, overwrite: bool) -> None:
     check_writable(path)
 
 
-def write_rerun(path: Path | None, run: Run, bag: list[Path], config: Path) -> None:
+def write_rerun(path: Path | None, run: Run, bags: BagPart, config: Path) -> None:
     from graphloc.eval import rerun_log
 
     if path is not None:
         told = (run.solution, run.recording, run.config, run.filters)
-        rerun_log.write_rerun(path, *told, bags=bag, folder=config.parent)
+        rerun_log.write_rerun(path, *told, bags=bags, folder=config.parent)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,6 +171,15 @@ class Wanted:
     as_json: bool
     figures: bool = False
     rerun: Path | None = None
+    start: float = 0.0
+    duration: float | None = None
+
+    @property
+    def part(self) -> BagPart:
+        """The bag, or the part of it that is wanted."""
+        from graphloc.frontends._part import BagPart
+
+        return BagPart(tuple(self.bag), self.start, self.duration)
 
     def check(self, mark: str = "") -> None:
         """Refuse before the work what could not be written after it; `mark`: the file by which a folder is known as ours."""
@@ -173,11 +189,13 @@ class Wanted:
         check_rerun(self.rerun, self.overwrite)
 
     def load(self, show: Callable[[str, int, int], None]) -> tuple[Recording, VesselConfig, Scans]:
-        """Read the bag and its vessel.yaml."""
+        """Read the bag and its vessel.yaml; of a part of the bag say which it is."""
         from graphloc import app as application
 
-        recording, vessel = application.load(self.bag, self.config, show)
-        return recording, vessel, application.Scans(tuple(self.bag), self.config.parent)
+        recording, vessel = application.load(self.part, self.config, show)
+        if recording.span is not None:
+            typer.echo(f"{', '.join(str(p) for p in self.bag)}: {recording.span}", err=True)
+        return recording, vessel, application.Scans(self.part, self.config.parent)
 
     def write(self, run: Run) -> None:
         """Write the run folder, and tell of it."""
@@ -187,7 +205,7 @@ class Wanted:
         page = application.write(
             run, self.out, inputs=self.bag, command=command, overwrite=self.overwrite, figures=self.figures
         )
-        write_rerun(self.rerun, run, self.bag, self.config)
+        write_rerun(self.rerun, run, self.part, self.config)
         print_run(run, page, self.as_json, self.rerun)
 
     def write_page(self, page: str, mark: str, write: Callable[[Path, str], None], said: Sequence[str]) -> None:

@@ -12,12 +12,14 @@ import typer
 from graphloc.cli._shared import (
     BagArgument,
     ConfigOption,
+    DurationOption,
     HoldOutOption,
     JobsOption,
     JsonOption,
     OutOption,
     OverwriteOption,
     SeedOption,
+    StartOption,
     Wanted,
     progress,
 )
@@ -27,6 +29,8 @@ def ablate(
     bag: BagArgument,
     config: ConfigOption,
     out: OutOption,
+    start: StartOption = 0.0,
+    duration: DurationOption = None,
     hold_out: HoldOutOption = None,
     jobs: JobsOption = None,
     overwrite: OverwriteOption = False,
@@ -38,7 +42,9 @@ def ablate(
     from graphloc.eval.holdout import HoldOut
 
     held = None if hold_out is None else HoldOut.parse(hold_out)
-    wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json)
+    wanted = Wanted(
+        bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, start=start, duration=duration
+    )
     wanted.check(page.MARK)
     show = progress()
     recording, vessel, scans = wanted.load(show)
@@ -53,6 +59,8 @@ def drill(
     bag: BagArgument,
     config: ConfigOption,
     out: OutOption,
+    start: StartOption = 0.0,
+    duration: DurationOption = None,
     times: Annotated[int, typer.Option(min=1, help="How often each failure strikes, at other times.")] = 2,
     only: Annotated[
         list[str] | None,
@@ -67,7 +75,9 @@ def drill(
     from graphloc import drills
     from graphloc.eval.drill import page
 
-    wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json)
+    wanted = Wanted(
+        bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, start=start, duration=duration
+    )
     wanted.check(page.MARK)
     show = progress()
     recording, vessel, scans = wanted.load(show)

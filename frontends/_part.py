@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A part of a bag: which one is asked for, and when the messages of a file were recorded."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+from graphloc.errors import InputError
+
+Times = Iterator[tuple[str, NDArray[np.int64]]]
+_MCAP_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries: time and offset, 8 bytes each
+
+
+@dataclass(frozen=True, slots=True)
+class BagPart:
+    """Bags, and which part of them is the run, by recording times, as `rosbag play` counts them.
+
+    Attributes:
+        paths: of one recording. start_s: of the part, since the earliest message of them all.
+        duration_s: of the part; None: to the end.
+
+    Raises:
+        InputError: times that are none.
+    """
+
+    paths: tuple[Path, ...]
+    start_s: float = 0.0
+    duration_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.start_s < math.inf:
+            raise InputError(f"--start {self.start_s:g}: give seconds from the beginning of the bag, 0 or more")
+        if self.duration_s is not None and not 0.0 < self.duration_s < math.inf:
+            raise InputError(f"--duration {self.duration_s:g}: give how many seconds of the bag to take, more than 0")
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is all of the bag."""
+        return self.start_s == 0.0 and self.duration_s is None
+
+
+Bags = Path | str | Sequence[Path | str] | BagPart
+"""A .bag, .mcap or .db3 file, the folder of a ROS 2 bag, several of one kind (split bags), or a part of them."""
+
+
+def recording_times(reader: Reader1 | Reader2) -> Times:
+    """Yield topics and recording times (N,) ns of their messages, in pieces, from a file's index; nothing is unpacked.
+
+    An MCAP file without chunks has no index and is walked through. Raises whatever rosbags raises on bad bytes.
+    """
+    if isinstance(reader, Reader1):
+        for c in reader.connections:
+            yield c.topic, np.array([entry.time for entry in reader.indexes[c.id]], dtype=np.int64)
+        return
+    for storage in reader.storage.storages if isinstance(reader.storage, DirectoryReader) else [reader.storage]:
+        if isinstance(storage, Sqlite3Reader):
+            yield from _times_sqlite3(storage)
+        elif isinstance(storage, McapReader):
+            yield from _times_mcap(storage)
+
+
+def _times_sqlite3(storage: Sqlite3Reader) -> Times:
+    assert storage.dbconn is not None
+    for c in storage.connections:
+        rows: Any = storage.dbconn.execute("SELECT timestamp FROM messages WHERE topic_id = ?", (c.id,))
+        yield c.topic, np.array([time for (time,) in rows], dtype=np.int64)
+
+
+def _times_mcap(storage: McapReader) -> Times:
+    assert storage.bio is not None
+    if not storage.chunks:
+        found: dict[str, list[int]] = defaultdict(list)
+        for c, time, _ in storage.messages_scan(storage.connections):
+            found[c.topic].append(time)
+        yield from ((topic, _signed(np.array(times, dtype=np.uint64))) for topic, times in found.items())
+        return
+    topics = {c.id: c.topic for c in storage.connections}
+    for chunk in storage.chunks:
+        for channel, offset in chunk.message_index_offsets.items():
+            storage.bio.seek(offset)
+            *_, size = _MCAP_INDEX.unpack(storage.bio.read(_MCAP_INDEX.size))
+            if size > chunk.message_index_length:
+                raise ValueError(f"an index of {size} bytes in {chunk.message_index_length}")
+            entries = np.frombuffer(storage.bio.read(size), dtype="<u8").reshape(-1, 2)
+            yield topics[channel], _signed(entries[:, 0])
+
+
+def _signed(times: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Times of which those that no clock shows stay far in the future."""
+    return np.minimum(times, np.uint64(2**63 - 1)).astype(np.int64)
