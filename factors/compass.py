@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compass heading with a mount offset.
+"""Compass heading with a mount offset and the vessel's magnetic deviation.
 
-    z = yaw(R_world_body R_body_sensor) + o + w,   w ~ N(0, s^2),   o: constant offset of the mount
+    z = y + A + B sin(h) + C cos(h) + D sin(2h) + E cos(2h) + w,   w ~ N(0, s^2)
+    y = yaw(R_world_body R_body_sensor),   h = 90 deg - y, clockwise from north
+
+A: offset of the mount. B to E: what the vessel's iron does, as navigators write it (A. Smith's coefficients; east is
+positive): constants of the run. Taken for noise instead, a deviation of 4 deg bends the heading by 2 deg and takes most
+aerial matches for false.
 
 yaw(R) = atan2(R10, R00). With R <- R Exp(theta): d yaw / d theta = -(row 2 of R) . (x-hat cross-terms),
 worked out in `_yaw_jacobian`. GTSAM has no native factor with yaw and offset in one, so this one is
@@ -22,6 +27,8 @@ from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import CompassHeading
 
 _FLOOR_RAD = np.radians(0.05)  # no compass is better, whatever it says
+_HELD_RAD = 1e-6  # of a mount that is held fixed beside a deviation
+_SHARES = (1.0, 1.0, 0.5, 0.5)  # B and C come of permanent magnetism; D and E, of soft iron, are smaller
 
 
 def _yaw_jacobian(R: Array, x_body: Array, x_world: Array) -> Array:
@@ -39,18 +46,29 @@ def _axis(at: Attachment) -> tuple[Array, Array, Array]:
     return R, x_body, R @ x_body
 
 
+def _read(at: Attachment, yaw: float) -> tuple[float, Array, float]:
+    """What a compass reads, d / d the coefficients A to E (k,), as many as there are, and d / d yaw."""
+    if at.slow_value is None:
+        return yaw, np.zeros(0), 1.0
+    s, c = math.sin(yaw), math.cos(yaw)
+    n = len(at.slow_value)
+    terms = np.array([1.0, c, s, 2.0 * s * c, s * s - c * c])[:n]
+    slopes = np.array([0.0, -s, c, 2.0 * (c * c - s * s), 4.0 * s * c])[:n]
+    return yaw + float(terms @ at.slow_value), terms, 1.0 + float(slopes @ at.slow_value)
+
+
 def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual predicted - measured (1,) in rad."""
     R, x_body, x = _axis(at)
-    offset = 0.0 if at.slow_value is None else float(at.slow_value[0])
-    raw = np.array([math.remainder(math.atan2(x[1], x[0]) + offset - m.yaw_rad, math.tau)])
+    read, terms, slope = _read(at, math.atan2(x[1], x[0]))
+    raw = np.array([math.remainder(read - m.yaw_rad, math.tau)])
     sigma = max(m.sigma_rad, _FLOOR_RAD)
     return (
         Residual(
             raw=raw,
             cov=np.array([[sigma**2]]),
-            jacobian=lambda: _yaw_jacobian(R, x_body, x)[None, :],
-            slow_jacobian=lambda: np.eye(1),
+            jacobian=lambda: slope * _yaw_jacobian(R, x_body, x)[None, :],
+            slow_jacobian=lambda: terms[None, :],
             prior=1.0,
             size_m=None,
             size_deg=abs(math.degrees(raw[0])),
@@ -62,30 +80,32 @@ def factors(m: CompassHeading, config: CompassConfig, at: Attachment, decision: 
     """Return the factor of one heading."""
     residual = residuals(m, config, at)[0]
     terms = [pose_term(at, residual.jacobian())]
-    if at.slow_key is not None:
-        terms.append(Term(at.slow_key, np.array(at.slow_value), np.eye(1)))
+    if at.slow_key is not None and residual.slow_jacobian is not None:
+        terms.append(Term(at.slow_key, np.array(at.slow_value), residual.slow_jacobian()))
     return linear_update(residual, terms, decision)
 
 
 def slow(config: CompassConfig) -> SlowProcess | None:
-    """Return the mount offset that the configuration asks for."""
-    if config.mount_offset_sigma_deg == 0.0:
+    """Return mount offset and deviation, as far as the configuration asks for them."""
+    mount, deviation = np.radians([config.mount_offset_sigma_deg, config.deviation_sigma_deg])
+    if mount == 0.0 and deviation == 0.0:
         return None
+    sigma = np.array([max(mount, _HELD_RAD), *(deviation * share for share in _SHARES if deviation)])
+    n = len(sigma)
     return SlowProcess(
         name="compass offset",
-        axes=("yaw",),
-        units=("deg",),
-        scale=np.array([180.0 / np.pi]),
-        sigma=np.radians([config.mount_offset_sigma_deg]),
-        time_constant_s=np.array([np.inf]),
+        axes=("yaw", "B", "C", "D", "E")[:n],
+        units=("deg",) * n,
+        scale=np.full(n, 180.0 / np.pi),
+        sigma=sigma,
+        time_constant_s=np.full(n, np.inf),
     )
 
 
 def ideal(at: Attachment, config: CompassConfig) -> CompassHeading:
     """Return the heading that the attachment's estimate would give."""
     _, _, x = _axis(at)
-    offset = 0.0 if at.slow_value is None else float(at.slow_value[0])
-    yaw = float(wrap_angle(np.arctan2(x[1], x[0]) + offset))
+    yaw = float(wrap_angle(np.array(_read(at, math.atan2(x[1], x[0]))[0])))
     return CompassHeading(stamp_ns=0, sensor="compass", seq=0, yaw_rad=yaw, sigma_rad=np.radians(config.sigma_deg))
 
 

@@ -32,7 +32,7 @@ from graphloc import keys
 from graphloc.build import JUMP, Problem, Stream, build_graph
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision
+from graphloc.graph import Attachment, Decision, SlowProcess
 from graphloc.offsets import Misfit, Offset, Offsets, Probe
 from graphloc.solve._batch import BatchResult
 
@@ -42,6 +42,7 @@ _ROUNDS, _SAME_WEIGHT, _SAME = 6, 0.2, 0.1
 # How far an offset may be off while weights are chosen, 1 sigma: m, rad, s.
 _FREE: dict[Offset, float] = {"x": 3.0, "y": 3.0, "yaw": 0.5, "time": 1.0}
 _LEAST_WEIGHT = 1e-6
+_HELD_RAD = 1e-6  # of a mount that is no state
 _DRAWS = 16  # random vectors that a trace is estimated with
 _NOISE_ROUNDS, _LEAST_FREEDOM, _UNLIKELY = 5, 3.0, 1e-4
 
@@ -131,8 +132,8 @@ def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values]:
     streams = []
     for stream in problem.streams:
         slow, left_out = stream.slow, stream.left_out
-        if slow is not None and slow.axes == ("yaw",) and not np.isfinite(slow.time_constant_s).any():
-            slow = None
+        if slow is not None and slow.axes[0] == "yaw" and not np.isfinite(slow.time_constant_s).any():
+            slow = _without_mount(problem, stream, slow, values)
         if left_out is not None:
             slow = left_out
             for j in range(len(problem.timeline.slow_stamps_ns)):
@@ -147,7 +148,7 @@ def _linearised(problem: Problem, values: gtsam.Values, result: BatchResult) -> 
     for key, verdict in result.verdicts.items():
         if verdict.decision is not None:
             plain = Decision(mode=verdict.decision.mode, weight=verdict.decision.weight)
-            decided[key] = (plain, _attached(problem, streams[key[0]], key[1], verdict.at))
+            decided[key] = (plain, _attached(problem, streams[key[0]], key[1], verdict.at, values))
     graph, guess = build_graph(problem, values, decided, 0, last, result.prior, jumps=False, made=made)
     kernels = [
         (factors, kernel)
@@ -168,14 +169,22 @@ def _linearised(problem: Problem, values: gtsam.Values, result: BatchResult) -> 
     return _Rows(J=J, b=b, states=last + 1, starts=starts, stamps_ns=stamps, made=made, kernels=kernels)
 
 
-def _attached(problem: Problem, stream: Stream, i: int, at: Attachment) -> Attachment:
+def _without_mount(problem: Problem, stream: Stream, slow: SlowProcess, values: gtsam.Values) -> SlowProcess | None:
+    """A compass's slow state with its mount held where it is configured, in `values` too; None where that is all of it."""
+    if len(slow.axes) == 1:
+        return None
+    for j in range(len(problem.timeline.slow_stamps_ns)):
+        key = keys.slow(stream.number, j)
+        values.update(key, np.concatenate([[0.0], values.atVector(key)[1:]]))
+    return replace(slow, sigma=np.concatenate([[_HELD_RAD], slow.sigma[1:]]))
+
+
+def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: gtsam.Values) -> Attachment:
     """An attachment of the solution, to the slow states that the stream has here."""
     if stream.slow is None:
         return replace(at, slow_key=None, slow_value=None, slow_next=None)
-    if at.slow_key is None:
-        key = keys.slow(stream.number, int(problem.timeline.slow_of[stream.state[i]]))
-        return replace(at, slow_key=key, slow_value=np.zeros(len(stream.slow.sigma)))
-    return at
+    key = keys.slow(stream.number, int(problem.timeline.slow_of[stream.state[i]]))
+    return replace(at, slow_key=key, slow_value=np.atleast_1d(values.atVector(key)))
 
 
 def _jumps(problem: Problem, held: list[Any]) -> list[int]:
