@@ -9,7 +9,7 @@ import pytest
 
 from graphloc.config import KernelConfig
 from graphloc.factors import KINDS, SENSORS
-from graphloc.frames import Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.graph import Attachment, Decision, Sensor
 from graphloc.measurements import CompassHeading
 
@@ -156,6 +156,31 @@ def test_compass_sign_and_wrap() -> None:
     at = replace(at, T_world_body=gtsam.Pose3(gtsam.Rot3.Yaw(np.pi - 0.01), np.zeros(3)))
     m = replace(cast(CompassHeading, row.ideal(at, config)), yaw_rad=-np.pi + 0.01)  # 0.02 rad further, across the wrap
     assert row.residuals(m, config, at)[0].raw[0] == pytest.approx(-0.02)
+
+
+def test_a_compass_reads_what_a_deviation_table_says() -> None:
+    """A ship heading 030 deg whose offset is 2 deg and whose B, C, D, E are 3, -1, 0.5, 0.25: read by hand; slopes by differences."""
+    row = next(r for r in SENSORS if r.kind == "compass")
+    config = row.config(kind="compass")
+    coefficients = np.radians([2.0, 3.0, -1.0, 0.5, 0.25])
+
+    def heading(deg: float, moved: Array) -> Attachment:
+        at = replace(attachment(row, config, tilt=0.0), T_state_sensor=gtsam.Pose3(), slow_value=coefficients + moved)
+        return replace(at, T_world_body=gtsam.Pose3(gtsam.Rot3.Yaw(np.radians(90.0 - deg)), np.zeros(3)))
+
+    def read(deg: float, moved: Array) -> float:
+        return float(cast(CompassHeading, row.ideal(heading(deg, moved), config)).yaw_rad)
+
+    still = np.zeros(5)
+    deviation = 3.0 * 0.5 - 1.0 * np.sqrt(0.75) + 0.5 * np.sqrt(0.75) + 0.25 * 0.5
+    assert np.degrees(read(30.0, still)) == pytest.approx(60.0 + 2.0 + deviation)
+    m = cast(CompassHeading, row.ideal(heading(30.0, still), config))
+    residual = row.residuals(m, config, heading(30.0, still))[0]
+    assert residual.slow_jacobian is not None
+    slopes = [(read(30.0, 1e-6 * step) - read(30.0, -1e-6 * step)) / 2e-6 for step in np.eye(5)]
+    np.testing.assert_allclose(residual.slow_jacobian()[0], slopes, atol=1e-6)
+    by_yaw = (read(30.0 - 1e-4, still) - read(30.0 + 1e-4, still)) / np.radians(2e-4)
+    assert residual.jacobian()[0, 2] == pytest.approx(by_yaw, abs=1e-6)
 
 
 @pytest.mark.parametrize("weight", [1.0, 0.25])

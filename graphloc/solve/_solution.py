@@ -132,12 +132,15 @@ def left_out(streams: Sequence[Any]) -> Array:
     return total
 
 
-def _far_from_prior(stream: Stream, result: BatchResult) -> float:
-    """How many of its sigmas a constant slow state (a mount's offset) lies from zero; 0 where there is none."""
-    if stream.slow is None:
-        return 0.0
-    value = np.atleast_1d(result.values.atVector(keys.slow(stream.number, 0))) / stream.slow.sigma
-    return float(np.abs(value[~np.isfinite(stream.slow.time_constant_s)]).max(initial=0.0))
+def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
+    """How many of its sigmas a constant slow state (a mount's offset) lies from zero, 0 where there is none; which, and where."""
+    slow = stream.slow
+    if slow is None:
+        return 0.0, ""
+    value = np.atleast_1d(result.values.atVector(keys.slow(stream.number, 0)))
+    far = np.where(np.isfinite(slow.time_constant_s), 0.0, np.abs(value) / slow.sigma)
+    k = int(np.argmax(far))
+    return float(far[k]), f"{slow.axes[k]} {value[k] * slow.scale[k]:.1f} {slow.units[k]}"
 
 
 def _misfit(stats: SolveStats, result: BatchResult) -> str:
@@ -312,11 +315,11 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
             "mount, a unit or a time offset is wrong"
         )
     for stream in problem.streams:
-        far = _far_from_prior(stream, result)
+        far, where = _far_from_prior(stream, result)
         if far > _FAR_OFF:
             warnings.append(
-                f"{stream.name}: its {stream.slow.name if stream.slow else 'offset'} is estimated {far:.1f} sigmas from "
-                "what the configuration allows for: check its mount and the IMU's, or raise that sigma"
+                f"{stream.name}: its {stream.slow.name if stream.slow else 'offset'} is estimated {far:.1f} sigmas ({where}) "
+                "from what the configuration allows for: check its mount and convention and the IMU's mount, or raise that sigma"
             )
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
             if result.values.exists(key):
