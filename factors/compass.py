@@ -28,6 +28,7 @@ from graphloc.measurements import CompassHeading
 
 _FLOOR_RAD = np.radians(0.05)  # no compass is better, whatever it says
 _HELD_RAD = 1e-6  # of a mount that is held fixed beside a deviation
+_DEVIATION = ("B", "C", "D", "E")
 _SHARES = (1.0, 1.0, 0.5, 0.5)  # B and C come of permanent magnetism; D and E, of soft iron, are smaller
 
 
@@ -94,11 +95,12 @@ def slow(config: CompassConfig) -> SlowProcess | None:
     n = len(sigma)
     return SlowProcess(
         name="compass offset",
-        axes=("yaw", "B", "C", "D", "E")[:n],
+        axes=("yaw", *_DEVIATION)[:n],
         units=("deg",) * n,
         scale=np.full(n, 180.0 / np.pi),
         sigma=sigma,
         time_constant_s=np.full(n, np.inf),
+        no_tails=_DEVIATION,
     )
 
 

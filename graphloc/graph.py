@@ -132,6 +132,7 @@ class SlowProcess:
     Attributes:
         name: for outputs. axes: k names. units: k of them. scale: (k,) from the state's units to these.
         sigma: (k,) standing size. time_constant_s: (k,) correlation time; inf for a constant.
+        no_tails: axes of constants that are never far from zero; a mount may be turned by any angle.
         jumps: put a robust loss on its steps.
         needs_company: leave it out where no second sensor can tell it from motion; its size is then
             added to the bounds.
@@ -143,6 +144,7 @@ class SlowProcess:
     scale: Array
     sigma: Array
     time_constant_s: Array
+    no_tails: tuple[str, ...] = ()
     jumps: bool = False
     needs_company: bool = False
 

@@ -48,11 +48,14 @@ def of(ablated: Ablated, name: str) -> Effect:
 
 
 def test_a_bad_compass_shows_without_truth(bad: tuple[SimulatedRun, Ablated]) -> None:
-    """12 deg over the root of its 1.06 deg, the 1 deg that its mount may be off, and the heading's own bound."""
+    """12 deg over the root of its 1.06 deg, the 1 deg that its mount may be off, its deviation, and the heading's own bound."""
     _, found = bad
     compass = of(found, "compass")
     heading_deg = (compass.bound_deg or 0.0) / 1.96
-    expected = OFF_DEG / np.sqrt(1.5**2 / 2.0 + 1.0 + heading_deg**2) / 0.6745  # the median of |N(0, 1)|
+    deviation_deg2 = 1.5**2 + 0.75**2  # B sin + C cos, and D, E likewise, at any heading
+    expected = (
+        OFF_DEG / np.sqrt(1.5**2 / 2.0 + 1.0 + deviation_deg2 + heading_deg**2) / 0.6745
+    )  # the median of |N(0, 1)|
     assert compass.contradiction == pytest.approx(expected, rel=0.1)
     assert compass.apart_deg == pytest.approx(OFF_DEG, abs=1.0)
     assert found.basis == "full"

@@ -36,8 +36,9 @@ def bias_step(links: InertialLink, j: int, dt_s: float) -> Any:
 def slow_begin(slow: SlowProcess, key: int, known: Array) -> Any:
     """Return the prior of a chain's first node; `known`: its estimate, for the tails of what is constant."""
     constant = ~np.isfinite(slow.time_constant_s)
-    # Why tails: see `_add_constants` in `_graph.py`. Each axis has its own: a turned mount says nothing of deviation.
+    # Why tails: see `_add_constants` in `_graph.py`.
     tails = np.sqrt(1.0 + (known / slow.sigma) ** 2 / CONSTANT_TAILS)
+    tails[[axis in slow.no_tails for axis in slow.axes]] = 1.0
     ends = slow.sigma * np.where(constant, tails, np.sqrt(CHAIN_END))
     return gtsam.PriorFactorVector(key, np.zeros(len(ends)), gtsam.noiseModel.Diagonal.Sigmas(ends))
 
