@@ -2,7 +2,7 @@
 """Compass heading with a mount offset and the vessel's magnetic deviation.
 
     z = y + A + B sin(h) + C cos(h) + D sin(2h) + E cos(2h) + w,   w ~ N(0, s^2)
-    y = yaw(R_world_body R_body_sensor),   h = 90 deg - y, clockwise from north
+    y = yaw(R_world_body R_body_sensor),   h = 90 deg - y: heading of the sensor's own x axis, clockwise from north
 
 A: offset of the mount. B to E: what the vessel's iron does, as navigators write it (A. Smith's coefficients; east is
 positive): constants of the run. Taken for noise instead, a deviation of 4 deg bends the heading by 2 deg and takes most
@@ -27,7 +27,6 @@ from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import CompassHeading
 
 _FLOOR_RAD = np.radians(0.05)  # no compass is better, whatever it says
-_HELD_RAD = 1e-6  # of a mount that is held fixed beside a deviation
 _DEVIATION = ("B", "C", "D", "E")
 _SHARES = (1.0, 1.0, 0.5, 0.5)  # B and C come of permanent magnetism; D and E, of soft iron, are smaller
 
@@ -89,9 +88,9 @@ def factors(m: CompassHeading, config: CompassConfig, at: Attachment, decision: 
 def slow(config: CompassConfig) -> SlowProcess | None:
     """Return mount offset and deviation, as far as the configuration asks for them."""
     mount, deviation = np.radians([config.mount_offset_sigma_deg, config.deviation_sigma_deg])
-    if mount == 0.0 and deviation == 0.0:
+    if mount == 0.0:
         return None
-    sigma = np.array([max(mount, _HELD_RAD), *(deviation * share for share in _SHARES if deviation)])
+    sigma = np.array([mount, *(deviation * share for share in _SHARES if deviation)])
     n = len(sigma)
     return SlowProcess(
         name="compass offset",

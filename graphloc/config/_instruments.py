@@ -132,7 +132,8 @@ class CompassConfig(SensorConfig):
     use_reported_sigma: bool = True
     """Take the yaw variance of an `Imu` message where it is positive and finite."""
     mount_offset_sigma_deg: NonNegative = 1.0
-    """Unknown but constant heading offset of the mount, 1 sigma, deg; 0 holds the mount fixed."""
+    """Unknown but constant heading offset of the mount, 1 sigma, deg; 0 holds the mount fixed, and what is read for free of
+    deviation."""
     deviation_sigma_deg: NonNegative = 1.5
     """Magnetic deviation: coefficients B and C (of sine and cosine of the heading), 1 sigma, deg; D and E (of twice the
     heading) are half of it. 0: none, as of a GNSS compass."""

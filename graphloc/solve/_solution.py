@@ -319,7 +319,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
         if far > _FAR_OFF:
             warnings.append(
                 f"{stream.name}: its {stream.slow.name if stream.slow else 'offset'} is estimated {far:.1f} sigmas ({where}) "
-                "from what the configuration allows for: check its mount and convention and the IMU's mount, or raise that sigma"
+                "from what the configuration allows for: check its mount and the IMU's, or raise that sigma"
             )
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
             if result.values.exists(key):
