@@ -173,3 +173,11 @@ def still_run(make: Messages, seconds: float = 4.0, start_ns: int = START_NS) ->
         if k % 10 == 0:
             items.append(("/fix", stamp + 10_000_000, make.fix(stamp)))
     return items
+
+
+def damage_last_chunk(path: Path) -> None:
+    """Overwrite some bytes of a ROS 1 bag in lz4, in its last chunk; its index stays whole."""
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"compression=lz4") + 60
+    data[at : at + 200] = bytes(200)
+    path.write_bytes(bytes(data))

@@ -13,7 +13,7 @@ from graphloc.frontends.bag import read_recording
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
 from graphloc.recording import Recording
-from tests.bagfactory import START_NS, Item, Messages, S, still_run, write_bag
+from tests.bagfactory import START_NS, Item, Messages, S, damage_last_chunk, still_run, write_bag
 from tests.test_bag import accounted, vessel
 
 MAKE = Messages(2)
@@ -149,10 +149,7 @@ def test_damage_in_the_middle_keeps_what_came_before(tmp_path: Path) -> None:
     """A chunk whose bytes are wrong; the index, at the end, is whole and announces all messages."""
     make = Messages(1)
     path = write_bag(tmp_path / "run.bag", make, still_run(make, 120.0), "ros1", "lz4")
-    data = bytearray(path.read_bytes())
-    at = data.rindex(b"compression=lz4") + 60
-    data[at : at + 200] = bytes(200)
-    path.write_bytes(bytes(data))
+    damage_last_chunk(path)
     recording = read_recording(path, vessel())
     assert recording.imu is not None
     assert 100 < len(recording.imu) < 6000

@@ -26,7 +26,7 @@ from graphloc.frontends.bag import read_recording
 from graphloc.frontends.tags.sightings import sightings_of_bag
 from graphloc.ledger import Outcome
 from graphloc.recording import Recording, quiet
-from tests.bagfactory import START_NS, Item, Messages, S, still_run, write_bag
+from tests.bagfactory import START_NS, Item, Messages, S, damage_last_chunk, still_run, write_bag
 from tests.commands import called
 from tests.tagimages import IMAGE, INFO, MIDDLE, image, info, picture, tags
 from tests.test_bag import accounted, vessel
@@ -187,10 +187,7 @@ def test_damage_in_the_part_is_counted(tmp_path: Path) -> None:
     """The index announces what lies in the part; what cannot be read of it is malformed, not left out."""
     make = Messages(1)
     path = write_bag(tmp_path / "run.bag", make, still_run(make, 120.0), "ros1", "lz4")
-    content = bytearray(path.read_bytes())
-    at = content.rindex(b"compression=lz4") + 60
-    content[at : at + 200] = bytes(200)
-    path.write_bytes(bytes(content))
+    damage_last_chunk(path)
     recording = read_recording(BagPart((path,), 10.0), vessel())
     assert recording.imu is not None
     lost = {row.topic: row.count for row in recording.rows if row.outcome is Outcome.MALFORMED}
