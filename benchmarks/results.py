@@ -19,6 +19,7 @@ from typing import Any
 
 import batch
 import calibration
+import compass
 import docking
 import drills
 import fuzz
@@ -38,6 +39,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "A.4": smoothing.starts,
     "A.5": smoothing.outages,
     "A.6": smoothing.speed,
+    "A.dev": compass.figures,
     "B.1": simulator.signals,
     "B.2": simulator.overlays,
     "B.3": simulator.tags,
