@@ -13,24 +13,28 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import bl_scenario, simulate
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
-from graphloc.solve._decide import by_hypotheses
-from graphloc.solve._hypotheses import FalseSequence, best_chain
+from graphloc.solve._best_chain import best_chain
+from graphloc.solve._decide import Verdict, by_hypotheses
+from graphloc.solve._hypotheses import FalseSequence
 
 SIGMA_M = 0.2
 
 
-@pytest.fixture
-def sequence() -> FalseSequence:
+@pytest.fixture(params=["all in the estimate", "some new"])
+def sequence(request: pytest.FixtureRequest) -> FalseSequence:
     rng = np.random.default_rng(2)
-    right, fresh = rng.normal(-1.0, 2.0, 7), rng.normal(-1.5, 1.0, 7)
-    return FalseSequence(right, fresh, np.concatenate([fresh[:1], fresh[1:] + rng.normal(0.0, 2.0, 6)]))
+    right, fresh = rng.normal(-1.0, 2.0, (2, 7)), rng.normal(-1.5, 1.0, (2, 7))
+    repeated = np.concatenate([fresh[:, :1], fresh[:, 1:] + rng.normal(0.0, 2.0, (2, 6))], axis=1)
+    new = np.array([False, False, True, False, True, True, True]) & (request.param == "some new")
+    return FalseSequence(right, fresh, repeated, new)
 
 
 def log_joint(s: FalseSequence, false: tuple[bool, ...]) -> float:
-    total = 0.0
+    total, seen = 0.0, 0  # whether a new one was right before
     for n, is_false in enumerate(false):
         repeated = n > 0 and false[n - 1]
-        total += (s.repeated[n] if repeated else s.fresh[n]) if is_false else s.right[n]
+        total += (s.repeated[seen, n] if repeated else s.fresh[seen, n]) if is_false else s.right[seen, n]
+        seen |= int(s.new[n] and not is_false)
     return float(total)
 
 
@@ -79,14 +83,49 @@ def test_a_loose_prediction_believes_but_one_of_two_that_contradict_each_other()
     stream, indices, residuals = stream_of(offsets)
     for n, m in enumerate(stream.measurements):
         m.stamp_ns = n // 2 * 1_000_000_000
-    stream.row.one_likelihood = False
-    at: Any = None
-    loose: list[Array | None] = [np.eye(2) * 2.0**2 for _ in offsets]
-    verdicts = by_hypotheses(stream, list(indices), [at] * 2 * count, residuals, loose)
+    verdicts = judged(stream, indices, residuals, [np.eye(2) * 2.0 for _ in offsets])
     weights = np.array([v.weight for v in verdicts]).reshape(-1, 2)
     assert weights[:, 0].min() > 0.9
     assert weights[:, 1].max() == 0.0
     assert all(v.decision is None for v in verdicts[1::2])
+
+
+def judged(
+    stream: Any, indices: range, residuals: list[tuple[Residual, ...]], roots: list[Array | None]
+) -> list[Verdict]:
+    stream.row.one_likelihood = False
+    at: Any = None
+    return by_hypotheses(stream, list(indices), [at] * len(residuals), residuals, roots)
+
+
+def test_right_ones_after_a_hole_are_no_repeated_false_one() -> None:
+    """The prediction is good to 20 m and 15 m off; every third match is false."""
+    rng, count = np.random.default_rng(7), 20
+    offsets = np.array([12.0, -9.0]) + rng.normal(0.0, SIGMA_M, (count, 2))
+    false = np.arange(count) % 3 == 1
+    offsets[false] += rng.uniform(2.0, 5.0, (int(false.sum()), 2))
+    verdicts = judged(*stream_of(offsets), [np.eye(2) * 20.0 for _ in offsets])
+    weights = np.array([v.weight for v in verdicts])
+    assert weights[~false].min() > 0.9
+    assert weights[false].max() < 0.1
+
+
+def test_what_repeats_far_outside_the_prediction_is_false() -> None:
+    """Five that agree with each other, 5 m off where the prediction is good to 0.7 m: each later one alone would do."""
+    offsets = np.array([4.0, 3.0]) + np.random.default_rng(8).normal(0.0, 0.05, (5, 2))
+    verdicts = judged(*stream_of(offsets), [np.eye(2) * 0.7 for _ in offsets])
+    assert max(v.weight for v in verdicts) < 0.1
+
+
+def test_a_heading_that_is_loose_moves_what_is_ahead_and_abeam_apart() -> None:
+    """30 m ahead and 30 m abeam, heading 6 deg off and good to 5: residuals of 3 m across each, one error."""
+    off_rad = np.radians(6.0)
+    arms = np.array([[0.0, 30.0], [-30.0, 0.0]] * 5)  # d raw / d heading
+    offsets = arms * off_rad + np.random.default_rng(9).normal(0.0, SIGMA_M, (10, 2))
+    roots: list[Array | None] = [
+        np.column_stack([np.eye(2) * 0.3, arm * np.radians(5.0)]) for arm in arms
+    ]  # place and heading
+    assert min(v.weight for v in judged(*stream_of(offsets), roots)) > 0.9
 
 
 def test_nothing_but_noise_makes_no_long_chain() -> None:

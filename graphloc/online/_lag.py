@@ -39,8 +39,10 @@ from graphloc.measurements import Measurement
 from graphloc.online._anchor import Anchor, Beside, beside, without_prior
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window, keys_of
+from graphloc.solve._best_chain import best_chain
 from graphloc.solve._decide import NEGLIGIBLE, Verdict, by_hypotheses
-from graphloc.solve._hypotheses import best_chain, sequence_of
+from graphloc.solve._foreseen import root_of
+from graphloc.solve._hypotheses import log_evidence_of
 from graphloc.solve._solution import AGREES, row_of
 
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
@@ -458,7 +460,7 @@ class Lag:
                 e.measurement, stream.config, attach(self.problem, stream, e.index, values)
             ) for e in own
         ]  # fmt: skip
-        evidence = sequence_of(stream, [e.index for e in own], found, [None] * len(own)).log_evidence()
+        evidence = log_evidence_of(stream, [e.index for e in own], found)
         return self._window.error([e.held for e in own if e.held is not None]) - evidence
 
     def _judged(self, stream: LiveStream, back: int = 0) -> list[_Entry]:
@@ -494,8 +496,8 @@ class Lag:
         plain = nis = residual.nis()
         opened = False
         if fresh and own.kind != "none" and nis > scale**2:
-            unsure = self._unsure(stream, at, stream.state[i], residual)
-            nis = residual.nis(unsure)
+            root = self._unsure(stream, at, stream.state[i], residual)
+            nis = residual.nis(root @ root.T)
             opened = plain > 1.5 * nis
             scale *= float(np.sqrt(plain / max(nis, 1e-9))) if opened else 1.0
         if fresh:
@@ -504,16 +506,15 @@ class Lag:
         return Verdict(Decision(kernel=kernel), kernel.weight(plain), 1.0, residual, 0, at), opened
 
     def _unsure(self, stream: LiveStream, at: Attachment, k: int, residual: Residual) -> Array:
-        """Covariance (m, m) of what is predicted of a residual, from pose and slow state together."""
+        """Root (m, n) of the covariance of what is predicted of a residual, from pose and slow state together."""
         timeline, window = self.problem.timeline, self._window
         base = min(k, self._committed)
-        wanted = [keys.pose(base)]
-        J = residual.jacobian()
-        if residual.slow_jacobian is not None and at.slow_key is not None:
+        wanted, size = [keys.pose(base)], 6
+        if residual.slow_jacobian is not None and at.slow_value is not None:
             wanted.append(keys.slow(stream.number, timeline.slow_of[base]))
-            J = np.hstack([J, residual.slow_jacobian()])
+            size += len(at.slow_value)
         if any(not window.is_committed(key) for key in wanted):
-            return np.zeros((len(residual.raw),) * 2)
+            return np.zeros((len(residual.raw), size))
         P = np.array(window.covariance(wanted))
         if base != k:  # what velocity and the IMU's noise add on the way: much, across a gap
             from_ns, to_ns = timeline.stamps_ns[base], timeline.stamps_ns[k]
@@ -521,7 +522,7 @@ class Lag:
             P[3:6, 3:6] += ((to_ns - from_ns) * 1e-9) ** 2 * R.T @ self._newest.velocity_cov @ R
             pim = self.problem.links.integrate(from_ns, to_ns, self._newest.bias)
             P[:6, :6] += np.asarray(pim.preintMeasCov())[:6, :6]
-        return np.asarray(J @ P @ J.T)
+        return root_of(residual, at, P)
 
     def _by_hypotheses(self, stream: LiveStream, own: list[_Entry]) -> bool:
         """Judge measurements of a stream as one sequence; what is new, by the prediction. Tell whether it may change yet."""
@@ -532,11 +533,11 @@ class Lag:
         residuals = [
             stream.row.residuals(e.measurement, stream.config, at) for e, at in zip(own, attached, strict=True)
         ]
-        predicted = [
+        roots = [
             self._unsure(stream, at, e.state, found[0]) if e.held is None and e.verdict.decision is None and not e.judged else None
             for e, at, found in zip(own, attached, residuals, strict=True)
         ]  # fmt: skip
-        verdicts = by_hypotheses(stream, [e.index for e in own], attached, residuals, predicted)
+        verdicts = by_hypotheses(stream, [e.index for e in own], attached, residuals, roots)
         for entry, verdict in zip(own, verdicts, strict=True):
             settled = entry.verdict.settled + (entry.judged and verdict.mode != entry.verdict.mode)
             if not entry.judged or verdict.weight >= AGREES:

@@ -17,13 +17,16 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 
 from graphloc.build import Decisions, Judged, Problem, Stream, attach
 from graphloc.chi2 import chi2_median
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
-from graphloc.solve._hypotheses import best_chain, sequence_of
+from graphloc.solve._best_chain import best_chain
+from graphloc.solve._foreseen import foresee, root_of
+from graphloc.solve._hypotheses import log_evidence_of, sequence_of
 
 # By stage, for every sensor that has a kernel at all: Huber is convex, so a start that is tens of metres
 # off still pulls in; Cauchy forgets outliers better and still lets the truth back in.
@@ -61,15 +64,12 @@ Verdicts = dict[tuple[int, int], Verdict]
 
 
 def _predicted(found: tuple[Residual, ...], at: Attachment, k: int, covariance: PredictedCovariance) -> Array | None:
-    """Covariance (k, k) of the prediction, from those of the pose and of the slow state; None: it is no prediction."""
+    """Root (k, m) of the prediction's covariance, from those of the pose and of the slow state; None: it is no prediction."""
     P = covariance(k, at.pose_key)
     if P is None:
         return None
-    terms = [(found[0].jacobian(), P)]
-    if found[0].slow_jacobian is not None and at.slow_key is not None:
-        S = covariance(k, at.slow_key)
-        terms += [] if S is None else [(found[0].slow_jacobian(), S)]
-    return np.asarray(sum(J @ C @ J.T for J, C in terms))
+    slow = None if found[0].slow_jacobian is None or at.slow_key is None else covariance(k, at.slow_key)
+    return root_of(found[0], at, P if slow is None else block_diag(P, slow))
 
 
 def weigh(
@@ -112,11 +112,11 @@ def weigh(
             for i, at in zip(indices, attached, strict=True)
         ]
         if several and hypotheses:
-            predicted = [
+            roots = [
                 _predicted(r, at, int(stream.state[i]), covariance)
                 for i, at, r in zip(indices, attached, residuals, strict=True)
             ]
-            found = by_hypotheses(stream, indices, attached, residuals, predicted)
+            found = by_hypotheses(stream, indices, attached, residuals, roots)
         else:
             found = _by_kernel(stream, attached, residuals, stage)
         verdicts.update({(stream.number, i): v for i, v in zip(indices, found, strict=True)})
@@ -173,31 +173,30 @@ def by_hypotheses(
     indices: list[int],
     attached: list[Attachment],
     residuals: list[tuple[Residual, ...]],
-    predicted: list[Array | None],
+    roots: list[Array | None],
 ) -> list[Verdict]:
     """Judge measurements of a sensor that can be false, as a sequence (see `sequence_of`).
 
-    Each by itself, a prediction that is loose believes measurements that contradict each other. Both in the graph bend
-    it to where neither is right, so only the most probable chain of those is believed that agree with each other.
+    Two that contradict each other, both in the graph, bend a loose prediction to where neither is right. So of what is
+    judged by a prediction (its root is given), only the most probable chain of those is believed that agree.
     """
-    posterior = sequence_of(stream, indices, residuals, predicted).posterior()
-    new = {n: P for n, P in enumerate(predicted) if P is not None}
-    chain: dict[int, int | None] = {}
-    if len(new) > 1:
+    new = {n: root for n, root in enumerate(roots) if root is not None}
+    chain: list[int | None] = [None] * len(residuals)
+    if new:
         chosen = best_chain(stream, [indices[n] for n in new], [residuals[n] for n in new], list(new.values()))
-        chain = dict(zip(new, chosen, strict=True))
+        for n, mode in zip(new, chosen, strict=True):
+            chain[n] = mode
+    foreseen = foresee(stream, indices, residuals, roots, chain)
+    posterior = sequence_of(stream, indices, residuals, roots, foreseen).posterior()
     verdicts = []
-    for n, found in enumerate(residuals):
-        logs = np.array([r.log_density(predicted[n]) for r in found])
-        mode = int(np.argmax(logs))
-        weight = float(posterior[n])
-        if n in chain:
-            on = chain[n]
-            mode, weight = (mode, 0.0) if on is None else (on, weight)
+    for n, (modes, cov, _) in enumerate(foreseen):
+        logs = np.array([r.log_density(cov) for r in modes])
+        on = chain[n]
+        mode, weight = int(np.argmax(logs)) if on is None else on, float(posterior[n])
         share = float(np.exp(logs[mode] - np.logaddexp.reduce(logs)))
         weight *= 1.0 if stream.row.one_likelihood else share
         kept = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
-        verdicts.append(Verdict(kept, weight, share, found[mode], mode, attached[n]))
+        verdicts.append(Verdict(kept, weight, share, residuals[n][mode], mode, attached[n]))
     return verdicts
 
 
@@ -208,7 +207,7 @@ def log_evidence(problem: Problem, values: gtsam.Values, first: int, last: int) 
         if stream.row.false is not None:
             indices = stream.between(first, last)
             residuals = [_residuals_at(problem, stream, i, values)[1] for i in indices]
-            total += sequence_of(stream, indices, residuals, [None] * len(indices)).log_evidence()
+            total += log_evidence_of(stream, indices, residuals)
     return total
 
 

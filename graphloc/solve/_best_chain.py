@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which measurements of a sensor are right, wherever that is.
+
+An estimate in the wrong place still has the right shape, so the residuals of the right measurements lie along one
+slowly moving offset from it. Where the estimate is a prediction, loose enough to believe two measurements that
+contradict each other, it tells which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from graphloc.build import Judged
+from graphloc.frames import Array
+from graphloc.graph import Residual
+from graphloc.solve._foreseen import carried, moved, taken_of, walk_of
+from graphloc.solve._hypotheses import log_repeat
+
+_LOOK_BACK = 64  # candidates for the right one before
+
+
+def best_chain(
+    stream: Judged,
+    indices: Sequence[int],
+    residuals: Sequence[tuple[Residual, ...]],
+    roots: Sequence[Array] | None = None,
+) -> list[int | None]:
+    """Return which mode of each of N measurements of a stream is right on the most probable chain; None: none is.
+
+    The longest path: nodes are modes taken for right, and an edge gains what its end gains over being false, as
+    its begin tells where it should be. False ones between that repeat each other gain too.
+
+    Args:
+        roots: N of the prediction (see `root_of`), which bounds where a chain begins; None: it may lie anywhere.
+    """
+    taken, models = taken_of(stream, indices)
+    dof, count = len(residuals[0][0].raw), len(residuals)
+    if any(len(found[0].raw) != dof for found in residuals):
+        return [None] * count
+    nothing = np.array(
+        [np.log(m.probability) - 0.5 * (np.linalg.slogdet(2.0 * np.pi * m.cov)[1] + dof) for m in models]
+    )
+    stamps = np.array([m.stamp_ns for m in taken]) * 1e-9
+    walk = np.array([walk_of(m) for m in models])
+    again = np.zeros(count)
+    for n in range(1, count):
+        repeats, age_s = models[n].repeats, stamps[n] - stamps[n - 1]
+        walked = walk[n] * age_s + (0.0 if roots is None else moved(roots[n - 1], roots[n], age_s))
+        same = np.log(max(repeats * models[n].probability, 1e-12))
+        same += log_repeat(residuals[n - 1], residuals[n], walked)
+        again[n] = max(0.0, float(np.logaddexp(np.log1p(-repeats), same - nothing[n])))
+    gained = np.concatenate([[0.0], np.cumsum(again)])  # by false ones that repeat, up to and without n
+    node = [(n, mode) for n, found in enumerate(residuals) for mode in range(len(found))]
+    at = np.array([n for n, _ in node])
+    raw = np.array([residuals[n][mode].raw for n, mode in node])
+    cov = np.array([residuals[n][mode].cov for n, mode in node])
+    alone = np.log([residuals[n][mode].prior for n, mode in node]) - nothing[at]
+    of_node = None if roots is None else np.array(roots)[at]
+    score, before = np.zeros(len(node)), np.full(len(node), -1)
+    for k, n in enumerate(at):
+        if of_node is None:
+            nis, begun = float(dof), cov[k] + models[n].cov
+        else:
+            begun = cov[k] + of_node[k] @ of_node[k].T
+            nis = float(raw[k] @ np.linalg.solve(begun, raw[k]))
+        score[k] = alone[k] + gained[n] - 0.5 * (np.linalg.slogdet(2.0 * np.pi * begun)[1] + nis)
+        lo, hi = np.searchsorted(at, [n - _LOOK_BACK, n])
+        if lo == hi:
+            continue
+        ages_s = stamps[n] - stamps[at[lo:hi]]
+        expected, left = raw[lo:hi], cov[lo:hi]
+        if of_node is not None:
+            expected, left = carried(expected, left, of_node[lo:hi], of_node[k], ages_s)
+        spread, step = left + cov[k] + ages_s[:, None, None] * walk[n], expected - raw[k]
+        off = np.einsum("ni,ni->n", step, np.linalg.solve(spread, step[:, :, None])[:, :, 0])
+        path = score[lo:hi] + alone[k] - 0.5 * (off + np.linalg.slogdet(2.0 * np.pi * spread)[1])
+        path += np.maximum(gained[n] - gained[np.minimum(at[lo:hi] + 2, n)], 0.0)
+        best = int(np.argmax(path))
+        if path[best] > score[k]:
+            score[k], before[k] = path[best], lo + best
+    ends = score + np.maximum(gained[count] - gained[np.minimum(at + 2, count)], 0.0)
+    chosen: list[int | None] = [None] * count
+    k = int(np.argmax(ends))
+    while k >= 0:
+        n, mode = node[k]
+        chosen[n] = mode
+        k = int(before[k])
+    return chosen
