@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 
 from graphloc.blocks import MountConfig
 from graphloc.frames import Array
@@ -18,15 +17,23 @@ def mounts_of(
 ) -> dict[str, tuple[Array, Array]]:
     """Return (t (3,), R (3, 3)) in body of each sensor, by name; `block` is what vessel.yaml calls their list.
 
+    What of `/tf_static` cannot be decoded is told to `bag.warnings`: another message may be whole.
+
     Raises:
         InputError: no chain of transforms leads from the body to a sensor.
     """
-    tree = StaticTree()
+    tree, broken = StaticTree(), 0
     if any(mount.tf_frame for mount in mounts.values()):
         for raw in bag.messages({TF_STATIC}):
-            with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; another may be whole
+            try:
                 if raw.msgtype == TF:
                     tree.add(bag.decode(raw))
+            except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
+                broken += 1
+    if broken:
+        bag.warnings.append(
+            f"{bag.name}: {TF_STATIC}: {broken} messages cannot be decoded; {block} have their mounts from the rest"
+        )
     return {
         name: tree.mount(body_frame, mount.tf_frame, f"{bag.name}: {block}.{name}.mount.tf_frame")
         if mount.tf_frame
