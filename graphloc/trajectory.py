@@ -73,7 +73,8 @@ class Trajectory:
     def at(self, stamps_ns: NDArray[np.int64]) -> Trajectory:
         """Return the trajectory at M stamps inside its span (cubic Hermite in position, slerp in attitude).
 
-        Covariances are those of the nearest pose; velocities are the derivative of the position.
+        Velocities are the derivative of the position. Covariances are linear in between as the position is, and so never
+        too small where an estimate jumps: the nearest one alone, after an outage, was that of the fix for a place halfway.
         """
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         if len(stamps) and (stamps[0] < self.stamps_ns[0] or stamps[-1] > self.stamps_ns[-1]):
@@ -91,8 +92,8 @@ class Trajectory:
         cov = None
         if self.cov is not None:
             right = np.clip(np.searchsorted(t, s), 1, len(t) - 1)
-            nearest = np.where(s - t[right - 1] < t[right] - s, right - 1, right)
-            cov = self.cov[near][nearest]
+            share = ((s - t[right - 1]) / np.maximum(t[right] - t[right - 1], 1e-9))[:, None, None]
+            cov = (1.0 - share) * self.cov[near][right - 1] + share * self.cov[near][right]
         return Trajectory(
             stamps_ns=stamps,
             p_world_m=position,
