@@ -24,6 +24,7 @@ T = TypeVar("T")
 # Residuals that say how wide a sensor scatters: with 50, a compass that is 100 deg off for 7 s is then taken for a wide one,
 # and turns the vessel.
 _REMEMBERED = 300
+_PAGE_S = 1.0  # states leave together by so much
 
 
 class Tape(Generic[T]):
@@ -86,6 +87,17 @@ class LiveTimeline:
     def due_ns(self) -> int:
         """Stamp of the next state."""
         return self.stamps_ns[self.last] + self._period_ns
+
+    def seconds(self, stamp_ns: int) -> float:
+        """Return s from the first state that there was."""
+        return (stamp_ns - self._start_ns) * 1e-9
+
+    def page_s(self, stamp_ns: int) -> float:
+        """Return when keys of a stamp are told to be from, s: those of a page leave together.
+
+        What leaves is re-eliminated together with all that is newer: once a second, and not at every state.
+        """
+        return float(np.ceil(self.seconds(stamp_ns) / _PAGE_S)) * _PAGE_S
 
     def append(self, stamp_ns: int) -> None:
         step = (stamp_ns - self._start_ns) // self._slow_ns

@@ -21,10 +21,11 @@ from graphloc.config import VesselConfig
 from graphloc.errors import in_one_line
 from graphloc.estimate import Estimate
 from graphloc.frames import Array, Datum
-from graphloc.graph import UNKNOWN_MPS2, UNKNOWN_RADPS, InertialRow, Sensor
+from graphloc.graph import InertialRow, Sensor
 from graphloc.hangs import WHY
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
+from graphloc.online._ahead import ahead, carry_on, no_further
 from graphloc.online._anchor import Anchor, sound
 from graphloc.online._intake import ImuIntake
 from graphloc.online._lag import Lag
@@ -312,7 +313,8 @@ class OnlineSmoother:
                 except Exception as error:  # noqa: BLE001 - as in `_advance`; nothing of it is staged yet
                     self._drop(m, Outcome.REJECTED, f"it could not be used: {in_one_line(error)}")
             lag.judge()
-            self._go(lag, before.stamp_ns, reached)
+            assert self._odometry is not None
+            carry_on(self._odometry, lag.problem, lag.newest, before.stamp_ns, reached)
             lag.commit()
             lag.try_others()
         self._settle(lag.gone())
@@ -339,31 +341,6 @@ class OnlineSmoother:
                 lag.take(m)
             self._own_due_ns[name] = at_ns + duration_ns(getattr(stream.config, "period_s", 1.0))
 
-    def _go(self, lag: Lag, before_ns: int, until_ns: int) -> None:
-        """Carry the odometry on, from the newest state or from where it is already, as the IMU says."""
-        odometry, newest, links = self._odometry, lag.newest, lag.problem.links
-        assert odometry is not None
-        if until_ns <= odometry.stamp_ns:
-            return
-        start = gtsam.NavState(newest.pose, newest.velocity)
-        if before_ns < odometry.stamp_ns:
-            start = links.integrate(before_ns, odometry.stamp_ns, newest.bias).predict(start, newest.bias)
-            before_ns = odometry.stamp_ns
-        pim = links.integrate(before_ns, until_ns, newest.bias)
-        there = pim.predict(start, newest.bias)
-        dp, dR = self._body_step(lag, start.pose(), there.pose())
-        R, noise = start.attitude().matrix(), np.asarray(pim.preintMeasCov())[:6, :6]
-        v_cov = R.T @ newest.velocity_cov @ R
-        odometry.step(until_ns, (until_ns - before_ns) * 1e-9, dp, dR, there.pose().rotation().matrix(), v_cov, noise)
-
-    @staticmethod
-    def _body_step(lag: Lag, a: gtsam.Pose3, b: gtsam.Pose3) -> tuple[Array, Array]:
-        """The step of the body's origin, from that of the IMU's place."""
-        lever = -lag.problem.t_body_imu_m
-        R = a.rotation().matrix()
-        dp = R.T @ (b.transformFrom(lever) - a.transformFrom(lever))
-        return dp, R.T @ b.rotation().matrix()
-
     # Estimates
 
     def predict(self, stamp_ns: int | None = None) -> Estimate | None:
@@ -382,34 +359,18 @@ class OnlineSmoother:
     def _estimate(self, lag: Lag, stamp_ns: int | None = None) -> Estimate:
         """The newest state, or what the IMU makes of it at a stamp after (a stamp before is answered with the state)."""
         assert self._odometry is not None
-        newest, links, odometry = lag.newest, lag.problem.links, self._odometry
-        pose, v, at_ns = newest.pose, newest.velocity, newest.stamp_ns
-        p_odom, R_odom = odometry.p_m, odometry.R
-        pose_cov, v_cov = newest.pose_cov, newest.velocity_cov
-        if stamp_ns is not None and stamp_ns > at_ns:
+        newest, problem, odometry = lag.newest, lag.problem, self._odometry
+        now = no_further(newest, odometry)
+        if stamp_ns is not None and stamp_ns > newest.stamp_ns:
             assert self._intake.newest is not None
             self._read(lag)
-            pim = links.integrate(at_ns, stamp_ns, newest.bias)
-            there = pim.predict(gtsam.NavState(pose, v), newest.bias)
-            p_odom, R_odom = odometry.after(*self._body_step(lag, pose, there.pose()))
-            dt_s, noise = (stamp_ns - at_ns) * 1e-9, pim.preintMeasCov()
-            dR = pose.rotation().between(there.pose().rotation()).matrix()
-            pose_cov = _turned(pose_cov, dR.T)
-            R = there.pose().rotation().matrix()
-            pose_cov[3:, 3:] += dt_s**2 * R.T @ v_cov @ R + noise[3:6, 3:6]
-            pose_cov[:3, :3] += noise[:3, :3]
-            v_cov = v_cov + noise[6:, 6:]
             blind_s = (stamp_ns - self._intake.newest.stamp_ns) * 1e-9
-            if blind_s > self._gap_s:
-                pose_cov[:3, :3] += UNKNOWN_RADPS**2 * blind_s * np.eye(3)
-                pose_cov[3:, 3:] += UNKNOWN_MPS2**2 * blind_s**3 / 3.0 * np.eye(3)
-                v_cov = v_cov + UNKNOWN_MPS2**2 * blind_s * np.eye(3)
-            pose, v, at_ns = there.pose(), np.asarray(there.velocity()), stamp_ns
-        lever = -lag.problem.t_body_imu_m
-        R = pose.rotation().matrix()
-        gyro = links.gyro_at(np.array([at_ns]))[0] - lag.problem.R_body_imu @ newest.bias.gyroscope()
-        cov = world_covariance(sound(pose_cov), R, lever)
-        cov[:3, :3] += left_out(list(lag.problem.streams.values()))
+            now = ahead(problem, newest, odometry, stamp_ns, blind_s if blind_s > self._gap_s else 0.0)
+        at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
+        R = now.pose.rotation().matrix()
+        gyro = problem.links.gyro_at(np.array([at_ns]))[0] - problem.R_body_imu @ newest.bias.gyroscope()
+        cov = world_covariance(sound(now.pose_cov), R, lever)
+        cov[:3, :3] += left_out(list(problem.streams.values()))
         agreed = {**self._agreed_ns, **lag.agreed_ns}
         since = {n: max((at_ns - agreed[n]) * 1e-9, 0.0) if n in agreed else np.inf for n in self._absolute}
         health, reason = health_of(cov, since, self._doubt)
@@ -417,13 +378,13 @@ class OnlineSmoother:
             reason = f"{reason}; {self._doubt}"
         return Estimate(
             stamp_ns=at_ns,
-            p_world_m=np.asarray(pose.transformFrom(lever)),
+            p_world_m=np.asarray(now.pose.transformFrom(lever)),
             R_world_body=R,
-            v_world_mps=v + R @ np.cross(gyro, lever),
+            v_world_mps=now.velocity + R @ np.cross(gyro, lever),
             cov=cov,
-            v_cov=v_cov,
-            p_odom_m=np.array(p_odom),
-            R_odom_body=np.array(R_odom),
+            v_cov=now.velocity_cov,
+            p_odom_m=np.array(now.p_odom_m),
+            R_odom_body=np.array(now.R_odom_body),
             step_cov=odometry.step_cov,
             gyro_radps=gyro,
             accel_bias_mps2=np.asarray(newest.bias.accelerometer()),
@@ -752,9 +713,3 @@ def _series(samples: Sequence[ImuSample]) -> ImuSeries:
         gyro_radps=np.array([m.gyro_radps for m in samples]).reshape(-1, 3),
         seqs=np.array([m.seq for m in samples], dtype=np.int64),
     )
-
-
-def _turned(cov: Array, R: Array) -> Array:
-    """A covariance (6, 6) of the body tangent, in turned axes."""
-    both = np.kron(np.eye(2), R)
-    return np.asarray(both @ cov @ both.T)

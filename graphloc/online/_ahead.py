@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the IMU makes of the newest state: where the vessel is by now, and the next step of the odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from graphloc.frames import Array
+from graphloc.graph import UNKNOWN_MPS2, UNKNOWN_RADPS
+from graphloc.online._live import LiveProblem
+from graphloc.online._odometry import Odometry
+from graphloc.online._states import Newest
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ahead:
+    """A state at some stamp.
+
+    Attributes:
+        pose, velocity: of the IMU's place, gtsam.Pose3 and (3,). pose_cov: (6, 6), in the body tangent.
+        velocity_cov: (3, 3). p_odom_m, R_odom_body: (3,) and (3, 3), of the body's origin.
+    """
+
+    stamp_ns: int
+    pose: gtsam.Pose3
+    velocity: Array
+    pose_cov: Array
+    velocity_cov: Array
+    p_odom_m: Array
+    R_odom_body: Array
+
+
+def no_further(newest: Newest, odometry: Odometry) -> Ahead:
+    """Return the newest state itself."""
+    return Ahead(
+        stamp_ns=newest.stamp_ns,
+        pose=newest.pose,
+        velocity=newest.velocity,
+        pose_cov=newest.pose_cov,
+        velocity_cov=newest.velocity_cov,
+        p_odom_m=odometry.p_m,
+        R_odom_body=odometry.R,
+    )
+
+
+def ahead(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: int, blind_s: float) -> Ahead:
+    """Return what becomes of the newest state until a later stamp; blind_s: for how long (s) of it nothing is known of its motion."""
+    pim = problem.links.integrate(newest.stamp_ns, stamp_ns, newest.bias)
+    pose = newest.pose
+    there = pim.predict(gtsam.NavState(pose, newest.velocity), newest.bias)
+    p_odom, R_odom = odometry.after(*_body_step(problem, pose, there.pose()))
+    dt_s, noise = (stamp_ns - newest.stamp_ns) * 1e-9, pim.preintMeasCov()
+    dR = pose.rotation().between(there.pose().rotation()).matrix()
+    pose_cov = _turned(newest.pose_cov, dR.T)
+    R = there.pose().rotation().matrix()
+    pose_cov[3:, 3:] += dt_s**2 * R.T @ newest.velocity_cov @ R + noise[3:6, 3:6]
+    pose_cov[:3, :3] += noise[:3, :3]
+    v_cov = newest.velocity_cov + noise[6:, 6:]
+    if blind_s > 0.0:
+        pose_cov[:3, :3] += UNKNOWN_RADPS**2 * blind_s * np.eye(3)
+        pose_cov[3:, 3:] += UNKNOWN_MPS2**2 * blind_s**3 / 3.0 * np.eye(3)
+        v_cov = v_cov + UNKNOWN_MPS2**2 * blind_s * np.eye(3)
+    return Ahead(
+        stamp_ns=stamp_ns,
+        pose=there.pose(),
+        velocity=np.asarray(there.velocity()),
+        pose_cov=pose_cov,
+        velocity_cov=v_cov,
+        p_odom_m=p_odom,
+        R_odom_body=R_odom,
+    )
+
+
+def carry_on(odometry: Odometry, problem: LiveProblem, newest: Newest, before_ns: int, until_ns: int) -> None:
+    """Carry the odometry on, from the newest state (`before_ns`) or from where it is already, as the IMU says."""
+    links = problem.links
+    if until_ns <= odometry.stamp_ns:
+        return
+    start = gtsam.NavState(newest.pose, newest.velocity)
+    if before_ns < odometry.stamp_ns:
+        start = links.integrate(before_ns, odometry.stamp_ns, newest.bias).predict(start, newest.bias)
+        before_ns = odometry.stamp_ns
+    pim = links.integrate(before_ns, until_ns, newest.bias)
+    there = pim.predict(start, newest.bias)
+    dp, dR = _body_step(problem, start.pose(), there.pose())
+    R, noise = start.attitude().matrix(), np.asarray(pim.preintMeasCov())[:6, :6]
+    v_cov = R.T @ newest.velocity_cov @ R
+    odometry.step(until_ns, (until_ns - before_ns) * 1e-9, dp, dR, there.pose().rotation().matrix(), v_cov, noise)
+
+
+def _body_step(problem: LiveProblem, a: gtsam.Pose3, b: gtsam.Pose3) -> tuple[Array, Array]:
+    """The step of the body's origin, from that of the IMU's place."""
+    lever = -problem.t_body_imu_m
+    R = a.rotation().matrix()
+    dp = R.T @ (b.transformFrom(lever) - a.transformFrom(lever))
+    return dp, R.T @ b.rotation().matrix()
+
+
+def _turned(cov: Array, R: Array) -> Array:
+    """A covariance (6, 6) of the body tangent, in turned axes."""
+    both = np.kron(np.eye(2), R)
+    return np.asarray(both @ cov @ both.T)

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The measurements of the last seconds: how each was judged, and its factors in the window."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from graphloc.build import attach
+from graphloc.graph import Attachment, Residual
+from graphloc.ledger import LedgerRow
+from graphloc.measurements import Measurement
+from graphloc.online._constants import Constants
+from graphloc.online._live import LiveProblem, LiveStream
+from graphloc.online._window import Held, Window, keys_of
+from graphloc.solve._decide import NEGLIGIBLE, Verdict
+from graphloc.solve._solution import row_of
+
+_CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
+_MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
+_SAME = 1e-9  # m, rad: the solver has linearised a pose anew, or not
+
+
+@dataclass(slots=True, eq=False)
+class Entry:
+    """A measurement in the window."""
+
+    stream: LiveStream
+    index: int
+    verdict: Verdict
+    held: Held | None = None
+    written: Any = None  # the pose whose tangent its factors are written in
+    opened: bool = False  # its kernel bends later than configured
+    judged: bool = False  # as a hypothesis, once at least
+
+    @property
+    def measurement(self) -> Measurement:
+        return self.stream.measurements[self.index]
+
+    @property
+    def state(self) -> int:
+        return self.stream.state[self.index]
+
+    def reaches(self, first: int) -> bool:
+        """Whether the states that it is carried from are still there."""
+        carry = self.stream.carry[self.index]
+        return self.state >= first and (carry is None or carry[0] >= first)
+
+    def weighs_other(self, verdict: Verdict) -> bool:
+        """Whether the weight is so much another that it is decided anew."""
+        return abs(verdict.weight - self.verdict.weight) > _CHANGED
+
+    def differs(self, verdict: Verdict) -> bool:
+        """Whether what is in the graph is not what was decided, or is linearised elsewhere."""
+        old = self.verdict
+        if (self.held is None) != (verdict.decision is None):
+            return True
+        if verdict.decision is None or old.decision is None:
+            return False
+        return (
+            verdict.mode != old.mode
+            or abs(verdict.decision.weight - old.decision.weight) > _CHANGED
+            or _moved(old.at.T_world_body, verdict.at.T_world_body)
+        )
+
+
+class Entries:
+    """Those in the window. What was decided of each is in the graph, or staged: who judges it says so by `change`."""
+
+    def __init__(self, problem: LiveProblem, window: Window, constants: Constants) -> None:
+        self._problem, self._window, self._constants = problem, window, constants
+        self._entries: dict[tuple[int, int], Entry] = {}
+        self._gone: list[LedgerRow] = []
+
+    def reachable(self, entry: Entry) -> bool:
+        """Whether it can still be judged: neither it has left, nor the states that it is carried from."""
+        here = (entry.stream.number, entry.index) in self._entries
+        return here and entry.reaches(self._problem.timeline.first)
+
+    def of(self, stream: LiveStream) -> list[Entry]:
+        """Return those of a stream that can still be judged, by stamp."""
+        own = [e for e in self._all_reachable() if e.stream is stream]
+        return sorted(own, key=lambda e: (e.measurement.stamp_ns, e.index))
+
+    def _all_reachable(self) -> Iterator[Entry]:
+        first = self._problem.timeline.first
+        return (e for e in self._entries.values() if e.reaches(first))
+
+    def residuals_at(self, stream: LiveStream, index: int) -> tuple[Attachment, tuple[Residual, ...]]:
+        """Return where a measurement meets the states as they are now estimated, and its residuals there, one for each mode."""
+        at = attach(self._problem, stream, index, self._window.values)
+        return at, stream.row.residuals(stream.measurements[index], stream.config, at)
+
+    # In the graph
+
+    def add(self, entry: Entry) -> None:
+        """Take a new one in, as it was judged."""
+        self._put(entry)
+        self._entries[(entry.stream.number, entry.index)] = entry
+
+    def change(self, entry: Entry, verdict: Verdict) -> None:
+        """Take an entry out of the graph, and in again as it is judged now; it stays where its part has left."""
+        if entry.held is not None:
+            if not self._window.remove(entry.held):
+                return
+            entry.held = None
+        entry.verdict = verdict
+        self._put(entry)
+
+    def _put(self, entry: Entry) -> None:
+        """Stage the factors of an entry."""
+        stream, verdict = entry.stream, entry.verdict
+        m = entry.measurement
+        if verdict.decision is None or verdict.decision.weight <= NEGLIGIBLE:
+            return
+        window, timeline = self._window, self._problem.timeline
+        t = timeline.page_s(timeline.stamps_ns[entry.state])
+        at = replace(verdict.at, T_solver=window.linearised_at(verdict.at.pose_key))
+        update = stream.row.factors(m, stream.config, at, verdict.decision)
+        for key, value in update.guesses:
+            if not window.values.exists(key):
+                window.guess(key, value, t)
+        used = {key for factor in update.factors for key in keys_of(factor)}
+        self._constants.use(stream, used)
+        entry.held, entry.written = window.add(update.factors), at.T_solver
+
+    def carry_anew(self, torn: Collection[int]) -> None:
+        """Integrate anew the ways from these states to measurements: samples of them came late."""
+        for entry in self._all_reachable():
+            carry = entry.stream.carry[entry.index]
+            if carry is not None and carry[0] in torn:
+                self._problem.carry_anew(entry.stream, entry.index)
+                if entry.held is not None:
+                    self._write(entry)
+
+    def follow_solver(self) -> None:
+        """Write anew what is written in a tangent that the solver has left, or before its next slow node came."""
+        self._write_anew(self._left_behind)
+
+    def follow_estimate(self) -> None:
+        """Write anew what is linear about a place that the estimate has left: judged there, right ones look false."""
+        self._write_anew(self._elsewhere)
+
+    def _write_anew(self, stale: Callable[[Entry], bool]) -> None:
+        """Stage anew, at the estimate, the stale ones of the factors that see to centimetres: of sensors with hypotheses."""
+        for entry in self._all_reachable():
+            if entry.stream.row.false is not None and entry.held is not None and stale(entry):
+                self._write(entry)
+
+    def _write(self, entry: Entry) -> None:
+        at = attach(self._problem, entry.stream, entry.index, self._window.values)
+        self.change(entry, replace(entry.verdict, at=at))
+
+    def _left_behind(self, entry: Entry) -> bool:
+        at = entry.verdict.at
+        loose = at.slow_key is not None and at.slow_next is None
+        # See `graphloc.linear.pose_term` for the tangents.
+        return loose or not self._window.linearised_at(at.pose_key).equals(entry.written, _SAME)
+
+    def _elsewhere(self, entry: Entry) -> bool:
+        at = entry.verdict.at
+        return _moved(at.T_world_body, self._window.values.atPose3(at.pose_key))
+
+    def expected_cost(self) -> float:
+        """Return the weighted squares that are to be expected of what is in the graph: as many as axes, by weight."""
+        held = [e.verdict for e in self._entries.values() if e.held is not None]
+        return sum((v.residual.rows or len(v.residual.raw)) * v.weight for v in held)
+
+    # In the ledger
+
+    def let_go(self) -> None:
+        """Forget the measurements whose states are forgotten."""
+        problem, first = self._problem, self._problem.timeline.first
+        for key, entry in list(self._entries.items()):
+            if entry.state < first:
+                self._gone.append(_row(entry))
+                del self._entries[key]
+        for stream in problem.streams.values():
+            kept = min((i for n, i in self._entries if n == stream.number), default=len(stream.measurements))
+            for tape in (stream.measurements, stream.state, stream.carry, stream.gyro_radps):
+                tape.forget(kept)
+
+    def gone(self) -> list[LedgerRow]:
+        """Return rows of measurements that have left since this was last asked."""
+        rows, self._gone = self._gone, []
+        return [row for row in rows if row.seq >= 0]
+
+    def held(self) -> list[LedgerRow]:
+        """Return rows, as they stand, of what is in the window."""
+        return [_row(e) for e in self._entries.values() if e.measurement.seq >= 0]
+
+
+def _row(entry: Entry) -> LedgerRow:
+    stream = entry.stream
+    return row_of(stream, entry.measurement, stream.config.topic, entry.verdict)
+
+
+def _moved(a: Any, b: Any) -> bool:
+    """Whether a factor that is linear about the one pose is another about the other."""
+    step = a.localCoordinates(b)
+    return float(np.linalg.norm(step[3:])) > _MOVED_M or float(np.linalg.norm(step[:3])) > _TURNED_RAD

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The states of the last seconds: each follows from the one before by the IMU, biases and slow errors by their steps."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc import keys
+from graphloc.build import CHAIN_END, bias_step, nav_state, slow_begin, slow_end, slow_step
+from graphloc.errors import SolveError
+from graphloc.frames import Array
+from graphloc.graph import Attachment, Residual
+from graphloc.online._anchor import Anchor, Beside, beside, without_prior
+from graphloc.online._constants import Constants
+from graphloc.online._live import LiveProblem, LiveStream
+from graphloc.online._window import Held, Window
+from graphloc.solve._foreseen import root_of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Newest:
+    """The newest state that is solved; while others are staged, not the last of the timeline.
+
+    Attributes:
+        number: in the timeline. pose, velocity: of the IMU's place, gtsam.Pose3 and (3,). bias: of the IMU.
+        pose_cov: (6, 6), in the body tangent. velocity_cov: (3, 3).
+    """
+
+    number: int
+    stamp_ns: int
+    pose: gtsam.Pose3
+    velocity: Array
+    bias: gtsam.imuBias.ConstantBias
+    pose_cov: Array
+    velocity_cov: Array
+
+
+class States:
+    """States from an anchor on, in a window.
+
+    Args:
+        constants: told of in an anchor. guess: pose, velocity (3,) and bias (6,) that the first state is first solved at;
+            its prior is the anchor's.
+
+    Raises (every method): SolveError: from then on it is of no use.
+    """
+
+    def __init__(
+        self,
+        problem: LiveProblem,
+        window: Window,
+        constants: Constants,
+        anchor: Anchor,
+        guess: tuple[gtsam.Pose3, Array, Array],
+    ) -> None:
+        self._problem, self._window, self._constants = problem, window, constants
+        self._ends: dict[str, Held] = {}  # what closes the slow chain of each sensor
+        self._links: dict[int, Held] = {}  # by the state that each begins at
+        state = (keys.pose(0), keys.velocity(0), keys.bias(0))
+        pose, velocity, bias = guess
+        window.guess(state[0], pose, 0.0)
+        window.guess(state[1], velocity, 0.0)
+        window.guess(state[2], gtsam.imuBias.ConstantBias(bias[:3], bias[3:]), 0.0)
+        window.add(anchor.factors(*state))
+        for stream in problem.streams.values():
+            if stream.slow is not None:
+                key, known = keys.slow(stream.number, 0), anchor.slow.get(stream.name)
+                if known is not None and len(known.value) != len(stream.slow.sigma):
+                    raise SolveError(f"{stream.name}: its slow error is of another size")
+                window.guess(key, np.zeros(len(stream.slow.sigma)) if known is None else known.value, 0.0)
+                window.add([slow_begin(stream.slow, key, np.zeros(len(stream.slow.sigma)))]
+                           if known is None else [anchor.beside(known, state[0], key)])  # fmt: skip
+                self._ends[stream.name] = window.add(slow_end(stream.slow, key))
+        window.commit()
+        self._newest = self._read()
+
+    @property
+    def newest(self) -> Newest:
+        return self._newest
+
+    def read(self) -> None:
+        """Read the newest state off the window, once it has been solved."""
+        self._newest = self._read()
+
+    def _read(self) -> Newest:
+        timeline, values = self._problem.timeline, self._window.values
+        k = timeline.last
+        newest = Newest(
+            number=k,
+            stamp_ns=timeline.stamps_ns[k],
+            pose=values.atPose3(keys.pose(k)),
+            velocity=np.asarray(values.atVector(keys.velocity(k))),
+            bias=values.atConstantBias(keys.bias(timeline.slow_of[k])),
+            pose_cov=self._window.covariance([keys.pose(k)]),
+            velocity_cov=self._window.covariance([keys.velocity(k)]),
+        )
+        arrays = (newest.pose.matrix(), newest.velocity, newest.bias.vector(), newest.pose_cov, newest.velocity_cov)
+        if not all(np.isfinite(a).all() for a in arrays) or min(np.diagonal(newest.pose_cov)) <= 0.0:
+            raise SolveError("the solver's result is not a number")
+        return newest
+
+    def grow(self, stamp_ns: int) -> bool:
+        """Stage the next state, where the IMU says that it is; tell whether slow states got a node, which closes a commit."""
+        timeline, window, links = self._problem.timeline, self._window, self._problem.links
+        k, values = timeline.last, window.values
+        j, before_ns = timeline.slow_of[k], timeline.stamps_ns[k]
+        timeline.append(stamp_ns)
+        following, t = timeline.slow_of[k + 1], timeline.page_s(stamp_ns)
+        bias = values.atConstantBias(keys.bias(j))
+        pim = links.integrate(before_ns, stamp_ns, gtsam.imuBias.ConstantBias())
+        there = pim.predict(nav_state(values, k), bias)
+        window.guess(keys.pose(k + 1), there.pose(), t)
+        window.guess(keys.velocity(k + 1), np.asarray(there.velocity()), t)
+        self._links[k] = window.add([links.factor(k, j, pim)])
+        if following != j:
+            dt_s = (timeline.slow_stamps_ns[following] - timeline.slow_stamps_ns[j]) * 1e-9
+            window.guess(keys.bias(following), bias, t)
+            window.add([bias_step(links, j, dt_s)])
+            self._next_slow(j, dt_s, t)
+        window.touch(keys.bias(following), t)
+        for stream in self._problem.streams.values():
+            if stream.slow is not None:
+                window.touch(keys.slow(stream.number, following), t)
+        return bool(following != j)
+
+    def _next_slow(self, j: int, dt_s: float, t: float) -> None:
+        window = self._window
+        for stream in self._problem.streams.values():
+            if stream.slow is None:
+                continue
+            key, following = (keys.slow(stream.number, n) for n in (j, j + 1))
+            window.guess(following, np.atleast_1d(window.values.atVector(key)), t)
+            window.add(slow_step(stream.slow, key, following, dt_s))
+            if stream.name in self._ends:
+                window.remove(self._ends[stream.name])
+            ends = list(slow_end(stream.slow, following))
+            if ends:
+                self._ends[stream.name] = window.add(ends)
+
+    def link_anew(self, torn: Collection[int]) -> None:
+        """Stage anew the IMU's steps that begin at these states: samples of them came late."""
+        timeline, links, window = self._problem.timeline, self._problem.links, self._window
+        for k in sorted(torn):
+            if k in self._links and window.remove(self._links[k]):
+                pim = links.integrate(timeline.stamps_ns[k], timeline.stamps_ns[k + 1], gtsam.imuBias.ConstantBias())
+                self._links[k] = window.add([links.factor(k, timeline.slow_of[k], pim)])
+
+    def let_go(self) -> bool:
+        """Forget the states that have left the window; tell whether any have."""
+        timeline = self._problem.timeline
+        first = timeline.first
+        gone = first
+        while gone < timeline.last and not self._window.is_committed(keys.pose(gone)):
+            gone += 1
+        if gone == first:
+            return False
+        for k in range(first, gone):
+            self._links.pop(k, None)
+        timeline.forget(gone)
+        self._problem.links.forget(timeline.stamps_ns[gone])
+        return True
+
+    def prediction_root(self, stream: LiveStream, at: Attachment, k: int, residual: Residual) -> Array:
+        """Return a root (m, n) of the covariance of what is predicted of a residual (m,) at state k, from pose and slow state together."""
+        timeline, window, newest = self._problem.timeline, self._window, self._newest
+        base = min(k, newest.number)
+        wanted, size = [keys.pose(base)], 6
+        if residual.slow_jacobian is not None and at.slow_value is not None:
+            wanted.append(keys.slow(stream.number, timeline.slow_of[base]))
+            size += len(at.slow_value)
+        if any(not window.is_committed(key) for key in wanted):
+            return np.zeros((len(residual.raw), size))
+        P = np.array(window.covariance(wanted))
+        if base != k:  # what velocity and the IMU's noise add on the way: much, across a gap
+            from_ns, to_ns = timeline.stamps_ns[base], timeline.stamps_ns[k]
+            R = at.T_world_body.rotation().matrix()
+            P[3:6, 3:6] += ((to_ns - from_ns) * 1e-9) ** 2 * R.T @ newest.velocity_cov @ R
+            pim = self._problem.links.integrate(from_ns, to_ns, newest.bias)
+            P[:6, :6] += np.asarray(pim.preintMeasCov())[:6, :6]
+        return root_of(residual, at, P)
+
+    def step_cost(self) -> float:
+        """Return the median cost of the IMU's steps; 0 where none is in the graph."""
+        steps = self._window.errors_of(held for held in self._links.values() if held.slots)
+        return float(np.median(steps)) if steps else 0.0
+
+    def anchor(self) -> Anchor:
+        """Return what is known at the newest state, but for what closes the slow chains: they go on from here."""
+        timeline, window, streams = self._problem.timeline, self._window, self._problem.streams
+        k = timeline.last
+        j = timeline.slow_of[k]
+        core = [keys.pose(k), keys.velocity(k), keys.bias(j)]
+        slow = {s.name: keys.slow(s.number, j) for s in streams.values() if s.slow is not None}
+        constants = self._constants.seen()
+        every = [*core, *slow.values(), *constants.values()]
+        joint = window.covariance(every)
+        vectors = [np.atleast_1d(window.values.atVector(key)) for key in every[3:]]
+        ends = np.cumsum([6, 3, 6, *map(len, vectors)])
+        rows = {key: np.arange(a, b) for key, a, b in zip(every, [0, *ends], ends, strict=False)}
+        bias = window.values.atConstantBias(core[2])
+        mean = np.concatenate([np.zeros(15), *vectors])  # of the state as steps from the estimate
+        for name, key in slow.items():
+            process = streams[name].slow
+            assert process is not None
+            closed = np.flatnonzero(np.isfinite(process.time_constant_s))
+            mean, joint = without_prior(mean, joint, rows[key][closed], CHAIN_END * process.sigma[closed] ** 2)
+
+        def known(key: int) -> Beside:
+            own = rows[key]
+            picked = np.concatenate([rows[core[0]], own])
+            return beside(mean[own], joint[np.ix_(picked, picked)])
+
+        def alone(key: int) -> Beside:  # not given the pose: its prior, when it is seen again, does not have that
+            own = rows[key]
+            return Beside(value=mean[own], gain=np.zeros((len(own), 6)), cov=joint[np.ix_(own, own)])
+
+        return Anchor(
+            stamp_ns=timeline.stamps_ns[k],
+            pose=window.values.atPose3(core[0]).retract(mean[:6]),
+            velocity=np.asarray(window.values.atVector(core[1])) + mean[6:9],
+            bias=np.concatenate([bias.accelerometer(), bias.gyroscope()]) + mean[9:15],
+            cov=joint[:15, :15],
+            slow={name: known(key) for name, key in slow.items()},
+            constants={**self._constants.remembered(), **{name: alone(key) for name, key in constants.items()}},
+        )
+
+    def track(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
+        """Return stamps (N,), places (N, 3), attitudes (N, 3, 3) and velocities (N, 3) of the body's origin."""
+        timeline, values, lever = self._problem.timeline, self._window.values, -self._problem.t_body_imu_m
+        states = range(timeline.first, len(timeline))
+        poses = [values.atPose3(keys.pose(k)) for k in states]
+        stamps = np.array([timeline.stamps_ns[k] for k in states], dtype=np.int64)
+        R = np.array([pose.rotation().matrix() for pose in poses])
+        bias = [values.atConstantBias(keys.bias(timeline.slow_of[k])).gyroscope() for k in states]
+        gyro = self._problem.links.gyro_at(stamps) - np.array(bias) @ self._problem.R_body_imu.T
+        v = np.array([values.atVector(keys.velocity(k)) for k in states])
+        p = np.array([pose.transformFrom(lever) for pose in poses])
+        return stamps, p, R, v + np.einsum("nij,nj->ni", R, np.cross(gyro, lever))
