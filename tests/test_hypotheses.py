@@ -15,6 +15,7 @@ from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
 from graphloc.solve._best_chain import best_chain
 from graphloc.solve._decide import Verdict, by_hypotheses
+from graphloc.solve._foreseen import Prediction
 from graphloc.solve._hypotheses import FalseSequence
 
 SIGMA_M = 0.2
@@ -83,7 +84,7 @@ def test_a_loose_prediction_believes_but_one_of_two_that_contradict_each_other()
     stream, indices, residuals = stream_of(offsets)
     for n, m in enumerate(stream.measurements):
         m.stamp_ns = n // 2 * 1_000_000_000
-    verdicts = judged(stream, indices, residuals, [np.eye(2) * 2.0 for _ in offsets])
+    verdicts = judged(stream, indices, residuals, [Prediction(np.eye(2) * 2.0, 4.0) for _ in offsets])
     weights = np.array([v.weight for v in verdicts]).reshape(-1, 2)
     assert weights[:, 0].min() > 0.9
     assert weights[:, 1].max() == 0.0
@@ -91,11 +92,11 @@ def test_a_loose_prediction_believes_but_one_of_two_that_contradict_each_other()
 
 
 def judged(
-    stream: Any, indices: range, residuals: list[tuple[Residual, ...]], roots: list[Array | None]
+    stream: Any, indices: range, residuals: list[tuple[Residual, ...]], predictions: list[Prediction | None]
 ) -> list[Verdict]:
     stream.row.one_likelihood = False
     at: Any = None
-    return by_hypotheses(stream, list(indices), [at] * len(residuals), residuals, roots)
+    return by_hypotheses(stream, list(indices), [at] * len(residuals), residuals, predictions)
 
 
 def test_right_ones_after_a_hole_are_no_repeated_false_one() -> None:
@@ -104,7 +105,7 @@ def test_right_ones_after_a_hole_are_no_repeated_false_one() -> None:
     offsets = np.array([12.0, -9.0]) + rng.normal(0.0, SIGMA_M, (count, 2))
     false = np.arange(count) % 3 == 1
     offsets[false] += rng.uniform(2.0, 5.0, (int(false.sum()), 2))
-    verdicts = judged(*stream_of(offsets), [np.eye(2) * 20.0 for _ in offsets])
+    verdicts = judged(*stream_of(offsets), [Prediction(np.eye(2) * 20.0, 30.0) for _ in offsets])
     weights = np.array([v.weight for v in verdicts])
     assert weights[~false].min() > 0.9
     assert weights[false].max() < 0.1
@@ -113,7 +114,7 @@ def test_right_ones_after_a_hole_are_no_repeated_false_one() -> None:
 def test_what_repeats_far_outside_the_prediction_is_false() -> None:
     """Five that agree with each other, 5 m off where the prediction is good to 0.7 m: each later one alone would do."""
     offsets = np.array([4.0, 3.0]) + np.random.default_rng(8).normal(0.0, 0.05, (5, 2))
-    verdicts = judged(*stream_of(offsets), [np.eye(2) * 0.7 for _ in offsets])
+    verdicts = judged(*stream_of(offsets), [Prediction(np.eye(2) * 0.7, 4.0) for _ in offsets])
     assert max(v.weight for v in verdicts) < 0.1
 
 
@@ -122,10 +123,10 @@ def test_a_heading_that_is_loose_moves_what_is_ahead_and_abeam_apart() -> None:
     off_rad = np.radians(6.0)
     arms = np.array([[0.0, 30.0], [-30.0, 0.0]] * 5)  # d raw / d heading
     offsets = arms * off_rad + np.random.default_rng(9).normal(0.0, SIGMA_M, (10, 2))
-    roots: list[Array | None] = [
-        np.column_stack([np.eye(2) * 0.3, arm * np.radians(5.0)]) for arm in arms
+    predictions: list[Prediction | None] = [
+        Prediction(np.column_stack([np.eye(2) * 0.3, arm * np.radians(5.0)])) for arm in arms
     ]  # place and heading
-    assert min(v.weight for v in judged(*stream_of(offsets), roots)) > 0.9
+    assert min(v.weight for v in judged(*stream_of(offsets), predictions)) > 0.9
 
 
 def test_nothing_but_noise_makes_no_long_chain() -> None:

@@ -107,8 +107,7 @@ class Judge:
         plain = nis = residual.nis()
         opened = False
         if fresh and own.kind != "none" and nis > scale**2:
-            root = self._states.prediction_root(stream, at, stream.state[i], residual)
-            nis = residual.nis(root @ root.T)
+            nis = residual.nis(self._states.prediction(stream, at, stream.state[i], residual).cov)
             opened = plain > 1.5 * nis
             scale *= float(np.sqrt(plain / max(nis, 1e-9))) if opened else 1.0
         if fresh:
@@ -143,12 +142,12 @@ class Judge:
         if not own:
             return False
         attached, residuals = self._met(own)
-        roots = [
-            self._states.prediction_root(stream, at, e.state, found[0])
+        predictions = [
+            self._states.prediction(stream, at, e.state, found[0])
             if e.held is None and e.verdict.decision is None and not e.judged else None
             for e, at, found in zip(own, attached, residuals, strict=True)
         ]  # fmt: skip
-        verdicts = by_hypotheses(stream, [e.index for e in own], attached, residuals, roots)
+        verdicts = by_hypotheses(stream, [e.index for e in own], attached, residuals, predictions)
         for entry, verdict in zip(own, verdicts, strict=True):
             settled = entry.verdict.settled + (entry.judged and verdict.mode != entry.verdict.mode)
             if not entry.judged or verdict.weight >= AGREES:
@@ -189,7 +188,7 @@ class Judge:
         """Where what was judged false agrees among itself, try that instead, and keep what is more probable. Tell whether any was tried."""
         names, self._refuted = self._refuted, set()
         moved = False
-        for name in names:
+        for name in sorted(names):
             stream = self._problem.streams[name]
             own = self._chapter(stream)
             if len(own) < _CHAIN:

@@ -19,7 +19,7 @@ from graphloc.online._anchor import Anchor, Beside, beside, without_prior
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
-from graphloc.solve._foreseen import root_of
+from graphloc.solve._foreseen import Prediction, prediction_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,8 +165,8 @@ class States:
         self._problem.links.forget(timeline.stamps_ns[gone])
         return True
 
-    def prediction_root(self, stream: LiveStream, at: Attachment, k: int, residual: Residual) -> Array:
-        """Return a root (m, n) of the covariance of what is predicted of a residual (m,) at state k, from pose and slow state together."""
+    def prediction(self, stream: LiveStream, at: Attachment, k: int, residual: Residual) -> Prediction:
+        """Return what is predicted of a residual at state k, from pose and slow state together."""
         timeline, window, newest = self._problem.timeline, self._window, self._newest
         base = min(k, newest.number)
         wanted, size = [keys.pose(base)], 6
@@ -174,7 +174,7 @@ class States:
             wanted.append(keys.slow(stream.number, timeline.slow_of[base]))
             size += len(at.slow_value)
         if any(not window.is_committed(key) for key in wanted):
-            return np.zeros((len(residual.raw), size))
+            return Prediction(np.zeros((len(residual.raw), size)))
         P = np.array(window.covariance(wanted))
         if base != k:  # what velocity and the IMU's noise add on the way: much, across a gap
             from_ns, to_ns = timeline.stamps_ns[base], timeline.stamps_ns[k]
@@ -182,7 +182,7 @@ class States:
             P[3:6, 3:6] += ((to_ns - from_ns) * 1e-9) ** 2 * R.T @ newest.velocity_cov @ R
             pim = self._problem.links.integrate(from_ns, to_ns, newest.bias)
             P[:6, :6] += np.asarray(pim.preintMeasCov())[:6, :6]
-        return root_of(residual, at, P)
+        return prediction_of(residual, at, P, newest.velocity_cov)
 
     def step_cost(self) -> float:
         """Return the median cost of the IMU's steps; 0 where none is in the graph."""

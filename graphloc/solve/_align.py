@@ -27,6 +27,7 @@ from graphloc.time import duration_ns, utc_text
 
 _STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
 _STILL_SPEED_MPS = 0.15
+_USUAL_SPEED_MPS = 10.0  # where nothing is known of it
 _BLOCK_S, _SWELL_S = 0.5, 10.0
 MOVED_M = 15.0  # travel from which a heading can be told without a heading sensor
 
@@ -333,15 +334,21 @@ def _position_and_velocity(
     heights = [h.p_world_m[2] for h in every if np.isnan(h.p_world_m[0]) and np.isfinite(h.p_world_m[2])]
     if heights:  # of sensors that tell nothing else: the waterline is surer than GNSS
         p0[2] = heights[0]
-    v0 = np.zeros(3)
+    v0, unsure = np.zeros(3), 0.0
     speeds = [h.v_world_mps for h in every if np.isfinite(h.v_world_mps).all()]
     if speeds:
         v0 = np.median(speeds[:5], axis=0)
     elif still is None:
         soon = track.t <= first + 5.0
         soon[: min(4, len(soon))] = True
-        v0[:2] = [_slope(track.t[soon], track.p[soon, i]) for i in range(2)]
-    v_sigma = np.full(3, 0.2 if still else 3.0)
+        slope = np.array([_slope(track.t[soon], track.p[soon, i]) for i in range(2)])
+        # Two sightings within a quarter of a second, each a metre off, tell a speed to 6 m/s at best.
+        noise = float(np.median(np.nan_to_num(track.sigma[soon, :2], nan=5.0))) / max(
+            float(np.std(track.t[soon]) * np.sqrt(soon.sum())), 1e-3
+        )
+        share = _USUAL_SPEED_MPS**2 / (_USUAL_SPEED_MPS**2 + noise**2)
+        v0[:2], unsure = share * slope, float(np.sqrt(share)) * noise
+    v_sigma = np.full(3, 0.2 if still else float(np.hypot(3.0, unsure)))
     v_sigma[2] = 0.2 if still else 1.0
     # Carried back to the first state, straight: what the vessel did before the first position is unknown.
     back_s = max(float(np.median(track.t[near])), 0.0)

@@ -13,9 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from graphloc.build import Judged
-from graphloc.frames import Array
 from graphloc.graph import Residual
-from graphloc.solve._foreseen import carried, moved, taken_of, walk_of
+from graphloc.solve._foreseen import Prediction, carried, kept_of, moved, taken_of, walk_of
 from graphloc.solve._hypotheses import log_repeat
 
 _LOOK_BACK = 64  # candidates for the right one before
@@ -25,7 +24,7 @@ def best_chain(
     stream: Judged,
     indices: Sequence[int],
     residuals: Sequence[tuple[Residual, ...]],
-    roots: Sequence[Array] | None = None,
+    predictions: Sequence[Prediction] | None = None,
 ) -> list[int | None]:
     """Return which mode of each of N measurements of a stream is right on the most probable chain; None: none is.
 
@@ -33,7 +32,7 @@ def best_chain(
     its begin tells where it should be. False ones between that repeat each other gain too.
 
     Args:
-        roots: N of the prediction (see `root_of`), which bounds where a chain begins; None: it may lie anywhere.
+        predictions: N, which bound where a chain begins; None: it may lie anywhere.
     """
     taken, models = taken_of(stream, indices)
     dof, count = len(residuals[0][0].raw), len(residuals)
@@ -47,7 +46,7 @@ def best_chain(
     again = np.zeros(count)
     for n in range(1, count):
         repeats, age_s = models[n].repeats, stamps[n] - stamps[n - 1]
-        walked = walk[n] * age_s + (0.0 if roots is None else moved(roots[n - 1], roots[n], age_s))
+        walked = walk[n] * age_s + (0.0 if predictions is None else moved(predictions[n - 1], predictions[n], age_s))
         same = np.log(max(repeats * models[n].probability, 1e-12))
         same += log_repeat(residuals[n - 1], residuals[n], walked)
         again[n] = max(0.0, float(np.logaddexp(np.log1p(-repeats), same - nothing[n])))
@@ -57,13 +56,14 @@ def best_chain(
     raw = np.array([residuals[n][mode].raw for n, mode in node])
     cov = np.array([residuals[n][mode].cov for n, mode in node])
     alone = np.log([residuals[n][mode].prior for n, mode in node]) - nothing[at]
-    of_node = None if roots is None else np.array(roots)[at]
+    roots = None if predictions is None else np.array([p.root for p in predictions])[at]
+    lasts_s = None if predictions is None else np.array([p.lasts_s for p in predictions])[at]
     score, before = np.zeros(len(node)), np.full(len(node), -1)
     for k, n in enumerate(at):
-        if of_node is None:
+        if roots is None:
             nis, begun = float(dof), cov[k] + models[n].cov
         else:
-            begun = cov[k] + of_node[k] @ of_node[k].T
+            begun = cov[k] + roots[k] @ roots[k].T
             nis = float(raw[k] @ np.linalg.solve(begun, raw[k]))
         score[k] = alone[k] + gained[n] - 0.5 * (np.linalg.slogdet(2.0 * np.pi * begun)[1] + nis)
         lo, hi = np.searchsorted(at, [n - _LOOK_BACK, n])
@@ -71,8 +71,9 @@ def best_chain(
             continue
         ages_s = stamps[n] - stamps[at[lo:hi]]
         expected, left = raw[lo:hi], cov[lo:hi]
-        if of_node is not None:
-            expected, left = carried(expected, left, of_node[lo:hi], of_node[k], ages_s)
+        if roots is not None and lasts_s is not None:
+            kept = kept_of(lasts_s[lo:hi], lasts_s[k], ages_s)
+            expected, left = carried(expected, left, roots[lo:hi], roots[k], kept)
         spread, step = left + cov[k] + ages_s[:, None, None] * walk[n], expected - raw[k]
         off = np.einsum("ni,ni->n", step, np.linalg.solve(spread, step[:, :, None])[:, :, 0])
         path = score[lo:hi] + alone[k] - 0.5 * (off + np.linalg.slogdet(2.0 * np.pi * spread)[1])

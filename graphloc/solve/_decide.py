@@ -19,13 +19,14 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
+from graphloc import keys
 from graphloc.build import Decisions, Judged, Problem, Stream, attach
 from graphloc.chi2 import chi2_median
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
 from graphloc.solve._best_chain import best_chain
-from graphloc.solve._foreseen import foresee, root_of
+from graphloc.solve._foreseen import Prediction, foresee, prediction_of
 from graphloc.solve._hypotheses import log_evidence_of, sequence_of
 
 # By stage, for every sensor that has a kernel at all: Huber is convex, so a start that is tens of metres
@@ -63,13 +64,15 @@ class Verdict:
 Verdicts = dict[tuple[int, int], Verdict]
 
 
-def _predicted(found: tuple[Residual, ...], at: Attachment, k: int, covariance: PredictedCovariance) -> Array | None:
-    """Root (k, m) of the prediction's covariance, from those of the pose and of the slow state; None: it is no prediction."""
-    P = covariance(k, at.pose_key)
-    if P is None:
+def _predicted(
+    found: tuple[Residual, ...], at: Attachment, k: int, covariance: PredictedCovariance
+) -> Prediction | None:
+    """What the prediction of a state knows of a residual; None: it is no prediction."""
+    P, V = covariance(k, at.pose_key), covariance(k, keys.velocity(k))
+    if P is None or V is None:
         return None
     slow = None if found[0].slow_jacobian is None or at.slow_key is None else covariance(k, at.slow_key)
-    return root_of(found[0], at, P if slow is None else block_diag(P, slow))
+    return prediction_of(found[0], at, P if slow is None else block_diag(P, slow), V)
 
 
 def weigh(
@@ -112,11 +115,11 @@ def weigh(
             for i, at in zip(indices, attached, strict=True)
         ]
         if several and hypotheses:
-            roots = [
+            predictions = [
                 _predicted(r, at, int(stream.state[i]), covariance)
                 for i, at, r in zip(indices, attached, residuals, strict=True)
             ]
-            found = by_hypotheses(stream, indices, attached, residuals, roots)
+            found = by_hypotheses(stream, indices, attached, residuals, predictions)
         else:
             found = _by_kernel(stream, attached, residuals, stage)
         verdicts.update({(stream.number, i): v for i, v in zip(indices, found, strict=True)})
@@ -173,21 +176,21 @@ def by_hypotheses(
     indices: list[int],
     attached: list[Attachment],
     residuals: list[tuple[Residual, ...]],
-    roots: list[Array | None],
+    predictions: list[Prediction | None],
 ) -> list[Verdict]:
     """Judge measurements of a sensor that can be false, as a sequence (see `sequence_of`).
 
     Two that contradict each other, both in the graph, bend a loose prediction to where neither is right. So of what is
-    judged by a prediction (its root is given), only the most probable chain of those is believed that agree.
+    judged by a prediction, only the most probable chain of those is believed that agree.
     """
-    new = {n: root for n, root in enumerate(roots) if root is not None}
+    new = {n: prediction for n, prediction in enumerate(predictions) if prediction is not None}
     chain: list[int | None] = [None] * len(residuals)
     if new:
         chosen = best_chain(stream, [indices[n] for n in new], [residuals[n] for n in new], list(new.values()))
         for n, mode in zip(new, chosen, strict=True):
             chain[n] = mode
-    foreseen = foresee(stream, indices, residuals, roots, chain)
-    posterior = sequence_of(stream, indices, residuals, roots, foreseen).posterior()
+    foreseen = foresee(stream, indices, residuals, predictions, chain)
+    posterior = sequence_of(stream, indices, residuals, predictions, foreseen).posterior()
     verdicts = []
     for n, (modes, cov, _) in enumerate(foreseen):
         logs = np.array([r.log_density(cov) for r in modes])

@@ -20,7 +20,7 @@ from graphloc.frames import Array
 from graphloc.graph import Attachment, FalseModel, Residual
 from graphloc.measurements import Measurement
 
-_PREDICTED_S = 60.0  # in which the error of a prediction becomes another one
+_LASTS_S = 60.0  # at most: in which the error of a prediction becomes another one
 # How fast the offset of an estimate in the wrong place may move besides: a random walk of this share of a false
 # error's size in a second (0.1 m of 5 m).
 _OFFSET_WALK = 0.02
@@ -40,11 +40,28 @@ class Foreseen(NamedTuple):
     possible: bool = True
 
 
-def root_of(residual: Residual, at: Attachment, P: Array) -> Array:
-    """Return a root (k, m) of the covariance that the prediction gives a residual.
+class Prediction(NamedTuple):
+    """What a prediction knows of a residual.
+
+    Attributes:
+        root: (k, m) of its covariance. lasts_s: in which the error becomes another one: sigma of place over that of velocity.
+    """
+
+    root: Array
+    lasts_s: float = _LASTS_S
+
+    @property
+    def cov(self) -> Array:
+        """Covariance (k, k)."""
+        return self.root @ self.root.T
+
+
+def prediction_of(residual: Residual, at: Attachment, P: Array, velocity_cov: Array) -> Prediction:
+    """Return what a prediction knows of a residual.
 
     Args:
         P: (m, m) of the state's pose in the body tangent (6), and of the slow state, where the residual has one.
+        velocity_cov: (3, 3) in (m/s)^2. A start knows its place better than its velocity: a moment later it errs otherwise.
     """
     J = residual.jacobian()
     if residual.slow_jacobian is not None and len(P) > J.shape[1]:
@@ -55,66 +72,75 @@ def root_of(residual: Residual, at: Attachment, P: Array) -> Array:
     )  # an error stays where it is as the vessel turns
     # The symmetric root: the only one that changes no more than P does, so that those of two states go together.
     values, vectors = np.linalg.eigh(turn @ P @ turn.T)
-    return np.asarray(J @ turn.T @ (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+    root = J @ turn.T @ (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    squared = float(np.trace(P[3:6, 3:6]) / max(np.trace(velocity_cov), 1e-12))
+    return Prediction(root, min(float(np.sqrt(max(squared, 0.0))), _LASTS_S))
 
 
 def foresee(
     stream: Judged,
     indices: Sequence[int],
     residuals: Sequence[tuple[Residual, ...]],
-    roots: Sequence[Array | None],
+    predictions: Sequence[Prediction | None],
     chain: Sequence[int | None],
 ) -> list[Foreseen]:
     """Return the residuals of N measurements as the prediction has them, given those before that are right.
 
     Args:
-        roots: N, of the prediction (see `root_of`), or None where the measurement took part in it.
+        predictions: N, or None where the measurement took part in the estimate.
         chain: N modes that are taken for right (see `best_chain`), or None.
     """
     taken, models = taken_of(stream, indices)
     chained = any(mode is not None for mode in chain)
     seen, last = [], None
-    for n, (found, root) in enumerate(zip(residuals, roots, strict=True)):
-        if root is None:
+    for n, (found, prediction) in enumerate(zip(residuals, predictions, strict=True)):
+        if prediction is None:
             seen.append(Foreseen(found, None))
             continue
         mode_now = chain[n]
         possible = mode_now is not None or not chained
         if last is None:
-            seen.append(Foreseen(found, root @ root.T, possible))
+            seen.append(Foreseen(found, prediction.cov, possible))
         else:
             j, before, mode = last
-            age_s = np.array([(taken[n].stamp_ns - taken[j].stamp_ns) * 1e-9])
+            age_s = (taken[n].stamp_ns - taken[j].stamp_ns) * 1e-9
+            kept = kept_of(np.array([before.lasts_s]), prediction.lasts_s, np.array([age_s]))
             right = residuals[j][mode]
-            mean, cov = carried(right.raw[None], right.cov[None], before[None], root, age_s)
+            mean, cov = carried(right.raw[None], right.cov[None], before.root[None], prediction.root, kept)
             modes = tuple(replace(r, raw=r.raw - mean[0]) for r in found)
-            seen.append(Foreseen(modes, cov[0] + walk_of(models[n]) * age_s[0], possible))
+            seen.append(Foreseen(modes, cov[0] + walk_of(models[n]) * age_s, possible))
         if mode_now is not None:
-            last = n, root, mode_now
+            last = n, prediction, mode_now
     return seen
 
 
-def carried(raw: Array, cov: Array, roots: Array, root: Array, ages_s: Array) -> tuple[Array, Array]:
+def kept_of(before_s: Array, now_s: float, ages_s: Array) -> Array:
+    """Return the share (J,) of the error that is still the same, between two that last so long: it changes as a velocity does."""
+    return np.asarray(np.exp(-0.5 * (ages_s / np.maximum(np.minimum(before_s, now_s), 1e-6)) ** 2))
+
+
+def carried(raw: Array, cov: Array, roots: Array, root: Array, kept: Array) -> tuple[Array, Array]:
     """Return mean (J, k) and covariance (J, k, k) of the error in a residual, from one of J before it that is right.
 
     Args:
-        raw: (J, k) residuals. cov: (J, k, k) of the measurements. roots: (J, k, m). ages_s: (J,) since each.
+        raw: (J, k) residuals. cov: (J, k, k) of the measurements. roots: (J, k, m). kept: (J,), see `kept_of`.
         root: (k, m) of the residual in question.
     """
-    cross = _kept(ages_s)[:, None, None] * (roots @ root.T)  # (J, k before, k now)
+    cross = kept[:, None, None] * (roots @ root.T)  # (J, k before, k now)
     gain = np.linalg.solve(cov + roots @ roots.transpose(0, 2, 1), cross).transpose(0, 2, 1)
     return (gain @ raw[:, :, None])[:, :, 0], root @ root.T - gain @ cross
 
 
-def moved(before: Array | None, now: Array | None, age_s: float) -> Array | float:
+def moved(before: Prediction | None, now: Prediction | None, age_s: float) -> Array | float:
     """Return the covariance (k, k) of what the error has changed from one residual to the next."""
     if before is None or now is None:
-        alone = before if now is None else now
-        return 0.0 if alone is None else np.asarray(alone @ alone.T)
-    if before.shape != now.shape:
+        alone = before or now
+        return 0.0 if alone is None else alone.cov
+    if before.root.shape != now.root.shape:
         return 0.0
-    cross = float(_kept(age_s)) * (before @ now.T)
-    return np.asarray(before @ before.T + now @ now.T - cross - cross.T)
+    (kept,) = kept_of(np.array([before.lasts_s]), now.lasts_s, np.array([age_s]))
+    cross = kept * (before.root @ now.root.T)
+    return np.asarray(before.cov + now.cov - cross - cross.T)
 
 
 def walk_of(model: FalseModel) -> Array:
@@ -127,8 +153,3 @@ def taken_of(stream: Judged, indices: Sequence[int]) -> tuple[list[Measurement],
     assert stream.row.false is not None
     taken = [stream.measurements[i] for i in indices]
     return taken, [stream.row.false(m, stream.config) for m in taken]
-
-
-def _kept(age_s: Array | float) -> Array:
-    """Share of the error that is still the same. It has a rate: 20 m move 0.3 m in a second, as a velocity does."""
-    return np.asarray(np.exp(-0.5 * (np.asarray(age_s) / _PREDICTED_S) ** 2))

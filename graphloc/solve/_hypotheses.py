@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
-from graphloc.solve._foreseen import Foreseen, moved, taken_of
+from graphloc.solve._foreseen import Foreseen, Prediction, moved, taken_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ def sequence_of(
     stream: Judged,
     indices: Sequence[int],
     residuals: Sequence[tuple[Residual, ...]],
-    roots: Sequence[Array | None],
+    predictions: Sequence[Prediction | None],
     foreseen: Sequence[Foreseen],
 ) -> FalseSequence:
     """Return the sequence of a stream's measurements.
@@ -78,12 +78,12 @@ def sequence_of(
     Args:
         stream: the sensor; its row has a false model. indices: N of its measurements.
         residuals: N tuples, one residual for each mode.
-        roots: N of the predictions' covariances (see `root_of`). foreseen: the residuals, given a chain.
+        predictions: N, or None where it took part in the estimate. foreseen: the residuals, given a chain.
     """
     taken, models = taken_of(stream, indices)
     densities = np.zeros((2, 2, len(models)))  # right or false, before or after
-    for n, (found, root, seen, model) in enumerate(zip(residuals, roots, foreseen, models, strict=True)):
-        P = None if root is None else root @ root.T
+    for n, (found, prediction, seen, model) in enumerate(zip(residuals, predictions, foreseen, models, strict=True)):
+        P = None if prediction is None else prediction.cov
         densities[:, 0, n] = densities[:, 1, n] = _log_right_and_false(found, P, model)
         if seen.modes is not found:
             densities[:, 1, n] = _log_right_and_false(seen.modes, seen.cov, model)
@@ -93,11 +93,11 @@ def sequence_of(
     repeated = fresh.copy()
     for n in range(1, len(models)):
         model = models[n]
-        walked = moved(roots[n - 1], roots[n], (taken[n].stamp_ns - taken[n - 1].stamp_ns) * 1e-9)
+        walked = moved(predictions[n - 1], predictions[n], (taken[n].stamp_ns - taken[n - 1].stamp_ns) * 1e-9)
         again = np.log(max(model.repeats * model.probability, 1e-12))
         again += log_repeat(residuals[n - 1], residuals[n], walked)
         repeated[:, n] = np.logaddexp(np.log1p(-model.repeats) + fresh[:, n], again)
-    return FalseSequence(right, fresh, repeated, np.array([root is not None for root in roots]))
+    return FalseSequence(right, fresh, repeated, np.array([prediction is not None for prediction in predictions]))
 
 
 def log_evidence_of(stream: Judged, indices: Sequence[int], residuals: Sequence[tuple[Residual, ...]]) -> float:
