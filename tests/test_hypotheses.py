@@ -129,6 +129,14 @@ def test_a_heading_that_is_loose_moves_what_is_ahead_and_abeam_apart() -> None:
     assert min(v.weight for v in judged(*stream_of(offsets), predictions)) > 0.9
 
 
+def test_what_a_loose_velocity_moves_apart_is_no_contradiction() -> None:
+    """At a start, two sightings 1 s apart: known to 3 m and 6 m/s, they may differ by 5 m; known to 0.1 m/s, they may not."""
+    offsets = np.array([[-2.0, 0.0], [3.0, 0.0]])
+    for lasts_s, both in ((3.0 / 6.0, True), (3.0 / 0.1, False)):
+        verdicts = judged(*stream_of(offsets), [Prediction(np.eye(2) * 3.0, lasts_s) for _ in offsets])
+        assert (min(v.weight for v in verdicts) > 0.4) == both
+
+
 def test_nothing_but_noise_makes_no_long_chain() -> None:
     offsets = np.random.default_rng(1).uniform(-5.0, 5.0, (30, 2))
     assert sum(mode is not None for mode in best_chain(*stream_of(offsets))) <= 5
