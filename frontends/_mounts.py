@@ -30,12 +30,12 @@ def mounts_of(
                     tree.add(bag.decode(raw))
             except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
                 broken += 1
-    if broken:
-        bag.warnings.append(
-            f"{bag.name}: {TF_STATIC}: {broken} messages cannot be decoded; {block} have their mounts from the rest"
-        )
+    damaged = f"{TF_STATIC}: messages that cannot be decoded: {broken}" if broken else ""
+    if damaged:
+        bag.warnings.append(f"{bag.name}: {damaged}; {block} have their mounts from the rest")
+    where = f"{bag.name}: {damaged}; {block}" if damaged else f"{bag.name}: {block}"  # it may have held what is missing
     return {
-        name: tree.mount(body_frame, mount.tf_frame, f"{bag.name}: {block}.{name}.mount.tf_frame")
+        name: tree.mount(body_frame, mount.tf_frame, f"{where}.{name}.mount.tf_frame")
         if mount.tf_frame
         else (mount.t_body_sensor_m, mount.R_body_sensor)
         for name, mount in mounts.items()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import gtsam
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from graphloc import keys
 from graphloc.config import AprilTagConfig
 from graphloc.factors.apriltag import ROW
 from graphloc.frames import Array, Datum, Geodetic
@@ -18,6 +20,7 @@ from graphloc.frontends.tags.pose import modes_of, poses_of
 from graphloc.graph import Attachment, Decision
 from graphloc.linear import Term, linear_update
 from graphloc.measurements import TagSighting
+from graphloc.solve._decide import _predicted, by_hypotheses
 from graphloc.survey import Survey
 from tests.tagfactory import AHEAD, FACES_SOUTH, SIGMA, SIZE_M, UNIT, degrees_between, nearest_mode, rays_of
 
@@ -189,6 +192,21 @@ def moved_sighting(motion: Array, T: Any) -> TagSighting:
 
 
 MOTION = np.array([0.25, -0.15, 0.4, 0.004, -0.003, 0.05])
+
+
+def test_tags_of_quay_and_dock_are_judged_together_by_one_prediction() -> None:
+    """0.3 m of error of the pose is in both; what the dock has moved is in one."""
+    T = vessel(6.0, 5.0)
+    seen = [sighting(T), moved_sighting(np.zeros(6), T), sighting(T)]
+    ats = [attached(T.retract(np.array([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])), np.zeros(6))] * len(seen)
+    found = [ROW.residuals(m, DOCKED, at) for m, at in zip(seen, ats, strict=True)]
+
+    def covariance(_state: int, key: int) -> Array:
+        return np.eye(3 if key == keys.velocity(0) else 6) * 0.3**2
+
+    predictions = [_predicted(r, at, 0, covariance) for r, at in zip(found, ats, strict=True)]
+    stream: Any = SimpleNamespace(row=ROW, config=DOCKED, measurements=seen)
+    assert min(v.weight for v in by_hypotheses(stream, [0, 1, 2], ats, found, predictions)) > 0.9
 
 
 TWO_DOCKS = AprilTagConfig(

@@ -283,7 +283,9 @@ def test_a_damaged_transform_is_told_where_cameras_look_for_their_mounts(tmp_pat
         mounts = mounts_of(bag, {"bow": MountConfig(tf_frame="camera")}, "base_link", "cameras")
         np.testing.assert_allclose(mounts["bow"][0], [3.0, 0.0, 2.0])
         (said,) = bag.warnings
-    assert "/tf_static: 1 messages cannot be decoded" in said
+        with pytest.raises(InputError, match=r"cannot be decoded: 1; cameras\.aft\.mount\.tf_frame: no chain"):
+            mounts_of(bag, {"aft": MountConfig(tf_frame="aft")}, "base_link", "cameras")
+    assert "/tf_static: messages that cannot be decoded: 1" in said
 
 
 def test_the_body_may_hang_below_another_frame(tmp_path: Path) -> None:

@@ -170,7 +170,7 @@ class States:
         timeline, window, newest = self._problem.timeline, self._window, self._newest
         base = min(k, newest.number)
         wanted, size = [keys.pose(base)], 6
-        if residual.slow_jacobian is not None and at.slow_value is not None:
+        if at.slow_value is not None:
             wanted.append(keys.slow(stream.number, timeline.slow_of[base]))
             size += len(at.slow_value)
         if any(not window.is_committed(key) for key in wanted):

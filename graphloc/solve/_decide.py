@@ -71,7 +71,7 @@ def _predicted(
     P, V = covariance(k, at.pose_key), covariance(k, keys.velocity(k))
     if P is None or V is None:
         return None
-    slow = None if found[0].slow_jacobian is None or at.slow_key is None else covariance(k, at.slow_key)
+    slow = None if at.slow_key is None else covariance(k, at.slow_key)
     return prediction_of(found[0], at, P if slow is None else block_diag(P, slow), V)
 
 

@@ -60,17 +60,19 @@ def prediction_of(residual: Residual, at: Attachment, P: Array, velocity_cov: Ar
     """Return what a prediction knows of a residual.
 
     Args:
-        P: (m, m) of the state's pose in the body tangent (6), and of the slow state, where the residual has one.
+        P: (m, m) of the state's pose in the body tangent (6), and of the sensor's slow state, where it has one: also for
+            a residual that has no part in that (a tag on the quay beside those of a dock), whose root is as wide.
         velocity_cov: (3, 3) in (m/s)^2. A start knows its place better than its velocity: a moment later it errs otherwise.
     """
     J = residual.jacobian()
-    if residual.slow_jacobian is not None and len(P) > J.shape[1]:
-        J = np.hstack([J, residual.slow_jacobian()])
+    if (others := len(P) - J.shape[1]) > 0:
+        slow = np.zeros((len(J), others)) if residual.slow_jacobian is None else residual.slow_jacobian()
+        J = np.hstack([J, slow])
     turn = np.eye(len(P))
     turn[:3, :3] = turn[3:6, 3:6] = (
         at.T_world_body.rotation().matrix()
     )  # an error stays where it is as the vessel turns
-    # The symmetric root: the only one that changes no more than P does, so that those of two states go together.
+    # The symmetric root is one that changes little where P does, so that those of two states go together.
     values, vectors = np.linalg.eigh(turn @ P @ turn.T)
     root = J @ turn.T @ (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     squared = float(np.trace(P[3:6, 3:6]) / max(np.trace(velocity_cov), 1e-12))
