@@ -14,7 +14,6 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 from ruamel.yaml import YAML
 
-from graphloc.blocks import MountConfig
 from graphloc.config import (
     CompassConfig,
     GnssConfig,
@@ -29,7 +28,6 @@ from graphloc.config import (
 )
 from graphloc.errors import InputError
 from graphloc.frames import Datum
-from graphloc.frontends._mounts import mounts_of
 from graphloc.frontends._source import Bag
 from graphloc.frontends.bag import read_recording
 from graphloc.ledger import Ledger, Outcome
@@ -270,22 +268,6 @@ def test_mounts_follow_the_chain_of_tf_static(tmp_path: Path) -> None:
     assert recording.message_count == accounted(recording) == 221
     with pytest.raises(InputError, match=r"gnss\.mount\.tf_frame: no chain from 'base_link' to 'lidar'.*gps, mast"):
         read_recording(path, vessel(gnss={"topic": "/fix", "mount": {"tf_frame": "lidar"}}))
-
-
-def test_a_damaged_transform_is_told_where_cameras_look_for_their_mounts(tmp_path: Path) -> None:
-    make = Messages(2)
-    whole = make.transforms([("base_link", "camera", (3, 0, 2), (0, 0, 0, 1))])
-    items = [
-        ("/tf_static", START_NS, whole),
-        ("/tf_static", START_NS, (whole.__msgtype__, b"\x00\x01\x00\x00\xff\xff\xff\x7f")),
-    ]
-    with Bag([write_bag(tmp_path / "run", make, items)]) as bag:
-        mounts = mounts_of(bag, {"bow": MountConfig(tf_frame="camera")}, "base_link", "cameras")
-        np.testing.assert_allclose(mounts["bow"][0], [3.0, 0.0, 2.0])
-        (said,) = bag.warnings
-        with pytest.raises(InputError, match=r"cannot be decoded: 1; cameras\.aft\.mount\.tf_frame: no chain"):
-            mounts_of(bag, {"aft": MountConfig(tf_frame="aft")}, "base_link", "cameras")
-    assert "/tf_static: messages that cannot be decoded: 1" in said
 
 
 def test_the_body_may_hang_below_another_frame(tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ def test_a_camera_info_that_cannot_be_read(tmp_path: Path, shown: NDArray[np.uin
     assert refused(path).endswith("no message can be read")
 
 
-def test_transforms_that_cannot_be_read_are_done_without(tmp_path: Path, shown: NDArray[np.uint8]) -> None:
+def test_transforms_that_cannot_be_read_are_done_without_and_told(tmp_path: Path, shown: NDArray[np.uint8]) -> None:
     make = Messages(2)
     static, junk = (
         make.transforms([("base_link", "lens", (1, 0, 0), (0, 0, 0, 1))]),
@@ -107,12 +107,13 @@ def test_transforms_that_cannot_be_read_are_done_without(tmp_path: Path, shown: 
     )
     mounted = tags(cameras={"bow": {"topic": IMAGE, "mount": {"tf_frame": "lens"}}})
     shot = ((INFO, info(make)), (IMAGE, image(make, shown)))
-    found = look(bag_of(tmp_path, make, ("/tf_static", static), ("/tf_static", junk), *shot), mounted)
-    assert only(found).t_body_camera_m.tolist() == [1.0, 0.0, 0.0]
+    (seen,), (said,) = look(bag_of(tmp_path, make, ("/tf_static", static), ("/tf_static", junk), *shot), mounted)
+    assert seen.sightings[0].t_body_camera_m.tolist() == [1.0, 0.0, 0.0]
+    assert said.endswith("/tf_static: messages that cannot be decoded: 1; cameras have their mounts from the rest")
     (tmp_path / "none").mkdir()
     said = refused(bag_of(tmp_path / "none", make, ("/tf_static", static), ("/tf_static", junk), *shot),
                    tags(cameras={"bow": {"topic": IMAGE, "mount": {"tf_frame": "mast"}}}))  # fmt: skip
-    assert "no chain from 'base_link' to 'mast'" in said
+    assert "cannot be decoded: 1; cameras.bow.mount.tf_frame: no chain from 'base_link' to 'mast'" in said
 
 
 def test_a_camera_info_that_changes(tmp_path: Path, shown: NDArray[np.uint8]) -> None:
