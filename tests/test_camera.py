@@ -163,9 +163,13 @@ def test_darkness_costs_light_and_gains_noise_and_drops_hide(detector: Detector)
     burnt = {name: (shot.pixels > 250).mean() for name, shot in shots.items()}
     assert burnt["counterlight"] > 5.0 * burnt["optimal"] + 0.005  # the sun, and its glitter on the water
     _, wet = docking("droplet")
-    hidden = [set(detected(detector, wet.take(float(t), k).pixels)) for k, t in enumerate(np.arange(30.0, 100.0, 2.0))]
+    hidden: set[frozenset[int]] = set()
+    for k, t in enumerate(np.arange(30.0, 100.0, 2.0)):  # drops come and go: until one hid a tag, and none did
+        hidden.add(frozenset(detected(detector, wet.take(float(t), k).pixels)))
+        if {226, 227, 228} in hidden and len(hidden) > 1:
+            break
+    assert {226, 227, 228} in hidden
     assert any(seen < {226, 227, 228} for seen in hidden)
-    assert any(seen == {226, 227, 228} for seen in hidden)
 
 
 def test_exposure_makes_the_mean_grey_and_noise_is_that_of_counts() -> None:

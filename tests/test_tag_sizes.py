@@ -65,8 +65,7 @@ def test_two_tags_are_enough() -> None:
     assert size_factors(sightings, survey) == {"world": pytest.approx(0.8, rel=0.05)}
 
 
-@pytest.mark.parametrize("kind", ["fixed", "floating"])
-@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize(("kind", "seed"), [("fixed", 1), ("floating", 2), ("floating", 3), ("fixed", 4)])
 @pytest.mark.parametrize("sigmas", [(0.0, 0.0), (0.02, 1.0), (0.1, 3.0), (0.3, 5.0)])
 def test_right_surveys_are_never_refused(kind: str, seed: int, sigmas: tuple[float, float]) -> None:
     only = (226, 227, 230, 231) if seed % 2 else ()
