@@ -56,14 +56,15 @@ def best_chain(
     raw = np.array([residuals[n][mode].raw for n, mode in node])
     cov = np.array([residuals[n][mode].cov for n, mode in node])
     alone = np.log([residuals[n][mode].prior for n, mode in node]) - nothing[at]
-    roots = None if predictions is None else np.array([p.root for p in predictions])[at]
-    lasts_s = None if predictions is None else np.array([p.lasts_s for p in predictions])[at]
+    bound = None
+    if predictions is not None:
+        bound = np.array([p.root for p in predictions])[at], np.array([p.lasts_s for p in predictions])[at]
     score, before = np.zeros(len(node)), np.full(len(node), -1)
     for k, n in enumerate(at):
-        if roots is None:
+        if predictions is None:
             nis, begun = float(dof), cov[k] + models[n].cov
         else:
-            begun = cov[k] + roots[k] @ roots[k].T
+            begun = cov[k] + predictions[n].cov
             nis = float(raw[k] @ np.linalg.solve(begun, raw[k]))
         score[k] = alone[k] + gained[n] - 0.5 * (np.linalg.slogdet(2.0 * np.pi * begun)[1] + nis)
         lo, hi = np.searchsorted(at, [n - _LOOK_BACK, n])
@@ -71,7 +72,8 @@ def best_chain(
             continue
         ages_s = stamps[n] - stamps[at[lo:hi]]
         expected, left = raw[lo:hi], cov[lo:hi]
-        if roots is not None and lasts_s is not None:
+        if bound is not None:
+            roots, lasts_s = bound
             kept = kept_of(lasts_s[lo:hi], lasts_s[k], ages_s)
             expected, left = carried(expected, left, roots[lo:hi], roots[k], kept)
         spread, step = left + cov[k] + ages_s[:, None, None] * walk[n], expected - raw[k]

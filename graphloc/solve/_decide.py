@@ -68,8 +68,8 @@ def _predicted(
     found: tuple[Residual, ...], at: Attachment, k: int, covariance: PredictedCovariance
 ) -> Prediction | None:
     """What the prediction of a state knows of a residual; None: it is no prediction."""
-    P, V = covariance(k, at.pose_key), covariance(k, keys.velocity(k))
-    if P is None or V is None:
+    P = covariance(k, at.pose_key)
+    if P is None or (V := covariance(k, keys.velocity(k))) is None:
         return None
     slow = None if at.slow_key is None else covariance(k, at.slow_key)
     return prediction_of(found[0], at, P if slow is None else block_diag(P, slow), V)

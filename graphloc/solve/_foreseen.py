@@ -69,9 +69,8 @@ def prediction_of(residual: Residual, at: Attachment, P: Array, velocity_cov: Ar
         slow = np.zeros((len(J), others)) if residual.slow_jacobian is None else residual.slow_jacobian()
         J = np.hstack([J, slow])
     turn = np.eye(len(P))
-    turn[:3, :3] = turn[3:6, 3:6] = (
-        at.T_world_body.rotation().matrix()
-    )  # an error stays where it is as the vessel turns
+    # In world axes: an error stays where it is as the vessel turns.
+    turn[:3, :3] = turn[3:6, 3:6] = at.T_world_body.rotation().matrix()
     # The symmetric root is one that changes little where P does, so that those of two states go together.
     values, vectors = np.linalg.eigh(turn @ P @ turn.T)
     root = J @ turn.T @ (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
@@ -92,7 +91,7 @@ def foresee(
         predictions: N, or None where the measurement took part in the estimate.
         chain: N modes that are taken for right (see `best_chain`), or None.
     """
-    taken, models = taken_of(stream, indices)
+    assert stream.row.false is not None
     chained = any(mode is not None for mode in chain)
     seen, last = [], None
     for n, (found, prediction) in enumerate(zip(residuals, predictions, strict=True)):
@@ -105,12 +104,13 @@ def foresee(
             seen.append(Foreseen(found, prediction.cov, possible))
         else:
             j, before, mode = last
-            age_s = (taken[n].stamp_ns - taken[j].stamp_ns) * 1e-9
+            m = stream.measurements[indices[n]]
+            age_s = (m.stamp_ns - stream.measurements[indices[j]].stamp_ns) * 1e-9
             kept = kept_of(np.array([before.lasts_s]), prediction.lasts_s, np.array([age_s]))
             right = residuals[j][mode]
             mean, cov = carried(right.raw[None], right.cov[None], before.root[None], prediction.root, kept)
             modes = tuple(replace(r, raw=r.raw - mean[0]) for r in found)
-            seen.append(Foreseen(modes, cov[0] + walk_of(models[n]) * age_s, possible))
+            seen.append(Foreseen(modes, cov[0] + walk_of(stream.row.false(m, stream.config)) * age_s, possible))
         if mode_now is not None:
             last = n, prediction, mode_now
     return seen

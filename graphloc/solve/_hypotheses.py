@@ -2,8 +2,9 @@
 """Right or false: the measurements of one sensor that can be false, as a sequence.
 
 A false measurement's error is drawn anew, or repeats that of the false one before it. So right and false
-form a chain of two states, and forward-backward gives each posterior exactly: without the repeats, six
-scans that take the same wrong boat for the right one outweigh IMU and GNSS together.
+form a chain of two states, and forward-backward gives each posterior of that chain: without the repeats, six
+scans that take the same wrong boat for the right one outweigh IMU and GNSS together. Of what is judged by a
+prediction, each state is two: what a right one tells the next (`foresee`) holds once one has been right.
 
 That is local: around an estimate. `best_chain` is global.
 """
