@@ -79,8 +79,10 @@ class _Seen:
             self.slow = (_between(at) if self.first is not None else np.asarray(at.slow_value))[self.own]
         self.moved = moved = self.slow[:6] if self.first is not None else np.zeros(6)
         self.edge_px = float(self.slow[-1]) if self.edges else 0.0
-        self.turn = gtsam.Rot3.Expmap(moved[3:]).matrix()
-        self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-moved[3:]))  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
+        self.turn = self.by_turn = np.eye(3)
+        if self.first is not None:
+            self.turn = gtsam.Rot3.Expmap(moved[3:]).matrix()
+            self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-moved[3:]))  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
         self.constants = _constants_of(m, config, at)
         tags = np.array(m.points_m).reshape(-1, 4, 3)
         self.within = tags - tags.mean(axis=1, keepdims=True)  # each corner from its tag's middle
@@ -113,8 +115,7 @@ def _docks(survey: Survey) -> list[str]:
 
 def _constants_of(m: TagSighting, config: AprilTagConfig, at: Attachment) -> list[tuple[int, Array] | None]:
     """Key and estimate of what the survey errs about each tag; None where there is none."""
-    index = {(str(tag.family), tag.id): k for k, tag in enumerate(config.surveyed.tags)}
-    found = [index.get(tag) for tag in m.tags]
+    found = [config.surveyed.place_of.get(tag) for tag in m.tags]
     return [at.constants[k] if k is not None and k < len(at.constants) else None for k in found]
 
 
@@ -172,12 +173,12 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
         return linear_update(by_mode, _terms(at, by_mode.jacobian(), by_mode.slow_jacobian), decision)
     flat, projected = pinhole(toward)
     by_point = projected @ seen.R.T  # d flat / d place of the corner
-    off = seen.points_m - seen.p
-    rotation = np.array([skew(v) for v in off])
-    camera = np.concatenate([-by_point, by_point @ rotation], axis=2).reshape(-1, 6)
-    swing = np.array([-skew(arm) for arm in seen.arms]) @ seen.by_turn
-    by_dock = np.concatenate([by_point, by_point @ swing], axis=2).reshape(-1, 6)
-    by_own = [] if seen.first is None else [by_dock]
+    turning = _turning(by_point, seen.points_m - seen.p)
+    camera = np.concatenate([-by_point, -turning], axis=2).reshape(-1, 6)
+    by_own = []
+    if seen.first is not None:
+        swing = _turning(by_point, seen.arms) @ seen.by_turn
+        by_own.append(np.concatenate([by_point, swing], axis=2).reshape(-1, 6))
     if seen.edges:
         outwards = m.px * _outwards(flat)  # not of the rays: their noise would tell edges from distance
         flat = flat + seen.edge_px * outwards
@@ -199,12 +200,17 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
             terms.append(Term(at.slow_key, np.array(at.slow_value), seen.placed(by_slow[own])))
         if constant is not None:
             at_rest = by_point[4 * k : 4 * k + 4] @ seen.turn
-            turned = at_rest @ np.array([-skew(arm) for arm in seen.within[k]])
+            turned = _turning(at_rest, seen.within[k])
             terms.append(
                 Term(constant[0], np.array(constant[1]), np.concatenate([at_rest, turned], axis=2).reshape(8, 6))
             )
         found += linear_update(corners, terms, decision).factors
     return GraphUpdate(factors=tuple(found), guesses=() if tie is None else tie.guesses)
+
+
+def _turning(by_point: Array, arms: Array) -> Array:
+    """Takes d / d places (n, 2, 3) of points to d / d a small turn (n, 2, 3) of the arms (n, 3) that they are at."""
+    return -np.cross(by_point, arms[:, None])  # b' (w x a) = (a x b)' w
 
 
 def _tie(seen: _Seen, dock: DockConfig, config: AprilTagConfig, at: Attachment) -> GraphUpdate:
