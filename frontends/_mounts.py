@@ -9,7 +9,6 @@ from graphloc.blocks import MountConfig
 from graphloc.frames import Array
 from graphloc.frontends._source import TF_STATIC, Bag
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends.decode import TF
 
 
 def mounts_of(
@@ -22,20 +21,18 @@ def mounts_of(
     Raises:
         InputError: no chain of transforms leads from the body to a sensor.
     """
-    tree, broken = StaticTree(), 0
+    tree = StaticTree()
     if any(mount.tf_frame for mount in mounts.values()):
         for raw in bag.messages({TF_STATIC}):
             try:
-                if raw.msgtype == TF:
-                    tree.add(bag.decode(raw))
+                msg = bag.decode(raw)
             except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
-                broken += 1
-    damaged = f"{TF_STATIC}: messages that cannot be decoded: {broken}" if broken else ""
-    if damaged:
-        bag.warnings.append(f"{bag.name}: {damaged}; {block} have their mounts from the rest")
-    where = f"{bag.name}: {damaged}; {block}" if damaged else f"{bag.name}: {block}"  # it may have held what is missing
+                msg = None
+            tree.take(raw.msgtype, msg)
+    if tree.damage:
+        bag.warnings.append(f"{bag.name}: {tree.damage}; {block} have their mounts from the rest")
     return {
-        name: tree.mount(body_frame, mount.tf_frame, f"{where}.{name}.mount.tf_frame")
+        name: tree.mount(body_frame, mount.tf_frame, f"{bag.name}: {block}.{name}.mount.tf_frame")
         if mount.tf_frame
         else (mount.t_body_sensor_m, mount.R_body_sensor)
         for name, mount in mounts.items()

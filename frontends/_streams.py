@@ -20,7 +20,6 @@ from graphloc.frontends.decode import (
     PLAIN_TWIST,
     POSE,
     QUATERNION,
-    TF,
     TWIST,
     header_stamp_ns,
 )
@@ -118,16 +117,17 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
     statics = {TF_STATIC} & set(bag.topics)
     for raw in bag.messages(set(streams) | statics) if streams or statics else ():
         stream = streams.get(raw.topic)
+        msg: Any = None
         try:
-            msg: Any = bag.decode(raw)
-            if stream is None:
-                if raw.msgtype == TF:
-                    tree.add(msg)
-                continue
-            row = ROWS[raw.msgtype](msg)
+            msg = bag.decode(raw)
+            row = None if stream is None else ROWS[raw.msgtype](msg)
         except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything; counted
-            if stream is not None:
-                stream.undecodable += 1
+            row = None
+        if stream is None:
+            tree.take(raw.msgtype, msg)
+            continue
+        if row is None:
+            stream.undecodable += 1
             continue
         stamp_ns = header_stamp_ns(msg)
         if stamp_ns is None:

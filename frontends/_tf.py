@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
 from graphloc.frames import Array
-from graphloc.frontends.decode import is_unit
+from graphloc.frontends._source import TF_STATIC
+from graphloc.frontends.decode import TF, is_unit
 
 # Names of the body frame, likeliest first.
 _WORLD_NAMES = ("map", "odom", "world", "earth", "utm")
@@ -23,12 +24,32 @@ Pose = tuple[Array, Array]  # t (3,), R (3, 3): T_parent_child
 
 
 class StaticTree:
-    """Static transforms by frame, walked in both directions."""
+    """Static transforms by frame, walked in both directions.
+
+    Attributes:
+        broken: messages that were of no use: another one may be whole.
+    """
 
     def __init__(self) -> None:
         self._edges: dict[str, dict[str, Pose]] = {}
         self._children: set[str] = set()
         self._unusable: set[str] = set()
+        self.broken = 0
+
+    def take(self, msgtype: str, msg: Any) -> None:
+        """Take a message of `/tf_static` as it comes: None where it cannot be decoded; of another type it says nothing."""
+        whole = msg is not None
+        if whole and msgtype == TF:
+            try:
+                self.add(msg)
+            except AttributeError:  # the bag's definition of it is damaged
+                whole = False
+        self.broken += not whole
+
+    @property
+    def damage(self) -> str:
+        """What is to be said of messages that were of no use; empty where all are whole."""
+        return f"{TF_STATIC}: messages that cannot be decoded: {self.broken}" if self.broken else ""
 
     def add(self, msg: Any) -> None:
         """Take the transforms of a `tf2_msgs/TFMessage`; a later one of the same pair replaces an earlier one."""
@@ -82,6 +103,8 @@ class StaticTree:
                 known += (
                     f"; without a pose, as NaN or no unit quaternion stands there: {', '.join(sorted(self._unusable))}"
                 )
+            if self.broken:
+                known += f"; messages that cannot be decoded: {self.broken}"  # one may have held what is missing
             raise InputError(
                 f"{where}: no chain from '{body}' to '{sensor}' in /tf_static (frames there: {known}); "
                 "set body_frame and mount.tf_frame to such names, or give mount.xyz_m and mount.rpy_deg"

@@ -34,7 +34,6 @@ from graphloc.frontends._turns import turn_warnings
 from graphloc.frontends.decode import (
     ODOMETRY,
     POSE,
-    TF,
     Decoded,
     Rejection,
     decoder_of,
@@ -162,7 +161,6 @@ class _Reader:
             self._wanted.add(TF_STATIC)
         self._rows: list[LedgerRow] = []
         self._seq = 0
-        self._broken_mounts = 0
 
     def read(self, progress: Progress | None) -> list[LedgerRow]:
         """Fill the sensors' readings; return the rows of all other messages."""
@@ -201,12 +199,7 @@ class _Reader:
                 item.logs_ns.append(raw.log_ns)
                 item.messages.append(msg)
         if raw.topic == TF_STATIC and self._tree is not None:
-            try:
-                if msg is not None and raw.msgtype == TF:
-                    self._tree.add(msg)
-            except AttributeError:  # the bag's definition of it is damaged
-                msg = None
-            self._broken_mounts += msg is None
+            self._tree.take(raw.msgtype, msg)
 
     def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:
         """Hand a message to its decoder; what gives no reading gives a row."""
@@ -250,9 +243,9 @@ class _Reader:
             for item in self._beside.get(topic, ()):
                 add(topic, item.count - item.broken, Outcome.READ, item.reason)
                 add(topic, item.broken, Outcome.MALFORMED, "cannot be decoded")
-            if topic == TF_STATIC:
-                add(topic, read[topic] - self._broken_mounts, Outcome.READ, "read for mounts")
-                add(topic, self._broken_mounts, Outcome.MALFORMED, "cannot be decoded")
+            if topic == TF_STATIC and self._tree is not None:
+                add(topic, read[topic] - self._tree.broken, Outcome.READ, "read for mounts")
+                add(topic, self._tree.broken, Outcome.MALFORMED, "cannot be decoded")
             missing = summary.messages - read[topic]
             add(topic, missing, Outcome.MALFORMED, "announced by the bag's index, but cannot be read")
         return rows

@@ -81,7 +81,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         streams, tree = read_streams(bag)
         clouds = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
         images = _frames_of(bag, _pictures(bag))
-        source, warnings = bag.name, tuple(bag.warnings)
+        source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
     by_topic = {s.topic: s for s in streams}
     filled = [s for s in streams if len(s)]
     fixes = [s for s in filled if s.msgtype == NAV_SAT_FIX]
@@ -182,6 +182,10 @@ def _useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
     for stream in streams:
         if stream.topic in used or stream.msgtype not in (IMU, NAV_SAT_FIX):
             continue
+        total = len(stream) + stream.undecodable + stream.no_stamp
+        if not total:
+            lines.append(f"{stream.topic}: not a message on it")
+            continue
         plausible = len(sane(stream)) if len(stream) else 0
         why = f"{stream.undecodable} cannot be decoded, {stream.no_stamp} have no stamp"
         if plausible < len(stream):
@@ -190,7 +194,6 @@ def _useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
             why += f", {int((stream.rows[:, 3] < 0).sum()) if len(stream) else 0} say 'no fix', the others lie at 0, 0 or are NaN"
         elif len(stream) and (hangs := samples_of(stream)[1]):
             why = hangs[0].removeprefix(f"{stream.topic}: ")
-        total = len(stream) + stream.undecodable + stream.no_stamp
         lines.append(f"{stream.topic}: nothing of its {total} messages can be used: {why}")
     return lines
 

@@ -428,6 +428,20 @@ def test_topics_that_give_nothing_are_said(status: int, said: str, tmp_path: Pat
     assert "nothing of its 20 messages" in render(found)
 
 
+def test_a_receiver_without_a_message_and_damaged_transforms_are_said(tmp_path: Path) -> None:
+    make = Messages(2)
+    with Writer(tmp_path / "run", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.add_connection("/fix", make.fix(START_NS).__msgtype__, typestore=make.store)
+        static = writer.add_connection("/tf_static", "tf2_msgs/msg/TFMessage", typestore=make.store)
+        whole = make.transforms([("base_link", "gps", (1, 2, 0), (0, 0, 0, 1))])
+        for data in (b"\1", make.store.serialize_cdr(whole, whole.__msgtype__)):
+            writer.write(static, START_NS, data)
+    found = inspect_bag(tmp_path / "run")
+    assert found.tf_frames == ("base_link", "gps")
+    assert "/tf_static: messages that cannot be decoded: 1" in found.warnings
+    assert any(w == "/fix: not a message on it" for w in found.warnings)
+
+
 def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
     make = Messages(2)
     items: list[Item] = []

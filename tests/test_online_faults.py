@@ -102,12 +102,12 @@ def test_a_lost_estimate_starts_anew() -> None:
     base, online = arrivals_of(run), smoother(run)
     n = at_s(base, 8.0)
     fed = feed(online, run, base[:n])
-    anchor = online._anchors[-1]  # noqa: SLF001
+    anchor = online._recent.anchors[-1]  # noqa: SLF001
     pose = type(anchor.pose)(anchor.pose.rotation(), anchor.pose.translation() + np.array([300.0, 0.0, 0.0]))
     known = {name: replace(b, cov=b.cov * 1e-4) for name, b in anchor.slow.items()}
-    online._anchors.clear()  # noqa: SLF001
-    online._anchors.append(replace(anchor, pose=pose, cov=anchor.cov * 1e-4, slow=known))  # noqa: SLF001
-    online._recent = [m for m in online._recent if m.stamp_ns >= anchor.stamp_ns]  # noqa: SLF001
+    online._recent.anchors.clear()  # noqa: SLF001
+    online._recent.anchors.append(replace(anchor, pose=pose, cov=anchor.cov * 1e-4, slow=known))  # noqa: SLF001
+    online._recent.begin([m for m in online._recent if m.stamp_ns >= anchor.stamp_ns])  # noqa: SLF001
     online._rebuild(RuntimeError("planted"))  # noqa: SLF001
     feed(online, run, base[n:], fed)
     assert complaints(base, finish(online, fed)) == []

@@ -113,7 +113,8 @@ def test_transforms_that_cannot_be_read_are_done_without_and_told(tmp_path: Path
     (tmp_path / "none").mkdir()
     said = refused(bag_of(tmp_path / "none", make, ("/tf_static", static), ("/tf_static", junk), *shot),
                    tags(cameras={"bow": {"topic": IMAGE, "mount": {"tf_frame": "mast"}}}))  # fmt: skip
-    assert "cannot be decoded: 1; cameras.bow.mount.tf_frame: no chain from 'base_link' to 'mast'" in said
+    assert "cameras.bow.mount.tf_frame: no chain from 'base_link' to 'mast'" in said
+    assert "(frames there: base_link, lens; messages that cannot be decoded: 1)" in said
 
 
 def test_a_camera_info_that_changes(tmp_path: Path, shown: NDArray[np.uint8]) -> None:

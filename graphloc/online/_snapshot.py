@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from graphloc.errors import in_one_line
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
 from graphloc.solve._solution import NO_NOISE
 
 _VERSION = 1
+_EVERY_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,3 +96,47 @@ class Snapshot:
             p_odom_m=p,
             R_odom_body=R,
         )
+
+
+class SnapshotFile:
+    """Where a run leaves its snapshots, and finds one; `path` None: nowhere."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._written_ns = 0
+        self._unwritable = False
+
+    def due(self, at_ns: int) -> bool:
+        """Whether it is time for one."""
+        return self._path is not None and at_ns - self._written_ns >= _EVERY_S * 1e9
+
+    def restart(self) -> None:
+        """The next is due at once, whatever the clock says."""
+        self._written_ns = 0
+
+    def write(self, snapshot: Snapshot) -> str:
+        """Replace what is there; return what is to be said, once, where that fails."""
+        assert self._path is not None
+        self._written_ns = snapshot.anchor.stamp_ns
+        try:
+            snapshot.write(self._path)
+        except OSError as error:
+            told, self._unwritable = self._unwritable, True
+            return "" if told else f"{self._path}: the snapshot cannot be written ({error.strerror or error})"
+        self._unwritable = False
+        return ""
+
+    def read(self, vessel: str, imu: str, datum: Datum | None) -> tuple[Snapshot | None, str]:
+        """Return the snapshot that is there, and why it is of no use where it is not: of another vessel or origin, damaged."""
+        path = self._path
+        if path is None or not path.exists():
+            return None, ""
+        try:
+            found = Snapshot.read(path, imu)
+            if found.vessel != vessel:
+                raise ValueError("it is of another vessel")
+            if datum is not None and not np.allclose(found.datum.origin, datum.origin, rtol=0.0, atol=1e-9):
+                raise ValueError("its origin of world is another one")
+        except Exception as error:  # noqa: BLE001 - a file that anything may have written
+            return None, f"{path}: the snapshot cannot be used ({in_one_line(error)}): starts anew"
+        return found, ""

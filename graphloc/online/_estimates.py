@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What users get of a state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from graphloc.estimate import Estimate
+from graphloc.online._ahead import Ahead
+from graphloc.online._anchor import sound
+from graphloc.online._lag import Lag
+from graphloc.online._odometry import Odometry
+from graphloc.solve._solution import health_of, left_out, world_covariance
+
+
+def estimate_of(
+    now: Ahead, lag: Lag, odometry: Odometry, *, agreed_ns: Mapping[str, int], absolute: Sequence[str], doubt: str
+) -> Estimate:
+    """Return the estimate at a state of the lag, or ahead of it.
+
+    Args:
+        agreed_ns: when each absolute sensor last agreed. absolute: names of all of them.
+        doubt: why the pose cannot be called good, or empty.
+    """
+    newest, problem = lag.newest, lag.problem
+    at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
+    R = now.pose.rotation().matrix()
+    gyro = problem.links.gyro_at(np.array([at_ns]))[0] - problem.R_body_imu @ newest.bias.gyroscope()
+    cov = world_covariance(sound(now.pose_cov), R, lever)
+    cov[:3, :3] += left_out(list(problem.streams.values()))
+    since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
+    health, reason = health_of(cov, since, doubt)
+    if doubt and reason != doubt:
+        reason = f"{reason}; {doubt}"
+    return Estimate(
+        stamp_ns=at_ns,
+        p_world_m=np.asarray(now.pose.transformFrom(lever)),
+        R_world_body=R,
+        v_world_mps=now.velocity + R @ np.cross(gyro, lever),
+        cov=cov,
+        v_cov=now.velocity_cov,
+        p_odom_m=np.array(now.p_odom_m),
+        R_odom_body=np.array(now.R_odom_body),
+        step_cov=odometry.step_cov,
+        gyro_radps=gyro,
+        accel_bias_mps2=np.asarray(newest.bias.accelerometer()),
+        gyro_bias_radps=np.asarray(newest.bias.gyroscope()),
+        health=health,
+        reason=reason,
+        since_agreed_s=since,
+    )

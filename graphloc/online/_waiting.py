@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What came while there is no estimate."""
+
+from __future__ import annotations
+
+from bisect import insort
+
+from graphloc.ledger import Outcome
+from graphloc.measurements import ImuSample, Measurement
+from graphloc.online._book import Book
+from graphloc.online._start import LEAST_S
+from graphloc.time import duration_ns
+
+_TRY_EVERY_S, _TRY_AGAIN = 0.5, 0.15  # of a start
+_LONGEST_S, _MOST = 120.0, 50_000  # what is older, or more, is let go
+
+
+class Waiting:
+    """Measurements by stamp, and `why`: what the start waits for, in plain words."""
+
+    def __init__(self, book: Book) -> None:
+        self.why = ""
+        self._book = book
+        self._held: list[Measurement] = []
+        self._tried_ns = 0
+
+    def begin(self, why: str) -> None:
+        """Wait anew, with nothing."""
+        self.why, self._held, self._tried_ns = why, [], 0
+
+    def hold(self, m: Measurement) -> None:
+        """Keep a measurement."""
+        insort(self._held, m, key=lambda held: held.stamp_ns)
+        if len(self._held) > _MOST:
+            self._let_go()
+
+    def due(self, newest_ns: int) -> bool:
+        """Whether a start is to be tried: the more there is to solve, the rarer."""
+        while newest_ns - self._held[0].stamp_ns > _LONGEST_S * 1e9:
+            self._let_go()
+        waited_ns = newest_ns - self._held[0].stamp_ns - duration_ns(LEAST_S)
+        if newest_ns - self._tried_ns < max(_TRY_EVERY_S * 1e9, _TRY_AGAIN * waited_ns):
+            return False
+        self._tried_ns = newest_ns
+        return True
+
+    def samples(self) -> list[ImuSample]:
+        """Return those of the IMU."""
+        return [m for m in self._held if isinstance(m, ImuSample)]
+
+    def others(self) -> list[Measurement]:
+        """Return all but the IMU's."""
+        return [m for m in self._held if not isinstance(m, ImuSample)]
+
+    def taken(self) -> list[Measurement]:
+        """Return all, and keep nothing."""
+        held, self._held = self._held, []
+        return held
+
+    def refuse(self, reason: str) -> None:
+        """Enter all into the ledger as not used."""
+        for m in self.taken():
+            self._book.drop(m, Outcome.REJECTED, reason)
+
+    def _let_go(self) -> None:
+        self._book.drop(self._held.pop(0), Outcome.REJECTED, f"came before the start: waiting for {self.why}")
