@@ -19,6 +19,7 @@ from graphloc.factors.imu import Links
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix
 from graphloc.online import OnlineSmoother
+from graphloc.online._live import live_problem
 from graphloc.online._window import Window
 from tests.faults import FAULTS, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
 
@@ -94,6 +95,24 @@ def test_starts_anew_after_a_long_silence() -> None:
     n = int(np.argmax(np.diff(stamps)))
     step = np.linalg.norm(fed.estimates[n + 1].p_odom_m - fed.estimates[n].p_odom_m)
     assert step < 6.0 * (np.linalg.norm(fed.estimates[n].v_world_mps) + 1.0)
+
+
+def test_a_start_that_fails_keeps_its_accounts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lag cannot be built: what came for it has its rows, and the next start is taken."""
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    base = base[: at_s(base, 13.0)]
+    failures = [RuntimeError("planted")]
+
+    def fails_once(*arguments: Any) -> Any:
+        if failures:
+            raise failures.pop()
+        return live_problem(*arguments)
+
+    monkeypatch.setattr("graphloc.online._smoother.live_problem", fails_once)
+    fed = whole(base, online)
+    assert complaints(base, fed) == []
+    assert [e for e in fed.events if e.startswith("the start failed") and "planted" in e]
+    assert [e for e in fed.events if e.startswith("started")]
 
 
 def test_a_lost_estimate_starts_anew() -> None:

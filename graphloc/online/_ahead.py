@@ -12,7 +12,7 @@ from graphloc.frames import Array
 from graphloc.graph import UNKNOWN_MPS2, UNKNOWN_RADPS
 from graphloc.online._live import LiveProblem
 from graphloc.online._odometry import Odometry
-from graphloc.online._states import Newest
+from graphloc.online._states import Newest, carried_on
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,11 +53,7 @@ def ahead(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: in
     there = pim.predict(gtsam.NavState(pose, newest.velocity), newest.bias)
     p_odom, R_odom = odometry.after(*_body_step(problem, pose, there.pose()))
     dt_s, noise = (stamp_ns - newest.stamp_ns) * 1e-9, pim.preintMeasCov()
-    dR = pose.rotation().between(there.pose().rotation()).matrix()
-    pose_cov = _turned(newest.pose_cov, dR.T)
-    R = there.pose().rotation().matrix()
-    pose_cov[3:, 3:] += dt_s**2 * R.T @ newest.velocity_cov @ R + noise[3:6, 3:6]
-    pose_cov[:3, :3] += noise[:3, :3]
+    pose_cov = carried_on(newest.pose_cov, newest, there.pose().rotation().matrix(), dt_s, noise)
     v_cov = newest.velocity_cov + noise[6:, 6:]
     if blind_s > 0.0:
         pose_cov[:3, :3] += UNKNOWN_RADPS**2 * blind_s * np.eye(3)
@@ -97,9 +93,3 @@ def _body_step(problem: LiveProblem, a: gtsam.Pose3, b: gtsam.Pose3) -> tuple[Ar
     R = a.rotation().matrix()
     dp = R.T @ (b.transformFrom(lever) - a.transformFrom(lever))
     return dp, R.T @ b.rotation().matrix()
-
-
-def _turned(cov: Array, R: Array) -> Array:
-    """A covariance (6, 6) of the body tangent, in turned axes."""
-    both = np.kron(np.eye(2), R)
-    return np.asarray(both @ cov @ both.T)

@@ -376,10 +376,10 @@ class OnlineSmoother:
         self._snapshot.restart()
 
     def _restart(self, why: str) -> None:
+        self._say(f"{why}: starts anew")
         if self._lag is not None:
             self._book.enter([*self._lag.gone(), *self._lag.held()])
             self._agreed_ns.update(self._lag.agreed_ns)
-            self._say(f"{why}: starts anew")
         for m in self._pending:
             self._book.drop(m, Outcome.REJECTED, "the run was cut before the IMU got there")
         self._waiting.refuse(f"the run was cut while it waited for {self._waiting.why}")
@@ -422,13 +422,11 @@ class OnlineSmoother:
         for sample in samples:
             self._book.used(sample)
         self._waiting.taken()
+        self._pending = others
         self._begin(started.anchor, samples, (started.pose, started.velocity, started.bias))
         assert self._lag is not None
-        for m in others:
-            if m.stamp_ns < self._lag.first_ns:
-                self._book.drop(m, Outcome.REJECTED, "no IMU data at this stamp")
-            else:
-                self._pending.append(m)
+        while self._pending and self._pending[0].stamp_ns < self._lag.first_ns:
+            self._book.drop(self._pending.pop(0), Outcome.REJECTED, "no IMU data at this stamp")
         self._recent.begin([*samples, *self._pending])
         self._step(self._lag)
         self._keep_anchor(self._lag)

@@ -40,6 +40,21 @@ class Newest:
     velocity_cov: Array
 
 
+def carried_on(cov: Array, newest: Newest, R: Array, dt_s: float, noise: Array) -> Array:
+    """Return a covariance at the newest state, dt_s later: much is added across a gap.
+
+    Args:
+        cov: (n, n), of its pose (body tangent) first, then of what stays.
+        R: (3, 3), body in world then. noise: (9, 9), what the IMU adds on the way, as preintegrated.
+    """
+    turn = np.eye(len(cov))
+    turn[:3, :3] = turn[3:6, 3:6] = R.T @ newest.pose.rotation().matrix()
+    later = turn @ cov @ turn.T
+    later[3:6, 3:6] += dt_s**2 * R.T @ newest.velocity_cov @ R
+    later[:6, :6] += noise[:6, :6]
+    return np.asarray(later)
+
+
 class States:
     """States from an anchor on, in a window.
 
@@ -176,12 +191,12 @@ class States:
         if any(not window.is_committed(key) for key in wanted):
             return Prediction(np.zeros((len(residual.raw), size)))
         P = np.array(window.covariance(wanted))
-        if base != k:  # what velocity and the IMU's noise add on the way: much, across a gap
+        if base != k:
             from_ns, to_ns = timeline.stamps_ns[base], timeline.stamps_ns[k]
-            R = at.T_world_body.rotation().matrix()
-            P[3:6, 3:6] += ((to_ns - from_ns) * 1e-9) ** 2 * R.T @ newest.velocity_cov @ R
             pim = self._problem.links.integrate(from_ns, to_ns, newest.bias)
-            P[:6, :6] += np.asarray(pim.preintMeasCov())[:6, :6]
+            P = carried_on(
+                P, newest, at.T_world_body.rotation().matrix(), (to_ns - from_ns) * 1e-9, pim.preintMeasCov()
+            )
         return prediction_of(residual, at, P, newest.velocity_cov)
 
     def step_cost(self) -> float:
