@@ -113,7 +113,7 @@ def render(results: dict[str, Any]) -> str:
     lines = [
         "# Results",
         "",
-        "Made by `make results` (about two hours on four cores; D.1 makes D.2, D.3 and D.5 too; A.1 wants the Husky bag in `../shared/data/husky`); the numbers are in",
+        "Made by `make results` (some twelve hours of one core, `--only` takes items; D.1 makes D.2, D.3 and D.5 too; A.1 wants the Husky bag in `../shared/data/husky`); the numbers are in",
         "`results.json`. A figure that misses its bound is marked **misses**. Items are those of the issues; 'BL' is the",
         "thesis of Bergman & Lindell: its cases are harbour entry, sharp turn and standing still, its EKF is alg. 6 with the",
         "2 m gate, told by hand of a signal loss as there. The honest EKF is `eval/ekf/`, tuned on other seeds. A `+`",
