@@ -63,7 +63,9 @@ class Lens:
             r2 = x * x + y * y
             radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
             shift = np.stack([2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
-            ray = (flat - shift) / radial
+            last, ray = ray, (flat - shift) / radial
+            if np.abs(ray - last).max() < 1e-12:
+                break
         return np.stack([*ray, np.ones_like(u)])
 
 

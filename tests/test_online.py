@@ -32,7 +32,13 @@ def smoother(run: SimulatedRun, *, lag_s: float = 10.0) -> OnlineSmoother:
 
 @cache
 def drift() -> SimulatedRun:
-    return simulate(replace(bl_scenario(1, "drift"), duration_s=30.0), 0)
+    """Sensors, and states, at half the rates of BL or less: a third of the time."""
+    scenario = replace(bl_scenario(1, "drift"), duration_s=30.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=2.0)
+    return slowly(simulate(scenario, 0))
+
+
+def slowly(run: SimulatedRun) -> SimulatedRun:
+    return replace(run, config=run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)}))
 
 
 def whole(run: SimulatedRun, arrivals: Arrivals, *, lag_s: float = 10.0) -> tuple[Fed, Trajectory]:
@@ -73,9 +79,9 @@ def test_a_clean_run_is_followed_and_each_message_has_its_row() -> None:
     assert np.mean(inside) > 0.8
 
 
-def test_estimates_come_at_ten_hertz_and_stamps_increase() -> None:
+def test_estimates_come_at_the_rate_of_states_and_stamps_increase() -> None:
     stamps = np.array([e.stamp_ns for e in in_order()[0].estimates])
-    assert np.allclose(np.diff(stamps), 0.1e9, atol=1)
+    assert np.allclose(np.diff(stamps), 0.2e9, atol=1)
 
 
 def test_false_matches_are_rejected_with_a_reason() -> None:
@@ -235,9 +241,7 @@ def test_starts_from_fix_and_compass() -> None:
 
 
 def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
-    run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0), 0)
-    config = run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)})  # half the time
-    run = replace(run, config=config)
+    run = slowly(simulate(replace(Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0), 0))
     arrivals = without(arrivals_of(run), lambda a: isinstance(a.m, (PoseFix, CompassHeading)))
     said, fed = said_while_waiting(run, arrivals)
     assert any(s.startswith("a heading") and "m of way" in s for s in said)
@@ -277,7 +281,7 @@ def test_starts_from_given_poses() -> None:
 
 def test_starts_from_a_tag_alone() -> None:
     scenario = replace(harbour_scenarios()["dock-fixed-optimal"], duration_s=120.0, gnss_hz=0.0, compass_hz=0.0)
-    run, _ = sighted(simulate(scenario, 0), rate_hz=2.0)
+    run, _ = sighted(slowly(simulate(replace(scenario, imu_hz=50.0), 0)), rate_hz=2.0)
     arrivals = arrivals_of(run)
     first = next(n for n, a in enumerate(arrivals) if a.m.sensor == "tags")
     begin = arrivals[first].true_ns - 6_000_000_000
@@ -320,7 +324,7 @@ def test_a_second_imu_is_left_aside() -> None:
 def test_odom_does_not_jump_where_the_map_does() -> None:
     """Fixes come back after 60 s of dead reckoning: the map jumps by metres, odometry goes on as the vessel does."""
     scenario = replace(bl_scenario(1, "drift"), duration_s=90.0, outage_s=(12.0, 72.0), gyro_bias_radps=0.01)
-    run = simulate(scenario, 2)
+    run = slowly(simulate(replace(scenario, imu_hz=50.0, gnss_hz=5.0, compass_hz=2.0), 2))
     fed, _ = whole(run, arrivals_of(run))
     e = fed.estimates
     true = run.truth.at(np.array([x.stamp_ns for x in e]))
@@ -334,7 +338,7 @@ def test_odom_does_not_jump_where_the_map_does() -> None:
         nis.append(float(off[:2] @ np.linalg.solve(e[n].step_cov[:2, :2], off[:2])))
     assert max(map_jumps) > 1.0
     assert nis[int(np.argmax(map_jumps))] < chi2.ppf(0.99, 2)
-    # Not 99 % of all: through an outage the error of a step is that of one velocity, so they are one draw, not six hundred.
+    # Not 99 % of all: through an outage the error of a step is that of one velocity, so they are one draw, not three hundred.
     assert np.mean(np.array(nis) < chi2.ppf(0.99, 2)) > 0.9
 
 

@@ -18,12 +18,17 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.measurements import GnssPosition, ImuSample
-from graphloc.replay import _timed, arrivals, replay
+from graphloc.replay import Replayed, _timed, arrivals, replay
 
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
     return simulate(replace(bl_scenario(1, "drift"), duration_s=30.0), 4)
+
+
+@pytest.fixture(scope="module")
+def whole(run: SimulatedRun) -> Replayed:
+    return replay(run.recording, run.config)
 
 
 @pytest.fixture(scope="module")
@@ -61,9 +66,8 @@ def test_what_a_front_end_made_comes_when_the_imu_is_there(run: SimulatedRun) ->
     assert waited > 100
 
 
-def test_each_pose_is_as_it_was_known_then(run: SimulatedRun) -> None:
+def test_each_pose_is_as_it_was_known_then(run: SimulatedRun, whole: Replayed) -> None:
     """What comes later changes nothing of what was said before; and each message has one row."""
-    whole = replay(run.recording, run.config)
     imu = run.recording.imu
     assert imu is not None
     half_ns = int(imu.stamps_ns[len(imu) // 2])
@@ -141,9 +145,9 @@ def test_compare_has_it_beside_the_filters(run: SimulatedRun) -> None:
     assert offline <= online + 0.05
 
 
-def test_a_guessed_heading_is_said_with_its_times(run: SimulatedRun) -> None:
+def test_a_guessed_heading_is_said_with_its_times(whole: Replayed) -> None:
     """Doubted in the first 51 of the estimates, 10 a second: for 5 s."""
-    estimates = replay(run.recording, run.config).estimates
+    estimates = whole.estimates
     doubt = "the heading is a guess: 2 explain the way so far"
     first_ns = estimates[0].stamp_ns
     some = [replace(e, reason=f"95 % bound 3 m; {doubt}" if k <= 50 else "") for k, e in enumerate(estimates)]

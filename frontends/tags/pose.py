@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from graphloc.frames import Array, pinhole
+from graphloc.frames import Array
 from graphloc.frontends.tags._spread import spread
 from graphloc.measurements import TagMode
 
@@ -113,41 +113,52 @@ def _mirrored(R: Array, t: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(2.0 * tilt * axis / length).as_matrix() @ R)
 
 
-def _errors(points_m: Array, rays: Array, R: Array, t: Array) -> tuple[Array, Array] | None:
-    """Errors (8 K,) and Jacobian (8 K, 6) by a shift and a turn about the points' middle, in camera; None: behind it."""
-    there = points_m @ R.T + t
-    if there[:, 2].min() < _NEAREST_M:
-        return None
-    flat, projected = pinhole(there)
-    x, y, z = (there - there.mean(axis=0)).T
-    turned = np.zeros((len(there), 3, 3))  # d (w x arm) / d w
-    turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2] = z, -y, x
-    turned[:, 1, 0], turned[:, 2, 0], turned[:, 2, 1] = -z, y, -x
-    return (flat - rays).ravel(), np.concatenate([projected, projected @ turned], axis=2).reshape(-1, 6)
+def _errors(arms_m: Array, rays: Array, R: Array, middle_m: Array) -> Array | None:
+    """Errors (8 K,) of points that lie `arms_m` (4 K, 3, in world) about a middle (3,) in camera; None: behind it."""
+    there = arms_m @ R.T + middle_m
+    z = there[:, 2:]
+    return None if z.min() < _NEAREST_M else (there[:, :2] / z - rays).ravel()
+
+
+def _jacobian(arms_m: Array, R: Array, middle_m: Array) -> Array:
+    """Of these errors, (8 K, 6) by a shift and a turn about the points' middle, in camera.
+
+    With the arm a in camera, and the ray u, v at depth z: d u = (1, 0, -u) / z (shift + turn x a), and so for v.
+    """
+    x, y, z = arms = R @ arms_m.T
+    u, v, depth = arms + middle_m[:, None]
+    u, v = u / depth, v / depth
+    J = np.zeros((len(arms_m), 2, 6))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = -u, -v
+    J[:, 0, 3], J[:, 0, 4], J[:, 0, 5] = -u * y, z + u * x, -y
+    J[:, 1, 3], J[:, 1, 4], J[:, 1, 5] = -z - v * y, v * x, x
+    J /= depth[:, None, None]
+    return J.reshape(-1, 6)
 
 
 def _misfit(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> float:
-    now = _errors(points_m, rays, R, t)
-    return np.inf if now is None else float(np.linalg.norm(whiten @ now[0]))
+    r = _errors(points_m, rays, R, t)
+    return np.inf if r is None else float(np.linalg.norm(whiten @ r))
 
 
 def _refine(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> PoseOfCamera | None:
     """Levenberg-Marquardt from a start."""
-    now = _errors(points_m, rays, R, t)
+    middle = points_m.mean(axis=0)
+    arms, there = points_m - middle, R @ middle + t
+    now = _errors(arms, rays, R, there)
     if now is None:
         return None
-    middle, damping = points_m.mean(axis=0), 1e-3
-    r, J = whiten @ now[0], whiten @ now[1]
+    r, J, damping = whiten @ now, whiten @ _jacobian(arms, R, there), 1e-3
     for _ in range(_ROUNDS):
         A = J.T @ J
-        step = np.linalg.solve(A + damping * np.diag(np.diagonal(A)) + 1e-9 * np.eye(6), -J.T @ r)
-        turn = Rotation.from_rotvec(step[3:]).as_matrix()
-        there = R @ middle + t + step[:3]
-        R_new = turn @ R
-        t_new = there - R_new @ middle
-        after = _errors(points_m, rays, R_new, t_new)
-        if after is not None and float((whiten @ after[0]) @ (whiten @ after[0])) <= float(r @ r):
-            R, t, r, J = R_new, t_new, whiten @ after[0], whiten @ after[1]
+        A.flat[::7] += damping * A.flat[::7] + 1e-9
+        step = np.linalg.solve(A, -J.T @ r)
+        R_new, there_new = cv2.Rodrigues(step[3:])[0] @ R, there + step[:3]
+        after = _errors(arms, rays, R_new, there_new)
+        whitened = None if after is None else whiten @ after
+        if whitened is not None and float(whitened @ whitened) <= float(r @ r):
+            R, there, r, J = R_new, there_new, whitened, whiten @ _jacobian(arms, R_new, there_new)
             damping = max(damping / 5.0, 1e-12)
             if np.abs(step).max() < _SETTLED:
                 break
@@ -155,9 +166,9 @@ def _refine(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> 
             damping *= 8.0
             if damping > 1e9:
                 break
-    if (R @ middle + t)[2] > _FARTHEST * float(np.linalg.norm(points_m[1] - points_m[0])):
+    if there[2] > _FARTHEST * float(np.linalg.norm(points_m[1] - points_m[0])):
         return None
-    return PoseOfCamera(R, t, float(r @ r), J.T @ J)
+    return PoseOfCamera(R, there - R @ middle, float(r @ r), J.T @ J)
 
 
 def _same(one: PoseOfCamera, other: PoseOfCamera, points_m: Array) -> bool:

@@ -65,8 +65,10 @@ def _factor(own: Sequence[TagSighting], survey: Survey, frame: str) -> float | N
         ]
         return min(Bundle(group, survey, frame).excess, 1e9)
 
-    best = minimize_scalar(excess, bounds=_LOG_FACTORS, method="bounded", options={"xatol": 1e-3})
     as_it_is, dof = excess(0.0), 8 * sum(len(m.tags) for m in own) - 7
+    if dof * as_it_is <= _SURE**2:
+        return None  # no factor could win by enough
+    best = minimize_scalar(excess, bounds=_LOG_FACTORS, method="bounded", options={"xatol": 1e-3})
     sure = dof * (as_it_is - best.fun) > _SURE**2 and abs(best.x) > _SURE * _unsure(own, listed)
     return float(np.exp(best.x)) if sure and best.fun < as_it_is / CONTRADICTS else None
 
