@@ -81,7 +81,7 @@ def test_each_sensor_is_left_out_but_the_imu(bad: tuple[SimulatedRun, Ablated]) 
 
 
 def test_against_truth_the_numbers_are_those_of_a_run_without_it() -> None:
-    run = made(compass_hz=0.0)
+    run = made(compass_hz=0.0, duration_s=12.0)
     found = ablate(run.recording, run.config)
     assert found.basis == "truth"
     gone = run.config.sensors["aerial"].model_copy(update={"enabled": False})
@@ -98,7 +98,7 @@ def test_against_truth_the_numbers_are_those_of_a_run_without_it() -> None:
 
 
 def test_held_out_fixes_stand_in_for_truth_and_what_starts_all_cannot_go(tmp_path: Path) -> None:
-    run = made(compass_hz=0.0, pose_hz=0.0)
+    run = made(compass_hz=0.0, pose_hz=0.0, duration_s=10.0)
     recording = replace(run.recording, truth=None)
     found = ablate(recording, run.config, hold_out=HoldOut.parse("every:5"))
     assert found.basis == "held"

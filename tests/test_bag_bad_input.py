@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Issue item A.7 at the reading level: each kind of bad input ends in a ledger row, a warning, or one clear line."""
 
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -81,18 +83,23 @@ def test_nothing_readable_names_the_tool_that_repairs(tmp_path: Path, name: str,
     one_line(error, name, hint)
 
 
+@cache
+def whole_file(kind: str, compression: str) -> bytes:
+    """A bag of four minutes: long enough for several chunks."""
+    make = Messages(1 if kind == "ros1" else 2)
+    with TemporaryDirectory() as folder:
+        target = Path(folder) / ("run.bag" if kind == "ros1" else "run")
+        path = write_bag(target, make, still_run(make, 240.0), kind, compression)
+        return (path if kind == "ros1" else path / "run.mcap").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("kind", "compression"), [("ros1", ""), ("ros1", "lz4"), ("ros1", "bz2"), ("mcap", ""), ("mcap", "storage")]
 )
 @pytest.mark.parametrize("share", [0.45, 0.7, 0.97])
 def test_truncated_bag_gives_what_is_whole(tmp_path: Path, kind: str, compression: str, share: float) -> None:
     """What is read is the beginning of the run, with every message in it, and a line that says so."""
-    make = Messages(1 if kind == "ros1" else 2)
-    suffix = "bag" if kind == "ros1" else "mcap"
-    path = write_bag(
-        tmp_path / ("run.bag" if kind == "ros1" else "run"), make, still_run(make, 240.0), kind, compression
-    )
-    whole = (path if kind == "ros1" else path / "run.mcap").read_bytes()
+    whole, suffix = whole_file(kind, compression), "bag" if kind == "ros1" else "mcap"
     cut = tmp_path / f"cut.{suffix}"
     cut.write_bytes(whole[: int(share * len(whole))])
     recording = read_recording(cut, vessel())

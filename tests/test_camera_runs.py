@@ -81,6 +81,7 @@ def test_the_recording_holds_images_as_drivers_write_them(tmp_path: Path, detect
             replace(
                 harbour_scenarios()["dock-floating-optimal"],
                 duration_s=40.0,
+                imu_hz=20.0,
                 lidar_hz=0.0,
                 camera_hz=0.1,
                 camera_raw=raw,
@@ -277,8 +278,8 @@ def test_fixes_claim_what_is_right_on_average_only() -> None:
 
 
 def test_the_long_run_has_all_of_it() -> None:
-    run = simulate(harbour_scenarios()["long"], 1)
-    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    run = simulate(replace(harbour_scenarios()["long"], imu_hz=10.0, compass_hz=0.0, pose_hz=0.0), 1)
+    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)][:-1]  # truth ends before
     stamps = np.array([m.stamp_ns for m in fixes])
     t = (stamps - run.truth.stamps_ns[0]) * 1e-9
     at = run.truth.at(stamps)

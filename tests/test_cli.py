@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from tests.commands import called
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return write_bag(simulate(Scenario(duration_s=25.0), 3), tmp_path_factory.mktemp("cli") / "bag", ros=2)
+    return write_bag(simulate(Scenario(duration_s=15.0), 3), tmp_path_factory.mktemp("cli") / "bag", ros=2)
 
 
 def edited(config: Path, folder: Path, old: str, new: str) -> Path:
@@ -58,7 +59,7 @@ def test_a_draft_from_inspect_gives_a_track(
 
     The antenna's place and the IMU's yaw (5 deg here) are in no bag: that much the track is off.
     """
-    where, _ = write_bag(simulate(bl_scenario(1, "clean"), 1), tmp_path / "bag", ros=1)
+    where, _ = write_bag(simulate(replace(bl_scenario(1, "clean"), duration_s=60.0), 1), tmp_path / "bag", ros=1)
     draft = tmp_path / "vessel.yaml"
     assert called(monkeypatch, "inspect", where, "--write", draft) == 0
     assert "guess" in draft.read_text()

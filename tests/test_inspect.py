@@ -39,7 +39,7 @@ def drive(
     gyro_scale: float = 1.0,
     status: int = 2,
     sigma_m: float = 0.02,
-    seconds: int = 120,
+    seconds: int = 60,
     noise_m: float = 0.0,
 ) -> list[Item]:
     """Speed 3 + 1.5 sin(0.4 t) m/s, yaw rate 0.15 sin(0.13 t) + 0.05 rad/s, first 10 s at rest; analytic IMU."""
@@ -106,7 +106,7 @@ def test_a_whole_draft(tmp_path: Path) -> None:
     # 0.02 m/s^2 and 1e-3 rad/s per sample at 50 Hz: times sqrt(0.02 s)
     assert imu.accel_noise_ug == pytest.approx(0.02 * np.sqrt(0.02) / 9.80665e-6, rel=0.1)
     assert imu.gyro_noise_mdps == pytest.approx(np.degrees(1e-3) * np.sqrt(0.02) * 1e3, rel=0.1)
-    assert gnss.statuses == {"gbas": 600}
+    assert gnss.statuses == {"gbas": 300}
     assert config.sensors["gnss"].slow_error.enabled is False
     assert (compass.usable, compass.convention) == (True, "ned")
     assert config.sensors["compass"].convention == "ned"
@@ -210,7 +210,7 @@ def test_imu_orientation_as_compass(
     make = Messages(2)
     rng = np.random.default_rng(0)
     items: list[Item] = []
-    for topic, at, m in drive(make):
+    for topic, at, m in drive(make, seconds=120):
         if topic == "/compass":
             yaw = np.pi / 2.0 - 2.0 * np.arctan2(m.quaternion.z, m.quaternion.w)
             half = 0.5 * (yaw + np.radians(offset_deg + scatter_deg * rng.normal()))

@@ -47,9 +47,14 @@ class Run:
 
 
 @pytest.fixture(scope="module")
+def matched(run: Run) -> list[Matched]:
+    return run.matched(run.sensor)
+
+
+@pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = tmp_path_factory.mktemp("live") / "sim"
-    scenario = find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "18", "lidar_hz": "2"})
+    scenario = find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "18", "lidar_hz": "2", "rig": "launch"})
     write_bag(simulate(scenario, 3), folder, ros=2)
     recording, vessel = app.load([folder / "run"], folder / "vessel.yaml")
     truth, sensor = recording.truth, vessel.sensors["aerial"]
@@ -74,7 +79,7 @@ def part(track: Trajectory, first_ns: float, last_ns: float) -> Trajectory:
     )
 
 
-def test_a_bag_is_matched_as_written_out(run: Run) -> None:
+def test_a_bag_is_matched_as_written_out(run: Run, matched: list[Matched]) -> None:
     """The same numbers, bit for bit, as when turns are gone through in one loop around the whole track."""
     matcher, last, before = Matcher(run.sensor, run.folder, run.datum), None, None
     window: list[Turn] = []
@@ -105,10 +110,9 @@ def test_a_bag_is_matched_as_written_out(run: Run) -> None:
             before = (at_ns, prior.pose[:2])
             expected.append((at_ns, found, news))
     assert 4 <= len(expected) <= 12
-    got = run.matched(run.sensor)
-    assert [m.stamp_ns for m in got] == [at_ns for at_ns, _, _ in expected]
-    assert [m.news for m in got] == [news for _, _, news in expected]
-    for item, (_, found, _) in zip(got, expected, strict=True):
+    assert [m.stamp_ns for m in matched] == [at_ns for at_ns, _, _ in expected]
+    assert [m.news for m in matched] == [news for _, _, news in expected]
+    for item, (_, found, _) in zip(matched, expected, strict=True):
         assert item.match is not None
         assert item.match.modes
         assert item.match.none == found.none
@@ -117,7 +121,7 @@ def test_a_bag_is_matched_as_written_out(run: Run) -> None:
         np.testing.assert_array_equal([m.cov for m in item.match.modes], [m.cov for m in found.modes])
 
 
-def test_live_as_offline_where_the_tracks_are_the_same(run: Run) -> None:
+def test_live_as_offline_where_the_tracks_are_the_same(run: Run, matched: list[Matched]) -> None:
     """A window of 6 s that follows 20 ms behind each turn's arrival, and a worker thread that matches."""
     got, waits = [], 0
     with Bag([run.folder / "run"]) as bag, ThreadPoolExecutor(1) as pool:
@@ -132,10 +136,9 @@ def test_live_as_offline_where_the_tracks_are_the_same(run: Run) -> None:
                 waits, now_ns = waits + 1, now_ns + S // 20
             if answer is not None:
                 got.append(answer)
-    expected = run.matched(run.sensor)
-    assert [m.stamp_ns for m in got] == [m.stamp_ns for m in expected]
+    assert [m.stamp_ns for m in got] == [m.stamp_ns for m in matched]
     assert waits > 10  # turns that are not due wait as well
-    for item, other in zip(got, expected, strict=True):
+    for item, other in zip(got, matched, strict=True):
         assert item.match is not None
         assert other.match is not None
         # Seconds since another begin of the track: places differ by their rounding.

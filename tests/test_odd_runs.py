@@ -50,8 +50,9 @@ def test_gnss_alone_owns_up_to_its_slow_error() -> None:
     assert ours.coverage_95 is not None
     assert ours.coverage_95 > 0.95
     assert any("slow error" in w for w in solved.stats.warnings)
+    begin = simulate(replace(BASE, noise="drift", duration_s=15.0), 2)
     told = app.smooth_recording(
-        run.recording, with_sensors(run, gnss=GnssConfig.model_validate({
+        begin.recording, with_sensors(begin, gnss=GnssConfig.model_validate({
             "topic": "/gnss/fix", "mount": {"xyz_m": (-1.5, 0.3, 2.2789)}, "slow_error": {"enabled": False},
         })),
     ).solution  # fmt: skip
@@ -92,38 +93,38 @@ def test_a_late_first_position_is_no_confident_prior() -> None:
 
 def test_a_recorder_pause_cuts_the_run() -> None:
     """Nothing at all for 60 s: each side is as good as a run of its own, and every message has its row."""
-    run = simulate(replace(BASE, duration_s=140.0), 1)
+    run = simulate(replace(BASE, duration_s=100.0), 1)
     imu = run.recording.imu
     assert imu is not None
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
-    silent = (int(imu.stamps_ns[0]) + 40 * 10**9, int(imu.stamps_ns[0]) + 100 * 10**9)
+    silent = (int(imu.stamps_ns[0]) + 20 * 10**9, int(imu.stamps_ns[0]) + 80 * 10**9)
     kept = tuple(m for m in run.recording.measurements if not silent[0] < m.stamp_ns < silent[1])
-    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 40.0) | (t > 100.0)))
+    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 20.0) | (t > 80.0)))
     paused = replace(paused, message_count=len(paused.imu or ()) + len(kept))
     solved = app.smooth_recording(paused, run.config).solution
     track = solved.trajectory
     seconds = (track.stamps_ns - imu.stamps_ns[0]) * 1e-9
-    assert not ((seconds > 41.0) & (seconds < 99.0)).any()
+    assert not ((seconds > 21.0) & (seconds < 79.0)).any()
     ours = compare_to_truth(track, run.truth)
     assert ours.position_rmse_m < 0.3
     assert ours.heading_max_deg < 2.0
-    assert ours.matched == pytest.approx(80.0 / 140.0, abs=0.02)
+    assert ours.matched == pytest.approx(40.0 / 100.0, abs=0.02)
     assert len(solved.ledger) == paused.message_count
     assert sum("solved as a part by itself" in w for w in solved.stats.warnings) == 2
 
 
 def test_a_part_that_cannot_be_solved_is_left_out() -> None:
     """No position after the pause: the first part stands, the second one's messages are rejected with the reason."""
-    run = simulate(replace(BASE, duration_s=100.0), 1)
+    run = simulate(replace(BASE, duration_s=50.0), 1)
     imu = run.recording.imu
     assert imu is not None
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
-    kept = tuple(m for m in run.recording.measurements if m.stamp_ns < imu.stamps_ns[0] + 30 * 10**9)
-    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 40.0) | (t > 80.0)))
+    kept = tuple(m for m in run.recording.measurements if m.stamp_ns < imu.stamps_ns[0] + 15 * 10**9)
+    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 20.0) | (t > 40.0)))
     solved = app.smooth_recording(paused, run.config).solution
-    assert (solved.trajectory.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 < 41.0
+    assert (solved.trajectory.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 < 21.0
     assert any("left out" in w and "no position" in w for w in solved.stats.warnings)
-    assert solved.ledger.counts()["imu"]["rejected"] == (t > 80.0).sum()
+    assert solved.ledger.counts()["imu"]["rejected"] == (t > 40.0).sum()
 
 
 def test_an_imu_that_ends_early_is_said() -> None:
@@ -136,12 +137,14 @@ def test_an_imu_that_ends_early_is_said() -> None:
 
 
 def test_a_sensor_that_is_switched_off_keeps_its_rows() -> None:
-    run = simulate(replace(BASE, duration_s=15.0, pose_hz=1.0), 1)
+    run = simulate(replace(BASE, duration_s=8.0, pose_hz=1.0), 1)
+    matches = sum(m.sensor == "aerial" for m in run.recording.measurements)
+    assert matches >= 7
     off = run.config.sensors["aerial"].model_copy(update={"enabled": False})
     for config in (with_sensors(run, aerial=off), with_sensors(run, aerial=None)):
         solved = app.smooth_recording(run.recording, config, compare=True)
         assert len(solved.solution.ledger) == run.recording.message_count
-        assert solved.solution.ledger.counts()["aerial"] == {"ignored": 14}
+        assert solved.solution.ledger.counts()["aerial"] == {"ignored": matches}
         filters = [f for f in solved.filters if f.name != "graphloc online"]  # which accounts for every message, too
         assert all(row.sensor != "aerial" for f in filters for row in f.ledger)
 
@@ -263,7 +266,10 @@ def test_a_compass_far_off_its_mount_is_said() -> None:
     run = simulate(replace(BASE, compass_offset_deg=8.0, gnss_sigma_m=0.02, duration_s=60.0), 2)
     warnings = app.simulated(run).solution.stats.warnings
     assert any(w.startswith("compass: its compass offset is estimated") for w in warnings)
-    assert not any("compass offset" in w for w in app.simulated(simulate(BASE, 2)).solution.stats.warnings)
+    assert not any(
+        "compass offset" in w
+        for w in app.simulated(simulate(replace(BASE, duration_s=20.0), 2)).solution.stats.warnings
+    )
 
 
 def test_the_deviation_of_a_compass_is_told_by_the_motion() -> None:
@@ -297,7 +303,14 @@ def test_the_deviation_of_a_compass_is_told_by_the_motion() -> None:
 def test_an_imu_noisier_than_configured_is_scaled_up() -> None:
     """Noise of 20 times what vessel.yaml says: scaled up and said; with `adapt_noise: false` left alone."""
     run = simulate(
-        replace(BASE, gnss_sigma_m=0.02, accel_noise_ug_per_sqrt_hz=30_000.0, gyro_noise_mdps_per_sqrt_hz=300.0), 2
+        replace(
+            BASE,
+            duration_s=20.0,
+            gnss_sigma_m=0.02,
+            accel_noise_ug_per_sqrt_hz=30_000.0,
+            gyro_noise_mdps_per_sqrt_hz=300.0,
+        ),
+        2,
     )
     imu = run.config.sensors["imu"].model_copy(
         update={"accel_noise_ug_per_sqrt_hz": 300.0, "gyro_noise_mdps_per_sqrt_hz": 3.0}
@@ -313,7 +326,7 @@ def test_an_imu_noisier_than_configured_is_scaled_up() -> None:
 
 def test_parts_that_lack_a_sensor_and_do_not_converge() -> None:
     """Joined: never since a part's missing sensor agreed; converged only where every part is."""
-    run = simulate(replace(BASE, duration_s=80.0, pose_hz=1.0, false_fraction=0.0), 1)
+    run = simulate(replace(BASE, duration_s=50.0, pose_hz=1.0, false_fraction=0.0), 1)
     imu = run.recording.imu
     assert imu is not None
     t0 = int(imu.stamps_ns[0])
@@ -321,12 +334,12 @@ def test_parts_that_lack_a_sensor_and_do_not_converge() -> None:
     kept = tuple(
         m
         for m in run.recording.measurements
-        if not 25 * 10**9 < m.stamp_ns - t0 < 55 * 10**9 and not (m.sensor == "aerial" and m.stamp_ns > t0 + 40 * 10**9)
+        if not 15 * 10**9 < m.stamp_ns - t0 < 35 * 10**9 and not (m.sensor == "aerial" and m.stamp_ns > t0 + 25 * 10**9)
     )
-    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 25.0) | (t > 55.0)))
+    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 15.0) | (t > 35.0)))
     solved = app.smooth_recording(paused, run.config).solution
     seconds = (solved.trajectory.stamps_ns - t0) * 1e-9
-    assert np.isinf(solved.since_agreed_s["aerial"][seconds > 50.0]).all()
+    assert np.isinf(solved.since_agreed_s["aerial"][seconds > 30.0]).all()
     assert solved.stats.converged
     one, other = (replace(solved.stats, converged=c) for c in (True, False))
     assert not _join_stats([one, other], ()).converged

@@ -281,7 +281,7 @@ def first_of(path: Path) -> int:
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return write_simulated(simulate(Scenario(duration_s=40.0), 3), tmp_path_factory.mktemp("part") / "bag", ros=2)
+    return write_simulated(simulate(Scenario(duration_s=20.0), 3), tmp_path_factory.mktemp("part") / "bag", ros=2)
 
 
 def test_smooth_and_replay_a_part(
@@ -290,10 +290,10 @@ def test_smooth_and_replay_a_part(
     """Both give the track of a bag of that part, to the last digit, and their folders say which part it was."""
     bag, config = simulated
     begin_ns = first_of(bag)
-    only = copied(bag, tmp_path / "only", lambda _, at: begin_ns + 8 * S <= at < begin_ns + 30 * S)
+    only = copied(bag, tmp_path / "only", lambda _, at: begin_ns + 4 * S <= at < begin_ns + 14 * S)
     for command in ("smooth", "replay"):
         part, cut = tmp_path / f"{command}-part", tmp_path / f"{command}-only"
-        assert called(monkeypatch, command, bag, "-c", config, "-o", part, "--start", 8, "--duration", 22) == 0
+        assert called(monkeypatch, command, bag, "-c", config, "-o", part, "--start", 4, "--duration", 10) == 0
         (line,) = (said for said in capsys.readouterr().err.splitlines() if said.startswith(str(bag)))
         assert called(monkeypatch, command, only, "-c", config, "-o", cut) == 0
         assert "part of" not in capsys.readouterr().err
@@ -301,7 +301,7 @@ def test_smooth_and_replay_a_part(
             assert (part / name).read_bytes() == (cut / name).read_bytes(), name
         run, other = (json.loads((folder / "run.json").read_text()) for folder in (part, cut))
         assert other["part"] is None
-        assert (run["part"]["start_s"], run["part"]["end_s"]) == (8.0, 30.0)
+        assert (run["part"]["start_s"], run["part"]["end_s"]) == (4.0, 14.0)
         inside, left_out = run["part"]["messages"]["/imu/data"], run["part"]["left_out"]["/imu/data"]
         assert inside == sum(other["ledger"]["imu"].values())
         assert f"{sum(run['part']['messages'].values())} of " in line
@@ -309,8 +309,8 @@ def test_smooth_and_replay_a_part(
             assert inside + left_out == reader.topics["/imu/data"].msgcount
         assert run["warnings"] == other["warnings"]
         page = (part / "report.html").read_text()
-        assert "8.0 s to 30.0 s of 40." in page
-        assert "run, 8 s to 30 s</h1>" in page
+        assert "4.0 s to 14.0 s of 20." in page
+        assert "run, 4 s to 14 s</h1>" in page
 
 
 def test_finished_runs_have_no_parts(
@@ -326,25 +326,25 @@ def test_finished_runs_have_no_parts(
 def test_scans_of_a_part_are_matched_and_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "sim"
     bag, config = write_simulated(
-        simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "20"}), 3), folder, ros=2
+        simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "14", "rig": "launch"}), 3), folder, ros=2
     )
     begin_ns = first_of(bag)
-    wanted = Wanted(bag=[bag], config=config, out=tmp_path, overwrite=False, as_json=False, start=5.0, duration=12.0)
+    wanted = Wanted(bag=[bag], config=config, out=tmp_path, overwrite=False, as_json=False, start=4.0, duration=8.0)
     recording, loaded, where = wanted.load(quiet)
-    scans = [row for row in recording.rows if row.topic.startswith("/lidar")]
+    scans = [row for row in recording.rows if row.topic.startswith("/mast")]
     with AnyReader([bag]) as reader:
         inside = [
             log for c, log, _ in reader.messages()
-            if c.topic.startswith("/lidar") and begin_ns + 5 * S <= log < begin_ns + 17 * S
+            if c.topic.startswith("/mast") and begin_ns + 4 * S <= log < begin_ns + 12 * S
         ]  # fmt: skip
     assert sum(row.count for row in scans) == len(inside)
     decoded = decoded_from_now_on(monkeypatch)
     run = app.smooth_recording(recording, loaded, scans=where)
     assert decoded == inside
-    assert len(inside) > 50
+    assert len(inside) == 8
     stamps = [m.stamp_ns for m in run.recording.measurements if m.sensor == "aerial"]
     assert len(stamps) > 5
-    assert begin_ns + 4.5 * S < min(stamps) <= max(stamps) < begin_ns + 17 * S
+    assert begin_ns + 3.5 * S < min(stamps) <= max(stamps) < begin_ns + 12 * S
     counts = run.solution.ledger.counts()
     assert sum(sum(c.values()) for c in counts.values()) == run.recording.message_count
     assert np.isfinite(run.solution.trajectory.p_world_m).all()

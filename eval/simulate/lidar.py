@@ -8,6 +8,7 @@ vessel's own hull, and water, of which little comes back.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,20 +38,16 @@ class Scan:
 
 def scan(name: str, lidar: LidarConfig, scene: Scene, motion: Motion, t_s: float, rng: np.random.Generator) -> Scan:
     """Take one turn of a LiDAR that begins at `t_s`."""
-    azimuth = np.radians(np.arange(0.0, 360.0, lidar.step_deg))
-    elevation = np.radians(np.linspace(lidar.lowest_deg, lidar.highest_deg, lidar.beams))
+    azimuth, columns, beams, ray = _rays(lidar.step_deg, lidar.lowest_deg, lidar.highest_deg, lidar.beams)
     dt = azimuth / (2.0 * np.pi) * lidar.scan_s
     p, R, _ = motion.pose(t_s + dt)
-    columns = np.repeat(np.arange(len(azimuth)), lidar.beams)
-    beams = np.tile(np.arange(lidar.beams), len(azimuth))
-    around, up = azimuth[columns], elevation[beams]
-    ray = np.column_stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
     T = lidar.T_body_lidar
     in_body = ray @ T[:3, :3].T
     origin = np.broadcast_to(T[:3, 3], in_body.shape)
-    away, water = scene.ranges(origin, in_body, R[columns], p[columns], t_s + 0.5 * lidar.scan_s)
+    turned = R[columns]
+    away, water = scene.ranges(origin, in_body, turned, p[columns], t_s + 0.5 * lidar.scan_s)
     # Flat water throws the light away; what comes back does so from near and steep.
-    steep = np.abs(np.einsum("nj,nj->n", R[columns][:, 2], in_body))
+    steep = np.abs(np.einsum("nj,nj->n", turned[:, 2], in_body))
     comes_back = rng.uniform(size=len(away)) > np.where(water, 1.0 - 0.3 * steep**2 * np.exp(-away / 12.0), lidar.drop)
     there = (away > 0.2) & (away < lidar.range_m) & comes_back
     away = away[there] + rng.normal(0.0, lidar.sigma_m, int(there.sum()))
@@ -63,6 +60,22 @@ def scan(name: str, lidar: LidarConfig, scene: Scene, motion: Motion, t_s: float
         ring=beams[there],
         intensity=np.clip(bright, 0.0, 255.0),
     )
+
+
+@lru_cache(maxsize=8)
+def _rays(
+    step_deg: float, lowest_deg: float, highest_deg: float, beams: int
+) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array]:
+    """Azimuth (C,) rad of each column; column (N,), beam (N,) and direction (N, 3) of each ray. Each turn has the same."""
+    azimuth = np.radians(np.arange(0.0, 360.0, step_deg))
+    elevation = np.radians(np.linspace(lowest_deg, highest_deg, beams))
+    column = np.repeat(np.arange(len(azimuth)), beams)
+    beam = np.tile(np.arange(beams), len(azimuth))
+    around, up = azimuth[column], elevation[beam]
+    ray = np.column_stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+    for made in (azimuth, column, beam, ray):
+        made.setflags(write=False)
+    return azimuth, column, beam, ray
 
 
 def world_points(scan: Scan, lidar: LidarConfig, motion: Motion) -> Array:

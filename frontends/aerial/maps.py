@@ -68,6 +68,7 @@ class Map:
         self._half_m = config.reach_m + 0.5 * _TILE_M + config.window_m
         self._weights = (on_image, on_lines)
         self._kept: dict[tuple[int, int], Layers] = {}
+        self._beyond: dict[tuple[int, int], str] = {}  # why a tile has no layers; each scan in it asks
         self._tries: Counter[tuple[int, int]] = Counter()
 
     def around(self, pose: Array, found: Outline) -> Layers:
@@ -77,10 +78,16 @@ class Map:
             InputError: the map does not reach there.
         """
         tile = (int(pose[0] // _TILE_M), int(pose[1] // _TILE_M))
+        if tile in self._beyond:
+            raise InputError(self._beyond[tile])
         layers = self._kept.pop(tile, None)
         if layers is None or (layers.shores is None and self._tries[tile] < _TRIES):
             self._tries[tile] += 1
-            layers = self._made((np.array(tile) + 0.5) * _TILE_M, pose, found)
+            try:
+                layers = self._made((np.array(tile) + 0.5) * _TILE_M, pose, found)
+            except InputError as error:
+                self._beyond[tile] = str(error)
+                raise
         while len(self._kept) >= _KEPT:
             self._kept.pop(next(iter(self._kept)))
         self._kept[tile] = layers  # the last used is the last to go
