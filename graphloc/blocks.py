@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLWarning
+from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 
 from graphloc.errors import ConfigError
 from graphloc.frames import Array, rotation_from_rpy_deg
@@ -37,6 +38,7 @@ Triple = tuple[Finite, Finite, Finite]
 _LONG = 40  # characters
 _MOST_SAID = 8  # things that are wrong with one file
 _MOST_BYTES, _MOST_VALUES = 10_000_000, 300_000  # a survey of 10 000 tags has 2 MB and 100 000 values
+_DEEPEST = 100
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, _LONG, _LONG
 
@@ -124,7 +126,7 @@ def _short(given: object) -> str:
 def read_mapping(path: Path | Traversable, cure: str = "") -> Mapping[str, Any]:
     """Read a file of YAML 1.2 (no tags) whose top level is a mapping; an empty one gives an empty mapping.
 
-    At most 10 MB and 300 000 values are read, an alias counting as all that it stands for.
+    At most 10 MB, 100 levels and 300 000 values are read, an alias counting as all that it stands for.
 
     Args:
         path: the file. cure: what to do where it cannot be read, for the message.
@@ -156,7 +158,11 @@ def _loaded(text: str) -> Any:
     reader = YAML(typ="safe", pure=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", YAMLWarning)  # that an anchor is there twice
+        depth = 0
         for event in reader.parse(text):
+            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+            if depth > _DEEPEST:  # what is nested deeper takes the square of its length to read
+                raise ValueError(f"nested deeper than {_DEEPEST}")
             if getattr(event, "tag", None) is not None:
                 raise ValueError(f"a tag ({event.tag}): write the value alone")
         return reader.load(text)
