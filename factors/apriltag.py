@@ -115,7 +115,8 @@ def _docks(survey: Survey) -> list[str]:
 
 def _constants_of(m: TagSighting, config: AprilTagConfig, at: Attachment) -> list[tuple[int, Array] | None]:
     """Key and estimate of what the survey errs about each tag; None where there is none."""
-    found = [config.surveyed.place_of.get(tag) for tag in m.tags]
+    index = {(str(tag.family), tag.id): k for k, tag in enumerate(config.surveyed.tags)}
+    found = [index.get(tag) for tag in m.tags]
     return [at.constants[k] if k is not None and k < len(at.constants) else None for k in found]
 
 

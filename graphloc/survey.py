@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping
-from functools import cached_property
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -144,22 +143,17 @@ class Survey(Block):
     def _numbers(self) -> Counter[tuple[str, int]]:
         return Counter((tag.family, tag.id) for tag in self.tags)
 
-    @cached_property  # asked at every sighting and pass
+    @property
     def frames(self) -> tuple[str, ...]:
         """Frames that have tags: world first, then docks in the order of the file."""
         have = {tag.frame for tag in self.tags}
         return tuple(name for name in (WORLD, *(dock.name for dock in self.docks)) if name in have)
 
-    @cached_property
-    def place_of(self) -> Mapping[tuple[str, int], int]:
-        """Return where a tag stands in `tags`, by family and id."""
-        return {(str(tag.family), tag.id): k for k, tag in enumerate(self.tags)}
-
     def of(self, frames: Collection[str]) -> Survey:
         """Return the part of it that is in some frames; berths stay, or one that lists others would get its own."""
         tags = tuple(tag for tag in self.tags if tag.frame in frames)
         docks = tuple(dock for dock in self.docks if dock.name in frames)
-        return Survey.model_construct(**{**dict(self), "tags": tags, "docks": docks})  # a copy keeps what is cached
+        return self.model_copy(update={"tags": tags, "docks": docks})
 
     def called(self, family: str, number: int) -> str:
         """Return what messages call a tag: by its id, and by its family where the survey has several."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,7 +12,7 @@ from graphloc.config import AprilTagConfig, CameraConfig
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.simulate._light import tag_in_world
 from graphloc.eval.simulate.docks import survey as surveyed
-from graphloc.eval.simulate.scene import scene_of
+from graphloc.eval.simulate.scene import Scene, scene_of
 from graphloc.frames import Array
 from graphloc.frontends.tags.bundles import Seeing, SeenTag, sightings_of
 from graphloc.measurements import TagMode, TagSighting
@@ -78,6 +79,11 @@ def survey_of(run: SimulatedRun) -> Survey:
     return Survey.model_validate(surveyed(run.harbour, np.random.default_rng([run.seed, 23])))
 
 
+@lru_cache(maxsize=4)
+def _scene(run: SimulatedRun) -> Scene:
+    return scene_of(run)
+
+
 def sighted(
     run: SimulatedRun,
     *,
@@ -96,7 +102,7 @@ def sighted(
         only: ids that are seen; empty: all. hidden_s: from, to: nothing is seen. alone: each tag for itself.
     """
     assert run.harbour is not None
-    survey, scene, rng = survey_of(run), scene_of(run), np.random.default_rng([run.seed, seed, 99])
+    survey, scene, rng = survey_of(run), _scene(run), np.random.default_rng([run.seed, seed, 99])
     camera = run.rig.cameras["camera"]
     focal, centre = np.array(camera.focal_px), np.array(camera.centre_px)
     size = np.array([camera.width_px, camera.height_px])
