@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer
 
 from graphloc.errors import InputError
 from graphloc.frontends._clock import longest_increasing
 from graphloc.frontends.bag import read_recording
+from graphloc.frontends.inspect import inspect_bag
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
 from graphloc.recording import Recording
@@ -215,6 +217,24 @@ def test_a_definition_of_transforms_that_is_damaged(tmp_path: Path) -> None:
         read_recording(path, vessel(gnss={"topic": "/fix", "mount": {"tf_frame": "gps"}}))
     recording = read_recording(path, vessel())
     assert recording.message_count == accounted(recording) == 221
+
+
+def test_a_definition_of_transforms_that_says_something_else(tmp_path: Path) -> None:
+    """By the bag's own definition `transforms` is a number: such messages are counted as damaged, and all else is read."""
+    make, path = Messages(1), tmp_path / "run.bag"
+    with Writer(path) as writer:
+        static = writer.add_connection(
+            "/tf_static", "tf2_msgs/msg/TFMessage", msgdef="int32 transforms", md5sum="0" * 32
+        )
+        writer.write(static, START_NS, bytes(4))
+        topics: dict[str, Any] = {}
+        for topic, at_ns, msg in still_run(make):
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, msg.__msgtype__, typestore=make.store)
+            writer.write(topics[topic], at_ns, make.store.serialize_ros1(msg, msg.__msgtype__))
+    assert "/tf_static: messages that cannot be decoded: 1" in inspect_bag(path).warnings
+    with pytest.raises(InputError, match=r"no chain from 'base_link' to 'gps'.*cannot be decoded: 1"):
+        read_recording(path, vessel(gnss={"topic": "/fix", "mount": {"tf_frame": "gps"}}))
 
 
 def test_nan_and_zero_covariance(tmp_path: Path) -> None:
