@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,15 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 
+from graphloc.config import AerialConfig
 from graphloc.errors import InputError
 from graphloc.frames import Datum, Geodetic
 from graphloc.frontends.aerial.image import AerialImage
+from graphloc.frontends.aerial.maps import Map
+from graphloc.frontends.aerial.scan import Outline
 from tests.mapfactory import BRIGHT, DARK, NEW_YORK, SWEDEN, Bytes, around, check, colours, drawn, framed, utm, write
+
+SEEN = Outline(*np.empty((8, 0)))
 
 
 @pytest.mark.parametrize(
@@ -183,3 +189,28 @@ def test_a_loose_tie_to_wgs_84_is_said(tmp_path: Path, caplog: pytest.LogCapture
 def test_a_path_that_is_none_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="File name too long"):
         AerialImage(tmp_path / ("x" * 300), Datum(SWEDEN))
+
+
+@pytest.mark.parametrize(("failures", "asked"), [(2, 3), (9, 3)])
+def test_a_tile_that_fails_is_asked_for_three_times(
+    failures: int, asked: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A network's disk may answer the next scan; what lies beyond the image says so without being read each time."""
+    utm(tmp_path / "a.tif", colours)
+    chart, calls = Map(AerialConfig(image="a.tif"), tmp_path, Datum(SWEDEN)), []
+    layers: Any = SimpleNamespace(shores=True)
+
+    def fails_at_first(*_: Any) -> Any:
+        calls.append(1)
+        if len(calls) <= failures:
+            raise InputError("a.tif: a part of it cannot be read")
+        return layers
+
+    monkeypatch.setattr(Map, "_made", fails_at_first)
+    for n in range(5):
+        if n < failures:
+            with pytest.raises(InputError, match=r"a\.tif: a part of it cannot be read"):
+                chart.around(np.zeros(3), SEEN)
+        else:
+            assert chart.around(np.zeros(3), SEEN) is layers
+    assert len(calls) == asked

@@ -36,7 +36,7 @@ _CELL_M = 0.25
 _TILE_M = 100.0  # a patch serves all priors of one tile
 _KEPT = 4  # patches, about 50 MB each
 _ON_IT = 0.7
-_TRIES = 3  # a first scan may have seen no water
+_TRIES = 3  # a first scan may have seen no water, a disk may have failed it
 
 # Fitted by benchmarks/tune_matcher.py on harbours drawn by chance; docs/decisions/0006. A tall face on an image may be on a
 # shadow as well; on a drawn line it is a house, for no boat is as tall.
@@ -86,7 +86,8 @@ class Map:
             try:
                 layers = self._made((np.array(tile) + 0.5) * _TILE_M, pose, found)
             except InputError as error:
-                self._beyond[tile] = str(error)
+                if self._tries[tile] >= _TRIES:
+                    self._beyond[tile] = str(error)
                 raise
         while len(self._kept) >= _KEPT:
             self._kept.pop(next(iter(self._kept)))

@@ -376,7 +376,7 @@ class OnlineSmoother:
         self._snapshot.restart()
 
     def _restart(self, why: str) -> None:
-        self._say(f"{why}: starts anew")
+        self._say(f"{why}: {'waits' if self._lag is None else 'starts'} anew")
         if self._lag is not None:
             self._book.enter([*self._lag.gone(), *self._lag.held()])
             self._agreed_ns.update(self._lag.agreed_ns)
