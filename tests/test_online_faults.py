@@ -122,6 +122,28 @@ def test_a_start_that_fails_keeps_its_accounts(monkeypatch: pytest.MonkeyPatch) 
     assert [e for e in fed.events if e.startswith("started")]
 
 
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_agreed_with_a_choice_that_was_given_up_does_not_count(
+    kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It put off the new start of an estimate 35 m aside by a minute: the right matches agreed, but only while they were tried."""
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    feed(online, run_of(), base[: at_s(base, 12.0)])
+    assert online._lag is not None  # noqa: SLF001
+    judge, agreement = online._lag._judge, online._lag._agreement  # noqa: SLF001
+    stream = online._lag.problem.streams["aerial"]  # noqa: SLF001
+    own = judge._chapter(stream)  # noqa: SLF001
+    agreement.back_to(({}, []))
+    for entry in own:
+        agreement.note(stream, entry.measurement, None)
+    refused = agreement.marked()
+    costs = iter([1.0, 0.0] if kept else [0.0, 1.0])
+    monkeypatch.setattr(judge, "_cost", lambda *_: next(costs))
+    judge._try(stream, own, [e.verdict for e in own])  # noqa: SLF001
+    assert (agreement.marked() == refused) is not kept
+    assert ("aerial" in agreement.agreed_ns) is kept
+
+
 def test_a_lost_estimate_starts_anew() -> None:
     """Its state put 300 m aside, with confidence: all sensors disagree, and after some seconds they are believed."""
     run = run_of(length_s=40.0)

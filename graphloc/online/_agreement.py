@@ -37,6 +37,14 @@ class Agreement:
         elif len(self._refused) < _FEW:
             self._refused.append(m.stamp_ns)
 
+    def marked(self) -> tuple[dict[str, int], list[int]]:
+        """Return what is remembered, for `back_to`."""
+        return dict(self.agreed_ns), list(self._refused)
+
+    def back_to(self, mark: tuple[dict[str, int], list[int]]) -> None:
+        """Forget what was noted since: it agreed with what has been given up."""
+        self.agreed_ns, self._refused = mark
+
     def refused_s(self, now_ns: int) -> float:
         """For how long absolute sensors have said, more than a few times, that it is elsewhere, and none that it is here."""
         if len(self._refused) < _FEW:

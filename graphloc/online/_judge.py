@@ -211,7 +211,7 @@ class Judge:
     def _try(self, stream: LiveStream, own: list[Entry], others: list[Verdict]) -> None:
         """Take other verdicts, settle around them, and go back if that is less probable."""
         self._window.settle()
-        before, cost = [e.verdict for e in own], self._cost(stream, own)
+        before, cost, agreement = [e.verdict for e in own], self._cost(stream, own), self._agreement.marked()
         for verdicts in (others, None):
             if verdicts is not None:
                 for entry, verdict in zip(own, verdicts, strict=True):
@@ -222,6 +222,7 @@ class Judge:
         if self._cost(stream, own) < cost:
             self._rounds[stream.name] = _ROUNDS
             return
+        self._agreement.back_to(agreement)
         for entry, verdict in zip(own, before, strict=True):
             self._entries.change(entry, verdict)
         self._window.settle(_STEPS)
