@@ -144,6 +144,30 @@ def test_what_agreed_with_a_choice_that_was_given_up_does_not_count(
     assert ("aerial" in agreement.agreed_ns) is kept
 
 
+@pytest.mark.parametrize("opened", [True, False])
+def test_what_was_let_in_agrees_when_it_is_asked_again(opened: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fix 300 m off, let in once a second as the prediction was unsure, put off the new start of a lost estimate."""
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    now, soon, later = (at_s(base, t_s) for t_s in (12.0, 12.8, 14.5))
+    feed(online, run_of(), base[:now])
+    assert online._lag is not None  # noqa: SLF001
+    judge, agreement = online._lag._judge, online._lag._agreement  # noqa: SLF001
+    by_kernel = judge._by_kernel  # noqa: SLF001
+
+    def lets_in(*arguments: Any, fresh: bool) -> Any:
+        verdict, _ = by_kernel(*arguments, fresh=fresh)
+        return replace(verdict, weight=1.0), opened and fresh
+
+    monkeypatch.setattr(judge, "_by_kernel", lets_in)
+    monkeypatch.setattr(judge, "_ask_again", lambda *_: None)
+    agreement.back_to(({}, []))
+    feed(online, run_of(), base[now:soon])
+    assert ("gnss" in agreement.agreed_ns) is not opened
+    monkeypatch.undo()
+    feed(online, run_of(), base[soon:later])
+    assert "gnss" in agreement.agreed_ns
+
+
 def test_a_lost_estimate_starts_anew() -> None:
     """Its state put 300 m aside, with confidence: all sensors disagree, and after some seconds they are believed."""
     run = run_of(length_s=40.0)

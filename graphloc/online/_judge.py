@@ -70,7 +70,9 @@ class Judge:
             raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
         if stream.row.false is None:
             verdict, opened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
-            self._agreement.note(stream, m, verdict)
+            # Where its kernel was opened it was let in; whether it agrees is seen when it is asked again.
+            if not opened or verdict.weight < AGREES:
+                self._agreement.note(stream, m, verdict)
             entry = Entry(stream, i, verdict, opened=opened)
             self._entries.add(entry)
             self._ask_at(self._problem.timeline.seconds(m.stamp_ns) + _AGAIN_S[0], entry)
