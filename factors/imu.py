@@ -6,11 +6,19 @@
 Forster et al., TRO 2017, as in GTSAM's `PreintegratedImuMeasurements` and `ImuFactor`. The bias is a
 state of its own at the slow period, held between its nodes, with a random walk from node to node
 (docs/decisions): at 1 s that walk is far below the noise of a sample. Samples are interpolated at
-the interval's ends and averaged between stamps (trapezoid). A hole of the data is interpolated
-across, with noise that lets a vessel do anything a vessel does. Gravity removed by the driver: the same
+the interval's ends and averaged between stamps (trapezoid). Gravity removed by the driver: the same
 integral with g = 0. The states stand at the IMU (see `graphloc.build`), so there is no lever arm here:
 `setBodyPSensor` would leave out the Euler term (angular acceleration x lever), 0.07 m/s^2 in harbour
 waves at 1 m, which lost whole runs. Not handled: coning faster than the sample rate.
+
+**A hole of the data**, and what lies after its end: what a sample says of the motion is forgotten within a second,
+
+    w(t) = w_m + (w_a - w_m) sinh((t_b - t) / tau) / sinh(T / tau) + (w_b - w_m) sinh((t - t_a) / tau) / sinh(T / tau)
+
+the mean of an Ornstein-Uhlenbeck process between both sides (for short holes: straight between them), w_m the mean of the
+seconds before, and straight from there to that after, which holds the bias and a steady turn. The force likewise, less its own mean, and with g = 0: what a vessel
+feels on average holds it up. Integrated with gravity, a roll that is not known turns into an acceleration (after
+13 s: 250 m), though vessels stay upright: roll and pitch are let wander no more in a hole than in its first second.
 """
 
 from __future__ import annotations
@@ -24,9 +32,11 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.config import ImuConfig
 from graphloc.frames import Array
-from graphloc.graph import UNKNOWN_MPS2, UNKNOWN_RADPS
 from graphloc.measurements import ImuSeries
 
+_UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # of motion in a hole, white beyond what a sample says
+_FORGET_S, _AROUND_S = 1.0, 10.0  # in a hole, what a sample says; the means are of so long to either side
+_HOLE_STEP_S = 0.1  # of integrating across a hole
 _INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz)-like floor that keeps position covariance positive
 
 
@@ -41,13 +51,10 @@ class Links:
         self._config = config
         self._R_body_imu = R_body_imu
         self._max_gap_ns = int(config.max_gap_s * 1e9)
-        mount = gtsam.Pose3(gtsam.Rot3(R_body_imu), np.zeros(3))
         self._noise_scale = noise_scale
-        self._gravity_mps2 = gravity_mps2 if config.gravity != "removed" else 0.0
-        self._params = self._make_params(
-            config.accel_noise_mps2 * noise_scale, config.gyro_noise_radps * noise_scale, mount
-        )
-        self._gap_params = self._make_params(UNKNOWN_MPS2, UNKNOWN_RADPS, mount)
+        gravity_mps2 = gravity_mps2 if config.gravity != "removed" else 0.0
+        gyro = config.gyro_noise_radps * noise_scale
+        self._params = self._make_params(gravity_mps2, config.accel_noise_mps2 * noise_scale, np.full(3, gyro))
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
         """Add samples (N, 6) at stamps that are new: specific force, rate; late ones go where they belong."""
@@ -62,13 +69,14 @@ class Links:
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
         self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()
 
-    def _make_params(self, accel: float, gyro: float, mount: Any) -> Any:
+    def _make_params(self, gravity_mps2: float, accel: float, gyro: Array) -> Any:
+        """Params with noise densities: of the accelerometer, and of the gyroscope (3,) about the body's axes."""
         # Every covariance of fresh params is 1.0: set them all.
-        params = gtsam.PreintegrationParams.MakeSharedU(self._gravity_mps2)
+        params = gtsam.PreintegrationParams.MakeSharedU(gravity_mps2)
         params.setAccelerometerCovariance(np.eye(3) * accel**2)
-        params.setGyroscopeCovariance(np.eye(3) * gyro**2)
+        params.setGyroscopeCovariance(self._R_body_imu.T @ np.diag(gyro**2) @ self._R_body_imu)
         params.setIntegrationCovariance(np.eye(3) * _INTEGRATION_SIGMA**2)
-        params.setBodyPSensor(mount)
+        params.setBodyPSensor(gtsam.Pose3(gtsam.Rot3(self._R_body_imu), np.zeros(3)))
         return params
 
     def integrate(self, start_ns: int, stop_ns: int, bias: Any) -> Any:
@@ -76,13 +84,20 @@ class Links:
         first = int(np.searchsorted(self._stamps, start_ns, side="right"))
         last = int(np.searchsorted(self._stamps, stop_ns, side="left"))
         edges = np.concatenate([[start_ns], self._stamps[first:last], [stop_ns]])
-        if len(edges) < 3:
+        hole = self._hole_of(start_ns, stop_ns)
+        if hole is not None:
+            a, b = max(start_ns, hole[0]), min(stop_ns, hole[1])
+            steps = np.linspace(a, b, 3 + int((b - a) * 1e-9 / _HOLE_STEP_S)).astype(np.int64)
+            edges = np.unique(np.concatenate([edges, steps]))
+        elif len(edges) < 3:
             edges = np.array([start_ns, (start_ns + stop_ns) // 2, stop_ns])
         dts = np.diff(edges) * 1e-9
-        middles = self._at((edges[:-1] + edges[1:]) // 2)
-        params = self._gap_params if self._in_gap(start_ns, stop_ns) else self._params
+        middles = (edges[:-1] + edges[1:]) // 2
+        samples, params = self._at(middles), self._params
+        if hole is not None:
+            samples, params = self._across(middles, samples, hole)
         pim = gtsam.PreintegratedImuMeasurements(params, bias)
-        for sample, dt in zip(middles, dts, strict=True):
+        for sample, dt in zip(samples, dts, strict=True):
             if dt > 0.0:
                 pim.integrateMeasurement(sample[:3], sample[3:], dt)
         return pim
@@ -94,10 +109,51 @@ class Links:
         share = np.clip((stamps_ns - a) / np.maximum(b - a, 1), 0.0, 1.0)[:, None]
         return np.asarray(self._samples[right - 1] * (1.0 - share) + self._samples[right] * share)
 
-    def _in_gap(self, start_ns: int, stop_ns: int) -> bool:
+    def _hole_of(self, start_ns: int, stop_ns: int) -> tuple[int, int] | None:
+        """The longest hole (start, stop) that an interval reaches into, if any; what lies after the last sample is one, too."""
         left = max(int(np.searchsorted(self._stamps, start_ns, side="right")) - 1, 0)
-        right = min(int(np.searchsorted(self._stamps, stop_ns, side="left")), len(self._stamps) - 1)
-        return bool((np.diff(self._stamps[left : right + 1]) > self._max_gap_ns).any())
+        right = int(np.searchsorted(self._stamps, stop_ns, side="left"))
+        stamps = self._stamps[left : right + 1]
+        if right == len(self._stamps):
+            stamps = np.append(stamps, stop_ns)
+        steps = np.diff(stamps)
+        if not len(steps) or (n := int(np.argmax(steps)), steps[n])[1] <= self._max_gap_ns:
+            return None
+        return int(stamps[n]), int(stamps[n + 1])
+
+    def _across(self, stamps_ns: NDArray[np.int64], samples: Array, hole: tuple[int, int]) -> tuple[Array, Any]:
+        """Return samples (M, 6) for an interval with a hole, and the params to integrate them with: without gravity."""
+        start_ns, stop_ns = hole
+        mean_before, mean_after = self._means_beside(start_ns, stop_ns)
+        length, t = (stop_ns - start_ns) * 1e-9 / _FORGET_S, (stamps_ns - start_ns)[:, None] * 1e-9 / _FORGET_S
+        inside = (t > 0.0) & (t < length)
+        t = np.clip(t, 0.0, length)
+        mean = mean_before + t / length * (mean_after - mean_before)
+        before, after = self._at(np.array(hole)) - [mean_before, mean_after]
+        if stop_ns > self._stamps[-1]:
+            across = mean + np.exp(-t) * before
+        else:
+            across = mean + _sinh_share(length - t, length) * before + _sinh_share(t, length) * after
+        samples = np.where(inside, across, samples)
+        samples[:, :3] -= mean[:, :3]
+        tilt = _UNKNOWN_RADPS / np.sqrt(max(length, 1.0))
+        return samples, self._make_params(0.0, _UNKNOWN_MPS2, np.array([tilt, tilt, _UNKNOWN_RADPS]))
+
+    def _means_beside(self, start_ns: int, stop_ns: int) -> tuple[Array, Array]:
+        """Means (6,) of the seconds before and after a hole; a side of which too little is there says what the other does."""
+        around_ns = int(_AROUND_S * 1e9)
+        first, start, stop, last = np.searchsorted(
+            self._stamps, [start_ns - around_ns, start_ns + 1, stop_ns, stop_ns + around_ns]
+        )
+        sides = [(first, start), (stop, last)]
+        means = [
+            self._samples[a:b].mean(axis=0)
+            for a, b in sides
+            if b > a and self._stamps[b - 1] - self._stamps[a] > around_ns // 2
+        ]
+        if not means:
+            means = [self._samples[first:last].mean(axis=0)]
+        return means[0], means[-1]
 
     def factor(self, k: int, j: int, preintegrated: Any) -> Any:
         """Return the factor between states k and k + 1 with the bias of slow node j."""
@@ -124,6 +180,11 @@ class Links:
         """Return the holes in the data."""
         wide = np.flatnonzero(np.diff(self._stamps) > self._max_gap_ns)
         return [(int(self._stamps[i]), int(self._stamps[i + 1])) for i in wide]
+
+
+def _sinh_share(t: Array, length: float) -> Array:
+    """sinh(t) / sinh(length), 0 <= t <= length, however long."""
+    return np.asarray((np.exp(t - length) - np.exp(-t - length)) / (1.0 - np.exp(-2.0 * length)))
 
 
 class ImuRow:

@@ -257,9 +257,6 @@ class InertialRow(Protocol):
         ...
 
 
-UNKNOWN_MPS2, UNKNOWN_RADPS = 1.0, 0.2  # of motion in a hole of the IMU's data, correlated over about a second
-
-
 class InertialLink(Protocol):
     """Preintegration of one IMU between any two stamps."""
 

@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.graph import UNKNOWN_MPS2, UNKNOWN_RADPS
 from graphloc.online._live import LiveProblem
 from graphloc.online._odometry import Odometry
 from graphloc.online._states import Newest, carried_on
@@ -46,25 +45,20 @@ def no_further(newest: Newest, odometry: Odometry) -> Ahead:
     )
 
 
-def ahead(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: int, blind_s: float) -> Ahead:
-    """Return what becomes of the newest state until a later stamp; blind_s: for how long (s) of it nothing is known of its motion."""
+def ahead(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: int) -> Ahead:
+    """Return what becomes of the newest state until a later stamp, be it after the IMU's last sample."""
     pim = problem.links.integrate(newest.stamp_ns, stamp_ns, newest.bias)
     pose = newest.pose
     there = pim.predict(gtsam.NavState(pose, newest.velocity), newest.bias)
     p_odom, R_odom = odometry.after(*_body_step(problem, pose, there.pose()))
     dt_s, noise = (stamp_ns - newest.stamp_ns) * 1e-9, pim.preintMeasCov()
     pose_cov = carried_on(newest.pose_cov, newest, there.pose().rotation().matrix(), dt_s, noise)
-    v_cov = newest.velocity_cov + noise[6:, 6:]
-    if blind_s > 0.0:
-        pose_cov[:3, :3] += UNKNOWN_RADPS**2 * blind_s * np.eye(3)
-        pose_cov[3:, 3:] += UNKNOWN_MPS2**2 * blind_s**3 / 3.0 * np.eye(3)
-        v_cov = v_cov + UNKNOWN_MPS2**2 * blind_s * np.eye(3)
     return Ahead(
         stamp_ns=stamp_ns,
         pose=there.pose(),
         velocity=np.asarray(there.velocity()),
         pose_cov=pose_cov,
-        velocity_cov=v_cov,
+        velocity_cov=newest.velocity_cov + noise[6:, 6:],
         p_odom_m=p_odom,
         R_odom_body=R_odom,
     )

@@ -340,10 +340,8 @@ class OnlineSmoother:
         newest, odometry = lag.newest, self._odometry
         now = no_further(newest, odometry)
         if stamp_ns is not None and stamp_ns > newest.stamp_ns:
-            assert self._intake.newest is not None
             self._read(lag)
-            blind_s = (stamp_ns - self._intake.newest.stamp_ns) * 1e-9
-            now = ahead(lag.problem, newest, odometry, stamp_ns, blind_s if blind_s > self._gap_s else 0.0)
+            now = ahead(lag.problem, newest, odometry, stamp_ns)
         agreed = {**self._agreed_ns, **lag.agreed_ns}
         return estimate_of(now, lag, odometry, agreed_ns=agreed, absolute=self._absolute, doubt=self._doubt)
 
