@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SensorConfig, VelocityConfig, VesselConfig
 from graphloc.frontends import _clock, _fixes, _sanity
 from graphloc.frontends._beside import Beside
+from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.decode import Decoded, ImuSample, Rejection, rejected
 from graphloc.hangs import WHY, hanging, hanging_warning
 from graphloc.ledger import LedgerRow
@@ -194,6 +195,14 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
     warnings += _fixes.scatter_warning(readings.sensor, fixes, readings.config)
     return rows
+
+
+def reject_scattered(imu: ImuSeries | None, readings: Readings, warnings: list[str]) -> list[LedgerRow]:
+    """Drop headings that have nothing to do with those beside them."""
+    if imu is None or not isinstance(readings.config, CompassConfig):
+        return []
+    bad = scattered(imu, [v for v in readings.values if isinstance(v, CompassHeading)])
+    return _drop(readings, bad, rejected(SCATTERED), warnings)
 
 
 def _content(value: Decoded) -> object:
