@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SensorConfig, VelocityConfig, VesselConfig
 from graphloc.frontends import _clock, _fixes, _sanity
 from graphloc.frontends._beside import Beside
+from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.decode import Decoded, ImuSample, Rejection, rejected
 from graphloc.hangs import WHY, hanging, hanging_warning
 from graphloc.ledger import LedgerRow
@@ -179,17 +180,29 @@ def reject_repeats(readings: Readings) -> list[LedgerRow]:
 
 
 def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop fixes that a driver only repeats; say so, and where stamps are cut or the claimed noise is far too small."""
+    """Drop fixes that a driver only repeats, or that hang; say so, and where stamps are cut or the claimed noise is far too small."""
     if isinstance(readings.config, (GnssConfig, CompassConfig, VelocityConfig)):
         warnings += _fixes.stamp_warning(readings.sensor, readings.stamps())
     if not isinstance(readings.config, GnssConfig):
         return []
+    fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
+    hangs = _fixes.hanging(fixes)
+    warnings += _fixes.hanging_warning(readings.sensor, fixes, hangs)
+    rows = readings.drop(hangs, rejected(f"{_fixes.HANGS}: the receiver or its driver hangs"))
     bad = _fixes.held([v for v in readings.values if isinstance(v, GnssPosition)])
     warnings += _fixes.held_warning(readings.sensor, bad)
-    rows = readings.drop(bad, rejected("repeats the place of the fix before under a new stamp: no new evidence"))
+    rows += readings.drop(bad, rejected("repeats the place of the fix before under a new stamp: no new evidence"))
     fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
     warnings += _fixes.scatter_warning(readings.sensor, fixes, readings.config)
     return rows
+
+
+def reject_scattered(imu: ImuSeries | None, readings: Readings, warnings: list[str]) -> list[LedgerRow]:
+    """Drop headings that have nothing to do with those beside them."""
+    if imu is None or not isinstance(readings.config, CompassConfig):
+        return []
+    bad = scattered(imu, [v for v in readings.values if isinstance(v, CompassHeading)])
+    return _drop(readings, bad, rejected(SCATTERED), warnings)
 
 
 def _content(value: Decoded) -> object:

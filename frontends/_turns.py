@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do headings turn as the gyroscope does? The solver, which holds both for true, would blame the IMU's noise."""
+"""Do headings turn as the gyroscope does, or at all alike? The solver, which holds both for true, would blame the IMU's noise."""
 
 from __future__ import annotations
 
@@ -16,6 +16,12 @@ _BLOCK_S = 120.0  # within it a gyro's bias and a compass's offset are steady
 _HOLE_S, _STEP_S = 0.5, 2.0
 _TURNS_DEG = 5.0  # RMS of the turns in 2 s, or all in all, from which they tell
 _CLEAR = 0.5  # correlation
+_NEAR_S, _ASKED, _FEW, _LOST_DEG = 2.0, 20, 3, 30.0
+"""Headings within `_NEAR_S`, the next `_ASKED` to either side at most and `_FEW` at least, are asked whether they agree: a
+bias of 3 deg/s is 6 deg by then, a craft in a sharp turn 30 deg off what it was."""
+SCATTERED = (
+    "parts from most headings beside it, by the gyroscope and without: a course over ground at rest is no heading"
+)
 _PART_DEG, _PART = 3.0, 3.0  # least RMS that is said; times the sigma that is claimed
 
 
@@ -28,7 +34,7 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
         headings: of one compass, as the configuration reads them. convention: by which it does.
     """
     together, power, apart, turns = 0.0, 0.0, [], []
-    for turned, yaw, at_s in _blocks(imu, headings):
+    for _, turned, yaw, at_s in _blocks(imu, headings):
         step = max(1, round(_STEP_S / max(float(np.median(np.diff(at_s))), 1e-3)))
         if len(at_s) < 20 or step >= len(at_s):
             continue
@@ -54,8 +60,29 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
     ]
 
 
-def _blocks(imu: ImuSeries, headings: Sequence[CompassHeading]) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield turned angle by the gyroscope, yaw, and time (s), at the headings of each block without a hole in the IMU."""
+def scattered(imu: ImuSeries, headings: Sequence[CompassHeading]) -> NDArray[np.bool_]:
+    """Return (N,) which headings agree with less than half of those beside them, whether the craft turned or not.
+
+    So are those that a receiver takes from its way while it has none: each of them claims to be good to a degree or two.
+    What the gyroscope alone speaks against is left in: its unit, or the headings' convention, may be wrong.
+    """
+    bad = np.zeros(len(headings), dtype=bool)
+    for own, turned, yaw, at_s in _blocks(imu, headings):
+        apart = np.full((2 * _ASKED, len(own)), np.nan)
+        for lag in range(1, min(_ASKED, len(own) - 1) + 1):
+            turns = wrap_angle(yaw[lag:] - yaw[:-lag])
+            off = np.minimum(np.abs(turns), np.abs(wrap_angle(turns - (turned[lag:] - turned[:-lag]))))
+            off[at_s[lag:] - at_s[:-lag] > _NEAR_S] = np.nan
+            apart[2 * lag - 2, lag:], apart[2 * lag - 1, :-lag] = off, off
+        known = np.isfinite(apart).sum(axis=0) >= _FEW
+        bad[own[known]] = np.nanmedian(apart[:, known], axis=0) > np.radians(_LOST_DEG)
+    return bad
+
+
+def _blocks(
+    imu: ImuSeries, headings: Sequence[CompassHeading]
+) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
+    """Yield places in `headings`, turned angle by the gyroscope, yaw, and time (s), at the headings of each block without a hole in the IMU."""
     up = np.median(imu.accel_mps2, axis=0) if len(imu.stamps_ns) else np.zeros(3)
     size = float(np.linalg.norm(up))
     if size < 5.0 or len(headings) < 20:  # m/s^2: no gravity in it
@@ -75,7 +102,7 @@ def _blocks(imu: ImuSeries, headings: Sequence[CompassHeading]) -> Iterator[tupl
     inside = (at >= t[0]) & (at <= t[-1]) & (t[after] - t[after - 1] <= _HOLE_S)
     for k in np.unique(block[inside]):
         own = inside & (block == k)
-        yield np.interp(at[own], t, turned), yaw[own], at[own]
+        yield order[own], np.interp(at[own], t, turned), yaw[own], at[own]
 
 
 def _rms(parts: Sequence[Array]) -> float:

@@ -26,6 +26,7 @@ from graphloc.frontends._readings import (
     reject_far,
     reject_jumps,
     reject_repeats,
+    reject_scattered,
     reject_set_back,
 )
 from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
@@ -88,12 +89,13 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
     warnings += clock_warnings(sensors)
     imu: ImuSeries | None = None
     measurements: list[Measurement] = []
-    for readings in sensors:
+    for readings in sorted(sensors, key=lambda r: r.config.kind != "imu"):
         if readings.config.kind == "imu":
             imu, more = imu_series(readings, warnings)
             rows += more
         else:
             rows += reject_repeats(readings) + reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
+            rows += reject_scattered(imu, readings, warnings)
             measurements += [v for v in readings.values if isinstance(v, Measurement)]
     if imu is not None:
         warnings += _turn_warnings(imu, sensors)

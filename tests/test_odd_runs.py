@@ -12,7 +12,7 @@ from graphloc import app
 from graphloc.blocks import MountConfig
 from graphloc.build import make_problem
 from graphloc.config import DatumConfig, GnssConfig, HeightConfig, PoseConfig, VesselConfig
-from graphloc.errors import InputError
+from graphloc.errors import InputError, SolveError
 from graphloc.eval.drill.failures import imu_where
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import TruthMetrics, compare_to_truth
@@ -374,3 +374,31 @@ def test_level_and_bias_at_a_tilted_start() -> None:
 def test_roll_or_pitch_alone_is_refused(axes: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match="roll and pitch go together"):
         PoseConfig.model_validate({"topic": "/p", "axes": axes})
+
+
+@pytest.mark.parametrize(
+    ("cause", "words"),
+    [
+        ("stamps", r"gnss: 200 of its messages gave nothing: my\.bag: header stamp is zero or negative$"),
+        ("ahead", r"gnss has 200 measurements from .*, all outside the IMU's span, which ends at 2023-11-14T22:13:39"),
+    ],
+)
+def test_a_run_without_a_place_says_why(cause: str, words: str) -> None:
+    """A datum is configured and a compass is heard, so nothing but the start misses the fixes."""
+    run = simulate(replace(BASE, duration_s=20.0, gnss_hz=10.0), 3)
+    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    others = tuple(m for m in run.recording.measurements if not isinstance(m, GnssPosition))
+    assert len(fixes) == 200
+    bad = only(run.recording, others)
+    if cause == "ahead":
+        bad = only(run.recording, (*others, *(replace(m, stamp_ns=m.stamp_ns + 60_000_000_000) for m in fixes)))
+    else:
+        why = "my.bag: header stamp is zero or negative, recorded at 2023-11-14T22:13:{:02d}.000000000Z"
+        rows = [
+            LedgerRow(seq=m.seq, stamp_ns=0, sensor="gnss", topic="/f", outcome=Outcome.MALFORMED, reason=why.format(k % 60))
+            for k, m in enumerate(fixes)
+        ]  # fmt: skip
+        bad = replace(bad, rows=tuple(rows))
+    with pytest.raises(SolveError, match=words) as told:
+        app.smooth_recording(bad, run.config)
+    assert "compass" not in str(told.value)

@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array
-from graphloc.frontends._turns import turn_warnings
+from graphloc.frontends._turns import scattered, turn_warnings
 from graphloc.frontends.bag import read_recording
 from graphloc.measurements import CompassHeading, ImuSeries
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
-from tests.test_bag_bad_input import vessel
+from tests.test_bag_bad_input import accounted, rows_of, vessel
 
 
 @pytest.fixture(scope="module")
@@ -108,3 +109,51 @@ def test_a_bag_is_looked_at(tmp_path: object) -> None:
         config = vessel(gnss=None, imu={"topic": "/imu"}, compass={"topic": "/compass", "convention": convention})
         found = [w for w in read_recording(path, config).warnings if "turn the other way" in w]
         assert len(found) == said
+
+
+@pytest.mark.parametrize("hz", [1, 10])
+def test_headings_that_have_nothing_to_do_with_each_other_are_no_headings(hz: int, run: SimulatedRun) -> None:
+    """As a course over ground at rest: 20 s of any heading, and a single one later."""
+    imu, headings = of(run)
+    headings = headings[:: 10 // hz]
+    rng = np.random.default_rng(4)
+    wild = [m.stamp_ns < headings[0].stamp_ns + 20 * S for m in headings]
+    alone = 100 * hz
+    wild[alone] = True
+    mixed = [replace(m, yaw_rad=rng.uniform(-np.pi, np.pi)) if w else m for m, w in zip(headings, wild, strict=True)]
+    mixed[alone] = replace(headings[alone], yaw_rad=headings[alone].yaw_rad + 2.0)
+    bad = scattered(imu, mixed)
+    assert bad[alone]
+    # One of seven lies within 30 deg of any course by chance; at the seam the others are right.
+    first = 20 * hz
+    assert bad[: first - 2 * hz].mean() > 0.9
+    assert not bad[first + 2 * hz :][np.arange(len(bad) - first - 2 * hz) != alone - first - 2 * hz].any()
+
+
+def test_headings_are_not_scattered_for_a_gyroscope_or_convention_that_is_wrong(run: SimulatedRun) -> None:
+    imu, headings = of(run)
+    assert not scattered(imu, headings).any()
+    assert not scattered(replace(imu, gyro_radps=np.degrees(imu.gyro_radps)), headings).any()
+    assert not scattered(imu, changed(headings, lambda yaw: np.pi / 2.0 - yaw)).any()
+    assert not scattered(imu, headings[:1]).any()
+
+
+def test_a_bag_with_scattered_headings_has_rows_for_them(tmp_path: Path) -> None:
+    """20 s at rest; the compass, which vessel.yaml names before the IMU, says any heading for half of it."""
+    make, rng = Messages(2), np.random.default_rng(6)
+    items: list[Item] = []
+    for k in range(1000):
+        stamp = START_NS + k * S // 50
+        items.append(("/imu", stamp, make.imu(stamp, accel=(0, 0, 9.8), gyro=(0.0, 0.0, 1e-4 * rng.normal()))))
+        if k % 5 == 0:
+            half = rng.uniform(-np.pi, np.pi) if k < 500 else 0.3
+            items.append(("/compass", stamp, make.compass(stamp, (0, 0, np.sin(half), np.cos(half)))))
+    path = write_bag(tmp_path / "run", make, items, "mcap")
+    recording = read_recording(
+        path, vessel(gnss=None, imu=None, compass={"topic": "/compass"}, gyro={"topic": "/imu", "kind": "imu"})
+    )
+    assert recording.message_count == accounted(recording)
+    rows = rows_of(recording, "compass")
+    assert 85 <= len(rows) <= 105
+    assert all("parts from most headings" in r.reason for r in rows)
+    assert any(f"{len(rows)} messages rejected: parts from" in w for w in recording.warnings)

@@ -64,7 +64,7 @@ class Problem:
     """A run, ready to be solved.
 
     `preintegrated` and `inertial` have the motion from each state to the next, and the factor of it: neither depends on
-    the estimate, so every graph shares them.
+    the estimate, so every graph shares them. `silent` says of each sensor that has no measurement here why, as a clause.
     """
 
     config: VesselConfig
@@ -81,6 +81,7 @@ class Problem:
     streams: tuple[Stream, ...]
     rejected: tuple[LedgerRow, ...]
     warnings: tuple[str, ...] = field(default=())
+    silent: str = ""
 
 
 Mounts = Mapping[str, tuple[Array, Array]]  # by sensor, from /tf_static: t (3,), R (3, 3) in body
@@ -165,7 +166,25 @@ def make_problem(
         streams=tuple(streams),
         rejected=tuple(rejected),
         warnings=tuple(warnings),
+        silent=_silent(recording, config, by_sensor, imu),
     )
+
+
+def _silent(recording: Recording, config: VesselConfig, heard: Container[str], imu: ImuSeries) -> str:
+    """Return clauses on why the sensors that are not `heard` have no measurement within the IMU's span."""
+    clauses = ""
+    for name, sensor in config.sensors.items():
+        if name in heard or not sensor.enabled or not sensor.topic or name == imu.sensor:
+            continue
+        stamps_ns = [m.stamp_ns for m in recording.measurements if m.sensor == name]
+        if stamps_ns:
+            clauses += (
+                f"; {name} has {len(stamps_ns)} measurements from {utc_text(min(stamps_ns))} to "
+                f"{utc_text(max(stamps_ns))}, all outside the IMU's span, which ends at {utc_text(int(imu.stamps_ns[-1]))}"
+            )
+        elif lost := recording.lost({name}):
+            clauses += f"; {name}{lost.replace(';', ':', 1)}"
+    return clauses
 
 
 def _sorted_out(

@@ -81,7 +81,7 @@ def align(problem: Problem) -> Start:
     if not len(track.t):
         raise SolveError(
             f"no position from {utc_text(origin)} on: no GNSS fix and no pose was accepted; "
-            "check the topics, the status and the stamps with `graphloc inspect`"
+            f"check the topics, the status and the stamps with `graphloc inspect`{problem.silent}"
         )
     still = _standstill(problem, track, yaws)
     bias, bias_sigma, notes = _gyro_bias(problem, origin, window, still, yaws)
