@@ -11,14 +11,15 @@ integral with g = 0. The states stand at the IMU (see `graphloc.build`), so ther
 `setBodyPSensor` would leave out the Euler term (angular acceleration x lever), 0.07 m/s^2 in harbour
 waves at 1 m, which lost whole runs. Not handled: coning faster than the sample rate.
 
-**A hole of the data**, and what lies after its end: what a sample says of the motion is forgotten within a second,
+**A hole of the data** of up to 2 s is interpolated across, with noise that lets a vessel do anything a vessel does. In a longer
+one, and in what lies after the end of the data, what a sample says of the motion is forgotten within a second,
 
     w(t) = w_m + (w_a - w_m) sinh((t_b - t) / tau) / sinh(T / tau) + (w_b - w_m) sinh((t - t_a) / tau) / sinh(T / tau)
 
-the mean of an Ornstein-Uhlenbeck process between both sides (for short holes: straight between them), w_m the mean of the
-seconds before, and straight from there to that after, which holds the bias and a steady turn. The force likewise, less its own mean, and with g = 0: what a vessel
-feels on average holds it up. Integrated with gravity, a roll that is not known turns into an acceleration (after
-13 s: 250 m), though vessels stay upright: roll and pitch are let wander no more in a hole than in its first second.
+the mean of an Ornstein-Uhlenbeck process between both sides, w_m the mean of the seconds before, and straight from there
+to that after, which holds the bias and a steady turn. The force likewise, less its own mean, and with g = 0: what a vessel feels on
+average holds it up. So the heading turns on, the velocity goes straight. Integrated with gravity, a roll that is not known turns into an
+acceleration (after 13 s: 250 m), though vessels stay upright: in one hole roll and pitch wander by no more than in a second.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from graphloc.frames import Array
 from graphloc.measurements import ImuSeries
 
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # of motion in a hole, white beyond what a sample says
+_SHORT_S = 2.0  # a hole that is interpolated across
 _FORGET_S, _AROUND_S = 1.0, 10.0  # in a hole, what a sample says; the means are of so long to either side
 _HOLE_STEP_S = 0.1  # of integrating across a hole
 _INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz)-like floor that keeps position covariance positive
@@ -52,9 +54,9 @@ class Links:
         self._R_body_imu = R_body_imu
         self._max_gap_ns = int(config.max_gap_s * 1e9)
         self._noise_scale = noise_scale
-        gravity_mps2 = gravity_mps2 if config.gravity != "removed" else 0.0
+        self._gravity_mps2 = gravity_mps2 if config.gravity != "removed" else 0.0
         gyro = config.gyro_noise_radps * noise_scale
-        self._params = self._make_params(gravity_mps2, config.accel_noise_mps2 * noise_scale, np.full(3, gyro))
+        self._params = self._make_params(self._gravity_mps2, config.accel_noise_mps2 * noise_scale, np.full(3, gyro))
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
         """Add samples (N, 6) at stamps that are new: specific force, rate; late ones go where they belong."""
@@ -94,8 +96,11 @@ class Links:
         dts = np.diff(edges) * 1e-9
         middles = (edges[:-1] + edges[1:]) // 2
         samples, params = self._at(middles), self._params
-        if hole is not None:
+        if hole is not None and hole[1] - hole[0] <= _SHORT_S * 1e9 and hole[1] <= self._stamps[-1]:
+            params = self._make_params(self._gravity_mps2, _UNKNOWN_MPS2, np.full(3, _UNKNOWN_RADPS))
+        elif hole is not None:
             samples, params = self._across(middles, samples, hole)
+            samples[:, :3] += bias.accelerometer()  # GTSAM takes it off; with its mean it is off already
         pim = gtsam.PreintegratedImuMeasurements(params, bias)
         for sample, dt in zip(samples, dts, strict=True):
             if dt > 0.0:

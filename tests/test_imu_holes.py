@@ -90,6 +90,27 @@ def test_a_turn_and_a_bias_go_on() -> None:
     assert there.attitude().yaw() == pytest.approx(13.0 * 0.05 - 0.08, abs=0.02)
 
 
+def test_of_a_short_hole_gravity_is_known() -> None:
+    """At rest in a swell (10 deg, 4 s), 0.6 s missing within 1.6 s: roll and force belong together, so it stays."""
+    t_s = np.arange(4000) / RATE_HZ
+    gyro, accel = level(len(t_s))
+    roll = np.radians(10.0) * np.sin(2 * np.pi * (t_s - 15.0) / 4.0)
+    gyro[:, 0] = np.gradient(roll, t_s)
+    accel[:, 1:] = G * np.column_stack([np.sin(roll), np.cos(roll)])
+    there, _ = across(imu_of(gyro, accel, (15.5, 16.1), UPRIGHT), 15.0, 16.6)
+    assert np.linalg.norm(there.velocity() - [3.0, 0.0, 0.0]) < 0.5
+
+
+def test_a_bias_that_is_known_is_taken_off_once() -> None:
+    """The mean that holds a vessel up holds the bias as well."""
+    gyro, accel = level(4000)
+    known = gtsam.imuBias.ConstantBias(np.array([0.2, 0.0, 0.0]), np.zeros(3))
+    imu = imu_of(gyro, accel + np.array([0.2, 0.0, 0.0]), (15.0, 28.0), UPRIGHT)
+    pim = ROW.link(imu, ImuConfig(), UPRIGHT, G).integrate(15 * S, 28 * S, known)
+    there = pim.predict(gtsam.NavState(gtsam.Pose3(), np.array([3.0, 0.0, 0.0])), known)
+    assert there.velocity() == pytest.approx(np.array([3.0, 0.0, 0.0]), abs=1e-6)
+
+
 def test_across_a_short_hole_it_goes_as_on_both_sides() -> None:
     """A turn that grows from 0.6 to 0.9 rad/s in 0.6 s: as good as straight between both; the seconds around have 0.5 rad/s."""
     t_s = np.arange(3000) / RATE_HZ
