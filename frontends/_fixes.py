@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixes that tell less than they say: places that a driver repeats or a receiver hangs at, stamps that are cut, noise that is hidden."""
+"""Fixes that tell less than they say: places that a driver repeats, stamps that it cuts, noise that a receiver hides."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +11,12 @@ from numpy.typing import NDArray
 from graphloc.config import GnssConfig
 from graphloc.frames import Array, Datum
 from graphloc.measurements import GnssPosition
-from graphloc.time import NS_PER_S, utc_text
+from graphloc.time import NS_PER_S
 
 _HELD_S = 2.5
 """A place that is repeated for less, and then changes, was held by a driver; for longer, the receiver itself stands still."""
-_LOOK_S, _UNDER_WAY_MPS, _LAST_MPS = 1.0, 1.0, 0.5
-"""Over so long is a velocity taken; from such a speed on, a craft is under way; and at less, a receiver may hold its place."""
 _OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp again, from which a line is due
 _FAST_S, _EVEN, _FEWEST = 0.25, 0.2, 100  # steps over which motion hides in no third difference, and how many tell
-HANGS = "repeat one place to the last bit while the craft is under way"
 SCATTERS = 2.0
 """Scatter over the claim from which the claim is not believed."""
 
@@ -47,59 +43,6 @@ def held_warning(sensor: str, bad: NDArray[np.bool_]) -> list[str]:
         return []
     said = f"{sensor}: {int(bad.sum())} of {len(bad)} fixes repeat the place of the one before under a new stamp, as drivers do "
     return [f"{said}that publish faster than the receiver measures: each place counts once, at its first stamp"]
-
-
-def hanging(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
-    """Return (N,) which fixes only repeat, for longer than a driver holds one, a place at which the craft cannot have stayed.
-
-    A receiver's filter may hold a place at rest, to the last bit. But who comes to rest slows down before: where the craft
-    went on as fast as ever until the place was first said, or goes so from the moment that another is said, and that one
-    is not where it could have come within `_LOOK_S`, the receiver hung. One that is slow all the while is believed.
-    """
-    bad = np.zeros(len(fixes), dtype=bool)
-    if not fixes:
-        return bad
-    order = sorted(range(len(fixes)), key=lambda i: (fixes[i].stamp_ns, fixes[i].seq))
-    lla = np.array([fixes[i].position for i in order])
-    t_s = (np.array([fixes[i].stamp_ns for i in order], dtype=np.int64) - fixes[order[0]].stamp_ns) / NS_PER_S
-    p_m = Datum(fixes[order[0]].position).enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])[:, :2]
-    starts = np.concatenate([[0], np.flatnonzero((lla[1:] != lla[:-1]).any(axis=1)) + 1, [len(lla)]]).tolist()
-    for first, beyond in pairwise(starts):
-        if t_s[beyond - 1] - t_s[first] <= _HELD_S:
-            continue
-        speed = _steady_speed(t_s[: first + 1], p_m[: first + 1])
-        if beyond < len(lla):
-            speed = max(speed, _steady_speed(-t_s[beyond:][::-1], p_m[beyond:][::-1]))
-            if np.linalg.norm(p_m[beyond] - p_m[first]) <= speed * _LOOK_S:
-                continue
-        bad[[order[k] for k in range(first + 1, beyond)]] = speed > 0.0
-    return bad
-
-
-def _steady_speed(t_s: Array, p_m: Array) -> float:
-    """Return the speed, m/s, up to the last of places (N, 2) if the craft was under way and not about to stop; else 0.
-
-    Of a craft that stops from a speed s at which its receiver holds the place, velocities v of the last second and u of
-    that before it differ by 2 (v - s); half of that is asked for. Scatter at rest has |u - v| > |v|, too.
-    """
-    last = len(t_s) - 1
-    middle = int(np.searchsorted(t_s, t_s[last] - _LOOK_S, side="right")) - 1 if last > 0 else -1
-    early = int(np.searchsorted(t_s, t_s[middle] - _LOOK_S, side="right")) - 1 if middle > 0 else -1
-    if early < 0 or t_s[last] - t_s[early] > 3.0 * _HELD_S:
-        return 0.0
-    v = (p_m[last] - p_m[middle]) / (t_s[last] - t_s[middle])
-    u = (p_m[middle] - p_m[early]) / (t_s[middle] - t_s[early])
-    speed = float(np.linalg.norm(v))
-    return speed if speed >= _UNDER_WAY_MPS and np.linalg.norm(u - v) < speed - _LAST_MPS else 0.0
-
-
-def hanging_warning(sensor: str, fixes: Sequence[GnssPosition], bad: NDArray[np.bool_]) -> list[str]:
-    """Return a line on what `hanging` found."""
-    if not bad.any():
-        return []
-    stamps_ns = np.sort([m.stamp_ns for m, hangs in zip(fixes, bad, strict=True) if hangs])
-    span = f"the first at {utc_text(int(stamps_ns[0]))}, the last at {utc_text(int(stamps_ns[-1]))}"
-    return [f"{sensor}: {int(bad.sum())} fixes, {span}, {HANGS}: not believed; look at the receiver and its driver"]
 
 
 def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:

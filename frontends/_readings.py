@@ -180,18 +180,14 @@ def reject_repeats(readings: Readings) -> list[LedgerRow]:
 
 
 def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop fixes that a driver only repeats, or that hang; say so, and where stamps are cut or the claimed noise is far too small."""
+    """Drop fixes that a driver only repeats; say so, and where stamps are cut or the claimed noise is far too small."""
     if isinstance(readings.config, (GnssConfig, CompassConfig, VelocityConfig)):
         warnings += _fixes.stamp_warning(readings.sensor, readings.stamps())
     if not isinstance(readings.config, GnssConfig):
         return []
-    fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
-    hangs = _fixes.hanging(fixes)
-    warnings += _fixes.hanging_warning(readings.sensor, fixes, hangs)
-    rows = readings.drop(hangs, rejected(f"{_fixes.HANGS}: the receiver or its driver hangs"))
     bad = _fixes.held([v for v in readings.values if isinstance(v, GnssPosition)])
     warnings += _fixes.held_warning(readings.sensor, bad)
-    rows += readings.drop(bad, rejected("repeats the place of the fix before under a new stamp: no new evidence"))
+    rows = readings.drop(bad, rejected("repeats the place of the fix before under a new stamp: no new evidence"))
     fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
     warnings += _fixes.scatter_warning(readings.sensor, fixes, readings.config)
     return rows

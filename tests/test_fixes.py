@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixes that say more than they know: repeated under new stamps, stamped in steps, noisier than they claim."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -110,51 +109,3 @@ def test_noise_that_a_receiver_hides(
         assert len(found) == (expected is not None)
         if expected is not None:
             assert float(found[0].split("sigma_scale:")[1].split("#")[0]) == pytest.approx(expected, rel=0.15)
-
-
-def voyage(path: Path, speed_mps: Callable[[float], float], hang: tuple[float, float], hz: int = 5) -> Recording:
-    """A minute eastward at a speed of the time, scatter 0.1 m; in `hang` the receiver says the place before again."""
-    rng = np.random.default_rng(5)
-    items: list[Item] = []
-    place = DATUM.geodetic_from_enu(np.zeros((1, 3)))[0]
-    ways = np.cumsum([speed_mps(n / 100) / 100 for n in range(6000)])
-    for k in range(60 * hz):
-        t, way = k / hz, ways[k * 100 // hz]
-        if not hang[0] < t < hang[1]:
-            place = DATUM.geodetic_from_enu(np.array([[way, 0.0, 0.0]]) + 0.1 * rng.normal(size=(1, 3)))[0]
-        stamp = START_NS + k * S // hz
-        items.append(
-            ("/fix", stamp, MAKE.fix(stamp, place[0], place[1], place[2], covariance=(0.01 * np.eye(3)).ravel()))
-        )
-    return read(path, items)
-
-
-@pytest.mark.parametrize("hz", [1, 5])
-@pytest.mark.parametrize(
-    ("speed_mps", "hang", "hangs"),
-    [
-        (lambda t: 2.0, (20.0, 40.0), True),  # and comes back 40 m farther on
-        (lambda t: 2.0, (20.0, 60.0), True),  # and never comes back
-        (lambda t: 2.0 if t > 20.0 else 0.0, (10.0, 40.0), True),  # it hung at rest, before the craft set out
-        (lambda t: max(0.0, min(3.0, 0.5 * (26.0 - t), 3.0)) if t < 45.0 else 0.5 * (t - 45.0), (26.0, 46.0), False),
-        (lambda t: max(0.0, 6.0 - 3.0 * max(t - 20.0, 0.0)), (22.0, 60.0), False),  # brakes as a car does
-        (lambda t: 0.0, (20.0, 40.0), False),
-    ],
-)  # fmt: skip
-def test_a_receiver_that_hangs_under_way_is_not_believed(
-    speed_mps: Callable[[float], float], hang: tuple[float, float], hangs: bool, hz: int, tmp_path: Path
-) -> None:
-    """At rest a receiver's filter may hold its place to the last bit; a craft that goes on at 2 m/s has no such place."""
-    recording = voyage(tmp_path, speed_mps, hang, hz)
-    rows = rows_of(recording, "gnss")
-    if not hangs:
-        assert not rows
-        assert not recording.warnings
-        return
-    stamps = sorted((r.stamp_ns - START_NS) / S for r in rows)
-    expected = [k / hz for k in range(60 * hz) if hang[0] < k / hz < hang[1]]
-    assert stamps == pytest.approx(expected, abs=1e-6)
-    assert all(r.outcome is Outcome.REJECTED and "hangs" in r.reason for r in rows)
-    (line,) = recording.warnings
-    assert f"{len(expected)} fixes" in line
-    assert "repeat one place" in line
