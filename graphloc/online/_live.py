@@ -18,6 +18,7 @@ from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.measurements import ImuSeries, Measurement
+from graphloc.online._habit import Habit
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
@@ -161,6 +162,7 @@ class LiveProblem:
     R_body_imu: Array
     links: InertialLink
     streams: dict[str, LiveStream]
+    habit: Habit
 
     def take(self, m: Measurement) -> tuple[LiveStream, int]:
         """Put a measurement where it belongs; return its stream and its index there."""
@@ -195,6 +197,7 @@ def live_problem(
     inertial: InertialRow,
     mounts: Mounts,
     noise_scale: float,
+    habit: Habit,
 ) -> LiveProblem:
     """Return a problem whose first state stands at `start_ns`; `imu`: the samples that are known from there on."""
     sensor = config.sensors[imu.sensor]
@@ -221,4 +224,5 @@ def live_problem(
         R_body_imu=R,
         links=inertial.link(imu, sensor, R, datum.gravity_mps2, noise_scale),
         streams=streams,
+        habit=habit,
     )

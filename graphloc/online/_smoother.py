@@ -29,6 +29,7 @@ from graphloc.online._ahead import ahead, carry_on, no_further
 from graphloc.online._anchor import Anchor
 from graphloc.online._book import Book
 from graphloc.online._estimates import estimate_of
+from graphloc.online._habit import Habit
 from graphloc.online._intake import ImuIntake
 from graphloc.online._lag import Lag
 from graphloc.online._live import live_problem
@@ -96,6 +97,7 @@ class OnlineSmoother:
         self._heights_m: Mapping[str, float] = {}
         self._doubt = ""
         self._noise = ImuNoise(adapt=bool(imu) and imu[self._imu_name].adapt_noise)
+        self._habit = Habit()
         self._intake = ImuIntake(self._gap_s, bool(imu) and imu[self._imu_name].gravity != "removed")
         self._resumable, trouble = self._snapshot.read(config.vessel, self._imu_name, self._datum)
         self._say(trouble)
@@ -451,6 +453,7 @@ class OnlineSmoother:
             self._inertial,
             self._mounts,
             self._noise.scale,
+            self._habit,
         )
         agreed = {} if self._lag is None else self._lag.agreed_ns
         if self._lag is not None:

@@ -17,6 +17,7 @@ from graphloc.frames import Array
 from graphloc.graph import Attachment, Residual
 from graphloc.online._anchor import Anchor, Beside, beside, without_prior
 from graphloc.online._constants import Constants
+from graphloc.online._habit import UNSURE_MPS, Moving
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
 from graphloc.solve._foreseen import Prediction, prediction_of
@@ -76,6 +77,7 @@ class States:
         self._problem, self._window, self._constants = problem, window, constants
         self._ends: dict[str, Held] = {}  # what closes the slow chain of each sensor
         self._links: dict[int, Held] = {}  # by the state that each begins at
+        self._turned = 0  # the last state that a slow node begins at
         state = (keys.pose(0), keys.velocity(0), keys.bias(0))
         pose, velocity, bias = guess
         window.guess(state[0], pose, 0.0)
@@ -137,11 +139,25 @@ class States:
             window.guess(keys.bias(following), bias, t)
             window.add([bias_step(links, j, dt_s)])
             self._next_slow(j, dt_s, t)
+            self._next_habit(dt_s)
         window.touch(keys.bias(following), t)
         for stream in self._problem.streams.values():
             if stream.slow is not None:
                 window.touch(keys.slow(stream.number, following), t)
         return bool(following != j)
+
+    def _next_habit(self, dt_s: float) -> None:
+        """Learn how the vessel moves, or, where that is hardly known, stage that it moves as usual."""
+        problem, newest, before = self._problem, self._newest, self._turned
+        self._turned = problem.timeline.last
+        if float(np.linalg.eigvalsh(newest.velocity_cov[:2, :2])[-1]) < UNSURE_MPS**2:
+            problem.habit.learn(newest.stamp_ns, (newest.pose.rotation().matrix().T @ newest.velocity)[:2])
+        elif before >= problem.timeline.first:
+            self._window.add(problem.habit.step(self._moving(before), self._moving(self._turned), dt_s))
+
+    def _moving(self, k: int) -> Moving:
+        values, key = self._window.values, keys.velocity(k)
+        return Moving(key, np.asarray(values.atVector(key)), values.atPose3(keys.pose(k)).rotation().matrix())
 
     def _next_slow(self, j: int, dt_s: float, t: float) -> None:
         window = self._window

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What bounds a track that nothing but the IMU tells: the vessel moves as it usually does."""
+
+from dataclasses import replace
+from unittest.mock import patch
+
+import gtsam
+import numpy as np
+import pytest
+
+from graphloc.config import TimelineConfig
+from graphloc.eval.simulate import Scenario, simulate
+from graphloc.frames import Array
+from graphloc.measurements import CompassHeading
+from graphloc.online._habit import Habit, Moving
+from graphloc.replay import replay
+from graphloc.trajectory import bounds_95
+
+SECOND = 1_000_000_000
+
+
+def taught(v_body_mps: Array) -> Habit:
+    """Taught with velocities (N, 2), one a second."""
+    habit = Habit()
+    for k, v in enumerate(v_body_mps):
+        habit.learn(k * SECOND, v)
+    return habit
+
+
+def wandering(speed_mps: float, change_mps: float, n: int) -> Array:
+    """Velocities (n, 2), one a second, of a vessel of that usual speed and change over 10 s along both axes."""
+    rng, phi = np.random.default_rng(3), (1.0 - change_mps**2 / (2.0 * speed_mps**2)) ** 0.1
+    v = [speed_mps * rng.standard_normal(2)]
+    for _ in range(n - 1):
+        v.append(phi * v[-1] + speed_mps * np.sqrt(1.0 - phi**2) * rng.standard_normal(2))
+    return np.array(v)
+
+
+def test_the_process_has_what_was_learned_beside_what_any_vessel_may_do() -> None:
+    """Its standing variance is that of the speeds, and its change over 10 s that of the changes."""
+    v = wandering(4.0, 2.0, 300)
+    phi, variance = taught(v).process(np.zeros(2), 10.0)
+    standing = variance / (1.0 - phi**2)
+    assert standing == pytest.approx(1.0 + (v**2).mean(axis=0), rel=0.1)
+    assert 2.0 * standing * (1.0 - phi) == pytest.approx(0.25 + ((v[10:] - v[:-10]) ** 2).mean(axis=0), rel=0.2)
+
+
+def test_ten_steps_of_a_second_are_one_of_ten() -> None:
+    habit = taught(wandering(4.0, 2.0, 60))
+    (phi, w), (phi_10, w_10) = habit.process(np.ones(2), 1.0), habit.process(np.ones(2), 10.0)
+    assert phi**10 == pytest.approx(phi_10)
+    assert sum(w * phi ** (2 * k) for k in range(10)) == pytest.approx(w_10)
+
+
+def test_a_vessel_is_not_slower_than_it_is_now() -> None:
+    """A car that has just been resumed at 15 m/s, with nothing learned, is not braked by a sigma within a minute."""
+    v = np.array([15.0, 0.0])
+    phi, variance = Habit().process(v, 60.0)
+    assert ((1.0 - phi) * v <= np.sqrt(variance)).all()
+
+
+def after_a_second(imu_mps: Array, sigma_mps: float) -> Array:
+    """Velocity (2,) in the body after a step, of a vessel at 2 m/s that turns by 0.3 rad, by the IMU and by habit together."""
+    habit, v_a = taught(np.tile([2.0, 0.0], (100, 1))), np.array([2.0, 0.0, 0.0])
+    R_a, R_b = np.eye(3), gtsam.Rot3.Yaw(0.3).matrix()
+    v_b = R_b @ np.append(imu_mps, 0.0)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for key, v, sigma in ((0, v_a, 1e-3), (1, v_b, sigma_mps)):
+        values.insert(key, v)
+        graph.add(gtsam.PriorFactorVector(key, v, gtsam.noiseModel.Isotropic.Sigma(3, sigma)))
+    for factor in habit.step(Moving(0, v_a, R_a), Moving(1, v_b, R_b), 1.0):
+        graph.add(factor)
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return np.asarray((R_b.T @ solved.atVector(1))[:2])
+
+
+def test_a_turn_is_no_change_and_a_creeping_error_is_held_back() -> None:
+    assert after_a_second(np.array([2.0, 0.0]), 0.3) == pytest.approx([2.0, 0.0], abs=0.01)
+    held = after_a_second(np.array([2.0, 0.3]), 0.3)
+    assert 0.05 < held[1] < 0.25
+
+
+def test_a_vessel_that_stops_is_believed_and_does_not_begin_to_slide() -> None:
+    """An IMU that knows a second to 0.1 m/s is believed when that is far from usual; along the other axis nothing changes."""
+    stopped = after_a_second(np.array([0.0, 0.0]), 0.1)
+    assert stopped[0] == pytest.approx(0.0, abs=0.05)
+    assert stopped[1] == pytest.approx(0.0, abs=1e-6)
+    assert after_a_second(np.array([0.0, 0.3]), 0.3)[1] == pytest.approx(
+        after_a_second(np.array([2.0, 0.3]), 0.3)[1], abs=1e-3
+    )
+
+
+def test_without_a_place_it_drifts_as_far_as_a_vessel_can_and_no_farther() -> None:
+    """Ninety seconds of compass and IMU alone: from the tilt, the IMU alone would be off by hundreds of metres."""
+    run = simulate(replace(Scenario(path="loops", noise="drift"), duration_s=115.0), 3)
+    config = run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=2.5)})
+    lost_ns = int(run.truth.stamps_ns[0]) + 25 * SECOND
+    kept = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < lost_ns)
+    steps: list[int] = []
+    with patch.object(Habit, "step", autospec=True, side_effect=counted(steps)):
+        track = replay(replace(run.recording, measurements=kept), config).solution.trajectory
+    assert track.cov is not None
+    off_m = np.hypot(*(track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[:, :2].T)
+    lost = track.stamps_ns >= lost_ns
+    true = run.truth.at(track.stamps_ns[lost]).p_world_m
+    way_m = float(np.hypot(*np.diff(true[:, :2], axis=0).T).sum())
+    assert off_m[lost].max() < 0.3 * way_m
+    assert (off_m < bounds_95(track.cov)[:, 0])[lost].mean() > 0.9
+    assert 60 < len(steps) <= 92, "a step a second, while the velocity is unsure"
+
+
+def counted(steps: list[int]):  # type: ignore[no-untyped-def]
+    real = Habit.step
+
+    def step(self: Habit, a: Moving, b: Moving, dt_s: float) -> list[object]:
+        steps.append(a.key)
+        return real(self, a, b, dt_s)
+
+    return step
