@@ -103,6 +103,13 @@ class Residual:
             return float(self.raw[0]) ** 2 / float(s[0, 0])
         return float(self.raw @ np.linalg.solve(s, self.raw))
 
+    def normalised(self, inflation: Array | None = None) -> Array:
+        """The residual (k,) by a root of `cov` (+ `inflation`): its square is `nis`."""
+        s = self.cov if inflation is None else self.cov + inflation
+        if len(self.raw) == 1:
+            return np.asarray(self.raw / np.sqrt(s[0]))
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(s), self.raw))
+
     def log_density(self, inflation: Array | None = None) -> float:
         """Log of prior x Gaussian density of the residual, covariance `cov` (+ `inflation`)."""
         s = self.cov if inflation is None else self.cov + inflation

@@ -105,15 +105,16 @@ class Judge:
     ) -> tuple[Verdict, bool]:
         """The sensor's kernel: as wide as its residuals scatter, and as the prediction is unsure. True: for that reason."""
         own, dof = stream.config.kernel, len(residual.raw)
-        scale = own.scale * stream.spread * float(np.sqrt(dof))
+        scale = own.scale * stream.scatter.times * float(np.sqrt(dof))
         plain = nis = residual.nis()
-        opened = False
+        opened, inflation = False, None
         if fresh and own.kind != "none" and nis > scale**2:
-            nis = residual.nis(self._states.prediction(stream, at, stream.state[i], residual).cov)
+            inflation = self._states.prediction(stream, at, stream.state[i], residual).cov
+            nis = residual.nis(inflation)
             opened = plain > 1.5 * nis
             scale *= float(np.sqrt(plain / max(nis, 1e-9))) if opened else 1.0
         if fresh:
-            stream.scattered(nis, dof)
+            stream.scatter.note(stream.measurements[i].stamp_ns, residual.normalised(inflation))
         kernel = KernelConfig(kind=own.kind, scale=scale)
         return Verdict(Decision(kernel=kernel), kernel.weight(plain), 1.0, residual, 0, at), opened
 

@@ -458,8 +458,7 @@ class OnlineSmoother:
         agreed = {} if self._lag is None else self._lag.agreed_ns
         if self._lag is not None:
             for name, stream in self._lag.problem.streams.items():
-                problem.streams[name].scatter.extend(stream.scatter)
-                problem.streams[name].spread = stream.spread
+                problem.streams[name].scatter = stream.scatter
         self._lag = Lag(problem, anchor, self._lag_s, guess)
         self._lag.agreed_ns.update(agreed)
         self._book.begin()
