@@ -189,6 +189,7 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     warnings += _fixes.held_warning(readings.sensor, bad)
     rows = readings.drop(bad, rejected("repeats the place of the fix before under a new stamp: no new evidence"))
     fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
+    warnings += _fixes.height_warning(readings.sensor, fixes)
     warnings += _fixes.scatter_warning(readings.sensor, fixes, readings.config)
     return rows
 

@@ -327,6 +327,8 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         f"{gnss.topic}: {statuses}; first fix {lat:.7f}, {lon:.7f}, {height:.1f} m",
         f"  track {gnss.travelled_m:.0f} m in a box of {east_m:.0f} x {north_m:.0f} m, height {gnss.height_range_m:.1f} m",
     ]
+    if gnss.without_height:
+        lines.append(f"  {gnss.without_height} messages have no height (NaN) and count as horizontal fixes")
     if gnss.reported_sigma_m is not None:
         lines.append(f"  reported sigma east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
     if gnss.scatter_m is not None:
