@@ -24,7 +24,7 @@ from graphloc.time import NS_PER_S, utc_text
 
 @dataclass(slots=True)
 class Readings:
-    """Columns of one sensor: arrival number, stamp, recording time, decoded value."""
+    """Columns of one sensor: arrival number, stamp, recording time, decoded value, file."""
 
     sensor: str
     config: SensorConfig
@@ -32,9 +32,11 @@ class Readings:
     stamps_ns: list[int] = field(default_factory=list)
     logs_ns: list[int] = field(default_factory=list)
     values: list[Decoded] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
 
-    def add(self, seq: int, stamp_ns: int, log_ns: int, value: Decoded) -> None:
+    def add(self, seq: int, stamp_ns: int, log_ns: int, value: Decoded, file: str) -> None:
         """Append a reading."""
+        self.files.append(file)
         self.seqs.append(seq)
         self.stamps_ns.append(stamp_ns)
         self.logs_ns.append(log_ns)
@@ -51,7 +53,7 @@ class Readings:
     def drop(self, bad: NDArray[np.bool_], rejection: Rejection) -> list[LedgerRow]:
         """Take readings out; return their rows."""
         rows = [self.row(self.seqs[i], self.stamps_ns[i], rejection) for i in np.flatnonzero(bad)]
-        columns: tuple[list[Any], ...] = (self.seqs, self.stamps_ns, self.logs_ns, self.values)
+        columns: tuple[list[Any], ...] = (self.seqs, self.stamps_ns, self.logs_ns, self.values, self.files)
         for column in columns if rows else ():
             column[:] = list(compress(column, ~bad))
         return rows
@@ -91,9 +93,13 @@ def reject_set_back(sensors: Sequence[Readings], beside: Sequence[Beside], warni
     """Keep the longest part of a run in which the IMU's clock was set back, by recording times; say where that was.
 
     Two parts that bear the same times would be laid over each other.
+
+    Raises:
+        InputError: they do so by the recording times, too.
     """
     for imu in (r for r in sensors if r.config.kind == "imu"):
         stamps, logs = imu.stamps(), imu.logs()
+        _clock.refuse_woven(imu.config.topic, stamps, logs, imu.values, imu.files)
         cuts = _clock.set_backs(stamps)
         if not cuts:
             continue

@@ -27,6 +27,7 @@ from graphloc.frontends._assess import (
 from graphloc.frontends._assess_imu import imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._assess_world import origin_of
+from graphloc.frontends._clock import refuse_woven
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._lag import lag
 from graphloc.frontends._reports import (
@@ -74,7 +75,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         paths: as for `read_recording`.
 
     Raises:
-        InputError: the bag cannot be opened.
+        InputError: the bag cannot be opened, or its parts lie over each other.
     """
     with Bag(paths) as bag:
         topics = bag.topics
@@ -82,6 +83,9 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         clouds = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
         images = _frames_of(bag, _pictures(bag))
         source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
+    for stream in streams:
+        if stream.msgtype == IMU:
+            refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
     by_topic = {s.topic: s for s in streams}
     filled = [s for s in streams if len(s)]
     fixes = [s for s in filled if s.msgtype == NAV_SAT_FIX]
