@@ -146,7 +146,11 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
 
 
 def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | None, list[LedgerRow]]:
-    """Return the samples in strictly increasing time, and rows of those that are not."""
+    """Return the samples in strictly increasing time, and rows of those that are not.
+
+    Raises:
+        InputError: their rates cannot be rad/s.
+    """
     assert isinstance(readings.config, ImuConfig)
     bad = ~_clock.longest_increasing(readings.stamps())
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
@@ -161,6 +165,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
         gyro_radps=np.array([s.gyro_radps for s in samples]),
         seqs=np.array(readings.seqs, dtype=np.int64),
     )
+    _sanity.refuse_degrees(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     return series, rows
 
