@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.frames import Array
+from graphloc.config import STANDARD_GRAVITY_MPS2
+from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import (
     Turning,
     compass_report,
@@ -45,10 +46,12 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._source import Bag
 from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import IMU, NAV_SAT_FIX, ODOMETRY, PLAIN_TWIST, POSE, QUATERNION, TWIST
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, info_beside
+from graphloc.measurements import CompassHeading, ImuSeries
 from graphloc.time import utc_text
 
 __all__ = [
@@ -116,7 +119,11 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         ),
         imus=tuple(found_imus),
         gnss=tuple(found_gnss),
-        compasses=tuple(_timed(c, s, turning) for s in candidates if (c := compass_report(s, courses, turning))),
+        compasses=tuple(
+            _asked_together(_timed(c, s, turning), s, [(i, by_topic[i.topic]) for i in found_imus])
+            for s in candidates
+            if (c := compass_report(s, courses, turning))
+        ),
         odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first, antenna)) for s in poses),
         velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
         lidars=_mounted(clouds, tree, body),
@@ -137,6 +144,32 @@ def _timed(report: CompassReport, stream: Stream, turning: Turning | None) -> Co
         return report
     value, sigma = found
     return replace(report, why=f"{report.why}; by the gyro, time_offset_s should be {value:.3f} +- {sigma:.3f}")
+
+
+def _asked_together(report: CompassReport, stream: Stream, imus: Sequence[tuple[ImuReport, Stream]]) -> CompassReport:
+    """The report, with how many readings have nothing to do with those beside them, by the best IMU."""
+    if not imus or not report.usable:
+        return report
+    imu, samples = imus[0]
+    keep = samples_of(samples)[0]
+    keep = keep[np.isfinite(samples.rows[keep, :6]).all(axis=1)]
+    rows = samples.rows[keep]
+    unit = STANDARD_GRAVITY_MPS2 if imu.accel_unit == "g" else 1.0
+    series = ImuSeries(
+        sensor=imu.topic,
+        stamps_ns=samples.stamps_ns[keep],
+        accel_mps2=rows[:, :3] * (-unit if imu.gravity == "inverted" else unit),
+        gyro_radps=np.radians(rows[:, 3:6]) if imu.gyro_unit == "deg/s" else rows[:, 3:6],
+        seqs=keep.astype(np.int64),
+    )
+    stamps, angle = headings(stream)
+    yaw = angle if report.convention == "enu" else np.pi / 2.0 - angle
+    said = [
+        CompassHeading(stamp_ns=int(s), sensor=stream.topic, seq=0, yaw_rad=float(y), sigma_rad=1.0)
+        for s, y in zip(stamps, wrap_angle(yaw), strict=True)
+    ]
+    bad = int(scattered(series, said).sum())
+    return replace(report, why=f"{report.why}; {bad} of {len(said)}: {SCATTERED}") if bad else report
 
 
 def _mounted(
