@@ -167,6 +167,7 @@ def compare_to_held_out(
     """Return the metrics of an estimate against held-out fixes."""
     stamps, error, matched = held_out_errors(estimate, held, datum, levers_m)
     horizontal = np.hypot(error[:, 0], error[:, 1])
+    solid = all(m.has_height for m in held)
     steps = np.diff(np.unique(stamps))
     usual = np.median(steps) if len(steps) else 1
     gap = np.cumsum(np.concatenate([[0], np.diff(stamps) > 2.5 * max(usual, 1)]))
@@ -175,7 +176,7 @@ def compare_to_held_out(
         horizontal_rmse_m=_rms(horizontal),
         horizontal_p95_m=float(np.percentile(horizontal, 95)),
         horizontal_max_m=float(horizontal.max()),
-        error_3d_rmse_m=None if estimate.planar else _rms(np.linalg.norm(error, axis=1)),
+        error_3d_rmse_m=None if estimate.planar or not solid else _rms(np.linalg.norm(error, axis=1)),
         outage_drift_m=_rms(largest) if len(largest) > 1 else None,
         fixes=len(stamps),
         matched=matched,

@@ -189,7 +189,9 @@ def _log_measurements(stream: Any, recording: Recording, solution: Solution) -> 
 def _said_m(m: Measurement, row: LedgerRow, datum: Datum, height_m: float) -> Array | None:
     """Where a measurement says that the body, or the antenna, is (3,) in world; None: it says no place."""
     if isinstance(m, GnssPosition):
-        return np.asarray(datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0])
+        place = np.array(datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0])
+        place[2] = place[2] if m.has_height else height_m
+        return place
     pose = as_pose(m, Survey()) if isinstance(m, TagSighting) else m
     if not isinstance(pose, PoseFix) or pose.axes[:2] != ("x", "y"):
         return None

@@ -63,6 +63,7 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
             prior=1.0,
             size_m=size,
             size_deg=None,
+            rows=3 if m.has_height else 2,  # that tell something
         ),
     )
 
@@ -120,7 +121,8 @@ def _antenna_jacobian(at: Attachment) -> Array:
 
 def hint(m: GnssPosition, mount_yaw_rad: float, datum: Datum) -> Hint:
     """Return the antenna's place."""
-    return Hint(p_world_m=_world_m(m, datum), p_sigma_m=np.sqrt(np.diagonal(m.cov_enu_m2)))
+    known = np.array([1.0, 1.0, 1.0 if m.has_height else np.nan])
+    return Hint(p_world_m=known * _world_m(m, datum), p_sigma_m=known * np.sqrt(np.diagonal(m.cov_enu_m2)))
 
 
 ROW = Sensor(

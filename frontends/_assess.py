@@ -81,12 +81,19 @@ def sane(stream: Stream) -> NDArray[np.intp]:
 
 
 def track(fixes: Stream) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return stamps (N,), positions (N, 3) m about the first good fix, and the good fixes' rows."""
+    """Return stamps (N,), positions (N, 3) m about the first good fix, and the good fixes' rows.
+
+    Fixes without a height lie as high as most of the others, or at 0.
+    """
     keep = sane(fixes)
     rows = fixes.rows[keep] if len(keep) else np.zeros((0, 8))
-    good = np.isfinite(rows[:, :3]).all(axis=1) & (rows[:, 3] >= 0) & (np.abs(rows[:, 0]) <= 90.0)
+    good = (
+        np.isfinite(rows[:, :2]).all(axis=1) & ~np.isinf(rows[:, 2]) & (rows[:, 3] >= 0) & (np.abs(rows[:, 0]) <= 90.0)
+    )
     good &= (rows[:, 0] != 0.0) | (rows[:, 1] != 0.0)
     keep, rows = keep[good], rows[good]
+    flat = np.isnan(rows[:, 2])
+    rows[flat, 2] = 0.0 if flat.all() else np.median(rows[~flat, 2])
     near = ~far_fixes_of(rows[:, :3])
     keep, rows = keep[near], rows[near]
     if len(keep) == 0:
@@ -142,6 +149,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         extent_m=(float(np.ptp(p[:, 0])), float(np.ptp(p[:, 1]))),
         travelled_m=float(np.hypot(chords[:, 0], chords[:, 1]).sum()),
         first=vec(rows[0, :3]),
+        without_height=int(np.isnan(fixes.rows[np.isfinite(fixes.rows[:, :2]).all(axis=1), 2]).sum()),
         white_m=scatter_m(stamps, p[:, :2]),
         slow_error=not precise,
         why=why,

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.time import NS_PER_S, duration_ns
+from graphloc.errors import InputError
+from graphloc.time import NS_PER_S, duration_ns, utc_text
 
 Stamps = NDArray[np.int64]
 JUMP_LIMIT_S = 60.0
@@ -80,6 +82,37 @@ def set_backs(stamps_ns: Stamps) -> list[int]:
         if again >= _FOLLOW // 2:
             found.append(i)
     return found
+
+
+def refuse_woven(
+    topic: str, stamps_ns: Stamps, logs_ns: Stamps, contents: Sequence[Hashable], files: Sequence[str]
+) -> None:
+    """Refuse files, or parts of one, that lie over each other by the recording clock too: nothing can part them again.
+
+    Two recordings of the same messages are none.
+
+    Args:
+        stamps_ns, logs_ns, contents, files: (N,) of an IMU's messages, in order of arrival.
+
+    Raises:
+        InputError: there are such.
+    """
+    names = list(dict.fromkeys(files))
+    if not set_backs(stamps_ns) and len(names) < 2:
+        return
+    first: dict[Hashable, int] = {}
+    for i in sorted(range(len(files)), key=lambda i: names.index(files[i])):
+        first.setdefault((int(stamps_ns[i]), contents[i]), i)
+    order = np.array(list(first.values()), dtype=np.int64)
+    stamps, logs = stamps_ns[order], logs_ns[order]
+    for k in set_backs(stamps):
+        if logs[k] < logs[k - 1]:
+            back_s, before, after = float(stamps[k - 1] - stamps[k]) / NS_PER_S, files[order[k - 1]], files[order[k]]
+            raise InputError(
+                f"{after}: {topic} goes back by {back_s:.1f} s there, to {utc_text(int(stamps[k]))}, into times that {before} has "
+                "too, by the stamps and by the recording times: a clock was set back between them, and as one run they "
+                "would be laid over each other; give them one at a time"
+            )
 
 
 def busiest_section(stamps_ns: Stamps, hole_s: float = HOLE_LIMIT_S) -> tuple[int, int]:

@@ -59,6 +59,17 @@ def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
     ]
 
 
+def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:
+    """Return a line where fixes have no height."""
+    flat = sum(not m.has_height for m in fixes)
+    if not flat:
+        return []
+    said = f"{sensor}: {flat} of {len(fixes)} fixes have no height (altitude is NaN) and count as horizontal ones"
+    if flat < len(fixes):
+        return [said]
+    return [f"{said}: the track's height comes from elsewhere (kind: height, poses, tags), or is a guess"]
+
+
 def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConfig) -> list[str]:
     """Return a line where fixes scatter from one to the next by far more than they claim."""
     if len(fixes) < _FEWEST:

@@ -24,7 +24,7 @@ from graphloc.time import NS_PER_S, utc_text
 
 @dataclass(slots=True)
 class Readings:
-    """Columns of one sensor: arrival number, stamp, recording time, decoded value."""
+    """Columns of one sensor: arrival number, stamp, recording time, decoded value, file."""
 
     sensor: str
     config: SensorConfig
@@ -32,9 +32,11 @@ class Readings:
     stamps_ns: list[int] = field(default_factory=list)
     logs_ns: list[int] = field(default_factory=list)
     values: list[Decoded] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
 
-    def add(self, seq: int, stamp_ns: int, log_ns: int, value: Decoded) -> None:
+    def add(self, seq: int, stamp_ns: int, log_ns: int, value: Decoded, file: str) -> None:
         """Append a reading."""
+        self.files.append(file)
         self.seqs.append(seq)
         self.stamps_ns.append(stamp_ns)
         self.logs_ns.append(log_ns)
@@ -51,7 +53,7 @@ class Readings:
     def drop(self, bad: NDArray[np.bool_], rejection: Rejection) -> list[LedgerRow]:
         """Take readings out; return their rows."""
         rows = [self.row(self.seqs[i], self.stamps_ns[i], rejection) for i in np.flatnonzero(bad)]
-        columns: tuple[list[Any], ...] = (self.seqs, self.stamps_ns, self.logs_ns, self.values)
+        columns: tuple[list[Any], ...] = (self.seqs, self.stamps_ns, self.logs_ns, self.values, self.files)
         for column in columns if rows else ():
             column[:] = list(compress(column, ~bad))
         return rows
@@ -91,9 +93,13 @@ def reject_set_back(sensors: Sequence[Readings], beside: Sequence[Beside], warni
     """Keep the longest part of a run in which the IMU's clock was set back, by recording times; say where that was.
 
     Two parts that bear the same times would be laid over each other.
+
+    Raises:
+        InputError: they do so by the recording times, too.
     """
     for imu in (r for r in sensors if r.config.kind == "imu"):
         stamps, logs = imu.stamps(), imu.logs()
+        _clock.refuse_woven(imu.config.topic, stamps, logs, imu.values, imu.files)
         cuts = _clock.set_backs(stamps)
         if not cuts:
             continue
@@ -140,7 +146,11 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
 
 
 def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | None, list[LedgerRow]]:
-    """Return the samples in strictly increasing time, and rows of those that are not."""
+    """Return the samples in strictly increasing time, and rows of those that are not.
+
+    Raises:
+        InputError: their rates cannot be rad/s.
+    """
     assert isinstance(readings.config, ImuConfig)
     bad = ~_clock.longest_increasing(readings.stamps())
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
@@ -155,6 +165,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
         gyro_radps=np.array([s.gyro_radps for s in samples]),
         seqs=np.array(readings.seqs, dtype=np.int64),
     )
+    _sanity.refuse_degrees(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     return series, rows
 
@@ -189,6 +200,7 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     warnings += _fixes.held_warning(readings.sensor, bad)
     rows = readings.drop(bad, rejected("repeats the place of the fix before under a new stamp: no new evidence"))
     fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
+    warnings += _fixes.height_warning(readings.sensor, fixes)
     warnings += _fixes.scatter_warning(readings.sensor, fixes, readings.config)
     return rows
 

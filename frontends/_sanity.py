@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.config import ImuConfig, VesselConfig
+from graphloc.errors import InputError
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition
 
@@ -47,6 +48,26 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
     if config.gyro_unit == "rad/s" and rate > NEVER_STILL_RADPS:
         lines.append(f"{sensor}: median angular rate is {rate:.2f} rad/s: looks like deg/s; set gyro_unit: deg/s")
     return lines
+
+
+def refuse_degrees(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> None:
+    """Refuse rates (N, 3) that are deg/s: the solver would be at them for many minutes.
+
+    Those about level axes are asked: a craft may pivot that fast, none rolls and pitches so all the while.
+
+    Raises:
+        InputError: they are.
+    """
+    up = np.median(accel_mps2, axis=0) if len(accel_mps2) >= 10 else np.zeros(3)
+    size = float(np.linalg.norm(up))
+    if config.gyro_unit != "rad/s" or size < 0.5 or without_gravity(accel_mps2):
+        return
+    rolls = float(np.median(np.linalg.norm(gyro_radps - np.outer(gyro_radps @ up, up) / size**2, axis=1)))
+    if rolls > NEVER_STILL_RADPS:
+        raise InputError(
+            f"{sensor}: it rolls and pitches at {rolls:.2f} rad/s (median of {config.topic}), {np.degrees(rolls):.0f} deg/s, which "
+            f"no craft does for long: angular_velocity looks like deg/s; set gyro_unit: deg/s of sensors.{sensor}"
+        )
 
 
 def _together(longitude_deg: Array) -> Array:

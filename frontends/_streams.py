@@ -77,13 +77,15 @@ class Stream:
     no_stamp: int = 0
     _stamps: list[int] = field(default_factory=list)
     _logs: list[int] = field(default_factory=list)
-    _rows: list[tuple[float, ...]] = field(default_factory=list)
+    tuples: list[tuple[float, ...]] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
 
-    def add(self, stamp_ns: int, log_ns: int, row: tuple[float, ...]) -> None:
+    def add(self, stamp_ns: int, log_ns: int, row: tuple[float, ...], file: str) -> None:
         """Append a message."""
+        self.files.append(file)
         self._stamps.append(stamp_ns)
         self._logs.append(log_ns)
-        self._rows.append(row)
+        self.tuples.append(row)
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -98,7 +100,7 @@ class Stream:
     @property
     def rows(self) -> Array:
         """The numbers (N, k); NaN for what nothing measures, whose square is no number."""
-        rows = np.array(self._rows, dtype=float)
+        rows = np.array(self.tuples, dtype=float)
         rows[np.abs(rows) > _MOST] = np.nan
         return rows
 
@@ -134,5 +136,5 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
             stream.no_stamp += 1
             continue
         stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
-        stream.add(stamp_ns, raw.log_ns, row)
+        stream.add(stamp_ns, raw.log_ns, row, raw.file)
     return list(streams.values()), tree

@@ -223,7 +223,7 @@ class _Reader:
             except (ValueError, ArithmeticError, AttributeError) as error:
                 value = malformed(" ".join(str(error).split()))
         if not isinstance(value, Rejection):
-            readings.add(seq, stamp_ns, raw.log_ns, value)
+            readings.add(seq, stamp_ns, raw.log_ns, value, raw.file)
         elif value.outcome is Outcome.MALFORMED:
             self._rows.append(readings.row(seq, stamp_ns, malformed(f"{raw.file}: {value.reason}")))
         else:

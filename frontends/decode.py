@@ -26,7 +26,16 @@ from graphloc.config import (
 from graphloc.extras import added
 from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.ledger import Outcome
-from graphloc.measurements import AXES, CompassHeading, GnssPosition, GnssVelocity, Measurement, PoseFix, PoseMode
+from graphloc.measurements import (
+    AXES,
+    NO_HEIGHT_M2,
+    CompassHeading,
+    GnssPosition,
+    GnssVelocity,
+    Measurement,
+    PoseFix,
+    PoseMode,
+)
 from graphloc.time import NS_PER_S
 
 IMU = "sensor_msgs/msg/Imu"
@@ -161,9 +170,12 @@ def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) ->
     if status < _MIN_STATUS[config.min_status]:
         return rejected(f"fix status {status} is below min_status '{config.min_status}'")
     lat, lon, height = float(msg.latitude), float(msg.longitude), float(msg.altitude)
-    if not np.isfinite([lat, lon, height]).all():
-        return malformed("latitude, longitude or height is NaN")
-    if abs(height) > _MOST_HEIGHT_M:
+    if not np.isfinite([lat, lon]).all():
+        return malformed("latitude or longitude is NaN")
+    planar = bool(np.isnan(height))  # NavSatFix: 'set to NaN if no altitude is available'
+    if planar:
+        height = 0.0
+    if not abs(height) <= _MOST_HEIGHT_M:
         return malformed(f"height is beyond {_MOST_HEIGHT_M / 1e3:g} km")
     if lat == 0.0 and lon == 0.0:
         return rejected("position 0, 0: the receiver had none")
@@ -179,6 +191,10 @@ def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) ->
         cov = np.diag(default)
     elif kind != _COVARIANCE_KNOWN:
         cov = np.diag(np.diagonal(cov))  # 'approximated' and 'diagonal known' promise the diagonal only
+    if planar:
+        cov = cov.copy()
+        cov[2, :] = cov[:, 2] = 0.0  # what the message claims of a height that it does not give
+        default[2] = NO_HEIGHT_M2
     return GnssPosition(
         stamp_ns=stamp_ns,
         sensor=sensor,

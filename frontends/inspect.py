@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.frames import Array
+from graphloc.config import STANDARD_GRAVITY_MPS2
+from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import (
     Turning,
     compass_report,
@@ -27,6 +28,7 @@ from graphloc.frontends._assess import (
 from graphloc.frontends._assess_imu import imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._assess_world import origin_of
+from graphloc.frontends._clock import refuse_woven
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._lag import lag
 from graphloc.frontends._reports import (
@@ -44,10 +46,12 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._source import Bag
 from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import IMU, NAV_SAT_FIX, ODOMETRY, PLAIN_TWIST, POSE, QUATERNION, TWIST
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, info_beside
+from graphloc.measurements import CompassHeading, ImuSeries
 from graphloc.time import utc_text
 
 __all__ = [
@@ -74,7 +78,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         paths: as for `read_recording`.
 
     Raises:
-        InputError: the bag cannot be opened.
+        InputError: the bag cannot be opened, or its parts lie over each other.
     """
     with Bag(paths) as bag:
         topics = bag.topics
@@ -82,6 +86,9 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         clouds = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
         images = _frames_of(bag, _pictures(bag))
         source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
+    for stream in streams:
+        if stream.msgtype == IMU:
+            refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
     by_topic = {s.topic: s for s in streams}
     filled = [s for s in streams if len(s)]
     fixes = [s for s in filled if s.msgtype == NAV_SAT_FIX]
@@ -112,7 +119,11 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         ),
         imus=tuple(found_imus),
         gnss=tuple(found_gnss),
-        compasses=tuple(_timed(c, s, turning) for s in candidates if (c := compass_report(s, courses, turning))),
+        compasses=tuple(
+            _asked_together(_timed(c, s, turning), s, [(i, by_topic[i.topic]) for i in found_imus])
+            for s in candidates
+            if (c := compass_report(s, courses, turning))
+        ),
         odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first, antenna)) for s in poses),
         velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
         lidars=_mounted(clouds, tree, body),
@@ -133,6 +144,32 @@ def _timed(report: CompassReport, stream: Stream, turning: Turning | None) -> Co
         return report
     value, sigma = found
     return replace(report, why=f"{report.why}; by the gyro, time_offset_s should be {value:.3f} +- {sigma:.3f}")
+
+
+def _asked_together(report: CompassReport, stream: Stream, imus: Sequence[tuple[ImuReport, Stream]]) -> CompassReport:
+    """The report, with how many readings have nothing to do with those beside them, by the best IMU."""
+    if not imus or not report.usable:
+        return report
+    imu, samples = imus[0]
+    keep = samples_of(samples)[0]
+    keep = keep[np.isfinite(samples.rows[keep, :6]).all(axis=1)]
+    rows = samples.rows[keep]
+    unit = STANDARD_GRAVITY_MPS2 if imu.accel_unit == "g" else 1.0
+    series = ImuSeries(
+        sensor=imu.topic,
+        stamps_ns=samples.stamps_ns[keep],
+        accel_mps2=rows[:, :3] * (-unit if imu.gravity == "inverted" else unit),
+        gyro_radps=np.radians(rows[:, 3:6]) if imu.gyro_unit == "deg/s" else rows[:, 3:6],
+        seqs=keep.astype(np.int64),
+    )
+    stamps, angle = headings(stream)
+    yaw = angle if report.convention == "enu" else np.pi / 2.0 - angle
+    said = [
+        CompassHeading(stamp_ns=int(s), sensor=stream.topic, seq=0, yaw_rad=float(y), sigma_rad=1.0)
+        for s, y in zip(stamps, wrap_angle(yaw), strict=True)
+    ]
+    bad = int(scattered(series, said).sum())
+    return replace(report, why=f"{report.why}; {bad} of {len(said)}: {SCATTERED}") if bad else report
 
 
 def _mounted(
@@ -327,6 +364,8 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         f"{gnss.topic}: {statuses}; first fix {lat:.7f}, {lon:.7f}, {height:.1f} m",
         f"  track {gnss.travelled_m:.0f} m in a box of {east_m:.0f} x {north_m:.0f} m, height {gnss.height_range_m:.1f} m",
     ]
+    if gnss.without_height:
+        lines.append(f"  {gnss.without_height} messages have no height (NaN) and count as horizontal fixes")
     if gnss.reported_sigma_m is not None:
         lines.append(f"  reported sigma east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
     if gnss.scatter_m is not None:

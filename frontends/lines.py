@@ -7,6 +7,7 @@ one run give the same measurements.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -134,14 +135,14 @@ class ImuLine(_Line):
 
 
 class GnssLine(_Line):
-    """A fix of the antenna on WGS 84, height above the ellipsoid; noise east, north, up."""
+    """A fix of the antenna on WGS 84, height above the ellipsoid, if it has one; noise east, north, up."""
 
     kind = "gnss"
     at_most_one_of = (("sigma_m", "cov_enu_m2"),)
     type: Literal["gnss"]
     lat_deg: Finite
     lon_deg: Finite
-    height_m: Finite
+    height_m: Finite | None = None
     sigma_m: Deviations | None = None
     cov_enu_m2: Matrix3 | None = None
     status: Literal["none", "fix", "sbas", "gbas"] = "fix"
@@ -150,7 +151,7 @@ class GnssLine(_Line):
         """Return the fix, or why it is none."""
         fix = SimpleNamespace(
             status=SimpleNamespace(status=_STATUS[self.status]), latitude=self.lat_deg, longitude=self.lon_deg,
-            altitude=self.height_m, position_covariance=_covariance(self.cov_enu_m2, self.sigma_m or _ZERO),
+            altitude=math.nan if self.height_m is None else self.height_m, position_covariance=_covariance(self.cov_enu_m2, self.sigma_m or _ZERO),
             position_covariance_type=_KNOWN if self.cov_enu_m2 or self.sigma_m else _UNKNOWN,
         )  # fmt: skip
         return _decoded(NAV_SAT_FIX, fix, at, config)

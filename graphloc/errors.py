@@ -5,8 +5,10 @@ The text of each says what is wrong, where (file, topic, stamp) and what to do, 
 the CLI prints it as it is and exits with 2.
 """
 
+import logging
 import re
 
+log = logging.getLogger(__name__)
 _LONGEST = 1500
 
 
@@ -34,6 +36,17 @@ class InputError(GraphlocError):
 
 class SolveError(GraphlocError):
     """The graph could not be started or solved."""
+
+
+def not_solved(what: str, error: Exception) -> SolveError:
+    """Return the error of a solver that gave up; its own words, of keys and options of GTSAM, go to the log."""
+    log.debug("%s: %s", what, error)
+    if isinstance(error, MemoryError):
+        return SolveError(f"{what}: no memory is left")
+    return SolveError(
+        f"{what}: the measurements leave something undetermined, or contradict each other beyond all bounds; look for a wrong "
+        "unit, mount, sign or clock (`graphloc inspect`)"
+    )
 
 
 class ExtraError(GraphlocError):

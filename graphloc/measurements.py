@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from graphloc.frames import Array, Geodetic
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+NO_HEIGHT_M2 = 1e12
+"""Variance, m^2, of the height of a fix that has none: 1000 km, 1 sigma."""
 
 
 def _frozen(value: object, shape: tuple[int, ...], name: str) -> Array:
@@ -50,11 +52,17 @@ class GnssPosition(Measurement):
 
     Attributes:
         position: geodetic position of the antenna phase centre (WGS 84).
-        cov_enu_m2: (3, 3) covariance as reported, east-north-up, m^2.
+        cov_enu_m2: (3, 3) covariance as reported, east-north-up, m^2; `NO_HEIGHT_M2` upwards where the receiver gives no
+            height: that of `position` then means nothing.
     """
 
     position: Geodetic
     cov_enu_m2: Array
+
+    @property
+    def has_height(self) -> bool:
+        """Whether it says a height."""
+        return bool(self.cov_enu_m2[2, 2] < NO_HEIGHT_M2)
 
     def __post_init__(self) -> None:
         lat, lon, height = (float(v) for v in self.position)

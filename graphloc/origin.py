@@ -21,7 +21,7 @@ _FAR_M = 200e3
 
 
 def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sensor]) -> Datum:
-    """Return the configured datum, or the median of the first fixes.
+    """Return the configured datum, or the median of the first fixes; height 0 where none says one.
 
     Raises:
         InputError: none is configured, and there is no fix to take one from, or something is given in world.
@@ -31,12 +31,15 @@ def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sens
         _refuse_far_fixes(recording, datum)
         return datum
     refuse_world_without_datum(config, recording.source, rows)
-    fixes = np.array([m.position for m in fixes_of(recording)][:5])
+    found = fixes_of(recording)
+    fixes = np.array([m.position for m in found][:5])
     if not len(fixes):
         raise InputError(f"{recording.source}: {_why_no_fix(recording, config)}")
     # Longitudes about the first one, so that fixes on both sides of the date line stay together.
     fixes[:, 1] = fixes[0, 1] + (fixes[:, 1] - fixes[0, 1] + 180.0) % 360.0 - 180.0
-    return Datum(Geodetic(*(float(v) for v in np.median(fixes, axis=0))))
+    lat, lon = (float(v) for v in np.median(fixes[:, :2], axis=0))
+    heights = [m.position.height_m for m in found if m.has_height][:5]
+    return Datum(Geodetic(lat, lon, float(np.median(heights)) if heights else 0.0))
 
 
 def fixes_of(recording: Recording) -> list[GnssPosition]:
@@ -109,5 +112,6 @@ def height_m(recording: Recording, config: VesselConfig, configured_m: float | N
     heights = [
         m.position.height_m - float(mount_of(m.sensor, config.sensors[m.sensor], recording.mounts)[0][2])
         for m in fixes_of(recording)
+        if m.has_height
     ]
     return float(np.median(heights)) - datum.origin.height_m if heights else 0.0

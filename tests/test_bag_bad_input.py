@@ -409,7 +409,7 @@ def test_a_sensor_in_another_epoch_is_said_and_not_fixed(tmp_path: Path) -> None
         ((0.01, 0, 0.02), (0, 0, 0), {}, "gravity: removed"),
         ((0, 0, 9.8), (0, 0, 0), {"accel_unit": "g"}, "accel_unit: m/s^2"),
         ((0, 0, 9.8), (0, 0, 0), {"gravity": "removed"}, "gravity: included"),
-        ((0, 0, 9.8), (2.0, -3.0, 5.0), {}, "gyro_unit: deg/s"),
+        ((0, 0, 9.8), (0.1, -0.1, 5.0), {}, "gyro_unit: deg/s"),  # it may pivot
         ((0, 0, 4.0), (0, 0, 0), {}, "not about 9.8"),
         ((0, 0, 9.8), (0, 0, 0.2), {}, ""),
         ((0, 0, 1.0), (0, 0, 0), {"accel_unit": "g"}, ""),
@@ -427,6 +427,25 @@ def test_wrong_units_and_gravity(tmp_path: Path, accel: Any, gyro: Any, block: d
         assert words in line
     else:
         assert recording.warnings == ()
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 9.8), (0.0, -9.8, 0.0), (0.0, 0.0, 1.0)])
+def test_rates_in_degrees_are_refused_at_once(tmp_path: Path, up: tuple[float, float, float]) -> None:
+    """Rolling by 1 deg at 0.25 Hz: 1.6 deg/s at most, which is no rate in rad/s; about the vertical it may turn as it likes."""
+    for scale, name in ((1.0, "rad"), (57.3, "deg")):
+        items: list[Item] = []
+        for k in range(500):
+            t, rate = START_NS + k * S // 50, scale * 0.027 * np.cos(1.57 * k / 50)
+            turn = scale * 0.6 * np.array(up) / np.linalg.norm(up)
+            items.append(("/imu", t, MAKE.imu(t, accel=up, gyro=turn + rate * np.array([1.0, 0.0, 0.0]))))
+        path = write_bag(tmp_path / name, MAKE, items, "mcap")
+        if name == "rad":
+            assert read_recording(path, vessel(gnss=None, imu={"topic": "/imu", "accel_unit": "m/s^2"})).imu is not None
+            continue
+        with pytest.raises(InputError) as error:
+            read_recording(path, vessel(gnss=None))
+        one_line(error, "looks like deg/s", "set gyro_unit: deg/s of sensors.imu")
+        assert read_recording(path, vessel(gnss=None, imu={"topic": "/imu", "gyro_unit": "deg/s"})).imu is not None
 
 
 def test_swapped_latitude_and_longitude(tmp_path: Path) -> None:

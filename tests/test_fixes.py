@@ -1,17 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixes that say more than they know: repeated under new stamps, stamped in steps, noisier than they claim."""
+"""Fixes that say more than they know: repeated under new stamps, stamped in steps, noisier than they claim, without a height."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from graphloc.app import smooth_recording
+from graphloc.eval.simulate import Scenario, simulate
+from graphloc.factors import SENSORS
 from graphloc.frames import Datum, Geodetic
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition
+from graphloc.origin import choose_datum, height_m
 from graphloc.recording import Recording
+from graphloc.replay import replay
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag_bad_input import accounted, rows_of, vessel
 
@@ -109,3 +115,54 @@ def test_noise_that_a_receiver_hides(
         assert len(found) == (expected is not None)
         if expected is not None:
             assert float(found[0].split("sigma_scale:")[1].split("#")[0]) == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_a_fix_without_a_height_is_a_horizontal_one(every: int, tmp_path: Path) -> None:
+    """NavSatFix says NaN where there is no altitude; a fix without a latitude or longitude stays refused."""
+    items = fixes(10)
+    for _, _, fix in items[::every]:
+        fix.altitude = np.nan
+    items[1][2].latitude, items[2][2].longitude = np.nan, np.nan
+    recording = read(tmp_path, items)
+    found = {m.stamp_ns: m for m in recording.measurements if isinstance(m, GnssPosition)}
+    assert len(found) == 398
+    assert [r.reason for r in rows_of(recording, "gnss")] == ["run: latitude or longitude is NaN"] * 2
+    flat = [m for m in found.values() if not m.has_height]
+    assert {m.stamp_ns for m in flat} == {log for _, log, _ in items[::every]} & found.keys()
+    assert all(m.cov_enu_m2[2, 2] >= 1e12 and m.cov_enu_m2[0, 0] == pytest.approx(0.01) for m in flat)
+    (line,) = recording.warnings
+    assert f"{len(flat)} of 398 fixes have no height" in line
+    # Origin and waterline are taken from fixes that have one: all of those are at 40 m, the antenna in the body's origin.
+    datum = choose_datum(recording, vessel(gnss={"topic": "/fix"}), SENSORS)
+    assert datum.origin.height_m == pytest.approx(0.0 if every == 1 else 40.0, abs=1e-3)
+    assert height_m(recording, vessel(gnss={"topic": "/fix"}), None, datum) == pytest.approx(0.0, abs=1e-3)
+    (report,) = inspect_bag(tmp_path / "run").gnss
+    assert report.without_height == len(flat)
+    assert report.fixes == 398
+    assert report.height_range_m < 0.01
+
+
+def test_horizontal_fixes_tell_the_same_track() -> None:
+    """Planar fixes beside the height prior: the horizontal track is that of fixes with their heights, batch and online."""
+    run = simulate(Scenario(path="loops", duration_s=30.0, noise="drift"), 2)
+    flat = tuple(_flattened(m) if isinstance(m, GnssPosition) else m for m in run.recording.measurements)
+    planar = replace(run.recording, measurements=flat)
+    for solve in (smooth_recording, replay):
+        whole, ours = (solve(recording, run.config).solution for recording in (run.recording, planar))
+        apart = ours.trajectory.p_world_m - whole.trajectory.p_world_m
+        assert np.sqrt((apart[:, :2] ** 2).sum(axis=1).mean()) < 0.05
+        assert np.abs(apart[:, 2]).max() < 0.5
+        assert ours.trajectory.cov is not None
+        assert whole.trajectory.cov is not None
+        assert np.median(ours.trajectory.cov[:, 0, 0] / whole.trajectory.cov[:, 0, 0]) == pytest.approx(1.0, rel=0.1)
+        if not ours.stats.online:  # three numbers a fix, or two
+            fewer = whole.stats.expected_cost - ours.stats.expected_cost
+            assert 100 < fewer <= sum(isinstance(m, GnssPosition) for m in flat)  # by their weights
+
+
+def _flattened(m: GnssPosition) -> GnssPosition:
+    """The fix as the decoder makes it where there is no altitude."""
+    return replace(
+        m, position=m.position._replace(height_m=0.0), cov_enu_m2=np.diag([*np.diagonal(m.cov_enu_m2)[:2], 1e12])
+    )

@@ -45,8 +45,9 @@ def test_a_state_that_nothing_holds_is_said() -> None:
     guess.insert(99, gtsam.Pose2())
     graph.add(gtsam.BetweenFactorPose2(99, 100, gtsam.Pose2(), gtsam.noiseModel.Unit.Create(3)))
     guess.insert(100, gtsam.Pose2())
-    with pytest.raises(SolveError, match="variable 99"):
+    with pytest.raises(SolveError, match=r"the solver failed: .* undetermined") as error:
         full_step(graph, guess)
+    assert not any(word in str(error.value).lower() for word in ("variable", "gtsam", "exception"))  # its own words
 
 
 def test_full_step_solves_a_linear_problem_and_gives_its_covariance() -> None:

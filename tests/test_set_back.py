@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graphloc.errors import InputError
 from graphloc.frontends._clock import set_backs
 from graphloc.frontends.bag import read_recording
+from graphloc.frontends.inspect import inspect_bag
 from graphloc.ledger import Outcome
 from graphloc.recording import Recording
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
-from tests.test_bag_bad_input import accounted, rows_of, vessel
+from tests.test_bag_bad_input import accounted, one_line, rows_of, vessel
 
 MAKE = Messages(2)
 LATE_NS = 10_000_000
@@ -62,3 +64,47 @@ def test_steady_clocks_late_samples_and_lone_stamps_are_left_alone() -> None:
     assert set_backs(lone) == []
     assert set_backs(np.concatenate([steady[:600], steady[300:]])) == [600]
     assert set_backs(np.concatenate([steady[:600], steady[300:500], steady[400:]])) == [600, 800]
+
+
+def parts(tmp_path: Path, second_s: tuple[float, float], back_s: float) -> list[Path]:
+    """Two files of one run: 0 to 20 s, and a part whose clocks, that of the recording too, were set back."""
+    found = []
+    for name, (first_s, last_s), back in (("a", (0.0, 20.0), 0.0), ("b", second_s, back_s)):
+        items: list[Item] = []
+        for k in range(round(first_s * 50), round(last_s * 50)):
+            stamp = START_NS + k * S // 50 - round(back * S)
+            items.append(("/imu", stamp + LATE_NS, MAKE.imu(stamp, gyro=(1e-6 * k, 0.0, 0.0))))
+        found.append(write_bag(tmp_path / name, MAKE, items, "mcap"))
+    return found
+
+
+@pytest.mark.parametrize("back_s", [5.0, 5.013])  # equal stamps are no repeats where they say other things
+@pytest.mark.parametrize("first", [0, 1])
+def test_parts_that_lie_over_each_other_are_refused(tmp_path: Path, back_s: float, first: int) -> None:
+    paths = parts(tmp_path, (20.0, 40.0), back_s)
+    for read in (lambda p: read_recording(p, vessel(gnss=None)), inspect_bag):
+        with pytest.raises(InputError) as error:
+            read(paths if not first else paths[::-1])
+        one_line(error, "b: /imu goes back by", "into times that a has too", "give them one at a time")
+
+
+def test_a_folder_whose_second_file_was_set_back_is_refused(tmp_path: Path) -> None:
+    """rosbags reads the files of a folder one after the other: in order of arrival the recording times go back as well."""
+    paths = parts(tmp_path, (20.0, 40.0), 5.0)
+    folder = tmp_path / "both"
+    folder.mkdir()
+    for k, path in enumerate(paths):
+        (file,) = path.glob("*.mcap")
+        file.rename(folder / f"both_{k}.mcap")
+    with pytest.raises(InputError) as error:
+        read_recording(folder, vessel(gnss=None))
+    one_line(error, "both_1.mcap: /imu goes back by 5.0 s", "into times that both_0.mcap has too")
+
+
+@pytest.mark.parametrize(("second_s", "samples"), [((20.0, 40.0), 2000), ((10.0, 30.0), 1500)])
+def test_parts_that_follow_or_repeat_each_other_are_one_run(
+    tmp_path: Path, second_s: tuple[float, float], samples: int
+) -> None:
+    recording = read_recording(parts(tmp_path, second_s, 0.0), vessel(gnss=None))
+    assert recording.imu is not None
+    assert len(recording.imu) == samples

@@ -101,6 +101,11 @@ def test_gnss_uncertainty() -> None:
     refused({**FIX, "cov_enu_m2": full, "sigma_m": [1, 1, 1]}, "give one of sigma_m, cov_enu_m2")
 
 
+def test_gnss_without_a_height_is_a_horizontal_fix() -> None:
+    flat = said({key: value for key, value in FIX.items() if key != "height_m"})
+    assert (flat.has_height, said(FIX).has_height) == (False, True)
+
+
 def test_gnss_without_a_fix_is_rejected_as_from_a_bag() -> None:
     assert refused({**FIX, "status": "none"}, "no fix", Outcome.REJECTED).stamp_ns == 5_000_000_000
     refused({**FIX, "lat_deg": 0, "lon_deg": 0}, "the receiver had none", Outcome.REJECTED)

@@ -13,6 +13,7 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array
 from graphloc.frontends._turns import scattered, turn_warnings
 from graphloc.frontends.bag import read_recording
+from graphloc.frontends.inspect import inspect_bag
 from graphloc.measurements import CompassHeading, ImuSeries
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag_bad_input import accounted, rows_of, vessel
@@ -157,3 +158,5 @@ def test_a_bag_with_scattered_headings_has_rows_for_them(tmp_path: Path) -> None
     assert 85 <= len(rows) <= 105
     assert all("parts from most headings" in r.reason for r in rows)
     assert any(f"{len(rows)} messages rejected: parts from" in w for w in recording.warnings)
+    (compass,) = inspect_bag(path).compasses
+    assert f"; {len(rows)} of 200: parts from most headings" in compass.why

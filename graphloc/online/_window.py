@@ -16,7 +16,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from graphloc.errors import SolveError
+from graphloc.errors import SolveError, not_solved
 from graphloc.frames import Array
 from graphloc.keys import is_pose
 
@@ -146,7 +146,7 @@ class Window:
         try:
             yield
         except (RuntimeError, IndexError, ValueError, MemoryError) as error:
-            raise SolveError(f"the solver failed: {' '.join(str(error).split())[:200]}") from error
+            raise not_solved("the solver failed", error) from error
 
     def leaving(self, keys: Iterable[int], now_s: float) -> list[int]:
         """Return those of the keys that the next commit at `now_s` lets go."""
@@ -164,7 +164,7 @@ class Window:
             else:
                 cov = np.asarray(self._smoother.getISAM2().jointMarginalCovariance(list(keys)).fullMatrix())
         except (RuntimeError, IndexError, ValueError) as error:
-            raise SolveError(f"the covariance could not be computed: {' '.join(str(error).split())[:200]}") from error
+            raise not_solved("the covariance could not be computed", error) from error
         # Poses first, by the signature: the solver's own tangents are those of its linearisation.
         for n, key in enumerate(itertools.takewhile(is_pose, keys)):
             turn = self.values.atPose3(key).rotation().matrix().T @ self.linearised_at(key).rotation().matrix()

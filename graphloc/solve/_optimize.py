@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import gtsam
 
-from graphloc.errors import SolveError
+from graphloc.errors import not_solved
 
 _ABSOLUTE_TOL = 1e-3
 _AS_PROMISED = 0.1  # of the tolerance
@@ -85,7 +85,7 @@ def _levenberg_marquardt(
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, guess, params)
         values = optimizer.optimize()
     except RuntimeError as error:
-        raise SolveError(f"the solver failed: {' '.join(str(error).split())[:200]}") from error
+        raise not_solved("the solver failed", error) from error
     return Optimized(values, used + optimizer.iterations(), optimizer.error())
 
 
@@ -98,7 +98,7 @@ def full_step(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> gtsam.V
     try:
         return guess.retract(_solved(graph.linearize(guess), graph.orderingCOLAMD()))
     except RuntimeError as error:
-        raise SolveError(f"the solver failed: {' '.join(str(error).split())[:200]}") from error
+        raise not_solved("the solver failed", error) from error
 
 
 def bayes_tree(
@@ -119,5 +119,5 @@ def bayes_tree(
     try:
         tree.update(graph, values, constrainedKeys=last)
     except RuntimeError as error:
-        raise SolveError(f"the covariance could not be computed: {' '.join(str(error).split())[:200]}") from error
+        raise not_solved("the covariance could not be computed", error) from error
     return tree
