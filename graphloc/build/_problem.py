@@ -172,7 +172,7 @@ def make_problem(
 
 def _silent(recording: Recording, config: VesselConfig, heard: Container[str], imu: ImuSeries) -> str:
     """Return clauses on why the sensors that are not `heard` have no measurement within the IMU's span."""
-    clauses = ""
+    clauses, span = "", _span(imu)
     for name, sensor in config.sensors.items():
         if name in heard or not sensor.enabled or not sensor.topic or name == imu.sensor:
             continue
@@ -180,11 +180,15 @@ def _silent(recording: Recording, config: VesselConfig, heard: Container[str], i
         if stamps_ns:
             clauses += (
                 f"; {name} has {len(stamps_ns)} measurements from {utc_text(min(stamps_ns))} to "
-                f"{utc_text(max(stamps_ns))}, all outside the IMU's span, which ends at {utc_text(int(imu.stamps_ns[-1]))}"
+                f"{utc_text(max(stamps_ns))}, all outside the IMU's span ({span})"
             )
         elif lost := recording.lost({name}):
             clauses += f"; {name}{lost.replace(';', ':', 1)}"
     return clauses
+
+
+def _span(imu: ImuSeries) -> str:
+    return f"{utc_text(int(imu.stamps_ns[0]))} to {utc_text(int(imu.stamps_ns[-1]))}"
 
 
 def _sorted_out(
@@ -212,7 +216,7 @@ def _sorted_out(
         rows.append(
             LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason)
         )
-    span = f"{utc_text(start)} to {utc_text(stop)}"
+    span = _span(imu)
     warnings = [
         f"{name}: {n} of {every[name]} measurements lie outside the IMU's span ({span}): no track there"
         for name, n in outside.items()
