@@ -10,8 +10,11 @@ import gtsam
 import numpy as np
 import pytest
 
+from graphloc import app, keys
+from graphloc.build import Problem, bridged, make_problem
 from graphloc.config import ImuConfig
 from graphloc.eval.simulate import Scenario, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
 from graphloc.graph import Going
@@ -135,6 +138,38 @@ def test_who_turns_goes_round(rpy: tuple[float, float, float], from_s: float) ->
     straight, onwards = (28.0 - from_s) * start.velocity(), gtsam.Rot3.Yaw(0.7 + turned).rotate([3.0, 0.0, 0.0])
     assert np.linalg.norm(there.position() - round_it) < late * np.linalg.norm(round_it - straight)
     assert np.linalg.norm(there.velocity() - onwards) < late * np.linalg.norm(onwards - start.velocity())
+
+
+def test_once_a_run_is_solved_its_links_lead_on_as_it_went() -> None:
+    """They are laid before anything is known: a bias of 0.3 m/s^2 is taken off twice then, and a turn leaves the velocity behind."""
+    run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=45.0), seed=2)
+    imu, truth = run.recording.imu, run.truth
+    assert imu is not None
+    t_s = (imu.stamps_ns - imu.stamps_ns[0]) / S
+    heard = (t_s <= 20.0) | (t_s >= 33.0)
+    columns = {name: getattr(imu, name)[heard] for name in ("stamps_ns", "accel_mps2", "gyro_radps", "seqs")}
+    columns["accel_mps2"] = columns["accel_mps2"] + [0.3, 0.0, 0.0]
+    recording = replace(run.recording, imu=replace(imu, **columns))
+    problem = make_problem(recording, run.config, app.choose_datum(recording, run.config), SENSORS, INERTIAL)
+    first, last = (problem.timeline.floor(int(imu.stamps_ns[0]) + at_s * S) for at_s in (20, 33))
+    there = truth.at(problem.timeline.stamps_ns[[first]])
+    assert there.v_world_mps is not None
+    begun = gtsam.NavState(gtsam.Pose3(gtsam.Rot3(there.R_world_body[0]), there.p_world_m[0]), there.v_world_mps[0])
+    bias = gtsam.imuBias.ConstantBias(np.array([0.3, 0.0, 0.0]), np.zeros(3))
+    values = gtsam.Values()
+    values.insert(keys.pose(first), begun.pose())
+    values.insert(keys.velocity(first), begun.velocity())
+    values.insert(keys.bias(int(problem.timeline.slow_of[first])), bias)
+
+    def sideways_mps(made: Problem) -> float:
+        state = begun
+        for k in range(first, last):
+            state = made.preintegrated[k].predict(state, bias)
+        return float(np.linalg.norm((state.bodyVelocity() - begun.bodyVelocity())[:2]))
+
+    # What it turned at either side is forgotten within a second, in which the heading gets ahead of the velocity.
+    assert sideways_mps(problem) > 1.5
+    assert sideways_mps(bridged(problem, values)) < 0.6
 
 
 def test_across_a_short_hole_it_goes_as_on_both_sides() -> None:

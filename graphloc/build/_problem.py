@@ -13,10 +13,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc import keys
+from graphloc.build._attach import nav_state
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array, Datum
-from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.graph import Constant, Going, InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.recording import Recording
@@ -243,6 +245,21 @@ def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
         problem, links=links, noise_scale=noise_scale, preintegrated=preintegrated,
         inertial=_inertial(problem.timeline, links, preintegrated),
     )  # fmt: skip
+
+
+def bridged(problem: Problem, values: gtsam.Values) -> Problem:
+    """Return the problem with the links across the IMU's holes made anew: what goes on there is what was before, by `values`."""
+    timeline, zero = problem.timeline, gtsam.imuBias.ConstantBias()
+    preintegrated, inertial = list(problem.preintegrated), list(problem.inertial)
+    for start_ns, stop_ns in problem.links.gaps():
+        first = timeline.floor(start_ns)
+        bias = values.atConstantBias(keys.bias(int(timeline.slow_of[first])))
+        going = Going.of(nav_state(values, first), bias)
+        for k in range(first, min(timeline.floor(stop_ns - 1) + 1, len(timeline) - 1)):
+            a, b = (int(stamp) for stamp in timeline.stamps_ns[k : k + 2])
+            preintegrated[k] = problem.links.integrate(a, b, zero, going)
+            inertial[k] = problem.links.factor(k, int(timeline.slow_of[k]), preintegrated[k])
+    return replace(problem, preintegrated=tuple(preintegrated), inertial=tuple(inertial))
 
 
 def _stream(
