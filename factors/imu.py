@@ -18,8 +18,10 @@ one, and in what lies after the end of the data, what a sample says of the motio
 
 the mean of an Ornstein-Uhlenbeck process between both sides, w_m the mean of the seconds before, and straight from there
 to that after, which holds the bias and a steady turn. The force likewise, less its own mean, and with g = 0: what a vessel feels on
-average holds it up. So the heading turns on, the velocity goes straight. Integrated with gravity, a roll that is not known turns into an
-acceleration (after 13 s: 250 m), though vessels stay upright: in one hole roll and pitch wander by no more than in a second.
+average holds it up. In its place comes (w_m - b_g) x v with the velocity in body axes when the hole began: it goes on where it points.
+Integrated with gravity, a roll that is not known turns into an acceleration (after 13 s: 250 m), though vessels stay upright: in one
+hole roll and pitch wander by no more than in a second. Bias and velocity are those that are known when a link is laid
+(`graphloc.graph.Going`), and are not solved for by it: preintegration wants its samples before it knows the velocity.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.config import ImuConfig
 from graphloc.frames import Array
+from graphloc.graph import Going
 from graphloc.measurements import ImuSeries
 
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # of motion in a hole, white beyond what a sample says
@@ -81,7 +84,7 @@ class Links:
         params.setBodyPSensor(gtsam.Pose3(gtsam.Rot3(self._R_body_imu), np.zeros(3)))
         return params
 
-    def integrate(self, start_ns: int, stop_ns: int, bias: Any) -> Any:
+    def integrate(self, start_ns: int, stop_ns: int, bias: Any, going: Going | None = None) -> Any:
         """Return the preintegrated measurement over [start_ns, stop_ns], at least two sub-steps."""
         first = int(np.searchsorted(self._stamps, start_ns, side="right"))
         last = int(np.searchsorted(self._stamps, stop_ns, side="left"))
@@ -99,8 +102,9 @@ class Links:
         if hole is not None and hole[1] - hole[0] <= _SHORT_S * 1e9 and hole[1] <= self._stamps[-1]:
             params = self._make_params(self._gravity_mps2, _UNKNOWN_MPS2, np.full(3, _UNKNOWN_RADPS))
         elif hole is not None:
-            samples, params = self._across(middles, samples, hole)
-            samples[:, :3] += bias.accelerometer()  # GTSAM takes it off; with its mean it is off already
+            going = going or Going(bias, np.zeros(3))
+            samples, bias = self._across(middles, samples, hole, going), going.bias
+            params = self._params_across(start_ns, stop_ns, hole)
         pim = gtsam.PreintegratedImuMeasurements(params, bias)
         for sample, dt in zip(samples, dts, strict=True):
             if dt > 0.0:
@@ -126,8 +130,8 @@ class Links:
             return None
         return int(stamps[n]), int(stamps[n + 1])
 
-    def _across(self, stamps_ns: NDArray[np.int64], samples: Array, hole: tuple[int, int]) -> tuple[Array, Any]:
-        """Return samples (M, 6) for an interval with a hole, and the params to integrate them with: without gravity."""
+    def _across(self, stamps_ns: NDArray[np.int64], samples: Array, hole: tuple[int, int], going: Going) -> Array:
+        """Return samples (M, 6) for an interval with a hole, to be integrated without gravity."""
         start_ns, stop_ns = hole
         mean_before, mean_after = self._means_beside(start_ns, stop_ns)
         length, t = (stop_ns - start_ns) * 1e-9 / _FORGET_S, (stamps_ns - start_ns)[:, None] * 1e-9 / _FORGET_S
@@ -140,9 +144,26 @@ class Links:
         else:
             across = mean + _sinh_share(length - t, length) * before + _sinh_share(t, length) * after
         samples = np.where(inside, across, samples)
-        samples[:, :3] -= mean[:, :3]
-        tilt = _UNKNOWN_RADPS / np.sqrt(max(length, 1.0))
-        return samples, self._make_params(0.0, _UNKNOWN_MPS2, np.array([tilt, tilt, _UNKNOWN_RADPS]))
+        # The mean force has the bias in it, which GTSAM takes off once more. A velocity that turns with the vessel feels w x v.
+        rates = (mean[:, 3:] - going.bias.gyroscope()) @ self._R_body_imu.T
+        samples[:, :3] += (
+            going.bias.accelerometer() - mean[:, :3] + np.cross(rates, going.v_body_mps) @ self._R_body_imu
+        )
+        return samples
+
+    def _params_across(self, start_ns: int, stop_ns: int, hole: tuple[int, int]) -> Any:
+        """Return the params of an interval with a hole.
+
+        Of what one hole tilts it has its share: by time, or, while nobody knows how long the hole will be, of what fades.
+        """
+        begin, end = ((np.clip(at_ns, *hole) - hole[0]) * 1e-9 / _FORGET_S for at_ns in (start_ns, stop_ns))
+        if hole[1] > self._stamps[-1]:
+            share = np.exp(-begin) - np.exp(-end)
+        else:
+            share = (end - begin) * _FORGET_S * 1e9 / (hole[1] - hole[0])
+        white = self._config.gyro_noise_radps * self._noise_scale
+        tilt = np.hypot(white, _UNKNOWN_RADPS * np.sqrt(share / ((stop_ns - start_ns) * 1e-9)))
+        return self._make_params(0.0, _UNKNOWN_MPS2, np.array([tilt, tilt, _UNKNOWN_RADPS]))
 
     def _means_beside(self, start_ns: int, stop_ns: int) -> tuple[Array, Array]:
         """Means (6,) of the seconds before and after a hole; a side of which too little is there says what the other does."""
@@ -151,14 +172,15 @@ class Links:
             self._stamps, [start_ns - around_ns, start_ns + 1, stop_ns, stop_ns + around_ns]
         )
         sides = [(first, start), (stop, last)]
-        means = [
-            self._samples[a:b].mean(axis=0)
-            for a, b in sides
-            if b > a and self._stamps[b - 1] - self._stamps[a] > around_ns // 2
-        ]
+        means = [self._samples[a:b].mean(axis=0) for a, b in sides if self._heard_ns(a, b) > around_ns // 2]
         if not means:
             means = [self._samples[first:last].mean(axis=0)]
         return means[0], means[-1]
+
+    def _heard_ns(self, a: int, b: int) -> int:
+        """For how long samples a to b speak, their holes left out."""
+        steps = np.diff(self._stamps[a:b])
+        return int(steps[steps <= self._max_gap_ns].sum())
 
     def factor(self, k: int, j: int, preintegrated: Any) -> Any:
         """Return the factor between states k and k + 1 with the bias of slow node j."""

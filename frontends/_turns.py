@@ -19,6 +19,7 @@ _CLEAR = 0.5  # correlation
 _NEAR_S, _ASKED, _FEW, _LOST_DEG = 2.0, 20, 3, 30.0
 """Headings within `_NEAR_S`, the next `_ASKED` to either side at most and `_FEW` at least, are asked whether they agree: a
 bias of 3 deg/s is 6 deg by then, a craft in a sharp turn 30 deg off what it was."""
+_LEAP_DEG, _SMOOTH_DEG = 120.0, 15.0  # beyond the one, which way it turned is a guess; RMS from a steady turn
 SCATTERED = (
     "parts from most headings beside it, by the gyroscope and without: a course over ground at rest is no heading"
 )
@@ -64,7 +65,7 @@ def scattered(imu: ImuSeries, headings: Sequence[CompassHeading]) -> NDArray[np.
     """Return (N,) which headings agree with less than half of those beside them, whether the craft turned or not.
 
     So are those that a receiver takes from its way while it has none: each of them claims to be good to a degree or two.
-    What the gyroscope alone speaks against is left in: its unit, or the headings' convention, may be wrong.
+    What the gyroscope alone speaks against is left in, be it a pivot: its unit, or the headings' convention, may be wrong.
     """
     bad = np.zeros(len(headings), dtype=bool)
     for own, turned, yaw, at_s in _blocks(imu, headings):
@@ -76,7 +77,22 @@ def scattered(imu: ImuSeries, headings: Sequence[CompassHeading]) -> NDArray[np.
             apart[2 * lag - 2, lag:], apart[2 * lag - 1, :-lag] = off, off
         known = np.isfinite(apart).sum(axis=0) >= _FEW
         bad[own[known]] = np.nanmedian(apart[:, known], axis=0) > np.radians(_LOST_DEG)
+        bad[own] &= ~_smooth(yaw, at_s)
     return bad
+
+
+def _smooth(yaw: Array, at_s: Array) -> NDArray[np.bool_]:
+    """Return (N,) which headings lie on a turn that they tell without the gyroscope: steady within `_NEAR_S` to either side."""
+    steps = wrap_angle(np.diff(yaw))
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    leaps = np.concatenate([[0], np.cumsum(np.abs(steps) > np.radians(_LEAP_DEG))])
+    sums = [np.concatenate([[0.0], np.cumsum(of)]) for of in (at_s, way, at_s**2, at_s * way, way**2)]
+    first, last = np.searchsorted(at_s, at_s - _NEAR_S), np.searchsorted(at_s, at_s + _NEAR_S, side="right")
+    n = np.maximum(last - first, 1)
+    t, y, tt, ty, yy = [(total[last] - total[first]) / n for total in sums]
+    line = (ty - t * y) ** 2 / np.maximum(tt - t**2, 1e-9)
+    rest = np.sqrt(np.maximum(yy - y**2 - line, 0.0))
+    return np.asarray((n > _FEW) & (leaps[last - 1] == leaps[first]) & (rest < np.radians(_SMOOTH_DEG)))
 
 
 def _blocks(

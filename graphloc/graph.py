@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -264,11 +264,28 @@ class InertialRow(Protocol):
         ...
 
 
+class Going(NamedTuple):
+    """What goes on where the inertial sensor is silent: its bias, and the velocity (3,), m/s, along the body's axes."""
+
+    bias: Any
+    v_body_mps: Array
+
+    @classmethod
+    def of(cls, state: Any, bias: Any) -> Going:
+        """What goes on from a NavState."""
+        return cls(bias, np.asarray(state.attitude().unrotate(state.velocity())))
+
+
 class InertialLink(Protocol):
     """Preintegration of one IMU between any two stamps."""
 
-    def integrate(self, start_ns: int, stop_ns: int, bias: Any) -> Any:
-        """Return the preintegrated measurement from `start_ns` to `stop_ns` (start < stop)."""
+    def integrate(self, start_ns: int, stop_ns: int, bias: Any, going: Going | None = None) -> Any:
+        """Return the preintegrated measurement from `start_ns` to `stop_ns` (start < stop).
+
+        Args:
+            bias: about which it is linearised. going: what goes on in a hole of the data, which is linearised about its bias;
+                without, `bias` and a vessel at rest.
+        """
         ...
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:

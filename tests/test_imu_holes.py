@@ -4,15 +4,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 import pytest
 
+from graphloc import app, keys
+from graphloc.build import Problem, bridged, make_problem
 from graphloc.config import ImuConfig
 from graphloc.eval.simulate import Scenario, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
+from graphloc.graph import Going
 from graphloc.measurements import ImuSeries, Measurement
 from tests.faults import arrivals_of, feed, numbered
 from tests.test_online_faults import smoother
@@ -106,9 +111,65 @@ def test_a_bias_that_is_known_is_taken_off_once() -> None:
     gyro, accel = level(4000)
     known = gtsam.imuBias.ConstantBias(np.array([0.2, 0.0, 0.0]), np.zeros(3))
     imu = imu_of(gyro, accel + np.array([0.2, 0.0, 0.0]), (15.0, 28.0), UPRIGHT)
-    pim = ROW.link(imu, ImuConfig(), UPRIGHT, G).integrate(15 * S, 28 * S, known)
-    there = pim.predict(gtsam.NavState(gtsam.Pose3(), np.array([3.0, 0.0, 0.0])), known)
-    assert there.velocity() == pytest.approx(np.array([3.0, 0.0, 0.0]), abs=1e-6)
+    start = gtsam.NavState(gtsam.Pose3(), np.array([3.0, 0.0, 0.0]))
+    for about in (known, BIAS):  # as an answer is given, and as a link is laid
+        pim = ROW.link(imu, ImuConfig(), UPRIGHT, G).integrate(15 * S, 28 * S, about, Going.of(start, known))
+        there = pim.predict(start, known)
+        assert there.velocity() == pytest.approx(np.array([3.0, 0.0, 0.0]), abs=1e-6)
+        assert there.position() == pytest.approx(np.array([39.0, 0.0, 0.0]), abs=1e-5)
+
+
+@pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.0), (np.pi / 2, 0.0, 0.4)])
+@pytest.mark.parametrize("from_s", [15.0, 14.9])
+def test_who_turns_goes_round(rpy: tuple[float, float, float], from_s: float) -> None:
+    """A vessel goes where it points: 13 s at 3 m/s and 0.2 rad/s are 2.6 rad of a circle of 15 m, by a gyroscope with a bias."""
+    R = gtsam.Rot3.RzRyRx(*rpy).matrix()
+    gyro, accel = level(4000)
+    gyro[:, 2], accel[:, 1] = 0.2, 0.6
+    known = gtsam.imuBias.ConstantBias(R.T @ [0.1, 0.2, -0.1], R.T @ [0.01, -0.02, 0.015])
+    imu = imu_of(gyro + R @ known.gyroscope(), accel + R @ known.accelerometer(), (15.0, 28.0), R)
+    start = gtsam.NavState(gtsam.Pose3(gtsam.Rot3.Yaw(0.7), np.zeros(3)), gtsam.Rot3.Yaw(0.7).rotate([3.0, 0.0, 0.0]))
+    pim = ROW.link(imu, ImuConfig(), R, G).integrate(int(from_s * S), 28 * S, BIAS, Going.of(start, known))
+    turned = 0.2 * (28.0 - from_s)
+    round_it = gtsam.Rot3.Yaw(0.7).rotate(15.0 * np.array([np.sin(turned), 1.0 - np.cos(turned), 0.0]))
+    there = pim.predict(start, known)
+    # In steps of 0.1 s the force turns half a step late: by 0.01 rad, of what it adds to going straight.
+    late = 1.02 * 0.01
+    straight, onwards = (28.0 - from_s) * start.velocity(), gtsam.Rot3.Yaw(0.7 + turned).rotate([3.0, 0.0, 0.0])
+    assert np.linalg.norm(there.position() - round_it) < late * np.linalg.norm(round_it - straight)
+    assert np.linalg.norm(there.velocity() - onwards) < late * np.linalg.norm(onwards - start.velocity())
+
+
+def test_once_a_run_is_solved_its_links_lead_on_as_it_went() -> None:
+    """They are laid before anything is known: a bias of 0.3 m/s^2 is taken off twice then, and a turn leaves the velocity behind."""
+    run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=45.0), seed=2)
+    imu, truth = run.recording.imu, run.truth
+    assert imu is not None
+    t_s = (imu.stamps_ns - imu.stamps_ns[0]) / S
+    heard = (t_s <= 20.0) | (t_s >= 33.0)
+    columns = {name: getattr(imu, name)[heard] for name in ("stamps_ns", "accel_mps2", "gyro_radps", "seqs")}
+    columns["accel_mps2"] = columns["accel_mps2"] + [0.3, 0.0, 0.0]
+    recording = replace(run.recording, imu=replace(imu, **columns))
+    problem = make_problem(recording, run.config, app.choose_datum(recording, run.config), SENSORS, INERTIAL)
+    first, last = (problem.timeline.floor(int(imu.stamps_ns[0]) + at_s * S) for at_s in (20, 33))
+    there = truth.at(problem.timeline.stamps_ns[[first]])
+    assert there.v_world_mps is not None
+    begun = gtsam.NavState(gtsam.Pose3(gtsam.Rot3(there.R_world_body[0]), there.p_world_m[0]), there.v_world_mps[0])
+    bias = gtsam.imuBias.ConstantBias(np.array([0.3, 0.0, 0.0]), np.zeros(3))
+    values = gtsam.Values()
+    values.insert(keys.pose(first), begun.pose())
+    values.insert(keys.velocity(first), begun.velocity())
+    values.insert(keys.bias(int(problem.timeline.slow_of[first])), bias)
+
+    def sideways_mps(made: Problem) -> float:
+        state = begun
+        for k in range(first, last):
+            state = made.preintegrated[k].predict(state, bias)
+        return float(np.linalg.norm((state.bodyVelocity() - begun.bodyVelocity())[:2]))
+
+    # What it turned at either side is forgotten within a second, in which the heading gets ahead of the velocity.
+    assert sideways_mps(problem) > 1.5
+    assert sideways_mps(bridged(problem, values)) < 0.6
 
 
 def test_across_a_short_hole_it_goes_as_on_both_sides() -> None:
@@ -118,6 +179,18 @@ def test_across_a_short_hole_it_goes_as_on_both_sides() -> None:
     gyro[:, 2] = np.clip(0.5 * (t_s - 15.0), 0.0, 1.0)
     there, _ = across(imu_of(gyro, accel, (16.2, 16.8), UPRIGHT), 16.2, 16.8)
     assert there.attitude().yaw() == pytest.approx(0.45, abs=0.01)
+
+
+def test_two_samples_that_are_far_apart_are_no_mean() -> None:
+    """6 s between two samples of which one says 0.3 rad/s; the other side of the hole has ten seconds of none."""
+    gyro, accel = level(4000)
+    gyro[:1000, 2] = 0.3
+    imu = imu_of(gyro, accel, (15.0, 28.0), UPRIGHT)
+    t_s = imu.stamps_ns / S
+    alone = (t_s >= 28.0) | np.isin(imu.stamps_ns, [9 * S, 15 * S])
+    columns = {name: getattr(imu, name)[alone] for name in ("stamps_ns", "accel_mps2", "gyro_radps", "seqs")}
+    there, _ = across(replace(imu, **columns), 15.0, 28.0)
+    assert there.attitude().yaw() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_after_the_last_sample_it_is_a_hole_as_well() -> None:
@@ -132,6 +205,20 @@ def test_after_the_last_sample_it_is_a_hole_as_well() -> None:
     assert far.attitude().roll() == pytest.approx(0.1, abs=0.03)
     assert np.sqrt(near_cov[3, 3]) < 0.02
     assert np.sqrt(far_cov[3, 3]) == pytest.approx(np.sqrt(8.0**3 / 3.0), rel=0.02)
+
+
+@pytest.mark.parametrize("calls", [1, 13, 130])
+@pytest.mark.parametrize("begun_s", [0.0, -0.05])
+def test_one_silence_tilts_by_one_bound(calls: int, begun_s: float) -> None:
+    """0.2 rad of roll and pitch in 13 s after the last sample, in however many steps they are asked for."""
+    imu = imu_of(*level(2000), (99.0, 99.0), UPRIGHT)
+    end_s = float(imu.stamps_ns[-1]) / S
+    asked = end_s + np.linspace(begun_s, 13.0, calls + 1)
+    variance = np.sum([np.diag(across(imu, a, b)[1])[:3] for a, b in pairwise(asked)], axis=0)
+    # Asked for often, half a second goes by as the last sample says: of the fading density, exp(-0.5) is left.
+    assert np.all(np.sqrt(variance[:2]) < 0.202)
+    assert np.all(np.sqrt(variance[:2]) > 0.2 * np.exp(-0.25) - 0.002)
+    assert np.sqrt(variance[2]) == pytest.approx(0.2 * np.sqrt(13.0), rel=0.03)
 
 
 def test_online_it_is_back_at_once_after_a_silence_of_everything() -> None:

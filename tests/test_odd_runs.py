@@ -380,7 +380,14 @@ def test_roll_or_pitch_alone_is_refused(axes: tuple[str, ...]) -> None:
     ("cause", "words"),
     [
         ("stamps", r"gnss: 200 of its messages gave nothing: my\.bag: header stamp is zero or negative$"),
-        ("ahead", r"gnss has 200 measurements from .*, all outside the IMU's span, which ends at 2023-11-14T22:13:39"),
+        (
+            "ahead",
+            r"gnss has 200 measurements from \S*:14:20\S* to \S*, all outside the IMU's span \(\S*:13:20\S* to \S*:13:39",
+        ),
+        (
+            "behind",
+            r"gnss has 200 measurements from \S*:12:20\S* to \S*, all outside the IMU's span \(\S*:13:20\S* to \S*:13:39",
+        ),
     ],
 )
 def test_a_run_without_a_place_says_why(cause: str, words: str) -> None:
@@ -390,8 +397,8 @@ def test_a_run_without_a_place_says_why(cause: str, words: str) -> None:
     others = tuple(m for m in run.recording.measurements if not isinstance(m, GnssPosition))
     assert len(fixes) == 200
     bad = only(run.recording, others)
-    if cause == "ahead":
-        bad = only(run.recording, (*others, *(replace(m, stamp_ns=m.stamp_ns + 60_000_000_000) for m in fixes)))
+    if shift_ns := {"ahead": 60_000_000_000, "behind": -60_000_000_000}.get(cause):
+        bad = only(run.recording, (*others, *(replace(m, stamp_ns=m.stamp_ns + shift_ns) for m in fixes)))
     else:
         why = "my.bag: header stamp is zero or negative, recorded at 2023-11-14T22:13:{:02d}.000000000Z"
         rows = [

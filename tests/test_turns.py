@@ -139,6 +139,26 @@ def test_headings_are_not_scattered_for_a_gyroscope_or_convention_that_is_wrong(
     assert not scattered(imu, headings[:1]).any()
 
 
+@pytest.mark.parametrize("gyro_times", [1.0, 0.0, -1.0, float(np.degrees(1.0))])
+@pytest.mark.parametrize("hz", [1, 2, 10])
+@pytest.mark.parametrize("pivot_degps", [30.0, 45.0])
+def test_a_pivot_is_not_scattered_whatever_the_gyroscope_says(pivot_degps: float, hz: int, gyro_times: float) -> None:
+    """12 s of pivot, begun and ended within half a second, by headings good to 2 deg: they tell a steady turn themselves."""
+    t_s = np.arange(6000) / 100.0
+    rate = np.radians(pivot_degps) * np.clip(2.0 * np.minimum(t_s % 30.0 - 10.0, 22.0 - t_s % 30.0), 0.0, 1.0)
+    rates = np.column_stack([0.0 * rate, 0.0 * rate, gyro_times * rate])
+    stamps_ns = START_NS + np.arange(6000) * (S // 100)
+    imu = ImuSeries(
+        sensor="imu", stamps_ns=stamps_ns, accel_mps2=np.tile([0.0, 0.0, 9.8], (6000, 1)), gyro_radps=rates, seqs=np.arange(6000)
+    )  # fmt: skip
+    yaw = np.cumsum(rate) / 100.0 + np.radians(2.0) * np.random.default_rng(8).normal(size=6000)
+    headings = [
+        CompassHeading(stamp_ns=int(stamps_ns[k]), seq=k, sensor="compass", yaw_rad=yaw[k], sigma_rad=0.03)
+        for k in range(0, 6000, 100 // hz)
+    ]
+    assert not scattered(imu, headings).any()
+
+
 def test_a_bag_with_scattered_headings_has_rows_for_them(tmp_path: Path) -> None:
     """20 s at rest; the compass, which vessel.yaml names before the IMU, says any heading for half of it."""
     make, rng = Messages(2), np.random.default_rng(6)

@@ -13,7 +13,16 @@ solution is moved to the body's origin at the end (`graphloc.solve`).
 from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state
 from graphloc.build._chains import CHAIN_END, CONSTANT_TAILS, JUMP, bias_step, slow_begin, slow_end, slow_step
 from graphloc.build._graph import Decisions, StartPrior, build_graph, state_keys
-from graphloc.build._problem import Mounts, Problem, Stream, company_of, make_problem, mount_of, with_noise_scale
+from graphloc.build._problem import (
+    Mounts,
+    Problem,
+    Stream,
+    bridged,
+    company_of,
+    make_problem,
+    mount_of,
+    with_noise_scale,
+)
 
 __all__ = [
     "CHAIN_END",
@@ -28,6 +37,7 @@ __all__ = [
     "Stream",
     "attach",
     "bias_step",
+    "bridged",
     "build_graph",
     "company_of",
     "constant_keys",

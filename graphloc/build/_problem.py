@@ -13,10 +13,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc import keys
+from graphloc.build._attach import nav_state
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array, Datum
-from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.graph import Constant, Going, InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.recording import Recording
@@ -172,7 +174,7 @@ def make_problem(
 
 def _silent(recording: Recording, config: VesselConfig, heard: Container[str], imu: ImuSeries) -> str:
     """Return clauses on why the sensors that are not `heard` have no measurement within the IMU's span."""
-    clauses = ""
+    clauses, span = "", _span(imu)
     for name, sensor in config.sensors.items():
         if name in heard or not sensor.enabled or not sensor.topic or name == imu.sensor:
             continue
@@ -180,11 +182,15 @@ def _silent(recording: Recording, config: VesselConfig, heard: Container[str], i
         if stamps_ns:
             clauses += (
                 f"; {name} has {len(stamps_ns)} measurements from {utc_text(min(stamps_ns))} to "
-                f"{utc_text(max(stamps_ns))}, all outside the IMU's span, which ends at {utc_text(int(imu.stamps_ns[-1]))}"
+                f"{utc_text(max(stamps_ns))}, all outside the IMU's span ({span})"
             )
         elif lost := recording.lost({name}):
             clauses += f"; {name}{lost.replace(';', ':', 1)}"
     return clauses
+
+
+def _span(imu: ImuSeries) -> str:
+    return f"{utc_text(int(imu.stamps_ns[0]))} to {utc_text(int(imu.stamps_ns[-1]))}"
 
 
 def _sorted_out(
@@ -212,7 +218,7 @@ def _sorted_out(
         rows.append(
             LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason)
         )
-    span = f"{utc_text(start)} to {utc_text(stop)}"
+    span = _span(imu)
     warnings = [
         f"{name}: {n} of {every[name]} measurements lie outside the IMU's span ({span}): no track there"
         for name, n in outside.items()
@@ -239,6 +245,21 @@ def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
         problem, links=links, noise_scale=noise_scale, preintegrated=preintegrated,
         inertial=_inertial(problem.timeline, links, preintegrated),
     )  # fmt: skip
+
+
+def bridged(problem: Problem, values: gtsam.Values) -> Problem:
+    """Return the problem with the links across the IMU's holes made anew: what goes on there is what was before, by `values`."""
+    timeline, zero = problem.timeline, gtsam.imuBias.ConstantBias()
+    preintegrated, inertial = list(problem.preintegrated), list(problem.inertial)
+    for start_ns, stop_ns in problem.links.gaps():
+        first = timeline.floor(start_ns)
+        bias = values.atConstantBias(keys.bias(int(timeline.slow_of[first])))
+        going = Going.of(nav_state(values, first), bias)
+        for k in range(first, min(timeline.floor(stop_ns - 1) + 1, len(timeline) - 1)):
+            a, b = (int(stamp) for stamp in timeline.stamps_ns[k : k + 2])
+            preintegrated[k] = problem.links.integrate(a, b, zero, going)
+            inertial[k] = problem.links.factor(k, int(timeline.slow_of[k]), preintegrated[k])
+    return replace(problem, preintegrated=tuple(preintegrated), inertial=tuple(inertial))
 
 
 def _stream(

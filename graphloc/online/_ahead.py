@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from graphloc.frames import Array
+from graphloc.graph import Going
 from graphloc.online._live import LiveProblem
 from graphloc.online._odometry import Odometry
 from graphloc.online._states import Newest, carried_on
@@ -47,9 +48,10 @@ def no_further(newest: Newest, odometry: Odometry) -> Ahead:
 
 def ahead(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: int) -> Ahead:
     """Return what becomes of the newest state until a later stamp, be it after the IMU's last sample."""
-    pim = problem.links.integrate(newest.stamp_ns, stamp_ns, newest.bias)
     pose = newest.pose
-    there = pim.predict(gtsam.NavState(pose, newest.velocity), newest.bias)
+    start = gtsam.NavState(pose, newest.velocity)
+    pim = problem.links.integrate(newest.stamp_ns, stamp_ns, newest.bias, Going.of(start, newest.bias))
+    there = pim.predict(start, newest.bias)
     p_odom, R_odom = odometry.after(*_body_step(problem, pose, there.pose()))
     dt_s, noise = (stamp_ns - newest.stamp_ns) * 1e-9, pim.preintMeasCov()
     pose_cov = carried_on(newest.pose_cov, newest, there.pose().rotation().matrix(), dt_s, noise)
@@ -66,15 +68,15 @@ def ahead(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: in
 
 def carry_on(odometry: Odometry, problem: LiveProblem, newest: Newest, before_ns: int, until_ns: int) -> None:
     """Carry the odometry on, from the newest state (`before_ns`) or from where it is already, as the IMU says."""
-    links = problem.links
+    links, bias = problem.links, newest.bias
     if until_ns <= odometry.stamp_ns:
         return
     start = gtsam.NavState(newest.pose, newest.velocity)
     if before_ns < odometry.stamp_ns:
-        start = links.integrate(before_ns, odometry.stamp_ns, newest.bias).predict(start, newest.bias)
+        start = links.integrate(before_ns, odometry.stamp_ns, bias, Going.of(start, bias)).predict(start, bias)
         before_ns = odometry.stamp_ns
-    pim = links.integrate(before_ns, until_ns, newest.bias)
-    there = pim.predict(start, newest.bias)
+    pim = links.integrate(before_ns, until_ns, bias, Going.of(start, bias))
+    there = pim.predict(start, bias)
     dp, dR = _body_step(problem, start.pose(), there.pose())
     R, noise = start.attitude().matrix(), np.asarray(pim.preintMeasCov())[:6, :6]
     v_cov = R.T @ newest.velocity_cov @ R

@@ -14,7 +14,7 @@ from graphloc import keys
 from graphloc.build import CHAIN_END, bias_step, nav_state, slow_begin, slow_end, slow_step
 from graphloc.errors import SolveError
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Residual
+from graphloc.graph import Attachment, Going, Residual
 from graphloc.online._anchor import Anchor, Beside, beside, without_prior
 from graphloc.online._constants import Constants
 from graphloc.online._habit import UNSURE_MPS, Moving
@@ -129,8 +129,9 @@ class States:
         timeline.append(stamp_ns)
         following, t = timeline.slow_of[k + 1], timeline.page_s(stamp_ns)
         bias = values.atConstantBias(keys.bias(j))
-        pim = links.integrate(before_ns, stamp_ns, gtsam.imuBias.ConstantBias())
-        there = pim.predict(nav_state(values, k), bias)
+        state = nav_state(values, k)
+        pim = links.integrate(before_ns, stamp_ns, gtsam.imuBias.ConstantBias(), Going.of(state, bias))
+        there = pim.predict(state, bias)
         window.guess(keys.pose(k + 1), there.pose(), t)
         window.guess(keys.velocity(k + 1), np.asarray(there.velocity()), t)
         self._links[k] = window.add([links.factor(k, j, pim)])
@@ -178,8 +179,12 @@ class States:
         timeline, links, window = self._problem.timeline, self._problem.links, self._window
         for k in sorted(torn):
             if k in self._links and window.remove(self._links[k]):
-                pim = links.integrate(timeline.stamps_ns[k], timeline.stamps_ns[k + 1], gtsam.imuBias.ConstantBias())
-                self._links[k] = window.add([links.factor(k, timeline.slow_of[k], pim)])
+                j, values = timeline.slow_of[k], window.values
+                going = Going.of(nav_state(values, k), values.atConstantBias(keys.bias(j)))
+                pim = links.integrate(
+                    timeline.stamps_ns[k], timeline.stamps_ns[k + 1], gtsam.imuBias.ConstantBias(), going
+                )
+                self._links[k] = window.add([links.factor(k, j, pim)])
 
     def let_go(self) -> bool:
         """Forget the states that have left the window; tell whether any have."""

@@ -19,7 +19,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from graphloc.build import Problem, StartPrior, with_noise_scale
+from graphloc.build import Problem, StartPrior, bridged, with_noise_scale
 from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
 from graphloc.solve._choices import by_best_chains, judged_by_the_rest, take_more_probable
@@ -65,10 +65,12 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     start = align(problem)
     grown, prior, known, iterations, headings = solve_start(problem, start, progress)
     iterations += grow(problem, grown, prior, known, progress)
+    problem = bridged(problem, grown)
     passes, estimate, ratio = 0, grown, 1.0
     for attempt in range(_MAX_NOISE_ROUNDS):
         if attempt > 0:
-            problem = with_noise_scale(problem, problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0)))
+            scale = problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0))
+            problem = bridged(with_noise_scale(problem, scale), estimate)
             estimate, used, passed = open_passes(problem, estimate, prior, progress)
             passes, iterations = passes + passed, iterations + used
         settled = _final_passes(problem, estimate, prior, progress)
