@@ -10,6 +10,8 @@ from graphloc import cli
 def called(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     """Call `graphloc` with arguments; return its exit status."""
     monkeypatch.setattr(sys, "argv", ["graphloc", *map(str, arguments)])
+    # Under `python -m pytest` click would call the program that.
+    monkeypatch.setattr(sys.modules["__main__"], "__package__", None)
     try:
         cli.main()
     except SystemExit as end:

@@ -353,7 +353,7 @@ def test_gnss_errors_are_those_of_the_thesis(name: str, rmse_m: float, largest_m
 
 
 def test_the_recording_is_whole_and_smooths(tmp_path: Path) -> None:
-    bag, config = write_bag(simulate(replace(SHORT, duration_s=20.0), 4), tmp_path / "sim", ros=2)
+    bag, config = write_bag(simulate(replace(SHORT, duration_s=8.0), 4), tmp_path / "sim", ros=2)
     assert {p.name for p in (tmp_path / "sim").iterdir()} == {
         "run", "vessel.yaml", "aerial.tif", "tags.yaml", "truth.json"
     }  # fmt: skip
@@ -362,7 +362,7 @@ def test_the_recording_is_whole_and_smooths(tmp_path: Path) -> None:
         connection = next(c for c in reader.connections if c.topic == "/lidar_4/points")
         _, log_ns, raw = next(iter(reader.messages([connection])))
         cloud: Any = reader.deserialize(raw, connection.msgtype)
-    assert counts["/lidar_1/points"] == counts["/lidar_5/points"] == 19
+    assert counts["/lidar_1/points"] == counts["/lidar_5/points"] == 7
     assert cloud.header.frame_id == "lidar_4"
     assert len(cloud.data) == cloud.width * cloud.point_step
     names = [f.name for f in cloud.fields]
@@ -382,4 +382,4 @@ def test_the_recording_is_whole_and_smooths(tmp_path: Path) -> None:
     assert recording.truth is not None
     assert compare_to_truth(solved.solution.trajectory, recording.truth).position_rmse_m < 0.4
     assert len(solved.solution.ledger) == recording.message_count
-    assert solved.solution.ledger.counts()["/lidar_1/points"] == {"ignored": 19}
+    assert solved.solution.ledger.counts()["/lidar_1/points"] == {"ignored": 7}

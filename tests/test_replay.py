@@ -23,7 +23,8 @@ from graphloc.replay import Replayed, _timed, arrivals, replay
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
-    return simulate(replace(bl_scenario(1, "drift"), duration_s=30.0), 4)
+    scenario = replace(bl_scenario(1, "drift"), duration_s=20.0, imu_hz=50.0, gnss_hz=5.0)
+    return simulate(scenario, 4)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def whole(run: SimulatedRun) -> Replayed:
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("replay") / "sim"
-    write_bag(simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "30"}), 3), folder, ros=2)
+    write_bag(simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "16"}), 3), folder, ros=2)
     return folder
 
 
@@ -103,11 +104,11 @@ def test_scans_are_matched_around_its_own_prediction(bag: Path, tmp_path: Path) 
     assert told["Against truth"]["graphloc online"]["position_rmse_m"] < 0.8
     assert told["verdict"]["graphloc online"]["said"] in ("can be trusted", "use with care", "do not rely on it")
     aerial = told["ledger"]["aerial"]
-    assert aerial["used"] > 8
+    assert aerial["used"] > 5
     text = (tmp_path / "out/ledger.csv").read_text()
     assert "there was no estimate to match around" in text
     assert (tmp_path / "out/report.html").stat().st_size > 10_000
-    assert (tmp_path / "out/solution.tum").read_text().count("\n") > 200
+    assert (tmp_path / "out/solution.tum").read_text().count("\n") > 100
 
 
 def test_a_run_that_never_starts_says_what_it_waited_for(run: SimulatedRun) -> None:

@@ -309,7 +309,7 @@ def test_single_tags_without_a_compass() -> None:
 
 def test_a_tag_that_stands_elsewhere_is_named() -> None:
     """Half a metre east of its place, 50 of its sigmas."""
-    docked = dock(tag=off(227, (0.5, 0.0, 0.0)))
+    docked = dock(tag=off(227, (0.5, 0.0, 0.0)), lasts_s=40.0, rate_hz=1.0)
     assert "tags: tag 227: " in docked.said
     assert "tag 227: the tags beside it, which agree, show it -0.5 m east" in docked.said
     assert docked.number("position_p95_0_to_5_m") < 0.08
@@ -348,7 +348,7 @@ def test_one_tag_of_another_size_is_named() -> None:
 
 def test_a_size_that_is_wrong_for_all_is_named() -> None:
     """The run follows some of them, and is metres off: what is said of sizes does not come of it, but of the images."""
-    docked = dock(tag=sized(0.162))
+    docked = dock(tag=sized(0.162), lasts_s=40.0)
     assert suggested_m(docked) == {number: pytest.approx(0.412, rel=0.02) for number in QUAY}
 
 
@@ -397,7 +397,7 @@ def turned(by_deg: float) -> Change:
 
 def test_a_camera_whose_mount_is_turned_is_named() -> None:
     """It looks ahead, and the configuration has it look to port: what it truly is, is said."""
-    docked = dock(change=turned(90.0))
+    docked = dock(change=turned(90.0), lasts_s=40.0, rate_hz=1.0)
     (line,) = [text for text in docked.said.split("\n") if "mount says" in text]
     assert "camera camera" in line
     # No better than the heading is, which the compass alone tells: to its deviation.
