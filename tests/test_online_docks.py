@@ -21,9 +21,9 @@ from tests import tagfactory
 
 
 @cache
-def docking() -> SimulatedRun:
+def docking(compass_hz: str = "4") -> SimulatedRun:
     """Without GNSS: place by the dock's tags (which moves by 0.3 m), height by that and the tide."""
-    less = {"imu_hz": "50", "gnss_hz": "2", "compass_hz": "4", "lidar_hz": "0", "camera_hz": "0"}
+    less = {"imu_hz": "50", "gnss_hz": "2", "compass_hz": compass_hz, "lidar_hz": "0", "camera_hz": "0"}
     true = simulate(find_scenario("dock-floating-optimal", {**less, "duration_s": "45", "route_s": "45"}), 1)
     run, _ = tagfactory.sighted(true, rate_hz=4.0)
     kept = tuple(m for m in run.recording.measurements if m.sensor != "gnss")
@@ -51,6 +51,15 @@ def test_the_last_pose_is_known_as_well_as_to_the_batch_and_no_better() -> None:
     off_m = np.linalg.norm(online.p_world_m - run.truth.at(online.stamps_ns).p_world_m, axis=1)
     assert off_m.max() < 1.5
     assert not any("anew" in line or "contradicts" in line for line in replayed.stats.events)
+
+
+def test_tags_that_come_late_are_the_place_of_a_batch() -> None:
+    """The first of them 10.7 s after the begin, and nothing else that tells a place: all were rejected, and the run 800 m off."""
+    run = docking("2")
+    solved = app.smooth_recording(run.recording, run.config).solution
+    assert solved.ledger.counts()["tags"].keys() == {"used"}
+    off_m = np.linalg.norm(solved.trajectory.p_world_m - run.truth.at(solved.trajectory.stamps_ns).p_world_m, axis=1)
+    assert off_m[-1] < 1.0
 
 
 def test_a_rebuild_does_not_make_it_surer(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,6 +24,7 @@ _SETTLED_M = 0.5
 _MAX_FAR_ROUNDS, _FAR_SETTLED_M = 8, 2.0
 # Starts that cost this much more (log-likelihood) are dropped; while others live, the window grows.
 _COST_APART, _LONGEST_START_S = 8.0, 60.0
+_PLACE_S, _LATE_PLACE_S = 5.0, 90.0  # of places in the first window; and by when they come at the latest
 # Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
 _START_STAGES = (("far", 8, 0.5, False), ("open", 2, 0.5, False), ("final", 2, 0.5, True))
 
@@ -40,7 +41,7 @@ class Begun(NamedTuple):
 
 def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
     """Try each candidate on the first window; look further while several explain it; keep the cheapest."""
-    seconds, iterations, until = start.window_s, 0, 0
+    seconds, iterations, until = max(start.window_s, _placed_s(problem)), 0, 0
     candidates = [_candidate(problem, start, yaw) for yaw in start.yaws_rad]
     failure: SolveError | None = None
     while True:
@@ -63,6 +64,18 @@ def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
         if len(candidates) == 1 or seconds >= _LONGEST_START_S or until == len(problem.timeline) - 1:
             return Begun(candidates[0].values, candidates[0].prior, until, iterations, len(candidates))
         seconds *= 1.6
+
+
+def _placed_s(problem: Problem) -> float:
+    """How far the first window must reach for a place to be in it, s; 0 where none comes soon.
+
+    Without one the next window would be dead reckoned, with biases that are hardly known: after 15 s, what tags say of a place
+    that is 300 m off cannot be weighed by it.
+    """
+    stamps = problem.timeline.stamps_ns
+    first_ns = [s.measurements[0].stamp_ns for s in problem.streams if s.row.absolute and s.measurements]
+    soon_s = float(min(first_ns) - stamps[0]) * 1e-9 + _PLACE_S if first_ns else 0.0
+    return soon_s if soon_s <= _LATE_PLACE_S else 0.0
 
 
 @dataclass(slots=True)
