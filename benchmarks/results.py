@@ -108,6 +108,21 @@ def misses(figure: Row) -> bool:
     return bool(figure["value"] > figure["bound"] if figure["direction"] == "<=" else figure["value"] < figure["bound"])
 
 
+def said_bound(figure: Row) -> str:
+    return "" if figure["bound"] is None else f"{figure['direction']} {figure['bound']:g}"
+
+
+def missed(figures: list[Row]) -> list[str]:
+    """How many bounds are kept, and those that are not."""
+    bound = [f for f in figures if f["bound"] is not None]
+    out = [f for f in bound if misses(f)]
+    lines = ["## What misses", "", f"{len(bound) - len(out)} of {len(bound)} bounds are kept; not these:", ""]
+    lines += ["| item | figure | value | unit | bound | commit |", "|---|---|---|---|---|---|"]
+    for f in out:
+        lines.append(f"| {f['item']} | {f['name']} | {f['value']:g} | {f['unit']} | {said_bound(f)} | {f['commit']} |")
+    return [*lines, ""]
+
+
 def render(results: dict[str, Any]) -> str:
     machine = results["machine"]
     lines = [
@@ -121,11 +136,14 @@ def render(results: dict[str, Any]) -> str:
         "",
         f"Machine: {machine['cores']} cores, Python {machine['python']}, GTSAM {machine['gtsam']}.",
         "",
+        *missed(results["figures"]),
+        "## All figures",
+        "",
         "| item | figure | value | unit | bound | | commit |",
         "|---|---|---|---|---|---|---|",
     ]
     for f in results["figures"]:
-        bound = "" if f["bound"] is None else f"{f['direction']} {f['bound']:g}"
+        bound = said_bound(f)
         mark = "" if f["bound"] is None else "**misses**" if misses(f) else "ok"
         if f["item"] == "B.3" and f["bound"] is None:
             continue  # in the table below
