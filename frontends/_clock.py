@@ -100,9 +100,17 @@ def refuse_woven(
     names = list(dict.fromkeys(files))
     if not set_backs(stamps_ns) and len(names) < 2:
         return
-    first: dict[Hashable, int] = {}
-    for i in sorted(range(len(files)), key=lambda i: names.index(files[i])):
-        first.setdefault((int(stamps_ns[i]), contents[i]), i)
+    of_file: dict[str, dict[tuple[int, Hashable], int]] = {}
+    for i, (stamp_ns, content, file) in enumerate(zip(stamps_ns.tolist(), contents, files, strict=True)):
+        of_file.setdefault(file, {}).setdefault((stamp_ns, content), i)
+    first: dict[tuple[int, Hashable], int] = {}
+    reached_ns = -1
+    for own in of_file.values():
+        shared = [key in first for key in own if key[0] <= reached_ns]
+        # A second recorder of the same clock: what it alone has there, the first has lost.
+        again = 2 * sum(shared) > len(shared)
+        first |= {key: i for key, i in own.items() if key not in first and not (again and key[0] <= reached_ns)}
+        reached_ns = max(stamp_ns for stamp_ns, _ in first)
     order = np.array(list(first.values()), dtype=np.int64)
     stamps, logs = stamps_ns[order], logs_ns[order]
     for k in set_backs(stamps):

@@ -165,7 +165,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
         gyro_radps=np.array([s.gyro_radps for s in samples]),
         seqs=np.array(readings.seqs, dtype=np.int64),
     )
-    _sanity.refuse_degrees(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
+    _sanity.refuse_degrees(readings.sensor, series.stamps_ns, series.accel_mps2, series.gyro_radps, readings.config)
     warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     return series, rows
 

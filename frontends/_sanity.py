@@ -17,6 +17,8 @@ FAR_M = 100e3
 """A fix this far from the middle of its run is not believed."""
 NEVER_STILL_RADPS = 0.5
 """Median rate that no vessel keeps up for a whole run (29 deg/s)."""
+_SWING_NS, _NO_SWING_RAD = 5_000_000_000, 1.5
+_STEP_S = 0.2  # at most, of a step that rates are integrated over
 
 
 def without_gravity(accel: Array) -> bool:
@@ -50,10 +52,13 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
     return lines
 
 
-def refuse_degrees(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> None:
+def refuse_degrees(
+    sensor: str, stamps_ns: NDArray[np.int64], accel_mps2: Array, gyro_radps: Array, config: ImuConfig
+) -> None:
     """Refuse rates (N, 3) that are deg/s: the solver would be at them for many minutes.
 
-    Those about level axes are asked: a craft may pivot that fast, none rolls and pitches so all the while.
+    How far they roll and pitch it within 5 s is asked: a small boat in chop has high rates, too, and a craft may pivot
+    fast, but none rolls to and fro by a quarter turn all the while.
 
     Raises:
         InputError: they are.
@@ -62,11 +67,16 @@ def refuse_degrees(sensor: str, accel_mps2: Array, gyro_radps: Array, config: Im
     size = float(np.linalg.norm(up))
     if config.gyro_unit != "rad/s" or size < 0.5 or without_gravity(accel_mps2):
         return
-    rolls = float(np.median(np.linalg.norm(gyro_radps - np.outer(gyro_radps @ up, up) / size**2, axis=1)))
-    if rolls > NEVER_STILL_RADPS:
+    level = gyro_radps - np.outer(gyro_radps @ up, up) / size**2
+    steps_s = np.minimum(np.diff(stamps_ns, prepend=stamps_ns[0]) * 1e-9, _STEP_S)
+    angle = np.cumsum(level * steps_s[:, None], axis=0)
+    begins = np.unique((stamps_ns - stamps_ns[0]) // _SWING_NS, return_index=True)[1]
+    swings = np.maximum.reduceat(angle, begins) - np.minimum.reduceat(angle, begins)
+    swing = float(np.median(np.linalg.norm(swings, axis=1)))
+    if swing > _NO_SWING_RAD:
         raise InputError(
-            f"{sensor}: it rolls and pitches at {rolls:.2f} rad/s (median of {config.topic}), {np.degrees(rolls):.0f} deg/s, which "
-            f"no craft does for long: angular_velocity looks like deg/s; set gyro_unit: deg/s of sensors.{sensor}"
+            f"{sensor}: it rolls and pitches by {np.degrees(swing):.0f} deg within 5 s (median of {config.topic}), which no craft "
+            f"does for long: angular_velocity looks like deg/s; set gyro_unit: deg/s of sensors.{sensor}"
         )
 
 

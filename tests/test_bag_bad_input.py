@@ -448,6 +448,15 @@ def test_rates_in_degrees_are_refused_at_once(tmp_path: Path, up: tuple[float, f
         assert read_recording(path, vessel(gnss=None, imu={"topic": "/imu", "gyro_unit": "deg/s"})).imu is not None
 
 
+def test_a_small_boat_in_chop_is_not_refused(tmp_path: Path) -> None:
+    """Rolling by 14 deg every 1.5 s: 1 rad/s, but not far."""
+    items: list[Item] = []
+    for k in range(500):
+        rate = 0.244 * 4.19 * np.cos(4.19 * k / 50)
+        items.append(("/imu", START_NS + k * S // 50, MAKE.imu(START_NS + k * S // 50, gyro=(rate, 0.0, 0.0))))
+    assert read_recording(write_bag(tmp_path / "chop", MAKE, items, "mcap"), vessel(gnss=None)).imu is not None
+
+
 def test_swapped_latitude_and_longitude(tmp_path: Path) -> None:
     """Beyond 90 deg it shows in the message; elsewhere the datum tells."""
     stamps = [START_NS + k * S for k in range(10)]

@@ -393,7 +393,9 @@ def test_nothing_grows() -> None:
                 largest = early if t < 30.0 else late
                 for name, size in sizes(online).items():
                     largest[name] = max(size, largest.get(name, 0))
-    remembered = {name for name in early if name.endswith("scatter._pairs")}  # fill up to their limit
+    remembered = {
+        name for name in early if name.endswith(("scatter._pairs", "scatter._squares"))
+    }  # fill up to their limit
     grown = {n: (early.get(n, 0), s) for n, s in late.items() if n not in remembered and s > 1.15 * early.get(n, 0) + 5}
     assert len(early) > 30
     assert grown == {}

@@ -35,7 +35,21 @@ def test_it_is_how_many_times_wider_than_configured_they_are(k: int, rate_hz: fl
 def test_what_they_have_in_common_does_not_make_them_wide() -> None:
     white = np.random.default_rng(2).standard_normal((300, 1))
     off = white + np.where(np.arange(300) < 100, 0.0, 15.0)[:, None]
-    assert scatter_of(off) == pytest.approx(scatter_of(white), rel=0.15)
+    assert scatter_of(off) < 1.3 * scatter_of(white)  # the pairs across the step are a tenth of all
+
+
+@pytest.mark.parametrize("k", [1, 3])
+def test_a_third_of_outliers_does_not_make_them_wide(k: int) -> None:
+    """Half of all pairs has one of them in it."""
+    rng = np.random.default_rng(2)
+    white = rng.standard_normal((600, k))
+    assert scatter_of(np.where(rng.uniform(size=(600, 1)) < 0.35, 30.0, white)) < 2.0
+
+
+@pytest.mark.parametrize("period_s", [2.0, 2.7, 3.7])
+def test_a_swell_as_long_as_pairs_are_apart_is_not_overlooked(period_s: float) -> None:
+    at_s = np.arange(600) / 10.0  # its RMS is 3.5, the half of all pairs is nearer
+    assert scatter_of(5.0 * np.sin(2.0 * np.pi * at_s / period_s)[:, None]) > 2.5
 
 
 def test_a_compass_that_is_off_beside_a_crane_is_not_followed() -> None:

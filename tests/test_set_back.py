@@ -101,6 +101,21 @@ def test_a_folder_whose_second_file_was_set_back_is_refused(tmp_path: Path) -> N
     one_line(error, "both_1.mcap: /imu goes back by 5.0 s", "into times that both_0.mcap has too")
 
 
+def test_two_recorders_that_lose_messages_are_one_run(tmp_path: Path) -> None:
+    """What the second alone has follows the first's end, and goes back to its begin: no clock did."""
+    rng, paths = np.random.default_rng(1), []
+    for name, late_ns in (("a", 0), ("b", 1_000_000)):
+        heard = np.flatnonzero(rng.uniform(size=6000) > 0.03)
+        items: list[Item] = []
+        for k in heard.tolist():
+            stamp = START_NS + k * S // 50
+            items.append(("/imu", stamp + LATE_NS + late_ns, MAKE.imu(stamp, gyro=(1e-6 * k, 0.0, 0.0))))
+        paths.append(write_bag(tmp_path / name, MAKE, items, "mcap"))
+    recording = read_recording(paths, vessel(gnss=None))
+    assert recording.imu is not None
+    assert 5980 < len(recording.imu) < 6000
+
+
 @pytest.mark.parametrize(("second_s", "samples"), [((20.0, 40.0), 2000), ((10.0, 30.0), 1500)])
 def test_parts_that_follow_or_repeat_each_other_are_one_run(
     tmp_path: Path, second_s: tuple[float, float], samples: int

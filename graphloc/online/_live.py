@@ -22,7 +22,8 @@ from graphloc.online._habit import Habit
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
-_REMEMBERED, _APART_S = 300, 2.0  # pairs of residuals that say how wide a sensor scatters, and how far apart they are
+_REMEMBERED = 300  # residuals, and pairs of them, that say how wide a sensor scatters
+_LAGS_S, _GOLDEN = (2.0, 4.0), 0.618  # how far apart pairs are; its multiples, whole turns taken off, spread evenly
 _PAGE_S = 1.0  # states leave together by so much
 
 
@@ -124,10 +125,11 @@ class LiveTimeline:
 
 
 class Scatter:
-    """How many times wider than configured a sensor's residuals scatter.
+    """How many times wider than configured a sensor's residuals scatter: about 0, or about each other if that is less.
 
-    About each other, 2 s apart, not about 0: what they have in common is no noise. Taken for it, a compass that was 15 deg off
-    beside a crane was believed after 15 s, for half of what was remembered said that it is always so far off.
+    What they have in common is no noise. Taken for it, a compass that was 15 deg off beside a crane was believed after 15 s, for
+    half of what was remembered said that it is always so far off. About each other alone, a third of outliers makes the half
+    of all pairs wide. Pairs are 2 to 4 s apart, evenly: of one lag, a swell of that period would not show.
 
     Attributes:
         times: at least 1.
@@ -136,19 +138,27 @@ class Scatter:
     def __init__(self) -> None:
         self.times = 1.0
         self._recent: deque[tuple[int, Array]] = deque()
+        self._noted = 0
+        self._squares: deque[float] = deque(maxlen=_REMEMBERED)
         self._pairs: deque[float] = deque(maxlen=_REMEMBERED)
 
     def note(self, stamp_ns: int, residual: Array) -> None:
         """Take in a residual (k,), normalised by its covariance."""
-        before = None
-        while self._recent and stamp_ns - self._recent[0][0] >= _APART_S * 1e9:
-            before = self._recent.popleft()[1]
+        self._squares.append(float(residual @ residual))
+        self._noted += 1
+        before, lag_ns = None, float(np.interp(self._noted * _GOLDEN % 1.0, (0.0, 1.0), _LAGS_S)) * 1e9
+        for stamp, other in self._recent:
+            if stamp_ns - stamp < lag_ns:
+                break
+            before = other
+        while len(self._recent) > 1 and stamp_ns - self._recent[1][0] >= _LAGS_S[1] * 1e9:
+            self._recent.popleft()
         self._recent.append((stamp_ns, residual))
-        if before is None:
-            return
-        self._pairs.append(0.5 * float((residual - before) @ (residual - before)))
+        if before is not None:
+            self._pairs.append(0.5 * float((residual - before) @ (residual - before)))
         if len(self._pairs) >= len(residual) + 4:
-            self.times = max(1.0, float(np.sqrt(np.median(self._pairs) / chi2_median(len(residual)))))
+            least = min(np.median(self._squares), np.median(self._pairs))
+            self.times = max(1.0, float(np.sqrt(least / chi2_median(len(residual)))))
 
 
 @dataclass(slots=True, eq=False)

@@ -22,6 +22,8 @@ from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
 from graphloc.solve._foreseen import Prediction, prediction_of
 
+_HOLE_S = 1.0  # in the IMU's data
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Newest:
@@ -150,11 +152,17 @@ class States:
     def _next_habit(self, dt_s: float) -> None:
         """Learn how the vessel moves, or, where that is hardly known, stage that it moves as usual."""
         problem, newest, before = self._problem, self._newest, self._turned
-        self._turned = problem.timeline.last
+        timeline, now = problem.timeline, problem.timeline.last
+        self._turned = now
         if float(np.linalg.eigvalsh(newest.velocity_cov[:2, :2])[-1]) < UNSURE_MPS**2:
             problem.habit.learn(newest.stamp_ns, (newest.pose.rotation().matrix().T @ newest.velocity)[:2])
-        elif before >= problem.timeline.first:
-            self._window.add(problem.habit.step(self._moving(before), self._moving(self._turned), dt_s))
+            return
+        if before < timeline.first:
+            return
+        # How it turned in a hole is a guess, and so is along which axes it moved there.
+        begin_ns, end_ns = timeline.stamps_ns[before], timeline.stamps_ns[now]
+        if not any(a < end_ns and b > begin_ns and b - a > _HOLE_S * 1e9 for a, b in problem.links.gaps()):
+            self._window.add(problem.habit.step(self._moving(before), self._moving(now), dt_s))
 
     def _moving(self, k: int) -> Moving:
         values, key = self._window.values, keys.velocity(k)
