@@ -37,9 +37,11 @@ _PLACES: WeakKeyDictionary[GnssPosition, tuple[Datum, Array]] = WeakKeyDictionar
 
 
 def _world_m(m: GnssPosition, datum: Datum) -> Array:
+    """The fix in world (3,), m; one without a height as high as the datum, for a degree is longer higher up."""
     known = _PLACES.get(m)
     if known is None or known[0] != datum:
-        known = (datum, np.asarray(datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0]))
+        place = m.position if m.has_height else m.position._replace(height_m=datum.origin.height_m)
+        known = (datum, np.asarray(datum.enu_from_geodetic(*(np.array([v]) for v in place))[0]))
         _PLACES[m] = known
     return known[1]
 

@@ -161,6 +161,17 @@ def test_horizontal_fixes_tell_the_same_track() -> None:
             assert 100 < fewer <= sum(isinstance(m, GnssPosition) for m in flat)  # by their weights
 
 
+def test_a_fix_without_a_height_on_a_lake_in_the_mountains_is_where_one_with_it_is() -> None:
+    """At 0 m a degree is shorter by height over the Earth's radius: 5 km east of the datum, 3 m."""
+    datum = Datum(Geodetic(-16.0, -69.0, 3812.0))
+    (row,) = (row for row in SENSORS if row.kind == "gnss")
+    position = Geodetic(*datum.geodetic_from_enu(np.array([[5000.0, 0.0, 0.0]]))[0])
+    whole = GnssPosition(stamp_ns=0, sensor="gnss", seq=0, position=position, cov_enu_m2=np.eye(3))
+    hint = row.hint(_flattened(whole), 0.0, datum)
+    assert hint.p_world_m is not None
+    assert hint.p_world_m[:2] == pytest.approx([5000.0, 0.0], abs=0.01)
+
+
 def _flattened(m: GnssPosition) -> GnssPosition:
     """The fix as the decoder makes it where there is no altitude."""
     return replace(
