@@ -17,7 +17,7 @@ from graphloc.chi2 import chi2_95
 from graphloc.errors import InputError
 from graphloc.eval.words import number
 from graphloc.frames import Array, Datum, wrap_angle
-from graphloc.measurements import GnssPosition
+from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.recording import SpeedSeries
 from graphloc.trajectory import Trajectory
 
@@ -149,8 +149,7 @@ def held_out_errors(
         NoCommonTimeError: the estimate covers none of them.
     """
     stamps = np.array([m.stamp_ns for m in held], dtype=np.int64)
-    positions = np.array([m.position for m in held])
-    fixes = datum.enu_from_geodetic(positions[:, 0], positions[:, 1], positions[:, 2])
+    fixes = world_from_fixes(held, datum)
     covered = estimate.covers(stamps)
     if not covered.any():
         raise NoCommonTimeError("the track covers none of the held-out fixes")

@@ -27,7 +27,7 @@ from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.aerial.live import Turn, outside
 from graphloc.frontends.aerial.scans import ScanFeed
 from graphloc.ledger import LedgerRow
-from graphloc.measurements import GnssPosition, Measurement, PoseFix, TagSighting
+from graphloc.measurements import GnssPosition, Measurement, PoseFix, TagSighting, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.solution import Health, Solution
 from graphloc.survey import Survey
@@ -189,7 +189,7 @@ def _log_measurements(stream: Any, recording: Recording, solution: Solution) -> 
 def _said_m(m: Measurement, row: LedgerRow, datum: Datum, height_m: float) -> Array | None:
     """Where a measurement says that the body, or the antenna, is (3,) in world; None: it says no place."""
     if isinstance(m, GnssPosition):
-        place = np.array(datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0])
+        place = np.array(world_from_fixes([m], datum)[0])
         place[2] = place[2] if m.has_height else height_m
         return place
     pose = as_pose(m, Survey()) if isinstance(m, TagSighting) else m

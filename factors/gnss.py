@@ -20,7 +20,7 @@ from graphloc.config import GnssConfig
 from graphloc.factors._noise import noise_model, with_floors
 from graphloc.frames import Array, Datum, Geodetic, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.measurements import GnssPosition
+from graphloc.measurements import GnssPosition, world_from_fixes
 
 _TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
 _TIE = gtsam.noiseModel.Isotropic.Sigma(3, _TIE_M)
@@ -37,11 +37,9 @@ _PLACES: WeakKeyDictionary[GnssPosition, tuple[Datum, Array]] = WeakKeyDictionar
 
 
 def _world_m(m: GnssPosition, datum: Datum) -> Array:
-    """The fix in world (3,), m; one without a height as high as the datum, for a degree is longer higher up."""
     known = _PLACES.get(m)
     if known is None or known[0] != datum:
-        place = m.position if m.has_height else m.position._replace(height_m=datum.origin.height_m)
-        known = (datum, np.asarray(datum.enu_from_geodetic(*(np.array([v]) for v in place))[0]))
+        known = (datum, world_from_fixes([m], datum)[0])
         _PLACES[m] = known
     return known[1]
 

@@ -7,12 +7,13 @@ number of the message in its recording, unique, and the key of its row in the le
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.frames import Array, Geodetic
+from graphloc.frames import Array, Datum, Geodetic
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 NO_HEIGHT_M2 = 1e12
@@ -70,6 +71,13 @@ class GnssPosition(Measurement):
             raise ValueError(f"position {lat}, {lon}, {height} is not on Earth")
         object.__setattr__(self, "position", Geodetic(lat, lon, height))
         object.__setattr__(self, "cov_enu_m2", _frozen_covariance(self.cov_enu_m2, 3, "cov_enu_m2"))
+
+
+def world_from_fixes(fixes: Sequence[GnssPosition], datum: Datum) -> Array:
+    """Return places (N, 3) in world, m; a fix without a height lies as high as the datum, for a degree is longer higher up."""
+    level = datum.origin.height_m
+    places = [m.position if m.has_height else m.position._replace(height_m=level) for m in fixes]
+    return datum.enu_from_geodetic(*np.array(places).reshape(-1, 3).T)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

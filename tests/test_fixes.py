@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 
 from graphloc.app import smooth_recording
+from graphloc.eval.ekf._honest import run_honest
+from graphloc.eval.metrics import held_out_errors
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import SENSORS
 from graphloc.frames import Datum, Geodetic
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
-from graphloc.measurements import GnssPosition
+from graphloc.measurements import GnssPosition, PoseFix
 from graphloc.origin import choose_datum, height_m
 from graphloc.recording import Recording
 from graphloc.replay import replay
+from graphloc.trajectory import Trajectory
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag_bad_input import accounted, rows_of, vessel
 
@@ -161,15 +164,40 @@ def test_horizontal_fixes_tell_the_same_track() -> None:
             assert 100 < fewer <= sum(isinstance(m, GnssPosition) for m in flat)  # by their weights
 
 
+LAKE = Datum(Geodetic(-16.0, -69.0, 3812.0))
+EAST_M = np.array([5000.0, 0.0, 0.0])
+
+
 def test_a_fix_without_a_height_on_a_lake_in_the_mountains_is_where_one_with_it_is() -> None:
     """At 0 m a degree is shorter by height over the Earth's radius: 5 km east of the datum, 3 m."""
-    datum = Datum(Geodetic(-16.0, -69.0, 3812.0))
     (row,) = (row for row in SENSORS if row.kind == "gnss")
-    position = Geodetic(*datum.geodetic_from_enu(np.array([[5000.0, 0.0, 0.0]]))[0])
-    whole = GnssPosition(stamp_ns=0, sensor="gnss", seq=0, position=position, cov_enu_m2=np.eye(3))
-    hint = row.hint(_flattened(whole), 0.0, datum)
+    position = Geodetic(*LAKE.geodetic_from_enu(EAST_M[None])[0])
+    fix = _flattened(GnssPosition(stamp_ns=0, sensor="gnss", seq=0, position=position, cov_enu_m2=np.eye(3)))
+    hint = row.hint(fix, 0.0, LAKE)
     assert hint.p_world_m is not None
-    assert hint.p_world_m[:2] == pytest.approx([5000.0, 0.0], abs=0.01)
+    assert hint.p_world_m[:2] == pytest.approx(EAST_M[:2], abs=0.01)
+    there = Trajectory(
+        stamps_ns=np.array([0, S]), p_world_m=np.array([EAST_M, EAST_M]), R_world_body=np.array([np.eye(3), np.eye(3)])
+    )
+    _, error, _ = held_out_errors(there, [fix], LAKE, {"gnss": np.zeros(3)})
+    assert error[:, :2] == pytest.approx(np.zeros((1, 2)), abs=0.01)
+
+
+def test_the_filters_read_such_a_fix_as_the_graph_does() -> None:
+    run = simulate(Scenario(path="loops", duration_s=20.0), 2)
+    home = choose_datum(run.recording, run.config, SENSORS)
+    said = [m for m in run.recording.measurements if not isinstance(m, PoseFix)]
+
+    def moved(m: GnssPosition) -> GnssPosition:
+        p = home.enu_from_geodetic(*(np.array([v]) for v in m.position)) + EAST_M
+        return _flattened(replace(m, position=Geodetic(*LAKE.geodetic_from_enu(p)[0])))
+
+    there = [moved(m) if isinstance(m, GnssPosition) else m for m in said]
+    near, far = (
+        run_honest(replace(run.recording, measurements=tuple(of), truth=None), run.config, datum).trajectory.p_world_m
+        for of, datum in ((said, home), (there, LAKE))
+    )
+    assert np.abs(far - near - EAST_M).max() < 0.01
 
 
 def _flattened(m: GnssPosition) -> GnssPosition:

@@ -24,6 +24,7 @@ from graphloc.measurements import (
     Measurement,
     PoseFix,
     TagSighting,
+    world_from_fixes,
 )
 from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
@@ -160,7 +161,7 @@ def _moved_fixes(recording: Recording, begin_ns: int, end_ns: int, error_m: Call
     if not fixes:
         return Struck(recording=recording)
     datum = Datum(fixes[0].position)
-    enu = datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T)
+    enu = world_from_fixes(fixes, datum)
     enu[:, :2] += error_m(np.array([(m.stamp_ns - begin_ns) / NS_PER_S for m in fixes]))
     moved = {id(m): Geodetic(*g) for m, g in zip(fixes, datum.geodetic_from_enu(enu), strict=True)}
     return _changed(

@@ -19,6 +19,7 @@ from graphloc.measurements import (
     PoseFix,
     PoseMode,
     TagSighting,
+    world_from_fixes,
 )
 from graphloc.recording import Recording
 from graphloc.survey import Survey
@@ -113,7 +114,7 @@ def start_of(events: list[Event], recording: Recording, datum: Datum) -> Array:
     fixes = [e.m for e in events if isinstance(e.m, GnssPosition)]
     poses = [e.m for e in events if isinstance(e.m, PoseFix) and e.m.axes[:2] == ("x", "y")]
     heading = next((e for e in events if isinstance(e.m, CompassHeading)), None)
-    track = datum.enu_from_geodetic(*np.array([f.position for f in fixes]).T)[:, :2] if fixes else np.zeros((1, 2))
+    track = world_from_fixes(fixes, datum)[:, :2] if fixes else np.zeros((1, 2))
     p = track[0] if fixes or not poses else poses[0].modes[0].value[:2]
     psi = 0.0
     if heading is not None:

@@ -13,7 +13,7 @@ from graphloc.config import VesselConfig
 from graphloc.eval.ekf._inputs import Event, Interval, events_of, intervals_of, start_of
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.ledger import Ledger, LedgerRow, Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, Measurement, PoseFix
+from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, Measurement, PoseFix, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
@@ -45,7 +45,7 @@ def _measurement(event: Event, x: Array, rate: float, datum: Datum) -> tuple[Arr
         H[:, 2:4], H[:, 4] = turn, np.array([[-s, -c], [c, -s]]) @ (x[2:4] + swing)
         return m.v_world_mps[:2] - turn @ (x[2:4] + swing), H, np.array(m.cov_m2ps2[:2, :2])
     if isinstance(m, GnssPosition):
-        z = datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0, :2]
+        z = world_from_fixes([m], datum)[0, :2]
         values, cov, index = {0: z[0], 1: z[1]}, m.cov_enu_m2[:2, :2], [0, 1]
     elif isinstance(m, CompassHeading):
         values, cov, index = {4: m.yaw_rad}, np.array([[m.sigma_rad**2]]), [4]

@@ -26,7 +26,7 @@ from graphloc.eval.plots._marks import (
 )
 from graphloc.frames import Array, Datum
 from graphloc.ledger import LedgerRow
-from graphloc.measurements import GnssPosition, Measurement, PoseFix, TagSighting
+from graphloc.measurements import GnssPosition, Measurement, PoseFix, TagSighting, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.survey import WORLD, Survey
@@ -58,7 +58,7 @@ def placed(recording: Recording, solution: Solution) -> Iterator[Placed]:
 
 def _place(m: Measurement, row: LedgerRow, datum: Datum) -> Array | None:
     if isinstance(m, GnssPosition):
-        return datum.enu_from_geodetic(*(np.array([v]) for v in m.position))[0, :2]
+        return world_from_fixes([m], datum)[0, :2]
     if isinstance(m, PoseFix) and m.axes[:2] == ("x", "y"):
         return np.asarray(m.modes[row.mode or 0].value[:2])
     if isinstance(m, TagSighting):
@@ -89,7 +89,7 @@ def run_map(
     """Return the map in ENU metres from the datum."""
     marks: list[Mark] = list(_measured(recording, solution))
     if held:
-        p = solution.datum.enu_from_geodetic(*np.array([m.position for m in held]).T)[thinned(len(held))]
+        p = world_from_fixes(held, solution.datum)[thinned(len(held))]
         marks.append(Points(name="held-out fixes", x=p[:, 0], y=p[:, 1], shape="x", size=4.0))
     for f in filters:
         marks.append(_track(f.name, f.trajectory, colour_of(f.name), "dash"))

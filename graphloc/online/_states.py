@@ -79,7 +79,6 @@ class States:
         self._problem, self._window, self._constants = problem, window, constants
         self._ends: dict[str, Held] = {}  # what closes the slow chain of each sensor
         self._links: dict[int, Held] = {}  # by the state that each begins at
-        self._turned = 0  # the last state that a slow node begins at
         state = (keys.pose(0), keys.velocity(0), keys.bias(0))
         pose, velocity, bias = guess
         window.guess(state[0], pose, 0.0)
@@ -142,27 +141,26 @@ class States:
             window.guess(keys.bias(following), bias, t)
             window.add([bias_step(links, j, dt_s)])
             self._next_slow(j, dt_s, t)
-            self._next_habit(dt_s)
+            self._next_habit(j, dt_s)
         window.touch(keys.bias(following), t)
         for stream in self._problem.streams.values():
             if stream.slow is not None:
                 window.touch(keys.slow(stream.number, following), t)
         return bool(following != j)
 
-    def _next_habit(self, dt_s: float) -> None:
-        """Learn how the vessel moves, or, where that is hardly known, stage that it moves as usual."""
-        problem, newest, before = self._problem, self._newest, self._turned
-        timeline, now = problem.timeline, problem.timeline.last
-        self._turned = now
+    def _next_habit(self, j: int, dt_s: float) -> None:
+        """Learn how the vessel moves, or, where that is hardly known, stage that from slow node j on it moved as usual."""
+        problem, newest, timeline = self._problem, self._newest, self._problem.timeline
         if float(np.linalg.eigvalsh(newest.velocity_cov[:2, :2])[-1]) < UNSURE_MPS**2:
             problem.habit.learn(newest.stamp_ns, (newest.pose.rotation().matrix().T @ newest.velocity)[:2])
             return
-        if before < timeline.first:
+        begin_ns, end_ns = timeline.slow_stamps_ns[j], timeline.stamps_ns[timeline.last]
+        if begin_ns < timeline.stamps_ns[timeline.first]:
             return
         # How it turned in a hole is a guess, and so is along which axes it moved there.
-        begin_ns, end_ns = timeline.stamps_ns[before], timeline.stamps_ns[now]
         if not any(a < end_ns and b > begin_ns and b - a > _HOLE_S * 1e9 for a, b in problem.links.gaps()):
-            self._window.add(problem.habit.step(self._moving(before), self._moving(now), dt_s))
+            before, now = self._moving(timeline.floor(begin_ns)), self._moving(timeline.last)
+            self._window.add(problem.habit.step(before, now, dt_s))
 
     def _moving(self, k: int) -> Moving:
         values, key = self._window.values, keys.velocity(k)
