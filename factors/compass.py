@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compass heading with a mount offset and the vessel's magnetic deviation.
+"""Compass heading with a mount offset, the vessel's magnetic deviation, and what turns it for a while.
 
-    z = y + A + B sin(h) + C cos(h) + D sin(2h) + E cos(2h) + w,   w ~ N(0, s^2)
+    z = y + A + B sin(h) + C cos(h) + D sin(2h) + E cos(2h) + e + w,   w ~ N(0, s^2)
     y = yaw(R_world_body R_body_sensor),   h = 90 deg - y: heading of the sensor's own x axis, clockwise from north
 
 A: offset of the mount. B to E: what the vessel's iron does, as navigators write it (A. Smith's coefficients; east is
-positive): constants of the run. Taken for noise instead, a deviation of 4 deg bends the heading by 2 deg and takes most
-aerial matches for false.
+positive): constants of the run. e: the wander, a first-order Gauss-Markov process, of what passes: a crane, a quay of
+sheet piles, the filter in the compass. Taken for noise instead, deviation or wander of some degrees bends the heading by
+half of it, ten readings a second being sure of it, and takes aerial matches for false.
 
 yaw(R) = atan2(R10, R00). With R <- R Exp(theta): d yaw / d theta = -(row 2 of R) . (x-hat cross-terms),
 worked out in `_yaw_jacobian`. GTSAM has no native factor with yaw and offset in one, so this one is
@@ -31,6 +32,15 @@ _DEVIATION = ("B", "C", "D", "E")
 _SHARES = (1.0, 1.0, 0.5, 0.5)  # B and C come of permanent magnetism; D and E, of soft iron, are smaller
 
 
+def _axes(config: CompassConfig) -> tuple[Array, Array]:
+    """Standing sigmas (6,) of A to E and of the wander, rad, 0 where there is none; and their time constants, s."""
+    mount, deviation, wander = np.radians(
+        [config.mount_offset_sigma_deg, config.deviation_sigma_deg, config.wander_sigma_deg]
+    )
+    sigma = np.array([mount, *(deviation * bool(mount) * share for share in _SHARES), wander])
+    return sigma, np.array([np.inf] * 5 + [config.wander_time_constant_s])
+
+
 def _yaw_jacobian(R: Array, x_body: Array, x_world: Array) -> Array:
     """Derivative (6,) of yaw(R Exp(theta) R_state_sensor) by the body tangent (theta, rho); x_*: the sensor's x axis."""
     # d(R Exp(theta) x)/d theta = -R [x]_x, of which a row r of R gives x x r; yaw = atan2(y, x)
@@ -46,21 +56,21 @@ def _axis(at: Attachment) -> tuple[Array, Array, Array]:
     return R, x_body, R @ x_body
 
 
-def _read(at: Attachment, yaw: float) -> tuple[float, Array, float]:
-    """What a compass reads, d / d the coefficients A to E (k,), as many as there are, and d / d yaw."""
+def _read(at: Attachment, config: CompassConfig, yaw: float) -> tuple[float, Array, float]:
+    """What a compass reads, d / d its slow state (k,), and d / d yaw."""
     if at.slow_value is None:
         return yaw, np.zeros(0), 1.0
     s, c = math.sin(yaw), math.cos(yaw)
-    n = len(at.slow_value)
-    terms = np.array([1.0, c, s, 2.0 * s * c, s * s - c * c])[:n]
-    slopes = np.array([0.0, -s, c, 2.0 * (c * c - s * s), 4.0 * s * c])[:n]
+    there = _axes(config)[0] > 0.0
+    terms = np.array([1.0, c, s, 2.0 * s * c, s * s - c * c, 1.0])[there]
+    slopes = np.array([0.0, -s, c, 2.0 * (c * c - s * s), 4.0 * s * c, 0.0])[there]
     return yaw + float(terms @ at.slow_value), terms, 1.0 + float(slopes @ at.slow_value)
 
 
 def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual predicted - measured (1,) in rad."""
     R, x_body, x = _axis(at)
-    read, terms, slope = _read(at, math.atan2(x[1], x[0]))
+    read, terms, slope = _read(at, config, math.atan2(x[1], x[0]))
     raw = np.array([math.remainder(read - m.yaw_rad, math.tau)])
     sigma = max(m.sigma_rad, _FLOOR_RAD)
     return (
@@ -86,19 +96,18 @@ def factors(m: CompassHeading, config: CompassConfig, at: Attachment, decision: 
 
 
 def slow(config: CompassConfig) -> SlowProcess | None:
-    """Return mount offset and deviation, as far as the configuration asks for them."""
-    mount, deviation = np.radians([config.mount_offset_sigma_deg, config.deviation_sigma_deg])
-    if mount == 0.0:
+    """Return mount offset, deviation and wander, as far as the configuration asks for them."""
+    sigma, time_constant_s = _axes(config)
+    there = sigma > 0.0
+    if not there.any():
         return None
-    sigma = np.array([mount, *(deviation * share for share in _SHARES if deviation)])
-    n = len(sigma)
     return SlowProcess(
         name="compass offset",
-        axes=("yaw", *_DEVIATION)[:n],
-        units=("deg",) * n,
-        scale=np.full(n, 180.0 / np.pi),
-        sigma=sigma,
-        time_constant_s=np.full(n, np.inf),
+        axes=tuple(np.array(["yaw", *_DEVIATION, "wander"])[there].tolist()),
+        units=("deg",) * int(there.sum()),
+        scale=np.full(int(there.sum()), 180.0 / np.pi),
+        sigma=sigma[there],
+        time_constant_s=time_constant_s[there],
         no_tails=_DEVIATION,
     )
 
@@ -106,7 +115,7 @@ def slow(config: CompassConfig) -> SlowProcess | None:
 def ideal(at: Attachment, config: CompassConfig) -> CompassHeading:
     """Return the heading that the attachment's estimate would give."""
     _, _, x = _axis(at)
-    yaw = float(wrap_angle(np.array(_read(at, math.atan2(x[1], x[0]))[0])))
+    yaw = float(wrap_angle(np.array(_read(at, config, math.atan2(x[1], x[0]))[0])))
     return CompassHeading(stamp_ns=0, sensor="compass", seq=0, yaw_rad=yaw, sigma_rad=np.radians(config.sigma_deg))
 
 

@@ -159,10 +159,10 @@ def test_compass_sign_and_wrap() -> None:
 
 
 def test_a_compass_reads_what_a_deviation_table_says() -> None:
-    """A ship heading 030 deg whose offset is 2 deg and whose B, C, D, E are 3, -1, 0.5, 0.25: read by hand; slopes by differences."""
+    """Heading 030 deg, offset 2 deg, B, C, D, E 3, -1, 0.5, 0.25, off by 0.7 for now: read by hand; slopes by differences."""
     row = next(r for r in SENSORS if r.kind == "compass")
     config = row.config(kind="compass")
-    coefficients = np.radians([2.0, 3.0, -1.0, 0.5, 0.25])
+    coefficients = np.radians([2.0, 3.0, -1.0, 0.5, 0.25, 0.7])
 
     def heading(deg: float, moved: Array) -> Attachment:
         at = replace(attachment(row, config, tilt=0.0), T_state_sensor=gtsam.Pose3(), slow_value=coefficients + moved)
@@ -171,16 +171,44 @@ def test_a_compass_reads_what_a_deviation_table_says() -> None:
     def read(deg: float, moved: Array) -> float:
         return float(cast(CompassHeading, row.ideal(heading(deg, moved), config)).yaw_rad)
 
-    still = np.zeros(5)
+    still = np.zeros(6)
     deviation = 3.0 * 0.5 - 1.0 * np.sqrt(0.75) + 0.5 * np.sqrt(0.75) + 0.25 * 0.5
-    assert np.degrees(read(30.0, still)) == pytest.approx(60.0 + 2.0 + deviation)
+    assert np.degrees(read(30.0, still)) == pytest.approx(60.0 + 2.0 + deviation + 0.7)
     m = cast(CompassHeading, row.ideal(heading(30.0, still), config))
     residual = row.residuals(m, config, heading(30.0, still))[0]
     assert residual.slow_jacobian is not None
-    slopes = [(read(30.0, 1e-6 * step) - read(30.0, -1e-6 * step)) / 2e-6 for step in np.eye(5)]
+    slopes = [(read(30.0, 1e-6 * step) - read(30.0, -1e-6 * step)) / 2e-6 for step in np.eye(6)]
     np.testing.assert_allclose(residual.slow_jacobian()[0], slopes, atol=1e-6)
     by_yaw = (read(30.0 - 1e-4, still) - read(30.0 + 1e-4, still)) / np.radians(2e-4)
     assert residual.jacobian()[0, 2] == pytest.approx(by_yaw, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "axes"),
+    [
+        ({}, ("yaw", "B", "C", "D", "E", "wander")),
+        ({"wander": 0.0}, ("yaw", "B", "C", "D", "E")),
+        ({"deviation": 0.0}, ("yaw", "wander")),
+        ({"mount_offset": 0.0}, ("wander",)),
+        ({"mount_offset": 0.0, "wander": 0.0}, ()),
+    ],
+)
+def test_a_compass_errs_as_configured(sigmas: dict[str, float], axes: tuple[str, ...]) -> None:
+    """Each part of its error goes with its sigma, alone; what is left is read as it was, and only the wander passes."""
+    row = next(r for r in SENSORS if r.kind == "compass")
+    config = row.config(kind="compass").model_copy(update={f"{n}_sigma_deg": value for n, value in sigmas.items()})
+    assert row.slow is not None
+    process = row.slow(config)
+    if not axes:
+        assert process is None
+        return
+    assert process is not None
+    assert process.axes == axes
+    assert np.isfinite(process.time_constant_s).tolist() == [axis == "wander" for axis in axes]
+    at = replace(attachment(row, config), slow_value=np.zeros(len(axes)))
+    off = replace(at, slow_value=np.radians([3.0 * (axis == "wander") for axis in axes]))
+    read = [cast(CompassHeading, row.ideal(a, config)).yaw_rad for a in (at, off)]
+    assert np.degrees(read[1] - read[0]) == pytest.approx(3.0 if "wander" in axes else 0.0)
 
 
 @pytest.mark.parametrize("weight", [1.0, 0.25])

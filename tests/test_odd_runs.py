@@ -284,7 +284,8 @@ def test_the_deviation_of_a_compass_is_told_by_the_motion() -> None:
         return replace(m, yaw_rad=float(m.yaw_rad + np.radians(4.0 * np.sin(h) - 2.0 * np.cos(h))))
 
     def smoothed(deviation_sigma_deg: float) -> tuple[Solution, TruthMetrics]:
-        compass = run.config.sensors["compass"].model_copy(update={"deviation_sigma_deg": deviation_sigma_deg})
+        errs = {"deviation_sigma_deg": deviation_sigma_deg, "wander_sigma_deg": 0.0}
+        compass = run.config.sensors["compass"].model_copy(update=errs)
         recording = only(run.recording, tuple(deviated(m) for m in run.recording.measurements))
         solved = app.smooth_recording(recording, with_sensors(run, compass=compass)).solution
         return solved, compare_to_truth(solved.trajectory, run.truth)
@@ -299,6 +300,30 @@ def test_the_deviation_of_a_compass_is_told_by_the_motion() -> None:
     off = slow.value[-1] - [0.0, 4.0, -2.0, 0.0, 0.0]
     assert (np.abs(off) < 3.0 * slow.sigma[-1]).all()
     assert np.abs(off[1:]).max() < 1.5
+
+
+def test_a_compass_that_wanders_is_held_by_the_map_and_in_its_bounds() -> None:
+    """Off by up to 3 deg, now to one side, now to the other, in 40 s. Held at nothing, its readings bend the heading."""
+    run = simulate(replace(BASE, duration_s=40.0, pose_hz=1.0, false_fraction=0.2), 3)
+
+    def wandered(m: Measurement) -> Measurement:
+        if not isinstance(m, CompassHeading):
+            return m
+        return replace(m, yaw_rad=float(m.yaw_rad + np.radians(3.0) * np.sin(2.0 * np.pi * m.stamp_ns / 40e9)))
+
+    recording = only(run.recording, tuple(wandered(m) for m in run.recording.measurements))
+
+    def heading(**errs: float) -> TruthMetrics:
+        compass = run.config.sensors["compass"].model_copy(update=errs)
+        solved = app.smooth_recording(recording, with_sensors(run, compass=compass)).solution
+        return compare_to_truth(solved.trajectory, run.truth)
+
+    found, held = heading(), heading(wander_sigma_deg=0.0)
+    assert held.heading_coverage_95 is not None
+    assert held.heading_coverage_95 < 0.7
+    assert found.heading_coverage_95 is not None
+    assert found.heading_coverage_95 > 0.9
+    assert found.heading_rmse_deg < 0.5 * held.heading_rmse_deg
 
 
 def test_an_imu_noisier_than_configured_is_scaled_up() -> None:

@@ -137,6 +137,10 @@ class CompassConfig(SensorConfig):
     deviation_sigma_deg: NonNegative = 1.5
     """Magnetic deviation: coefficients B and C (of sine and cosine of the heading), 1 sigma, deg; D and E (of twice the
     heading) are half of it. 0: none, as of a GNSS compass."""
+    wander_sigma_deg: NonNegative = 1.0
+    """How far what is not of the vessel (a crane, a quay, the filter in the compass) turns its reading for a while, 1 sigma, deg."""
+    wander_time_constant_s: Positive = 60.0
+    """How long such an error lasts, s."""
 
 
 class VelocityConfig(SensorConfig):

@@ -132,7 +132,7 @@ def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values]:
     streams = []
     for stream in problem.streams:
         slow, left_out = stream.slow, stream.left_out
-        if slow is not None and slow.axes[0] == "yaw" and not np.isfinite(slow.time_constant_s).any():
+        if slow is not None and slow.axes[0] == "yaw" and not np.isfinite(slow.time_constant_s[0]):
             slow = _without_mount(problem, stream, slow, values)
         if left_out is not None:
             slow = left_out
