@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import scatter_m
+from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
-from graphloc.frontends.decode import IMU, ODOMETRY, Rejection, yaw_of_x_axis
+from graphloc.frontends.decode import IMU, ODOMETRY, yaw_of_x_axis
 from graphloc.time import NS_PER_S
 
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}

@@ -21,6 +21,7 @@ from graphloc.frontends._reports import (
 )
 from graphloc.frontends.decode import IMU
 
+_MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
@@ -51,8 +52,12 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         yield _imu_block(_numbered("imu", k), imu, enabled=k == 0)
     for k, gnss in enumerate(inspection.gnss):
         yield _gnss_block(_numbered("gnss", k), gnss, enabled=k == 0)
-    for k, compass in enumerate(c for c in inspection.compasses if c.usable):
-        yield _compass_block(_numbered("compass", k), compass)
+    compasses = sorted((c for c in inspection.compasses if c.usable), key=lambda c: c.topic.endswith(_MAGNETIC))
+    seen: set[str] = set()
+    for k, compass in enumerate(compasses):
+        name = compass.topic.partition(" ")[0]
+        yield _compass_block(_numbered("compass", k), compass, enabled=name not in seen)
+        seen.add(name)
     for compass in (c for c in inspection.compasses if not c.usable):
         yield [f"# orientation of {compass.topic}: left out as a compass; {compass.why}"]
     for k, twist in enumerate(inspection.velocities):
@@ -125,7 +130,7 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
 
 def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
     """Add a time offset where the recording times say that a receiver's clock is off; poses may take their time."""
-    latency = {t.topic: t.latency_s[1] for t in inspection.topics if t.latency_s is not None}
+    latency = {t.topic.partition(" ")[0]: t.latency_s[1] for t in inspection.topics if t.latency_s is not None}
     reference = next((latency[i.topic] for i in inspection.imus if i.topic in latency), None)
     kind = next((line.split()[1] for line in block if line.startswith("  kind:")), "")
     topic = next((line.split()[1] for line in block if line.startswith("  topic:")), "")
@@ -136,6 +141,12 @@ def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
         return block
     side = "behind" if behind > 0 else "ahead of"
     return [*block, f"  time_offset_s: {behind:.3f}  # guess: its clock is {side} the IMU's, by the recording times"]
+
+
+def _topic_lines(topic: str) -> list[str]:
+    """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
+    name, _, sentence = topic.partition(" ")
+    return [f"  topic: {name}", *([f"  nmea: [{sentence}]"] if sentence else [])]
 
 
 def _numbered(name: str, k: int) -> str:
@@ -176,7 +187,7 @@ def _noise_lines(imu: ImuReport) -> list[str]:
 
 
 def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
-    lines = [f"{name}:", "  kind: gnss", f"  topic: {gnss.topic}"]
+    lines = [f"{name}:", "  kind: gnss", *_topic_lines(gnss.topic)]
     if not enabled:
         lines.append("  enabled: false  # guess: the receiver with most fixes is used")
     if gnss.tf_frame is not None:
@@ -204,7 +215,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
 
 
 def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None) -> list[str]:
-    lines = [f"{name}:", "  kind: gnss_velocity", f"  topic: {twist.topic}"]
+    lines = [f"{name}:", "  kind: gnss_velocity", *_topic_lines(twist.topic)]
     if twist.axes not in (None, "east, north, up"):
         lines.append(f"  enabled: false  # guess: east, north, up is wanted, its axes look {twist.axes}; {twist.why}")
     else:
@@ -218,13 +229,17 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None) -
     return lines
 
 
-def _compass_block(name: str, compass: CompassReport) -> list[str]:
+def _compass_block(name: str, compass: CompassReport, *, enabled: bool) -> list[str]:
     lines = [
         f"{name}:",
         "  kind: compass",
-        f"  topic: {compass.topic}",
+        *_topic_lines(compass.topic),
         f"  convention: {compass.convention}  # guess: {compass.why}",
     ]
+    if not enabled:
+        lines.append(
+            "  enabled: false  # guess: another heading of the same topic is used, a true one before a magnetic one"
+        )
     if compass.offset_deg is not None and abs(compass.offset_deg) > 10.0:
         quarter = 90.0 * round(compass.offset_deg / 90.0)
         rest = abs(compass.offset_deg - quarter)

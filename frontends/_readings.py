@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SensorConfig, VelocityConfig, VesselConfig
 from graphloc.frontends import _clock, _fixes, _sanity
 from graphloc.frontends._beside import Beside
+from graphloc.frontends._rejections import Rejection, rejected
 from graphloc.frontends._turns import SCATTERED, scattered
-from graphloc.frontends.decode import Decoded, ImuSample, Rejection, rejected
+from graphloc.frontends.decode import Decoded, ImuSample
 from graphloc.hangs import WHY, hanging, hanging_warning
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix

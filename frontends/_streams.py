@@ -11,18 +11,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._source import TF_STATIC, Bag
+from graphloc.frontends import nmea
+from graphloc.frontends._rejections import Rejection
+from graphloc.frontends._source import TF_STATIC, Bag, RawMessage
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.decode import (
+    GPS_FIXES,
     IMU,
     NAV_SAT_FIX,
+    NMEA,
+    NMEA_STATUS,
     ODOMETRY,
+    PLAIN_POSE,
     PLAIN_TWIST,
     POSE,
     QUATERNION,
     TWIST,
+    VECTOR,
     header_stamp_ns,
+    nav_sat_status,
 )
+
+Row = tuple[float, ...]
 
 
 def _xyz(v: Any) -> tuple[float, float, float]:
@@ -41,11 +51,12 @@ def _imu_row(m: Any) -> tuple[float, ...]:
 def _fix_row(m: Any) -> tuple[float, ...]:
     c = m.position_covariance
     kind = m.position_covariance_type
-    return (m.latitude, m.longitude, m.altitude, m.status.status, kind, c[0], c[4], c[8])
+    return (m.latitude, m.longitude, m.altitude, nav_sat_status(m.status.status), kind, c[0], c[4], c[8])
 
 
 def _pose_row(m: Any) -> tuple[float, ...]:
-    return (*_xyz(m.pose.pose.position), *_xyzw(m.pose.pose.orientation), 0.0, 0.0, 0.0)
+    pose = getattr(m.pose, "pose", m.pose)
+    return (*_xyz(pose.position), *_xyzw(pose.orientation), 0.0, 0.0, 0.0)
 
 
 def _odometry_row(m: Any) -> tuple[float, ...]:
@@ -60,6 +71,35 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
     POSE: _pose_row,
     TWIST: lambda m: _xyz(m.twist.twist.linear),
     PLAIN_TWIST: lambda m: _xyz(m.twist.linear),
+    VECTOR: lambda m: _xyz(m.vector),
+    **dict.fromkeys(GPS_FIXES, _fix_row),
+    PLAIN_POSE: _pose_row,
+}
+
+
+def _nmea_fix(text: str, wanted: str) -> tuple[float, ...]:
+    said = nmea.fix(text, [wanted])
+    if isinstance(said, Rejection):
+        return (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)
+    return (said.latitude_deg, said.longitude_deg, said.height_m, NMEA_STATUS.get(said.quality, 0), 0.0, 0.0, 0.0, 0.0)
+
+
+def _nmea_heading(text: str, wanted: str) -> tuple[float, ...]:
+    said = nmea.heading_deg(text, [wanted])
+    half = np.nan if isinstance(said, Rejection) else np.radians(90.0 - said) / 2.0
+    return (0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
+
+
+def _nmea_velocity(text: str, wanted: str) -> tuple[float, ...]:
+    said = nmea.velocity_mps(text, [wanted])
+    return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (*said, 0.0)
+
+
+# Of a sentence: the message type that says the same, and its row.
+SENTENCES: dict[str, tuple[str, Callable[[str, str], tuple[float, ...]]]] = {
+    **dict.fromkeys(nmea.HEADINGS, (QUATERNION, _nmea_heading)),
+    "VTG": (TWIST, _nmea_velocity),
+    **dict.fromkeys(nmea.PLACES, (NAV_SAT_FIX, _nmea_fix)),
 }
 
 
@@ -109,24 +149,29 @@ class Stream:
 
 
 def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
-    """Read all topics of the types in `ROWS`, and the static transforms."""
+    """Read all topics of the types in `ROWS`, and the static transforms.
+
+    A topic of NMEA gives a stream for each sentence of each talker, named 'TOPIC GPGGA', as if it were of the type that
+    says the same.
+    """
     streams = {
         t.topic: Stream(t.topic, t.msgtypes[0])
         for t in bag.topics.values()
         if len(t.msgtypes) == 1 and t.msgtypes[0] in ROWS
     }
     tree = StaticTree()
-    statics = {TF_STATIC} & set(bag.topics)
-    for raw in bag.messages(set(streams) | statics) if streams or statics else ():
-        stream = streams.get(raw.topic)
+    mixed = {t.topic for t in bag.topics.values() if t.msgtypes == (NMEA,)}
+    wanted = set(streams) | mixed | ({TF_STATIC} & set(bag.topics))
+    for raw in bag.messages(wanted) if wanted else ():
         msg: Any = None
         try:
             msg = bag.decode(raw)
-            row = None if stream is None else ROWS[raw.msgtype](msg)
+            stream, row = _sentence(raw.topic, msg, streams) if raw.topic in mixed else _plain(raw, msg, streams)
         except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything; counted
-            row = None
-        if stream is None:
+            stream, row = streams.get(raw.topic), None
+        if raw.topic == TF_STATIC:
             tree.take(raw.msgtype, msg)
+        if stream is None:
             continue
         if row is None:
             stream.undecodable += 1
@@ -138,3 +183,17 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
         stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
         stream.add(stamp_ns, raw.log_ns, row, raw.file)
     return list(streams.values()), tree
+
+
+def _plain(raw: RawMessage, msg: Any, streams: dict[str, Stream]) -> tuple[Stream | None, Row | None]:
+    return streams.get(raw.topic), ROWS[raw.msgtype](msg) if raw.topic in streams else None
+
+
+def _sentence(topic: str, msg: Any, streams: dict[str, Stream]) -> tuple[Stream | None, Row | None]:
+    """The stream of a sentence, made where it is the first one."""
+    talker, kind = nmea.identity(msg.sentence)
+    if kind not in SENTENCES:
+        return None, None
+    msgtype, row_of = SENTENCES[kind]
+    name = f"{topic} {talker}{kind}"
+    return streams.setdefault(name, Stream(name, msgtype)), row_of(msg.sentence, talker + kind)

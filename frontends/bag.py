@@ -29,17 +29,17 @@ from graphloc.frontends._readings import (
     reject_scattered,
     reject_set_back,
 )
+from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import turn_warnings
 from graphloc.frontends.decode import (
     ODOMETRY,
+    PLAIN_POSE,
     POSE,
     Decoded,
-    Rejection,
     decoder_of,
     header_stamp_ns,
-    malformed,
     supported_types,
 )
 from graphloc.ledger import LedgerRow, Outcome
@@ -284,7 +284,7 @@ def _or(names: Sequence[str]) -> str:
 def _beside(topic: str | None, key: str, reason: str, topics: Mapping[str, TopicSummary], bag: str) -> Beside | None:
     if topic is None:
         return None
-    _check_topic(topic, key, (ODOMETRY, POSE) if key == "truth_topic" else (ODOMETRY,), topics, bag)
+    _check_topic(topic, key, (ODOMETRY, POSE, PLAIN_POSE) if key == "truth_topic" else (ODOMETRY,), topics, bag)
     return Beside(topic, reason)
 
 

@@ -25,7 +25,8 @@ from graphloc.config import (
 )
 from graphloc.extras import added
 from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
-from graphloc.ledger import Outcome
+from graphloc.frontends import nmea
+from graphloc.frontends._rejections import Rejection, malformed, rejected
 from graphloc.measurements import (
     AXES,
     NO_HEIGHT_M2,
@@ -45,21 +46,21 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
 PLAIN_TWIST = "geometry_msgs/msg/TwistStamped"
+VECTOR = "geometry_msgs/msg/Vector3Stamped"
+PLAIN_POSE = "geometry_msgs/msg/PoseStamped"
+GPS_FIXES = ("gps_msgs/msg/GPSFix", "gps_common/msg/GPSFix")
+NMEA = "nmea_msgs/msg/Sentence"
 TF = "tf2_msgs/msg/TFMessage"
 
 _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
+NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # of NavSatStatus, by quality of GGA: differential, RTK
+_RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # horizontal, vertical, at a dilution of 1: fixed, float
+_NO_CLIMB_MPS2 = 1e6  # variance of a vertical velocity that is not told, m^2/s^2
 # Beyond these no sensor of a vessel measures; they are finite, and a sum or a square of them need not be.
 _MOST_INERTIAL = 1e4  # in the unit of the bag: 1000 g; 30 turns a second in deg/s
 MOST_SPEED_MPS, MOST_DISTANCE_M, _MOST_HEIGHT_M = 1e4, 1e7, 1e5
 _VARIANCES = (1e-18, 1e12)  # m^2 and the like: 1 nm to 1000 km
-
-
-class Rejection(NamedTuple):
-    """A message that gives no measurement, and why."""
-
-    outcome: Outcome
-    reason: str
 
 
 class ImuSample(NamedTuple):
@@ -72,16 +73,6 @@ class ImuSample(NamedTuple):
 Decoded = Measurement | ImuSample | Rejection
 # The message and the configuration are whatever this row of the table asks for, hence Any.
 Decoder = Callable[[Any, int, int, str, Any], Decoded]
-
-
-def malformed(reason: str) -> Rejection:
-    """A message whose content cannot be used."""
-    return Rejection(Outcome.MALFORMED, reason)
-
-
-def rejected(reason: str) -> Rejection:
-    """A well-formed message that says itself that it is not to be used, or is not believed."""
-    return Rejection(Outcome.REJECTED, reason)
 
 
 def header_stamp_ns(msg: Any) -> int | None:
@@ -144,6 +135,11 @@ def yaw_of_x_axis(x: float, y: float, z: float, w: float) -> float | Rejection:
     return float(np.arctan2(left, forward))
 
 
+def nav_sat_status(status: int) -> int:
+    """Return a status of NavSatFix or GPSFix as NavSatFix has it: differential (18) and WAAS (33) are `sbas` there."""
+    return 1 if status in (18, 33) else status
+
+
 def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -> Decoded:
     a, w = msg.linear_acceleration, msg.angular_velocity
     accel, gyro = (float(a.x), float(a.y), float(a.z)), (float(w.x), float(w.y), float(w.z))
@@ -164,12 +160,41 @@ def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -
 
 
 def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:
-    status = int(msg.status.status)
+    status = nav_sat_status(int(msg.status.status))
     if status < 0:
         return rejected("no fix (STATUS_NO_FIX)")
     if status < _MIN_STATUS[config.min_status]:
         return rejected(f"fix status {status} is below min_status '{config.min_status}'")
-    lat, lon, height = float(msg.latitude), float(msg.longitude), float(msg.altitude)
+    place = float(msg.latitude), float(msg.longitude), float(msg.altitude)
+    cov = np.asarray(msg.position_covariance, dtype=float).reshape(3, 3)
+    kind = int(msg.position_covariance_type)
+    if kind == _COVARIANCE_UNKNOWN:
+        cov = np.zeros((3, 3))
+    elif kind != _COVARIANCE_KNOWN:
+        cov = np.diag(np.diagonal(cov))  # 'approximated' and 'diagonal known' promise the diagonal only
+    return _placed(place, cov, stamp_ns, seq, sensor, config)
+
+
+def _gnss_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:
+    fix = nmea.fix(msg.sentence, config.nmea)
+    if isinstance(fix, Rejection):
+        return fix
+    status = NMEA_STATUS.get(fix.quality, 0)
+    if status < _MIN_STATUS[config.min_status]:
+        return rejected(f"quality {fix.quality} is below min_status '{config.min_status}'")
+    horizontal, vertical = _RTK_SIGMAS_M.get(
+        fix.quality, (config.default_horizontal_sigma_m, config.default_vertical_sigma_m)
+    )
+    dilution = max(fix.hdop, 1.0) if isfinite(fix.hdop) else 1.0
+    cov = np.diag([horizontal, horizontal, vertical]) ** 2 * min(dilution, 100.0) ** 2
+    return _placed((fix.latitude_deg, fix.longitude_deg, fix.height_m), cov, stamp_ns, seq, sensor, config)
+
+
+def _placed(
+    place: tuple[float, float, float], cov: Array, stamp_ns: int, seq: int, sensor: str, config: GnssConfig
+) -> Decoded:
+    """A fix at latitude and longitude, deg, and height, m (NaN: not told)."""
+    lat, lon, height = place
     if not np.isfinite([lat, lon]).all():
         return malformed("latitude or longitude is NaN")
     planar = bool(np.isnan(height))  # NavSatFix: 'set to NaN if no altitude is available'
@@ -185,12 +210,6 @@ def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) ->
     if not -180.0 <= lon <= 360.0:
         return malformed("longitude is beyond 180 deg")
     default = np.array([config.default_horizontal_sigma_m] * 2 + [config.default_vertical_sigma_m]) ** 2
-    cov = np.asarray(msg.position_covariance, dtype=float).reshape(3, 3)
-    kind = int(msg.position_covariance_type)
-    if kind == _COVARIANCE_UNKNOWN:
-        cov = np.diag(default)
-    elif kind != _COVARIANCE_KNOWN:
-        cov = np.diag(np.diagonal(cov))  # 'approximated' and 'diagonal known' promise the diagonal only
     if planar:
         cov = cov.copy()
         cov[2, :] = cov[:, 2] = 0.0  # what the message claims of a height that it does not give
@@ -225,15 +244,43 @@ def _compass_imu(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Compass
     return _heading(msg.orientation, float(msg.orientation_covariance[8]), stamp_ns, seq, sensor, config)
 
 
+def _compass_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
+    heading = nmea.heading_deg(msg.sentence, config.nmea)
+    if isinstance(heading, Rejection):
+        return heading
+    yaw = float(wrap_angle(np.radians(90.0 - heading)))
+    return CompassHeading(
+        stamp_ns=stamp_ns, sensor=sensor, seq=seq, yaw_rad=yaw, sigma_rad=float(np.radians(config.sigma_deg))
+    )
+
+
 def _velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
     with_covariance = hasattr(msg.twist, "covariance")
     v = msg.twist.twist.linear if with_covariance else msg.twist.linear
-    value = np.array([v.x, v.y, v.z], dtype=float)
+    cov = covariance_translation_first(msg.twist.covariance)[:3, :3] if with_covariance else np.zeros((3, 3))
+    return _moving((v.x, v.y, v.z), cov, stamp_ns, seq, sensor, config)
+
+
+def _velocity_vector(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
+    v = msg.vector
+    return _moving((v.x, v.y, v.z), np.zeros((3, 3)), stamp_ns, seq, sensor, config)
+
+
+def _velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
+    v = nmea.velocity_mps(msg.sentence, config.nmea)
+    if isinstance(v, Rejection):
+        return v
+    return _moving((*v, 0.0), np.diag([0.0, 0.0, _NO_CLIMB_MPS2]), stamp_ns, seq, sensor, config)
+
+
+def _moving(
+    v_mps: tuple[float, float, float], cov: Array, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig
+) -> Decoded:
+    value = np.array(v_mps, dtype=float)
     if not np.isfinite(value).all():
         return malformed("velocity is NaN")
     if np.abs(value).max() > MOST_SPEED_MPS:
         return malformed(f"velocity is beyond {MOST_SPEED_MPS:g} m/s")
-    cov = covariance_translation_first(msg.twist.covariance)[:3, :3] if with_covariance else np.zeros((3, 3))
     default = np.full(3, config.default_sigma_mps**2)
     return GnssVelocity(
         stamp_ns=stamp_ns, sensor=sensor, seq=seq, v_world_mps=value, cov_m2ps2=usable_covariance(cov, default)
@@ -246,11 +293,12 @@ def is_unit(quaternion: Array) -> bool:
 
 
 def pose_of(msg: Any) -> tuple[Array, Array | None]:
-    """Return position (3,) and rotation (3, 3) of an Odometry or PoseWithCovarianceStamped message.
+    """Return position (3,) and rotation (3, 3) of an Odometry, PoseWithCovarianceStamped or PoseStamped message.
 
     The rotation is None where the quaternion is not one.
     """
-    p, q = msg.pose.pose.position, msg.pose.pose.orientation
+    pose = getattr(msg.pose, "pose", msg.pose)
+    p, q = pose.position, pose.orientation
     position = np.array([p.x, p.y, p.z], dtype=float)
     quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
     return position, np.asarray(Rotation.from_quat(quaternion).as_matrix()) if is_unit(quaternion) else None
@@ -268,7 +316,9 @@ def _pose(msg: Any, stamp_ns: int, seq: int, sensor: str, config: PoseConfig) ->
     if np.abs(value).max() > MOST_DISTANCE_M:
         return malformed(f"position is over {MOST_DISTANCE_M / 1e3:g} km from the datum")
     default = np.array([config.default_sigma_m] * 3 + [np.radians(config.default_sigma_deg)] * 3) ** 2
-    cov = covariance_translation_first(msg.pose.covariance)[np.ix_(picked, picked)]
+    plain = not hasattr(msg.pose, "covariance")
+    cov = np.zeros((6, 6)) if plain else covariance_translation_first(msg.pose.covariance)
+    cov = cov[np.ix_(picked, picked)]
     mode = PoseMode(value=value, cov=usable_covariance(cov, default[picked]))
     return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=seq, axes=config.axes, modes=(mode,))
 
@@ -276,11 +326,17 @@ def _pose(msg: Any, stamp_ns: int, seq: int, sensor: str, config: PoseConfig) ->
 DECODERS: dict[tuple[str, str], Decoder] = {
     ("imu", IMU): _imu,
     ("gnss", NAV_SAT_FIX): _gnss,
+    **{("gnss", msgtype): _gnss for msgtype in GPS_FIXES},
+    ("gnss", NMEA): _gnss_nmea,
     ("compass", QUATERNION): _compass_quaternion,
     ("compass", IMU): _compass_imu,
+    ("compass", NMEA): _compass_nmea,
     ("gnss_velocity", TWIST): _velocity,
     ("gnss_velocity", PLAIN_TWIST): _velocity,
+    ("gnss_velocity", VECTOR): _velocity_vector,
+    ("gnss_velocity", NMEA): _velocity_nmea,
     ("pose", POSE): _pose,
+    ("pose", PLAIN_POSE): _pose,
     ("pose", ODOMETRY): _pose,
 }
 

@@ -48,7 +48,18 @@ from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.aerial.cloud import CLOUD
-from graphloc.frontends.decode import IMU, NAV_SAT_FIX, ODOMETRY, PLAIN_TWIST, POSE, QUATERNION, TWIST
+from graphloc.frontends.decode import (
+    GPS_FIXES,
+    IMU,
+    NAV_SAT_FIX,
+    ODOMETRY,
+    PLAIN_POSE,
+    PLAIN_TWIST,
+    POSE,
+    QUATERNION,
+    TWIST,
+    VECTOR,
+)
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, info_beside
 from graphloc.measurements import CompassHeading, ImuSeries
@@ -68,6 +79,7 @@ __all__ = [
     "render",
 ]
 
+_FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MOST_TRIED = 200  # messages of a topic that cannot be decoded
 
 
@@ -91,15 +103,15 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
     by_topic = {s.topic: s for s in streams}
     filled = [s for s in streams if len(s)]
-    fixes = [s for s in filled if s.msgtype == NAV_SAT_FIX]
-    poses = [s for s in filled if s.msgtype in (ODOMETRY, POSE)]
+    fixes = [s for s in filled if s.msgtype in _FIXES]
+    poses = [s for s in filled if s.msgtype in (ODOMETRY, POSE, PLAIN_POSE)]
     wheels = [s for s in poses if _role(s)[0] == "check_speed"]
-    twists = [s for s in filled if s.msgtype in (TWIST, PLAIN_TWIST)]
+    twists = [s for s in filled if s.msgtype in (TWIST, PLAIN_TWIST, VECTOR)]
     motion = motion_of(wheels, twists, fixes)
     body = tree.body()
     # The best first: what they say is what the others are judged by.
     found_gnss = [g for s in fixes if (g := gnss_report(s, _known(s, tree, body)))]
-    found_gnss.sort(key=lambda g: -g.fixes)
+    found_gnss.sort(key=lambda g: (-g.fixes, g.without_height))
     stamps, p_m, scatter_m, first = _best_track(by_topic, found_gnss)
     frame = found_gnss[0].tf_frame if found_gnss else None
     mount = tree.resolve(body, frame) if frame else None
@@ -116,7 +128,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             if t.topic in by_topic
             else TopicReport(topic=t.topic, msgtype=" or ".join(t.msgtypes), count=t.messages)
             for t in topics.values()
-        ),
+        )
+        + tuple(topic_report(s, len(s)) for s in streams if s.topic not in topics),
         imus=tuple(found_imus),
         gnss=tuple(found_gnss),
         compasses=tuple(
@@ -217,7 +230,7 @@ def _useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
         else ["the bag holds no message of a known type"]
     )
     for stream in streams:
-        if stream.topic in used or stream.msgtype not in (IMU, NAV_SAT_FIX):
+        if stream.topic in used or stream.msgtype not in (IMU, *_FIXES):
             continue
         total = len(stream) + stream.undecodable + stream.no_stamp
         if not total:
@@ -227,7 +240,7 @@ def _useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
         why = f"{stream.undecodable} cannot be decoded, {stream.no_stamp} have no stamp"
         if plausible < len(stream):
             why += f", {len(stream) - plausible} have a stamp that repeats, runs backwards or is far from the recording time"
-        elif stream.msgtype == NAV_SAT_FIX:
+        elif stream.msgtype in _FIXES:
             why += f", {int((stream.rows[:, 3] < 0).sum()) if len(stream) else 0} say 'no fix', the others lie at 0, 0 or are NaN"
         elif len(stream) and (hangs := samples_of(stream)[1]):
             why = hangs[0].removeprefix(f"{stream.topic}: ")

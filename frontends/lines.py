@@ -30,7 +30,8 @@ from graphloc.config import (
     VesselConfig,
 )
 from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
-from graphloc.frontends.decode import DECODERS, NAV_SAT_FIX, POSE, TWIST, Rejection, malformed
+from graphloc.frontends._rejections import Rejection, malformed
+from graphloc.frontends.decode import DECODERS, NAV_SAT_FIX, POSE, TWIST
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, ImuSample, Measurement, PoseFix, PoseMode
 from graphloc.time import NS_PER_S, duration_ns

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, PoseConfig, VelocityConfig
-from graphloc.frontends.decode import DECODERS, ImuSample, Rejection, covariance_translation_first, usable_covariance
+from graphloc.frontends._rejections import Rejection
+from graphloc.frontends.decode import DECODERS, ImuSample, covariance_translation_first, usable_covariance
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
 from tests.bagfactory import START_NS, Messages

@@ -83,6 +83,9 @@ class ImuConfig(SensorConfig):
         return float(np.radians(self.gyro_bias_sigma_dps))
 
 
+Sentences = tuple[Annotated[str, Field(pattern=r"^[A-Z]{3}([A-Z]{2})?$")], ...]
+
+
 class SlowErrorConfig(Block):
     """The slowly varying part of the GNSS error: a first-order Gauss-Markov process per axis."""
 
@@ -100,7 +103,7 @@ class SlowErrorConfig(Block):
 
 
 class GnssConfig(SensorConfig):
-    """GNSS position (`sensor_msgs/NavSatFix`)."""
+    """GNSS position (`sensor_msgs/NavSatFix`, `gps_msgs/GPSFix`, `nmea_msgs/Sentence`)."""
 
     kind: Literal["gnss"] = "gnss"
     """Which row of the sensor table reads this block."""
@@ -118,15 +121,17 @@ class GnssConfig(SensorConfig):
     """The same for height, m."""
     slow_error: SlowErrorConfig = SlowErrorConfig()
     """The modelled slow error."""
+    nmea: Sentences = ("GGA", "GNS")
+    """Sentences that are read of an `nmea_msgs/Sentence` topic, of one talker (`GPGGA`) or of any (`GGA`): GGA, GNS, RMC."""
 
 
 class CompassConfig(SensorConfig):
-    """Heading (`geometry_msgs/QuaternionStamped`, or the orientation of a `sensor_msgs/Imu`)."""
+    """Heading (`geometry_msgs/QuaternionStamped`, the orientation of a `sensor_msgs/Imu`, or `nmea_msgs/Sentence`)."""
 
     kind: Literal["compass"] = "compass"
     """Which row of the sensor table reads this block."""
     convention: Literal["enu", "ned"] = "enu"
-    """Yaw in the message: `enu` from east, counter-clockwise (REP 103); `ned` from north, clockwise."""
+    """Yaw in the message: `enu` from east, counter-clockwise (REP 103); `ned` from north, clockwise. NMEA is the latter."""
     sigma_deg: Positive = 1.5
     """Heading noise, 1 sigma, deg. Used where the message carries no covariance."""
     use_reported_sigma: bool = True
@@ -141,10 +146,12 @@ class CompassConfig(SensorConfig):
     """How far what is not of the vessel (a crane, a quay, the filter in the compass) turns its reading for a while, 1 sigma, deg."""
     wander_time_constant_s: Positive = 60.0
     """How long such an error lasts, s."""
+    nmea: Sentences = ("HDT", "THS")
+    """Sentences that are read of an `nmea_msgs/Sentence` topic, of one talker (`HEHDT`) or of any (`HDT`): HDT, THS, HDG, HDM."""
 
 
 class VelocityConfig(SensorConfig):
-    """GNSS velocity in ENU (`geometry_msgs/TwistWithCovarianceStamped` or `TwistStamped`)."""
+    """GNSS velocity in ENU (`geometry_msgs/TwistWithCovarianceStamped`, `TwistStamped`, `Vector3Stamped`, `nmea_msgs/Sentence`)."""
 
     kind: Literal["gnss_velocity"] = "gnss_velocity"
     """Which row of the sensor table reads this block."""
@@ -152,6 +159,8 @@ class VelocityConfig(SensorConfig):
     """Floor of the velocity sigma, m/s."""
     default_sigma_mps: Positive = 0.3
     """Taken where the message reports no covariance, m/s."""
+    nmea: Sentences = ("VTG",)
+    """Sentences that are read of an `nmea_msgs/Sentence` topic, of one talker (`GPVTG`) or of any (`VTG`): VTG, RMC."""
 
 
 class HeightConfig(SensorConfig):

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a sentence of NMEA 0183 says (`nmea_msgs/Sentence`): a place, a heading, a velocity over ground.
+
+Reading the fields is left to pynmeagps. A sentence that was not asked for is not read at all.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
+from math import cos, isfinite, nan, radians, sin
+from typing import Any
+
+from pynmeagps import VALCKSUM, NMEAReader, exceptions
+
+from graphloc.frontends._rejections import Rejection, ignored, malformed, rejected
+
+PLACES = ("GGA", "GNS", "RMC")
+HEADINGS = ("HDT", "THS", "HDG", "HDM")
+VELOCITIES = ("VTG", "RMC")
+_SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
+_UNREADABLE = (
+    exceptions.NMEAParseError, exceptions.NMEAMessageError, exceptions.NMEATypeError, exceptions.NMEAStreamError,
+    ValueError, TypeError, KeyError, IndexError, AttributeError,
+)  # fmt: skip
+_KNOT_MPS, _KM_PER_H_MPS = 1852.0 / 3600.0, 1.0 / 3.6
+_SLOW_MPS = 0.1  # below it a receiver may leave the course out
+# Quality of a fix as GGA has it, from the mode letters of GNS and RMC.
+_QUALITIES = {"N": 0, "A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
+_NOT_MEASURED = {0: "no fix", 6: "dead reckoned by the receiver", 7: "typed in by hand", 8: "simulated by the receiver"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fix:
+    """A place: deg; height above the ellipsoid, m, NaN where it is not told; quality as in GGA; horizontal dilution."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    quality: int
+    hdop: float
+
+
+def identity(text: str) -> tuple[str, str]:
+    """Return talker and sentence ('GP', 'GGA'); empty where it is none."""
+    found = _SENTENCE.search(text)
+    return (found[1], found[2]) if found else ("", "")
+
+
+def fix(text: str, wanted: Collection[str]) -> Fix | Rejection:
+    """Return the place.
+
+    Args:
+        text: the sentence. wanted: sentences that are read, with a talker ('GPGGA') or of any ('GGA').
+    """
+    said = _read(text, wanted, PLACES, "place")
+    if isinstance(said, Rejection):
+        return said
+    quality = _field(said, "quality") if said.msgID == "GGA" else _quality(said)
+    if not isinstance(quality, int):
+        return malformed(f"{said.msgID}: no quality: it ends early")
+    if quality in _NOT_MEASURED:
+        return rejected(f"{said.msgID}: {_NOT_MEASURED[quality]}")
+    # Heights in NMEA are above the geoid; without the separation the ellipsoid's is not known.
+    return Fix(
+        latitude_deg=_number(said, "lat"),
+        longitude_deg=_number(said, "lon"),
+        height_m=_number(said, "alt") + _number(said, "sep"),
+        quality=quality,
+        hdop=_number(said, "HDOP"),
+    )
+
+
+def heading_deg(text: str, wanted: Collection[str]) -> float | Rejection:
+    """Return the heading, deg clockwise from north: true, or magnetic (HDM, and HDG without a variation)."""
+    said = _read(text, wanted, HEADINGS, "heading")
+    if isinstance(said, Rejection):
+        return said
+    if said.msgID == "THS" and _field(said, "mi") != "A":
+        return rejected("THS: its mode is not 'A': the heading is not measured")
+    value = _number(said, {"HDT": "headingT", "THS": "headt", "HDM": "headingM", "HDG": "headingM"}[said.msgID])
+    if said.msgID == "HDG":
+        value += _east(said, "deviation") + _east(said, "variation")
+    return value if isfinite(value) else rejected(f"{said.msgID}: no heading")
+
+
+def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Rejection:
+    """Return velocity east and north, m/s."""
+    said = _read(text, wanted, VELOCITIES, "velocity")
+    if isinstance(said, Rejection):
+        return said
+    if (quality := _quality(said)) in _NOT_MEASURED:
+        return rejected(f"{said.msgID}: {_NOT_MEASURED[quality]}")
+    if said.msgID == "RMC":
+        speed, course = _KNOT_MPS * _number(said, "spd"), _number(said, "cog")
+    else:
+        knots, km_per_h, course = (_number(said, name) for name in ("sogn", "sogk", "cogt"))
+        speed = _KNOT_MPS * knots if isfinite(knots) else _KM_PER_H_MPS * km_per_h
+    if not isfinite(speed) or (speed > _SLOW_MPS and not isfinite(course)):
+        return rejected(f"{said.msgID}: no {'course' if isfinite(speed) else 'speed'}")
+    east = radians(course if isfinite(course) else 0.0)
+    return speed * sin(east), speed * cos(east)
+
+
+def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str) -> Any | Rejection:
+    """The fields of a sentence, as pynmeagps names them."""
+    found = _SENTENCE.search(text)
+    if not found:
+        return malformed(f"no sentence of NMEA 0183 with a checksum: {text.strip()[:20]!r}")
+    talker, kind = found[1], found[2]
+    if kind not in wanted and talker + kind not in wanted:
+        return ignored(f"{kind}: not among the sentences that are read ({', '.join(wanted)})")
+    if kind not in kinds:
+        return ignored(f"{kind}: read for a {what} are {', '.join(kinds)}")
+    try:
+        said = NMEAReader.parse(found[0], validate=VALCKSUM)
+    except _UNREADABLE as error:
+        return malformed(f"{kind}: {' '.join(str(error).split())}")
+    return said if said is not None else malformed(f"{kind}: it cannot be read")
+
+
+def _quality(said: Any) -> int:
+    """The best of a sentence's modes, one letter each constellation; old receivers have a status, or nothing."""
+    if getattr(said, "status", "A") != "A":
+        return 0
+    modes = [_QUALITIES[letter] for letter in str(_field(said, "posMode")) if letter in _QUALITIES]
+    return max((q for q in modes if q not in _NOT_MEASURED), default=modes[0] if modes else 1)
+
+
+def _field(said: Any, name: str) -> Any:
+    """A field; empty where the sentence ends before it."""
+    return getattr(said, name, "")
+
+
+def _number(said: Any, name: str) -> float:
+    value = _field(said, name)
+    return float(value) if isinstance(value, int | float) else nan
+
+
+def _east(said: Any, name: str) -> float:
+    """A deviation or variation, east positive; 0 where it is not told."""
+    size = _number(said, name)
+    return (-size if _field(said, f"{name}EW") == "W" else size) if isfinite(size) else 0.0

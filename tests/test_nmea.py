@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sentences of NMEA 0183 as a source of places, headings and velocities; messages of other packages that say the same."""
+
+import operator
+from functools import reduce
+from math import isnan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import get_types_from_msg
+
+from graphloc.app import smooth_recording
+from graphloc.config import load_config
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors import KINDS
+from graphloc.frontends import nmea
+from graphloc.frontends._rejections import Rejection
+from graphloc.frontends._source import _OTHER_TYPES
+from graphloc.frontends.bag import read_recording
+from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.ledger import Outcome
+from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
+from tests.bagfactory import Item, Messages, S, write_bag
+
+SENTENCE = "nmea_msgs/msg/Sentence"
+
+
+def sealed(body: str) -> str:
+    """With its checksum: the exclusive or of what is between $ and *."""
+    return f"${body}*{reduce(operator.xor, body.encode()):02X}"
+
+
+def test_a_place_is_above_the_ellipsoid() -> None:
+    """48 deg 07.038' N, 11 deg 31' W, 545.4 m above a geoid that lies 46.9 m above the ellipsoid."""
+    said = nmea.fix(sealed("GPGGA,123519,4807.038,N,01131.000,W,4,08,0.9,545.4,M,46.9,M,,") + "\r\n", ["GGA"])
+    assert isinstance(said, nmea.Fix)
+    assert said.latitude_deg == pytest.approx(48.0 + 7.038 / 60.0, abs=1e-9)
+    assert said.longitude_deg == pytest.approx(-11.0 - 31.0 / 60.0, abs=1e-9)
+    assert said.height_m == pytest.approx(592.3)
+    assert (said.quality, said.hdop) == (4, 0.9)
+    low = nmea.fix(sealed("GPGGA,123519,4807.038,N,01131.000,W,1,08,,545.4,M,,M,,"), ["GPGGA"])
+    assert isinstance(low, nmea.Fix)
+    assert isnan(low.height_m)  # the geoid is not told
+    assert isnan(low.hdop)
+
+
+@pytest.mark.parametrize(
+    ("body", "quality"),
+    [("GNGNS,122310.2,3722.425671,N,12258.856215,W,DN,14,0.9,1005.543,6.5,,", 2),
+     ("GNRMC,122310.2,A,3722.425671,N,12258.856215,W,5.0,90.0,230324,,,R", 4),
+     ("GPRMC,122310.2,A,3722.425671,N,12258.856215,W,5.0,90.0,230324,003.1,W", 1)],
+)  # fmt: skip
+def test_other_sentences_say_places_too(body: str, quality: int) -> None:
+    said = nmea.fix(sealed(body), nmea.PLACES)
+    assert isinstance(said, nmea.Fix)
+    assert said.quality == quality
+    assert said.latitude_deg == pytest.approx(37.0 + 22.425671 / 60.0, abs=1e-9)
+    assert isnan(said.height_m) == ("RMC" in body)
+
+
+@pytest.mark.parametrize(
+    ("body", "deg"),
+    [("HEHDT,123.456,T", 123.456), ("GPTHS,77.52,A", 77.52), ("HCHDM,238.5,M", 238.5),
+     ("HCHDG,101.1,2.0,E,7.1,W", 96.0), ("HCHDG,101.1,,,,", 101.1)],
+)  # fmt: skip
+def test_headings_are_clockwise_from_north(body: str, deg: float) -> None:
+    """HDG: what the needle says, deviation and variation east of it counted on."""
+    assert nmea.heading_deg(sealed(body), nmea.HEADINGS) == pytest.approx(deg)
+
+
+@pytest.mark.parametrize(
+    ("body", "east_mps", "north_mps"),
+    [("GPVTG,090.0,T,,M,010.0,N,018.5,K,A", 10.0 * 1852.0 / 3600.0, 0.0),
+     ("GPVTG,180.0,T,,M,,N,036.0,K", 0.0, -10.0),
+     ("GPVTG,,T,,M,0.01,N,0.02,K,D", 0.0, 0.01 * 1852.0 / 3600.0),  # at rest there is no course
+     ("GPRMC,122310.2,A,3722.425671,N,12258.856215,W,10.0,270.0,230324,,,A", -10.0 * 1852.0 / 3600.0, 0.0)],
+)  # fmt: skip
+def test_velocities_are_east_and_north(body: str, east_mps: float, north_mps: float) -> None:
+    assert nmea.velocity_mps(sealed(body), nmea.VELOCITIES) == pytest.approx((east_mps, north_mps), abs=6e-3)
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "outcome", "says"),
+    [
+        (nmea.fix, sealed("GPGGA,123519,,,,,0,00,,,M,,M,,"), Outcome.REJECTED, "no fix"),
+        (nmea.fix, sealed("GPGGA,123519,4807.0,N,01131.0,E,6,08,0.9,5.4,M,46.9,M,,"), Outcome.REJECTED, "dead reckoned"),
+        (nmea.fix, sealed("GPGGA,123519,4807.0,N,01131.0,E,1,08,0.9,5.4,M,46.9,M,,")[:-2] + "00", Outcome.MALFORMED, "checksum"),
+        (nmea.fix, sealed("GPGGA,123519,4807.0"), Outcome.MALFORMED, "GGA"),
+        (nmea.fix, "$GPGGA,123519,4807.0,N,01131.0,E", Outcome.MALFORMED, "checksum"),
+        (nmea.fix, "", Outcome.MALFORMED, "no sentence"),
+        (nmea.fix, "!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24", Outcome.MALFORMED, "no sentence"),
+        (nmea.fix, sealed("GPGSV,1,1,00"), Outcome.IGNORED, "GSV"),
+        (nmea.fix, sealed("GPVTG,090.0,T,,M,010.0,N,018.5,K,A"), Outcome.IGNORED, "VTG"),
+        (nmea.fix, sealed("GPRMC,122310.2,V,,,,,,,230324,,,N"), Outcome.REJECTED, "no fix"),
+        (nmea.heading_deg, sealed("GPTHS,77.52,S"), Outcome.REJECTED, "not measured"),
+        (nmea.heading_deg, sealed("HEHDT,,T"), Outcome.REJECTED, "no heading"),
+        (nmea.velocity_mps, sealed("GPVTG,,T,,M,010.0,N,018.5,K,A"), Outcome.REJECTED, "no course"),
+        (nmea.velocity_mps, sealed("GPVTG,,,,,,,,,N"), Outcome.REJECTED, "no fix"),
+    ],
+)  # fmt: skip
+def test_what_says_nothing_says_why(read: Any, text: str, outcome: Outcome, says: str) -> None:
+    said = read(text, (*nmea.PLACES, *nmea.HEADINGS, *nmea.VELOCITIES))
+    assert isinstance(said, Rejection)
+    assert said.outcome is outcome
+    assert says in said.reason
+
+
+def test_one_talker_is_not_another() -> None:
+    text = sealed("HEHDT,123.456,T")
+    assert nmea.heading_deg(text, ["HEHDT"]) == pytest.approx(123.456)
+    said = nmea.heading_deg(text, ["GPHDT"])
+    assert isinstance(said, Rejection)
+    assert said.outcome is Outcome.IGNORED
+
+
+def minutes(deg: float, sides: str, width: int) -> str:
+    side, deg = sides[deg < 0.0], abs(deg)
+    return f"{int(deg):0{width}d}{60.0 * (deg % 1.0):010.7f},{side}"
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    return simulate(Scenario(path="loops", duration_s=40.0, noise="clean", pose_hz=0.0, gnss_hz=5.0, compass_hz=5.0), 4)
+
+
+@pytest.fixture(scope="module")
+def bag(run: SimulatedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Receiver, gyro compass and fluxgate talk on one line (the velocity is that of the body), in sqlite3, which holds no definitions of messages."""
+    make, imu = Messages(2), run.recording.imu
+    assert imu is not None
+    make.store.register(get_types_from_msg("std_msgs/Header header\nstring sentence", SENTENCE))
+    items: list[Item] = [
+        ("/imu", int(n), make.imu(int(n), a, w)) for n, a, w in zip(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps, strict=True)
+    ]  # fmt: skip
+
+    def say(stamp_ns: int, body: str) -> None:
+        message = make.t[SENTENCE](header=make.header(stamp_ns, "gps"), sentence=sealed(body))
+        items.append(("/nmea_sentence", stamp_ns, message))
+
+    assert run.recording.truth is not None
+    for m in run.recording.measurements:
+        if isinstance(m, GnssPosition):
+            lat, lon, height = m.position
+            place = f"{minutes(lat, 'NS', 2)},{minutes(lon, 'EW', 3)}"
+            say(m.stamp_ns, f"GPGGA,120000.00,{place},1,09,0.9,{height - 30.0:.3f},M,30.0,M,,")
+            say(m.stamp_ns, "GPGSV,1,1,01,01,40,083,46")
+            east, north, _ = run.recording.truth.at(np.array([m.stamp_ns])).v_world_mps[0]  # type: ignore[index]
+            knots, course = np.hypot(east, north) * 3600.0 / 1852.0, np.degrees(np.arctan2(east, north)) % 360.0
+            say(m.stamp_ns, f"GPVTG,{course:.2f},T,,M,{knots:.3f},N,{knots * 1.852:.3f},K,A")
+        elif isinstance(m, CompassHeading):
+            say(m.stamp_ns, f"HEHDT,{(90.0 - np.degrees(m.yaw_rad)) % 360.0:.3f},T")
+            say(m.stamp_ns, f"HCHDM,{(78.0 - np.degrees(m.yaw_rad)) % 360.0:.1f},M")
+    return write_bag(tmp_path_factory.mktemp("nmea") / "run", make, sorted(items, key=lambda i: i[1]))
+
+
+def test_a_bag_of_sentences_is_read_as_drafted(run: SimulatedRun, bag: Path, tmp_path: Path) -> None:
+    """`inspect` finds receiver, compass and velocity on the line; so drafted, they are what the simulator's own messages say."""
+    drafted = tmp_path / "vessel.yaml"
+    drafted.write_text(draft_config(inspect_bag(bag)))
+    config = load_config(drafted, KINDS)
+    kinds = {name: (s.kind, getattr(s, "nmea", ()), s.enabled) for name, s in config.sensors.items()}
+    assert kinds["gnss"] == ("gnss", ("GPGGA",), True)
+    assert kinds["compass"] == ("compass", ("HEHDT",), True)
+    assert kinds["compass_2"] == ("compass", ("HCHDM",), False)  # two of one mast are not two witnesses
+    assert kinds["gnss_velocity"] == ("gnss_velocity", ("GPVTG",), True)
+    recording = read_recording(bag, config)
+    assert recording.message_count == len(recording.measurements) + len(recording.imu or ()) + sum(
+        r.count for r in recording.rows
+    )
+    assert all(r.outcome is Outcome.IGNORED for r in recording.rows)
+    for kind in (GnssPosition, CompassHeading):
+        ours, theirs = ([m for m in r.measurements if isinstance(m, kind)] for r in (recording, run.recording))
+        assert [m.stamp_ns for m in ours] == [m.stamp_ns for m in theirs]
+        for a, b in zip(ours, theirs, strict=True):
+            if isinstance(a, GnssPosition) and isinstance(b, GnssPosition):
+                assert a.position == pytest.approx(b.position, abs=1e-3)
+                assert a.position[:2] == pytest.approx(b.position[:2], abs=1e-8)
+            elif isinstance(a, CompassHeading) and isinstance(b, CompassHeading):
+                assert np.degrees(a.yaw_rad - b.yaw_rad) == pytest.approx(0.0, abs=1e-3)
+    topics = {"imu": "/imu", "gnss": "/nmea_sentence", "compass": "/nmea_sentence"}
+    known = {name: run.config.sensors[name].model_copy(update={"topic": topic}) for name, topic in topics.items()}
+    sigmas = np.sqrt(np.diagonal(next(m.cov_enu_m2 for m in run.recording.measurements if isinstance(m, GnssPosition))))
+    said = {"default_horizontal_sigma_m": float(sigmas[0]), "default_vertical_sigma_m": float(sigmas[2])}
+    known["gnss"] = known["gnss"].model_copy(update=said)
+    measured = run.config.model_copy(update={"sensors": {**run.config.sensors, **known}, "truth_topic": None})
+    tracks = [smooth_recording(r, measured).solution.trajectory for r in (read_recording(bag, measured), run.recording)]
+    assert np.abs(tracks[0].p_world_m - tracks[1].p_world_m).max() < 0.01
+    assert all(m.cov_m2ps2[2, 2] >= 1e6 for m in recording.measurements if isinstance(m, GnssVelocity))
+
+
+def test_messages_of_other_packages_say_the_same(tmp_path: Path) -> None:
+    """A GPSFix with WAAS, a velocity as a bare vector, a pose without a covariance."""
+    make, items = Messages(2), []
+    make.store.register(get_types_from_msg(_OTHER_TYPES["gps_msgs/msg/GPSFix"], "gps_msgs/msg/GPSFix"))
+    for k in range(40):
+        stamp = 1_700_000_000 * S + k * S // 5
+        none = {n: 0.0 for n in ("track", "speed", "climb", "pitch", "roll", "dip", "time", "gdop", "pdop", "hdop", "vdop", "tdop", "err", "err_horz", "err_vert", "err_track", "err_speed", "err_climb", "err_time", "err_pitch", "err_roll", "err_dip")}  # fmt: skip
+        lists = {n: np.zeros(0, dtype=np.int32) for n in ("satellite_used_prn", "satellite_visible_prn", "satellite_visible_z", "satellite_visible_azimuth", "satellite_visible_snr")}  # fmt: skip
+        status = make.t["gps_msgs/msg/GPSStatus"](header=make.header(stamp), satellites_used=0, satellites_visible=0, status=33, motion_source=0, orientation_source=0, position_source=0, **lists)  # fmt: skip
+        fix = make.t["gps_msgs/msg/GPSFix"](header=make.header(stamp), status=status, latitude=57.7, longitude=11.9 + 1e-5 * k, altitude=40.0, position_covariance=np.diag([0.25, 0.25, 1.0]).ravel(), position_covariance_type=2, **none)  # fmt: skip
+        items += [
+            ("/gps", stamp, fix),
+            ("/vel", stamp, make.t["geometry_msgs/msg/Vector3Stamped"](header=make.header(stamp), vector=make.vector((3.0, 0.0, 0.0)))),
+            ("/pose", stamp, make.t["geometry_msgs/msg/PoseStamped"](header=make.header(stamp), pose=make.pose(stamp, (3.0 * k, 1.0, 0.0)).pose.pose)),
+        ]  # fmt: skip
+    path = write_bag(tmp_path / "run", make, items)
+    config = tmp_path / "vessel.yaml"
+    config.write_text(
+        "vessel: other\ndatum: {latitude_deg: 57.7, longitude_deg: 11.9, height_m: 40.0}\nsensors:\n  gnss: {kind: gnss, topic: /gps, min_status: sbas}\n"
+        "  v: {kind: gnss_velocity, topic: /vel}\n  pose: {kind: pose, topic: /pose}\n"
+    )
+    found = read_recording(path, load_config(config, KINDS)).measurements
+    fixes = [m for m in found if isinstance(m, GnssPosition)]
+    assert len(fixes) == 40
+    assert np.diagonal(fixes[3].cov_enu_m2) == pytest.approx([0.25, 0.25, 1.0])
+    assert [m.v_world_mps[0] for m in found if isinstance(m, GnssVelocity)] == [3.0] * 40
+    assert [m.modes[0].value[0] for m in found if isinstance(m, PoseFix)] == [3.0 * k for k in range(40)]
+    seen = inspect_bag(path)
+    assert [g.statuses for g in seen.gnss] == [{"sbas": 40}]
+    assert [v.topic for v in seen.velocities] == ["/vel"]
+    assert [o.topic for o in seen.odometry] == ["/pose"]
