@@ -37,7 +37,14 @@ Status = Callable[[float, float, Estimate | None, str], None]
 
 
 _GUESS = "the heading is a guess"
-_WARNS = ("anew", "rebuilt", "interrupted", "no second sensor", _GUESS)  # of events, that a reader must see
+_WARNS = (
+    "anew",
+    "rebuilt",
+    "interrupted",
+    "no second sensor",
+    "the heading is off",
+    _GUESS,
+)  # of events, that a reader must see
 _BUSY = "not tried: the scan before it was still being matched"
 
 

@@ -393,9 +393,11 @@ def test_nothing_grows() -> None:
                 largest = early if t < 30.0 else late
                 for name, size in sizes(online).items():
                     largest[name] = max(size, largest.get(name, 0))
-    remembered = {
-        name for name in early if name.endswith(("scatter._pairs", "scatter._squares"))
-    }  # fill up to their limit
+    full = ("scatter._pairs", "scatter._squares", "_turned._steps", "_turned._fixes")
+    remembered = {name for name in early if name.endswith(full)}  # fill up to their limit
+    # 40 s: at the 10 Hz of states, at the 2 Hz of fixes
+    assert late["online._turned._steps"] <= 401
+    assert late["online._turned._fixes"] <= 83
     grown = {n: (early.get(n, 0), s) for n, s in late.items() if n not in remembered and s > 1.15 * early.get(n, 0) + 5}
     assert len(early) > 30
     assert grown == {}

@@ -38,6 +38,7 @@ from graphloc.online._odometry import Odometry
 from graphloc.online._recent import Recent
 from graphloc.online._snapshot import Snapshot, SnapshotFile
 from graphloc.online._start import Started, try_start
+from graphloc.online._turned import Turned
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
 from graphloc.solve._solution import alone
@@ -98,6 +99,7 @@ class OnlineSmoother:
         self._doubt = ""
         self._noise = ImuNoise(adapt=bool(imu) and imu[self._imu_name].adapt_noise)
         self._habit = Habit()
+        self._turned = Turned()
         self._intake = ImuIntake(self._gap_s, bool(imu) and imu[self._imu_name].gravity != "removed")
         self._resumable, trouble = self._snapshot.read(config.vessel, self._imu_name, self._datum)
         self._say(trouble)
@@ -250,6 +252,8 @@ class OnlineSmoother:
         try:
             self._step(self._lag)
             self._keep_anchor(self._lag)
+            if self._turned.look(self._lag):
+                self._say(self._turned.said)
             if self._lag.refused_s > _LOST_S:
                 return self._start_over(self._lag)
             if said := self._noise.contradicted(self._lag):
@@ -290,6 +294,7 @@ class OnlineSmoother:
                     continue
                 try:
                     lag.take(m)
+                    self._turned.note(m, lag)
                 except Exception as error:  # noqa: BLE001 - as in `_advance`; nothing of it is staged yet
                     self._book.drop(m, Outcome.REJECTED, f"it could not be used: {in_one_line(error)}")
             lag.judge()
@@ -345,7 +350,8 @@ class OnlineSmoother:
             self._read(lag)
             now = ahead(lag.problem, newest, odometry, stamp_ns)
         agreed = {**self._agreed_ns, **lag.agreed_ns}
-        return estimate_of(now, lag, odometry, agreed_ns=agreed, absolute=self._absolute, doubt=self._doubt)
+        doubt = "; ".join(why for why in (self._turned.said, self._doubt) if why)
+        return estimate_of(now, lag, odometry, agreed_ns=agreed, absolute=self._absolute, doubt=doubt)
 
     def window(self) -> Trajectory | None:
         """Return the states of the lag as they are now estimated, up to the newest IMU sample: a prior for front-ends.

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is the heading that of the motion? What the IMU feels, turned as the estimate says, must move the antenna as its fixes do.
+
+Over 40 s, with places as complex numbers, east + i north:
+
+    z(t) = a + b t + c t^2 + d t^3 + f x2(t) + g x3(t) + rho s(t)
+
+s: the specific force in axes that the gyroscope carries on, integrated twice, and the lever; x2, x3: exp(i yaw), integrated twice
+and three times. a, b: place and velocity; c, d: gravity, by a tilt that is off or moves; f, g: biases of the accelerometer and
+the gyroscope, about 0 and not the estimate's: with a wrong heading these are wrong, too. A heading that is
+right leaves rho = 1, one that is off by e leaves exp(-i e). So a compass that is turned, or in other axes, is told from a craft
+that goes astern, sideways or with a current: what it feels fits how it moves. A course tells neither.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from graphloc.frames import Array
+from graphloc.measurements import Measurement
+from graphloc.online._lag import Lag
+from graphloc.online._states import Newest
+from graphloc.solve._solution import world_covariance
+from graphloc.trajectory import bounds_95
+
+_WINDOW_S, _EVERY_S = 40.0, 5.0
+_LONGEST_STEP_S = 1.0  # of the IMU; a longer one is a hole: what it felt there is a guess
+_TURNED_RAD, _KNOWN_DEG = np.radians(20.0), 20.0  # off by more than this, where the 95 % bound is less
+_SIGMAS = 3.0  # and by more than so many of its own
+_SIZE, _SURE = (0.7, 1.4), 0.2  # |rho| is 1 unless fixes jump; its sigma
+_APART_S = 1.0  # what fixes err by stays the same for so long, at least
+_FEWEST = 15  # fixes; and how often in turn it must be wrong, or right, to be said
+_IN_A_ROW = 2
+_BIASES = np.array([0.1, 9.8 * 0.005])  # 1 sigma: m/s^2, and of the rate that tilts gravity, m/s^3
+
+
+class _Step(NamedTuple):
+    """What the IMU felt between two stamps, by its own axes at the first: velocity, place (without gravity), rotation."""
+
+    from_ns: int
+    until_ns: int
+    dv: Array
+    dp: Array
+    dR: Array
+
+
+class Turned:
+    """Watches fixes and steps of the IMU.
+
+    Attributes:
+        said: what is wrong with the heading, in plain words; empty where nothing is known to be.
+    """
+
+    def __init__(self) -> None:
+        self.said = ""
+        self._steps: deque[_Step] = deque()
+        self._fixes: deque[tuple[int, complex]] = deque()
+        self._sensor = ""
+        self._looked_ns, self._wrong, self._right = 0, 0, 0
+
+    def note(self, m: Measurement, lag: Lag) -> None:
+        """Take in a place of the first sensor whose places are never false altogether: of a GNSS receiver."""
+        stream = lag.problem.streams.get(m.sensor)
+        if (
+            stream is None
+            or not stream.row.absolute
+            or stream.row.false is not None
+            or self._sensor not in ("", m.sensor)
+        ):
+            return
+        p = stream.row.hint(m, 0.0, lag.problem.datum).p_world_m
+        if p is not None and np.isfinite(p[:2]).all():
+            self._sensor = m.sensor
+            self._fixes.append((m.stamp_ns, complex(p[0], p[1])))
+
+    def look(self, lag: Lag) -> bool:
+        """Carry the IMU on to the newest state; tell whether it is newly said that the heading is wrong."""
+        newest = lag.newest
+        self._carry_on(lag, newest)
+        if not self._steps or newest.stamp_ns - self._looked_ns < _EVERY_S * 1e9:
+            return False
+        self._looked_ns = newest.stamp_ns
+        off_rad = self._off_rad(lag, newest) if self._sensor in lag.problem.streams else None
+        if off_rad is None:
+            return False
+        known = (
+            float(
+                bounds_95(world_covariance(newest.pose_cov, newest.pose.rotation().matrix(), np.zeros(3))[None])[0, 2]
+            )
+            < _KNOWN_DEG
+        )
+        if known and abs(off_rad) > _TURNED_RAD:
+            self._wrong, self._right = self._wrong + 1, 0
+        else:
+            self._wrong, self._right = 0, self._right + 1
+        was = self.said
+        if self._wrong >= _IN_A_ROW:
+            self.said = was or (
+                f"the heading is off by about {np.degrees(off_rad):.0f} deg: so the IMU's accelerations and the fixes of {self._sensor} "
+                "have it; check the compass (convention, mount), and the IMU's axes"
+            )
+        elif self._right >= _IN_A_ROW:
+            self.said = ""
+        return self.said != "" and not was
+
+    def _carry_on(self, lag: Lag, newest: Newest) -> None:
+        """Take in the IMU's step since the last; begin anew after a hole, or a clock that was set back."""
+        until_ns = newest.stamp_ns
+        from_ns = self._steps[-1].until_ns if self._steps else lag.first_ns
+        if until_ns == from_ns:
+            return
+        if not 0 < until_ns - from_ns < _LONGEST_STEP_S * 1e9:
+            self._steps.clear()
+            self._fixes.clear()
+            from_ns = max(lag.first_ns, until_ns - round(_LONGEST_STEP_S * 1e8))
+            if from_ns >= until_ns:
+                return
+        pim = lag.problem.links.integrate(from_ns, until_ns, gtsam.imuBias.ConstantBias())
+        self._steps.append(
+            _Step(from_ns, until_ns, np.array(pim.deltaVij()), np.array(pim.deltaPij()), pim.deltaRij().matrix())
+        )
+        begin_ns = until_ns - round(_WINDOW_S * 1e9)
+        while self._steps[0].from_ns < begin_ns:
+            self._steps.popleft()
+        while self._fixes and self._fixes[0][0] < begin_ns:
+            self._fixes.popleft()
+
+    def _off_rad(self, lag: Lag, newest: Newest) -> float | None:
+        """How far the heading is off by the motion, 0 where that may be its noise; None where it does not tell."""
+        at_s, felt = self._felt(lag, newest)
+        fixes = [(stamp, z) for stamp, z in self._fixes if self._steps[0].until_ns <= stamp <= newest.stamp_ns]
+        if at_s[-1] - at_s[0] < 0.9 * _WINDOW_S or len(fixes) < _FEWEST:
+            return None
+        t = (np.array([stamp for stamp, _ in fixes]) - newest.stamp_ns) * 1e-9
+        z = np.array([place for _, place in fixes])
+        rows = [np.interp(t, at_s, row.real) + 1j * np.interp(t, at_s, row.imag) for row in felt]
+        basis, _ = np.linalg.qr(np.vander(1.0 + 2.0 * t / _WINDOW_S, 4))
+        free = np.column_stack([z, *rows])
+        free = free - basis @ (basis.T @ free)
+        moved, terms = free[:, 0], free[:, 1:]
+        left = moved - terms @ np.linalg.lstsq(terms, moved, rcond=None)[0]
+        variance = float(np.mean(np.abs(left) ** 2)) * len(t) / (_WINDOW_S / _APART_S)  # of a fix, as all go together
+        information = terms.conj().T @ terms / variance + np.diag([0.0, *(1.0 / _BIASES**2)])
+        rho = complex(np.linalg.solve(information, terms.conj().T @ moved / variance)[0])
+        sigma = float(np.sqrt(np.linalg.inv(information)[0, 0].real))
+        if not _SIZE[0] < abs(rho) < _SIZE[1] or sigma > _SURE:
+            return None
+        off_rad = -float(np.angle(rho))
+        return off_rad if abs(off_rad) > _SIGMAS * sigma else 0.0
+
+    def _felt(self, lag: Lag, newest: Newest) -> tuple[Array, Array]:
+        """Times (N,), s to the newest state; s, and what e^(i psi) makes in two and in three integrals (3, N), in world."""
+        stream = lag.problem.streams[self._sensor]
+        lever = np.asarray(stream.mount.translation()) - lag.problem.t_body_imu_m
+        R, v, p, places, ahead = np.eye(3), np.zeros(3), np.zeros(3), [], []
+        for step in self._steps:
+            dt_s = (step.until_ns - step.from_ns) * 1e-9
+            p, v = p + v * dt_s + R @ step.dp, v + R @ step.dv
+            R = R @ step.dR
+            places.append(p + R @ lever)
+            ahead.append(R[:, 0] * dt_s)
+        in_world = newest.pose.rotation().matrix() @ R.T
+        place, x = (np.array(of) @ in_world[:2].T @ np.array([1.0, 1j]) for of in (places, ahead))
+        dt = np.array([step.until_ns - step.from_ns for step in self._steps]) * 1e-9
+        twice = np.cumsum(np.cumsum(x) * dt)
+        at_s = (np.array([step.until_ns for step in self._steps]) - newest.stamp_ns) * 1e-9
+        return at_s, np.array([place, twice, np.cumsum(twice * dt)])

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A heading that the motion contradicts is said under way; a craft that goes astern is not."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphloc.config import TimelineConfig, VesselConfig
+from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
+from graphloc.frames import wrap_angle
+from graphloc.measurements import CompassHeading
+from graphloc.recording import Recording
+from graphloc.replay import Replayed, replay
+from graphloc.solution import Health
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    scenario = replace(bl_scenario(1, "clean"), duration_s=58.0, pose_hz=0.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
+    return simulate(scenario, 4)
+
+
+def replayed(recording: Recording, config: VesselConfig) -> Replayed:
+    return replay(recording, config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)}))
+
+
+def read_as(recording: Recording, sense: float, off_deg: float) -> Recording:
+    """A compass whose yaw is counted the other way (-1), from elsewhere."""
+    turned = tuple(
+        replace(m, yaw_rad=float(wrap_angle(sense * m.yaw_rad + np.radians(off_deg))))
+        if isinstance(m, CompassHeading)
+        else m
+        for m in recording.measurements
+    )
+    return replace(recording, measurements=turned)
+
+
+def astern(config: VesselConfig) -> VesselConfig:
+    """The same craft, its bow taken for its stern: it goes astern all the way, and all of it agrees."""
+    sensors: dict[str, Any] = dict(config.sensors)
+    for name in ("imu", "gnss", "compass"):
+        (x, y, z), (roll, pitch, yaw) = sensors[name].mount.xyz_m, sensors[name].mount.rpy_deg
+        mount = sensors[name].mount.model_copy(update={"xyz_m": (-x, -y, z), "rpy_deg": (roll, pitch, yaw + 180.0)})
+        sensors[name] = sensors[name].model_copy(update={"mount": mount})
+    return config.model_copy(update={"sensors": sensors})
+
+
+@pytest.mark.parametrize(("sense", "off_deg"), [(1.0, 90.0), (-1.0, 90.0)])
+def test_a_compass_in_other_axes_is_said_under_way(sense: float, off_deg: float, run: SimulatedRun) -> None:
+    """By how much it is off is told as well, as the truth has it."""
+    found = replayed(read_as(run.recording, sense, off_deg), run.config)
+    (event,) = (line for line in found.solution.stats.events if "the heading is off by about" in line)
+    said = [e for e in found.estimates if "the heading is off by about" in e.reason]
+    assert said
+    assert all(e.health is not Health.GOOD for e in said)
+    yaw = np.arctan2(said[0].R_world_body[1, 0], said[0].R_world_body[0, 0])
+    off = wrap_angle(yaw - run.truth.at(np.array([said[0].stamp_ns])).yaw_rad[0])
+    told = float(event.split("off by about ")[1].split(" deg")[0])
+    assert wrap_angle(np.radians(told) - off) == pytest.approx(0.0, abs=np.radians(20.0))
+    assert any("the heading is off by about" in line for line in found.solution.stats.warnings)
+
+
+def test_nothing_is_said_of_a_craft_that_goes_astern(run: SimulatedRun) -> None:
+    found = replayed(run.recording, astern(run.config))
+    track = found.solution.trajectory
+    turned = wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad - np.pi)
+    assert np.median(np.abs(turned)) < np.radians(3.0)
+    assert not any("heading is off" in line for line in found.solution.stats.events)
