@@ -43,6 +43,7 @@ _WARNS = (
     "interrupted",
     "no second sensor",
     "the heading is off",
+    "it hangs",
     _GUESS,
 )  # of events, that a reader must see
 _BUSY = "not tried: the scan before it was still being matched"

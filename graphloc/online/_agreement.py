@@ -37,6 +37,10 @@ class Agreement:
         elif len(self._refused) < _FEW:
             self._refused.append(m.stamp_ns)
 
+    def forget_refused(self) -> None:
+        """Of what disagreed, a receiver is known to be wrong: nothing says any more that it is elsewhere."""
+        self._refused = []
+
     def marked(self) -> tuple[dict[str, int], list[int]]:
         """Return what is remembered, for `back_to`."""
         return dict(self.agreed_ns), list(self._refused)

@@ -16,11 +16,13 @@ import numpy as np
 
 from graphloc.config import KernelConfig
 from graphloc.errors import SolveError
+from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
 from graphloc.online._entries import Entries, Entry
 from graphloc.online._live import LiveProblem, LiveStream
+from graphloc.online._parting import PARTING_S
 from graphloc.online._states import States
 from graphloc.online._window import Window
 from graphloc.solve._best_chain import best_chain
@@ -68,7 +70,9 @@ class Judge:
         if (away_m := min(r.size_m or 0.0 for r in residuals)) > _FAR_M:
             self._agreement.note(stream, m, None)
             raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
-        if stream.row.false is None:
+        if self._parts(stream, m, at, residuals[0]):
+            self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
+        elif stream.row.false is None:
             verdict, opened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
             # Where its kernel was opened it was let in; whether it agrees is seen when it is asked again.
             if not opened or verdict.weight < AGREES:
@@ -79,6 +83,32 @@ class Judge:
         else:
             self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
             self._rounds[stream.name] = _ROUNDS
+
+    def _parts(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> bool:
+        """Whether a place comes from a receiver that hangs; then what it said while that was not seen goes, too."""
+        if stream.row.false is not None or not stream.row.absolute:
+            return False
+        told_m = stream.row.hint(m, 0.0, self._problem.datum).p_world_m[:2]
+        if not np.isfinite(told_m).all():
+            return False
+        newest, parting, parted = self._states.newest, stream.parting, stream.parting.parted
+        at_s = self._problem.timeline.seconds(m.stamp_ns)
+        parting.note(
+            at_s,
+            told_m,
+            np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2],
+            _largest(residual.cov),
+            newest.velocity[:2],
+            _largest(newest.velocity_cov),
+        )
+        if parting.parted and not parted:
+            self._agreement.forget_refused()
+            for entry in self._entries.of(stream):
+                if m.stamp_ns - entry.measurement.stamp_ns < PARTING_S * 1e9:
+                    self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0))
+        if parting.for_long(at_s):
+            self._agreement.note(stream, m, None)
+        return parting.parted
 
     def judge(self) -> None:
         """Stage what is to be decided, anew or again."""
@@ -122,7 +152,7 @@ class Judge:
         heapq.heappush(self._again, (due_s, next(self._turn), entry))
 
     def _ask_again(self, entry: Entry, now_s: float) -> None:
-        if not self._entries.reachable(entry):
+        if not self._entries.reachable(entry) or entry.verdict.decision is None:
             return
         at, residuals = self._entries.residuals_at(entry.stream, entry.index)
         verdict, opened = self._by_kernel(entry.stream, entry.index, at, residuals[0], fresh=False)
@@ -234,3 +264,8 @@ class Judge:
         """Minus the log of the probability of the window, all hypotheses of a stream summed over."""
         evidence = log_evidence_of(stream, [e.index for e in own], self._met(own)[1])
         return self._window.error([e.held for e in own if e.held is not None]) - evidence
+
+
+def _largest(cov: Array) -> float:
+    """The largest sigma of the first two axes."""
+    return float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))

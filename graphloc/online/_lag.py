@@ -145,6 +145,11 @@ class Lag:
         """For how long absolute sensors have said, more than a few times, that it is elsewhere, and none that it is here."""
         return self._agreement.refused_s(self.newest.stamp_ns)
 
+    @property
+    def parted(self) -> set[str]:
+        """Receivers that hang (see `_parting.py`)."""
+        return {name for name, stream in self.problem.streams.items() if stream.parting.parted}
+
     def gone(self) -> list[LedgerRow]:
         """Return rows of measurements that have left since this was last asked."""
         return self._entries.gone()

@@ -19,6 +19,7 @@ from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._habit import Habit
+from graphloc.online._parting import Parting
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
@@ -178,6 +179,7 @@ class LiveStream:
     carry: Tape[Carry | None] = field(default_factory=Tape)
     gyro_radps: Tape[Array] = field(default_factory=Tape)
     scatter: Scatter = field(default_factory=Scatter)
+    parting: Parting = field(default_factory=Parting)
 
 
 @dataclass(slots=True, eq=False)

@@ -100,6 +100,7 @@ class OnlineSmoother:
         self._noise = ImuNoise(adapt=bool(imu) and imu[self._imu_name].adapt_noise)
         self._habit = Habit()
         self._turned = Turned()
+        self._parted: set[str] = set()
         self._intake = ImuIntake(self._gap_s, bool(imu) and imu[self._imu_name].gravity != "removed")
         self._resumable, trouble = self._snapshot.read(config.vessel, self._imu_name, self._datum)
         self._say(trouble)
@@ -254,6 +255,7 @@ class OnlineSmoother:
             self._keep_anchor(self._lag)
             if self._turned.look(self._lag):
                 self._say(self._turned.said)
+            self._say_parted(self._lag.parted)
             if self._lag.refused_s > _LOST_S:
                 return self._start_over(self._lag)
             if said := self._noise.contradicted(self._lag):
@@ -263,6 +265,13 @@ class OnlineSmoother:
         except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
             self._rebuild(error)
         return self._try_estimate()
+
+    def _say_parted(self, parted: set[str]) -> None:
+        for name in sorted(parted ^ self._parted):
+            again = "moves with the vessel again: its places are believed"
+            hangs = "says the same place while the vessel moves: it hangs; its places are not believed"
+            self._say(f"{name}: {hangs if name in parted else again}")
+        self._parted = parted
 
     def _try_estimate(self, stamp_ns: int | None = None) -> Estimate | None:
         """Return an estimate if there is one to be had."""

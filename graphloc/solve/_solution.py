@@ -258,6 +258,8 @@ def row_of(stream: Judged, m: Measurement, topic: str, verdict: Verdict) -> Ledg
     nis, dof = residual.nis(), len(residual.raw)
     if weight >= AGREES:
         outcome, reason = Outcome.USED, ""
+    elif stream.row.false is None and verdict.decision is None:
+        outcome, reason = Outcome.REJECTED, "its receiver hangs: it says the same place while the vessel moves"
     elif stream.row.false is not None and weight < _FALSE:
         outcome, reason = Outcome.REJECTED, "judged false: no mode agrees with the rest"
     else:

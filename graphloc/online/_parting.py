@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A receiver that hangs: it says the same place while the vessel goes on.
+
+What its places are off by then grows as fast as the vessel goes, second after second. Multipath drifts by decimetres a second,
+and jumps; so no such error is right, but as a chain of jumps it is cheaper than it should be: in a window of seconds the estimate
+would sooner or later follow, by a tilt and a bias that were never there.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from graphloc.frames import Array
+
+PARTING_S, _FEWEST = 4.0, 4  # fixes, over so long at least
+_PARTS_MPS = 0.7  # no multipath drifts so fast
+_SHARE = 0.5  # of the vessel's speed: a late stamp parts in a turn, too, by less
+_SIGMAS = 4.0
+_STILL = (
+    0.3  # of what it parts by, it moves itself: a receiver that moves otherwise may be right, and the estimate wrong
+)
+_LONGEST_S = 30.0  # that it is passed over in silence
+_ALONG_S = 10.0  # it has moved along for: before, it may be the estimate that starts wrong
+_LINE = 0.15  # of the way that they part by: fixes that jump lie farther off a line
+
+
+class Parting:
+    """Of one receiver.
+
+    Attributes:
+        parted: it stands while the vessel goes; its places are not believed until it moves along again.
+    """
+
+    def __init__(self) -> None:
+        self.parted = False
+        self._seen: deque[tuple[float, Array, Array]] = deque()
+        self._parted_s = 0.0
+        self._along_s: float | None = None  # since when it has moved along
+
+    def for_long(self, at_s: float) -> bool:
+        """Whether it has parted for so long that the estimate may be wrong instead."""
+        return self.parted and at_s - self._parted_s > _LONGEST_S
+
+    def note(
+        self, at_s: float, told_m: Array, estimated_m: Array, sigma_m: float, v_mps: Array, sigma_mps: float
+    ) -> None:
+        """Take in a fix; one that is late is passed over.
+
+        Args:
+            told_m, estimated_m: (2,) place of the antenna. sigma_m: of the place told. v_mps: (2,) velocity of the vessel.
+            sigma_mps: of that velocity.
+        """
+        if self._seen and at_s <= self._seen[-1][0]:
+            return
+        self._seen.append((at_s, np.array(told_m), np.array(told_m - estimated_m)))
+        while at_s - self._seen[0][0] > 1.25 * PARTING_S:
+            self._seen.popleft()
+        t = np.array([s for s, _, _ in self._seen])
+        if len(t) < _FEWEST or t[-1] - t[0] < PARTING_S:
+            return
+        off = np.array([o for _, _, o in self._seen])
+        dt = t - t.mean()
+        slope = dt @ (off - off.mean(axis=0)) / (dt @ dt)
+        left = off - off.mean(axis=0) - np.outer(dt, slope)
+        rms, speed = float(np.sqrt((left**2).sum(axis=1).mean())), float(np.linalg.norm(slope))
+        least = max(_PARTS_MPS, _SHARE * float(np.linalg.norm(v_mps)), _SIGMAS * sigma_mps)
+        if self.parted:  # whatever it jumps by: back to the vessel, too, it has first to move along
+            self.parted = speed > 0.5 * least
+        else:
+            least = max(least, _SIGMAS * float(np.hypot(max(sigma_m, rms) / np.sqrt(dt @ dt), sigma_mps)))
+            told = np.array([place for _, place, _ in self._seen])
+            moves = float(np.linalg.norm(dt @ (told - told.mean(axis=0)) / (dt @ dt)))
+            parts = moves < _STILL * speed and speed > least and rms < _LINE * speed * (t[-1] - t[0])
+            self._along_s = at_s if self._along_s is None and speed < 0.5 * least else self._along_s
+            self.parted = parts and self._along_s is not None and at_s - self._along_s > _ALONG_S
+            if self.parted:  # without it the estimate is another one
+                self._parted_s = at_s
+                self._seen.clear()

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A receiver that hangs under way is told from one that drifts, jumps, is noisy or late."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphloc.eval.simulate import Scenario, simulate
+from graphloc.frames import Array, Datum, Geodetic
+from graphloc.ledger import Outcome
+from graphloc.measurements import GnssPosition, world_from_fixes
+from graphloc.online._parting import PARTING_S, Parting
+from graphloc.replay import replay
+
+Off = Callable[[float, Array], Array]
+
+
+def parted(off_m: Off, v_mps: Array, *, hz: float = 5.0, sigma_m: float = 0.2, until_s: float = 60.0, sigma_mps: float = 0.1) -> list[float]:  # fmt: skip
+    """When a receiver parts that is off by `off_m` of the time and of a normal (2,)."""
+    rng, parting, when = np.random.default_rng(1), Parting(), []
+    for k in range(round(until_s * hz)):
+        there_m = v_mps * k / hz
+        parting.note(k / hz, there_m + off_m(k / hz, rng.standard_normal(2)), there_m, sigma_m, v_mps, sigma_mps)
+        when += [k / hz] if parting.parted else []
+    return when
+
+
+V = np.array([2.0, 1.0])
+
+
+@pytest.mark.parametrize("hz", [1.0, 5.0, 20.0])
+def test_one_that_hangs_parts_as_fast_as_the_vessel_goes_until_it_moves_along(hz: float) -> None:
+    """It says the place of 20 s until 40 s, then the right one, where it is off by a jump."""
+    when = parted(lambda t, n: 0.2 * n - V * (t - 20.0) * (20.0 < t < 40.0), V, hz=hz)
+    assert 20.0 < when[0] < 20.0 + 1.5 * PARTING_S
+    assert 38.9 < when[-1] < 40.0 + 2.0 * PARTING_S
+    assert len(when) > 0.9 * hz * (when[-1] - when[0])
+
+
+@pytest.mark.parametrize(
+    ("off_m", "hz", "sigma_m"),
+    [
+        (lambda t, n: 1.5 * n, 1.0, 1.5),
+        (lambda t, n: 1.5 * n, 10.0, 0.02),  # noisier than it claims
+        (lambda t, n: 0.2 * n + np.array([0.3 * t, 0.0]), 5.0, 0.2),  # multipath that drifts
+        (lambda t, n: 0.2 * n + 10.0 * np.array([t > 20.0, t > 40.0]), 5.0, 0.2),  # and that jumps
+        (lambda t, n: 0.05 * n + 0.5 * 2.2 * np.array([np.cos(0.3 * t), np.sin(0.3 * t)]), 5.0, 0.05),  # 0.5 s late, in a turn
+    ],
+)  # fmt: skip
+def test_what_drifts_jumps_is_noisy_or_late_does_not_part(off_m: Off, hz: float, sigma_m: float) -> None:
+    assert parted(off_m, V, hz=hz, sigma_m=sigma_m, until_s=200.0) == []
+
+
+def test_a_velocity_that_is_hardly_known_tells_nothing() -> None:
+    """After an outage it is the estimate that goes astray, and the receiver that is right."""
+    assert parted(lambda t, n: 0.2 * n - V * max(t - 20.0, 0.0), V, sigma_mps=1.0) == []
+
+
+def test_one_that_moves_otherwise_may_be_right() -> None:
+    """The estimate went astray, and says that the vessel stands: the receiver says that it goes on."""
+    assert parted(lambda t, n: 0.2 * n + V * max(t - 20.0, 0.0), 0.0 * V) == []
+
+
+def test_at_the_start_it_may_be_the_estimate_that_is_wrong() -> None:
+    assert parted(lambda t, n: 0.2 * n - V * t * (t < 8.0), V, until_s=16.0) == []
+
+
+def test_online_a_receiver_that_hangs_is_not_followed() -> None:
+    """Beside matches, 40 % of them false. Followed, it would be off by 30 m and more, and call that good."""
+    run = simulate(Scenario(path="loops", duration_s=45.0, noise="drift"), 1)
+    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    begin_ns, end_ns = fixes[0].stamp_ns + 18 * 10**9, fixes[0].stamp_ns + 33 * 10**9
+    stuck = next(m for m in fixes if m.stamp_ns >= begin_ns)
+    datum, rng = Datum(stuck.position), np.random.default_rng(5)
+
+    def heard(m: GnssPosition) -> GnssPosition:
+        if not begin_ns <= m.stamp_ns < end_ns:
+            return m
+        place = world_from_fixes([stuck], datum) + 0.03 * rng.standard_normal((1, 3))
+        return replace(m, position=Geodetic(*datum.geodetic_from_enu(place)[0]))
+
+    said = tuple(heard(m) if isinstance(m, GnssPosition) else m for m in run.recording.measurements)
+    found = replay(replace(run.recording, measurements=said), run.config).solution
+    track = found.trajectory
+    off_m = (track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[:, :2]
+    seen = ~((track.stamps_ns > begin_ns) & (track.stamps_ns < begin_ns + 6 * 10**9))
+    assert np.hypot(*off_m[seen].T).max() < 1.0
+    rows = [row for row in found.ledger if row.sensor == "gnss" and begin_ns + 6 * 10**9 < row.stamp_ns < end_ns]
+    assert {row.outcome for row in rows} == {Outcome.REJECTED}
+    assert {row.reason for row in rows} == {"its receiver hangs: it says the same place while the vessel moves"}
+    late = [row for row in found.ledger if row.sensor == "gnss" and row.stamp_ns > end_ns + 8 * 10**9]
+    assert not any("hangs" in row.reason for row in late)
+    assert any("gnss: says the same place while" in line for line in found.stats.events)
+    assert any("gnss: moves with the vessel again" in line for line in found.stats.events)
