@@ -20,6 +20,7 @@ PLACES = ("GGA", "GNS", "RMC")
 HEADINGS = ("HDT", "THS", "HDG", "HDM")
 VELOCITIES = ("VTG", "RMC")
 _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
+_FOREIGN = re.compile(r"!|\$P")
 _UNREADABLE = (
     exceptions.NMEAParseError, exceptions.NMEAMessageError, exceptions.NMEATypeError, exceptions.NMEAStreamError,
     ValueError, TypeError, KeyError, IndexError, AttributeError,
@@ -107,6 +108,8 @@ def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Re
 def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str) -> Any | Rejection:
     """The fields of the first sentence that is wanted, as pynmeagps names them."""
     sentences = list(_SENTENCE.finditer(text))
+    if not sentences and (foreign := _FOREIGN.search(text)):
+        return ignored(f"{foreign[0]}...: AIS or a maker's own sentence: not read")
     if not sentences:
         return malformed(f"no sentence of NMEA 0183 with a checksum: {text.strip()[:20]!r}")
     found = next((f for f in sentences if f[2] in wanted or f[1] + f[2] in wanted), sentences[0])
