@@ -169,8 +169,9 @@ def motion_of(odometry: list[Stream], twists: list[Stream], fixes: list[Stream])
                 return Motion(stream.topic, int(stream.stamps_ns[keep[0]]), t, speed)
     for stream in twists:
         keep = sane(stream)
+        keep = keep[np.isfinite(stream.rows[keep, :2]).all(axis=1)] if len(keep) else keep  # NaN: before the first fix
         speed = np.hypot(stream.rows[keep, 0], stream.rows[keep, 1]) if len(keep) > 20 else np.zeros(0)
-        if len(speed) and np.isfinite(speed).all() and float(np.percentile(speed, 90)) > 0.5:
+        if len(speed) and float(np.percentile(speed, 90)) > 0.5:
             t = (stream.stamps_ns[keep] - stream.stamps_ns[keep[0]]) / NS_PER_S
             return Motion(stream.topic, int(stream.stamps_ns[keep[0]]), t, speed)
     for stream in fixes:

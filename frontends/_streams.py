@@ -166,34 +166,34 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
         msg: Any = None
         try:
             msg = bag.decode(raw)
-            stream, row = _sentence(raw.topic, msg, streams) if raw.topic in mixed else _plain(raw, msg, streams)
+            said = _sentences(raw.topic, msg, streams) if raw.topic in mixed else _plain(raw, msg, streams)
         except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything; counted
-            stream, row = streams.get(raw.topic), None
+            said = [(streams[raw.topic], None)] if raw.topic in streams else []
         if raw.topic == TF_STATIC:
             tree.take(raw.msgtype, msg)
-        if stream is None:
-            continue
-        if row is None:
-            stream.undecodable += 1
-            continue
-        stamp_ns = header_stamp_ns(msg)
-        if stamp_ns is None:
-            stream.no_stamp += 1
-            continue
-        stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
-        stream.add(stamp_ns, raw.log_ns, row, raw.file)
+        for stream, row in said:
+            if row is None:
+                stream.undecodable += 1
+                continue
+            stamp_ns = header_stamp_ns(msg)
+            if stamp_ns is None:
+                stream.no_stamp += 1
+                continue
+            stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
+            stream.add(stamp_ns, raw.log_ns, row, raw.file)
     return list(streams.values()), tree
 
 
-def _plain(raw: RawMessage, msg: Any, streams: dict[str, Stream]) -> tuple[Stream | None, Row | None]:
-    return streams.get(raw.topic), ROWS[raw.msgtype](msg) if raw.topic in streams else None
+def _plain(raw: RawMessage, msg: Any, streams: dict[str, Stream]) -> list[tuple[Stream, Row | None]]:
+    return [(streams[raw.topic], ROWS[raw.msgtype](msg))] if raw.topic in streams else []
 
 
-def _sentence(topic: str, msg: Any, streams: dict[str, Stream]) -> tuple[Stream | None, Row | None]:
-    """The stream of a sentence, made where it is the first one."""
-    talker, kind = nmea.identity(msg.sentence)
-    if kind not in SENTENCES:
-        return None, None
-    msgtype, row_of = SENTENCES[kind]
-    name = f"{topic} {talker}{kind}"
-    return streams.setdefault(name, Stream(name, msgtype)), row_of(msg.sentence, talker + kind)
+def _sentences(topic: str, msg: Any, streams: dict[str, Stream]) -> list[tuple[Stream, Row | None]]:
+    """The stream of each sentence, made where it is the first one."""
+    said: list[tuple[Stream, Row | None]] = []
+    for talker, kind in nmea.identities(msg.sentence):
+        if kind in SENTENCES:
+            msgtype, row_of = SENTENCES[kind]
+            name = f"{topic} {talker}{kind}"
+            said.append((streams.setdefault(name, Stream(name, msgtype)), row_of(msg.sentence, talker + kind)))
+    return said

@@ -20,6 +20,7 @@ PLACES = ("GGA", "GNS", "RMC")
 HEADINGS = ("HDT", "THS", "HDG", "HDM")
 VELOCITIES = ("VTG", "RMC")
 _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
+_FOREIGN = re.compile(r"!|\$P")
 _UNREADABLE = (
     exceptions.NMEAParseError, exceptions.NMEAMessageError, exceptions.NMEATypeError, exceptions.NMEAStreamError,
     ValueError, TypeError, KeyError, IndexError, AttributeError,
@@ -42,10 +43,9 @@ class Fix:
     hdop: float
 
 
-def identity(text: str) -> tuple[str, str]:
-    """Return talker and sentence ('GP', 'GGA'); empty where it is none."""
-    found = _SENTENCE.search(text)
-    return (found[1], found[2]) if found else ("", "")
+def identities(text: str) -> list[tuple[str, str]]:
+    """Return talker and sentence ('GP', 'GGA') of each sentence, once; some drivers put a whole burst into a message."""
+    return list(dict.fromkeys((found[1], found[2]) for found in _SENTENCE.finditer(text)))
 
 
 def fix(text: str, wanted: Collection[str]) -> Fix | Rejection:
@@ -62,6 +62,8 @@ def fix(text: str, wanted: Collection[str]) -> Fix | Rejection:
         return malformed(f"{said.msgID}: no quality: it ends early")
     if quality in _NOT_MEASURED:
         return rejected(f"{said.msgID}: {_NOT_MEASURED[quality]}")
+    if _field(said, "NS") not in ("N", "S") or _field(said, "EW") not in ("E", "W"):
+        return malformed(f"{said.msgID}: no hemisphere (N or S, E or W)")
     # Heights in NMEA are above the geoid; without the separation the ellipsoid's is not known.
     return Fix(
         latitude_deg=_number(said, "lat"),
@@ -104,10 +106,13 @@ def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Re
 
 
 def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str) -> Any | Rejection:
-    """The fields of a sentence, as pynmeagps names them."""
-    found = _SENTENCE.search(text)
-    if not found:
+    """The fields of the first sentence that is wanted, as pynmeagps names them."""
+    sentences = list(_SENTENCE.finditer(text))
+    if not sentences and (foreign := _FOREIGN.search(text)):
+        return ignored(f"{foreign[0]}...: AIS or a maker's own sentence: not read")
+    if not sentences:
         return malformed(f"no sentence of NMEA 0183 with a checksum: {text.strip()[:20]!r}")
+    found = next((f for f in sentences if f[2] in wanted or f[1] + f[2] in wanted), sentences[0])
     talker, kind = found[1], found[2]
     if kind not in wanted and talker + kind not in wanted:
         return ignored(f"{kind}: not among the sentences that are read ({', '.join(wanted)})")

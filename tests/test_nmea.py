@@ -16,9 +16,12 @@ from graphloc.config import load_config
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
 from graphloc.frontends import nmea
+from graphloc.frontends._assess import motion_of
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._source import _OTHER_TYPES
+from graphloc.frontends._streams import Stream
 from graphloc.frontends.bag import read_recording
+from graphloc.frontends.decode import TWIST
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
@@ -89,8 +92,10 @@ def test_velocities_are_east_and_north(body: str, east_mps: float, north_mps: fl
         (nmea.fix, sealed("GPGGA,123519,4807.0,N,01131.0,E,1,08,0.9,5.4,M,46.9,M,,")[:-2] + "00", Outcome.MALFORMED, "checksum"),
         (nmea.fix, sealed("GPGGA,123519,4807.0"), Outcome.MALFORMED, "GGA"),
         (nmea.fix, "$GPGGA,123519,4807.0,N,01131.0,E", Outcome.MALFORMED, "checksum"),
+        (nmea.fix, sealed("GPGGA,123519,4807.0,N,01131.0,,1,08,0.9,5.4,M,46.9,M,,"), Outcome.MALFORMED, "hemisphere"),
         (nmea.fix, "", Outcome.MALFORMED, "no sentence"),
-        (nmea.fix, "!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24", Outcome.MALFORMED, "no sentence"),
+        (nmea.fix, "!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24", Outcome.IGNORED, "AIS"),
+        (nmea.fix, sealed("PUBX,00,1"), Outcome.IGNORED, "maker"),
         (nmea.fix, sealed("GPGSV,1,1,00"), Outcome.IGNORED, "GSV"),
         (nmea.fix, sealed("GPVTG,090.0,T,,M,010.0,N,018.5,K,A"), Outcome.IGNORED, "VTG"),
         (nmea.fix, sealed("GPRMC,122310.2,V,,,,,,,230324,,,N"), Outcome.REJECTED, "no fix"),
@@ -113,6 +118,26 @@ def test_one_talker_is_not_another() -> None:
     said = nmea.heading_deg(text, ["GPHDT"])
     assert isinstance(said, Rejection)
     assert said.outcome is Outcome.IGNORED
+
+
+def test_a_message_may_hold_a_burst() -> None:
+    """The sentence that is wanted is found behind others, tag blocks and ends of lines."""
+    bodies = ("GPGSV,1,1,00", "HEHDT,123.456,T", "GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,5,M,4,M,,")
+    text = "\r\n".join(f"\\s:gps*00\\{sealed(body)}" for body in bodies) + "\r\n"
+    assert nmea.identities(text) == [("GP", "GSV"), ("HE", "HDT"), ("GP", "GGA")]
+    assert nmea.heading_deg(text, ["HDT"]) == pytest.approx(123.456)
+    assert isinstance(nmea.fix(text, ["GPGGA"]), nmea.Fix)
+    assert isinstance(nmea.fix(text, ["GNGGA"]), Rejection)
+
+
+def test_a_velocity_that_begins_without_a_fix_still_tells_the_motion() -> None:
+    stream = Stream("/nmea GPVTG", TWIST)
+    for k in range(60):
+        speed = (np.nan, np.nan, np.nan) if k < 20 else (0.1 * k, 1.0, 0.0)
+        stream.add((1 + k) * S, (1 + k) * S, speed, "run.db3")
+    motion = motion_of([], [stream], [])
+    assert motion is not None
+    assert motion.speed_mps == pytest.approx([np.hypot(0.1 * k, 1.0) for k in range(20, 60)])
 
 
 def minutes(deg: float, sides: str, width: int) -> str:
