@@ -37,7 +37,8 @@ def _axes(config: CompassConfig) -> tuple[Array, Array]:
     mount, deviation, wander = np.radians(
         [config.mount_offset_sigma_deg, config.deviation_sigma_deg, config.wander_sigma_deg]
     )
-    sigma = np.array([mount, *(deviation * bool(mount) * share for share in _SHARES), wander])
+    trusted = mount == 0.0
+    sigma = np.array([mount, *(0.0 if trusted else deviation * share for share in _SHARES), 0.0 if trusted else wander])
     return sigma, np.array([np.inf] * 5 + [config.wander_time_constant_s])
 
 

@@ -252,7 +252,7 @@ def _compass_block(name: str, compass: CompassReport, *, enabled: bool) -> list[
             f"  mount_offset_sigma_deg: {abs(compass.offset_deg):.1f}  # guess: as far as it is off the GNSS course"
         )
     lines.append("  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass")
-    lines.append("  wander_sigma_deg: 1.0  # guess: a harbour's iron turns it for a while; 0.2 for a GNSS compass")
+    lines.append("  wander_sigma_deg: 0.5  # guess: a harbour's iron turns it for a while; 0.2 for a GNSS compass")
     if compass.msgtype == IMU:
         lines.append("  use_reported_sigma: false  # guess: drivers' orientation covariances are seldom measured")
     return lines

@@ -13,6 +13,7 @@ from rosbags.typesys import get_types_from_msg
 
 from graphloc.app import smooth_recording
 from graphloc.config import load_config
+from graphloc.errors import ConfigError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
 from graphloc.frontends import nmea
@@ -246,3 +247,11 @@ def test_messages_of_other_packages_say_the_same(tmp_path: Path) -> None:
     assert [g.statuses for g in seen.gnss] == [{"sbas": 40}]
     assert [v.topic for v in seen.velocities] == ["/vel"]
     assert [o.topic for o in seen.odometry] == ["/pose"]
+
+
+@pytest.mark.parametrize(("kind", "asked"), [("gnss", "[VTG]"), ("compass", "[]"), ("gnss_velocity", "[gpvtg]")])
+def test_sentences_that_do_not_say_it_are_refused_with_the_key(kind: str, asked: str, tmp_path: Path) -> None:
+    path = tmp_path / "vessel.yaml"
+    path.write_text(f"sensors:\n  it: {{kind: {kind}, topic: /line, nmea: {asked}}}\n")
+    with pytest.raises(ConfigError, match=r"sensors\.it\.nmea"):
+        load_config(path, KINDS)

@@ -35,7 +35,7 @@ def test_one_that_hangs_parts_as_fast_as_the_vessel_goes_until_it_moves_along(hz
     """It says the place of 20 s until 40 s, then the right one, where it is off by a jump."""
     when = parted(lambda t, n: 0.2 * n - V * (t - 20.0) * (20.0 < t < 40.0), V, hz=hz)
     assert 20.0 < when[0] < 20.0 + 1.5 * PARTING_S
-    assert 38.9 < when[-1] < 40.0 + 2.0 * PARTING_S
+    assert 38.9 < when[-1] < 41.0
     assert len(when) > 0.9 * hz * (when[-1] - when[0])
 
 
@@ -59,8 +59,9 @@ def test_a_velocity_that_is_hardly_known_tells_nothing() -> None:
 
 
 def test_one_that_moves_otherwise_may_be_right() -> None:
-    """The estimate went astray, and says that the vessel stands: the receiver says that it goes on."""
+    """The estimate went astray: it stands while the receiver goes on, or goes much faster."""
     assert parted(lambda t, n: 0.2 * n + V * max(t - 20.0, 0.0), 0.0 * V) == []
+    assert parted(lambda t, n: 0.2 * n - 4.0 * V * max(t - 20.0, 0.0), 5.0 * V) == []
 
 
 def test_at_the_start_it_may_be_the_estimate_that_is_wrong() -> None:
@@ -90,7 +91,7 @@ def test_online_a_receiver_that_hangs_is_not_followed() -> None:
     rows = [row for row in found.ledger if row.sensor == "gnss" and begin_ns + 6 * 10**9 < row.stamp_ns < end_ns]
     assert {row.outcome for row in rows} == {Outcome.REJECTED}
     assert {row.reason for row in rows} == {"its receiver hangs: it says the same place while the vessel moves"}
-    late = [row for row in found.ledger if row.sensor == "gnss" and row.stamp_ns > end_ns + 8 * 10**9]
+    late = [row for row in found.ledger if row.sensor == "gnss" and row.stamp_ns > end_ns + 2 * 10**9]
     assert not any("hangs" in row.reason for row in late)
     assert any("gnss: says the same place while" in line for line in found.stats.events)
-    assert any("gnss: moves with the vessel again" in line for line in found.stats.events)
+    assert any("gnss: hangs no more" in line for line in found.stats.events)

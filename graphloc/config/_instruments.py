@@ -83,7 +83,10 @@ class ImuConfig(SensorConfig):
         return float(np.radians(self.gyro_bias_sigma_dps))
 
 
-Sentences = tuple[Annotated[str, Field(pattern=r"^[A-Z]{3}([A-Z]{2})?$")], ...]
+_TALKER = "^([A-Z]{2})?"
+Places = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(GGA|GNS|RMC)$")], ...], Field(min_length=1)]
+Headings = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(HDT|THS|HDG|HDM)$")], ...], Field(min_length=1)]
+Velocities = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(VTG|RMC)$")], ...], Field(min_length=1)]
 
 
 class SlowErrorConfig(Block):
@@ -121,7 +124,7 @@ class GnssConfig(SensorConfig):
     """The same for height, m."""
     slow_error: SlowErrorConfig = SlowErrorConfig()
     """The modelled slow error."""
-    nmea: Sentences = ("GGA", "GNS")
+    nmea: Places = ("GGA",)
     """Sentences that are read of an `nmea_msgs/Sentence` topic, of one talker (`GPGGA`) or of any (`GGA`): GGA, GNS, RMC."""
 
 
@@ -138,15 +141,15 @@ class CompassConfig(SensorConfig):
     """Take the yaw variance of an `Imu` message where it is positive and finite."""
     mount_offset_sigma_deg: NonNegative = 1.0
     """Unknown but constant heading offset of the mount, 1 sigma, deg; 0 holds the mount fixed, and what is read for free of
-    deviation."""
+    deviation and wander."""
     deviation_sigma_deg: NonNegative = 1.5
     """Magnetic deviation: coefficients B and C (of sine and cosine of the heading), 1 sigma, deg; D and E (of twice the
     heading) are half of it. 0: none, as of a GNSS compass."""
-    wander_sigma_deg: NonNegative = 1.0
+    wander_sigma_deg: NonNegative = 0.5
     """How far what is not of the vessel (a crane, a quay, the filter in the compass) turns its reading for a while, 1 sigma, deg."""
     wander_time_constant_s: Positive = 60.0
     """How long such an error lasts, s."""
-    nmea: Sentences = ("HDT", "THS")
+    nmea: Headings = ("HDT", "THS")
     """Sentences that are read of an `nmea_msgs/Sentence` topic, of one talker (`HEHDT`) or of any (`HDT`): HDT, THS, HDG, HDM."""
 
 
@@ -159,7 +162,7 @@ class VelocityConfig(SensorConfig):
     """Floor of the velocity sigma, m/s."""
     default_sigma_mps: Positive = 0.3
     """Taken where the message reports no covariance, m/s."""
-    nmea: Sentences = ("VTG",)
+    nmea: Velocities = ("VTG",)
     """Sentences that are read of an `nmea_msgs/Sentence` topic, of one talker (`GPVTG`) or of any (`VTG`): VTG, RMC."""
 
 

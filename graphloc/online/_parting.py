@@ -18,10 +18,8 @@ PARTING_S, _FEWEST = 4.0, 4  # fixes, over so long at least
 _PARTS_MPS = 0.7  # no multipath drifts so fast
 _SHARE = 0.5  # of the vessel's speed: a late stamp parts in a turn, too, by less
 _SIGMAS = 4.0
-_STILL = (
-    0.3  # of what it parts by, it moves itself: a receiver that moves otherwise may be right, and the estimate wrong
-)
-_LONGEST_S = 30.0  # that it is passed over in silence
+_STANDS_MPS = 0.3  # that it says: one that moves otherwise may be right, and the estimate wrong
+_LONGEST_S = 15.0  # that it is passed over in silence
 _ALONG_S = 10.0  # it has moved along for: before, it may be the estimate that starts wrong
 _LINE = 0.15  # of the way that they part by: fixes that jump lie farther off a line
 
@@ -60,21 +58,27 @@ class Parting:
         t = np.array([s for s, _, _ in self._seen])
         if len(t) < _FEWEST or t[-1] - t[0] < PARTING_S:
             return
-        off = np.array([o for _, _, o in self._seen])
-        dt = t - t.mean()
-        slope = dt @ (off - off.mean(axis=0)) / (dt @ dt)
-        left = off - off.mean(axis=0) - np.outer(dt, slope)
-        rms, speed = float(np.sqrt((left**2).sum(axis=1).mean())), float(np.linalg.norm(slope))
+        told, off = (np.array([row[k] for row in self._seen]) for k in (1, 2))
+        (moves, noise), (parts, steady) = _slope(t[late := t > t[-1] - 0.5 * PARTING_S], told[late]), _slope(t, off)
+        left = off - off.mean(axis=0) - np.outer(t - t.mean(), parts)
+        rms, speed = float(np.sqrt((left**2).sum(axis=1).mean())), float(np.linalg.norm(parts))
+        stands = float(np.linalg.norm(moves)) < _STANDS_MPS + _SIGMAS * sigma_m * noise
         least = max(_PARTS_MPS, _SHARE * float(np.linalg.norm(v_mps)), _SIGMAS * sigma_mps)
-        if self.parted:  # whatever it jumps by: back to the vessel, too, it has first to move along
-            self.parted = speed > 0.5 * least
-        else:
-            least = max(least, _SIGMAS * float(np.hypot(max(sigma_m, rms) / np.sqrt(dt @ dt), sigma_mps)))
-            told = np.array([place for _, place, _ in self._seen])
-            moves = float(np.linalg.norm(dt @ (told - told.mean(axis=0)) / (dt @ dt)))
-            parts = moves < _STILL * speed and speed > least and rms < _LINE * speed * (t[-1] - t[0])
-            self._along_s = at_s if self._along_s is None and speed < 0.5 * least else self._along_s
-            self.parted = parts and self._along_s is not None and at_s - self._along_s > _ALONG_S
-            if self.parted:  # without it the estimate is another one
-                self._parted_s = at_s
-                self._seen.clear()
+        if self.parted:
+            self.parted = stands and speed > 0.5 * least
+            return
+        least = max(least, _SIGMAS * float(np.hypot(max(sigma_m, rms) * steady, sigma_mps)))
+        if self._along_s is None and speed < 0.5 * least:
+            self._along_s = at_s
+        along = self._along_s is not None and at_s - self._along_s > _ALONG_S
+        self.parted = along and stands and speed > least and rms < _LINE * speed * float(t[-1] - t[0])
+        if self.parted:  # without it the estimate is another one
+            self._parted_s = at_s
+            self._seen.clear()
+
+
+def _slope(t: Array, places_m: Array) -> tuple[Array, float]:
+    """Velocity (2,) of places (N, 2), and its sigma for each metre of their noise."""
+    dt = t - t.mean()
+    square = max(float(dt @ dt), 1e-9)
+    return dt @ (places_m - places_m.mean(axis=0)) / square, 1.0 / float(np.sqrt(square))

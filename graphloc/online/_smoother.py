@@ -268,7 +268,7 @@ class OnlineSmoother:
 
     def _say_parted(self, parted: set[str]) -> None:
         for name in sorted(parted ^ self._parted):
-            again = "moves with the vessel again: its places are believed"
+            again = "hangs no more: its places are judged as before"
             hangs = "says the same place while the vessel moves: it hangs; its places are not believed"
             self._say(f"{name}: {hangs if name in parted else again}")
         self._parted = parted
