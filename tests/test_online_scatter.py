@@ -16,9 +16,9 @@ from graphloc.replay import replay
 SECOND = 1_000_000_000
 
 
-def scatter_of(residuals: np.ndarray, rate_hz: float = 10.0) -> float:
+def scatter_of(residuals: np.ndarray, rate_hz: float = 10.0, *, jumps: bool = False) -> float:
     """Of normalised residuals (N, k)."""
-    scatter = Scatter()
+    scatter = Scatter(jumps=jumps)
     for k, residual in enumerate(residuals):
         scatter.note(round(k * SECOND / rate_hz), residual)
     return scatter.times
@@ -36,6 +36,11 @@ def test_what_they_have_in_common_does_not_make_them_wide() -> None:
     white = np.random.default_rng(2).standard_normal((300, 1))
     off = white + np.where(np.arange(300) < 100, 0.0, 15.0)[:, None]
     assert scatter_of(off) < 1.3 * scatter_of(white)  # the pairs across the step are a tenth of all
+
+
+def test_a_slow_error_that_may_jump_makes_them_wide_until_it_has() -> None:
+    off = np.random.default_rng(2).standard_normal((300, 3)) + 15.0
+    assert scatter_of(off, jumps=True) > 5.0 * scatter_of(off)
 
 
 @pytest.mark.parametrize("k", [1, 3])

@@ -132,12 +132,16 @@ class Scatter:
     half of what was remembered said that it is always so far off. About each other alone, a third of outliers makes the half
     of all pairs wide. Pairs are 2 to 4 s apart, evenly: of one lag, a swell of that period would not show.
 
+    Args:
+        jumps: what residuals have in common is a state that may jump, and has not yet: only about 0.
+
     Attributes:
         times: at least 1.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, jumps: bool = False) -> None:
         self.times = 1.0
+        self._jumps = jumps
         self._recent: deque[tuple[int, Array]] = deque()
         self._noted = 0
         self._squares: deque[float] = deque(maxlen=_REMEMBERED)
@@ -158,7 +162,8 @@ class Scatter:
         if before is not None:
             self._pairs.append(0.5 * float((residual - before) @ (residual - before)))
         if len(self._pairs) >= len(residual) + 4:
-            least = min(np.median(self._squares), np.median(self._pairs))
+            about = np.median(self._squares)
+            least = about if self._jumps else min(about, np.median(self._pairs))
             self.times = max(1.0, float(np.sqrt(least / chi2_median(len(residual)))))
 
 
@@ -246,7 +251,10 @@ def live_problem(
         t_sensor, R_sensor = mount_of(name, block, mounts)
         mount = gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t)
         kept = slow if left_out is None else None
-        streams[name] = LiveStream(number, name, row, block, kept, left_out, row.constants(block), mount)
+        scatter = Scatter(jumps=kept is not None and kept.jumps)
+        streams[name] = LiveStream(
+            number, name, row, block, kept, left_out, row.constants(block), mount, scatter=scatter
+        )
     return LiveProblem(
         config=config,
         datum=datum,
