@@ -19,6 +19,7 @@ from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, 
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
 from graphloc.frontends.decode import IMU, ODOMETRY, yaw_of_x_axis
+from graphloc.stuck import stuck, stuck_warning
 from graphloc.time import NS_PER_S
 
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
@@ -152,6 +153,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         first=vec(rows[0, :3]),
         without_height=int(np.isnan(fixes.rows[np.isfinite(fixes.rows[:, :2]).all(axis=1), 2]).sum()),
         white_m=scatter_m(stamps, p[:, :2]),
+        hangs="".join(stuck_warning(fixes.topic, stamps, stuck(stamps, rows[:, :2], p[:, :2]))),
         slow_error=not precise,
         why=why,
         tf_frame=tf_frame,

@@ -143,7 +143,11 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         cameras=_mounted(images, tree, body, {t.topic for t in topics.values() if INFO in t.msgtypes}),
         tf_frames=tree.frames,
         body_frame=body,
-        warnings=(*warnings, *_useless(streams, {g.topic for g in found_gnss} | {i.topic for i in found_imus})),
+        warnings=(
+            *warnings,
+            *(g.hangs for g in found_gnss if g.hangs),
+            *_useless(streams, {g.topic for g in found_gnss} | {i.topic for i in found_imus}),
+        ),
     )
 
 

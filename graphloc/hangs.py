@@ -51,16 +51,22 @@ def hanging_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.b
     """Return a line on what `hanging` found."""
     if not bad.any():
         return []
+    where = stretches(stamps_ns, bad)
+    return [
+        f"{sensor}: for {where} {WHY}; {int(bad.sum())} samples are not believed, and nothing is known of the motion there"
+    ]
+
+
+def stretches(stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> str:
+    """Return where (N,) bad ones repeat the one before: for how long, and from when."""
     first = np.flatnonzero(np.diff(bad.astype(int), prepend=0) == 1)
     last = np.flatnonzero(np.diff(bad.astype(int), append=0) == -1)
     lasts_s = (stamps_ns[last] - stamps_ns[first - 1]) / NS_PER_S
     longest = int(np.argmax(lasts_s))
-    where = f"for {lasts_s[longest]:.1f} s from {utc_text(int(stamps_ns[first[longest] - 1]))}"
+    where = f"{lasts_s[longest]:.1f} s from {utc_text(int(stamps_ns[first[longest] - 1]))}"
     if len(first) > 1:
-        where = f"in {len(first)} stretches, {lasts_s.sum():.1f} s in all, the longest {where}"
-    return [
-        f"{sensor}: {where} {WHY}; {int(bad.sum())} samples are not believed, and nothing is known of the motion there"
-    ]
+        return f"{len(first)} stretches, {lasts_s.sum():.1f} s in all, the longest {where}"
+    return where
 
 
 def _at_rest(samples: Array) -> NDArray[np.bool_]:

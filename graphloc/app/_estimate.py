@@ -31,6 +31,7 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.replay import Status, replay, silent
 from graphloc.solution import Solution
 from graphloc.solve import smooth
+from graphloc.stuck import without_stuck
 
 
 def configured(config_path: Path, changes: Mapping[str, object] = MappingProxyType({})) -> VesselConfig:
@@ -169,7 +170,9 @@ def solve(
         SolveError: it cannot be started or solved.
     """
     config = seen_frames(config, recording)
-    return smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, probe=probe, progress=progress)
+    recording, said = without_stuck(recording, datum)
+    solution = smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, probe=probe, progress=progress)
+    return replace(solution, stats=replace(solution.stats, warnings=(*solution.stats.warnings, *said)))
 
 
 def seen_frames(config: VesselConfig, recording: Recording) -> VesselConfig:

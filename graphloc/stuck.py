@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A receiver that hangs, or its driver: it says one place, to the last bit, while the vessel goes on.
+
+Judged from a whole run, before it is solved: beside few other sensors the graph would follow, by a tilt and a bias that were never
+there. At rest a receiver may well say one place for minutes, so it has to have been under way: the next place it says is then a leap
+away, or, where there is none, it stood still from one fix to the next. Online: `online/_parting.py`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array, Datum
+from graphloc.hangs import stretches
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.measurements import GnssPosition, world_from_fixes
+from graphloc.recording import Recording
+from graphloc.time import NS_PER_S
+
+WHY = "its receiver or driver hangs: it says one place to the last bit while the vessel goes on"
+_HELD_S, _FEWEST = 2.5, 3  # a stretch of one place; for less a driver repeats (`frontends/_fixes.py`)
+_BEFORE_S = 3.0  # whose fixes tell how fast it was under way
+_SIGMAS = 3.0
+_UNDER_WAY_MPS, _LEAP_M, _SHARE = 0.5, 2.0, 0.5  # speed before; the leap after, and its share of the way at that speed
+_STOPS_MPS, _BRAKES_MPS2 = (
+    1.5,
+    3.0,
+)  # what stands at once from faster than this, and than brakes stop between two fixes, hangs
+
+
+def stuck(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Array) -> NDArray[np.bool_]:
+    """Return (N,) which fixes of one receiver, in order of time, only repeat one that hangs.
+
+    Args:
+        stamps_ns: (N,). lat_lon_deg: (N, 2), as they came. places_m: (N, 2), the same in metres, axes level.
+    """
+    bad = np.zeros(len(stamps_ns), dtype=bool)
+    if not len(bad):
+        return bad
+    t_s = (stamps_ns - stamps_ns[0]) / NS_PER_S
+    firsts = np.concatenate([[0], np.flatnonzero((lat_lon_deg[1:] != lat_lon_deg[:-1]).any(axis=1)) + 1])
+    for first, after in zip(firsts, [*firsts[1:], len(bad)], strict=True):
+        if after - first >= _FEWEST and t_s[after - 1] - t_s[first] >= _HELD_S:
+            bad[first + 1 : after] = _hangs(t_s[: after + 1], places_m[: after + 1], int(first), int(after))
+    return bad
+
+
+def _hangs(t_s: Array, places_m: Array, first: int, after: int) -> bool:
+    """Whether the stretch from `first` on hangs; at `after` it moves again, or the run has ended."""
+    before = np.flatnonzero((t_s[:first] >= t_s[first] - _BEFORE_S) & (t_s[:first] < t_s[first]))
+    if len(before) < 2:
+        return False
+    way = np.append(before, first)
+    speed, sigma = _speed(t_s[way], places_m[way])
+    if after < len(t_s):
+        leap = float(np.linalg.norm(places_m[after] - places_m[first]))
+        return speed - _SIGMAS * sigma > _UNDER_WAY_MPS and leap > max(
+            _LEAP_M, _SHARE * speed * (t_s[after] - t_s[first])
+        )
+    earlier, later = way[: len(way) // 2 + 1], way[len(way) // 2 :]
+    last, noise = _speed(t_s[later], places_m[later])
+    step_s = t_s[first] - t_s[before[-1]]
+    brakes = last < 0.8 * _speed(t_s[earlier], places_m[earlier])[0]
+    return not brakes and min(speed, last) - _SIGMAS * max(sigma, noise) > _STOPS_MPS + _BRAKES_MPS2 * step_s
+
+
+def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:
+    """Speed along places (N, 2), and its sigma by how far they lie off a line."""
+    dt = t_s - t_s.mean()
+    square = max(float(dt @ dt), 1e-9)
+    v = dt @ (places_m - places_m.mean(axis=0)) / square
+    left = places_m - places_m.mean(axis=0) - np.outer(dt, v)
+    return float(np.linalg.norm(v)), float(np.sqrt((left**2).sum() / max(2 * len(t_s) - 4, 1) / square))
+
+
+def stuck_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> list[str]:
+    """Return a line on what `stuck` found."""
+    if not bad.any():
+        return []
+    return [f"{sensor}: for {stretches(stamps_ns, bad)} {WHY}; {int(bad.sum())} fixes are not believed"]
+
+
+def without_stuck(recording: Recording, datum: Datum) -> tuple[Recording, list[str]]:
+    """Return a recording with the fixes of receivers that hang in the ledger instead, and a line on each such receiver."""
+    of: dict[str, list[GnssPosition]] = {}
+    for m in recording.measurements:
+        if isinstance(m, GnssPosition):
+            of.setdefault(m.sensor, []).append(m)
+    gone: dict[int, GnssPosition] = {}
+    said = []
+    for sensor, fixes in of.items():
+        stamps_ns = np.array([m.stamp_ns for m in fixes], dtype=np.int64)
+        bad = stuck(stamps_ns, np.array([m.position[:2] for m in fixes]), world_from_fixes(fixes, datum)[:, :2])
+        gone |= {m.seq: m for m, b in zip(fixes, bad, strict=True) if b}
+        said += stuck_warning(sensor, stamps_ns, bad)
+    rows = [
+        LedgerRow(
+            seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=recording.topics.get(m.sensor, ""), outcome=Outcome.REJECTED,
+            reason=WHY,
+        )
+        for m in gone.values()
+    ]  # fmt: skip
+    left = tuple(m for m in recording.measurements if m.seq not in gone)
+    return (replace(recording, measurements=left, rows=(*recording.rows, *rows)) if gone else recording), said

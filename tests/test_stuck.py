@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A receiver that says one place to the last bit while the vessel goes on: told from one at rest, and not believed."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.eval.simulate import Scenario, simulate
+from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frontends.inspect import inspect_bag, render
+from graphloc.ledger import Outcome
+from graphloc.measurements import GnssPosition, PoseFix
+from graphloc.stuck import stuck
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+
+DATUM = Datum(Geodetic(57.7, 11.9, 40.0))
+Way = Callable[[Array], Array]
+
+
+def said(way: Way, held_s: tuple[float, float], hz: float, noise_m: float) -> tuple[Array, Array, Array]:
+    """Times (N,) s, latitudes and longitudes (N, 2), places (N, 2) m of a receiver that says one place in `held_s`."""
+    t = np.arange(0.0, 60.0, 1.0 / hz)
+    x = way(t)
+    p = np.column_stack([x, 0.3 * x, 0.0 * x]) / np.hypot(1.0, 0.3)
+    p[:, :2] += noise_m * np.random.default_rng(4).normal(size=(len(t), 2))
+    held = np.flatnonzero((t >= held_s[0]) & (t < held_s[1]))
+    p[held] = p[held[0]]
+    return t, DATUM.geodetic_from_enu(p)[:, :2], p[:, :2]
+
+
+def judged(way: Way, held_s: tuple[float, float], hz: float, noise_m: float) -> Array:
+    t, lat_lon, p = said(way, held_s, hz, noise_m)
+    return t[stuck(START_NS + np.round(t * S).astype(np.int64), lat_lon, p)]
+
+
+def at(speed_mps: float) -> Way:
+    return lambda t: speed_mps * t
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "held_s", "hz", "noise_m"),
+    [
+        (2.0, (20.0, 40.0), 1.0, 0.2),
+        (2.0, (20.0, 40.0), 10.0, 0.3),
+        (1.0, (20.0, 26.0), 5.0, 0.05),
+        (15.0, (20.0, 24.0), 1.0, 1.0),
+        (3.0, (30.0, 60.0), 5.0, 0.1),  # to the end: it stood from one fix to the next
+        (8.0, (30.0, 60.0), 1.0, 0.3),
+    ],
+)
+def test_all_but_the_first_place_of_one_that_hangs_are_none(
+    speed_mps: float, held_s: tuple[float, float], hz: float, noise_m: float
+) -> None:
+    found = judged(at(speed_mps), held_s, hz, noise_m)
+    assert found[0] == pytest.approx(held_s[0] + 1.0 / hz)
+    assert len(found) == round((held_s[1] - held_s[0]) * hz) - 1
+
+
+@pytest.mark.parametrize(
+    ("way", "held_s", "hz"),
+    [
+        (lambda t: 2.0 * np.minimum(t, 20.0), (20.5, 60.0), 5.0),  # stops, with a receiver that holds at rest
+        (lambda t: 2.0 * (np.minimum(t, 20.0) + np.maximum(t - 40.0, 0.0)), (20.5, 40.0), 5.0),  # and goes on
+        (lambda t: 0.0 * t, (10.0, 60.0), 1.0),
+        (lambda t: 12.0 * (t > 40.0), (10.0, 40.0), 1.0),  # at rest, and then multipath jumps
+        (lambda t: 10.0 * np.minimum(t, 20.0) - 1.5 * np.clip(t - 17.0, 0.0, 3.0) ** 2, (20.0, 60.0), 1.0),  # brakes
+        (lambda t: np.minimum(t, 20.0), (20.2, 60.0), 5.0),  # a robot at 1 m/s stops at once
+        (lambda t: 2.0 * t, (20.0, 21.9), 10.0),  # a driver repeats
+    ],
+)
+@pytest.mark.parametrize("noise_m", [0.0, 0.02])
+def test_one_at_rest_or_that_repeats_for_a_moment_is_believed(
+    way: Way, held_s: tuple[float, float], hz: float, noise_m: float
+) -> None:
+    assert len(judged(way, held_s, hz, noise_m)) == 0
+
+
+def test_a_receiver_that_hangs_is_as_good_as_silent() -> None:
+    """Followed, the track is 26 to 36 m off there; nothing but IMU and compass is beside it."""
+    run = simulate(Scenario(path="loops", duration_s=60.0, noise="drift"), 1)
+    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    begin_ns, end_ns = fixes[0].stamp_ns + 25 * S, fixes[0].stamp_ns + 40 * S
+    held = next(m for m in fixes if m.stamp_ns >= begin_ns)
+
+    def heard(m: GnssPosition) -> GnssPosition:
+        return replace(m, position=held.position) if begin_ns <= m.stamp_ns < end_ns else m
+
+    left = tuple(
+        heard(m) if isinstance(m, GnssPosition) else m for m in run.recording.measurements if not isinstance(m, PoseFix)
+    )
+    recording = replace(run.recording, measurements=left)
+    solution = app.solve(recording, run.config, app.choose_datum(recording, run.config))
+    track = solution.trajectory
+    off_m = np.linalg.norm((track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[:, :2], axis=1)
+    assert off_m.max() < 3.0
+    rows = [r for r in solution.ledger if r.outcome is Outcome.REJECTED and "hangs" in r.reason]
+    assert {r.seq for r in rows} == {m.seq for m in fixes if held.stamp_ns < m.stamp_ns < end_ns}
+    assert {r.topic for r in rows} == {run.recording.topics["gnss"]}
+    (line,) = (w for w in solution.stats.warnings if "hangs" in w)
+    assert f"; {len(rows)} fixes are not believed" in line
+
+
+def test_inspect_says_it(tmp_path: Path) -> None:
+    make = Messages(2)
+    t, lat_lon, _ = said(at(2.0), (20.0, 40.0), 5.0, 0.1)
+    items: list[Item] = [
+        ("/fix", START_NS + round(s * S), make.fix(START_NS + round(s * S), lat, lon))
+        for s, (lat, lon) in zip(t, lat_lon, strict=True)
+    ]
+    path = write_bag(tmp_path / "run", make, items, "mcap")
+    assert "warning: /fix: for 19.8 s from 2023-11-14T22:13:40" in render(inspect_bag(path))
