@@ -7,6 +7,7 @@ Everything here is a guess with its evidence in words; `draft_config` writes bot
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +19,7 @@ from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
-from graphloc.frontends.decode import IMU, ODOMETRY, yaw_of_x_axis
+from graphloc.frontends.decode import IMU, NUMBERS, ODOMETRY, QUATERNION, yaw_of_x_axis
 from graphloc.stuck import stuck, stuck_warning
 from graphloc.time import NS_PER_S
 
@@ -220,7 +221,17 @@ def against_turning(
     return int(np.sign(together)) if abs(together) > clear else 0
 
 
+def unit_of(stream: Stream) -> str | None:
+    """Return the unit of a stream of bare numbers, if they are headings; None where it is none."""
+    if stream.msgtype not in NUMBERS:
+        return None
+    return "rad" if float(np.nanmax(np.abs(stream.rows), initial=0.0)) < 2.0 * np.pi + 0.1 else "deg"
+
+
 def _quaternions(stream: Stream, rows: Array) -> Array:
+    if unit := unit_of(stream):
+        half = (np.radians(rows[:, 0]) if unit == "deg" else rows[:, 0]) / 2.0
+        return np.column_stack([0.0 * half, 0.0 * half, np.sin(half), np.cos(half)])
     return rows[:, 6:10] if stream.msgtype == IMU else rows[:, :4]
 
 
@@ -243,14 +254,14 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
         return None
     yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in quaternions]
     good = np.array([not isinstance(y, Rejection) for y in yaw])
-    plain = {"topic": stream.topic, "msgtype": stream.msgtype}
+    plain: dict[str, Any] = {"topic": stream.topic, "msgtype": stream.msgtype, "unit": unit_of(stream)}
     if good.sum() < 10:
         why = "its quaternions give no yaw"
         return CompassReport(
             **plain, usable=False, convention="enu", offset_deg=None, scatter_deg=None, samples=0, why=why
         )
     angle = np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
-    named = stream.msgtype != IMU  # a topic of bare headings is meant as a compass
+    named = stream.msgtype == QUATERNION  # a topic of bare orientations is meant as a compass
     sense = against_turning(turning, stream.stamps_ns[keep][good], angle)
     by_gyro = {1: "enu", -1: "ned"}.get(sense)
     if courses is None or len(courses.stamps_ns) < 20:

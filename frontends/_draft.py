@@ -236,6 +236,8 @@ def _compass_block(name: str, compass: CompassReport, *, enabled: bool) -> list[
         *_topic_lines(compass.topic),
         f"  convention: {compass.convention}  # guess: {compass.why}",
     ]
+    if compass.unit is not None:
+        lines.append(f"  unit: {compass.unit}  # guess: by how large its numbers are")
     if not enabled:
         lines.append(
             "  enabled: false  # guess: another heading of the same topic is used, a true one before a magnetic one"

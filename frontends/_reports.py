@@ -111,7 +111,7 @@ class CompassReport:
     Attributes:
         usable: whether it fits the course; convention: the better one.
         offset_deg: mean of yaw minus course; scatter_deg: its circular standard deviation.
-        samples: courses compared; why: the judgement in words.
+        samples: courses compared; why: the judgement in words. unit: of bare numbers, else None.
     """
 
     topic: str
@@ -122,6 +122,7 @@ class CompassReport:
     scatter_deg: float | None
     samples: int
     why: str
+    unit: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

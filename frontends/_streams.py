@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,6 +22,7 @@ from graphloc.frontends.decode import (
     NAV_SAT_FIX,
     NMEA,
     NMEA_STATUS,
+    NUMBERS,
     ODOMETRY,
     PLAIN_POSE,
     PLAIN_TWIST,
@@ -28,8 +30,8 @@ from graphloc.frontends.decode import (
     QUATERNION,
     TWIST,
     VECTOR,
-    header_stamp_ns,
     nav_sat_status,
+    stamp_ns_of,
 )
 
 Row = tuple[float, ...]
@@ -74,7 +76,9 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
     VECTOR: lambda m: _xyz(m.vector),
     **dict.fromkeys(GPS_FIXES, _fix_row),
     PLAIN_POSE: _pose_row,
+    **dict.fromkeys(NUMBERS, lambda m: (m.data,)),
 }
+_HEADING = re.compile(r"head|hdg|hdt|yaw|compass|azimuth", re.IGNORECASE)  # a topic of numbers that may be one
 
 
 def _nmea_fix(text: str, wanted: str) -> tuple[float, ...]:
@@ -157,7 +161,7 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
     streams = {
         t.topic: Stream(t.topic, t.msgtypes[0])
         for t in bag.topics.values()
-        if len(t.msgtypes) == 1 and t.msgtypes[0] in ROWS
+        if len(t.msgtypes) == 1 and t.msgtypes[0] in ROWS and (t.msgtypes[0] not in NUMBERS or _HEADING.search(t.topic))
     }
     tree = StaticTree()
     mixed = {t.topic for t in bag.topics.values() if t.msgtypes == (NMEA,)}
@@ -175,11 +179,12 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
             if row is None:
                 stream.undecodable += 1
                 continue
-            stamp_ns = header_stamp_ns(msg)
+            stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns)
             if stamp_ns is None:
                 stream.no_stamp += 1
                 continue
-            stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
+            if raw.msgtype not in NUMBERS:
+                stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
             stream.add(stamp_ns, raw.log_ns, row, raw.file)
     return list(streams.values()), tree
 

@@ -34,12 +34,14 @@ from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, To
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import turn_warnings
 from graphloc.frontends.decode import (
+    NUMBERS,
     ODOMETRY,
     PLAIN_POSE,
     POSE,
     Decoded,
     decoder_of,
     header_stamp_ns,
+    stamp_ns_of,
     supported_types,
 )
 from graphloc.ledger import LedgerRow, Outcome
@@ -99,7 +101,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
             measurements += [v for v in readings.values if isinstance(v, Measurement)]
     if imu is not None:
         warnings += _turn_warnings(imu, sensors)
-    warnings += _silent(sensors, rows, topics)
+    warnings += _silent(sensors, rows, topics) + _unstamped(sensors, topics)
     return Recording(
         source=bag.name if span is None else f"{bag.name}, {span.start_s:g} s to {span.end_s:g} s",
         imu=imu,
@@ -205,7 +207,7 @@ class _Reader:
 
     def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:
         """Hand a message to its decoder; what gives no reading gives a row."""
-        stamp_ns = header_stamp_ns(msg)
+        stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns)
         if stamp_ns is None:
             text = f"{raw.file}: header stamp is zero or negative, recorded at {utc_text(raw.log_ns)}"
             self._rows.append(readings.row(seq, 0, malformed(text)))
@@ -306,6 +308,16 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
             headings = [v for v in readings.values if isinstance(v, CompassHeading)]
             lines += turn_warnings(imu, readings.sensor, headings, readings.config.convention)
     return lines
+
+
+def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) -> list[str]:
+    """Say which sensors' messages have no stamp."""
+    return [
+        f"{r.sensor}: {_or(topics[r.config.topic].msgtypes)} has no stamp: its messages count from when they were recorded; "
+        "time_offset_s (negative) where that was late"
+        for r in sensors
+        if set(topics[r.config.topic].msgtypes) & set(NUMBERS)
+    ]
 
 
 def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary]) -> list[str]:

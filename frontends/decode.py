@@ -50,12 +50,14 @@ VECTOR = "geometry_msgs/msg/Vector3Stamped"
 PLAIN_POSE = "geometry_msgs/msg/PoseStamped"
 GPS_FIXES = ("gps_msgs/msg/GPSFix", "gps_common/msg/GPSFix")
 NMEA = "nmea_msgs/msg/Sentence"
+NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")  # they have no stamp
 TF = "tf2_msgs/msg/TFMessage"
 
 _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # of NavSatStatus, by quality of GGA: differential, RTK
 _RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # horizontal, vertical, at a dilution of 1: fixed, float
+_MOST_TURNS = 20  # of a heading that is counted on from turn to turn
 _NO_CLIMB_MPS2 = 1e6  # variance of a vertical velocity that is not told, m^2/s^2
 # Beyond these no sensor of a vessel measures; they are finite, and a sum or a square of them need not be.
 _MOST_INERTIAL = 1e4  # in the unit of the bag: 1000 g; 30 turns a second in deg/s
@@ -82,6 +84,11 @@ def header_stamp_ns(msg: Any) -> int | None:
         return None
     stamp_ns = int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
     return stamp_ns if stamp_ns > 0 else None
+
+
+def stamp_ns_of(msg: Any, msgtype: str, log_ns: int) -> int | None:
+    """Return the stamp of a message, ns: its header's, or of a type that has none when it was recorded; None where there is none."""
+    return log_ns if msgtype in NUMBERS else header_stamp_ns(msg)
 
 
 def covariance_translation_first(values: ArrayLike) -> Array:
@@ -254,6 +261,20 @@ def _compass_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Compas
     )
 
 
+def _compass_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
+    angle = float(np.radians(msg.data)) if config.unit == "deg" else float(msg.data)
+    if not isfinite(angle):
+        return malformed("heading is NaN")
+    if abs(angle) > _MOST_TURNS * 2.0 * pi:
+        return malformed(
+            f"heading {float(msg.data):g} {config.unit} is beyond {_MOST_TURNS} turns: is it in another unit?"
+        )
+    yaw = float(wrap_angle(pi / 2.0 - angle if config.convention == "ned" else angle))
+    return CompassHeading(
+        stamp_ns=stamp_ns, sensor=sensor, seq=seq, yaw_rad=yaw, sigma_rad=float(np.radians(config.sigma_deg))
+    )
+
+
 def _velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
     with_covariance = hasattr(msg.twist, "covariance")
     v = msg.twist.twist.linear if with_covariance else msg.twist.linear
@@ -331,6 +352,7 @@ DECODERS: dict[tuple[str, str], Decoder] = {
     ("compass", QUATERNION): _compass_quaternion,
     ("compass", IMU): _compass_imu,
     ("compass", NMEA): _compass_nmea,
+    **{("compass", msgtype): _compass_number for msgtype in NUMBERS},
     ("gnss_velocity", TWIST): _velocity,
     ("gnss_velocity", PLAIN_TWIST): _velocity,
     ("gnss_velocity", VECTOR): _velocity_vector,

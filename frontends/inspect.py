@@ -52,6 +52,7 @@ from graphloc.frontends.decode import (
     GPS_FIXES,
     IMU,
     NAV_SAT_FIX,
+    NUMBERS,
     ODOMETRY,
     PLAIN_POSE,
     PLAIN_TWIST,
@@ -120,7 +121,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, courses, tree, body))]
     found_imus.sort(key=lambda i: i.gyro_noise_mdps)
     turning = turning_of(by_topic[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
-    candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU)]
+    candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU, *NUMBERS)]
     return Inspection(
         source=source,
         topics=tuple(

@@ -3,4 +3,4 @@
 
 import gc
 
-gc.set_threshold(100_000, 20, 100)  # runs that tests share are millions of objects: looking through them again took a tenth of the time
+gc.set_threshold(100_000, 20, 100)  # looking again and again through runs that tests share took a tenth of the time

@@ -129,12 +129,14 @@ class GnssConfig(SensorConfig):
 
 
 class CompassConfig(SensorConfig):
-    """Heading (`geometry_msgs/QuaternionStamped`, the orientation of a `sensor_msgs/Imu`, or `nmea_msgs/Sentence`)."""
+    """Heading: `geometry_msgs/QuaternionStamped`, orientation of `sensor_msgs/Imu`, `nmea_msgs/Sentence`, `std_msgs/Float64` or `Float32`."""
 
     kind: Literal["compass"] = "compass"
     """Which row of the sensor table reads this block."""
     convention: Literal["enu", "ned"] = "enu"
     """Yaw in the message: `enu` from east, counter-clockwise (REP 103); `ned` from north, clockwise. NMEA is the latter."""
+    unit: Literal["deg", "rad"] = "deg"
+    """Of a number; of other messages it is known."""
     sigma_deg: Positive = 1.5
     """Heading noise, 1 sigma, deg. Used where the message carries no covariance."""
     use_reported_sigma: bool = True

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Headings that come as bare numbers without a stamp, as autopilots publish them."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphloc.config import load_config
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors import KINDS
+from graphloc.frontends.bag import read_recording
+from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.ledger import Outcome
+from graphloc.measurements import CompassHeading, GnssPosition
+from tests.bagfactory import Item, Messages, write_bag
+from tests.test_bag_bad_input import accounted
+
+DOUBLE, SINGLE = "std_msgs/msg/Float64", "std_msgs/msg/Float32"
+LATE_NS = 20_000_000  # of the recorder
+HEADING, YAW = "/mavros/global_position/compass_hdg", "/boat/yaw"
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    return simulate(Scenario(path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, gnss_hz=5.0, compass_hz=5.0), 4)
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def bag(run: SimulatedRun, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    make, imu = Messages(request.param), run.recording.imu
+    assert imu is not None
+
+    def number(msgtype: str, value: float) -> Any:
+        return make.t[msgtype](data=value)
+
+    items: list[Item] = [
+        ("/imu", int(n) + LATE_NS, make.imu(int(n), a, w)) for n, a, w in zip(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps, strict=True)
+    ]  # fmt: skip
+    for m in run.recording.measurements:
+        at = m.stamp_ns + LATE_NS
+        if isinstance(m, GnssPosition):
+            items.append(("/fix", at, make.fix(m.stamp_ns, *m.position)))
+            items.append(("/battery/ahead", at, number(DOUBLE, 24.0)))  # 'head' in its name, and no heading
+            items.append(("/battery/volt", at, number(DOUBLE, 24.0)))
+        elif isinstance(m, CompassHeading):
+            items.append((HEADING, at, number(DOUBLE, (90.0 - np.degrees(m.yaw_rad)) % 360.0)))
+            items.append((YAW, at, number(SINGLE, m.yaw_rad)))
+    items.append((HEADING, items[-1][1] + 1, number(DOUBLE, np.nan)))
+    return write_bag(tmp_path_factory.mktemp("numbers") / "run", make, sorted(items, key=lambda i: i[1]))
+
+
+def test_they_are_drafted_and_read_as_what_they_are(run: SimulatedRun, bag: Path, tmp_path: Path) -> None:
+    drafted = tmp_path / "vessel.yaml"
+    drafted.write_text(draft_config(inspect_bag(bag)))
+    config = load_config(drafted, KINDS)
+    found = {s.topic: s for s in config.sensors.values() if s.kind == "compass"}
+    assert set(found) == {HEADING, YAW}
+    assert [(found[t].convention, found[t].unit) for t in (HEADING, YAW)] == [("ned", "deg"), ("enu", "rad")]
+    recording = read_recording(bag, config)
+    assert recording.message_count == accounted(recording)
+    theirs = [m for m in run.recording.measurements if isinstance(m, CompassHeading)]
+    for name, sensor in config.of_kind("compass").items():
+        ours = [m for m in recording.measurements if m.sensor == name and isinstance(m, CompassHeading)]
+        assert [m.stamp_ns for m in ours] == [m.stamp_ns + LATE_NS for m in theirs]
+        apart = np.array([a.yaw_rad - b.yaw_rad for a, b in zip(ours, theirs, strict=True)])
+        assert np.abs(np.exp(1j * apart) - 1.0).max() < 1e-6
+        assert {m.sigma_rad for m in ours} == {np.radians(sensor.sigma_deg)}
+        assert any(w.startswith(f"{name}: std_msgs/Float") and "has no stamp" in w for w in recording.warnings)
+    (row,) = (r for r in recording.rows if r.outcome is Outcome.MALFORMED)
+    assert row.topic == HEADING
+    assert "NaN" in row.reason
+
+
+def test_a_number_that_no_course_confirms_is_left_out(bag: Path) -> None:
+    draft = draft_config(inspect_bag(bag))
+    assert "# orientation of /battery/ahead: left out as a compass" in draft
+    assert "/battery/volt" not in draft
+
+
+def test_the_wrong_unit_is_named(bag: Path, tmp_path: Path) -> None:
+    drafted = tmp_path / "vessel.yaml"
+    drafted.write_text(draft_config(inspect_bag(bag)).replace("unit: deg", "unit: rad"))
+    recording = read_recording(bag, load_config(drafted, KINDS))
+    reasons = {r.reason for r in recording.rows if r.topic == HEADING}
+    assert any("is beyond 20 turns: is it in another unit?" in reason for reason in reasons)
