@@ -68,6 +68,7 @@ def test_all_but_the_first_place_of_one_that_hangs_are_none(
         (lambda t: 0.0 * t, (10.0, 60.0), 1.0),
         (lambda t: 12.0 * (t > 40.0), (10.0, 40.0), 1.0),  # at rest, and then multipath jumps
         (lambda t: 10.0 * np.minimum(t, 20.0) - 1.5 * np.clip(t - 17.0, 0.0, 3.0) ** 2, (20.0, 60.0), 1.0),  # brakes
+        (lambda t: 12.0 * np.minimum(t, 20.0) - 2.0 * np.clip(t - 17.0, 0.0, 3.0) ** 2, (20.0, 60.0), 5.0),
         (lambda t: np.minimum(t, 20.0), (20.2, 60.0), 5.0),  # a robot at 1 m/s stops at once
         (lambda t: 2.0 * t, (20.0, 21.9), 10.0),  # a driver repeats
     ],
