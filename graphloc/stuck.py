@@ -60,11 +60,10 @@ def _hangs(t_s: Array, places_m: Array, first: int, after: int) -> bool:
         return speed - _SIGMAS * sigma > _UNDER_WAY_MPS and leap > max(
             _LEAP_M, _SHARE * speed * (t_s[after] - t_s[first])
         )
-    earlier, later = way[: len(way) // 2 + 1], way[len(way) // 2 :]
+    later = way[len(way) // 2 :]  # one that brakes is slower there, and its way is no line
     last, noise = _speed(t_s[later], places_m[later])
     step_s = t_s[first] - t_s[before[-1]]
-    brakes = last < 0.8 * _speed(t_s[earlier], places_m[earlier])[0]
-    return not brakes and min(speed, last) - _SIGMAS * max(sigma, noise) > _STOPS_MPS + _BRAKES_MPS2 * step_s
+    return min(speed, last) - _SIGMAS * max(sigma, noise) > _STOPS_MPS + _BRAKES_MPS2 * step_s
 
 
 def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:
