@@ -25,10 +25,8 @@ _HELD_S, _FEWEST = 2.5, 3  # a stretch of one place; for less a driver repeats (
 _BEFORE_S = 3.0  # whose fixes tell how fast it was under way
 _SIGMAS = 3.0
 _UNDER_WAY_MPS, _LEAP_M, _SHARE = 0.5, 2.0, 0.5  # speed before; the leap after, and its share of the way at that speed
-_STOPS_MPS, _BRAKES_MPS2 = (
-    1.5,
-    3.0,
-)  # what stands at once from faster than this, and than brakes stop between two fixes, hangs
+# What stands at once from faster than this, and than brakes stop between two fixes, hangs.
+_STOPS_MPS, _BRAKES_MPS2 = 1.5, 3.0
 
 
 def stuck(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Array) -> NDArray[np.bool_]:
