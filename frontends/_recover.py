@@ -119,6 +119,7 @@ def recover(path: Path) -> Recovered | None:
 
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
+_MCAP_HEADER_BYTES = 1 << 16  # at most: two words
 _MCAP_FOOTER, _MCAP_MESSAGE, _MCAP_CHUNK, _MCAP_DATA_END = 0x02, 0x05, 0x06, 0x0F
 
 
@@ -136,7 +137,29 @@ def _recover_mcap(path: Path) -> Recovered | None:
             whole = file.seek(length, io.SEEK_CUR)
             filled |= op in (_MCAP_MESSAGE, _MCAP_CHUNK)
     footer = struct.pack("<BQQQI", _MCAP_FOOTER, 20, 0, 0, 0) + _MCAP_MAGIC
-    return Recovered(path, b"", whole, footer) if filled else None
+    return Recovered(path, _ros2_head(path), whole, footer) if filled else None
+
+
+def as_ros2(path: Path) -> Recovered | None:
+    """Return a view of an MCAP file of another profile as one of `ros2`; None where it is that, or no MCAP file.
+
+    rosbags reads no other; yet tools that merge or filter files leave the profile empty, and the messages are what they were.
+    """
+    head = _ros2_head(path) if path.suffix == ".mcap" else b""
+    return Recovered(path, head, path.stat().st_size, b"") if head else None
+
+
+def _ros2_head(path: Path) -> bytes:
+    """The first record of an MCAP file, as long as it is, with `ros2` for its profile; empty where that stands there."""
+    with path.open("rb") as file:
+        start = file.read(len(_MCAP_MAGIC) + 9)
+        if not start.startswith(_MCAP_MAGIC) or len(start) < len(_MCAP_MAGIC) + 9:
+            return b""
+        (length,) = struct.unpack("<Q", start[-8:])
+        ros2 = struct.pack("<I", 4) + b"ros2"
+        if not len(ros2) <= length < _MCAP_HEADER_BYTES or file.read(len(ros2)) == ros2:
+            return b""
+    return start + ros2.ljust(length, b"\0")  # nobody reads the rest of it: who wrote the file
 
 
 class _Chunk(NamedTuple):

@@ -31,7 +31,7 @@ from rosbags.typesys.store import Typestore
 
 from graphloc.errors import InputError
 from graphloc.frontends._part import BagPart, Bags, recording_times
-from graphloc.frontends._recover import Recovered, recover
+from graphloc.frontends._recover import Recovered, as_ros2, recover
 from graphloc.frontends._unpack import limit_unpacking
 from graphloc.recording import Span
 from graphloc.time import duration_ns, seconds_between, utc_text
@@ -269,8 +269,12 @@ class Bag:
     def _try(self, path: Path, kind: type[Reader1 | Reader2]) -> bool:
         """Open with rosbags; a file that is cut short is opened again as far as it is whole."""
         try:
-            reader = _open_reader(kind, path)
+            view = as_ros2(path) if path.is_file() else None
+            reader = _open_reader(kind, view or path)
         except Exception as error:  # noqa: BLE001 - rosbags lets struct, assertion, sqlite and codec errors through
+            if isinstance(error, KeyError) and path.suffix == ".mcap":
+                self._broken.append(_of_others(path, str(error)))
+                return False
             reason = f"{path}: cannot be read ({_text(error)})"
             repaired = recover(path) if path.is_file() else None
             if repaired is None or not self._try_recovered(path, kind, repaired):
@@ -281,9 +285,12 @@ class Bag:
                 f"of {repaired.file_bytes}; {HINTS[path.suffix]} to repair it"
             )
             return True
+        self._append(path, reader)
+        return True
+
+    def _append(self, path: Path, reader: Reader1 | Reader2) -> None:
         self._stack.callback(reader.close)
         self._opened.append(_Opened(path, reader))
-        return True
 
     def _try_recovered(self, path: Path, kind: type[Reader1 | Reader2], repaired: Recovered) -> bool:
         try:
@@ -291,8 +298,7 @@ class Bag:
         except Exception as error:  # noqa: BLE001 - as above
             log.debug("%s: recovery failed: %s", path, error)
             return False
-        self._stack.callback(reader.close)
-        self._opened.append(_Opened(path, reader))
+        self._append(path, reader)
         return True
 
     @property
@@ -426,6 +432,13 @@ def _stream(
         read = storage.messages if storage.chunks else storage.messages_scan
         return read(wanted, start_ns, end_ns)
     return opened.reader.messages(wanted, start_ns, end_ns)
+
+
+def _of_others(path: Path, encoding: str) -> str:
+    """What is said of an MCAP file with a schema in an encoding that rosbags does not know."""
+    if "ros1" in encoding:
+        return f"{path}: holds messages of ROS 1, which are read from a .bag only: give the one that it was made of"
+    return f"{path}: holds messages that are not ROS 2's ({encoding}): write its ROS topics to a file of their own (`mcap filter`)"
 
 
 def _text(error: BaseException) -> str:

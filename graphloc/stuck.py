@@ -61,7 +61,7 @@ def _hangs(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     later = way[len(way) // 2 :]  # one that brakes is slower there, and its way is no line
     last, noise = _speed(t_s[later], places_m[later])
     step_s = t_s[first] - t_s[before[-1]]
-    return min(speed, last) - _SIGMAS * max(sigma, noise) > _STOPS_MPS + _BRAKES_MPS2 * step_s
+    return bool(min(speed, last) - _SIGMAS * max(sigma, noise) > _STOPS_MPS + _BRAKES_MPS2 * step_s)
 
 
 def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Issue item A.7 at the reading level: each kind of bad input ends in a ledger row, a warning, or one clear line."""
 
+import struct
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -115,6 +116,34 @@ def test_truncated_bag_gives_what_is_whole(tmp_path: Path, kind: str, compressio
     assert "cut.bag: damaged or cut short" in line or "cut.mcap: damaged or cut short" in line
     assert f"of {int(share * len(whole))}" in line
     assert ("rosbag reindex" if kind == "ros1" else "mcap recover") in line
+
+
+@pytest.mark.parametrize(("cut", "warned"), [(0, False), (3000, True)])
+def test_an_mcap_file_that_a_tool_has_merged_is_read(cut: int, warned: bool, tmp_path: Path) -> None:
+    """Its profile is empty; the messages are those of ROS 2."""
+    whole = whole_file("mcap", "")
+    head, said = len(b"\x89MCAP0\r\n") + 9, b"\x04\0\0\0ros2"
+    assert whole[head : head + len(said)] == said
+    merged = tmp_path / "merged.mcap"  # as long: what wrote it has a name that is four letters longer
+    (named,) = struct.unpack("<I", whole[head + 8 : head + 12])
+    library = whole[head + 12 : head + 12 + named]
+    data = whole[:head] + bytes(4) + struct.pack("<I", named + 4) + library + b"more" + whole[head + 12 + named :]
+    merged.write_bytes(data[: len(data) - cut])
+    recording = read_recording(merged, vessel())
+    (tmp_path / "same.mcap").write_bytes(whole[: len(data) - cut])
+    assert len(recording.measurements) == len(read_recording(tmp_path / "same.mcap", vessel()).measurements) > 0
+    assert any("cut short" in w for w in recording.warnings) == warned
+
+
+@pytest.mark.parametrize(
+    ("encoding", "says"), [(b"ros1msg", "give the one that it was made of"), (b"flatbuf", "mcap filter")]
+)
+def test_an_mcap_file_of_others_is_refused_with_the_cause(encoding: bytes, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "others.mcap"
+    path.write_bytes(whole_file("mcap", "").replace(b"ros2msg", encoding))
+    with pytest.raises(InputError) as error:
+        read_recording(path, vessel())
+    one_line(error, path.name, says)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
