@@ -28,6 +28,11 @@ def is_pose(key: int) -> bool:
     return key >> 56 == ord("x")
 
 
+def is_leaf(key: int) -> bool:
+    """Whether a key is that of a leaf of one measurement."""
+    return chr(key >> 56) in LEAVES
+
+
 def velocity(k: int) -> int:
     """Key of the velocity of state `k`."""
     return _V + k

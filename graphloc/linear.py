@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import gtsam
 import numpy as np
 
-from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual
 
@@ -62,12 +61,12 @@ def linear_update(residual: Residual, terms: Sequence[Term], decision: Decision)
         terms: the states; of the pose, `pose_term`.
         decision: of this pass.
     """
-    kernel = decision.kernel or KernelConfig(kind="none")
-    weight = decision.weight * max(kernel.weight(residual.nis()), 1e-6)
-    cov = residual.cov / weight
+    weight = decision.weight
+    if decision.kernel is not None:
+        weight *= max(decision.kernel.weight(residual.nis()), 1e-6)
     # Most residuals here are of one row (headings, heights), and at every pass: two calls into LAPACK for a root show.
-    single = len(cov) == 1
-    whiten = 1.0 / np.sqrt(cov) if single else np.linalg.inv(np.linalg.cholesky(cov))
+    cov, single = residual.cov, len(residual.cov) == 1
+    whiten = np.sqrt(weight) * (1.0 / np.sqrt(cov) if single else np.linalg.inv(np.linalg.cholesky(cov)))
     point, raw = gtsam.Values(), residual.raw
     arguments: list[Any] = []
     for term in terms:

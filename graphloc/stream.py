@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import logging
 import os
@@ -234,6 +235,7 @@ def serve(
     _refuse(config, str(config_path))
     smoother = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, lag_s=lag_s, snapshot=snapshot)
     lines = Lines(sys.stdin.buffer)
+    gc.freeze()  # what is loaded stays: to look through it for garbage takes a tenth of a second, in the midst of an update
     before = {number: signal.signal(number, lines.stop) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         # Ours alone: whatever a library may print goes to stderr. A reader that went away is no error.

@@ -3,4 +3,4 @@
 
 import gc
 
-gc.set_threshold(100_000, 20, 100)  # looking again and again through runs that tests share took a tenth of the time
+gc.set_threshold(100_000, 20, 100)  # looking again and again through runs that tests share took 3 % of the time

@@ -80,7 +80,7 @@ class Lag:
         timeline, window = self.problem.timeline, self._window
         pose, now_s = keys.pose(timeline.last), timeline.page_s(timeline.stamps_ns[timeline.last])
         self.fresh = now_s > self._page_s
-        if self.fresh:  # just before a page leaves, which re-eliminates everything as well
+        if self.fresh:  # together with the page that leaves, which re-eliminates everything as well
             self._page_s = now_s
             window.relinearise()
             self._entries.follow_solver()

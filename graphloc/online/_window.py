@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of the last seconds: iSAM2 in a fixed lag.
+"""The graph of the last seconds: iSAM2, whose oldest keys are marginalised.
 
-What is added and taken out is staged, and goes in whole or not at all. GTSAM's smoother is not safe after
+What is added and taken out is staged, and goes in whole or not at all. `ISAM2` is not safe after
 an exception: from then on it is thrown away, and the caller builds another.
+
+GTSAM's own fixed lag leaves the order of elimination to fill-in. Here the newest keys come last: what is asked and
+added at every update is then at the root of the tree.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,8 +21,9 @@ import numpy as np
 
 from graphloc.errors import SolveError, not_solved
 from graphloc.frames import Array
-from graphloc.keys import is_pose
+from graphloc.keys import is_leaf, is_pose
 
+_LEAVES, _STAYS, _NEWEST = range(3)  # groups of keys, in the order of elimination
 _RELINEARIZE = 0.02  # of any tangent: m, rad, m/s; the gap to the batch is millimetres
 _NEVER = 1_000_000_000  # updates
 
@@ -49,9 +53,10 @@ class Window:
         params.relinearizeSkip = _NEVER  # but see `relinearise`
         params.setRelinearizeThreshold(_RELINEARIZE)
         self.lag_s = lag_s
-        self._smoother = gtsam.IncrementalFixedLagSmoother(lag_s, params)
+        self._solver = gtsam.ISAM2(params)
         self.values = gtsam.Values()
-        self._alive: dict[int, float] = {}  # keys in the smoother, and when each was last touched
+        self._alive: dict[int, float] = {}  # keys in the solver, and when each was last touched
+        self._newest: set[int] = set()  # keys of the last commit
         self._linearised = gtsam.Values()  # the point of each key that the solver's tangents are those of
         self._clear()
 
@@ -59,7 +64,9 @@ class Window:
         self._graph, self._guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._stamps: dict[int, float] = {}
         self._remove: list[int] = []
+        self._bare: set[int] = set()  # leaves whose factors are removed: the solver forgets them
         self._added: list[Held] = []
+        self._to_relinearise = False
 
     def guess(self, key: int, value: Any, t_s: float) -> None:
         """Stage a new key."""
@@ -90,6 +97,7 @@ class Window:
             self._graph.add(factor)
         held = Held(keys, len(found))
         self._added.append(held)
+        self._bare -= keys
         return held
 
     def remove(self, held: Held) -> bool:
@@ -97,6 +105,7 @@ class Window:
         if not held.slots or any(key not in self._alive for key in held.keys):
             return False
         self._remove += held.slots
+        self._bare |= {key for key in held.keys if is_leaf(key)}
         held.slots = []
         return True
 
@@ -104,41 +113,62 @@ class Window:
         """Return the value that the solver's tangent of a key is that of."""
         return self._linearised.atPose3(key)
 
+    def relinearise(self) -> bool:
+        """Have the next commit linearise anew where the estimate has moved away; `linearised_at` says at once where.
+
+        Tell whether it has anywhere.
+        """
+        step = self._solver.getDelta()
+        poses = [key for key in self._alive if is_pose(key)]
+        moved = np.abs(step.vector(poses).reshape(-1, 6)).max(axis=1) >= _RELINEARIZE
+        held = self._solver.getFixedVariables()
+        for key in itertools.compress(poses, moved):
+            if not held.count(key):
+                self._linearised.update(key, self.values.atPose3(key))
+        self._to_relinearise = bool(np.abs(step.vector()).max(initial=0.0) >= _RELINEARIZE)
+        return self._to_relinearise
+
     def commit(self) -> None:
         """Take in what is staged, and estimate anew.
 
         Raises:
             SolveError: the linear algebra failed; this window is of no use from now on.
         """
+        alive = {key: touched_s for key, touched_s in (self._alive | self._stamps).items() if key not in self._bare}
+        oldest_s = max(alive.values(), default=0.0) - self.lag_s
+        gone = [key for key, touched_s in alive.items() if touched_s < oldest_s]
+        self._newest = {key for key in self._stamps if not is_leaf(key)} or self._newest
+        params = gtsam.ISAM2UpdateParams()
+        params.removeFactorIndices = self._remove
+        params.force_relinearize = self._to_relinearise
+        if gone or self._to_relinearise:
+            params.constrainedKeys = _groups(alive, gone, self._newest)
+        if gone:
+            params.extraReelimKeys = _listed(
+                self._alive.keys() & alive
+            )  # what goes must have nothing below it in the tree
         with self._solving():
-            self._smoother.update(self._graph, self._guess, self._stamps, self._remove)  # type: ignore[arg-type]
-            slots = list(self._smoother.getISAM2Result().getNewFactorsIndices())
-            self.values = self._smoother.calculateEstimate()
+            slots = list(self._solver.update(self._graph, self._guess, params).getNewFactorsIndices())
+            if gone:
+                self._solver.marginalizeLeaves(_listed(gone))
+            self.values = self._solver.calculateEstimate()
+            if gone or self._to_relinearise:
+                self._linearised = gtsam.Values(self._solver.getLinearizationPoint())
         for held in self._added:
             held.slots, slots = slots[: held.count], slots[held.count :]
-        self._alive |= self._stamps
+        for key in gone:
+            del alive[key]
+        self._alive = alive
         self._clear()
-        if min(self._alive.values(), default=0.0) < max(self._alive.values(), default=0.0) - self.lag_s:
-            self._alive = self._smoother.timestamps()  # some have left; asked for each time it is a tenth of an update
-            self._linearised = gtsam.Values(self._smoother.getLinearizationPoint())
-
-    def relinearise(self) -> None:
-        """Linearise anew where the estimate has moved away."""
-        with self._solving():
-            solver = self._smoother.getISAM2()  # the smoother's own, not a copy
-            if not solver.update(force_relinearize=True).getVariablesRelinearized():
-                return
-            self.values = self._smoother.calculateEstimate()
-            self._linearised = gtsam.Values(self._smoother.getLinearizationPoint())
-        for values in (self.values, self._linearised):
-            values.insert(self._guess)
 
     def settle(self, steps: int = 1) -> None:
         """Take in what is staged, if anything is, and relinearise `steps` times."""
         if self._added or self._remove:
             self.commit()
         for _ in range(steps):
-            self.relinearise()
+            if not self.relinearise():
+                break
+            self.commit()
 
     @staticmethod
     @contextmanager
@@ -160,9 +190,9 @@ class Window:
         """
         try:
             if len(keys) == 1:
-                cov = np.atleast_2d(self._smoother.marginalCovariance(keys[0]))
+                cov = np.atleast_2d(self._solver.marginalCovariance(keys[0]))
             else:
-                cov = np.asarray(self._smoother.getISAM2().jointMarginalCovariance(list(keys)).fullMatrix())
+                cov = np.asarray(self._solver.jointMarginalCovariance(list(keys)).fullMatrix())
         except (RuntimeError, IndexError, ValueError) as error:
             raise not_solved("the covariance could not be computed", error) from error
         # Poses first, by the signature: the solver's own tangents are those of its linearisation.
@@ -175,11 +205,11 @@ class Window:
 
     def error(self, without: Iterable[Held] = ()) -> float:
         """Return the cost of the graph at the estimate (half of the weighted squares), less that of some factors."""
-        return float(self._smoother.getFactors().error(self.values)) - sum(self.errors_of(without))
+        return float(self._solver.getFactorsUnsafe().error(self.values)) - sum(self.errors_of(without))
 
     def errors_of(self, parts: Iterable[Held]) -> list[float]:
         """Return the share of the cost that committed factors have, together as they went in."""
-        factors = self._smoother.getFactors()
+        factors = self._solver.getFactorsUnsafe()
         return [float(sum(factors.at(slot).error(self.values) for slot in held.slots)) for held in parts]
 
     def is_committed(self, key: int) -> bool:
@@ -188,4 +218,21 @@ class Window:
     @property
     def factor_slots(self) -> int:
         """Places that the smoother keeps for factors: must not grow with time."""
-        return int(self._smoother.getFactors().size())
+        return int(self._solver.getFactorsUnsafe().size())
+
+
+def _listed(keys: Iterable[int]) -> Any:
+    found = gtsam.KeyList()
+    for key in keys:
+        found.push_back(key)
+    return found
+
+
+def _groups(alive: Iterable[int], gone: Iterable[int], newest: Collection[int]) -> Any:
+    """The order of elimination: what leaves, what stays, what is asked and added next."""
+    groups = gtsam.KeyGroupMap()
+    for key in gone:
+        groups.insert2(key, _LEAVES)
+    for key in alive:  # what has a group keeps it
+        groups.insert2(key, _NEWEST if key in newest else _STAYS)
+    return groups

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lag's graph against GTSAM's own fixed lag, which orders otherwise: the same estimates, the same covariances."""
+
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from graphloc import keys
+from graphloc.frames import Array
+from graphloc.online._window import Window
+
+LAG_S, STEPS, HZ = 3.0, 80, 5
+STEP = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01, 0.01, 0.02, 0.1, 0.1, 0.05]))
+PLACE = gtsam.noiseModel.Isotropic.Sigma(3, 0.3)
+LEVER, EXACT = np.array([0.5, 0.1, 1.0]), gtsam.noiseModel.Isotropic.Sigma(3, 0.005)
+FIRST = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.1, 0.1, 0.2, 0.5, 0.5, 0.5]))
+OFFSET = keys.constant(0, 0)  # of the receiver, in every fix
+Staged = tuple[list[Any], dict[int, Any], float]
+
+
+def drive(seed: int) -> list[Staged]:
+    """A turning vessel with an antenna: of each step its factors, what is new, and when that leaves with."""
+    rng, true, steps = np.random.default_rng(seed), gtsam.Pose3(), []
+    moved = gtsam.Pose3(gtsam.Rot3.Ypr(0.1, 0.02, 0.0), np.array([0.4, 0.0, 0.0]))
+    guess = true
+    for k in range(STEPS):
+        if k:
+            true = true.compose(moved)
+            told = moved.retract(rng.normal(0.0, STEP.sigmas()))
+            guess = guess.compose(told)
+            factors: list[Any] = [gtsam.BetweenFactorPose3(keys.pose(k - 1), keys.pose(k), told, STEP)]
+        else:
+            factors = [gtsam.PriorFactorPose3(keys.pose(0), true, FIRST)]
+        antenna, lever = keys.leaves(k)
+        fix = true.transformFrom(LEVER) + rng.normal(0.0, 0.3, 3)
+        new = {keys.pose(k): guess, antenna: fix, lever: LEVER}
+        if k == 0:
+            factors.append(gtsam.PriorFactorPoint3(OFFSET, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.2)))
+            new[OFFSET] = np.zeros(3)
+        factors += [
+            gtsam.PriorFactorPoint3(lever, LEVER, EXACT),
+            gtsam.ReferenceFrameFactorPoint3Pose3(lever, keys.pose(k), antenna, EXACT),
+            gtsam.BetweenFactorPoint3(antenna, OFFSET, -fix, PLACE),
+        ]
+        steps.append((factors, new, float(np.ceil(k / HZ))))
+    return steps
+
+
+def gtsams_own(steps: list[Staged]) -> tuple[gtsam.Pose3, Array]:
+    params = gtsam.ISAM2Params()
+    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
+    params.setFactorization("QR")
+    params.relinearizeSkip = 1
+    params.setRelinearizeThreshold(0.02)
+    smoother = gtsam.IncrementalFixedLagSmoother(LAG_S, params)
+    for factors, new, t_s in steps:
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for factor in factors:
+            graph.add(factor)
+        for key, value in new.items():
+            values.insert(key, value)
+        smoother.update(graph, values, dict.fromkeys([*new, OFFSET], t_s))
+    last = keys.pose(len(steps) - 1)
+    turn = smoother.calculateEstimate().atPose3(last).rotation().matrix().T @ (
+        smoother.getLinearizationPoint().atPose3(last).rotation().matrix()
+    )
+    whole = np.kron(np.eye(2), turn)
+    return smoother.calculateEstimate().atPose3(last), whole @ smoother.marginalCovariance(last) @ whole.T
+
+
+def ours(steps: list[Staged]) -> Window:
+    window = Window(LAG_S)
+    for factors, new, t_s in steps:
+        for key, value in new.items():
+            window.guess(key, value, t_s)
+        window.touch(OFFSET, t_s)
+        window.add(factors)
+        window.relinearise()
+        window.commit()
+    return window
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_lag_says_what_gtsams_own_says(seed: int) -> None:
+    steps = drive(seed)
+    pose, cov = gtsams_own(steps)
+    window, last = ours(steps), keys.pose(STEPS - 1)
+    assert (
+        np.abs(pose.localCoordinates(window.values.atPose3(last))).max() < 2e-3
+    )  # 1 of 100 sigmas: linearised elsewhere
+    np.testing.assert_allclose(np.sqrt(np.diag(window.covariance([last]))), np.sqrt(np.diag(cov)), rtol=0.02)
+
+
+def test_what_is_older_than_the_lag_leaves_by_the_second_and_nothing_else() -> None:
+    window, now_s = ours(drive(0)), float(np.ceil((STEPS - 1) / HZ))
+    stay = [k for k in range(STEPS) if np.ceil(k / HZ) >= now_s - LAG_S]
+    assert [k for k in range(STEPS) if window.is_committed(keys.pose(k))] == stay
+    assert [k for k in range(STEPS) if window.values.exists(keys.pose(k))] == stay
+
+
+def test_a_leaf_whose_factors_are_taken_out_can_be_put_in_again() -> None:
+    """The solver forgets it with its last factor: told to order what it does not know, it fails."""
+    steps, window = drive(0), Window(LAG_S)
+    for k, (factors, new, t_s) in enumerate(steps):
+        for key, value in new.items():
+            window.guess(key, value, t_s)
+        window.touch(OFFSET, t_s)
+        window.add(factors[:-3])
+        held = window.add(factors[-3:])
+        window.commit()
+        if k % HZ == 1:
+            antenna, lever = keys.leaves(k)
+            assert window.remove(held)
+            window.relinearise()
+            window.commit()
+            assert not window.values.exists(antenna)
+            assert not window.remove(held)
+            for key in (antenna, lever):
+                window.guess(key, new[key], t_s)
+            again = window.add(factors[-3:])
+            window.settle(2)
+            assert window.is_committed(antenna)
+            assert window.remove(again)
+    pose, _ = gtsams_own(steps)
+    assert np.linalg.norm(window.values.atPose3(keys.pose(STEPS - 1)).translation() - pose.translation()) < 0.5
+
+
+def test_it_is_told_beforehand_where_the_solver_linearises_anew() -> None:
+    """Factors are written in tangents that the next commit is the first to have."""
+    window, moved = Window(LAG_S), 0
+    for factors, new, t_s in drive(1):
+        for key, value in new.items():
+            window.guess(key, value, t_s)
+        window.touch(OFFSET, t_s)
+        window.add(factors)
+        window.commit()
+        poses = [k for k in range(STEPS) if window.is_committed(keys.pose(k))]
+        before = [window.linearised_at(keys.pose(k)) for k in poses]
+        window.relinearise()
+        told = [window.linearised_at(keys.pose(k)) for k in poses]
+        window.commit()
+        for k, was, at in zip(poses, before, told, strict=True):
+            assert window.linearised_at(keys.pose(k)).equals(at, 1e-9)
+            moved += not was.equals(at, 1e-9)
+    assert moved > 20
