@@ -103,7 +103,10 @@ def _to_batch(job: Case) -> Any:
     smoother = _smoother(run, lag_s=2.0 * scenario.duration_s)
     for a in bad.arrivals_of(run):
         smoother.feed(a.m)
-    window, batch = smoother.window(), app.simulated(run).solution.trajectory
+    window = smoother.window()
+    unheard = {row.seq for row in smoother.finish() if row.reason == "the run ended before a state there"}
+    heard = tuple(m for m in run.recording.measurements if m.seq not in unheard)
+    batch = app.simulated(replace(run, recording=replace(run.recording, measurements=heard))).solution.trajectory
     assert window is not None
     there = window.stamps_ns[batch.covers(window.stamps_ns)]
     return np.linalg.norm(window.at(there).p_world_m - batch.at(there).p_world_m, axis=1)
