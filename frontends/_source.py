@@ -272,13 +272,12 @@ class Bag:
             view = as_ros2(path) if path.is_file() else None
             reader = _open_reader(kind, view or path)
         except Exception as error:  # noqa: BLE001 - rosbags lets struct, assertion, sqlite and codec errors through
-            if isinstance(error, KeyError) and path.suffix == ".mcap":
-                self._broken.append(_of_others(path, str(error)))
-                return False
-            reason = f"{path}: cannot be read ({_text(error)})"
+            reason = f"{path}: cannot be read ({_text(error)}); {HINTS.get(path.suffix, HINTS[''])}"
             repaired = recover(path) if path.is_file() else None
             if repaired is None or not self._try_recovered(path, kind, repaired):
-                self._broken.append(f"{reason}; {HINTS.get(path.suffix, HINTS[''])}")
+                # Only now: the summary alone may be damaged.
+                others = isinstance(error, KeyError) and path.suffix == ".mcap"
+                self._broken.append(_of_others(path, str(error)) if others else reason)
                 return False
             self.warnings.append(
                 f"{path}: damaged or cut short ({_text(error)}): read up to byte {repaired.whole_bytes} "

@@ -3,7 +3,7 @@
 
 Judged from a whole run, before it is solved: beside few other sensors the graph would follow, by a tilt and a bias that were never
 there. At rest a receiver may well say one place for minutes, so it has to have been under way: the next place it says is then a leap
-away, or, where there is none, it stood still from one fix to the next. Online: `online/_parting.py`.
+away, or, where there is none (or so late that it may have gone there from rest), it stood still from one fix to the next. Online: `online/_parting.py`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _HELD_S, _FEWEST = 2.5, 3  # a stretch of one place; for less a driver repeats (
 _BEFORE_S = 3.0  # whose fixes tell how fast it was under way
 _SIGMAS = 3.0
 _UNDER_WAY_MPS, _LEAP_M, _SHARE = 0.5, 2.0, 0.5  # speed before; the leap after, and its share of the way at that speed
-# What stands at once from faster than this, and than brakes stop between two fixes, hangs.
+# What stands at once from faster than this, and than brakes stop between two fixes, hangs. None sets off faster, either.
 _STOPS_MPS, _BRAKES_MPS2 = 1.5, 3.0
 
 
@@ -47,7 +47,7 @@ def stuck(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Array) -> 
 
 
 def _hangs(t_s: Array, places_m: Array, first: int, after: int) -> bool:
-    """Whether the stretch from `first` on hangs; at `after` it moves again, or the run has ended."""
+    """Whether the stretch from `first` on hangs; at `after` it says another place, or the run has ended."""
     before = np.flatnonzero((t_s[:first] >= t_s[first] - _BEFORE_S) & (t_s[:first] < t_s[first]))
     if len(before) < 2:
         return False
@@ -55,9 +55,11 @@ def _hangs(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     speed, sigma = _speed(t_s[way], places_m[way])
     if after < len(t_s):
         leap = float(np.linalg.norm(places_m[after] - places_m[first]))
-        return speed - _SIGMAS * sigma > _UNDER_WAY_MPS and leap > max(
-            _LEAP_M, _SHARE * speed * (t_s[after] - t_s[first])
-        )
+        silent_s = t_s[after] - t_s[after - 1]
+        set_off_m = _BRAKES_MPS2 * silent_s**2 / 2.0  # from rest, while it said nothing
+        if silent_s < _HELD_S or leap > set_off_m:
+            least_m = max(_LEAP_M, set_off_m, _SHARE * speed * (t_s[after] - t_s[first]))
+            return speed - _SIGMAS * sigma > _UNDER_WAY_MPS and leap > least_m
     later = way[len(way) // 2 :]  # one that brakes is slower there, and its way is no line
     last, noise = _speed(t_s[later], places_m[later])
     step_s = t_s[first] - t_s[before[-1]]

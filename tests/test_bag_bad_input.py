@@ -146,6 +146,19 @@ def test_an_mcap_file_of_others_is_refused_with_the_cause(encoding: bytes, says:
     one_line(error, path.name, says)
 
 
+def test_an_mcap_file_whose_summary_is_damaged_is_no_file_of_others(tmp_path: Path) -> None:
+    """A bit of an encoding's name, which stands there twice: what the data section says counts."""
+    data = bytearray(whole_file("mcap", ""))
+    data[data.rindex(b"ros2msg")] ^= 1
+    path = tmp_path / "bit.mcap"
+    path.write_bytes(data)
+    recording = read_recording(path, vessel())
+    assert recording.imu is not None
+    assert len(recording.imu) == 12000
+    (line,) = recording.warnings
+    assert "bit.mcap: damaged or cut short" in line
+
+
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_truncated_before_the_first_message(tmp_path: Path, kind: str) -> None:
     make = Messages(1 if kind == "ros1" else 2)

@@ -80,6 +80,31 @@ def test_one_at_rest_or_that_repeats_for_a_moment_is_believed(
     assert len(judged(way, held_s, hz, noise_m)) == 0
 
 
+def rests(speed_mps: float, t: Array) -> Array:
+    """The way of one that brakes for 2 s, and is at rest from 20 s on."""
+    return np.asarray(speed_mps * (np.minimum(t, 20.0) - np.clip(t - 18.0, 0.0, 2.0) ** 2 / 4.0))
+
+
+@pytest.mark.parametrize("hz", [1.0, 10.0])
+@pytest.mark.parametrize(
+    ("way", "silent_s", "found"),
+    [
+        (lambda t: rests(2.0, t) + 2.0 * np.maximum(t - 30.0, 0.0), (30.0, 45.0), False),  # it went on meanwhile
+        (lambda t: rests(1.0, t) + 3.0 * np.maximum(t - 30.0, 0.0), (30.0, 36.0), False),
+        (lambda t: 8.0 * t, (30.0, 32.0), True),  # no craft is as far off by then
+        (lambda t: 8.0 * t, (30.0, 55.0), True),  # it stood from one fix to the next
+    ],
+)
+def test_what_comes_after_a_silence_tells_little_of_a_rest(
+    way: Way, silent_s: tuple[float, float], found: bool, hz: float
+) -> None:
+    """A receiver that holds its place at rest, and then says nothing until the vessel is under way."""
+    t, lat_lon, p = said(way, (20.0, 30.0), hz, 0.0)
+    heard = (t < silent_s[0]) | (t >= silent_s[1])
+    bad = stuck(START_NS + np.round(t[heard] * S).astype(np.int64), lat_lon[heard], p[heard])
+    assert bad.any() == found
+
+
 def test_a_receiver_that_hangs_is_as_good_as_silent() -> None:
     """Followed, the track is 26 to 36 m off there; nothing but IMU and compass is beside it."""
     run = simulate(Scenario(path="loops", duration_s=60.0, noise="drift"), 1)
