@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import itertools
 import json
 import os
@@ -165,6 +166,7 @@ def _took_s(docking: bool) -> tuple[float, Any]:
     """In a process of its own, since threads that are there already would keep all cores: the start, the updates."""
     os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:2]))
     run = _docking() if docking else simulate(bl_scenario(1, "drift"), 0)
+    gc.freeze()  # as `graphloc stream` and `graphloc replay` do
     took = replay(run.recording, run.config).update_s
     return float(took[0]), took[1:]
 

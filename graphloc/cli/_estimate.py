@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 from pathlib import Path
@@ -94,6 +95,7 @@ def replay(
     )  # fmt: skip
     wanted.check()
     recording, vessel, scans = wanted.load(progress())
+    gc.freeze()  # as in `graphloc.stream`: what is loaded stays
     run = application.replay_recording(recording, vessel, scans=scans, rate=rate, lag_s=lag, status=status_line())
     if sys.stderr.isatty():
         sys.stderr.write("\r\033[K")
