@@ -51,8 +51,11 @@ def smooth(
         SolveError: the run cannot be started or solved; the text says why.
     """
 
-    def solve(part: Recording) -> Solution:
-        problem = make_problem(part, config, datum, rows, inertial)
+    def solve(part: Recording, heading_deg: float | None) -> Solution:
+        begun = config
+        if heading_deg is not None:
+            begun = config.model_copy(update={"start": config.start.model_copy(update={"heading_deg": heading_deg})})
+        problem = make_problem(part, begun, datum, rows, inertial)
         result = solve_batch(problem, progress)
         solution = make_solution(problem, part, result)
         if probe is None:
@@ -63,7 +66,9 @@ def smooth(
 
     imu = config.of_kind(inertial.kind).values()
     bridge_s = min((sensor.max_bridge_s for sensor in imu), default=np.inf)
-    return _on_deep_stack(lambda: solve_parts(recording, bridge_s, solve))
+    absolute = {name for row in rows if row.absolute for name in config.of_kind(row.kind)}
+    leg_s = config.timeline.leg_s
+    return _on_deep_stack(lambda: solve_parts(recording, bridge_s, leg_s, absolute, solve))
 
 
 def _with_offsets(solution: Solution, result: BatchResult, probe: Probe) -> Solution:

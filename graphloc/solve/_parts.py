@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run whose IMU fell silent for long is several runs: cut there, each solved for itself, joined again.
+"""A run whose IMU fell silent for long is several runs: cut there, each solved for itself (in legs, if it is long), joined again.
 
 Over a hole of minutes nothing links the two sides: as one graph, both sides were bent by the link that
 has to stand for it (120 s: 4.6 m and 30 deg off beside the hole, where 0.1 m is usual).
@@ -7,7 +7,7 @@ has to stand for it (120 s: 4.6 m and 30 deg off beside the hole, where 0.1 m is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,26 +19,37 @@ from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.offsets import joined
 from graphloc.recording import Recording
 from graphloc.solution import SlowEstimate, Solution, SolveStats
+from graphloc.solve._legs import Solve, seams, solve_legs
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory
 
 
-def solve_parts(recording: Recording, bridge_s: float, solve: Callable[[Recording], Solution]) -> Solution:
-    """Cut the recording at holes of the IMU longer than `bridge_s`; solve the parts and join them.
+def solve_parts(
+    recording: Recording, bridge_s: float, leg_s: float, absolute: Collection[str], solve: Solve
+) -> Solution:
+    """Cut the recording at holes of the IMU longer than `bridge_s`, and what is long into legs; solve these and join them.
+
+    Args:
+        leg_s: about how long legs are at most. absolute: the sensors that tell a place.
 
     Raises:
         SolveError: no part could be solved; it is the first part's.
     """
     parts = _cut(recording, bridge_s)
-    if len(parts) == 1:
-        return solve(recording)
+    if len(parts) == 1 and not seams(recording, leg_s, absolute):
+        return solve(recording, None)
     solutions, rows, warnings, failure = [], list(recording.rows), [], None
     for part in parts:
         assert part.imu is not None
         start, stop = (utc_text(int(part.imu.stamps_ns[k])) for k in (0, -1))
         try:
-            solutions.append(solve(part))
-            warnings.append(f"the IMU is silent for long before or after {start} to {stop}: solved as a part by itself")
+            legs, said = _in_legs(part, leg_s, absolute, solve)
+            solutions += legs
+            warnings += said
+            if len(parts) > 1:
+                warnings.append(
+                    f"the IMU is silent for long before or after {start} to {stop}: solved as a part by itself"
+                )
         except SolveError as error:
             failure = failure or error
             warnings.append(f"the part from {start} to {stop} is left out: {error}")
@@ -47,6 +58,22 @@ def solve_parts(recording: Recording, bridge_s: float, solve: Callable[[Recordin
         assert failure is not None
         raise failure
     return _join(solutions, rows, warnings)
+
+
+def _in_legs(
+    part: Recording, leg_s: float, absolute: Collection[str], solve: Solve
+) -> tuple[list[Solution], list[str]]:
+    """Solve a part, one that is long in legs; as a whole where a leg cannot be solved by itself. Return what is said of it."""
+    part = replace(part, rows=())
+    where = seams(part, leg_s, absolute)
+    if not where:
+        return [solve(part, None)], []
+    try:
+        legs, apart = solve_legs(part, where, leg_s, solve)
+    except SolveError as error:
+        return [solve(part, None)], [f"solved as a whole: a leg of it could not be solved by itself ({error})"]
+    said = f"where these meet they are {apart.m:.2f} m and {apart.deg:.1f} deg apart at most"
+    return legs, [f"solved in {len(legs)} legs that overlap (`timeline.leg_s`): {said}"]
 
 
 def _cut(recording: Recording, bridge_s: float) -> list[Recording]:

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run of hours is solved in legs that overlap, so that memory does not grow with it.
+
+What is known at the end of the overlap hardly depends on what came before it: biases and slow errors are known again
+after some tens of seconds. Only a heading that no sensor tells is handed on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import heading_deg_from_yaw, wrap_angle
+from graphloc.ledger import Ledger
+from graphloc.recording import Recording
+from graphloc.solution import Solution
+from graphloc.solve._memory import give_back_memory
+from graphloc.time import NS_PER_S
+
+_OVERLAP_S, _SHARE = 60.0, 0.2  # on each side of a seam, at most such a share of a leg
+_LOOK = 0.1  # of a leg, to each side: where a seam is looked for
+_ENOUGH = 0.9  # of the most places that are told beside any of these
+
+Solve = Callable[[Recording, float | None], Solution]
+"""Solves a recording; with the compass heading (deg) at its start, where that is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """How far two legs are apart where they meet."""
+
+    m: float
+    deg: float
+
+
+def seams(recording: Recording, leg_s: float, absolute: Collection[str]) -> list[int]:
+    """Return the stamps at which a run is cut into legs of at most about `leg_s`; none where it is no longer.
+
+    Args:
+        absolute: sensors that tell a place: a leg cannot start amid an outage, so seams keep away from these.
+    """
+    imu = recording.imu
+    if imu is None or len(imu) < 2:
+        return []
+    begin, end = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
+    legs = int(np.ceil((end - begin) / NS_PER_S / leg_s))
+    told = np.array([m.stamp_ns for m in recording.measurements if m.sensor in absolute], dtype=np.int64)
+    found = []
+    for k in range(1, legs):
+        long_ns = (end - begin) / legs
+        near = begin + ((k + np.linspace(-_LOOK, _LOOK, 21)) * long_ns).astype(np.int64)
+        beside = np.diff(np.searchsorted(told, near[:, None] + np.array([-1, 1]) * overlap_ns(leg_s))).ravel()
+        good = np.flatnonzero(beside >= _ENOUGH * beside.max())
+        found.append(int(near[good[np.argmin(np.abs(good - 10))]]))
+    return found
+
+
+def overlap_ns(leg_s: float) -> int:
+    """Return how far a leg goes on beyond a seam."""
+    return round(min(_OVERLAP_S, _SHARE * leg_s) * NS_PER_S)
+
+
+def solve_legs(
+    recording: Recording, seams_ns: Collection[int], leg_s: float, solve: Solve
+) -> tuple[list[Solution], Apart]:
+    """Solve the legs of a run in turn; return what each says of its own time, and how far they are apart at most.
+
+    Raises:
+        SolveError: one of them could not be solved.
+    """
+    assert recording.imu is not None
+    over = overlap_ns(leg_s)
+    edges = [np.iinfo(np.int64).min // 2, *seams_ns, np.iinfo(np.int64).max // 2]
+    legs: list[Solution] = []
+    heading_deg, before, apart = None, None, Apart(0.0, 0.0)
+    for begin, end in pairwise(edges):
+        whole = solve(_between(recording, begin - over, end + over), heading_deg)
+        if before is not None:
+            apart = _farther(apart, before, whole, begin)
+        at = np.array([end - over])
+        known = whole.trajectory.covers(at)[0]
+        heading_deg = float(heading_deg_from_yaw(whole.trajectory.at(at).yaw_rad)[0]) if known else None
+        legs.append(_own(whole, begin, end, legs[-1] if legs else None))
+        before = whole
+        give_back_memory()
+    return legs, apart
+
+
+def _between(recording: Recording, begin_ns: int, end_ns: int) -> Recording:
+    imu = recording.imu
+    assert imu is not None
+    own = slice(*np.searchsorted(imu.stamps_ns, [begin_ns, end_ns]))
+    samples = replace(
+        imu,
+        stamps_ns=imu.stamps_ns[own],
+        accel_mps2=imu.accel_mps2[own],
+        gyro_radps=imu.gyro_radps[own],
+        seqs=imu.seqs[own],
+    )
+    kept = tuple(m for m in recording.measurements if begin_ns <= m.stamp_ns < end_ns)
+    return replace(recording, imu=samples, measurements=kept, rows=())
+
+
+def _farther(apart: Apart, before: Solution, after: Solution, at_ns: int) -> Apart:
+    at = np.array([at_ns])
+    if not (before.trajectory.covers(at)[0] and after.trajectory.covers(at)[0]):
+        return apart
+    one, other = before.trajectory.at(at), after.trajectory.at(at)
+    off_m = float(np.hypot(*(one.p_world_m - other.p_world_m)[0, :2]))
+    off_deg = float(np.degrees(abs(wrap_angle(one.yaw_rad - other.yaw_rad)))[0])
+    return Apart(max(apart.m, off_m), max(apart.deg, off_deg))
+
+
+def _own(leg: Solution, begin_ns: int, end_ns: int, before: Solution | None) -> Solution:
+    """What a leg says of its own time."""
+
+    def mine(stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return np.asarray((stamps_ns >= begin_ns) & (stamps_ns < end_ns))
+
+    track, own = leg.trajectory, mine(leg.trajectory.stamps_ns)
+    assert track.v_world_mps is not None
+    assert track.cov is not None
+    kept = replace(
+        track,
+        stamps_ns=track.stamps_ns[own],
+        p_world_m=track.p_world_m[own],
+        R_world_body=track.R_world_body[own],
+        v_world_mps=track.v_world_mps[own],
+        cov=track.cov[own],
+    )
+    since = {name: s[own] for name, s in leg.since_agreed_s.items()}
+    if before is not None:
+        gone_s = (kept.stamps_ns - before.trajectory.stamps_ns[-1]) / NS_PER_S
+        for name, s in before.since_agreed_s.items():  # 'never' is never in this leg
+            own_s = since.get(name, np.full(len(kept), np.inf))
+            since[name] = np.where(np.isinf(own_s), s[-1] + gone_s, own_s)
+    slow = {
+        name: replace(s, stamps_ns=s.stamps_ns[m := mine(s.stamps_ns)], value=s.value[m], sigma=s.sigma[m])
+        for name, s in leg.slow.items()
+    }
+    berths = tuple(
+        replace(
+            b,
+            stamps_ns=b.stamps_ns[m := mine(b.stamps_ns)],
+            value=b.value[m],
+            rate=b.rate[m],
+            cov=None if b.cov is None else b.cov[m],
+        )
+        for b in leg.berths
+    )
+    return replace(
+        leg,
+        trajectory=kept,
+        v_cov=leg.v_cov[own],
+        accel_bias_mps2=leg.accel_bias_mps2[own],
+        gyro_bias_radps=leg.gyro_bias_radps[own],
+        gyro_radps=leg.gyro_radps[own],
+        health=tuple(h for h, m in zip(leg.health, own, strict=True) if m),
+        health_reason=tuple(h for h, m in zip(leg.health_reason, own, strict=True) if m),
+        since_agreed_s=since,
+        slow=slow,
+        berths=tuple(b for b in berths if len(b.stamps_ns)),
+        ledger=Ledger(row for row in leg.ledger if begin_ns <= row.stamp_ns < end_ns),
+        stats=replace(leg.stats, states=int(own.sum())),
+    )

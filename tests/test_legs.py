@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run of hours is solved in legs: as good as in one, and every message has its row."""
+
+from collections.abc import Sized
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import graphloc.solve
+from graphloc import app
+from graphloc.build import Problem, make_problem
+from graphloc.config import VesselConfig
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.frames import heading_deg_from_yaw, wrap_angle
+from graphloc.measurements import CompassHeading, GnssPosition, Measurement, PoseFix
+from graphloc.recording import Recording
+from graphloc.solution import Solution
+from graphloc.solve._legs import overlap_ns, seams
+
+S = 10**9
+LEG_S = 60.0
+LOOPS = Scenario(path="loops", duration_s=130.0, noise="drift", gnss_hz=2.0, compass_hz=2.0)
+
+
+def in_legs(config: VesselConfig, leg_s: float = LEG_S) -> VesselConfig:
+    return config.model_copy(update={"timeline": config.timeline.model_copy(update={"leg_s": leg_s})})
+
+
+def solved(run: SimulatedRun, leg_s: float = LEG_S, measurements: tuple[Measurement, ...] | None = None) -> Solution:
+    recording = run.recording
+    if measurements is not None:
+        recording = replace(recording, measurements=measurements)
+    return app.smooth_recording(recording, in_legs(run.config, leg_s)).solution
+
+
+def begin_ns(run: SimulatedRun) -> int:
+    assert run.recording.imu is not None
+    return int(run.recording.imu.stamps_ns[0])
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    return simulate(LOOPS, 3)
+
+
+@pytest.fixture(scope="module")
+def whole(run: SimulatedRun) -> Solution:
+    return solved(run, 1000.0)
+
+
+@pytest.fixture(scope="module")
+def legs(run: SimulatedRun) -> Solution:
+    return solved(run)
+
+
+def test_legs_are_as_good_as_the_whole(run: SimulatedRun, whole: Solution, legs: Solution) -> None:
+    (said,) = [w for w in legs.stats.warnings if "legs" in w]
+    assert said.startswith("solved in 3 legs")
+    assert not any("legs" in w for w in whole.stats.warnings)
+    one, several = (compare_to_truth(s.trajectory, run.truth) for s in (whole, legs))
+    assert several.matched == pytest.approx(one.matched, abs=1e-3)
+    assert several.position_rmse_m < one.position_rmse_m + 0.03
+    assert several.heading_rmse_deg < one.heading_rmse_deg + 0.1
+    assert several.coverage_95 is not None
+    assert several.coverage_95 > 0.85
+    common = whole.trajectory.stamps_ns[legs.trajectory.covers(whole.trajectory.stamps_ns)]
+    apart = np.linalg.norm(whole.trajectory.at(common).p_world_m - legs.trajectory.at(common).p_world_m, axis=1)
+    assert apart.max() < 0.2
+    # What is said of the seams is what the track does there: it steps by no more.
+    told_m = float(said.rpartition("they are ")[2].split(" m")[0])
+    assert told_m < 0.2
+
+
+def test_every_message_has_one_row_and_every_state_its_values(whole: Solution, legs: Solution) -> None:
+    assert [row.seq for row in legs.ledger] == [row.seq for row in whole.ledger]
+    assert len(legs.ledger) == len(whole.ledger)
+    n = len(legs.trajectory)
+    assert abs(n - len(whole.trajectory)) <= 3
+    assert legs.stats.states == n
+    columns: list[Sized] = [
+        legs.v_cov,
+        legs.accel_bias_mps2,
+        legs.gyro_bias_radps,
+        legs.gyro_radps,
+        legs.health,
+        legs.health_reason,
+    ]
+    assert {len(c) for c in (*columns, *legs.since_agreed_s.values())} == {n}
+    assert np.diff(legs.trajectory.stamps_ns).max() < 0.25 * S
+    assert legs.slow.keys() == whole.slow.keys()
+    for name, slow in legs.slow.items():
+        assert (np.diff(slow.stamps_ns) > 0).all()
+        assert len(slow.value) == len(slow.stamps_ns) == len(slow.sigma)
+        assert len(slow.stamps_ns) == pytest.approx(len(whole.slow[name].stamps_ns), abs=4)
+
+
+def test_seams_keep_away_from_an_outage(run: SimulatedRun) -> None:
+    recording, first = run.recording, begin_ns(run)
+    absolute = {m.sensor for m in recording.measurements if not isinstance(m, CompassHeading)}
+    assert seams(recording, 1000.0, absolute) == []
+    usual = seams(recording, LEG_S, absolute)
+    assert [s - first for s in usual] == pytest.approx([130 * S / 3, 260 * S / 3], abs=S)
+    gone = (usual[0] - 14 * S, usual[0] + 10 * S)
+    kept = tuple(m for m in recording.measurements if m.sensor not in absolute or not gone[0] < m.stamp_ns < gone[1])
+    away = seams(replace(recording, measurements=kept), LEG_S, absolute)
+    assert usual[0] + 3 * S < away[0] < usual[0] + 5 * S  # as far as it is looked for: a tenth of a leg
+    assert away[1] == usual[1]
+
+
+def test_a_heading_that_no_sensor_tells_is_handed_on(run: SimulatedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a vessel that only its way tells: in the first seconds of a leg it might be any."""
+    asked: list[float | None] = []
+
+    def noted(part: Recording, config: VesselConfig, *rest: Any) -> Problem:
+        asked.append(config.start.heading_deg)
+        return make_problem(part, config, *rest)
+
+    monkeypatch.setattr(graphloc.solve, "make_problem", noted)
+    fixes = tuple(m for m in run.recording.measurements if isinstance(m, GnssPosition))
+    solved(run, measurements=fixes)
+    where = seams(replace(run.recording, measurements=fixes), LEG_S, {"gnss"})
+    assert asked[0] is None
+    for seam, heading_deg in zip(where, asked[1:], strict=True):
+        true = run.truth.at(np.array([seam - overlap_ns(LEG_S)]))
+        assert heading_deg == pytest.approx(float(heading_deg_from_yaw(true.yaw_rad)[0]), abs=6.0)
+
+
+def test_a_leg_without_a_place_is_no_reason_to_fail(run: SimulatedRun) -> None:
+    first = begin_ns(run)
+    early = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < first + 20 * S)
+    found = solved(run, measurements=early)
+    (said,) = [w for w in found.stats.warnings if "a leg of it could not be solved" in w]
+    assert "no position" in said
+    assert found.trajectory.stamps_ns[-1] > first + 125 * S
+
+
+def test_a_sensor_that_fell_silent_was_heard_in_the_leg_before(run: SimulatedRun) -> None:
+    first = begin_ns(run)
+    quiet = tuple(m for m in run.recording.measurements if not isinstance(m, PoseFix) or m.stamp_ns < first + 30 * S)
+    found = solved(run, measurements=quiet)
+    name = next(m.sensor for m in run.recording.measurements if isinstance(m, PoseFix))
+    seconds = (found.trajectory.stamps_ns - first) * 1e-9
+    since = found.since_agreed_s[name][seconds > 35.0]
+    assert np.isfinite(since).all()
+    heard = seconds[seconds > 35.0] - since
+    assert np.ptp(heard) < 0.1
+    assert 20.0 < heard[0] < 30.1
+
+
+def test_legs_overlap_by_a_minute_to_each_side_and_less_where_they_are_short() -> None:
+    assert overlap_ns(1800.0) == 60 * S
+    assert overlap_ns(60.0) == 12 * S
+
+
+def test_turning_where_legs_meet_is_no_jump(legs: Solution) -> None:
+    yaw = np.unwrap(legs.trajectory.yaw_rad)
+    dt = np.diff(legs.trajectory.stamps_ns) * 1e-9
+    rate = legs.gyro_radps[:-1, 2]
+    assert np.abs(wrap_angle(np.diff(yaw) - rate * dt)).max() < np.radians(2.0)
