@@ -19,7 +19,7 @@ from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
-from graphloc.frontends.decode import IMU, NUMBERS, ODOMETRY, QUATERNION, yaw_of_x_axis
+from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, ODOMETRY, QUATERNION, yaw_of_x_axis
 from graphloc.stuck import stuck, stuck_warning
 from graphloc.time import NS_PER_S
 
@@ -225,12 +225,15 @@ def unit_of(stream: Stream) -> str | None:
     """Return the unit of a stream of bare numbers, if they are headings; None where it is none."""
     if stream.msgtype not in NUMBERS:
         return None
-    return "rad" if float(np.nanmax(np.abs(stream.rows), initial=0.0)) < 2.0 * np.pi + 0.1 else "deg"
+    known = np.abs(stream.rows[np.isfinite(stream.rows)])
+    # Not the largest: a driver may say -999 while it knows none.
+    return "rad" if len(known) and float(np.percentile(known, 95)) < 2.0 * np.pi + 0.1 else "deg"
 
 
 def _quaternions(stream: Stream, rows: Array) -> Array:
     if unit := unit_of(stream):
-        half = (np.radians(rows[:, 0]) if unit == "deg" else rows[:, 0]) / 2.0
+        angle = np.radians(rows[:, 0]) if unit == "deg" else rows[:, 0]
+        half = np.where(np.abs(angle) <= MOST_TURNS * 2.0 * np.pi, angle, np.nan) / 2.0
         return np.column_stack([0.0 * half, 0.0 * half, np.sin(half), np.cos(half)])
     return rows[:, 6:10] if stream.msgtype == IMU else rows[:, :4]
 
@@ -256,7 +259,7 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
     good = np.array([not isinstance(y, Rejection) for y in yaw])
     plain: dict[str, Any] = {"topic": stream.topic, "msgtype": stream.msgtype, "unit": unit_of(stream)}
     if good.sum() < 10:
-        why = "its quaternions give no yaw"
+        why = "its messages give no yaw"
         return CompassReport(
             **plain, usable=False, convention="enu", offset_deg=None, scatter_deg=None, samples=0, why=why
         )
@@ -264,8 +267,12 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
     named = stream.msgtype == QUATERNION  # a topic of bare orientations is meant as a compass
     sense = against_turning(turning, stream.stamps_ns[keep][good], angle)
     by_gyro = {1: "enu", -1: "ned"}.get(sense)
-    if courses is None or len(courses.stamps_ns) < 20:
+    spoke_ns = stream.stamps_ns[keep][good]
+    heard = 0 if courses is None else int(np.searchsorted(courses.stamps_ns, spoke_ns[[0, -1]]) @ [-1, 1])
+    if courses is None or heard < 20:
         why = "no GNSS course in motion to check it by" + (", the convention by the gyro" if by_gyro else "")
+        if courses is not None and not heard and stream.msgtype in NUMBERS:
+            why = "no GNSS course in motion while it speaks: it has no stamp, and was recorded at another time"
         return CompassReport(
             **plain, usable=named, convention=by_gyro or "enu", offset_deg=None, scatter_deg=None, samples=0, why=why
         )

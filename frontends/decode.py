@@ -57,7 +57,7 @@ _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # of NavSatStatus, by quality of GGA: differential, RTK
 _RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # horizontal, vertical, at a dilution of 1: fixed, float
-_MOST_TURNS = 20  # of a heading that is counted on from turn to turn
+MOST_TURNS = 20  # of a heading that is counted on from turn to turn
 _NO_CLIMB_MPS2 = 1e6  # variance of a vertical velocity that is not told, m^2/s^2
 # Beyond these no sensor of a vessel measures; they are finite, and a sum or a square of them need not be.
 _MOST_INERTIAL = 1e4  # in the unit of the bag: 1000 g; 30 turns a second in deg/s
@@ -265,9 +265,9 @@ def _compass_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Comp
     angle = float(np.radians(msg.data)) if config.unit == "deg" else float(msg.data)
     if not isfinite(angle):
         return malformed("heading is NaN")
-    if abs(angle) > _MOST_TURNS * 2.0 * pi:
+    if abs(angle) > MOST_TURNS * 2.0 * pi:
         return malformed(
-            f"heading {float(msg.data):g} {config.unit} is beyond {_MOST_TURNS} turns: is it in another unit?"
+            f"heading {float(msg.data):g} {config.unit} is beyond {MOST_TURNS} turns: is it in another unit?"
         )
     yaw = float(wrap_angle(pi / 2.0 - angle if config.convention == "ned" else angle))
     return CompassHeading(

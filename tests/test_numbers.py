@@ -85,3 +85,32 @@ def test_the_wrong_unit_is_named(bag: Path, tmp_path: Path) -> None:
     recording = read_recording(bag, load_config(drafted, KINDS))
     reasons = {r.reason for r in recording.rows if r.topic == HEADING}
     assert any("is beyond 20 turns: is it in another unit?" in reason for reason in reasons)
+
+
+def drafted(tmp_path: Path, run: SimulatedRun, late_ns: int, unknown: float) -> str:
+    """Of a bag with a heading in radians whose first ten are `unknown`, recorded so much after the fixes' stamps."""
+    make, imu = Messages(2), run.recording.imu
+    assert imu is not None
+    items: list[Item] = [
+        ("/imu", int(n), make.imu(int(n), a, w)) for n, a, w in zip(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps, strict=True)
+    ]  # fmt: skip
+    headings = [m for m in run.recording.measurements if isinstance(m, CompassHeading)]
+    items += [("/fix", m.stamp_ns, make.fix(m.stamp_ns, *m.position)) for m in run.recording.measurements if isinstance(m, GnssPosition)]  # fmt: skip
+    items += [
+        (YAW, m.stamp_ns + late_ns, make.t[DOUBLE](data=unknown if k < 10 else m.yaw_rad))
+        for k, m in enumerate(headings)
+    ]
+    return draft_config(inspect_bag(write_bag(tmp_path / "run", make, sorted(items, key=lambda i: i[1]))))
+
+
+def test_what_says_that_it_does_not_know_is_no_unit(run: SimulatedRun, tmp_path: Path) -> None:
+    assert "unit: rad" in drafted(tmp_path, run, 0, -999.0)
+
+
+def test_a_recorder_of_another_time_is_named(run: SimulatedRun, tmp_path: Path) -> None:
+    """A bag that was played and recorded again: stamps are of then, and what has none is of now."""
+    draft = drafted(tmp_path, run, 10**16, 0.0)
+    assert (
+        "left out as a compass; no GNSS course in motion while it speaks: it has no stamp, and was recorded at another time"
+        in draft
+    )

@@ -53,6 +53,27 @@ def test_the_last_pose_is_known_as_well_as_to_the_batch_and_no_better() -> None:
     assert not any("anew" in line or "contradicts" in line for line in replayed.stats.events)
 
 
+def test_what_is_seen_in_a_hole_of_the_imu_leads_nowhere() -> None:
+    """It tells of the state before: written as news of the nearest, it was news again each time, and the track 56 m off."""
+    run = docking()
+    imu, recording = (
+        run.recording.imu,
+        app.with_synthetic(run.recording, run.config, app.choose_datum(run.recording, run.config)),
+    )
+    assert imu is not None
+    since_s = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    heard = (since_s < 15.3) | (since_s >= 17.3)
+    kept = replace(
+        imu, stamps_ns=imu.stamps_ns[heard], accel_mps2=imu.accel_mps2[heard], gyro_radps=imu.gyro_radps[heard],
+        seqs=imu.seqs[heard],
+    )  # fmt: skip
+    replayed = replay(replace(recording, imu=kept), run.config, datum=app.choose_datum(recording, run.config)).solution
+    track = replayed.trajectory
+    off_m = np.linalg.norm(track.p_world_m - run.truth.at(track.stamps_ns).p_world_m, axis=1)
+    assert off_m.max() < 1.5
+    assert not any("anew" in line or "failed" in line for line in replayed.stats.events)
+
+
 def test_tags_that_come_late_are_the_place_of_a_batch() -> None:
     """The first of them 10.7 s after the begin, and nothing else that tells a place: all were rejected, and the run 800 m off."""
     run = docking("2")

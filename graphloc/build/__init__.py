@@ -10,7 +10,7 @@ whose Euler term GTSAM's preintegration leaves out. Every other mount is taken f
 solution is moved to the body's origin at the end (`graphloc.solve`).
 """
 
-from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state
+from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state, state_of
 from graphloc.build._chains import CHAIN_END, CONSTANT_TAILS, JUMP, bias_step, slow_begin, slow_end, slow_step
 from graphloc.build._graph import Decisions, StartPrior, build_graph, state_keys
 from graphloc.build._problem import (
@@ -48,5 +48,6 @@ __all__ = [
     "slow_end",
     "slow_step",
     "state_keys",
+    "state_of",
     "with_noise_scale",
 ]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import gtsam
@@ -11,9 +12,18 @@ import numpy as np
 from graphloc import keys
 from graphloc.frames import Array, Datum
 from graphloc.graph import Attachment, Constant, Sensor, SlowProcess
+from graphloc.measurements import Measurement
 
 Carry = tuple[int, Any]
 """A state, and the motion preintegrated from there."""
+
+
+class Stamps(Protocol):
+    """Stamps of states, by number."""
+
+    def __getitem__(self, k: int, /) -> Any:
+        """Of one."""
+        ...
 
 
 class OnTimeline(Protocol):
@@ -115,6 +125,17 @@ class Judged(Attaching, Protocol):
 def nav_state(values: gtsam.Values, k: int) -> Any:
     """Return the NavState of state k."""
     return gtsam.NavState(values.atPose3(keys.pose(k)), values.atVector(keys.velocity(k)))
+
+
+def state_of(m: Measurement, floor: int, nearest: int, stamps_ns: Stamps, holes: Sequence[tuple[int, int]]) -> int:
+    """Return the state that a measurement belongs to: the nearest, or where a hole of the IMU lies in between the one before (`floor`).
+
+    It is carried from there. How the nearest lies to that is a guess across a hole: what tells of the one, written as news of
+    the other, is news again each time it is written.
+    """
+    start_ns, stop_ns = int(stamps_ns[floor]), int(stamps_ns[nearest])
+    in_hole = nearest != floor and m.stamp_ns > start_ns and any(a < stop_ns and b > start_ns for a, b in holes)
+    return floor if in_hole else nearest
 
 
 def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> Attachment:

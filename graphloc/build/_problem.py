@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build._attach import nav_state
+from graphloc.build._attach import nav_state, state_of
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array, Datum
@@ -35,7 +35,7 @@ class Stream:
         slow: its slow state, or None. left_out: the slow state that it would have in company.
         constants: what its measurements may share.
         mount: pose of the sensor from the IMU's place, body axes.
-        measurements: M of them by stamp. state: (M,) nearest state. carry: per measurement the
+        measurements: M of them by stamp. state: (M,) its state (`state_of`). carry: per measurement the
             preintegrated motion from the state before it, or None where it stands on a state.
         gyro_radps: (M, 3) raw rate at each measurement, body axes.
         sparse: (M,) true for the first measurement at each slow node.
@@ -275,10 +275,10 @@ def _stream(
     links: InertialLink,
 ) -> Stream:
     zero = gtsam.imuBias.ConstantBias()
-    state, carry = [], []
+    state, carry, holes = [], [], links.gaps()
     for m in measurements:
         floor = timeline.floor(m.stamp_ns)
-        state.append(timeline.nearest(m.stamp_ns))
+        state.append(state_of(m, floor, timeline.nearest(m.stamp_ns), timeline.stamps_ns, holes))
         at = int(timeline.stamps_ns[floor])
         carry.append(None if m.stamp_ns <= at else (floor, links.integrate(at, m.stamp_ns, zero)))
     T_state_sensor = gtsam.Pose3(gtsam.Rot3(mount[1]), mount[0])

@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 import gtsam
 import numpy as np
 
-from graphloc.build import Carry, Mounts, company_of, mount_of
+from graphloc.build import Carry, Mounts, company_of, mount_of, state_of
 from graphloc.chi2 import chi2_median
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
@@ -204,8 +204,10 @@ class LiveProblem:
         """Put a measurement where it belongs; return its stream and its index there."""
         stream = self.streams[m.sensor]
         carry, gyro_radps = self._motion(m.stamp_ns)
+        timeline = self.timeline
+        floor, nearest = timeline.floor(m.stamp_ns), timeline.nearest(m.stamp_ns)
         stream.measurements.append(m)
-        stream.state.append(self.timeline.nearest(m.stamp_ns))
+        stream.state.append(state_of(m, floor, nearest, timeline.stamps_ns, self.links.gaps()))
         stream.carry.append(carry)
         stream.gyro_radps.append(gyro_radps)
         return stream, len(stream.measurements) - 1
