@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -17,6 +18,7 @@ from graphloc.config import TimelineConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import Links
+from graphloc.keys import is_pose
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix
 from graphloc.online import OnlineSmoother
@@ -274,6 +276,30 @@ def test_a_rebuild_loses_nothing(monkeypatch: pytest.MonkeyPatch, error: Excepti
     assert off[-1] < 0.03
     odom = [np.linalg.norm(e.p_odom_m - plain[e.stamp_ns].p_odom_m) for e in fed.estimates]
     assert max(odom) < 0.15  # what was built anew is not walked twice
+
+
+def test_a_solver_that_runs_away_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps from far off may lead farther, and the linear algebra does not mind: 10^20 m were once given out."""
+    every, online = arrivals_of(run_of()), smoother(run_of())
+    n, base = at_s(every, 12.0), every[: at_s(every, 18.0)]
+    fed, commit, lost = feed(online, run_of(), base[:n]), Window.commit, list[Window]()
+
+    def astray(window: Window) -> None:
+        """The first window goes, whatever is solved again; another that is built anew does not."""
+        commit(window)
+        lost.append(window)
+        if window is lost[0]:
+            for key in [k for k in window.values.keys() if is_pose(k)]:  # noqa: SIM118 - no mapping
+                pose = window.values.atPose3(key)
+                window.values.update(key, gtsam.Pose3(pose.rotation(), pose.translation() + 1e5))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Window, "commit", astray)
+        feed(online, run_of(), base[n : n + 30], fed)
+    feed(online, run_of(), base[n + 30 :], fed)
+    assert complaints(base, finish(online, fed)) == []
+    assert any("ran away" in e and "rebuilt from" in e for e in fed.events)
+    assert max(fed.errors_m) < 5.0
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from graphloc.online._window import Held, Window
 from graphloc.solve._foreseen import Prediction, prediction_of
 
 _HOLE_S = 1.0  # in the IMU's data
+_AWAY_M = 2e3  # no vessel goes so far from one state to the next, in the longest hole that is bridged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,8 +103,15 @@ class States:
         return self._newest
 
     def read(self) -> None:
-        """Read the newest state off the window, once it has been solved."""
-        self._newest = self._read()
+        """Read the newest state off the window, once it has been solved.
+
+        Raises:
+            SolveError: the solver ran away.
+        """
+        newest = self._read()
+        if np.linalg.norm(newest.pose.translation() - self._newest.pose.translation()) > _AWAY_M:
+            raise SolveError("the solver ran away")
+        self._newest = newest
 
     def _read(self) -> Newest:
         timeline, values = self._problem.timeline, self._window.values
