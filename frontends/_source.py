@@ -30,6 +30,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from graphloc.errors import InputError
+from graphloc.frontends._clock import refuse_set_back
 from graphloc.frontends._part import BagPart, Bags, recording_times
 from graphloc.frontends._recover import Recovered, as_ros2, recover
 from graphloc.frontends._unpack import limit_unpacking
@@ -351,6 +352,24 @@ class Bag:
                 f"{opened.path}: damaged after {read} messages ({_text(error)}): the rest was not read; "
                 f"{HINTS.get(opened.path.suffix, HINTS[''])}"
             )
+
+    def refuse_set_back(self, topics: Collection[str]) -> None:
+        """Refuse the bag, or the part of it, where the recorder's clock was set back while these topics were written.
+
+        Raises:
+            InputError: it was.
+        """
+        start_ns, end_ns = self._within
+        for opened in self._opened:
+            for topic in topics:
+                try:
+                    pieces = [np.clip(times, 0, LATEST_NS) for _, times in recording_times(opened.reader, topic)]
+                except Exception as error:  # noqa: BLE001 - as above; what is damaged is said when it is read
+                    log.debug("%s: no recording times: %s", opened.path, error)
+                    continue
+                times = np.concatenate([np.empty(0, dtype=np.int64), *pieces])
+                inside = (times >= (start_ns or 0)) & (times < (LATEST_NS + 1 if end_ns is None else end_ns))
+                refuse_set_back(topic, str(opened.path), times[inside])
 
     def decode(self, message: RawMessage) -> object:
         """Return the deserialised message. Raises whatever rosbags raises on bad bytes."""

@@ -95,6 +95,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     """
     with Bag(paths) as bag:
         topics = bag.topics
+        bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
         streams, tree = read_streams(bag)
         clouds = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
         images = _frames_of(bag, _pictures(bag))
