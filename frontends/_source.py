@@ -253,6 +253,11 @@ class Bag:
     def _open_folder(self, path: Path) -> None:
         if (path / "metadata.yaml").exists():
             if self._try(path, Reader2):
+                if left := _not_named(path):
+                    self.warnings.append(
+                        f"{path}: its metadata.yaml does not name {', '.join(left)}, so what is in there is not read "
+                        f"({HINTS['']}, or give the files one by one)"
+                    )
                 return
             reason = self._broken.pop()
         else:
@@ -401,6 +406,12 @@ class Bag:
 
 def _whole(paths: Path | str | Sequence[Path | str]) -> BagPart:
     return BagPart((Path(paths),) if isinstance(paths, str | Path) else tuple(Path(p) for p in paths))
+
+
+def _not_named(folder: Path) -> list[str]:
+    """Files of a folder that its metadata.yaml does not name: of a recorder that died, say, or copied there."""
+    named = (folder / "metadata.yaml").read_text(encoding="utf-8", errors="replace")
+    return sorted(p.name for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.name not in named)
 
 
 def _instead(folder: Path) -> str:
