@@ -24,6 +24,7 @@ from graphloc.frontends.decode import IMU
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
+_LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
@@ -108,8 +109,12 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
         "  kind: apriltag",
         "  enabled: false  # guess: true once there is a survey of the tags",
         "  survey: tags.yaml  # which tags stand where, and how large they are: docs/tags.md",
-        "  cameras:",
     ]
+    if any(camera.listed for camera in cameras):
+        lines.append(
+            f"  edge_sigma_px: {_LISTED_EDGE_PX}  # guess: another's detector, which sees white creep into black (gamma)"
+        )
+    lines.append("  cameras:")
     for k, camera in enumerate(cameras):
         lines.append(f"    {_numbered('camera', k)}:")
         lines.append(f"      topic: {camera.topic}")
