@@ -123,6 +123,31 @@ def refuse_woven(
             )
 
 
+def refuse_set_back(topic: str, file: str, logs_ns: Stamps) -> None:
+    """Refuse a file whose recording clock was set back while it was written: readers put it in order of time, and so weave it.
+
+    Messages that a file holds twice are none.
+
+    Args:
+        logs_ns: (N,) recording times of an IMU's messages, in the order in which they were written.
+
+    Raises:
+        InputError: it was.
+    """
+    for k in set_backs(logs_ns):
+        after = logs_ns[k:]
+        woven = after[after <= logs_ns[:k].max()]
+        if 2 * int(np.isin(woven, logs_ns[:k]).sum()) > len(woven):
+            continue
+        back_s = float(logs_ns[k - 1] - logs_ns[k]) / NS_PER_S
+        raise InputError(
+            f"{file}: {topic} goes back by {back_s:.1f} s within the file, from {utc_text(int(logs_ns[k - 1]))} to "
+            f"{utc_text(int(logs_ns[k]))}, by the recording times: the recorder's clock was set back, and what was recorded "
+            "before and after it would be laid over each other; take a part of the bag before the latter time or after the "
+            "former (--start, --duration)"
+        )
+
+
 def busiest_section(stamps_ns: Stamps, hole_s: float = HOLE_LIMIT_S) -> tuple[int, int]:
     """Return first and last stamp of the section with most readings, sections being parted by holes."""
     ordered = np.sort(stamps_ns)

@@ -23,6 +23,8 @@ from graphloc.frontends.decode import IMU
 
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
+_ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
+_LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
@@ -107,8 +109,12 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
         "  kind: apriltag",
         "  enabled: false  # guess: true once there is a survey of the tags",
         "  survey: tags.yaml  # which tags stand where, and how large they are: docs/tags.md",
-        "  cameras:",
     ]
+    if any(camera.listed for camera in cameras):
+        lines.append(
+            f"  edge_sigma_px: {_LISTED_EDGE_PX}  # guess: another's detector, which sees white creep into black (gamma)"
+        )
+    lines.append("  cameras:")
     for k, camera in enumerate(cameras):
         lines.append(f"    {_numbered('camera', k)}:")
         lines.append(f"      topic: {camera.topic}")
@@ -246,7 +252,10 @@ def _compass_block(name: str, compass: CompassReport, *, enabled: bool) -> list[
         quarter = 90.0 * round(compass.offset_deg / 90.0)
         rest = abs(compass.offset_deg - quarter)
         yaw, sigma = (quarter, rest) if rest < 15.0 else (round(compass.offset_deg), _LEEWAY_DEG)
-        lines.append(f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course")
+        astern = ", unless the craft goes astern most of the time: then 0" if abs(yaw) > _ASTERN_DEG else ""
+        lines.append(
+            f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course{astern}"
+        )
         if sigma > _COMPASS_SIGMA_DEG:
             lines.append(f"  mount_offset_sigma_deg: {sigma:.1f}  # guess: a course is no heading, and tells no more")
     elif compass.offset_deg is not None and abs(compass.offset_deg) > _COMPASS_SIGMA_DEG:

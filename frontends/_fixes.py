@@ -17,6 +17,7 @@ _HELD_S = 2.5
 """A place that is repeated for less, and then changes, was held by a driver; for longer, the receiver itself stands still."""
 _OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp again, from which a line is due
 _FAST_S, _EVEN, _FEWEST = 0.25, 0.2, 100  # steps over which motion hides in no third difference, and how many tell
+_NOTHING_M = 100.0  # 1 sigma, from which a fix is none
 SCATTERS = 2.0
 """Scatter over the claim from which the claim is not believed."""
 
@@ -71,7 +72,7 @@ def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:
 
 
 def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConfig) -> list[str]:
-    """Return a line where fixes scatter from one to the next by far more than they claim."""
+    """Return a line where fixes scatter from one to the next by far more than they claim, or claim to tell next to nothing."""
     if len(fixes) < _FEWEST:
         return []
     ordered = sorted(fixes, key=lambda m: (m.stamp_ns, m.seq))
@@ -82,6 +83,10 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
     claimed = max(
         config.sigma_scale * float(np.sqrt(np.median(variances, axis=0).max())), config.min_horizontal_sigma_m
     )
+    if claimed > _NOTHING_M:
+        scatter = "" if found is None else f", though they scatter by {found:.2f} m from one to the next"
+        said = f"{sensor}: its fixes count as good to {claimed:.0f} m only, and so next to nothing{scatter}"
+        return [f"{said}: by the covariance of its messages, and sigma_scale; look at what the driver writes there"]
     if found is None or found < SCATTERS * claimed:
         return []
     said = f"{sensor}: its fixes scatter by {found:.2f} m from one to the next, and count as good to {claimed:.2f} m"

@@ -6,13 +6,14 @@ from __future__ import annotations
 import math
 import struct
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2.reader import DirectoryReader
@@ -57,40 +58,48 @@ Bags = Path | str | Sequence[Path | str] | BagPart
 """A .bag, .mcap or .db3 file, the folder of a ROS 2 bag, several of one kind (split bags), or a part of them."""
 
 
-def recording_times(reader: Reader1 | Reader2) -> Times:
-    """Yield topics and recording times (N,) ns of their messages, in pieces, from a file's index; nothing is unpacked.
+def recording_times(reader: Reader1 | Reader2, only: str | None = None) -> Times:
+    """Yield topics (or `only` one) and recording times (N,) ns of their messages, in pieces, from a file's index.
 
+    In the order in which they were written, which is not that of time where a clock was set back; nothing is unpacked.
     An MCAP file without chunks has no index and is walked through. Raises whatever rosbags raises on bad bytes.
     """
     if isinstance(reader, Reader1):
-        for c in reader.connections:
-            yield c.topic, np.array([entry.time for entry in reader.indexes[c.id]], dtype=np.int64)
+        for c in _only(reader.connections, only):
+            entries = sorted(reader.indexes[c.id], key=lambda entry: (entry.chunk_pos, entry.offset))
+            yield c.topic, np.array([entry.time for entry in entries], dtype=np.int64)
         return
     for storage in reader.storage.storages if isinstance(reader.storage, DirectoryReader) else [reader.storage]:
         if isinstance(storage, Sqlite3Reader):
-            yield from _times_sqlite3(storage)
+            yield from _times_sqlite3(storage, only)
         elif isinstance(storage, McapReader):
-            yield from _times_mcap(storage)
+            yield from _times_mcap(storage, only)
 
 
-def _times_sqlite3(storage: Sqlite3Reader) -> Times:
+def _only(connections: Iterable[Connection], topic: str | None) -> list[Connection]:
+    return [c for c in connections if topic in (None, c.topic)]
+
+
+def _times_sqlite3(storage: Sqlite3Reader, only: str | None) -> Times:
     assert storage.dbconn is not None
-    for c in storage.connections:
-        rows: Any = storage.dbconn.execute("SELECT timestamp FROM messages WHERE topic_id = ?", (c.id,))
+    for c in _only(storage.connections, only):
+        rows: Any = storage.dbconn.execute("SELECT timestamp FROM messages WHERE topic_id = ? ORDER BY id", (c.id,))
         yield c.topic, np.array([time for (time,) in rows], dtype=np.int64)
 
 
-def _times_mcap(storage: McapReader) -> Times:
+def _times_mcap(storage: McapReader, only: str | None) -> Times:
     assert storage.bio is not None
+    topics = {c.id: c.topic for c in _only(storage.connections, only)}
     if not storage.chunks:
         found: dict[str, list[int]] = defaultdict(list)
-        for c, time, _ in storage.messages_scan(storage.connections):
+        for c, time, _ in storage.messages_scan(_only(storage.connections, only)):
             found[c.topic].append(time)
         yield from ((topic, _signed(np.array(times, dtype=np.uint64))) for topic, times in found.items())
         return
-    topics = {c.id: c.topic for c in storage.connections}
-    for chunk in storage.chunks:
+    for chunk in sorted(storage.chunks, key=lambda chunk: chunk.chunk_start_offset):
         for channel, offset in chunk.message_index_offsets.items():
+            if channel not in topics:
+                continue
             storage.bio.seek(offset)
             *_, size = _MCAP_INDEX.unpack(storage.bio.read(_MCAP_INDEX.size))
             if size > chunk.message_index_length:

@@ -159,13 +159,14 @@ class MountedTopic:
 
     Attributes:
         tf_frame: the same where /tf_static leads to it, else None. info_topic: a camera's CameraInfo where one lies beside
-            it, else ''.
+            it, else ''. listed: it holds what a detector found, not images.
     """
 
     topic: str
     frame_id: str
     tf_frame: str | None
     info_topic: str = ""
+    listed: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

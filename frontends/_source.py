@@ -30,6 +30,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from graphloc.errors import InputError
+from graphloc.frontends._clock import refuse_set_back
 from graphloc.frontends._part import BagPart, Bags, recording_times
 from graphloc.frontends._recover import Recovered, as_ros2, recover
 from graphloc.frontends._unpack import limit_unpacking
@@ -252,6 +253,11 @@ class Bag:
     def _open_folder(self, path: Path) -> None:
         if (path / "metadata.yaml").exists():
             if self._try(path, Reader2):
+                if left := _not_named(path):
+                    self.warnings.append(
+                        f"{path}: its metadata.yaml does not name {', '.join(left)}, so what is in there is not read "
+                        f"({HINTS['']}, or give the files one by one)"
+                    )
                 return
             reason = self._broken.pop()
         else:
@@ -351,6 +357,24 @@ class Bag:
                 f"{HINTS.get(opened.path.suffix, HINTS[''])}"
             )
 
+    def refuse_set_back(self, topics: Collection[str]) -> None:
+        """Refuse the bag, or the part of it, where the recorder's clock was set back while these topics were written.
+
+        Raises:
+            InputError: it was.
+        """
+        start_ns, end_ns = self._within
+        for opened in self._opened:
+            for topic in topics:
+                try:
+                    pieces = [np.clip(times, 0, LATEST_NS) for _, times in recording_times(opened.reader, topic)]
+                except Exception as error:  # noqa: BLE001 - as above; what is damaged is said when it is read
+                    log.debug("%s: no recording times: %s", opened.path, error)
+                    continue
+                times = np.concatenate([np.empty(0, dtype=np.int64), *pieces])
+                inside = (times >= (start_ns or 0)) & (times < (LATEST_NS + 1 if end_ns is None else end_ns))
+                refuse_set_back(topic, str(opened.path), times[inside])
+
     def decode(self, message: RawMessage) -> object:
         """Return the deserialised message. Raises whatever rosbags raises on bad bytes."""
         if message.msgtype not in self._stores:
@@ -381,6 +405,12 @@ class Bag:
 
 def _whole(paths: Path | str | Sequence[Path | str]) -> BagPart:
     return BagPart((Path(paths),) if isinstance(paths, str | Path) else tuple(Path(p) for p in paths))
+
+
+def _not_named(folder: Path) -> list[str]:
+    """Files of a folder that its metadata.yaml does not name: of a recorder that died, say, or copied there."""
+    named = (folder / "metadata.yaml").read_text(encoding="utf-8", errors="replace")
+    return sorted(p.name for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.name not in named)
 
 
 def _instead(folder: Path) -> str:

@@ -82,6 +82,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         topics = bag.topics
         sensors, truth, check = _asked_for(config, bag)
         span = _span(bag, config)
+        bag.refuse_set_back([r.config.topic for r in sensors if r.config.kind == "imu"])
         tree = StaticTree() if any(s.enabled and s.mount.tf_frame for s in config.sensors.values()) else None
         rows = _Reader(bag, topics, sensors, [b for b in (truth, check) if b], tree).read(progress)
         warnings = list(bag.warnings)

@@ -95,6 +95,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     """
     with Bag(paths) as bag:
         topics = bag.topics
+        bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
         streams, tree = read_streams(bag)
         clouds = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
         images = _frames_of(bag, _pictures(bag))
@@ -141,7 +142,10 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first, antenna)) for s in poses),
         velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
         lidars=_mounted(clouds, tree, body),
-        cameras=_mounted(images, tree, body, {t.topic for t in topics.values() if INFO in t.msgtypes}),
+        cameras=tuple(
+            replace(camera, listed=bool(set(LISTS) & set(topics[camera.topic].msgtypes)))
+            for camera in _mounted(images, tree, body, {t.topic for t in topics.values() if INFO in t.msgtypes})
+        ),
         tf_frames=tree.frames,
         body_frame=body,
         warnings=(

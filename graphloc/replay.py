@@ -30,6 +30,7 @@ from graphloc.measurements import ImuSample, Measurement, TagSighting
 from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
 from graphloc.solution import Solution, SolveStats
+from graphloc.solve._solution import disagreeing
 from graphloc.trajectory import Trajectory
 
 Status = Callable[[float, float, Estimate | None, str], None]
@@ -320,6 +321,12 @@ def _solution(estimates: Sequence[Estimate], ledger: Ledger, smoother: OnlineSmo
     assert smoother.datum is not None
     stamps = np.array([e.stamp_ns for e in kept], dtype=np.int64)
     names = kept[-1].since_agreed_s
+    judged: dict[str, list[float]] = {}
+    for row in ledger:
+        if row.weight is not None:
+            judged.setdefault(row.sensor, []).append(row.weight)
+    warnings = [line for line in said if any(word in line for word in _WARNS)]
+    warnings += [line for name, weights in judged.items() for line in disagreeing(name, np.array(weights))]
     return Solution(
         datum=smoother.datum,
         trajectory=Trajectory(
@@ -341,7 +348,6 @@ def _solution(estimates: Sequence[Estimate], ledger: Ledger, smoother: OnlineSmo
         ledger=ledger,
         stats=SolveStats(
             passes=0, iterations=len(estimates), states=len(kept), factors=0, cost=0.0, expected_cost=0.0, converged=True,
-            warnings=tuple(line for line in said if any(word in line for word in _WARNS)), events=tuple(said),
-            online=True,
+            warnings=tuple(warnings), events=tuple(said), online=True,
         ),
     )  # fmt: skip

@@ -137,6 +137,19 @@ def test_split_ros1_bags(tmp_path: Path) -> None:
         assert recording.warnings == ()
 
 
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_files_that_metadata_does_not_name_are_said(tmp_path: Path, kind: str) -> None:
+    """Half of a run was left out without a word."""
+    make = Messages(2)
+    folder = write_bag(tmp_path / "run", make, still_run(make), kind)
+    second = write_bag(tmp_path / "next", make, still_run(make, start_ns=START_NS + 4 * S), "mcap")
+    (second / "next.mcap").rename(folder / "next.mcap")
+    recording = read_recording(folder, vessel())
+    assert len(recording.measurements) == 20
+    (said,) = recording.warnings
+    assert said.startswith(f"{folder}: its metadata.yaml does not name next.mcap")
+
+
 @pytest.mark.parametrize(("kind", "suffix"), [("sqlite3", "db3"), ("mcap", "mcap")])
 def test_split_ros2_bag(tmp_path: Path, kind: str, suffix: str) -> None:
     make = Messages(2)

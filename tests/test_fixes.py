@@ -120,6 +120,14 @@ def test_noise_that_a_receiver_hides(
             assert float(found[0].split("sigma_scale:")[1].split("#")[0]) == pytest.approx(expected, rel=0.15)
 
 
+@pytest.mark.parametrize(("hz", "sigma_m", "said"), [(10, 1e4, 1), (2, 1e4, 1), (10, 20.0, 0)])
+def test_fixes_that_claim_to_tell_nothing_are_said(hz: int, sigma_m: float, said: int, tmp_path: Path) -> None:
+    """A driver that writes 1e8 m^2: the track was 100 m off its fixes, and its bounds km, without a word."""
+    lines = read(tmp_path, fixes(hz, noise_m=0.2, sigma_m=sigma_m, seconds=60)).warnings
+    assert len(lines) == said
+    assert all("gnss: its fixes count as good to 10000 m only" in line for line in lines)
+
+
 @pytest.mark.parametrize("every", [1, 3])
 def test_a_fix_without_a_height_is_a_horizontal_one(every: int, tmp_path: Path) -> None:
     """NavSatFix says NaN where there is no altitude; a fix without a latitude or longitude stays refused."""

@@ -200,6 +200,7 @@ def test_standard_receiver_gets_a_slow_error(tmp_path: Path) -> None:
         (90.0, 2.0, True, 90.0, 1.0),
         (98.0, 2.0, True, 90.0, 8.0),
         (40.0, 2.0, True, 40.0, 5.0),
+        (172.0, 2.0, True, 180.0, 8.0),
         (0.0, 60.0, False, 0.0, 0.0),
     ],
 )
@@ -227,6 +228,7 @@ def test_imu_orientation_as_compass(
         assert report.convention == "enu"
         assert compass.mount.rpy_deg == pytest.approx((0.0, 0.0, mount_deg), abs=1.0)
         assert compass.mount_offset_sigma_deg == pytest.approx(sigma_deg, abs=1.0)
+        assert ("unless the craft goes astern" in text) is (mount_deg == 180.0)
     else:
         assert "compass" not in config.sensors
         assert "orientation of /ahrs: left out as a compass" in text

@@ -8,6 +8,7 @@ import pytest
 
 from graphloc.errors import InputError
 from graphloc.frontends._clock import set_backs
+from graphloc.frontends._part import BagPart
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag
 from graphloc.ledger import Outcome
@@ -123,3 +124,30 @@ def test_parts_that_follow_or_repeat_each_other_are_one_run(
     recording = read_recording(parts(tmp_path, second_s, 0.0), vessel(gnss=None))
     assert recording.imu is not None
     assert len(recording.imu) == samples
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap", "ros1"])
+def test_a_recorder_whose_clock_was_set_back_within_a_file_is_refused(tmp_path: Path, kind: str) -> None:
+    """All readers put messages in order of time: the parts were woven into one run, 39 m off."""
+    make = Messages(1 if kind == "ros1" else 2)
+    items: list[Item] = []
+    for k in range(2000):
+        stamp = START_NS + k * S // 50 - (round(15.013 * S) if k >= 1000 else 0)
+        items.append(("/imu", stamp + LATE_NS, make.imu(stamp, gyro=(1e-6 * k, 0.0, 0.0))))
+    path = write_bag(tmp_path / f"run{'.bag' if kind == 'ros1' else ''}", make, items, kind)
+    for read in (lambda p: read_recording(p, vessel(gnss=None)), inspect_bag):
+        with pytest.raises(InputError) as error:
+            read(path)
+        one_line(error, "run", "/imu goes back by 15.0 s within the file", "--start, --duration")
+    for part, samples in ((BagPart((path,), duration_s=4.5), 225), (BagPart((path,), start_s=21.0), 199)):
+        recording = read_recording(part, vessel(gnss=None))
+        assert recording.imu is not None
+        assert abs(len(recording.imu) - samples) < 3
+
+
+def test_a_file_that_holds_a_part_twice_is_one_run(tmp_path: Path) -> None:
+    steady: list[Item] = [("/imu", START_NS + k * S // 50, MAKE.imu(START_NS + k * S // 50)) for k in range(1500)]
+    path = write_bag(tmp_path / "run", MAKE, [*steady[:1000], *steady[500:]], "sqlite3")
+    recording = read_recording(path, vessel(gnss=None))
+    assert recording.imu is not None
+    assert len(recording.imu) == 1500

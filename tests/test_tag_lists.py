@@ -13,10 +13,13 @@ from pupil_apriltags import Detector
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
+from graphloc.config import AprilTagConfig, load_config
+from graphloc.factors import KINDS
 from graphloc.frames import Array
 from graphloc.frontends._source import Bag
+from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.frontends.tags.listed import LISTS, ListedTag, read_list
-from tests.bagfactory import START_NS, Messages, write_bag
+from tests.bagfactory import START_NS, Messages, still_run, write_bag
 
 CORNERS, POSES = "apriltag_msgs/msg/AprilTagDetectionArray", "apriltag_ros/msg/AprilTagDetectionArray"
 # As christianrauch/apriltag_msgs and AprilRobotics/apriltag_ros have them.
@@ -259,3 +262,15 @@ def test_a_bad_entry_spoils_no_other() -> None:
     assert [line.split(":")[0] for line in unusable] == ["tag 8"]
     np.testing.assert_allclose(np.abs(rays_of(tags[1])), 0.2 / 3.0)  # the length of a quaternion is not one of the tag
     assert read_list(listing(make, POSES), POSES) == ([], [])
+
+
+def test_a_draft_allows_for_the_edges_of_another_detector(tmp_path: Path) -> None:
+    """AprilTag 3 on images as a camera gives them: 0.2 m off, and 55 % of the time within its bounds of 95 %."""
+    make = maker(CORNERS)
+    items = [*still_run(make), ("/detections", START_NS, listing(make, CORNERS, with_corners(make, np.eye(4, 2))))]
+    draft = draft_config(inspect_bag(write_bag(tmp_path / "lists", make, items)))
+    assert "    edge_sigma_px: 0.3  # guess" in draft
+    (tmp_path / "vessel.yaml").write_text(draft)
+    tags = load_config(tmp_path / "vessel.yaml", KINDS).sensors["tags"]
+    assert isinstance(tags, AprilTagConfig)
+    assert tags.edge_sigma_px == 0.3

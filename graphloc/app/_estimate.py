@@ -18,6 +18,7 @@ from graphloc.eval.digerud import run_digerud
 from graphloc.eval.match_picture import Gallery
 from graphloc.eval.posture import posture_warnings
 from graphloc.eval.simulate import SimulatedRun
+from graphloc.eval.tag_check import suspect_tags
 from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Datum
@@ -148,7 +149,7 @@ def replay_recording(
     """Run a recording through the online mode (see `graphloc.replay`)."""
     replayed = replay(recording, config, scans=scans, rate=rate, lag_s=lag_s, stoppable=True, status=status)
     recording, solution = replayed.recording, replayed.solution
-    said = _track_warnings(solution, recording, config)
+    said = suspect_tags(recording, config, solution) + _track_warnings(solution, recording, config)
     run = Run(recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution)
     return made_comparable(_with_underlay(run, scans))
 

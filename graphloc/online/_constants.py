@@ -53,6 +53,14 @@ class Constants:
                 window.add([gtsam.PriorFactorVector(key, value, model)])
             window.touch(key, now_s)
 
+    def marked(self) -> dict[int, Beside]:
+        """Return what is remembered, for `back_to`."""
+        return dict(self._known)
+
+    def back_to(self, mark: Mapping[int, Beside]) -> None:
+        """Remember what was remembered then: what was taken from there since has left the graph again."""
+        self._known = dict(mark)
+
     def remember(self, now_s: float) -> None:
         """Remember those that the next commit lets go."""
         for key in self._window.leaving([key for _, key in self._keys()], now_s):

@@ -110,6 +110,20 @@ class Entries:
         entry.verdict = verdict
         self._put(entry)
 
+    def marked(self, own: Collection[Entry]) -> Callable[[], None]:
+        """Return a way back to the window as it is, nothing being staged, and to what is in it of some entries."""
+        window, constants = self._window.marked(), self._constants.marked()
+        entries = [(e, e.verdict, e.held, e.written, e.judged) for e in own]
+        places = [(held, tuple(held.slots)) for _, _, held, _, _ in entries if held is not None]
+
+        def back() -> None:
+            self._window.back_to(window, places)
+            self._constants.back_to(constants)
+            for entry, verdict, held, written, judged in entries:
+                entry.verdict, entry.held, entry.written, entry.judged = verdict, held, written, judged
+
+        return back
+
     def _put(self, entry: Entry) -> None:
         """Stage the factors of an entry."""
         stream, verdict = entry.stream, entry.verdict

@@ -242,23 +242,26 @@ class Judge:
         return moved
 
     def _try(self, stream: LiveStream, own: list[Entry], others: list[Verdict]) -> None:
-        """Take other verdicts, settle around them, and go back if that is less probable."""
+        """Take other verdicts, settle around them, and go back if that is less probable, or if the solver runs away.
+
+        Back by a mark: from far off its steps do not lead back.
+        """
         self._window.settle()
-        before, cost, agreement = [e.verdict for e in own], self._cost(stream, own), self._agreement.marked()
-        for verdicts in (others, None):
-            if verdicts is not None:
-                for entry, verdict in zip(own, verdicts, strict=True):
-                    self._entries.change(entry, verdict)
-            else:
-                self._by_hypotheses(stream, self._chapter(stream))
+        cost, agreement, back = self._cost(stream, own), self._agreement.marked(), self._entries.marked(own)
+        try:
+            for entry, verdict in zip(own, others, strict=True):
+                self._entries.change(entry, verdict)
             self._window.settle(_STEPS)  # a metre off, one step says nothing of the cost
-        if self._cost(stream, own) < cost:
+            self._by_hypotheses(stream, self._chapter(stream))
+            self._window.settle(_STEPS)
+            better = self._cost(stream, own) < cost
+        except (SolveError, RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):
+            better = False
+        if better:
             self._rounds[stream.name] = _ROUNDS
             return
         self._agreement.back_to(agreement)
-        for entry, verdict in zip(own, before, strict=True):
-            self._entries.change(entry, verdict)
-        self._window.settle(_STEPS)
+        back()
 
     def _cost(self, stream: LiveStream, own: list[Entry]) -> float:
         """Minus the log of the probability of the window, all hypotheses of a stream summed over."""

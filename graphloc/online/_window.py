@@ -42,6 +42,17 @@ class Held:
     slots: list[int] = field(default_factory=list)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Mark:
+    """A window with nothing staged, to go back to: a copy of all that a commit changes."""
+
+    solver: gtsam.ISAM2
+    values: gtsam.Values
+    linearised: gtsam.Values
+    alive: dict[int, float]
+    newest: set[int]
+
+
 class Window:
     """A fixed lag. `values` is the estimate of every key in it, and the guess of what is staged."""
 
@@ -177,6 +188,30 @@ class Window:
             yield
         except (RuntimeError, IndexError, ValueError, MemoryError) as error:
             raise not_solved("the solver failed", error) from error
+
+    def marked(self) -> Mark:
+        """Return a window as it is, nothing being staged, for `back_to`."""
+        assert not self._added
+        assert not self._remove
+        return Mark(
+            gtsam.ISAM2(self._solver),
+            gtsam.Values(self.values),
+            gtsam.Values(self._linearised),
+            dict(self._alive),
+            set(self._newest),
+        )
+
+    def back_to(self, mark: Mark, held: Iterable[tuple[Held, Sequence[int]]]) -> None:
+        """Go back to a mark, also after an exception; once for each mark.
+
+        Args:
+            held: factors that may have been removed since, and their places then.
+        """
+        self._solver, self.values, self._linearised = mark.solver, mark.values, mark.linearised
+        self._alive, self._newest = mark.alive, mark.newest
+        self._clear()
+        for factors, slots in held:
+            factors.slots = list(slots)
 
     def leaving(self, keys: Iterable[int], now_s: float) -> list[int]:
         """Return those of the keys that the next commit at `now_s` lets go."""

@@ -292,6 +292,14 @@ def alone(sensor: str, slow: SlowProcess) -> str:
     )
 
 
+def disagreeing(sensor: str, weights: Array) -> list[str]:
+    """Say where most measurements (N,) of a sensor disagree with the rest: a line, or none."""
+    share = float((weights < AGREES).mean()) if len(weights) else 0.0
+    if share <= 0.5 or len(weights) <= 10:
+        return []
+    return [f"{sensor}: {100 * share:.0f} % of its measurements disagree with the rest"]
+
+
 def _stats(problem: Problem, result: BatchResult) -> SolveStats:
     expected = expected_cost(problem, result.verdicts)
     warnings = list(problem.warnings)
@@ -334,9 +342,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
         if stream.left_out is not None:
             warnings.append(alone(stream.name, stream.left_out))
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
-        share = float((weights < AGREES).mean()) if len(weights) else 0.0
-        if share > 0.5 and len(weights) > 10:
-            warnings.append(f"{stream.name}: {100 * share:.0f} % of its measurements disagree with the rest")
+        warnings += disagreeing(stream.name, weights)
     return SolveStats(
         passes=result.passes,
         iterations=result.iterations,
