@@ -28,7 +28,7 @@ from graphloc.solve._decide import (
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._ordering import nodes_last
 from graphloc.solve._passes import SETTLED_M, SETTLED_WEIGHT, Settled, changed
-from graphloc.solve._stretch import copy_states, solve_stretch, update_states, weak_prior
+from graphloc.solve._stretch import copy_states, solve_until_written_there, update_states, weak_prior
 
 # A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
 # short enough to dead-reckon through.
@@ -164,7 +164,7 @@ def _solve_around(
 ) -> _Around:
     local = copy_states(problem, values, max(first - 1, 0), min(last + 1, len(problem.timeline) - 1))
     for _ in range(_AROUND_PASSES):
-        step = solve_stretch(problem, local, first, last, prior, decisions(verdicts), tol=1e-3, thin=False)
+        step = solve_until_written_there(problem, local, first, last, prior, decisions(verdicts), tol=1e-3, thin=False)
         used, verdicts = verdicts, weigh(problem, local, first=first, last=last, stage="final")
         if step.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
             break

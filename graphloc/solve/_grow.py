@@ -17,7 +17,15 @@ from graphloc.frames import wrap_angle
 from graphloc.recording import Progress
 from graphloc.solve._align import Start, start_pose
 from graphloc.solve._decide import PredictedCovariance, Verdicts, decisions, predicted_covariance, weigh
-from graphloc.solve._stretch import StretchStep, dead_reckon, fill_slow, prior_at, solve_stretch, thin_tree
+from graphloc.solve._stretch import (
+    StretchStep,
+    dead_reckon,
+    fill_slow,
+    prior_at,
+    solve_stretch,
+    solve_until_written_there,
+    thin_tree,
+)
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
 _SETTLED_M = 0.5
@@ -207,7 +215,7 @@ def _solve_grown(
     covariance: PredictedCovariance = lambda k, key: predicted(k, key) if k > known else None
     for _ in range(2):
         verdicts = weigh(problem, values, first=first, last=last, stage="final", covariance=covariance, sparse=True)
-        step = solve_stretch(problem, values, first, last, prior, decisions(verdicts))
+        step = solve_until_written_there(problem, values, first, last, prior, decisions(verdicts))
         iterations += step.iterations
         covariance = lambda _state, _key: None
         if step.moved_m < _SETTLED_M:

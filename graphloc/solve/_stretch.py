@@ -41,38 +41,51 @@ def solve_stretch(
 ) -> StretchStep:
     """Optimise states first..last in place, roughly: what it leaves, the passes over the whole run take up.
 
-    What is decided of sensors with hypotheses is written anew where the estimate has moved from: a factor that was
-    linear a metre away leaves a right sighting tenths of a metre off, and judged there it looks false.
-
     `thin`: sensors are thinned (`weigh`), which another order of elimination suits.
     """
-    begin, iterations = None, 0
+    graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps)
+    order = along_nodes(guess, problem.timeline.slow_of) if thin else None
+    solved = optimize(graph, guess, 15, tol, order)
+    moved_m = moved(guess, solved.values)
+    update_states(problem, values, solved.values, first, last)
+    return StretchStep(solved.values, graph, solved.iterations, solved.error, moved_m)
+
+
+def solve_until_written_there(
+    problem: Problem,
+    values: gtsam.Values,
+    first: int,
+    last: int,
+    prior: StartPrior,
+    decided: Decisions,
+    *,
+    tol: float = 3e-3,
+    thin: bool = True,
+) -> StretchStep:
+    """`solve_stretch`, again and again while it moves away from where its factors were written.
+
+    What is decided of sensors with hypotheses is linear about the estimate. Written a metre away, a right sighting is left
+    tenths of a metre off, and judged there it looks false.
+    """
+    begin, iterations = values.extract(state_keys(problem, first, last)), 0
     for _ in range(_MOST_TIMES):
-        graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps)
-        begin = guess if begin is None else begin
-        order = along_nodes(guess, problem.timeline.slow_of) if thin else None
-        solved = optimize(graph, guess, 15, tol, order)
-        iterations += solved.iterations
-        update_states(problem, values, solved.values, first, last)
-        if moved(guess, solved.values) < _MOVED_M:
+        step = solve_stretch(problem, values, first, last, prior, decided, tol=tol, thin=thin)
+        iterations += step.iterations
+        if step.moved_m < _MOVED_M:
             break
-        written = _written_anew(problem, values, decided)
-        if written is None:
-            break
-        decided = written
-    assert begin is not None
-    return StretchStep(solved.values, graph, iterations, solved.error, moved(begin, solved.values))
+        decided = _written_anew(problem, values, first, last, decided)
+    return step._replace(iterations=iterations, moved_m=moved(begin, step.values))
 
 
-def _written_anew(problem: Problem, values: gtsam.Values, decided: Decisions) -> Decisions | None:
-    """What is decided, where it meets the graph now, of sensors with hypotheses; None where there is nothing of them."""
-    streams = {s.number: s for s in problem.streams if s.row.false is not None}
-    anew = {
-        (number, i): (found[0], attach(problem, streams[number], i, values))
-        for (number, i), found in decided.items()
-        if found is not None and number in streams
-    }
-    return {**decided, **anew} if anew else None
+def _written_anew(problem: Problem, values: gtsam.Values, first: int, last: int, decided: Decisions) -> Decisions:
+    """What is decided of a stretch, where it meets the graph now, of sensors with hypotheses."""
+    written = dict(decided)
+    for stream in problem.streams:
+        if stream.row.false is not None:
+            for i in stream.between(first, last):
+                if (found := decided.get((stream.number, i))) is not None:
+                    written[stream.number, i] = (found[0], attach(problem, stream, i, values))
+    return written
 
 
 def moved(old: gtsam.Values, new: gtsam.Values) -> float:
