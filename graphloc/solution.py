@@ -57,7 +57,7 @@ class SolveStats:
         converged: whether the last pass moved no state noticeably.
         warnings: one line each, for the report.
         online: each pose is as it was known then; passes, factors and cost say nothing.
-        events: what happened on the way, online.
+        events: what happened on the way: online, or that a long run was solved in legs.
     """
 
     passes: int

@@ -57,9 +57,10 @@ def legs(run: SimulatedRun) -> Solution:
 
 
 def test_legs_are_as_good_as_the_whole(run: SimulatedRun, whole: Solution, legs: Solution) -> None:
-    (said,) = [w for w in legs.stats.warnings if "legs" in w]
+    (said,) = legs.stats.events
     assert said.startswith("solved in 3 legs")
-    assert not any("legs" in w for w in whole.stats.warnings)
+    assert legs.stats.warnings == whole.stats.warnings  # nothing is wrong
+    assert whole.stats.events == ()
     one, several = (compare_to_truth(s.trajectory, run.truth) for s in (whole, legs))
     assert several.matched == pytest.approx(one.matched, abs=1e-3)
     assert several.position_rmse_m < one.position_rmse_m + 0.03
@@ -132,7 +133,8 @@ def test_a_leg_without_a_place_is_no_reason_to_fail(run: SimulatedRun) -> None:
     first = begin_ns(run)
     early = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < first + 20 * S)
     found = solved(run, measurements=early)
-    (said,) = [w for w in found.stats.warnings if "a leg of it could not be solved" in w]
+    (said,) = found.stats.events
+    assert "a leg of it could not be solved" in said
     assert "no position" in said
     assert found.trajectory.stamps_ns[-1] > first + 125 * S
 
@@ -148,6 +150,25 @@ def test_a_sensor_that_fell_silent_was_heard_in_the_leg_before(run: SimulatedRun
     heard = seconds[seconds > 35.0] - since
     assert np.ptp(heard) < 0.1
     assert 20.0 < heard[0] < 30.1
+
+
+def test_legs_that_lie_apart_are_a_warning(run: SimulatedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the second leg all places are 5 m off, to the metre known: the track would step there, and say nothing."""
+    solve, count = graphloc.solve.make_solution, [0]
+
+    def shifted(*args: Any) -> Solution:
+        count[0] += 1
+        found = solve(*args)
+        off_m = np.array([5.0 * (count[0] == 2), 0.0, 0.0])
+        return replace(found, trajectory=replace(found.trajectory, p_world_m=found.trajectory.p_world_m + off_m))
+
+    monkeypatch.setattr(graphloc.solve, "make_solution", shifted)
+    few = tuple(m for m in run.recording.measurements if not isinstance(m, CompassHeading) or m.seq % 4 == 0)
+    found = solved(run, measurements=few)
+    (said,) = [w for w in found.stats.warnings if "legs that overlap" in w]
+    assert float(said.rpartition("they are ")[2].split(" m")[0]) == pytest.approx(5.0, abs=0.3)
+    assert "do not allow" in said
+    assert found.stats.events == ()
 
 
 def test_legs_overlap_by_a_minute_to_each_side_and_less_where_they_are_short() -> None:

@@ -155,11 +155,11 @@ def calibration(data: ReportData) -> str:
 def solver(solution: Solution) -> str:
     """Return how the solver fared."""
     s = solution.stats
+    events = "<ul>" + "".join(f"<li>{escape(event)}</li>" for event in s.events) + "</ul>" if s.events else ""
     if s.online:
-        events = "".join(f"<li>{escape(event)}</li>" for event in s.events)
-        return f"<p>Online: {s.states} poses, each as it was known at its time.</p><ul>{events}</ul>"
+        return f"<p>Online: {s.states} poses, each as it was known at its time.</p>{events}"
     return (
         f"<p>{s.states} states, {s.factors} factors, {s.passes} passes, {s.iterations} iterations; "
         f"{'converged' if s.converged else 'NOT converged'}. Cost {s.cost:.0f}, expected {s.expected_cost:.0f} "
-        f"(ratio {s.cost / max(s.expected_cost, 1.0):.2f}; near 1 where the noise is configured right).</p>"
+        f"(ratio {s.cost / max(s.expected_cost, 1.0):.2f}; near 1 where the noise is configured right).</p>{events}"
     )

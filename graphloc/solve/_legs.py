@@ -20,6 +20,7 @@ from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.solve._memory import give_back_memory
 from graphloc.time import NS_PER_S
+from graphloc.trajectory import bounds_95
 
 _OVERLAP_S, _SHARE = 60.0, 0.2  # on each side of a seam, at most such a share of a leg
 _LOOK = 0.1  # of a leg, to each side: where a seam is looked for
@@ -31,10 +32,11 @@ Solve = Callable[[Recording, float | None], Solution]
 
 @dataclass(frozen=True, slots=True)
 class Apart:
-    """How far two legs are apart where they meet."""
+    """How far legs are apart where they meet, at most; `within`: of what their bounds (95 %) allow."""
 
-    m: float
-    deg: float
+    m: float = 0.0
+    deg: float = 0.0
+    within: bool = True
 
 
 def seams(recording: Recording, leg_s: float, absolute: Collection[str]) -> list[int]:
@@ -76,7 +78,7 @@ def solve_legs(
     over = overlap_ns(leg_s)
     edges = [np.iinfo(np.int64).min // 2, *seams_ns, np.iinfo(np.int64).max // 2]
     legs: list[Solution] = []
-    heading_deg, before, apart = None, None, Apart(0.0, 0.0)
+    heading_deg, before, apart = None, None, Apart()
     for begin, end in pairwise(edges):
         whole = solve(_between(recording, begin - over, end + over), heading_deg)
         if before is not None:
@@ -112,7 +114,9 @@ def _farther(apart: Apart, before: Solution, after: Solution, at_ns: int) -> Apa
     one, other = before.trajectory.at(at), after.trajectory.at(at)
     off_m = float(np.hypot(*(one.p_world_m - other.p_world_m)[0, :2]))
     off_deg = float(np.degrees(abs(wrap_angle(one.yaw_rad - other.yaw_rad)))[0])
-    return Apart(max(apart.m, off_m), max(apart.deg, off_deg))
+    bounds = np.array([bounds_95(t.cov)[0] for t in (one, other) if t.cov is not None]).sum(axis=0)
+    within = bool(off_m <= bounds[0] and off_deg <= bounds[2])
+    return Apart(max(apart.m, off_m), max(apart.deg, off_deg), apart.within and within)
 
 
 def _own(leg: Solution, begin_ns: int, end_ns: int, before: Solution | None) -> Solution:

@@ -38,14 +38,15 @@ def solve_parts(
     parts = _cut(recording, bridge_s)
     if len(parts) == 1 and not seams(recording, leg_s, absolute):
         return solve(recording, None)
-    solutions, rows, warnings, failure = [], list(recording.rows), [], None
+    solutions, rows, failure = list[Solution](), list(recording.rows), None
+    warnings, events = list[str](), list[str]()
     for part in parts:
         assert part.imu is not None
         start, stop = (utc_text(int(part.imu.stamps_ns[k])) for k in (0, -1))
         try:
-            legs, said = _in_legs(part, leg_s, absolute, solve)
+            legs, said, wrong = _in_legs(part, leg_s, absolute, solve)
             solutions += legs
-            warnings += said
+            (warnings if wrong else events).extend(said)
             if len(parts) > 1:
                 warnings.append(
                     f"the IMU is silent for long before or after {start} to {stop}: solved as a part by itself"
@@ -57,23 +58,28 @@ def solve_parts(
     if not solutions:
         assert failure is not None
         raise failure
-    return _join(solutions, rows, warnings)
+    whole = _join(solutions, rows, warnings)
+    return replace(whole, stats=replace(whole.stats, events=tuple(events)))
 
 
 def _in_legs(
     part: Recording, leg_s: float, absolute: Collection[str], solve: Solve
-) -> tuple[list[Solution], list[str]]:
-    """Solve a part, one that is long in legs; as a whole where a leg cannot be solved by itself. Return what is said of it."""
+) -> tuple[list[Solution], list[str], bool]:
+    """Solve a part, one that is long in legs; as a whole where a leg cannot be solved by itself.
+
+    Return what is said of it, and whether something is wrong.
+    """
     part = replace(part, rows=())
     where = seams(part, leg_s, absolute)
     if not where:
-        return [solve(part, None)], []
+        return [solve(part, None)], [], False
     try:
         legs, apart = solve_legs(part, where, leg_s, solve)
     except SolveError as error:
-        return [solve(part, None)], [f"solved as a whole: a leg of it could not be solved by itself ({error})"]
+        return [solve(part, None)], [f"solved as a whole: a leg of it could not be solved by itself ({error})"], False
     said = f"where these meet they are {apart.m:.2f} m and {apart.deg:.1f} deg apart at most"
-    return legs, [f"solved in {len(legs)} legs that overlap (`timeline.leg_s`): {said}"]
+    said += "" if apart.within else ", which their bounds do not allow"
+    return legs, [f"solved in {len(legs)} legs that overlap (`timeline.leg_s`): {said}"], not apart.within
 
 
 def _cut(recording: Recording, bridge_s: float) -> list[Recording]:
