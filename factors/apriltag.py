@@ -212,9 +212,7 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
 
 def _turning(by_point: Array, arms: Array) -> Array:
     """Takes d / d places (n, 2, 3) of points to d / d a small turn (n, 2, 3) of the arms (n, 3) that they are at."""
-    across = np.zeros(
-        (len(arms), 3, 3)
-    )  # w x a = -across w; by hand, since `np.cross` takes 50 us to look at its arguments
+    across = np.zeros((len(arms), 3, 3))  # w x a = -across w; `np.cross` takes 50 us to look at its arguments
     across[:, [2, 0, 1], [1, 2, 0]], across[:, [1, 2, 0], [2, 0, 1]] = arms, -arms
     return -by_point @ across
 

@@ -8,7 +8,7 @@ number of the message in its recording, unique, and the key of its row in the le
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -296,3 +296,13 @@ class ImuSeries:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def where(self, kept: slice | NDArray[np.bool_]) -> ImuSeries:
+        """Return some of the samples."""
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[kept],
+            accel_mps2=self.accel_mps2[kept],
+            gyro_radps=self.gyro_radps[kept],
+            seqs=self.seqs[kept],
+        )

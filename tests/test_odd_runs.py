@@ -13,7 +13,6 @@ from graphloc.blocks import MountConfig
 from graphloc.build import make_problem
 from graphloc.config import DatumConfig, GnssConfig, HeightConfig, PoseConfig, VesselConfig
 from graphloc.errors import InputError, SolveError
-from graphloc.eval.drill.failures import imu_where
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import TruthMetrics, compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
@@ -99,7 +98,7 @@ def test_a_recorder_pause_cuts_the_run() -> None:
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
     silent = (int(imu.stamps_ns[0]) + 20 * 10**9, int(imu.stamps_ns[0]) + 80 * 10**9)
     kept = tuple(m for m in run.recording.measurements if not silent[0] < m.stamp_ns < silent[1])
-    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 20.0) | (t > 80.0)))
+    paused = replace(only(run.recording, kept), imu=imu.where((t < 20.0) | (t > 80.0)))
     paused = replace(paused, message_count=len(paused.imu or ()) + len(kept))
     solved = app.smooth_recording(paused, run.config).solution
     track = solved.trajectory
@@ -120,7 +119,7 @@ def test_a_part_that_cannot_be_solved_is_left_out() -> None:
     assert imu is not None
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
     kept = tuple(m for m in run.recording.measurements if m.stamp_ns < imu.stamps_ns[0] + 15 * 10**9)
-    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 20.0) | (t > 40.0)))
+    paused = replace(only(run.recording, kept), imu=imu.where((t < 20.0) | (t > 40.0)))
     solved = app.smooth_recording(paused, run.config).solution
     assert (solved.trajectory.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 < 21.0
     assert any("left out" in w and "no position" in w for w in solved.stats.warnings)
@@ -131,7 +130,7 @@ def test_an_imu_that_ends_early_is_said() -> None:
     run = simulate(BASE, 1)
     imu = run.recording.imu
     assert imu is not None
-    early = replace(run.recording, imu=imu_where(imu, imu.stamps_ns < imu.stamps_ns[0] + 10 * 10**9))
+    early = replace(run.recording, imu=imu.where(imu.stamps_ns < imu.stamps_ns[0] + 10 * 10**9))
     warnings = app.smooth_recording(early, run.config).solution.stats.warnings
     assert any(w.startswith("gnss: 300 of 400 measurements lie outside the IMU's span") for w in warnings)
 
@@ -362,7 +361,7 @@ def test_parts_that_lack_a_sensor_and_do_not_converge() -> None:
         for m in run.recording.measurements
         if not 15 * 10**9 < m.stamp_ns - t0 < 35 * 10**9 and not (m.sensor == "aerial" and m.stamp_ns > t0 + 25 * 10**9)
     )
-    paused = replace(only(run.recording, kept), imu=imu_where(imu, (t < 15.0) | (t > 35.0)))
+    paused = replace(only(run.recording, kept), imu=imu.where((t < 15.0) | (t > 35.0)))
     solved = app.smooth_recording(paused, run.config).solution
     seconds = (solved.trajectory.stamps_ns - t0) * 1e-9
     assert np.isinf(solved.since_agreed_s["aerial"][seconds > 30.0]).all()

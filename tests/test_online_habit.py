@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from graphloc.config import TimelineConfig
-from graphloc.eval.drill.failures import imu_where
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array
 from graphloc.measurements import CompassHeading
@@ -102,7 +101,7 @@ def test_without_a_place_it_drifts_as_far_as_a_vessel_can_and_no_farther() -> No
     kept = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < lost_ns)
     imu = run.recording.imu
     assert imu is not None
-    imu = imu_where(imu, (imu.stamps_ns < lost_ns + 60 * SECOND) | (imu.stamps_ns > lost_ns + 66 * SECOND))
+    imu = imu.where((imu.stamps_ns < lost_ns + 60 * SECOND) | (imu.stamps_ns > lost_ns + 66 * SECOND))
     steps: list[int] = []
     with patch.object(Habit, "step", autospec=True, side_effect=counted(steps)):
         track = replay(replace(run.recording, imu=imu, measurements=kept), config).solution.trajectory

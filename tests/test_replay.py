@@ -76,9 +76,7 @@ def test_each_pose_is_as_it_was_known_then(run: SimulatedRun, whole: Replayed) -
     first = replay(
         replace(
             run.recording,
-            imu=replace(
-                imu, stamps_ns=imu.stamps_ns[:n], accel_mps2=imu.accel_mps2[:n], gyro_radps=imu.gyro_radps[:n], seqs=imu.seqs[:n]
-            ),
+            imu=imu.where(slice(n)),
             measurements=tuple(m for m in run.recording.measurements if m.stamp_ns < half_ns),
         ),
         run.config,

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graphloc.eval.simulate.noise import drift_m
 from graphloc.frames import Array, Datum, Geodetic, wrap_angle
@@ -20,7 +19,6 @@ from graphloc.measurements import (
     CompassHeading,
     GnssPosition,
     GnssVelocity,
-    ImuSeries,
     Measurement,
     PoseFix,
     TagSighting,
@@ -254,15 +252,4 @@ def _imu_gap(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.G
         )
         for q, s in zip(imu.seqs[gone], imu.stamps_ns[gone], strict=True)
     )  # fmt: skip
-    return Struck(recording=replace(recording, imu=imu_where(imu, ~gone), rows=(*recording.rows, *rows)))
-
-
-def imu_where(imu: ImuSeries, kept: NDArray[np.bool_]) -> ImuSeries:
-    """Return the samples where `kept` (N,) is true."""
-    return replace(
-        imu,
-        stamps_ns=imu.stamps_ns[kept],
-        accel_mps2=imu.accel_mps2[kept],
-        gyro_radps=imu.gyro_radps[kept],
-        seqs=imu.seqs[kept],
-    )
+    return Struck(recording=replace(recording, imu=imu.where(~gone), rows=(*recording.rows, *rows)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphloc.eval.drill.failures import Failure, imu_where
+from graphloc.eval.drill.failures import Failure
 from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
 
@@ -98,4 +98,4 @@ def cut(recording: Recording, window: Window) -> Recording:
         return recording
     inside = (recording.imu.stamps_ns >= window.begin_ns) & (recording.imu.stamps_ns <= window.end_ns)
     kept = tuple(m for m in recording.measurements if window.begin_ns <= m.stamp_ns <= window.end_ns)
-    return replace(recording, imu=imu_where(recording.imu, inside), measurements=kept, rows=())
+    return replace(recording, imu=recording.imu.where(inside), measurements=kept, rows=())

@@ -23,7 +23,7 @@ from graphloc.errors import SolveError, not_solved
 from graphloc.frames import Array
 from graphloc.keys import is_leaf, is_pose
 
-_LEAVES, _STAYS, _NEWEST = range(3)  # groups of keys, in the order of elimination
+_GOES, _STAYS, _NEWEST = range(3)  # groups of keys, in the order of elimination
 _RELINEARIZE = 0.02  # of any tangent: m, rad, m/s; the gap to the batch is millimetres
 _NEVER = 1_000_000_000  # updates
 
@@ -154,10 +154,8 @@ class Window:
         params.force_relinearize = self._to_relinearise
         if gone or self._to_relinearise:
             params.constrainedKeys = _groups(alive, gone, self._newest)
-        if gone:
-            params.extraReelimKeys = _listed(
-                self._alive.keys() & alive
-            )  # what goes must have nothing below it in the tree
+        if gone:  # it must have nothing below it in the tree
+            params.extraReelimKeys = _listed(self._alive.keys() & alive)
         with self._solving():
             slots = list(self._solver.update(self._graph, self._guess, params).getNewFactorsIndices())
             if gone:
@@ -267,7 +265,7 @@ def _groups(alive: Iterable[int], gone: Iterable[int], newest: Collection[int]) 
     """The order of elimination: what leaves, what stays, what is asked and added next."""
     groups = gtsam.KeyGroupMap()
     for key in gone:
-        groups.insert2(key, _LEAVES)
+        groups.insert2(key, _GOES)
     for key in alive:  # what has a group keeps it
         groups.insert2(key, _NEWEST if key in newest else _STAYS)
     return groups

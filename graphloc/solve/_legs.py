@@ -95,14 +95,7 @@ def solve_legs(
 def _between(recording: Recording, begin_ns: int, end_ns: int) -> Recording:
     imu = recording.imu
     assert imu is not None
-    own = slice(*np.searchsorted(imu.stamps_ns, [begin_ns, end_ns]))
-    samples = replace(
-        imu,
-        stamps_ns=imu.stamps_ns[own],
-        accel_mps2=imu.accel_mps2[own],
-        gyro_radps=imu.gyro_radps[own],
-        seqs=imu.seqs[own],
-    )
+    samples = imu.where(slice(*np.searchsorted(imu.stamps_ns, [begin_ns, end_ns])))
     kept = tuple(m for m in recording.measurements if begin_ns <= m.stamp_ns < end_ns)
     return replace(recording, imu=samples, measurements=kept, rows=())
 

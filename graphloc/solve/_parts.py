@@ -36,15 +36,16 @@ def solve_parts(
         SolveError: no part could be solved; it is the first part's.
     """
     parts = _cut(recording, bridge_s)
-    if len(parts) == 1 and not seams(recording, leg_s, absolute):
+    cuts = [seams(part, leg_s, absolute) for part in parts]
+    if cuts == [[]]:
         return solve(recording, None)
     solutions, rows, failure = list[Solution](), list(recording.rows), None
     warnings, events = list[str](), list[str]()
-    for part in parts:
+    for part, where in zip(parts, cuts, strict=True):
         assert part.imu is not None
         start, stop = (utc_text(int(part.imu.stamps_ns[k])) for k in (0, -1))
         try:
-            legs, said, wrong = _in_legs(part, leg_s, absolute, solve)
+            legs, said, wrong = _in_legs(replace(part, rows=()), where, leg_s, solve)
             solutions += legs
             (warnings if wrong else events).extend(said)
             if len(parts) > 1:
@@ -63,14 +64,12 @@ def solve_parts(
 
 
 def _in_legs(
-    part: Recording, leg_s: float, absolute: Collection[str], solve: Solve
+    part: Recording, where: Collection[int], leg_s: float, solve: Solve
 ) -> tuple[list[Solution], list[str], bool]:
-    """Solve a part, one that is long in legs; as a whole where a leg cannot be solved by itself.
+    """Solve a part, one that is long in legs, between the stamps `where`; as a whole where a leg cannot be solved by itself.
 
     Return what is said of it, and whether something is wrong.
     """
-    part = replace(part, rows=())
-    where = seams(part, leg_s, absolute)
     if not where:
         return [solve(part, None)], [], False
     try:
@@ -94,15 +93,8 @@ def _cut(recording: Recording, bridge_s: float) -> list[Recording]:
     part_of = np.maximum(np.searchsorted(starts, [m.stamp_ns for m in recording.measurements], side="right") - 1, 0)
     parts = []
     for k, (a, b) in enumerate(zip(first, [*first[1:], len(imu)], strict=True)):
-        own = replace(
-            imu,
-            stamps_ns=imu.stamps_ns[a:b],
-            accel_mps2=imu.accel_mps2[a:b],
-            gyro_radps=imu.gyro_radps[a:b],
-            seqs=imu.seqs[a:b],
-        )
         kept = tuple(m for m, part in zip(recording.measurements, part_of, strict=True) if part == k)
-        parts.append(replace(recording, imu=own, measurements=kept, rows=()))
+        parts.append(replace(recording, imu=imu.where(slice(a, b)), measurements=kept, rows=()))
     return parts
 
 
