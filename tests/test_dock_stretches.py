@@ -1,17 +1,25 @@
-"""A stretch of a run that ends between two nodes of a dock's motion is solved without the node beyond."""
+"""Stretches of a run at a floating dock: ends between two nodes of its motion, and what is handed on to the next one."""
 
-from graphloc import app
-from graphloc.build import make_problem
+from functools import cache
+
+import gtsam
+import numpy as np
+
+from graphloc import app, keys
+from graphloc.build import Problem, build_graph, make_problem, state_keys
 from graphloc.eval.simulate import find_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
+from graphloc.frames import Array
 from graphloc.solve._align import align
 from graphloc.solve._decide import decisions, weigh
 from graphloc.solve._grow import grow, solve_start
-from graphloc.solve._stretch import solve_stretch, weak_prior
+from graphloc.solve._optimize import bayes_tree
+from graphloc.solve._stretch import past_at, solve_stretch, weak_prior
 from tests import tagfactory
 
 
-def test_a_stretch_may_end_anywhere() -> None:
+@cache
+def grown() -> tuple[Problem, gtsam.Values]:
     less = {"imu_hz": "50", "gnss_hz": "2", "compass_hz": "4", "lidar_hz": "0", "camera_hz": "0"}
     true = simulate(find_scenario("dock-floating-optimal", {**less, "duration_s": "30", "route_s": "30"}), 1)
     run, _ = tagfactory.sighted(true, rate_hz=3.0)
@@ -20,6 +28,11 @@ def test_a_stretch_may_end_anywhere() -> None:
     problem = make_problem(whole, app.seen_frames(run.config, whole), datum, SENSORS, INERTIAL)
     values, prior, known, *_ = solve_start(problem, align(problem), lambda *_: None)
     grow(problem, values, prior, known, lambda *_: None)
+    return problem, values
+
+
+def test_a_stretch_may_end_anywhere() -> None:
+    problem, values = grown()
     last = len(problem.timeline) - 1
     seen = next(s for s in problem.streams if s.name == "tags")
     for stop in (int(k) for k in seen.state[len(seen.state) // 2 :][:6]):
@@ -27,6 +40,51 @@ def test_a_stretch_may_end_anywhere() -> None:
         verdicts = weigh(problem, values, first=first, last=stop, stage="final")
         assert any(v.at.slow_next is not None for key, v in verdicts.items() if key[0] == seen.number)
         start = weak_prior(problem, values, first)
-        step = solve_stretch(problem, values, first, stop, start, decisions(verdicts))
+        step = solve_stretch(problem, gtsam.Values(values), first, stop, start, decisions(verdicts))
         assert step.moved_m < 2.0  # as far as the weak prior lets it
     assert stop < last
+
+
+def test_the_past_says_of_a_state_what_the_whole_stretch_says_without_what_comes_after() -> None:
+    """Gaussian sums are exact: past and later measurements together are the whole, for each state and for sums of them."""
+    problem, values = grown()
+    slow_of, last = problem.timeline.slow_of, len(problem.timeline) - 1
+    first, stop = 60, last - 40
+    verdicts = weigh(problem, values, first=first, last=stop, stage="final")
+    prior = weak_prior(problem, values, first)
+    here = gtsam.Values(values)
+    for _ in range(6):  # until the tails of the constants' priors stand
+        step = solve_stretch(problem, here, first, stop, prior, decisions(verdicts), tol=1e-9)
+    whole = bayes_tree(step.graph, step.values)
+    for k in (int(np.searchsorted(slow_of, slow_of[at])) for at in (first + 20, first + 60, stop - 30)):
+        past = past_at(problem, step, k)
+        rest, at = build_graph(problem, step.values, decisions(verdicts), k, stop, past)
+        assert sum(chr(key >> 56) == "c" for key in past.known) == 3  # each tag's place in the survey
+        at.update(step.values.extract([key for key in list(at.keys()) if keys.is_leaf(key)]))
+        later = bayes_tree(rest, at)
+        np.testing.assert_allclose(
+            [later.calculateBestEstimate().atPose3(keys.pose(n)).translation() for n in (k, stop)],
+            [step.values.atPose3(keys.pose(n)).translation() for n in (k, stop)],
+            atol=1e-3,
+        )
+        for key in [*state_keys(problem, k, k + 3), *state_keys(problem, stop, stop), *past.known]:
+            np.testing.assert_allclose(
+                later.marginalCovariance(key), whole.marginalCovariance(key), rtol=1e-3, atol=1e-9
+            )
+        # A place and what GNSS is off there (place less fix) are hardly known apart; together they are.
+        gnss = next(s for s in problem.streams if s.name == "gnss")
+        joint = _joint(past.factors, step.values, [keys.pose(k), keys.slow(gnss.number, int(slow_of[k]))])
+        turn = step.values.atPose3(keys.pose(k)).rotation().matrix()
+        place, off, both = turn @ joint[3:6, 3:6] @ turn.T, joint[6:, 6:], turn @ joint[3:6, 6:]
+        fix = place + off - both - both.T
+        assert np.trace(fix[:2, :2]) < 0.5 * np.trace((place + off)[:2, :2])
+        assert joint[3, 3] > 1.1 * whole.marginalCovariance(keys.pose(k))[3, 3]  # what comes later is not in it
+
+
+def _joint(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, names: list[int]) -> Array:
+    """The covariance of some keys of a graph, pose first, by inverting its information."""
+    linear = graph.linearize(values)
+    others = [key for key in linear.keyVector() if key not in names]
+    jacobian, _ = linear.jacobian(gtsam.Ordering(names + others))
+    size = 6 + sum(len(np.atleast_1d(values.atVector(key))) for key in names[1:])
+    return np.asarray(np.linalg.inv(jacobian.T @ jacobian)[:size, :size])

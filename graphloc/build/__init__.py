@@ -12,7 +12,7 @@ solution is moved to the body's origin at the end (`graphloc.solve`).
 
 from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state, state_of
 from graphloc.build._chains import CHAIN_END, CONSTANT_TAILS, JUMP, bias_step, slow_begin, slow_end, slow_step
-from graphloc.build._graph import Decisions, StartPrior, build_graph, state_keys
+from graphloc.build._graph import Decisions, Past, StartPrior, build_graph, state_keys
 from graphloc.build._problem import (
     Mounts,
     Problem,
@@ -32,6 +32,7 @@ __all__ = [
     "Decisions",
     "Judged",
     "Mounts",
+    "Past",
     "Problem",
     "StartPrior",
     "Stream",

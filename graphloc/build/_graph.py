@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,11 +20,10 @@ from graphloc.graph import Attachment, Decision, SlowProcess
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartPrior:
-    """Gaussian prior on the first state of a stretch (block-diagonal; sigmas or covariances).
+    """Gaussian prior on the first state of a stretch (block-diagonal; covariances).
 
     Attributes:
-        slow, constants: value and covariance, by the sensor's number and by key; those that are not there have the prior
-            of their kind.
+        slow: value and covariance, by the sensor's number; those that are not there have the prior of their kind.
     """
 
     pose: Any
@@ -34,7 +33,20 @@ class StartPrior:
     bias: Any
     bias_cov: Array
     slow: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
-    constants: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Past:
+    """All that was before the first state of a stretch: what it says of that state, its slow states and constants, jointly.
+
+    A place and a receiver's slow error may each be hardly known, and their sum well.
+
+    Attributes:
+        factors: linear ones. known: the keys that they hold.
+    """
+
+    factors: gtsam.NonlinearFactorGraph
+    known: Collection[int]
 
 
 # What was decided about (stream number, measurement index), and where it attaches; without it, or None: left out.
@@ -47,7 +59,7 @@ def build_graph(
     decisions: Decisions,
     first: int,
     last: int,
-    prior: StartPrior,
+    prior: StartPrior | Past,
     *,
     jumps: bool = True,
     made: dict[tuple[int, int], range] | None = None,
@@ -65,7 +77,10 @@ def build_graph(
     nodes = nodes_of(problem, first, last)
     for j in nodes[:-1]:
         graph.add(bias_step(problem.links, j, _node_dt_s(problem, j)))
-    _add_start(graph, prior, first, nodes[0])
+    if isinstance(prior, Past):
+        graph.push_back(prior.factors)
+    else:
+        _add_start(graph, prior, first, nodes[0])
     for stream in problem.streams:
         if stream.slow is not None:
             _add_slow_chain(graph, problem, stream, stream.slow, values, nodes, prior, jumps)
@@ -102,7 +117,11 @@ def state_keys(problem: Problem, first: int, last: int) -> list[int]:
 
 
 def _add_constants(
-    graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values, stream: Stream, values: gtsam.Values, prior: StartPrior
+    graph: gtsam.NonlinearFactorGraph,
+    guess: gtsam.Values,
+    stream: Stream,
+    values: gtsam.Values,
+    prior: StartPrior | Past,
 ) -> None:
     """Those that a factor has, each with its prior: what is not seen in a stretch needs no state there.
 
@@ -113,9 +132,11 @@ def _add_constants(
     for (key, known), constant in zip(constants_of(stream, values), stream.constants, strict=True):
         if key in used:
             guess.insert(key, known)
-            value, cov = prior.constants.get(key, (np.zeros(len(constant.sigma)), np.diag(constant.sigma**2)))
-            cov = cov * (1.0 + float(((known / constant.sigma) ** 2).sum()) / CONSTANT_TAILS)
-            graph.add(gtsam.PriorFactorVector(key, value, gtsam.noiseModel.Gaussian.Covariance(cov)))
+            if isinstance(prior, Past) and key in prior.known:
+                continue
+            tails = np.sqrt(1.0 + float(((known / constant.sigma) ** 2).sum()) / CONSTANT_TAILS)
+            model = gtsam.noiseModel.Diagonal.Sigmas(constant.sigma * tails)
+            graph.add(gtsam.PriorFactorVector(key, np.zeros(len(constant.sigma)), model))
 
 
 def _node_dt_s(problem: Problem, j: int) -> float:
@@ -137,15 +158,15 @@ def _add_slow_chain(
     slow: SlowProcess,
     values: gtsam.Values,
     nodes: range,
-    prior: StartPrior,
+    prior: StartPrior | Past,
     jumps: bool,
 ) -> None:
     key = [keys.slow(stream.number, j) for j in nodes]
-    given = prior.slow.get(stream.number)
-    if given is not None:
-        graph.add(gtsam.PriorFactorVector(key[0], given[0], gtsam.noiseModel.Gaussian.Covariance(given[1])))
-    else:
-        graph.add(slow_begin(slow, key[0], np.atleast_1d(values.atVector(key[0]))))
+    if isinstance(prior, StartPrior):
+        if (given := prior.slow.get(stream.number)) is not None:
+            graph.add(gtsam.PriorFactorVector(key[0], given[0], gtsam.noiseModel.Gaussian.Covariance(given[1])))
+        else:
+            graph.add(slow_begin(slow, key[0], np.atleast_1d(values.atVector(key[0]))))
     for n, j in enumerate(nodes[:-1]):
         for factor in slow_step(slow, key[n], key[n + 1], _node_dt_s(problem, j), jumps=jumps):
             graph.add(factor)

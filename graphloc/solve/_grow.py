@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from graphloc import keys
-from graphloc.build import Problem, StartPrior
+from graphloc.build import Past, Problem, StartPrior
 from graphloc.errors import SolveError
 from graphloc.frames import wrap_angle
 from graphloc.recording import Progress
@@ -21,7 +21,7 @@ from graphloc.solve._stretch import (
     StretchStep,
     dead_reckon,
     fill_slow,
-    prior_at,
+    past_at,
     solve_stretch,
     solve_until_written_there,
     thin_tree,
@@ -160,7 +160,7 @@ def _index_after(problem: Problem, seconds: float) -> int:
 def grow(
     problem: Problem,
     estimate: gtsam.Values,
-    prior: StartPrior,
+    start: StartPrior,
     known: int,
     progress: Progress,
     *,
@@ -174,15 +174,17 @@ def grow(
         chunk_s, overlap_s: how far a step goes, and how far back its window reaches.
         watch: is told the last state of each window and what was decided in it: what one knew then.
     """
-    stamps, end = problem.timeline.stamps_ns, len(problem.timeline) - 1
+    stamps, slow_of, end = problem.timeline.stamps_ns, problem.timeline.slow_of, len(problem.timeline) - 1
+    prior: StartPrior | Past = start
     verdicts = weigh(problem, estimate, first=0, last=known, stage="final", sparse=True)
     step = solve_stretch(problem, estimate, 0, known, prior, decisions(verdicts))
     iterations, first = step.iterations, 0
     while known < end:
         until = int(min(np.searchsorted(stamps, stamps[known] + int(chunk_s * 1e9)), end))
-        start_of_window = int(np.searchsorted(stamps, stamps[known] - int(overlap_s * 1e9)))
-        if start_of_window > first:
-            prior = prior_at(problem, step, start_of_window)
+        back = problem.timeline.floor(int(stamps[known]) - int(overlap_s * 1e9))
+        start_of_window = int(np.searchsorted(slow_of, slow_of[back]))
+        if start_of_window > first and slow_of[start_of_window] < slow_of[known]:
+            prior = past_at(problem, step, start_of_window)
             first = start_of_window
         dead_reckon(problem, estimate, known, until)
         used, step, verdicts = _solve_grown(problem, estimate, first, known, until, prior)
@@ -193,7 +195,7 @@ def grow(
 
 
 def _solve_grown(
-    problem: Problem, values: gtsam.Values, first: int, known: int, last: int, prior: StartPrior
+    problem: Problem, values: gtsam.Values, first: int, known: int, last: int, prior: StartPrior | Past
 ) -> tuple[int, StretchStep, Verdicts]:
     """Solve a window whose states after `known` are new, in place; return iterations, the last step and its verdicts.
 

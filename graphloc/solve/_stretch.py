@@ -9,7 +9,17 @@ import gtsam
 import numpy as np
 
 from graphloc import keys
-from graphloc.build import Decisions, Problem, StartPrior, attach, build_graph, constant_keys, nav_state, state_keys
+from graphloc.build import (
+    Decisions,
+    Past,
+    Problem,
+    StartPrior,
+    attach,
+    build_graph,
+    constant_keys,
+    nav_state,
+    state_keys,
+)
 from graphloc.frames import Array
 from graphloc.solve._optimize import bayes_tree, optimize
 from graphloc.solve._ordering import along_nodes, nodes_last
@@ -18,10 +28,14 @@ _MOVED_M, _MOST_TIMES = 0.3, 4  # a solution so far from where it was written is
 
 
 class StretchStep(NamedTuple):
-    """One optimisation of a window: what came out, iterations, final error, how far any pose moved."""
+    """One optimisation of a window: what came out, iterations, final error, how far any pose moved.
+
+    `made`: where the factors of each measurement stand in the graph.
+    """
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
+    made: dict[tuple[int, int], range]
     iterations: int
     error: float
     moved_m: float
@@ -32,7 +46,7 @@ def solve_stretch(
     values: gtsam.Values,
     first: int,
     last: int,
-    prior: StartPrior,
+    prior: StartPrior | Past,
     decided: Decisions,
     *,
     jumps: bool = True,
@@ -43,12 +57,13 @@ def solve_stretch(
 
     `thin`: sensors are thinned (`weigh`), which another order of elimination suits.
     """
-    graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps)
+    made: dict[tuple[int, int], range] = {}
+    graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps, made=made)
     order = along_nodes(guess, problem.timeline.slow_of) if thin else None
     solved = optimize(graph, guess, 15, tol, order)
     moved_m = moved(guess, solved.values)
     update_states(problem, values, solved.values, first, last)
-    return StretchStep(solved.values, graph, solved.iterations, solved.error, moved_m)
+    return StretchStep(solved.values, graph, made, solved.iterations, solved.error, moved_m)
 
 
 def solve_until_written_there(
@@ -56,7 +71,7 @@ def solve_until_written_there(
     values: gtsam.Values,
     first: int,
     last: int,
-    prior: StartPrior,
+    prior: StartPrior | Past,
     decided: Decisions,
     *,
     tol: float = 3e-3,
@@ -161,31 +176,21 @@ def thin_tree(problem: Problem, step: StretchStep) -> gtsam.ISAM2:
     return bayes_tree(step.graph, step.values, nodes_last(step.values, problem.timeline.slow_of))
 
 
-def prior_at(problem: Problem, step: StretchStep, k: int) -> StartPrior:
-    """The marginals at state `k` as a prior.
+def past_at(problem: Problem, step: StretchStep, k: int) -> Past:
+    """What a solved stretch says of state `k`, the first one of its slow node, by what it has from before.
 
-    Cross terms are left out: a place and a receiver's slow error that are known by their sum count twice, and predictions in the
-    next stretch are up to 1.4 times too sure of each.
+    Measurements of the states from there on are left out: the next stretch has them, and they would count twice.
     """
-    tree, values = thin_tree(problem, step), step.values
-    j = int(problem.timeline.slow_of[k])
-    cov = {key: np.asarray(tree.marginalCovariance(key)) for key in (keys.pose(k), keys.velocity(k), keys.bias(j))}
-    slow = {}
-    for stream in problem.streams:
-        if stream.slow is not None:
-            key = keys.slow(stream.number, j)
-            slow[stream.number] = (np.atleast_1d(values.atVector(key)), np.asarray(tree.marginalCovariance(key)))
-    return StartPrior(
-        pose=values.atPose3(keys.pose(k)),
-        pose_cov=cov[keys.pose(k)],
-        velocity=values.atVector(keys.velocity(k)),
-        velocity_cov=cov[keys.velocity(k)],
-        bias=values.atConstantBias(keys.bias(j)),
-        bias_cov=cov[keys.bias(j)],
-        slow=slow,
-        constants={
-            key: (np.atleast_1d(values.atVector(key)), np.asarray(tree.marginalCovariance(key)))
-            for key in _constants(problem)
-            if values.exists(key)
-        },
-    )
+    names = np.array(list(step.values.keys()), dtype=np.uint64)
+    letter, index = keys.parts(names)
+    state, node = (np.isin(letter, list(kind)) for kind in (keys.STATES, keys.NODES))
+    at = np.where(state, index - k, np.where(node, index - int(problem.timeline.slow_of[k]), -1))
+    after, known = set(names[at > 0].tolist()), names[(at == 0) | (letter == "c")].tolist()
+    state_of = {s.number: s.state for s in problem.streams}
+    measured_after = {n for (number, i), found in step.made.items() if state_of[number][i] >= k for n in found}
+    before = gtsam.NonlinearFactorGraph()
+    for n in range(step.graph.size()):
+        if n not in measured_after and after.isdisjoint((factor := step.graph.at(n)).keys()):
+            before.add(factor)
+    linear = before.linearize(step.values).marginal(known, gtsam.EliminateQR)
+    return Past(factors=gtsam.LinearContainerFactor.ConvertLinearGraph(linear, step.values), known=frozenset(known))
