@@ -62,6 +62,7 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
         said[key] = f"{len(doubted)} of {len(own)} sightings disagree with the rest; {why}"
     surveys = {name: sensor.surveyed for name, sensor in config.of_kind("apriltag").items()}
     return [
+        *_estimated_mounts(sightings, solution),
         *_late(sightings, solution),
         *(f"{sensor}: {surveys[sensor].called(*tag)}: {line}" for (sensor, tag), line in said.items()),
     ]
@@ -199,17 +200,35 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
         offs = np.array([_by_tags(m, B) for m, B in zip(doubted, R, strict=True)]) - track.at(stamps).p_world_m[where]
         moved = np.median(offs, axis=0)
         if off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
-            rpy = ", ".join(f"{a:.0f}" for a in usual.as_euler("xyz", degrees=True))
-            lines.append(
-                f"{sensor}: camera {camera}: by its tags it looks {off_deg:.0f} deg elsewhere than its mount says: rpy_deg "
-                f"[{rpy}] would do (of the optical frame: x right, y down, z forward)"
-            )
+            lines.append(_looks_elsewhere(sensor, camera, off_deg, usual))
         elif np.linalg.norm(moved) > _TOGETHER_M and np.median(np.abs(offs - moved)) < 0.1 * np.linalg.norm(moved):
             lines.append(
                 f"{sensor}: camera {camera}: its tags all put the vessel {moved[0]:.1f} m east, {moved[1]:.1f} m north, "
                 f"{moved[2]:.1f} m above of where the rest has her: is `datum` the survey's origin?"
             )
     return lines
+
+
+def _estimated_mounts(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:
+    """Say of each camera whose mount the run has estimated far from the one that is configured."""
+    given = {(m.sensor, m.camera): m.R_body_camera for m in sightings}
+    for (sensor, camera), R_body_camera in sorted(given.items()):
+        slow = solution.slow.get(sensor)
+        axes = [f"{camera} mount {axis}" for axis in ("roll", "pitch", "yaw")]
+        if slow is None or not set(axes) <= set(slow.axes):
+            continue
+        off = Rotation.from_rotvec(slow.value[-1, [slow.axes.index(axis) for axis in axes]], degrees=True)
+        off_deg = float(np.degrees(off.magnitude()))
+        if off_deg > _TURNED_DEG:
+            yield _looks_elsewhere(sensor, camera, off_deg, off * Rotation.from_matrix(R_body_camera))
+
+
+def _looks_elsewhere(sensor: str, camera: str, off_deg: float, mount: Rotation) -> str:
+    rpy = ", ".join(f"{a:.0f}" for a in mount.as_euler("xyz", degrees=True))
+    return (
+        f"{sensor}: camera {camera}: by its tags it looks {off_deg:.0f} deg elsewhere than its mount says: rpy_deg "
+        f"[{rpy}] would do (of the optical frame: x right, y down, z forward)"
+    )
 
 
 def _by_tags(m: TagSighting, R_world_body: Array) -> Array:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """AprilTags that a camera sees: the corners themselves are fused, the poses that explain them are its modes.
 
-    z_i = pi(R' (P_i - p)) + w_i,   w_i ~ N(0, C),   pi(x, y, z) = (x, y) / z
+    z_i = pi(R' (P_i - p)) + w_i,   w_i ~ N(0, C),   pi(x, y, z) = (x, y) / z,   R = R_b Exp(u) M
     P_i = c + d + Exp(w) (Q_i - c),   Q_i = S_i + e_k + f_k x (S_i - m_k)
     seen further out from its tag's middle, by b px at each edge
 
-p, R: camera in world; S_i: a corner as surveyed, its frame at rest; e_k, f_k: what the survey errs about tag k, its middle
+p, R: camera in world; R_b: body in world; M: the camera's mount, which is off by u, a constant of the run; S_i: a corner as surveyed, its frame at rest; e_k, f_k: what the survey errs about tag k, its middle
 m_k, a constant of the run; d, w: motion and small turn about c of the floating dock that the tag rides on, a slow state
 (D has neither); b: what detector, light, print and focal length make tags seem wider than they are, a slow state as well.
 Taken for noise of each sighting instead, such errors average out over hundreds of them, and the bounds are too small:
@@ -48,7 +48,8 @@ _BY_A_MODE_RAD = float(np.radians(20.0))
 _FREEDOM = ("east", "north", "up", "roll", "pitch", "yaw")
 _LEAST_M, _LEAST_RAD = 1e-3, float(np.radians(0.01))
 _LEAST = np.repeat([_LEAST_M, _LEAST_RAD], 3)
-_TIE = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4])  # where a sighting stands on a node: m, rad, px
+# Where a sighting stands on a node: m, rad of a dock; rad of a mount; px.
+_TIE_DOCK, _TIE_MOUNT, _TIE_EDGE = (1e-4,) * 3 + (1e-5,) * 3, (1e-5,) * 3, (1e-4,)
 _TIDE_S = 3600.0
 _EDGE_S = 30.0  # range and light change in about that
 
@@ -58,30 +59,40 @@ class _Seen:
 
     Attributes:
         R, p: camera in world. points_m: (n, 3) corners where their frame is now. middle_m: of these.
-        body: (6, 6) d (place, rotation about the world's axes) of the camera / d tangent of the state.
-        edges: whether these are modelled. own: rows of the slow state that it knows of: its dock's six, that of the edges.
-            slow: their values; moved: (6,) of the dock; edge_px: b.
+        body: (6, 6) d (place, rotation about the world's axes) of the camera / d tangent of the state. by_mount: (3, 3) d that
+            rotation / d u. own: rows of the slow state that it knows of: six of its dock, three of its camera's mount, that of the
+            edges, each where it is modelled (rides, mounted, edges). slow: their values; moved: (6,) of the dock; edge_px: b.
     """
 
     def __init__(self, m: TagSighting, config: AprilTagConfig, at: Attachment) -> None:
+        docks, cameras = (_docks(config.surveyed), _mounted(config)) if at.slow_value is not None else ([], [])
+        self.slow_size = 0 if at.slow_value is None else len(at.slow_value)
+        self.rides, self.mounted = m.frame in docks, m.camera in cameras
+        self.edges = self.slow_size > 6 * len(docks) + 3 * len(cameras)
+        self.own: list[int] = []
+        if self.rides:
+            self.own += range(first := 6 * docks.index(m.frame), first + 6)
+        if self.mounted:
+            self.own += range(first := 6 * len(docks) + 3 * cameras.index(m.camera), first + 3)
+        self.own += [self.slow_size - 1] * self.edges
+        self.slow = np.zeros(0)
+        if at.slow_value is not None:  # of tags that stand still: the edges of the node before, no leaf in between
+            self.slow = (_between(at) if self.rides else np.asarray(at.slow_value))[self.own]
         T_state_camera = at.T_state_sensor.compose(gtsam.Pose3(gtsam.Rot3(m.R_body_camera), m.t_body_camera_m))
         T_world_camera = at.T_world_body.compose(T_state_camera)
         self.R, self.p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
         adjoint = np.asarray(T_state_camera.inverse().AdjointMap())
         self.body = np.vstack([self.R @ adjoint[3:], self.R @ adjoint[:3]])
-        self.slow_size = 0 if at.slow_value is None else len(at.slow_value)
-        docks = _docks(config.surveyed) if self.slow_size else []
-        self.first = 6 * docks.index(m.frame) if self.slow_size and m.frame in docks else None
-        self.edges = self.slow_size > 6 * len(docks)
-        self.own = list(range(self.first, self.first + 6)) if self.first is not None else []
-        self.own += [self.slow_size - 1] * self.edges
-        self.slow = np.zeros(0)
-        if at.slow_value is not None:  # of tags that stand still: the edges of the node before, no leaf in between
-            self.slow = (_between(at) if self.first is not None else np.asarray(at.slow_value))[self.own]
-        self.moved = moved = self.slow[:6] if self.first is not None else np.zeros(6)
+        self.by_mount = np.eye(3)
+        if self.mounted:
+            off = self.slow[6 * self.rides :][:3]
+            R_world_body = self.R @ m.R_body_camera.T
+            self.R = R_world_body @ gtsam.Rot3.Expmap(off).matrix() @ m.R_body_camera
+            self.by_mount = R_world_body @ np.asarray(gtsam.Rot3.ExpmapDerivative(-off))
+        self.moved = moved = self.slow[:6] if self.rides else np.zeros(6)
         self.edge_px = float(self.slow[-1]) if self.edges else 0.0
         self.turn = self.by_turn = np.eye(3)
-        if self.first is not None:
+        if self.rides:
             self.turn = gtsam.Rot3.Expmap(moved[3:]).matrix()
             self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-moved[3:]))  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
         self.constants = _constants_of(m, config, at)
@@ -114,6 +125,11 @@ def _docks(survey: Survey) -> list[str]:
     return [frame for frame in survey.frames if frame != WORLD]
 
 
+def _mounted(config: AprilTagConfig) -> list[str]:
+    """The cameras of whose mounts it is estimated what they are off."""
+    return [name for name, camera in config.cameras.items() if camera.mount_sigma_deg > 0.0]
+
+
 def _constants_of(m: TagSighting, config: AprilTagConfig, at: Attachment) -> list[tuple[int, Array] | None]:
     """Key and estimate of what the survey errs about each tag; None where there is none."""
     index = {(str(tag.family), tag.id): k for k, tag in enumerate(config.surveyed.tags)}
@@ -143,16 +159,23 @@ def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode)
         return np.asarray(turned @ seen.body)
 
     def slow_jacobian() -> Array:
-        rigid = -np.eye(6)
-        rigid[:3, 3:] = skew(seen.middle_m - m.pivot_m)
-        rigid[:, 3:] = rigid[:, 3:] @ seen.by_turn
-        return seen.placed(rigid)
+        by_own = []
+        if seen.rides:
+            rigid = -np.eye(6)
+            rigid[:3, 3:] = skew(seen.middle_m - m.pivot_m - seen.moved[:3])
+            rigid[:, 3:] = rigid[:, 3:] @ seen.by_turn
+            by_own.append(rigid)
+        if seen.mounted:
+            by_own.append(np.vstack([-skew(toward), np.eye(3)]) @ seen.by_mount)
+        return seen.placed(np.hstack(by_own))
 
     return Residual(
         raw=raw,
         cov=_turned(seen.R) @ mode.cov @ _turned(seen.R).T + np.diag(_TO_DECIDE**2),
         jacobian=jacobian,
-        slow_jacobian=slow_jacobian if seen.first is not None else None,  # edges are no matter where modes are chosen
+        slow_jacobian=slow_jacobian
+        if seen.rides or seen.mounted
+        else None,  # edges are no matter where modes are chosen
         prior=mode.probability * (1.0 - config.false_fraction),
         size_m=float(np.hypot(raw[0], raw[1])),
         size_deg=float(np.degrees(np.linalg.norm(rotation))),
@@ -178,16 +201,18 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
     turning = _turning(by_point, seen.points_m - seen.p)
     camera = np.concatenate([-by_point, -turning], axis=2).reshape(-1, 6)
     by_own = []
-    if seen.first is not None:
+    if seen.rides:
         swing = _turning(by_point, seen.arms) @ seen.by_turn
         by_own.append(np.concatenate([by_point, swing], axis=2).reshape(-1, 6))
+    if seen.mounted:
+        by_own.append(-turning.reshape(-1, 3) @ seen.by_mount)
     if seen.edges:
         outwards = m.px * _outwards(flat)  # not of the rays: their noise would tell edges from distance
         flat = flat + seen.edge_px * outwards
         by_own.append(outwards.reshape(-1, 1))
     by_slow = np.hstack(by_own) if by_own else np.zeros((m.rays.size, 0))
     raw, by_body = (flat - m.rays).ravel(), camera @ seen.body
-    dock = config.surveyed.dock(m.frame) if seen.first is not None else None
+    dock = config.surveyed.dock(m.frame) if seen.rides else None
     tie = None if dock is None else _tie(seen, dock, config, at)
     found: list[Any] = [] if tie is None else list(tie.factors)
     for k, constant in enumerate(seen.constants):  # GTSAM's linear factors have at most three keys: one for each tag
@@ -226,12 +251,16 @@ def _tie(seen: _Seen, dock: DockConfig, config: AprilTagConfig, at: Attachment) 
     n = len(seen.own)
     picked = seen.placed(np.eye(n))
     share, dt_s = (0.0, 0.0) if at.slow_next is None else at.slow_next[2:]
-    sigma, time_s = (np.append(a, b)[:n] for a, b in zip(_swing(dock), (config.edge_sigma_px, _EDGE_S), strict=True))
+    swing, swing_s = _swing(dock)
+    step = np.concatenate(
+        [swing / np.sqrt(swing_s), [0.0] * 3 * seen.mounted, [config.edge_sigma_px / np.sqrt(_EDGE_S)] * seen.edges]
+    )
+    tie = np.array(_TIE_DOCK + _TIE_MOUNT * seen.mounted + _TIE_EDGE * seen.edges)
     # Where there is no next node yet, it has gone on by itself.
     steps_s = at.slow_age_s if at.slow_next is None else dt_s * share * (1.0 - share)
-    bridge = sigma * np.sqrt(2.0 * steps_s / time_s)
+    bridge = step * np.sqrt(2.0 * steps_s)
     residual = Residual(
-        raw=np.zeros(n), cov=np.diag(np.maximum(bridge, _TIE[:n]) ** 2), jacobian=lambda: np.zeros((n, 6)), prior=1.0,
+        raw=np.zeros(n), cov=np.diag(np.maximum(bridge, tie) ** 2), jacobian=lambda: np.zeros((n, 6)), prior=1.0,
         size_m=None, size_deg=None,
     )  # fmt: skip
     terms = [
@@ -292,23 +321,39 @@ def constants(config: AprilTagConfig) -> tuple[Constant, ...]:
 
 
 def slow(config: AprilTagConfig) -> SlowProcess | None:
-    """Return how the docks that carry tags move, and how far out edges are seen.
+    """Return how the docks that carry tags move, what the cameras' mounts are off, and how far out edges are seen.
 
     A dock that swings with period T and RMS s moves at 2 pi s / T; the Markov process that steps as far in 1 s has a time
     constant of T^2 / 2 pi^2. How far it wanders is taken for two sigmas.
     """
     docks = [dock for name in _docks(config.surveyed) if (dock := config.surveyed.dock(name)) is not None]
+    cameras = _mounted(config) if config.surveyed.tags else []
     edges = [config.edge_sigma_px] if config.edge_sigma_px and config.surveyed.tags else []
-    if not docks and not edges:
+    if not docks and not cameras and not edges:
         return None
     swings = [_swing(dock) for dock in docks]
+    mounts = np.radians([config.cameras[name].mount_sigma_deg for name in cameras])
+    said = ["docks moved"] * bool(docks) + ["mounts"] * bool(cameras) + ["edges seen"] * bool(edges)
     return SlowProcess(
-        name=" and ".join(["docks moved"] * bool(docks) + ["edges seen"] * bool(edges)),
-        axes=(*(f"{dock.name} {axis}" for dock in docks for axis in _FREEDOM), *["outwards"] * len(edges)),
-        units=(*("m", "m", "m", "deg", "deg", "deg") * len(docks), *["px"] * len(edges)),
-        scale=np.append(np.tile(np.repeat([1.0, 180.0 / np.pi], 3), len(docks)), np.ones(len(edges))),
-        sigma=np.concatenate([*(sigma for sigma, _ in swings), edges]),
-        time_constant_s=np.concatenate([*(time_s for _, time_s in swings), [_EDGE_S] * len(edges)]),
+        name=" and ".join(said),
+        offset="camera mount",
+        axes=(
+            *(f"{dock.name} {axis}" for dock in docks for axis in _FREEDOM),
+            *(f"{name} mount {axis}" for name in cameras for axis in _FREEDOM[3:]),
+            *["outwards"] * len(edges),
+        ),
+        units=(*("m", "m", "m", "deg", "deg", "deg") * len(docks), *("deg",) * 3 * len(cameras), *["px"] * len(edges)),
+        scale=np.concatenate(
+            [
+                np.tile(np.repeat([1.0, 180.0 / np.pi], 3), len(docks)),
+                [180.0 / np.pi] * 3 * len(cameras),
+                np.ones(len(edges)),
+            ]
+        ),
+        sigma=np.concatenate([*(sigma for sigma, _ in swings), np.repeat(mounts, 3), edges]),
+        time_constant_s=np.concatenate(
+            [*(time_s for _, time_s in swings), [np.inf] * 3 * len(cameras), [_EDGE_S] * len(edges)]
+        ),
     )
 
 
@@ -328,11 +373,15 @@ def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:
     T_world_camera = at.T_world_body.compose(at.T_state_sensor).compose(
         gtsam.Pose3(gtsam.Rot3(R_body_camera), t_body_camera)
     )
+    docks, cameras = (_docks(survey), _mounted(config)) if at.slow_value is not None else ([], [])
     R, p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
+    if "camera" in cameras:
+        first = 6 * len(docks) + 3 * cameras.index("camera")
+        off = gtsam.Rot3.Expmap(np.asarray(at.slow_value)[first : first + 3]).matrix()
+        R = R @ R_body_camera.T @ off @ R_body_camera
     corners = np.array([(-0.2, -0.2, 4.1), (0.2, -0.2, 3.9), (0.2, 0.2, 3.9), (-0.2, 0.2, 4.1)])
     now = p + corners @ R.T
-    dock = at.slow_value is not None and bool(_docks(survey))
-    moved = np.asarray(at.slow_value)[:6] if dock else np.zeros(6)
+    moved = np.asarray(at.slow_value)[:6] if docks else np.zeros(6)
     pivot = now.mean(axis=0) + np.array([2.0, -1.0, 0.5])
     back = np.asarray(Rotation.from_rotvec(-moved[3:]).as_matrix())
     mode = TagMode(
@@ -340,7 +389,7 @@ def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:
         cov=np.diag([0.02**2] * 3 + [0.01**2] * 3), probability=1.0,
     )  # fmt: skip
     return TagSighting(
-        stamp_ns=0, sensor="apriltag", seq=0, camera="camera", frame=_docks(survey)[0] if dock else WORLD, numbers=(0,),
+        stamp_ns=0, sensor="apriltag", seq=0, camera="camera", frame=docks[0] if docks else WORLD, numbers=(0,),
         families=("36h11",), points_m=pivot + (now - pivot - moved[:3]) @ back.T, pivot_m=pivot,
         rays=corners[:, :2] / corners[:, 2:], cov=np.eye(8) * 1e-6, t_body_camera_m=t_body_camera,
         R_body_camera=R_body_camera, modes=(mode,),

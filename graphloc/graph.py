@@ -137,7 +137,7 @@ class SlowProcess:
     """A slow state: per axis a first-order Gauss-Markov process.
 
     Attributes:
-        name: for outputs. axes: k names. units: k of them. scale: (k,) from the state's units to these.
+        name: for outputs. offset: what its constants are together, where it has others beside them. axes: k names. units: k of them. scale: (k,) from the state's units to these.
         sigma: (k,) standing size. time_constant_s: (k,) correlation time; inf for a constant.
         no_tails: axes of constants that are never far from zero; a mount may be turned by any angle.
         jumps: put a robust loss on its steps.
@@ -151,6 +151,7 @@ class SlowProcess:
     scale: Array
     sigma: Array
     time_constant_s: Array
+    offset: str = ""
     no_tails: tuple[str, ...] = ()
     jumps: bool = False
     needs_company: bool = False

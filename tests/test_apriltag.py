@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from graphloc import keys
-from graphloc.config import AprilTagConfig
+from graphloc.config import AprilTagConfig, CameraConfig
 from graphloc.factors.apriltag import ROW
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.tags.pose import modes_of, poses_of
@@ -323,6 +323,59 @@ def test_what_the_survey_errs_about_a_tag_is_a_constant() -> None:
     np.testing.assert_allclose(constant, off, atol=1e-4)  # the turn is taken to first order
 
 
+BOW = {"bow": CameraConfig(topic="/images")}
+
+
+@pytest.mark.parametrize("on_a_dock", [False, True])
+def test_what_a_mount_is_off_is_found_where_the_vessel_is_known(on_a_dock: bool) -> None:
+    """The camera looks 17 deg elsewhere than its mount says; where the estimate has that, nothing is left to explain."""
+    off = np.array([0.03, -0.05, 0.3])
+    near = vessel(9.0, 40.0, roll_pitch_deg=(3.0, -2.0))
+    true = gtsam.Pose3(near.rotation(), near.translation() + PIER_M) if on_a_dock else near
+    given, docks = (DOCKED, MOTION) if on_a_dock else (FIXED, np.zeros(0))
+    config = given.model_copy(update={"cameras": {"stern": CameraConfig(topic="/others")} | BOW})
+    seen = moved_sighting(MOTION, true) if on_a_dock else sighting(true)
+    m = replace(seen, R_body_camera=Rotation.from_rotvec(-off).as_matrix() @ seen.R_body_camera)
+    mode = nearest_mode(m.modes, true.rotation().matrix() @ AHEAD)
+    none, slow = np.concatenate([docks, np.zeros(7)]), np.concatenate([docks, np.zeros(7)])
+    for _ in range(6):
+        at = attached(true, slow)
+        update = ROW.factors(m, config, at, Decision(mode=mode))
+        values = gtsam.Values()
+        values.insert(1, true)
+        values.insert(3, slow)
+        for key, value in update.guesses:
+            values.insert(key, value)
+        known = gtsam.PriorFactorPose3(1, true, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
+        sigmas = np.concatenate([np.full(len(docks), 1e-7), np.full(6, 30.0), [1e-7]])
+        loose = gtsam.PriorFactorVector(3, none, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+        leaf = [key for key, _ in update.guesses]
+        slow = step([*update.factors, known, loose], values, (1, 3, *leaf)).atVector(3)
+    np.testing.assert_allclose(slow, np.concatenate([docks, np.zeros(3), off, [0.0]]), atol=1e-4)
+    np.testing.assert_allclose(ROW.residuals(m, config, attached(true, slow))[mode].raw, 0.0, atol=5e-3)
+    as_given = config.model_copy(update={"cameras": {"bow": BOW["bow"].model_copy(update={"mount_sigma_deg": 0.0})}})
+    fixed = ROW.residuals(m, as_given, attached(true, np.append(docks, 0.0)))[mode].raw
+    assert np.linalg.norm(fixed[3:]) == pytest.approx(np.linalg.norm(off), abs=1e-2)
+
+
+@pytest.mark.parametrize("on_a_dock", [False, True])
+def test_how_a_modes_residual_changes_with_the_slow_state(on_a_dock: bool) -> None:
+    true = vessel(9.0, 40.0, roll_pitch_deg=(3.0, -2.0))
+    config = (DOCKED if on_a_dock else FIXED).model_copy(update={"cameras": BOW})
+    m = moved_sighting(MOTION, true) if on_a_dock else sighting(true)
+    slow = np.concatenate([MOTION * on_a_dock, [0.004, -0.002, 0.003, 0.0]])[0 if on_a_dock else 6 :]
+    (found, *_) = ROW.residuals(m, config, attached(true, slow))
+    assert found.slow_jacobian is not None
+    slopes = found.slow_jacobian()
+    for k in range(len(slow)):
+        ends = [
+            ROW.residuals(m, config, attached(true, slow + way * np.eye(len(slow))[k]))[0].raw for way in (-1e-6, 1e-6)
+        ]
+        np.testing.assert_allclose(
+            slopes[:, k], (ends[1] - ends[0]) / 2e-6, atol=0.02 * max(1.0, np.abs(slopes[:, k]).max())
+        )
+
+
 def test_slow_states_and_constants() -> None:
     tags = [
         {**TAG, "sigma_m": 0.03, "sigma_deg": 0.5},
@@ -346,6 +399,15 @@ def test_slow_states_and_constants() -> None:
     alone = ROW.slow(quay)
     assert alone is not None
     assert alone.axes == ("outwards",)
+    steady = {
+        "stern": CameraConfig(topic="/stern", mount_sigma_deg=0.0),
+        "bow": CameraConfig(topic="/bow", mount_sigma_deg=2.0),
+    }
+    mounted = ROW.slow(config.model_copy(update={"cameras": steady}))
+    assert mounted is not None
+    assert mounted.axes[6:] == ("bow mount roll", "bow mount pitch", "bow mount yaw", "outwards")
+    np.testing.assert_allclose((mounted.scale * mounted.sigma)[6:9], 2.0)
+    assert np.isinf(mounted.time_constant_s).tolist() == [False] * 6 + [True] * 3 + [False]
     assert ROW.slow(quay.model_copy(update={"edge_sigma_px": 0.0})) is None
     assert ROW.slow(AprilTagConfig()) is None
 

@@ -140,7 +140,8 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     value = np.atleast_1d(result.values.atVector(keys.slow(stream.number, 0)))
     far = np.where(np.isfinite(slow.time_constant_s), 0.0, np.abs(value) / slow.sigma)
     k = int(np.argmax(far))
-    return float(far[k]), f"{slow.axes[k]} {value[k] * slow.scale[k]:.1f} {slow.units[k]}"
+    where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.1f} {slow.units[k]}"
+    return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where})"
 
 
 def _misfit(stats: SolveStats, result: BatchResult) -> str:
@@ -325,11 +326,10 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
             "mount, a unit or a time offset is wrong"
         )
     for stream in problem.streams:
-        far, where = _far_from_prior(stream, result)
+        far, said = _far_from_prior(stream, result)
         if far > _FAR_OFF:
             warnings.append(
-                f"{stream.name}: its {stream.slow.name if stream.slow else 'offset'} is estimated {far:.1f} sigmas ({where}) "
-                "from what the configuration allows for: check its mount and the IMU's, or raise that sigma"
+                f"{stream.name}: {said} from what the configuration allows for: check its mount and the IMU's, or raise that sigma"
             )
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
             if result.values.exists(key):
