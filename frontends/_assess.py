@@ -6,6 +6,7 @@ Everything here is a guess with its evidence in words; `draft_config` writes bot
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +20,7 @@ from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
-from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, ODOMETRY, QUATERNION, yaw_of_x_axis
+from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, ODOMETRY, PLAIN_POSE, POSE, QUATERNION, yaw_of_x_axis
 from graphloc.stuck import stuck, stuck_warning
 from graphloc.time import NS_PER_S
 
@@ -81,6 +82,23 @@ def sane(stream: Stream) -> NDArray[np.intp]:
     """Return indices of messages in order of strictly increasing stamps, without clock jumps."""
     good = np.flatnonzero(~_clock.clock_jumps(stream.stamps_ns, stream.logs_ns))
     return good[_clock.longest_increasing(stream.stamps_ns[good])]
+
+
+def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:
+    """Return streams with messages, each on the clock of the first IMU where its own is another one, by the recording times.
+
+    One cannot be judged by another that lies seconds or years away. A pose may well come late: it takes time to match.
+    """
+    latency = {s.topic: _clock.usual_latency_s(s.stamps_ns, s.logs_ns) for s in streams}
+    reference = next((latency[s.topic] for s in streams if s.msgtype == IMU), None)
+    if reference is None:
+        return list(streams)
+    found = []
+    for stream in streams:
+        behind = latency[stream.topic] - reference
+        limit = _clock.JUMP_LIMIT_S if stream.msgtype in (POSE, PLAIN_POSE) else _clock.EPOCH_LIMIT_S
+        found.append(stream.later(round(behind * NS_PER_S)) if abs(behind) > limit else stream)
+    return found
 
 
 def track(fixes: Stream) -> tuple[NDArray[np.int64], Array, Array]:

@@ -418,6 +418,26 @@ def test_a_clock_ahead_gets_an_offset(tmp_path: Path) -> None:
     assert config.sensors["gnss"].time_offset_s == pytest.approx(-37.0, abs=0.1)
 
 
+@pytest.mark.parametrize(
+    ("topic", "behind_s"), [("/fix", -18), ("/fix", -3600), ("/imu", START_NS // S - 100)], ids=["leap", "zone", "boot"]
+)
+def test_sensors_on_other_clocks_are_judged_by_each_other(topic: str, behind_s: int, tmp_path: Path) -> None:
+    """Without wheels: fixes tell the yaw of the IMU, and whether a compass is one, as on the same clock."""
+    make, items = Messages(2), []
+    for name, log_ns, message in drive(make, rotation_z(90.0), seconds=120):
+        if name == topic:
+            message.header.stamp.sec -= behind_s
+        if name != "/wheel/odom":
+            items.append((name, log_ns, message))
+    found, config, _ = look(tmp_path, items, make)
+    assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
+    (compass,) = found.compasses
+    assert (compass.usable, compass.convention) == (True, "ned")
+    assert compass.samples > 100
+    offset_s = behind_s if topic == "/fix" else -behind_s
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(offset_s, abs=0.1)
+
+
 @pytest.mark.parametrize(("status", "said"), [(-1, "say 'no fix'"), (0, "lie at 0, 0")])
 def test_topics_that_give_nothing_are_said(status: int, said: str, tmp_path: Path) -> None:
     make = Messages(2)
