@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import scatter_m
 from graphloc.frontends._rejections import Rejection
@@ -150,7 +150,9 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
     known = (rows[:, 4] > 0) & np.isfinite(rows[:, 5:8]).all(axis=1) & (rows[:, 5:8] > 0.0).all(axis=1)
     sigma = np.sqrt(np.median(rows[known, 5:8], axis=0)) if known.any() else None
     # Third differences remove position, velocity and acceleration; those of white noise have 20 x its variance.
-    scatter = 1.4826 * np.median(np.abs(np.diff(p, n=3, axis=0)), axis=0) / np.sqrt(20.0) if len(p) > 10 else None
+    bad = stuck(stamps, rows[:, :2], p[:, :2])
+    own = p[~bad]
+    scatter = 1.4826 * np.median(np.abs(np.diff(own, n=3, axis=0)), axis=0) / np.sqrt(20.0) if len(own) > 10 else None
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
     precise = sigma is not None and float(sigma[:2].max()) < 0.1 and float(np.median(rows[:, 3])) >= 2.0
     if precise:
@@ -171,8 +173,8 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         travelled_m=float(np.hypot(chords[:, 0], chords[:, 1]).sum()),
         first=vec(rows[0, :3]),
         without_height=int(np.isnan(fixes.rows[np.isfinite(fixes.rows[:, :2]).all(axis=1), 2]).sum()),
-        white_m=scatter_m(stamps, p[:, :2]),
-        hangs="".join(stuck_warning(fixes.topic, stamps, stuck(stamps, rows[:, :2], p[:, :2]))),
+        white_m=scatter_m(stamps[~bad], own[:, :2]),
+        hangs="".join(stuck_warning(fixes.topic, stamps, bad)),
         slow_error=not precise,
         why=why,
         tf_frame=tf_frame,
@@ -264,6 +266,14 @@ def headings(stream: Stream) -> tuple[NDArray[np.int64], Array]:
     return stream.stamps_ns[keep][good], np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
 
 
+def _middle_deg(angle: Array) -> tuple[float, float]:
+    """Return the middle and the scatter (as of a normal) of angles (N,), deg, whatever a few say: fixes may jump, or hang."""
+    mean = float(np.angle(np.exp(1j * angle).mean()))
+    middle = mean + float(np.median(wrap_angle(angle - mean)))
+    scatter = 1.4826 * float(np.median(np.abs(wrap_angle(angle - middle))))
+    return float(np.degrees(wrap_angle(middle))), float(np.degrees(scatter))
+
+
 def compass_report(stream: Stream, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
     """Return whether an orientation is a heading, and in which convention; None where there is none."""
     keep = sane(stream)
@@ -300,9 +310,7 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
     )
     fits = {}
     for convention, value in (("enu", measured), ("ned", np.pi / 2.0 - measured)):
-        mean = complex(np.exp(1j * (value - courses.course_rad)).mean())
-        scatter = float(np.degrees(np.sqrt(-2.0 * np.log(max(abs(mean), 1e-9)))))
-        fits[convention] = (float(np.degrees(np.angle(mean))), scatter)
+        fits[convention] = _middle_deg(value - courses.course_rad)
     turned = float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(max(abs(np.exp(1j * courses.course_rad).mean()), 1e-9))))))
     if by_gyro:
         convention = by_gyro

@@ -65,6 +65,7 @@ from graphloc.frontends.decode import (
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, info_beside
 from graphloc.measurements import CompassHeading, ImuSeries
+from graphloc.stuck import stuck
 from graphloc.time import NS_PER_S, utc_text
 
 __all__ = [
@@ -268,12 +269,13 @@ def _known(stream: Stream, tree: StaticTree, body: str) -> str | None:
 def _best_track(
     by_topic: dict[str, Stream], gnss: Sequence[GnssReport]
 ) -> tuple[NDArray[np.int64], Array, float, Vec | None]:
-    """Return stamps, places about the first fix, scatter (m) and first fix of the receiver with most fixes."""
+    """Return stamps, places about the first fix, scatter (m) and first fix of the receiver with most fixes, where it does not hang."""
     if not gnss:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None
     best = gnss[0]
-    stamps, p, _ = track(by_topic[best.topic])
-    return stamps, p, max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first
+    stamps, p, rows = track(by_topic[best.topic])
+    good = ~stuck(stamps, rows[:, :2], p[:, :2])
+    return stamps[good], p[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first
 
 
 def _role(stream: Stream) -> tuple[str, float, str]:
