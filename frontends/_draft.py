@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from graphloc.config import ImuConfig, SlowErrorConfig
+from graphloc.config import GnssConfig, ImuConfig, SlowErrorConfig
 from graphloc.frontends._clock import EPOCH_LIMIT_S
 from graphloc.frontends._fixes import SCATTERS
 from graphloc.frontends._reports import (
@@ -200,12 +200,16 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # /tf_static knows it")
     else:
         lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
-    if gnss.white_m is not None and gnss.reported_sigma_m is not None:
-        claimed = max(gnss.reported_sigma_m[:2])
-        if gnss.white_m > SCATTERS * claimed:
+    default = GnssConfig()
+    claimed = max(gnss.reported_sigma_m[:2]) if gnss.reported_sigma_m else default.default_horizontal_sigma_m
+    if gnss.white_m is not None and gnss.white_m > SCATTERS * claimed:
+        scatter, times = f"guess: fixes scatter by {gnss.white_m:.2f} m from one to the next", gnss.white_m / claimed
+        if gnss.reported_sigma_m:
+            lines.append(f"  sigma_scale: {times:.1f}  # {scatter}, and claim {claimed:.2f} m")
+        else:
+            lines.append(f"  default_horizontal_sigma_m: {gnss.white_m:.1f}  # {scatter}, and claim nothing")
             lines.append(
-                f"  sigma_scale: {gnss.white_m / claimed:.1f}  # guess: fixes scatter by {gnss.white_m:.2f} m from one to the "
-                f"next, and claim {claimed:.2f} m"
+                f"  default_vertical_sigma_m: {times * default.default_vertical_sigma_m:.1f}  # guess: as many times"
             )
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
     if wanders:
