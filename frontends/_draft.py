@@ -25,6 +25,7 @@ _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
 _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
+_UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
@@ -265,6 +266,11 @@ def _compass_block(name: str, compass: CompassReport, *, enabled: bool) -> list[
     elif compass.offset_deg is not None and abs(compass.offset_deg) > _COMPASS_SIGMA_DEG:
         lines.append(
             f"  mount_offset_sigma_deg: {abs(compass.offset_deg):.1f}  # guess: as far as it is off the GNSS course"
+        )
+    elif compass.offset_deg is None:
+        lines.append(
+            f"  mount_offset_sigma_deg: {_UNKNOWN_DEG:.1f}  # guess: no course tells; declination, or a mount, may be in it; 1 for "
+            "a true heading whose mount is known"
         )
     lines.append("  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass")
     lines.append("  wander_sigma_deg: 0.5  # guess: a harbour's iron turns it for a while; 0.2 for a GNSS compass")

@@ -340,6 +340,7 @@ def test_a_moored_compass_is_judged_by_the_gyro(convention: str, tmp_path: Path)
             items.append(("/compass", stamp, make.compass(stamp, (0, 0, np.sin(angle), np.cos(angle)))))
     _, config, text = look(tmp_path, items, make)
     assert config.sensors["compass"].convention == convention
+    assert config.sensors["compass"].mount_offset_sigma_deg == 10.0  # declination may be in it, and nothing here tells
     assert "by the gyro" in text
 
 
