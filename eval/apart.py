@@ -6,7 +6,8 @@ A receiver's slow error d is a process of sigma s and time constant T_c that com
     sigma_mean^2 = 2 s^2 (T_c / T) (1 - (T_c / T) (1 - exp(-T / T_c)))
 
 so that |mean|^2 / sigma_mean^2 of two axes is a chi-square of 2. What lies beyond its 95 %, and hardly moves, is no multipath:
-a map, a survey or the datum lies as far off, or a lever does. Which of them is wrong nothing here tells.
+a map, a survey or the datum lies as far off, or a lever does. Which of them is wrong nothing here tells. Of a height three sigmas
+are asked, as it is one more that may be off by chance: one above the geoid is, beside one above the ellipsoid.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 
 _STEADY = 0.5  # RMS about the mean, as a share of it
+_HEIGHT_SIGMAS = 3.0
 _BLOCK_S, _FEWEST = 10.0, 3  # fewer blocks do not tell what hardly moves
 _PLACES = ("pose", "aerial", "apriltag", "gnss")
 
@@ -41,26 +43,40 @@ def apart_warnings(track: Trajectory, datum: Datum, recording: Recording, config
             continue
         lever = {name: mount_of(name, sensor, recording.mounts)[0]}
         stamps, error, _ = held_out_errors(track, fixes, datum, lever)
-        off = _means(stamps, -error[:, :2])
+        off = _means(stamps, -error)
         if len(off) < _FEWEST:
             continue
-        mean, lasts_s = off.mean(axis=0), float(stamps[-1] - stamps[0]) / NS_PER_S
-        size, process = float(np.hypot(*mean)), sensor.slow_error
-        allowed = _mean_variance(process.horizontal_sigma_m, process.time_constant_s, lasts_s)
-        moves = float(np.sqrt(((off - mean) ** 2).sum(axis=1).mean()))
-        if size**2 < chi2_95(2) * allowed or moves > _STEADY * size:
+        process, lasts_s = sensor.slow_error, float(stamps[-1] - stamps[0]) / NS_PER_S
+        size, mean = _steady(off[:, :2])
+        if size**2 >= chi2_95(2) * _mean_variance(process.horizontal_sigma_m, process.time_constant_s, lasts_s):
+            towards = float(heading_deg_from_yaw(np.arctan2(mean[1], mean[0])))
+            lines.append(
+                f"{name} stands {size:.1f} m (towards {towards:.0f} deg) off what {', '.join(others)} says, all the while; its slow "
+                f"error of {process.horizontal_sigma_m:.1f} m (1 sigma) does not explain that: a map, a survey, the datum or a "
+                "lever is off by as much, or the receiver is; the track follows the others"
+            )
+        if any(not m.has_height for m in fixes):
             continue
-        towards = float(heading_deg_from_yaw(np.arctan2(mean[1], mean[0])))
-        lines.append(
-            f"{name} stands {size:.1f} m (towards {towards:.0f} deg) off what {', '.join(others)} says, all the while; its slow "
-            f"error of {process.horizontal_sigma_m:.1f} m (1 sigma) does not explain that: a map, a survey, the datum or a lever "
-            "is off by as much, or the receiver is; the track follows the others"
-        )
+        size, mean = _steady(off[:, 2:])
+        others = [*others, *config.of_kind("height")]
+        if size**2 >= _HEIGHT_SIGMAS**2 * _mean_variance(process.vertical_sigma_m, process.time_constant_s, lasts_s):
+            lines.append(
+                f"{name} stands {size:.1f} m ({'up' if mean[0] > 0.0 else 'down'}) off what {', '.join(others)} says, all the "
+                f"while; its slow error of {process.vertical_sigma_m:.1f} m in height (1 sigma) does not explain that: one of them may be above the geoid, and the other above the ellipsoid"
+            )
     return lines
 
 
+def _steady(off_m: Array) -> tuple[float, Array]:
+    """Return how far off the mean of blocks (N, k) is, 0 where they move, and that mean (k,)."""
+    mean = off_m.mean(axis=0)
+    size = float(np.linalg.norm(mean))
+    moves = float(np.sqrt(((off_m - mean) ** 2).sum(axis=1).mean()))
+    return (size if moves <= _STEADY * size else 0.0), mean
+
+
 def _means(stamps_ns: NDArray[np.int64], off_m: Array) -> Array:
-    """Return the mean of each block, in which white noise goes, of (N, 2)."""
+    """Return the mean of each block, in which white noise goes, of (N, k)."""
     _, block = np.unique((stamps_ns - stamps_ns[0]) // int(_BLOCK_S * NS_PER_S), return_inverse=True)
     count = np.bincount(block)
     return np.column_stack([np.bincount(block, weights=column) / count for column in off_m.T])

@@ -6,20 +6,21 @@ Everything here is a guess with its evidence in words; `draft_config` writes bot
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import scatter_m
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
-from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, ODOMETRY, QUATERNION, yaw_of_x_axis
+from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, ODOMETRY, PLAIN_POSE, POSE, QUATERNION, yaw_of_x_axis
 from graphloc.stuck import stuck, stuck_warning
 from graphloc.time import NS_PER_S
 
@@ -83,6 +84,23 @@ def sane(stream: Stream) -> NDArray[np.intp]:
     return good[_clock.longest_increasing(stream.stamps_ns[good])]
 
 
+def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:
+    """Return streams with messages, each on the clock of the first IMU where its own is another one, by the recording times.
+
+    One cannot be judged by another that lies seconds or years away. A pose may well come late: it takes time to match.
+    """
+    latency = {s.topic: _clock.usual_latency_s(s.stamps_ns, s.logs_ns) for s in streams}
+    reference = next((latency[s.topic] for s in streams if s.msgtype == IMU), None)
+    if reference is None:
+        return list(streams)
+    found = []
+    for stream in streams:
+        behind = latency[stream.topic] - reference
+        limit = _clock.JUMP_LIMIT_S if stream.msgtype in (POSE, PLAIN_POSE) else _clock.EPOCH_LIMIT_S
+        found.append(stream.later(round(behind * NS_PER_S)) if abs(behind) > limit else stream)
+    return found
+
+
 def track(fixes: Stream) -> tuple[NDArray[np.int64], Array, Array]:
     """Return stamps (N,), positions (N, 3) m about the first good fix, and the good fixes' rows.
 
@@ -132,7 +150,9 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
     known = (rows[:, 4] > 0) & np.isfinite(rows[:, 5:8]).all(axis=1) & (rows[:, 5:8] > 0.0).all(axis=1)
     sigma = np.sqrt(np.median(rows[known, 5:8], axis=0)) if known.any() else None
     # Third differences remove position, velocity and acceleration; those of white noise have 20 x its variance.
-    scatter = 1.4826 * np.median(np.abs(np.diff(p, n=3, axis=0)), axis=0) / np.sqrt(20.0) if len(p) > 10 else None
+    bad = stuck(stamps, rows[:, :2], p[:, :2])
+    own = p[~bad]
+    scatter = 1.4826 * np.median(np.abs(np.diff(own, n=3, axis=0)), axis=0) / np.sqrt(20.0) if len(own) > 10 else None
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
     precise = sigma is not None and float(sigma[:2].max()) < 0.1 and float(np.median(rows[:, 3])) >= 2.0
     if precise:
@@ -153,8 +173,8 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         travelled_m=float(np.hypot(chords[:, 0], chords[:, 1]).sum()),
         first=vec(rows[0, :3]),
         without_height=int(np.isnan(fixes.rows[np.isfinite(fixes.rows[:, :2]).all(axis=1), 2]).sum()),
-        white_m=scatter_m(stamps, p[:, :2]),
-        hangs="".join(stuck_warning(fixes.topic, stamps, stuck(stamps, rows[:, :2], p[:, :2]))),
+        white_m=scatter_m(stamps[~bad], own[:, :2]),
+        hangs="".join(stuck_warning(fixes.topic, stamps, bad)),
         slow_error=not precise,
         why=why,
         tf_frame=tf_frame,
@@ -246,6 +266,14 @@ def headings(stream: Stream) -> tuple[NDArray[np.int64], Array]:
     return stream.stamps_ns[keep][good], np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
 
 
+def _middle_deg(angle: Array) -> tuple[float, float]:
+    """Return the middle and the scatter (as of a normal) of angles (N,), deg, whatever a few say: fixes may jump, or hang."""
+    mean = float(np.angle(np.exp(1j * angle).mean()))
+    middle = mean + float(np.median(wrap_angle(angle - mean)))
+    scatter = 1.4826 * float(np.median(np.abs(wrap_angle(angle - middle))))
+    return float(np.degrees(wrap_angle(middle))), float(np.degrees(scatter))
+
+
 def compass_report(stream: Stream, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
     """Return whether an orientation is a heading, and in which convention; None where there is none."""
     keep = sane(stream)
@@ -282,9 +310,7 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
     )
     fits = {}
     for convention, value in (("enu", measured), ("ned", np.pi / 2.0 - measured)):
-        mean = complex(np.exp(1j * (value - courses.course_rad)).mean())
-        scatter = float(np.degrees(np.sqrt(-2.0 * np.log(max(abs(mean), 1e-9)))))
-        fits[convention] = (float(np.degrees(np.angle(mean))), scatter)
+        fits[convention] = _middle_deg(value - courses.course_rad)
     turned = float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(max(abs(np.exp(1j * courses.course_rad).mean()), 1e-9))))))
     if by_gyro:
         convention = by_gyro

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from graphloc.config import ImuConfig, SlowErrorConfig
+from graphloc.config import GnssConfig, ImuConfig, SlowErrorConfig
 from graphloc.frontends._clock import EPOCH_LIMIT_S
 from graphloc.frontends._fixes import SCATTERS
 from graphloc.frontends._reports import (
@@ -25,6 +25,7 @@ _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
 _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
+_UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
@@ -200,12 +201,16 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # /tf_static knows it")
     else:
         lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
-    if gnss.white_m is not None and gnss.reported_sigma_m is not None:
-        claimed = max(gnss.reported_sigma_m[:2])
-        if gnss.white_m > SCATTERS * claimed:
+    default = GnssConfig()
+    claimed = max(gnss.reported_sigma_m[:2]) if gnss.reported_sigma_m else default.default_horizontal_sigma_m
+    if gnss.white_m is not None and gnss.white_m > SCATTERS * claimed:
+        scatter, times = f"guess: fixes scatter by {gnss.white_m:.2f} m from one to the next", gnss.white_m / claimed
+        if gnss.reported_sigma_m:
+            lines.append(f"  sigma_scale: {times:.1f}  # {scatter}, and claim {claimed:.2f} m")
+        else:
+            lines.append(f"  default_horizontal_sigma_m: {gnss.white_m:.1f}  # {scatter}, and claim nothing")
             lines.append(
-                f"  sigma_scale: {gnss.white_m / claimed:.1f}  # guess: fixes scatter by {gnss.white_m:.2f} m from one to the "
-                f"next, and claim {claimed:.2f} m"
+                f"  default_vertical_sigma_m: {times * default.default_vertical_sigma_m:.1f}  # guess: as many times"
             )
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
     if wanders:
@@ -261,6 +266,11 @@ def _compass_block(name: str, compass: CompassReport, *, enabled: bool) -> list[
     elif compass.offset_deg is not None and abs(compass.offset_deg) > _COMPASS_SIGMA_DEG:
         lines.append(
             f"  mount_offset_sigma_deg: {abs(compass.offset_deg):.1f}  # guess: as far as it is off the GNSS course"
+        )
+    elif compass.offset_deg is None:
+        lines.append(
+            f"  mount_offset_sigma_deg: {_UNKNOWN_DEG:.1f}  # guess: no course tells; declination, or a mount, may be in it; 1 for "
+            "a true heading whose mount is known"
         )
     lines.append("  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass")
     lines.append("  wander_sigma_deg: 0.5  # guess: a harbour's iron turns it for a while; 0.2 for a GNSS compass")

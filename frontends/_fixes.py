@@ -16,7 +16,8 @@ from graphloc.time import NS_PER_S
 _HELD_S = 2.5
 """A place that is repeated for less, and then changes, was held by a driver; for longer, the receiver itself stands still."""
 _OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp again, from which a line is due
-_FAST_S, _EVEN, _FEWEST = 0.25, 0.2, 100  # steps over which motion hides in no third difference, and how many tell
+_FAST_S, _SLOW_S, _EVEN, _FEWEST = 0.25, 1.5, 0.2, 100  # steps: motion hides in none, in few, how even, how many tell
+_UNSTEADY_MPS2 = 4.0  # of slow ones, twice what a craft's acceleration changes by from step to step, most of the time
 _NOTHING_M = 100.0  # 1 sigma, from which a fix is none
 SCATTERS = 2.0
 """Scatter over the claim from which the claim is not believed."""
@@ -94,9 +95,9 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
 
 
 def scatter_m(stamps_ns: NDArray[np.int64], p_m: Array) -> float | None:
-    """Return the white part of the noise of places (N, 2), m, of the worst axis; None where motion could be in it.
+    """Return the white part of the noise of places (N, 2), m, of the worst axis; None where it could be motion.
 
-    Third differences remove motion where steps are short and even; those of white noise have 20 times its variance.
+    Third differences remove a steady acceleration; those of white noise have 20 times its variance.
     """
     steps = np.diff(stamps_ns) / NS_PER_S
     if len(steps) < _FEWEST:
@@ -104,7 +105,9 @@ def scatter_m(stamps_ns: NDArray[np.int64], p_m: Array) -> float | None:
     usual = float(np.median(steps))
     even = np.abs(steps - usual) < _EVEN * usual
     good = even[:-2] & even[1:-1] & even[2:]
-    if usual > _FAST_S or good.sum() < _FEWEST:
+    if usual > _SLOW_S or good.sum() < _FEWEST:
         return None
-    third = np.abs(np.diff(p_m, n=3, axis=0))[good]
-    return float(1.4826 * np.median(third, axis=0).max() / np.sqrt(20.0))
+    third = float(np.median(np.abs(np.diff(p_m, n=3, axis=0))[good], axis=0).max())
+    if usual > _FAST_S and third < _UNSTEADY_MPS2 * usual**2:
+        return None
+    return 1.4826 * third / float(np.sqrt(20.0))

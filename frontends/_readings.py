@@ -237,3 +237,18 @@ def reject_far(readings: Readings, config: VesselConfig, warnings: list[str]) ->
     warnings += _sanity.gnss_warnings(readings.sensor, fixes, config)
     far = rejected(f"over {_sanity.FAR_M / 1e3:.0f} km from the rest of the run")
     return _drop(readings, _sanity.far_fixes(fixes), far, warnings)
+
+
+def reject_far_poses(sensors: Sequence[Readings], warnings: list[str]) -> list[LedgerRow]:
+    """Drop poses that lie far from the datum, of a run that has fixes about it: the solver would be at them for minutes, and fail."""
+    if not any(isinstance(v, GnssPosition) for readings in sensors for v in readings.values):
+        return []
+    rows = []
+    far = rejected(
+        f"over {_sanity.FAR_M / 1e3:.0f} km from the datum: its frame looks like a map grid (UTM); wanted are poses in east, north, "
+        "up about `datum:`"
+    )
+    for readings in sensors:
+        bad = [isinstance(v, PoseFix) and _sanity.far_pose(v) for v in readings.values]
+        rows += _drop(readings, np.array(bad, dtype=bool), far, warnings) if any(bad) else []
+    return rows

@@ -81,7 +81,7 @@ class GnssReport:
     Attributes:
         statuses: fixes by status name; known_covariance: share of fixes that report one.
         reported_sigma_m: median sigma east, north, up; scatter_m: the white part seen in the data, the same.
-        white_m: the horizontal scatter, where fixes come so fast that no motion is in it.
+        white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
         hangs: where it says one place while the craft goes on, in words; '' where it does not.
         without_height: messages with a place and no height. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """

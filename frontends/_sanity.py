@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from graphloc.config import ImuConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum, Geodetic
-from graphloc.measurements import GnssPosition
+from graphloc.measurements import GnssPosition, PoseFix
 
 FAR_M = 100e3
 """A fix this far from the middle of its run is not believed."""
@@ -98,6 +98,12 @@ def far_fixes_of(lla: Array) -> NDArray[np.bool_]:
 def far_fixes(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
     """Return (N,) whether a fix lies further than `FAR_M` from the median of all fixes."""
     return far_fixes_of(np.array([f.position for f in fixes]).reshape(-1, 3))
+
+
+def far_pose(pose: PoseFix) -> bool:
+    """Return whether no mode of a pose lies within `FAR_M` of the origin of world."""
+    level = [pose.axes.index(axis) for axis in ("x", "y") if axis in pose.axes]
+    return all(float(np.linalg.norm(np.asarray(mode.value)[level])) > FAR_M for mode in pose.modes)
 
 
 def gnss_warnings(sensor: str, fixes: Sequence[GnssPosition], config: VesselConfig) -> list[str]:

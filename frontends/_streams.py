@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -130,6 +130,10 @@ class Stream:
         self._stamps.append(stamp_ns)
         self._logs.append(log_ns)
         self.tuples.append(row)
+
+    def later(self, by_ns: int) -> Stream:
+        """Return the stream with `by_ns` added to its stamps."""
+        return replace(self, _stamps=[stamp_ns + by_ns for stamp_ns in self._stamps])
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:

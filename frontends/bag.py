@@ -24,6 +24,7 @@ from graphloc.frontends._readings import (
     imu_series,
     judge_fixes,
     reject_far,
+    reject_far_poses,
     reject_jumps,
     reject_repeats,
     reject_scattered,
@@ -88,6 +89,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         warnings = list(bag.warnings)
 
     rows += reject_jumps(sensors, warnings)
+    rows += reject_far_poses(sensors, warnings)
     rows += reject_set_back(sensors, [b for b in (truth, check) if b], warnings)
     warnings += clock_warnings(sensors)
     imu: ImuSeries | None = None

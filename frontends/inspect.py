@@ -21,6 +21,7 @@ from graphloc.frontends._assess import (
     gnss_report,
     headings,
     motion_of,
+    on_one_clock,
     sane,
     topic_report,
     track,
@@ -64,7 +65,8 @@ from graphloc.frontends.decode import (
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, info_beside
 from graphloc.measurements import CompassHeading, ImuSeries
-from graphloc.time import utc_text
+from graphloc.stuck import stuck
+from graphloc.time import NS_PER_S, utc_text
 
 __all__ = [
     "CompassReport",
@@ -104,7 +106,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         if stream.msgtype == IMU:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
     by_topic = {s.topic: s for s in streams}
-    filled = [s for s in streams if len(s)]
+    filled = on_one_clock([s for s in streams if len(s)])
+    heard = {s.topic: s for s in filled}
     fixes = [s for s in filled if s.msgtype in _FIXES]
     poses = [s for s in filled if s.msgtype in (ODOMETRY, POSE, PLAIN_POSE)]
     wheels = [s for s in poses if _role(s)[0] == "check_speed"]
@@ -112,16 +115,16 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     motion = motion_of(wheels, twists, fixes)
     body = tree.body()
     # The best first: what they say is what the others are judged by.
-    found_gnss = [g for s in fixes if (g := gnss_report(s, _known(s, tree, body)))]
+    found_gnss = [g for s in fixes if (g := gnss_report(by_topic[s.topic], _known(s, tree, body)))]
     found_gnss.sort(key=lambda g: (-g.fixes, g.without_height))
-    stamps, p_m, scatter_m, first = _best_track(by_topic, found_gnss)
+    stamps, p_m, scatter_m, first = _best_track(heard, found_gnss)
     frame = found_gnss[0].tf_frame if found_gnss else None
     mount = tree.resolve(body, frame) if frame else None
     antenna = None if mount is None else mount[0]
     courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
     found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, courses, tree, body))]
     found_imus.sort(key=lambda i: i.gyro_noise_mdps)
-    turning = turning_of(by_topic[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
+    turning = turning_of(heard[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
     candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU, *NUMBERS)]
     return Inspection(
         source=source,
@@ -135,7 +138,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         imus=tuple(found_imus),
         gnss=tuple(found_gnss),
         compasses=tuple(
-            _asked_together(_timed(c, s, turning), s, [(i, by_topic[i.topic]) for i in found_imus])
+            _asked_together(_timed(c, s, by_topic[s.topic], turning), s, [(i, heard[i.topic]) for i in found_imus])
             for s in candidates
             if (c := compass_report(s, courses, turning))
         ),
@@ -156,8 +159,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     )
 
 
-def _timed(report: CompassReport, stream: Stream, turning: Turning | None) -> CompassReport:
-    """The report, with what the gyroscope says of the stamps."""
+def _timed(report: CompassReport, stream: Stream, told: Stream, turning: Turning | None) -> CompassReport:
+    """The report, with what the gyroscope says of the stamps, as they were told."""
     if turning is None or not report.usable:
         return report
     stamps, angle = headings(stream)
@@ -165,6 +168,7 @@ def _timed(report: CompassReport, stream: Stream, turning: Turning | None) -> Co
     if found is None:
         return report
     value, sigma = found
+    value += float(stream.stamps_ns[0] - told.stamps_ns[0]) / NS_PER_S
     return replace(report, why=f"{report.why}; by the gyro, time_offset_s should be {value:.3f} +- {sigma:.3f}")
 
 
@@ -265,12 +269,13 @@ def _known(stream: Stream, tree: StaticTree, body: str) -> str | None:
 def _best_track(
     by_topic: dict[str, Stream], gnss: Sequence[GnssReport]
 ) -> tuple[NDArray[np.int64], Array, float, Vec | None]:
-    """Return stamps, places about the first fix, scatter (m) and first fix of the receiver with most fixes."""
+    """Return stamps, places about the first fix, scatter (m) and first fix of the receiver with most fixes, where it does not hang."""
     if not gnss:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None
     best = gnss[0]
-    stamps, p, _ = track(by_topic[best.topic])
-    return stamps, p, max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first
+    stamps, p, rows = track(by_topic[best.topic])
+    good = ~stuck(stamps, rows[:, :2], p[:, :2])
+    return stamps[good], p[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first
 
 
 def _role(stream: Stream) -> tuple[str, float, str]:

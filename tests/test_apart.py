@@ -29,7 +29,7 @@ def run() -> SimulatedRun:
     return replace(run, config=run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)}))
 
 
-def said(run: SimulatedRun, east_north_m: Array, every_s: int = 1) -> list[str]:
+def said(run: SimulatedRun, east_north_m: Array, every_s: int = 1, up_m: float = 0.0) -> list[str]:
     """What is said of a GNSS error (N, 2) at each fix beside a craft that lies still, with 0.3 m of white noise on it."""
     off = east_north_m + 0.3 * np.random.default_rng(1).normal(size=east_north_m.shape)
     n = len(off)
@@ -38,7 +38,7 @@ def said(run: SimulatedRun, east_north_m: Array, every_s: int = 1) -> list[str]:
         stamps_ns=stamps[0] + np.arange(n + 1) * every_s * S, p_world_m=np.zeros((n + 1, 3)), R_world_body=np.tile(np.eye(3), (n + 1, 1, 1))
     )  # fmt: skip
     lever = run.config.sensors["gnss"].mount.t_body_sensor_m
-    lla = DATUM.geodetic_from_enu(lever + np.column_stack([off, np.zeros(n)]))
+    lla = DATUM.geodetic_from_enu(lever + np.column_stack([off, np.full(n, up_m)]))
     unit = np.eye(3)
     fixes = tuple(
         GnssPosition(stamp_ns=int(t), sensor="gnss", seq=k, position=Geodetic(*map(float, lla[k])), cov_enu_m2=unit)
@@ -79,6 +79,13 @@ def test_a_fix_or_two_are_no_steady_distance(run: SimulatedRun) -> None:
     assert said(run, np.tile([8.0, 0.0], (1, 1))) == []
     assert said(run, np.tile([8.0, 0.0], (15, 1))) == []
     assert len(said(run, np.tile([8.0, 0.0], (60, 1)))) == 1
+
+
+def test_a_height_above_the_geoid_beside_one_above_the_ellipsoid_is_said(run: SimulatedRun) -> None:
+    (line,) = said(run, np.zeros((60, 2)), up_m=-36.0)
+    assert "gnss stands 36.0 m (down) off what aerial" in line
+    assert "geoid" in line
+    assert said(run, np.zeros((60, 2)), up_m=12.0) == []  # its slow error in height is 5 m, 1 sigma
 
 
 def test_poses_all_off_by_five_metres_are_said(run: SimulatedRun) -> None:

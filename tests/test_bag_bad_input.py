@@ -2,6 +2,7 @@
 """Issue item A.7 at the reading level: each kind of bad input ends in a ledger row, a warning, or one clear line."""
 
 import struct
+from collections import Counter
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +17,7 @@ from graphloc.frontends._clock import longest_increasing
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.measurements import CompassHeading, GnssPosition, PoseFix
 from graphloc.recording import Recording
 from tests.bagfactory import START_NS, Item, Messages, S, damage_last_chunk, still_run, write_bag
 from tests.test_bag import accounted, vessel
@@ -316,6 +317,23 @@ def test_a_sensor_that_gives_nothing_is_said(tmp_path: Path) -> None:
     items = [("/fix", START_NS + k * S, MAKE.fix(START_NS + k * S, status=-1)) for k in range(5)]
     recording = read(tmp_path, items, imu=None)
     assert any("gnss: none of the 5 messages on /fix" in w and "NO_FIX" in w for w in recording.warnings)
+
+
+def test_poses_on_a_map_grid(tmp_path: Path) -> None:
+    """UTM northings: the solver was at it for two minutes, and failed. Without fixes any plane will do."""
+    make = Messages(2)
+    items: list[Item] = []
+    for k in range(40):
+        stamp = START_NS + k * S
+        items += [("/fix", stamp, make.fix(stamp)), ("/pose", stamp, make.pose(stamp, (672_000.0, 6_398_000.0, 40.0)))]
+    items.append(("/pose", START_NS + 40 * S, make.pose(START_NS + 40 * S, (3.0, 4.0, 40.0))))
+    path = write_bag(tmp_path / "run", make, items, "mcap")
+    recording = read_recording(path, vessel(imu=None, gnss={"topic": "/fix"}, pose={"topic": "/pose"}))
+    assert Counter(row.outcome for row in rows_of(recording, "pose")) == {Outcome.REJECTED: 40}
+    assert sum(isinstance(m, PoseFix) for m in recording.measurements) == 1
+    assert any("pose: 40 messages rejected" in w and "map grid (UTM)" in w for w in recording.warnings)
+    alone = read_recording(path, vessel(imu=None, gnss=None, pose={"topic": "/pose"}))
+    assert sum(isinstance(m, PoseFix) for m in alone.measurements) == 41
 
 
 def test_fixes_at_null_island_and_far_away(tmp_path: Path) -> None:

@@ -292,6 +292,15 @@ def test_it_is_written_and_shown(right: app.Run, tmp_path: Path) -> None:
     assert told["checks"][0]["sigma"] == 0.02
 
 
+def test_a_clock_years_away_is_said_to_milliseconds() -> None:
+    """It read '-1.75e+09 s instead of -1.75e+09'."""
+    clock = Suggestion(
+        sensor="compass", key="time_offset_s", unit="s", configured=-1749999862.753, suggested=-1749999862.8016, sigma=0.00923,
+        z=5.3, evidence="it fits", action="measure it",
+    )  # fmt: skip
+    assert str(clock).startswith("time_offset_s: -1749999862.802 +- 0.00923 s instead of -1749999862.753")
+
+
 def headings(late_s: float, seed: int) -> tuple[Turning, Any, Any]:
     """A craft that swings about, its compass off, disturbed by its own heading, and read `late_s` after its stamps."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, 120.0, 0.01)

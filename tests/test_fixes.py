@@ -102,6 +102,8 @@ def test_stamps_cut_to_seconds_are_said(step_ns: int, said: int, tmp_path: Path)
         (10, 0.05, 0.05, 1.0, None),
         (10, 0.0, 0.05, 1.0, None),
         (1, 0.5, 0.05, 1.0, None),  # motion could be in it
+        (1, 5.0, 0.5, 1.0, 10.0),  # but not that much
+        (1, 5.0, 4.0, 1.0, None),
     ],
 )
 def test_noise_that_a_receiver_hides(
@@ -118,6 +120,21 @@ def test_noise_that_a_receiver_hides(
         assert len(found) == (expected is not None)
         if expected is not None:
             assert float(found[0].split("sigma_scale:")[1].split("#")[0]) == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize(("hz", "noise_m", "expected"), [(1, 5.0, 5.0), (10, 5.0, 5.0), (10, 1.0, None)])
+def test_noise_of_a_receiver_that_claims_none(hz: int, noise_m: float, expected: float | None, tmp_path: Path) -> None:
+    """1.5 m is taken where nothing is reported: five times as noisy, the graph would blame the IMU."""
+    items = fixes(hz, noise_m=noise_m, sigma_m=0.0, seconds=200)
+    for _, _, message in items:
+        message.position_covariance_type = 0
+    said = [w for w in read(tmp_path, items).warnings if "scatter" in w]
+    text = draft_config(inspect_bag(tmp_path / "run"))
+    found = [
+        float(line.split(":")[1].split("#")[0]) for line in text.splitlines() if "default_horizontal_sigma_m:" in line
+    ]
+    assert len(said) == len(found) == (expected is not None)
+    assert found == pytest.approx([expected] if expected else [], rel=0.15)
 
 
 @pytest.mark.parametrize(("hz", "sigma_m", "said"), [(10, 1e4, 1), (2, 1e4, 1), (10, 20.0, 0)])

@@ -340,6 +340,7 @@ def test_a_moored_compass_is_judged_by_the_gyro(convention: str, tmp_path: Path)
             items.append(("/compass", stamp, make.compass(stamp, (0, 0, np.sin(angle), np.cos(angle)))))
     _, config, text = look(tmp_path, items, make)
     assert config.sensors["compass"].convention == convention
+    assert config.sensors["compass"].mount_offset_sigma_deg == 10.0  # declination may be in it, and nothing here tells
     assert "by the gyro" in text
 
 
@@ -416,6 +417,46 @@ def test_a_clock_ahead_gets_an_offset(tmp_path: Path) -> None:
         items.append((topic, log_ns, message))
     _, config, _ = look(tmp_path, items, make)
     assert config.sensors["gnss"].time_offset_s == pytest.approx(-37.0, abs=0.1)
+
+
+@pytest.mark.parametrize("fault", ["jumps", "hangs"])
+def test_fixes_that_err_for_a_while_leave_no_compass_out(fault: str, tmp_path: Path) -> None:
+    """15 m off now and then, or a quarter of the run at one place: most courses still tell what the compass is."""
+    make, held = Messages(2), None
+    items = drive(make, seconds=120, noise_m=0.5)
+    for topic, log_ns, message in items:
+        t = (log_ns - START_NS) / S
+        if topic == "/fix":
+            if fault == "jumps" and t % 12.0 > 8.0:
+                message.latitude += 15.0 / 111e3
+            elif fault == "hangs" and 50.0 < t < 80.0:
+                held = held or message
+                message.latitude, message.longitude = held.latitude, held.longitude
+    found, config, _ = look(tmp_path, items, make)
+    (compass,) = found.compasses
+    assert compass.usable
+    assert abs(compass.offset_deg or 0.0) < 5.0
+    assert "compass" in config.sensors
+
+
+@pytest.mark.parametrize(
+    ("topic", "behind_s"), [("/fix", -18), ("/fix", -3600), ("/imu", START_NS // S - 100)], ids=["leap", "zone", "boot"]
+)
+def test_sensors_on_other_clocks_are_judged_by_each_other(topic: str, behind_s: int, tmp_path: Path) -> None:
+    """Without wheels: fixes tell the yaw of the IMU, and whether a compass is one, as on the same clock."""
+    make, items = Messages(2), []
+    for name, log_ns, message in drive(make, rotation_z(90.0), seconds=120):
+        if name == topic:
+            message.header.stamp.sec -= behind_s
+        if name != "/wheel/odom":
+            items.append((name, log_ns, message))
+    found, config, _ = look(tmp_path, items, make)
+    assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
+    (compass,) = found.compasses
+    assert (compass.usable, compass.convention) == (True, "ned")
+    assert compass.samples > 100
+    offset_s = behind_s if topic == "/fix" else -behind_s
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(offset_s, abs=0.1)
 
 
 @pytest.mark.parametrize(("status", "said"), [(-1, "say 'no fix'"), (0, "lie at 0, 0")])

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A receiver that hangs under way is told from one that drifts, jumps, is noisy or late."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from graphloc.eval.simulate import Scenario, simulate
+from graphloc.config import SlowErrorConfig
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.online._parting import PARTING_S, Parting
+from graphloc.recording import Recording
 from graphloc.replay import replay
 
 Off = Callable[[float, Array], Array]
@@ -58,6 +60,19 @@ def test_a_velocity_that_is_hardly_known_tells_nothing() -> None:
     assert parted(lambda t, n: 0.2 * n - V * max(t - 20.0, 0.0), V, sigma_mps=1.0) == []
 
 
+def test_one_that_hangs_does_so_though_the_velocity_is_known_ever_less() -> None:
+    """Nothing but it had told the velocity. What it has said since it stands is told, too: that drew the estimate along."""
+    rng, parting, when = np.random.default_rng(1), Parting(), []
+    for k in range(200):
+        t = k / 5.0
+        there_m, told_m = V * t, V * min(t, 20.0) + 0.2 * rng.standard_normal(2)
+        parting.note(t, told_m, there_m, 0.2, V, 0.1 + 0.2 * max(t - 25.0, 0.0))
+        when += [t] if parting.parted else []
+    assert when[-1] == 199 / 5.0
+    assert len(when) > 0.9 * 5.0 * (when[-1] - when[0])
+    assert 19.0 < parting.stands_s < 20.5
+
+
 def test_one_that_moves_otherwise_may_be_right() -> None:
     """The estimate went astray: it stands while the receiver goes on, or goes much faster."""
     assert parted(lambda t, n: 0.2 * n + V * max(t - 20.0, 0.0), 0.0 * V) == []
@@ -68,11 +83,9 @@ def test_at_the_start_it_may_be_the_estimate_that_is_wrong() -> None:
     assert parted(lambda t, n: 0.2 * n - V * t * (t < 8.0), V, until_s=16.0) == []
 
 
-def test_online_a_receiver_that_hangs_is_not_followed() -> None:
-    """Beside matches, 40 % of them false. Followed, it would be off by 30 m and more, and call that good."""
-    run = simulate(Scenario(path="loops", duration_s=45.0, noise="drift"), 1)
+def hung(run: SimulatedRun, begin_ns: int, end_ns: int, sensors: Collection[str]) -> Recording:
+    """The recording of some sensors; between two times the receiver says one place, but for centimetres."""
     fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
-    begin_ns, end_ns = fixes[0].stamp_ns + 18 * 10**9, fixes[0].stamp_ns + 33 * 10**9
     stuck = next(m for m in fixes if m.stamp_ns >= begin_ns)
     datum, rng = Datum(stuck.position), np.random.default_rng(5)
 
@@ -82,8 +95,36 @@ def test_online_a_receiver_that_hangs_is_not_followed() -> None:
         place = world_from_fixes([stuck], datum) + 0.03 * rng.standard_normal((1, 3))
         return replace(m, position=Geodetic(*datum.geodetic_from_enu(place)[0]))
 
-    said = tuple(heard(m) if isinstance(m, GnssPosition) else m for m in run.recording.measurements)
-    found = replay(replace(run.recording, measurements=said), run.config).solution
+    kept = [m for m in run.recording.measurements if m.sensor in sensors]
+    return replace(run.recording, measurements=tuple(heard(m) if isinstance(m, GnssPosition) else m for m in kept))
+
+
+def test_online_a_receiver_that_hangs_draws_nothing_along() -> None:
+    """Beside a compass alone. It takes 7 s to find, by when the estimate has been set back by 16 m, and braked: 86 m later."""
+    scenario = Scenario(
+        path="loops", duration_s=50.0, noise="clean", gnss_hz=5.0, gnss_sigma_m=0.5, accel_bias_mps2=0.3, gyro_bias_radps=0.03,
+        wave_roll_deg=5.0, wave_heave_m=0.3,
+    )  # fmt: skip
+    run = simulate(scenario, 1)
+    sensors = {name: run.config.sensors[name] for name in ("imu", "gnss", "compass")}
+    sensors["gnss"] = sensors["gnss"].model_copy(update={"slow_error": SlowErrorConfig()})
+    assert run.recording.imu is not None
+    begin_ns = int(run.recording.imu.stamps_ns[0]) + 25 * 10**9
+    said = hung(run, begin_ns, begin_ns + 20 * 10**9, ("gnss", "compass"))
+    track = replay(said, run.config.model_copy(update={"sensors": sensors})).solution.trajectory
+    off_m = np.hypot(*(track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[:, :2].T)
+    since_s = (track.stamps_ns - begin_ns) * 1e-9
+    assert off_m[(since_s > 8.0) & (since_s < 10.0)].max() < 10.0
+    assert off_m.max() < 35.0
+
+
+def test_online_a_receiver_that_hangs_is_not_followed() -> None:
+    """Beside matches, 40 % of them false. Followed, it would be off by 30 m and more, and call that good."""
+    run = simulate(Scenario(path="loops", duration_s=45.0, noise="drift"), 1)
+    begin_ns = next(m.stamp_ns for m in run.recording.measurements if isinstance(m, GnssPosition)) + 18 * 10**9
+    end_ns = begin_ns + 15 * 10**9
+    said = hung(run, begin_ns, end_ns, {m.sensor for m in run.recording.measurements})
+    found = replay(said, run.config).solution
     track = found.trajectory
     off_m = (track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[:, :2]
     seen = ~((track.stamps_ns > begin_ns) & (track.stamps_ns < begin_ns + 6 * 10**9))

@@ -6,6 +6,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from graphloc.eval.metrics import Table
 
 
@@ -32,8 +34,8 @@ class Suggestion:
 
     def __str__(self) -> str:
         return (
-            f"{self.key}: {_number(self.suggested)} +- {_number(self.sigma)} {self.unit} instead of "
-            f"{_number(self.configured)}: {self.evidence}; {self.action}"
+            f"{self.key}: {_number(self.suggested, self.sigma)} +- {_number(self.sigma)} {self.unit} instead of "
+            f"{_number(self.configured, self.sigma)}: {self.evidence}; {self.action}"
         )
 
 
@@ -80,5 +82,9 @@ class Calibration:
         }
 
 
-def _number(value: float) -> str:
-    return f"{value:.4g}" if abs(value) >= 1000.0 else f"{value:.3g}"
+def _number(value: float, sigma: float = np.inf) -> str:
+    """Three digits, or as many as its sigma tells: clocks may be years apart, and known to milliseconds."""
+    digits = max(3, 4 if abs(value) >= 1000.0 else 3)
+    if value and 0.0 < sigma < abs(value):
+        digits = max(digits, 2 + int(np.floor(np.log10(abs(value) / sigma))))
+    return f"{value:.{digits}g}"

@@ -92,7 +92,8 @@ class Judge:
         if not np.isfinite(told_m).all():
             return False
         newest, parting, parted = self._states.newest, stream.parting, stream.parting.parted
-        at_s = self._problem.timeline.seconds(m.stamp_ns)
+        timeline = self._problem.timeline
+        at_s = timeline.seconds(m.stamp_ns)
         parting.note(
             at_s,
             told_m,
@@ -103,8 +104,9 @@ class Judge:
         )
         if parting.parted and not parted:
             self._agreement.forget_refused()
+            since_s = min(at_s - PARTING_S, parting.stands_s)  # it drew the estimate along from when it began to stand
             for entry in self._entries.of(stream):
-                if m.stamp_ns - entry.measurement.stamp_ns < PARTING_S * 1e9:
+                if timeline.seconds(entry.measurement.stamp_ns) >= since_s:
                     self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0))
         if parting.for_long(at_s):
             self._agreement.note(stream, m, None)

@@ -18,7 +18,7 @@ PARTING_S, _FEWEST = 4.0, 4  # fixes, over so long at least
 _PARTS_MPS = 0.7  # no multipath drifts so fast
 _SHARE = 0.5  # of the vessel's speed: a late stamp parts in a turn, too, by less
 _SIGMAS = 4.0
-_STANDS_MPS = 0.3  # that it says: one that moves otherwise may be right, and the estimate wrong
+_STANDS_MPS, _STANDS_M = 0.3, 0.5  # that it says: one that moves otherwise may be right, and the estimate wrong
 _LONGEST_S = 15.0  # that it is passed over in silence
 _ALONG_S = 10.0  # it has moved along for: before, it may be the estimate that starts wrong
 _LINE = 0.15  # of the way that they part by: fixes that jump lie farther off a line
@@ -29,10 +29,13 @@ class Parting:
 
     Attributes:
         parted: it stands while the vessel goes; its places are not believed until it moves along again.
+        stands_s: since when it says the same place, but for its noise.
     """
 
     def __init__(self) -> None:
         self.parted = False
+        self.stands_s = -np.inf
+        self._stands_m: Array | None = None
         self._seen: deque[tuple[float, Array, Array]] = deque()
         self._parted_s = 0.0
         self._along_s: float | None = None  # since when it has moved along
@@ -52,6 +55,9 @@ class Parting:
         """
         if self._seen and at_s <= self._seen[-1][0]:
             return
+        still_m = max(_STANDS_M, _SIGMAS * float(np.sqrt(2.0)) * sigma_m)  # of two places
+        if self._stands_m is None or float(np.linalg.norm(told_m - self._stands_m)) > still_m:
+            self.stands_s, self._stands_m = at_s, np.array(told_m)
         self._seen.append((at_s, np.array(told_m), np.array(told_m - estimated_m)))
         while at_s - self._seen[0][0] > 1.25 * PARTING_S:
             self._seen.popleft()
@@ -63,8 +69,8 @@ class Parting:
         left = off - off.mean(axis=0) - np.outer(t - t.mean(), parts)
         rms, speed = float(np.sqrt((left**2).sum(axis=1).mean())), float(np.linalg.norm(parts))
         stands = float(np.linalg.norm(moves)) < _STANDS_MPS + _SIGMAS * sigma_m * noise
-        least = max(_PARTS_MPS, _SHARE * float(np.linalg.norm(v_mps)), _SIGMAS * sigma_mps)
-        if self.parted:
+        least = max(_PARTS_MPS, _SHARE * float(np.linalg.norm(v_mps)))
+        if self.parted:  # that the velocity is known ever less without it does not make it move
             self.parted = stands and speed > 0.5 * least
             return
         least = max(least, _SIGMAS * float(np.hypot(max(sigma_m, rms) * steady, sigma_mps)))
