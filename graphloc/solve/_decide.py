@@ -33,6 +33,8 @@ from graphloc.solve._hypotheses import log_evidence_of, sequence_of
 # off still pulls in; Cauchy forgets outliers better and still lets the truth back in.
 _STAGE_KERNEL = {"far": KernelConfig(kind="huber", scale=1.5), "open": KernelConfig(kind="cauchy", scale=1.5)}
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
+# How far apart pairs of residuals are; multiples of the latter, whole turns taken off, spread them evenly.
+_LAGS_S, _GOLDEN = (2.0, 4.0), 0.618
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
 
 # Of a state and a key: the covariance of the key's value as it is predicted for that state; None: not predicted.
@@ -121,7 +123,7 @@ def weigh(
             ]
             found = by_hypotheses(stream, indices, attached, residuals, predictions)
         else:
-            found = _by_kernel(stream, attached, residuals, stage)
+            found = _by_kernel(stream, indices, attached, residuals, stage)
         verdicts.update({(stream.number, i): v for i, v in zip(indices, found, strict=True)})
     return verdicts
 
@@ -134,7 +136,7 @@ def _residuals_at(
 
 
 def _by_kernel(
-    stream: Stream, attached: list[Attachment], residuals: list[tuple[Residual, ...]], stage: str
+    stream: Stream, indices: list[int], attached: list[Attachment], residuals: list[tuple[Residual, ...]], stage: str
 ) -> list[Verdict]:
     """The sensor's own kernel, or the stage's where that one is gentler."""
     nis = _nis([r for found in residuals for r in found])
@@ -145,7 +147,11 @@ def _by_kernel(
     gentle = _CONVEXITY.index(own.kind) <= _CONVEXITY.index(limit.kind)
     # The norm of k whitened residuals is about sqrt(k) where all is well: bend that much later.
     dof = len(residuals[0][0].raw)
-    widening = _spread(best, dof) * float(np.sqrt(dof))
+    spread = _spread(best, dof)
+    if spread > 1.0 and not stream.row.absolute:  # of places, what they have in common may be the estimate's own error
+        pairs = _pairs(stream, indices, [found[m] for m, found in zip(mode, residuals, strict=True)])
+        spread = min(spread, _spread(pairs, dof)) if len(pairs) >= dof + 4 else spread
+    widening = spread * float(np.sqrt(dof))
     kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=own.scale * widening)
     return [
         Verdict(Decision(mode=m, kernel=kernel), kernel.weight(n), 1.0, found[m], m, at)
@@ -169,6 +175,19 @@ def _spread(nis: list[float], dof: int) -> float:
     good sensor (measured on KITTI: 97 % of the fixes lost, 23 m off). So the bend follows the median.
     """
     return max(1.0, float(np.sqrt(np.median(nis) / chi2_median(dof)))) if nis else 1.0
+
+
+def _pairs(stream: Stream, indices: list[int], residuals: list[Residual]) -> list[float]:
+    """Half the squares of what normalised residuals 2 to 4 s apart differ by: what they have in common is no scatter.
+
+    Taken for it, a compass that was 90 deg off for more than half of a window bent its kernel at 90 deg, and turned the run.
+    """
+    stamps_ns = np.array([stream.measurements[i].stamp_ns for i in indices])
+    lags_s = np.interp(np.arange(len(indices)) * _GOLDEN % 1.0, (0.0, 1.0), _LAGS_S)
+    before = np.searchsorted(stamps_ns, stamps_ns - np.rint(1e9 * lags_s).astype(np.int64), side="right") - 1
+    (now,) = np.nonzero((before >= 0) & (stamps_ns - stamps_ns[before] < 2e9 * _LAGS_S[1]))
+    normal = [r.normalised() for r in residuals]
+    return [0.5 * float(np.sum((normal[n] - normal[before[n]]) ** 2)) for n in now]
 
 
 def by_hypotheses(

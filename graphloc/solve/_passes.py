@@ -16,6 +16,7 @@ from graphloc.solve._stretch import moved
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
 _MAX_OPEN_PASSES, _OPEN_SETTLED_M = 4, 0.5
+_UPHILL = 1.1  # times the cost before: from there a single step has not landed
 _OUTLIER = 0.1  # weight under its own kernel below which a measurement is an outlier
 
 
@@ -40,11 +41,14 @@ def optimise_run(
 
 
 def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Step:
-    """One step of the whole run."""
+    """One step of the whole run; more where it comes out uphill, by more than a step on curved ground ever does at the end."""
     last = len(problem.timeline) - 1
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
-    values = full_step(graph, guess)
-    return Step(values, graph, 1, moved(guess, values))
+    values, iterations = full_step(graph, guess), 1
+    before = float(graph.error(guess))
+    if not float(graph.error(values)) < _UPHILL * before + 1.0:
+        values, iterations, _ = optimize(graph, guess, 12, 1e-3)
+    return Step(values, graph, iterations, moved(guess, values))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
