@@ -2,7 +2,8 @@
 """Fixes far off for seconds are outliers, not the IMU's noise."""
 
 from dataclasses import replace
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from graphloc.config import KernelConfig
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Geodetic, wrap_angle
+from graphloc.graph import Residual
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
+from graphloc.solve._decide import _by_kernel
 
 
 def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
@@ -59,6 +62,24 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one() -> None:
     off_deg = np.degrees(np.abs(wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad)))
     assert off_deg.max() < 3.0
     assert solved.ledger.counts()["aerial"]["used"] > 30
+
+
+def test_a_sensor_that_lies_by_more_than_numbers_hold_is_an_outlier() -> None:
+    """Of 0.1 mm, stated, and 10^9 m off: a scale without a limit was none that a kernel takes, and the run ended in a traceback."""
+    off = Residual(
+        raw=np.array([1e9, 0.0]),
+        cov=np.eye(2) * 1e-8,
+        jacobian=lambda: np.zeros((2, 6)),
+        prior=1.0,
+        size_m=1e9,
+        size_deg=None,
+    )
+    stream: Any = SimpleNamespace(
+        row=SimpleNamespace(absolute=True), config=SimpleNamespace(kernel=KernelConfig(kind="cauchy"))
+    )
+    at: Any = None
+    verdicts = _by_kernel(stream, [0, 1, 2], [at] * 3, [(off,)] * 3, "final")
+    assert max(v.weight for v in verdicts) < 1e-6
 
 
 @pytest.mark.parametrize("kind", ["none", "huber", "cauchy", "geman_mcclure", "tukey"])

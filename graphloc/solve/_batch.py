@@ -22,7 +22,7 @@ import numpy as np
 from graphloc.build import Problem, StartPrior, bridged, with_noise_scale
 from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
-from graphloc.solve._choices import by_best_chains, judged_by_the_rest, take_more_probable
+from graphloc.solve._choices import by_best_chains, judged_by_the_rest, take_more_probable, without_its_ends
 from graphloc.solve._decide import Verdicts, weigh
 from graphloc.solve._grow import grow, solve_start
 from graphloc.solve._optimize import bayes_tree
@@ -98,16 +98,16 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
 def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress) -> Settled:
     """Re-choose modes and weights over the whole run until they stand, and look for better choices.
 
-    Choices confirm themselves: the estimate follows them. So two others are tried: the most probable chain of
-    measurements that agree with each other, and what the run says of each stretch without its own. Where one
-    of these is more probable, it is taken.
+    Choices confirm themselves: the estimate follows them. So three others are tried: the most probable chain of
+    measurements that agree with each other, what the run says of each stretch without its own, and none of those at its
+    ends. Where one of these is more probable, it is taken.
     """
     last = len(problem.timeline) - 1
     settled = settle(
         problem, estimate, weigh(problem, estimate, first=0, last=last, stage="final"), prior, progress, _FIRST_PASSES
     )
     changed, iterations = False, settled.iterations
-    for other in (by_best_chains, judged_by_the_rest):
+    for other in (by_best_chains, judged_by_the_rest, without_its_ends):
         others, used = other(problem, settled, prior)
         changed = take_more_probable(problem, settled, others, prior) or changed
         iterations += used

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Other choices of modes and weights than those that the estimate confirms.
 
-Choices confirm themselves: the estimate follows them. Two others are made here: along the most probable
-chain of measurements that agree with each other, and by what the run says of each stretch without its own.
+Choices confirm themselves: the estimate follows them. Three others are made here: along the most probable
+chain of measurements that agree with each other, by what the run says of each stretch without its own, and without
+what is believed at the ends.
 """
 
 from __future__ import annotations
@@ -81,6 +82,26 @@ def judged_by_the_rest(problem: Problem, settled: Settled, prior: StartPrior) ->
     return judged, iterations
 
 
+def without_its_ends(problem: Problem, settled: Settled, prior: StartPrior) -> tuple[Verdicts, int]:
+    """Refuse what is believed at either end of a sensor's measurements, where others near by are refused.
+
+    There only one side speaks against a few false ones that agree.
+    """
+    others = dict(settled.verdicts)
+    for stream in problem.streams:
+        if stream.row.false is None or not stream.measurements:
+            continue
+        stamps = [m.stamp_ns for m in stream.measurements]
+        for end_ns in (stamps[0], stamps[-1]):
+            away_s = {(stream.number, i): abs(stamp - end_ns) * 1e-9 for i, stamp in enumerate(stamps)}
+            if all(others[key].weight > 0.5 for key, s in away_s.items() if s <= _AROUND_S):
+                continue
+            for key, s in away_s.items():
+                if s <= _STRETCH_S:
+                    others[key] = replace(others[key], decision=None, weight=0.0)
+    return others, 0
+
+
 class _Rest(NamedTuple):
     """The run without some measurements: values, and the tree that gives their covariances."""
 
@@ -116,8 +137,11 @@ def take_more_probable(problem: Problem, settled: Settled, others: Verdicts, pri
         low, high = min(states), max(states)
         first, last = _index_around(problem, low, -_AROUND_S), _index_around(problem, high, _AROUND_S)
         start = prior if first == 0 else weak_prior(problem, settled.values, first)
+        there = _solve_around(problem, settled.values, others, first, last, start, unlike=settled.verdicts)
+        if there is None:
+            continue
         here = _solve_around(problem, settled.values, settled.verdicts, first, last, start)
-        there = _solve_around(problem, settled.values, others, first, last, start)
+        assert here is not None
         if there.cost < here.cost:
             update_states(problem, settled.values, there.values, first, last)
             settled.verdicts.update(there.verdicts)
@@ -160,15 +184,29 @@ class _Around(NamedTuple):
 
 
 def _solve_around(
-    problem: Problem, values: gtsam.Values, verdicts: Verdicts, first: int, last: int, prior: StartPrior
-) -> _Around:
+    problem: Problem,
+    values: gtsam.Values,
+    verdicts: Verdicts,
+    first: int,
+    last: int,
+    prior: StartPrior,
+    unlike: Verdicts | None = None,
+) -> _Around | None:
+    """Solve a stretch until its choices stand; None where they become those of `unlike`."""
     local = copy_states(problem, values, max(first - 1, 0), min(last + 1, len(problem.timeline) - 1))
     for _ in range(_AROUND_PASSES):
         step = solve_until_written_there(problem, local, first, last, prior, decisions(verdicts), tol=1e-3, thin=False)
         used, verdicts = verdicts, weigh(problem, local, first=first, last=last, stage="final")
+        if unlike is not None and all(_alike(v, unlike[key]) for key, v in verdicts.items()):
+            return None
         if step.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
             break
     numbers = {s.number for s in problem.streams if s.row.false is not None}
     plain = decisions(verdicts, {key for key in verdicts if key[0] in numbers})
     graph, guess = build_graph(problem, local, plain, first, last, prior)
     return _Around(local, verdicts, float(graph.error(guess)) - log_evidence(problem, local, first, last))
+
+
+def _alike(one: Verdict, other: Verdict) -> bool:
+    """Whether both believe the measurement, in the same mode, or neither does."""
+    return abs(one.weight - other.weight) < 0.5 and (one.mode == other.mode or one.weight < 0.5)

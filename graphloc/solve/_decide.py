@@ -35,6 +35,7 @@ _STAGE_KERNEL = {"far": KernelConfig(kind="huber", scale=1.5), "open": KernelCon
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
 # How far apart pairs of residuals are; multiples of the latter, whole turns taken off, spread them evenly.
 _LAGS_S, _GOLDEN = (2.0, 4.0), 0.618
+_WIDEST = 1e9  # sigmas: a sensor that lies by more (0.1 mm stated, 100 km off) is no less an outlier for it
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
 
 # Of a state and a key: the covariance of the key's value as it is predicted for that state; None: not predicted.
@@ -151,8 +152,8 @@ def _by_kernel(
     if spread > 1.0 and not stream.row.absolute:  # of places, what they have in common may be the estimate's own error
         pairs = _pairs(stream, indices, [found[m] for m, found in zip(mode, residuals, strict=True)])
         spread = min(spread, _spread(pairs, dof)) if len(pairs) >= dof + 4 else spread
-    widening = spread * float(np.sqrt(dof))
-    kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=own.scale * widening)
+    scale = min(own.scale * spread * float(np.sqrt(dof)), _WIDEST)
+    kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=scale)
     return [
         Verdict(Decision(mode=m, kernel=kernel), kernel.weight(n), 1.0, found[m], m, at)
         for m, n, found, at in zip(mode, best, residuals, attached, strict=True)
