@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver that hangs, or its driver: it says one place, to the last bit, while the vessel goes on.
+"""A receiver that hangs, or its driver: it says one place, to the last bit or but for its noise, while the vessel goes on.
 
 Judged from a whole run, before it is solved: beside few other sensors the graph would follow, by a tilt and a bias that were never
 there. At rest a receiver may well say one place for minutes, so it has to have been under way: the next place it says is then a leap
@@ -20,8 +20,9 @@ from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
 
-WHY = "its receiver or driver hangs: it says one place to the last bit while the vessel goes on"
+WHY = "its receiver or driver hangs: it says one place while the vessel goes on"
 _HELD_S, _FEWEST = 2.5, 3  # a stretch of one place; for less a driver repeats (`frontends/_fixes.py`)
+_NOISE_M = 0.5  # how far one place may scatter
 _BEFORE_S = 3.0  # whose fixes tell how fast it was under way
 _SIGMAS = 3.0
 _UNDER_WAY_MPS, _LEAP_M, _SHARE = 0.5, 2.0, 0.5  # speed before; the leap after, and its share of the way at that speed
@@ -43,27 +44,84 @@ def stuck(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Array) -> 
     for first, after in zip(firsts, [*firsts[1:], len(bad)], strict=True):
         if after - first >= _FEWEST and t_s[after - 1] - t_s[first] >= _HELD_S:
             bad[first + 1 : after] = _hangs(t_s[: after + 1], places_m[: after + 1], int(first), int(after))
+    return bad | _stuck_but_for_noise(t_s, places_m, bad)
+
+
+def _stuck_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which fixes say one place but for its noise, where `known` has none to the last bit.
+
+    Any receiver does so at rest: it must have been under way until then, *and* go on with a leap.
+    """
+    bad = np.zeros(len(t_s), dtype=bool)
+    held = np.searchsorted(t_s, t_s + _HELD_S)  # the first that is so much later
+    before = np.searchsorted(t_s, t_s - _BEFORE_S)
+    stays = np.append(
+        np.linalg.norm(places_m[held[held < len(t_s)]] - places_m[held < len(t_s)], axis=1) < 2.0 * _NOISE_M, False
+    )
+    first = 0
+    while first < len(t_s) and held[first] < len(t_s):
+        if not stays[first] or held[first] - first < _FEWEST:
+            first += 1
+            continue
+        after = _gone(places_m, first, int(held[first]))
+        if after == len(t_s) or known[first:after].any():
+            first = after
+        elif (
+            after > held[first]
+            and _stopped_at_once(t_s, places_m, first, _UNDER_WAY_MPS)
+            and _hangs(t_s[: after + 1], places_m[: after + 1], first, after)
+        ):
+            bad[first + 1 : after] = True
+            first = after
+        elif after > held[first] and np.linalg.norm(places_m[before[first]] - places_m[first]) < 2.0 * _NOISE_M:
+            first = after  # it was here before: at rest
+        else:
+            first += 1
     return bad
 
 
+def _gone(places_m: Array, first: int, held: int) -> int:
+    """The first that is farther from the middle of those in [first, held) than noise is; or how many there are."""
+    middle, long = places_m[first:held].mean(axis=0), held - first
+    while True:
+        away = np.linalg.norm(places_m[first : first + long] - middle, axis=1) > _NOISE_M
+        if away.any():
+            return first + int(np.argmax(away))
+        if first + long >= len(places_m):
+            return len(places_m)
+        long *= 2
+
+
 def _hangs(t_s: Array, places_m: Array, first: int, after: int) -> bool:
-    """Whether the stretch from `first` on hangs; at `after` it says another place, or the run has ended."""
-    before = np.flatnonzero((t_s[:first] >= t_s[first] - _BEFORE_S) & (t_s[:first] < t_s[first]))
+    """Whether the stretch of one place from `first` on hangs; at `after` it says another place, or the run has ended."""
+    before = _before(t_s, first)
     if len(before) < 2:
         return False
-    way = np.append(before, first)
-    speed, sigma = _speed(t_s[way], places_m[way])
     if after < len(t_s):
         leap = float(np.linalg.norm(places_m[after] - places_m[first]))
         silent_s = t_s[after] - t_s[after - 1]
         set_off_m = _BRAKES_MPS2 * silent_s**2 / 2.0  # from rest, while it said nothing
         if silent_s < _HELD_S or leap > set_off_m:
+            speed, sigma = _speed(t_s[way := np.append(before, first)], places_m[way])
             least_m = max(_LEAP_M, set_off_m, _SHARE * speed * (t_s[after] - t_s[first]))
             return speed - _SIGMAS * sigma > _UNDER_WAY_MPS and leap > least_m
+    return _stopped_at_once(t_s, places_m, first, _STOPS_MPS)
+
+
+def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) -> bool:
+    """Whether it was under way until the fix before, faster than this and than brakes stop between two fixes."""
+    before = _before(t_s, first)
+    if len(before) < 2:
+        return False
+    way = np.append(before, first)
     later = way[len(way) // 2 :]  # one that brakes is slower there, and its way is no line
-    last, noise = _speed(t_s[later], places_m[later])
+    (speed, sigma), (last, noise) = (_speed(t_s[of], places_m[of]) for of in (way, later))
     step_s = t_s[first] - t_s[before[-1]]
-    return bool(min(speed, last) - _SIGMAS * max(sigma, noise) > _STOPS_MPS + _BRAKES_MPS2 * step_s)
+    return bool(min(speed, last) - _SIGMAS * max(sigma, noise) > least_mps + _BRAKES_MPS2 * step_s)
+
+
+def _before(t_s: Array, first: int) -> NDArray[np.int64]:
+    return np.flatnonzero((t_s[:first] >= t_s[first] - _BEFORE_S) & (t_s[:first] < t_s[first]))
 
 
 def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver that says one place to the last bit while the vessel goes on: told from one at rest, and not believed."""
+"""A receiver that says one place, or one but for noise, while the vessel goes on: told from one at rest, and not believed."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -78,6 +78,44 @@ def test_one_at_rest_or_that_repeats_for_a_moment_is_believed(
     way: Way, held_s: tuple[float, float], hz: float, noise_m: float
 ) -> None:
     assert len(judged(way, held_s, hz, noise_m)) == 0
+
+
+def scattered(way: Way, held_s: tuple[float, float], hz: float, noise_m: float) -> Array:
+    """The times that are judged to hang of a receiver whose one place scatters."""
+    t, _, p = said(way, held_s, hz, noise_m)
+    held = (t >= held_s[0]) & (t < held_s[1])
+    p[held] += noise_m * np.random.default_rng(5).normal(size=(int(held.sum()), 2))
+    return t[stuck(START_NS + np.round(t * S).astype(np.int64), p, p)]
+
+
+@pytest.mark.parametrize("noise_m", [0.05, 0.15])
+@pytest.mark.parametrize(
+    ("speed_mps", "held_s", "hz"),
+    [(5.0, (20.0, 40.0), 1.0), (2.0, (20.0, 40.0), 10.0), (2.5, (20.0, 26.0), 5.0), (15.0, (20.0, 24.0), 1.0)],
+)
+def test_a_place_that_scatters_hangs_as_well(
+    speed_mps: float, held_s: tuple[float, float], hz: float, noise_m: float
+) -> None:
+    found = scattered(at(speed_mps), held_s, hz, noise_m)
+    assert len(found) >= round((held_s[1] - held_s[0]) * hz) - 2  # it may begin with the last one on the way
+    assert found.min() >= held_s[0] - 0.5
+    assert found.max() < held_s[1]
+
+
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+@pytest.mark.parametrize(
+    "way",
+    [
+        lambda t: rests(4.0, t) + 12.0 * (t > 40.0),  # at rest, and then multipath jumps
+        lambda t: rests(0.6, t) + 5.0 * (t > 24.0),  # at the quay, soon after
+        lambda t: 2.0 * np.minimum(t, 20.0) + 3.0 * np.maximum(t - 26.0, 0.0),  # sets off again
+        lambda t: 2.0 * np.minimum(t, 20.0),
+        lambda t: 0.15 * t + 10.0 * (t > 30.0),  # drifts
+    ],
+)
+def test_one_that_scatters_at_rest_is_believed(way: Way, hz: float) -> None:
+    for noise_m in (0.02, 0.1, 0.4):
+        assert len(scattered(way, (59.0, 59.0 + 1.0 / hz), hz, noise_m)) == 0
 
 
 def rests(speed_mps: float, t: Array) -> Array:
