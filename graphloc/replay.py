@@ -30,7 +30,7 @@ from graphloc.measurements import ImuSample, Measurement, TagSighting
 from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
 from graphloc.solution import Solution, SolveStats
-from graphloc.solve._solution import disagreeing
+from graphloc.solve._solution import disagreeing, refused_together
 from graphloc.trajectory import Trajectory
 
 Status = Callable[[float, float, Estimate | None, str], None]
@@ -285,7 +285,7 @@ def replay(
                       outcome=Outcome.IGNORED, reason="the replay was interrupted before")
             for m in arrivals(recording) if m.seq >= 0 and m.seq not in told
         ]  # fmt: skip
-    solution = _solution(estimates, Ledger(rows), smoother, told_of)
+    solution = _solution(estimates, Ledger(rows), smoother, told_of, config)
     return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=np.array(took_s))
 
 
@@ -311,7 +311,9 @@ def _timed(said: Sequence[tuple[int, str]], estimates: Sequence[Estimate]) -> li
     return lines
 
 
-def _solution(estimates: Sequence[Estimate], ledger: Ledger, smoother: OnlineSmoother, said: Sequence[str]) -> Solution:
+def _solution(
+    estimates: Sequence[Estimate], ledger: Ledger, smoother: OnlineSmoother, said: Sequence[str], config: VesselConfig
+) -> Solution:
     """Each pose as it was known then; where a restart went back in time, the newer one counts."""
     kept: list[Estimate] = []
     for estimate in estimates:
@@ -321,12 +323,17 @@ def _solution(estimates: Sequence[Estimate], ledger: Ledger, smoother: OnlineSmo
     assert smoother.datum is not None
     stamps = np.array([e.stamp_ns for e in kept], dtype=np.int64)
     names = kept[-1].since_agreed_s
-    judged: dict[str, list[float]] = {}
+    judged: dict[str, list[LedgerRow]] = {}
     for row in ledger:
         if row.weight is not None:
-            judged.setdefault(row.sensor, []).append(row.weight)
+            judged.setdefault(row.sensor, []).append(row)
     warnings = [line for line in said if any(word in line for word in _WARNS)]
-    warnings += [line for name, weights in judged.items() for line in disagreeing(name, np.array(weights))]
+    for name, rows in judged.items():
+        rows.sort(key=lambda row: row.stamp_ns)
+        weights = np.array([row.weight for row in rows])
+        warnings += disagreeing(name, weights)
+        if (usual := getattr(config.sensors.get(name), "false_fraction", None)) is not None:
+            warnings += refused_together(name, np.array([row.stamp_ns for row in rows]), weights, usual)
     return Solution(
         datum=smoother.datum,
         trajectory=Trajectory(

@@ -13,10 +13,13 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import bl_scenario, simulate
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
+from graphloc.measurements import Measurement, PoseFix
+from graphloc.replay import replay
 from graphloc.solve._best_chain import best_chain
 from graphloc.solve._decide import Verdict, by_hypotheses
 from graphloc.solve._foreseen import Prediction
 from graphloc.solve._hypotheses import FalseSequence
+from graphloc.solve._solution import refused_together
 
 SIGMA_M = 0.2
 
@@ -152,6 +155,40 @@ def test_nothing_but_noise_makes_no_long_chain() -> None:
 def test_false_matches_that_repeat_do_not_bend_the_track(noise: Any, seed: int, why: str) -> None:
     run = simulate(bl_scenario(3, noise), seed)
     assert compare_to_truth(app.simulated(run).solution.trajectory, run.truth).position_rmse_m < 0.2, why
+
+
+def test_matches_that_are_refused_together_are_said() -> None:
+    """For 20 s all say 15 m beside: so many are not false by chance. Usual ones, 40 % of them, are not said."""
+    run = simulate(replace(bl_scenario(1, "clean"), duration_s=70.0), 3)
+    begin_ns = int(run.truth.stamps_ns[0]) + 30_000_000_000
+
+    def beside(m: Measurement) -> Measurement:
+        if not isinstance(m, PoseFix) or not 0 <= m.stamp_ns - begin_ns < 20_000_000_000:
+            return m
+        return replace(m, modes=tuple(replace(mode, value=mode.value + np.array([15.0, 0.0, 0.0])) for mode in m.modes))
+
+    recording = replace(run.recording, measurements=tuple(beside(m) for m in run.recording.measurements))
+    said = {
+        "usual": [
+            *app.simulated(run).solution.stats.warnings,
+            *replay(run.recording, run.config).solution.stats.warnings,
+        ],
+        "batch": app.smooth_recording(recording, run.config).solution.stats.warnings,
+        "online": replay(recording, run.config).solution.stats.warnings,
+    }
+    assert not any("are refused" in line for line in said["usual"])
+    for mode in ("batch", "online"):
+        (line,) = (line for line in said[mode] if line.startswith("aerial: all its ") and "are refused" in line)
+        assert 18 <= int(line.split("all its ")[1].split()[0]) <= 24, line
+
+
+def test_few_or_brief_ones_are_no_news() -> None:
+    stamps_ns, weights = np.arange(40) * 1_000_000_000, np.ones(40)
+    weights[10:17] = 0.0
+    assert refused_together("tags", stamps_ns, weights, 0.02)
+    assert not refused_together("aerial", stamps_ns, weights, 0.4)  # 0.4 ** 7 * 40 is 0.07
+    assert not refused_together("tags", stamps_ns // 10, weights, 0.02)  # within 0.6 s
+    assert not refused_together("tags", stamps_ns, np.zeros(40), 0.02)  # all: said otherwise
 
 
 def test_long_outage_does_not_lock_the_matches_out() -> None:
