@@ -169,10 +169,7 @@ def test_matches_that_are_refused_together_are_said() -> None:
 
     recording = replace(run.recording, measurements=tuple(beside(m) for m in run.recording.measurements))
     said = {
-        "usual": [
-            *app.simulated(run).solution.stats.warnings,
-            *replay(run.recording, run.config).solution.stats.warnings,
-        ],
+        "usual": app.simulated(run).solution.stats.warnings,
         "batch": app.smooth_recording(recording, run.config).solution.stats.warnings,
         "online": replay(recording, run.config).solution.stats.warnings,
     }
