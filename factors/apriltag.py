@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """AprilTags that a camera sees: the corners themselves are fused, the poses that explain them are its modes.
 
-    z_i = pi(R' (P_i - p)) + w_i,   w_i ~ N(0, C),   pi(x, y, z) = (x, y) / z,   R = R_b Exp(u) M
+    z_i = pi(R' (P_i - p)) + w_i,   w_i ~ N(0, C),   pi(x, y, z) = (x, y) / z,   R = R_b Exp(u) M,   at t_i - l
     P_i = c + d + Exp(w) (Q_i - c),   Q_i = S_i + e_k + f_k x (S_i - m_k)
     seen further out from its tag's middle, by b px at each edge
 
-p, R: camera in world; R_b: body in world; M: the camera's mount, which is off by u, a constant of the run; S_i: a corner as surveyed, its frame at rest; e_k, f_k: what the survey errs about tag k, its middle
+p, R: camera in world; R_b: body in world; M: the camera's mount, which is off by u; t_i: the stamp, late by l; both are constants of the run; S_i: a corner as surveyed, its frame at rest; e_k, f_k: what the survey errs about tag k, its middle
 m_k, a constant of the run; d, w: motion and small turn about c of the floating dock that the tag rides on, a slow state
 (D has neither); b: what detector, light, print and focal length make tags seem wider than they are, a slow state as well.
 Taken for noise of each sighting instead, such errors average out over hundreds of them, and the bounds are too small:
@@ -48,8 +48,8 @@ _BY_A_MODE_RAD = float(np.radians(20.0))
 _FREEDOM = ("east", "north", "up", "roll", "pitch", "yaw")
 _LEAST_M, _LEAST_RAD = 1e-3, float(np.radians(0.01))
 _LEAST = np.repeat([_LEAST_M, _LEAST_RAD], 3)
-# Where a sighting stands on a node: m, rad of a dock; rad of a mount; px.
-_TIE_DOCK, _TIE_MOUNT, _TIE_EDGE = (1e-4,) * 3 + (1e-5,) * 3, (1e-5,) * 3, (1e-4,)
+# Where a sighting stands on a node: m, rad of a dock; rad of a mount; s; px.
+_TIE_DOCK, _TIE_MOUNT, _TIE_LATE, _TIE_EDGE = (1e-4,) * 3 + (1e-5,) * 3, (1e-5,) * 3, (1e-5,), (1e-4,)
 _TIDE_S = 3600.0
 _EDGE_S = 30.0  # range and light change in about that
 
@@ -60,21 +60,19 @@ class _Seen:
     Attributes:
         R, p: camera in world. points_m: (n, 3) corners where their frame is now. middle_m: of these.
         body: (6, 6) d (place, rotation about the world's axes) of the camera / d tangent of the state. by_mount: (3, 3) d that
-            rotation / d u. own: rows of the slow state that it knows of: six of its dock, three of its camera's mount, that of the
-            edges, each where it is modelled (rides, mounted, edges). slow: their values; moved: (6,) of the dock; edge_px: b.
+            rotation / d u. by_late: (6,) d (place, rotation) / d l. own: rows of the slow state that it knows of: six of its dock, three of
+            its camera's mount, one of its stamps, that of the edges, each where it is modelled (rides, mounted, timed, edges).
+            slow: their values; moved: (6,) of the dock; edge_px: b.
     """
 
     def __init__(self, m: TagSighting, config: AprilTagConfig, at: Attachment) -> None:
-        docks, cameras = (_docks(config.surveyed), _mounted(config)) if at.slow_value is not None else ([], [])
+        docks, cameras = (_docks(config.surveyed), _rows(config)) if at.slow_value is not None else ([], {})
+        mount, late = cameras.get(m.camera, (range(0), range(0)))
         self.slow_size = 0 if at.slow_value is None else len(at.slow_value)
-        self.rides, self.mounted = m.frame in docks, m.camera in cameras
-        self.edges = self.slow_size > 6 * len(docks) + 3 * len(cameras)
-        self.own: list[int] = []
-        if self.rides:
-            self.own += range(first := 6 * docks.index(m.frame), first + 6)
-        if self.mounted:
-            self.own += range(first := 6 * len(docks) + 3 * cameras.index(m.camera), first + 3)
-        self.own += [self.slow_size - 1] * self.edges
+        self.rides, self.mounted, self.timed = m.frame in docks, len(mount) > 0, len(late) > 0
+        self.edges = self.slow_size > max([6 * len(docks), *(stamps.stop for _, stamps in cameras.values())])
+        first = 6 * docks.index(m.frame) if self.rides else 0
+        self.own = [*range(first, first + 6 * self.rides), *mount, *late, *[self.slow_size - 1] * self.edges]
         self.slow = np.zeros(0)
         if at.slow_value is not None:  # of tags that stand still: the edges of the node before, no leaf in between
             self.slow = (_between(at) if self.rides else np.asarray(at.slow_value))[self.own]
@@ -83,12 +81,18 @@ class _Seen:
         self.R, self.p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
         adjoint = np.asarray(T_state_camera.inverse().AdjointMap())
         self.body = np.vstack([self.R @ adjoint[3:], self.R @ adjoint[:3]])
-        self.by_mount = np.eye(3)
+        self.by_mount, self.by_late = np.eye(3), np.zeros(6)
+        R_world_body, arm = self.R @ m.R_body_camera.T, self.p - np.asarray(at.T_world_body.translation())
+        off, ago_s = self.slow[6 * self.rides :][:3], self.slow[6 * self.rides + 3 * self.mounted :][: len(late)]
+        if self.timed:
+            rate = R_world_body @ at.gyro_radps
+            self.by_late = -np.concatenate([at.v_world_mps + at.dv_world_mps + np.cross(rate, arm), rate])
+            self.p = self.p + self.by_late[:3] * ago_s
+            R_world_body = gtsam.Rot3.Expmap(self.by_late[3:] * ago_s).matrix() @ R_world_body
         if self.mounted:
-            off = self.slow[6 * self.rides :][:3]
-            R_world_body = self.R @ m.R_body_camera.T
-            self.R = R_world_body @ gtsam.Rot3.Expmap(off).matrix() @ m.R_body_camera
             self.by_mount = R_world_body @ np.asarray(gtsam.Rot3.ExpmapDerivative(-off))
+            R_world_body = R_world_body @ gtsam.Rot3.Expmap(off).matrix()
+        self.R = R_world_body @ m.R_body_camera
         self.moved = moved = self.slow[:6] if self.rides else np.zeros(6)
         self.edge_px = float(self.slow[-1]) if self.edges else 0.0
         self.turn = self.by_turn = np.eye(3)
@@ -125,9 +129,14 @@ def _docks(survey: Survey) -> list[str]:
     return [frame for frame in survey.frames if frame != WORLD]
 
 
-def _mounted(config: AprilTagConfig) -> list[str]:
-    """The cameras of whose mounts it is estimated what they are off."""
-    return [name for name, camera in config.cameras.items() if camera.mount_sigma_deg > 0.0]
+def _rows(config: AprilTagConfig) -> dict[str, tuple[range, range]]:
+    """Rows of the slow state, by camera: what its mount is off, and its stamps are late; empty where that is not estimated."""
+    found, first = {}, 6 * len(_docks(config.surveyed))
+    for name, camera in config.cameras.items():
+        stop = first + 3 * (camera.mount_sigma_deg > 0.0)
+        found[name] = (range(first, stop), range(stop, stop + (camera.stamp_sigma_s > 0.0)))
+        first = found[name][1].stop
+    return found
 
 
 def _constants_of(m: TagSighting, config: AprilTagConfig, at: Attachment) -> list[tuple[int, Array] | None]:
@@ -159,14 +168,16 @@ def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode)
         return np.asarray(turned @ seen.body)
 
     def slow_jacobian() -> Array:
-        by_own = []
+        by_own, turned = [], np.vstack([-skew(toward), np.eye(3)])
         if seen.rides:
             rigid = -np.eye(6)
             rigid[:3, 3:] = skew(seen.middle_m - m.pivot_m - seen.moved[:3])
             rigid[:, 3:] = rigid[:, 3:] @ seen.by_turn
             by_own.append(rigid)
         if seen.mounted:
-            by_own.append(np.vstack([-skew(toward), np.eye(3)]) @ seen.by_mount)
+            by_own.append(turned @ seen.by_mount)
+        if seen.timed:
+            by_own.append((np.append(seen.by_late[:3], np.zeros(3)) + turned @ seen.by_late[3:])[:, None])
         return seen.placed(np.hstack(by_own))
 
     return Residual(
@@ -206,6 +217,8 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
         by_own.append(np.concatenate([by_point, swing], axis=2).reshape(-1, 6))
     if seen.mounted:
         by_own.append(-turning.reshape(-1, 3) @ seen.by_mount)
+    if seen.timed:
+        by_own.append(camera @ seen.by_late[:, None])
     if seen.edges:
         outwards = m.px * _outwards(flat)  # not of the rays: their noise would tell edges from distance
         flat = flat + seen.edge_px * outwards
@@ -252,10 +265,9 @@ def _tie(seen: _Seen, dock: DockConfig, config: AprilTagConfig, at: Attachment) 
     picked = seen.placed(np.eye(n))
     share, dt_s = (0.0, 0.0) if at.slow_next is None else at.slow_next[2:]
     swing, swing_s = _swing(dock)
-    step = np.concatenate(
-        [swing / np.sqrt(swing_s), [0.0] * 3 * seen.mounted, [config.edge_sigma_px / np.sqrt(_EDGE_S)] * seen.edges]
-    )
-    tie = np.array(_TIE_DOCK + _TIE_MOUNT * seen.mounted + _TIE_EDGE * seen.edges)
+    still, edge = [0.0] * (3 * seen.mounted + seen.timed), [config.edge_sigma_px / np.sqrt(_EDGE_S)] * seen.edges
+    step = np.concatenate([swing / np.sqrt(swing_s), still, edge])
+    tie = np.array(_TIE_DOCK + _TIE_MOUNT * seen.mounted + _TIE_LATE * seen.timed + _TIE_EDGE * seen.edges)
     # Where there is no next node yet, it has gone on by itself.
     steps_s = at.slow_age_s if at.slow_next is None else dt_s * share * (1.0 - share)
     bridge = step * np.sqrt(2.0 * steps_s)
@@ -327,33 +339,29 @@ def slow(config: AprilTagConfig) -> SlowProcess | None:
     constant of T^2 / 2 pi^2. How far it wanders is taken for two sigmas.
     """
     docks = [dock for name in _docks(config.surveyed) if (dock := config.surveyed.dock(name)) is not None]
-    cameras = _mounted(config) if config.surveyed.tags else []
+    cameras = config.cameras if config.surveyed.tags else {}
     edges = [config.edge_sigma_px] if config.edge_sigma_px and config.surveyed.tags else []
-    if not docks and not cameras and not edges:
-        return None
+    axes = [f"{dock.name} {axis}" for dock in docks for axis in _FREEDOM]
+    units = ["m", "m", "m", "deg", "deg", "deg"] * len(docks)
     swings = [_swing(dock) for dock in docks]
-    mounts = np.radians([config.cameras[name].mount_sigma_deg for name in cameras])
-    said = ["docks moved"] * bool(docks) + ["mounts"] * bool(cameras) + ["edges seen"] * bool(edges)
+    sigma, time_s = ([value for swing in swings for value in swing[k]] for k in (0, 1))
+    for name, camera in cameras.items():
+        mount, late = 3 * (camera.mount_sigma_deg > 0.0), int(camera.stamp_sigma_s > 0.0)
+        axes += [f"{name} mount {axis}" for axis in _FREEDOM[3:]][:mount] + [f"{name} late"] * late
+        units += ["deg"] * mount + ["s"] * late
+        sigma += [np.radians(camera.mount_sigma_deg)] * mount + [camera.stamp_sigma_s] * late
+        time_s += [np.inf] * (mount + late)
+    if not axes and not edges:
+        return None
+    of_cameras = len(axes) > 6 * len(docks)
     return SlowProcess(
-        name=" and ".join(said),
-        offset="camera mount",
-        axes=(
-            *(f"{dock.name} {axis}" for dock in docks for axis in _FREEDOM),
-            *(f"{name} mount {axis}" for name in cameras for axis in _FREEDOM[3:]),
-            *["outwards"] * len(edges),
-        ),
-        units=(*("m", "m", "m", "deg", "deg", "deg") * len(docks), *("deg",) * 3 * len(cameras), *["px"] * len(edges)),
-        scale=np.concatenate(
-            [
-                np.tile(np.repeat([1.0, 180.0 / np.pi], 3), len(docks)),
-                [180.0 / np.pi] * 3 * len(cameras),
-                np.ones(len(edges)),
-            ]
-        ),
-        sigma=np.concatenate([*(sigma for sigma, _ in swings), np.repeat(mounts, 3), edges]),
-        time_constant_s=np.concatenate(
-            [*(time_s for _, time_s in swings), [np.inf] * 3 * len(cameras), [_EDGE_S] * len(edges)]
-        ),
+        name=" and ".join(["docks moved"] * bool(docks) + ["cameras off"] * of_cameras + ["edges seen"] * len(edges)),
+        offset="camera's mount or clock",
+        axes=(*axes, *["outwards"] * len(edges)),
+        units=(*units, *["px"] * len(edges)),
+        scale=np.array([180.0 / np.pi if unit == "deg" else 1.0 for unit in units] + [1.0] * len(edges)),
+        sigma=np.array([*sigma, *edges]),
+        time_constant_s=np.array([*time_s, *[_EDGE_S] * len(edges)]),
     )
 
 
@@ -373,12 +381,8 @@ def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:
     T_world_camera = at.T_world_body.compose(at.T_state_sensor).compose(
         gtsam.Pose3(gtsam.Rot3(R_body_camera), t_body_camera)
     )
-    docks, cameras = (_docks(survey), _mounted(config)) if at.slow_value is not None else ([], [])
+    docks = _docks(survey) if at.slow_value is not None else []
     R, p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
-    if "camera" in cameras:
-        first = 6 * len(docks) + 3 * cameras.index("camera")
-        off = gtsam.Rot3.Expmap(np.asarray(at.slow_value)[first : first + 3]).matrix()
-        R = R @ R_body_camera.T @ off @ R_body_camera
     corners = np.array([(-0.2, -0.2, 4.1), (0.2, -0.2, 3.9), (0.2, 0.2, 3.9), (-0.2, 0.2, 4.1)])
     now = p + corners @ R.T
     moved = np.asarray(at.slow_value)[:6] if docks else np.zeros(6)

@@ -323,7 +323,7 @@ def test_what_the_survey_errs_about_a_tag_is_a_constant() -> None:
     np.testing.assert_allclose(constant, off, atol=1e-4)  # the turn is taken to first order
 
 
-BOW = {"bow": CameraConfig(topic="/images")}
+BOW = {"bow": CameraConfig(topic="/images", stamp_sigma_s=0.0)}
 
 
 @pytest.mark.parametrize("on_a_dock", [False, True])
@@ -333,7 +333,7 @@ def test_what_a_mount_is_off_is_found_where_the_vessel_is_known(on_a_dock: bool)
     near = vessel(9.0, 40.0, roll_pitch_deg=(3.0, -2.0))
     true = gtsam.Pose3(near.rotation(), near.translation() + PIER_M) if on_a_dock else near
     given, docks = (DOCKED, MOTION) if on_a_dock else (FIXED, np.zeros(0))
-    config = given.model_copy(update={"cameras": {"stern": CameraConfig(topic="/others")} | BOW})
+    config = given.model_copy(update={"cameras": {"stern": CameraConfig(topic="/others", stamp_sigma_s=0.0)} | BOW})
     seen = moved_sighting(MOTION, true) if on_a_dock else sighting(true)
     m = replace(seen, R_body_camera=Rotation.from_rotvec(-off).as_matrix() @ seen.R_body_camera)
     mode = nearest_mode(m.modes, true.rotation().matrix() @ AHEAD)
@@ -358,18 +358,60 @@ def test_what_a_mount_is_off_is_found_where_the_vessel_is_known(on_a_dock: bool)
     assert np.linalg.norm(fixed[3:]) == pytest.approx(np.linalg.norm(off), abs=1e-2)
 
 
+def under_way(T: Any, slow_value: Array) -> Attachment:
+    """It rolls by 6 deg/s, turns by 3 deg/s, and goes at 2 m/s."""
+    at = attached(T, slow_value)
+    return replace(
+        at,
+        v_world_mps=np.array([1.5, 1.0, 0.1]),
+        dv_world_mps=np.array([0.2, 0.1, 0.0]),
+        gyro_radps=np.radians([6.0, 1.0, 3.0]),
+    )
+
+
+@pytest.mark.parametrize("on_a_dock", [False, True])
+def test_by_how_much_stamps_are_late_is_found_where_the_vessel_is_known(on_a_dock: bool) -> None:
+    """The image is of 0.2 s before its stamp, and she was where her speed and turning have her then."""
+    near = vessel(9.0, 40.0, roll_pitch_deg=(3.0, -2.0))
+    then = gtsam.Pose3(near.rotation(), near.translation() + PIER_M) if on_a_dock else near
+    given, docks = (DOCKED, MOTION) if on_a_dock else (FIXED, np.zeros(0))
+    config = given.model_copy(update={"cameras": {"bow": CameraConfig(topic="/images", mount_sigma_deg=0.0)}})
+    m = moved_sighting(MOTION, then) if on_a_dock else sighting(then)
+    mode = nearest_mode(m.modes, then.rotation().matrix() @ AHEAD)
+    at = under_way(then, np.zeros(0))
+    world_radps = then.rotation().matrix() @ at.gyro_radps
+    now = gtsam.Pose3(
+        gtsam.Rot3.Expmap(0.2 * world_radps).compose(then.rotation()),
+        then.translation() + 0.2 * (at.v_world_mps + at.dv_world_mps),
+    )
+    none = slow = np.concatenate([docks, np.zeros(2)])
+    for _ in range(6):
+        update = ROW.factors(m, config, under_way(now, slow), Decision(mode=mode))
+        values = gtsam.Values()
+        values.insert(1, now)
+        values.insert(3, slow)
+        for key, value in update.guesses:
+            values.insert(key, value)
+        known = gtsam.PriorFactorPose3(1, now, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
+        sigmas = np.concatenate([np.full(len(docks), 1e-7), [30.0, 1e-7]])
+        loose = gtsam.PriorFactorVector(3, none, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+        leaf = [key for key, _ in update.guesses]
+        slow = step([*update.factors, known, loose], values, (1, 3, *leaf)).atVector(3)
+    assert slow[-2] == pytest.approx(0.2, abs=0.01)  # to first order
+
+
 @pytest.mark.parametrize("on_a_dock", [False, True])
 def test_how_a_modes_residual_changes_with_the_slow_state(on_a_dock: bool) -> None:
     true = vessel(9.0, 40.0, roll_pitch_deg=(3.0, -2.0))
-    config = (DOCKED if on_a_dock else FIXED).model_copy(update={"cameras": BOW})
+    config = (DOCKED if on_a_dock else FIXED).model_copy(update={"cameras": {"bow": CameraConfig(topic="/images")}})
     m = moved_sighting(MOTION, true) if on_a_dock else sighting(true)
-    slow = np.concatenate([MOTION * on_a_dock, [0.004, -0.002, 0.003, 0.0]])[0 if on_a_dock else 6 :]
-    (found, *_) = ROW.residuals(m, config, attached(true, slow))
+    slow = np.concatenate([MOTION * on_a_dock, [0.004, -0.002, 0.003, 0.01, 0.0]])[0 if on_a_dock else 6 :]
+    (found, *_) = ROW.residuals(m, config, under_way(true, slow))
     assert found.slow_jacobian is not None
     slopes = found.slow_jacobian()
     for k in range(len(slow)):
         ends = [
-            ROW.residuals(m, config, attached(true, slow + way * np.eye(len(slow))[k]))[0].raw for way in (-1e-6, 1e-6)
+            ROW.residuals(m, config, under_way(true, slow + way * np.eye(len(slow))[k]))[0].raw for way in (-1e-6, 1e-6)
         ]
         np.testing.assert_allclose(
             slopes[:, k], (ends[1] - ends[0]) / 2e-6, atol=0.02 * max(1.0, np.abs(slopes[:, k]).max())
@@ -401,13 +443,14 @@ def test_slow_states_and_constants() -> None:
     assert alone.axes == ("outwards",)
     steady = {
         "stern": CameraConfig(topic="/stern", mount_sigma_deg=0.0),
-        "bow": CameraConfig(topic="/bow", mount_sigma_deg=2.0),
+        "bow": CameraConfig(topic="/bow", mount_sigma_deg=2.0, stamp_sigma_s=0.0),
     }
     mounted = ROW.slow(config.model_copy(update={"cameras": steady}))
     assert mounted is not None
-    assert mounted.axes[6:] == ("bow mount roll", "bow mount pitch", "bow mount yaw", "outwards")
-    np.testing.assert_allclose((mounted.scale * mounted.sigma)[6:9], 2.0)
-    assert np.isinf(mounted.time_constant_s).tolist() == [False] * 6 + [True] * 3 + [False]
+    assert mounted.axes[6:] == ("stern late", "bow mount roll", "bow mount pitch", "bow mount yaw", "outwards")
+    assert mounted.units[6:] == ("s", "deg", "deg", "deg", "px")
+    np.testing.assert_allclose((mounted.scale * mounted.sigma)[6:10], [0.03, 2.0, 2.0, 2.0])
+    assert np.isinf(mounted.time_constant_s).tolist() == [False] * 6 + [True] * 4 + [False]
     assert ROW.slow(quay.model_copy(update={"edge_sigma_px": 0.0})) is None
     assert ROW.slow(AprilTagConfig()) is None
 

@@ -145,7 +145,7 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     value = np.atleast_1d(result.values.atVector(keys.slow(stream.number, 0)))
     far = np.where(np.isfinite(slow.time_constant_s), 0.0, np.abs(value) / slow.sigma)
     k = int(np.argmax(far))
-    where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.1f} {slow.units[k]}"
+    where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
     return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where})"
 
 
