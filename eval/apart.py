@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from graphloc.build import mount_of
 from graphloc.chi2 import chi2_95
-from graphloc.config import VesselConfig
+from graphloc.config import SensorConfig, VesselConfig
 from graphloc.eval.metrics import held_out_errors
 from graphloc.frames import Array, Datum, heading_deg_from_yaw
 from graphloc.measurements import GnssPosition
@@ -58,13 +58,19 @@ def apart_warnings(track: Trajectory, datum: Datum, recording: Recording, config
         if any(not m.has_height for m in fixes):
             continue
         size, mean = _steady(off[:, 2:])
-        others = [*others, *config.of_kind("height")]
-        if size**2 >= _HEIGHT_SIGMAS**2 * _mean_variance(process.vertical_sigma_m, process.time_constant_s, lasts_s):
+        others = [n for n in others if _tells_height(config.sensors[n])] + list(config.of_kind("height"))
+        if others and size**2 >= _HEIGHT_SIGMAS**2 * _mean_variance(
+            process.vertical_sigma_m, process.time_constant_s, lasts_s
+        ):
             lines.append(
                 f"{name} stands {size:.1f} m ({'up' if mean[0] > 0.0 else 'down'}) off what {', '.join(others)} says, all the "
                 f"while; its slow error of {process.vertical_sigma_m:.1f} m in height (1 sigma) does not explain that: one of them may be above the geoid, and the other above the ellipsoid"
             )
     return lines
+
+
+def _tells_height(sensor: SensorConfig) -> bool:
+    return sensor.kind in ("apriltag", "gnss") or "z" in getattr(sensor, "axes", ())
 
 
 def _steady(off_m: Array) -> tuple[float, Array]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -43,6 +44,9 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
     sightings = [
         m for m in recording.measurements if isinstance(m, TagSighting) and track.covers(np.array([m.stamp_ns]))[0]
     ]
+    said_of_mounts = list(_estimated_mounts(sightings, solution))
+    found = {(m.sensor, m.camera): mount_off(solution, m.sensor, m.camera).as_matrix() for m in sightings}
+    sightings = [replace(m, R_body_camera=found[m.sensor, m.camera] @ m.R_body_camera) for m in sightings]
     turned = _turned_mounts(sightings, rows, solution)
     if turned:  # then nothing else that tags say can be judged
         return turned
@@ -62,7 +66,7 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
         said[key] = f"{len(doubted)} of {len(own)} sightings disagree with the rest; {why}"
     surveys = {name: sensor.surveyed for name, sensor in config.of_kind("apriltag").items()}
     return [
-        *_estimated_mounts(sightings, solution),
+        *said_of_mounts,
         *_late(sightings, solution),
         *(f"{sensor}: {surveys[sensor].called(*tag)}: {line}" for (sensor, tag), line in said.items()),
     ]
@@ -209,15 +213,18 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
     return lines
 
 
+def mount_off(solution: Solution, sensor: str, camera: str) -> Rotation:
+    """Return what the run has found a camera's mount to be off, about the body's axes: `mount_off * mount` is the true one."""
+    slow = solution.slow.get(sensor)
+    off_deg = None if slow is None else slow.surest([f"{camera} mount {axis}" for axis in ("roll", "pitch", "yaw")])
+    return Rotation.identity() if off_deg is None else Rotation.from_rotvec(off_deg, degrees=True)
+
+
 def _estimated_mounts(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:
     """Say of each camera whose mount the run has estimated far from the one that is configured."""
     given = {(m.sensor, m.camera): m.R_body_camera for m in sightings}
     for (sensor, camera), R_body_camera in sorted(given.items()):
-        slow = solution.slow.get(sensor)
-        axes = [f"{camera} mount {axis}" for axis in ("roll", "pitch", "yaw")]
-        if slow is None or not set(axes) <= set(slow.axes):
-            continue
-        off = Rotation.from_rotvec(slow.value[-1, [slow.axes.index(axis) for axis in axes]], degrees=True)
+        off = mount_off(solution, sensor, camera)
         off_deg = float(np.degrees(off.magnitude()))
         if off_deg > _TURNED_DEG:
             yield _looks_elsewhere(sensor, camera, off_deg, off * Rotation.from_matrix(R_body_camera))

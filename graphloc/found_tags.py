@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from ruamel.yaml import YAML
 
 from graphloc.config import VesselConfig
-from graphloc.eval.tag_check import suspect_tags
+from graphloc.eval.tag_check import mount_off, suspect_tags
 from graphloc.frontends.tags.unsurveyed import Riding, estimate_tags, only_beside
 from graphloc.measurements import TagSighting
 from graphloc.recording import Recording
@@ -30,7 +31,13 @@ def about_tags(
     surveys = {name: sensor.surveyed for name, sensor in config.of_kind("apriltag").items()}
     size_m = next((s.other_size_m for s in surveys.values() if s.other_size_m), None)
     riding = _riding(recording, surveys, solution)
-    found, left = estimate_tags(recording.tag_views, solution.trajectory, size_m, riding)
+    off = {
+        name: mount_off(solution, sensor, name)
+        for sensor, c in config.of_kind("apriltag").items()
+        for name in c.cameras
+    }
+    views = [replace(v, R_body_camera=off[v.camera].as_matrix() @ v.R_body_camera) for v in recording.tag_views]
+    found, left = estimate_tags(views, solution.trajectory, size_m, riding)
     every = Survey.model_construct(tags=(*found, *(tag for s in surveys.values() for tag in s.tags)))
     for frame in sorted({tag.frame for tag in found}):
         names = ", ".join(every.called(tag.family, tag.id) for tag in found if tag.frame == frame)

@@ -285,7 +285,7 @@ def replay(
                       outcome=Outcome.IGNORED, reason="the replay was interrupted before")
             for m in arrivals(recording) if m.seq >= 0 and m.seq not in told
         ]  # fmt: skip
-    solution = _solution(estimates, Ledger(rows), smoother, told_of, config)
+    solution = _solution(estimates, Ledger(rows), smoother, told_of, config, _false_of(recording, config))
     return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=np.array(took_s))
 
 
@@ -311,8 +311,24 @@ def _timed(said: Sequence[tuple[int, str]], estimates: Sequence[Estimate]) -> li
     return lines
 
 
+def _false_of(recording: Recording, config: VesselConfig) -> dict[int, float]:
+    """How probable it is that each measurement is false, where its sensor has such."""
+    rows = {row.kind: row for row in SENSORS}
+    found = {}
+    for m in recording.measurements:
+        sensor = config.sensors.get(m.sensor)
+        if sensor is not None and (row := rows.get(sensor.kind)) is not None and row.false is not None:
+            found[m.seq] = row.false(m, sensor).probability
+    return found
+
+
 def _solution(
-    estimates: Sequence[Estimate], ledger: Ledger, smoother: OnlineSmoother, said: Sequence[str], config: VesselConfig
+    estimates: Sequence[Estimate],
+    ledger: Ledger,
+    smoother: OnlineSmoother,
+    said: Sequence[str],
+    config: VesselConfig,
+    false_of: Mapping[int, float],
 ) -> Solution:
     """Each pose as it was known then; where a restart went back in time, the newer one counts."""
     kept: list[Estimate] = []
@@ -333,7 +349,8 @@ def _solution(
         weights = np.array([row.weight for row in rows])
         warnings += disagreeing(name, weights)
         if (usual := getattr(config.sensors.get(name), "false_fraction", None)) is not None:
-            warnings += refused_together(name, np.array([row.stamp_ns for row in rows]), weights, usual)
+            false = np.array([false_of.get(row.seq, usual) for row in rows])
+            warnings += refused_together(name, np.array([row.stamp_ns for row in rows]), weights, false)
     return Solution(
         datum=smoother.datum,
         trajectory=Trajectory(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +42,13 @@ class SlowEstimate:
     stamps_ns: NDArray[np.int64]
     value: Array
     sigma: Array
+
+    def surest(self, axes: Sequence[str]) -> Array | None:
+        """Return what some of its axes, constants, are (k,) where they are known best: each leg of a run learns them anew."""
+        if not set(axes) <= set(self.axes):
+            return None
+        columns = [self.axes.index(axis) for axis in axes]
+        return np.asarray(self.value[np.argmin(self.sigma[:, columns].sum(axis=1)), columns])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -50,33 +50,34 @@ def stuck(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Array) -> 
 def _stuck_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which fixes say one place but for its noise, where `known` has none to the last bit.
 
-    Any receiver does so at rest: it must have been under way until then, *and* go on with a leap.
+    Any receiver does so at rest, and multipath leaps from there: it must have been under way until then, and be so again
+    where it leaps to.
     """
     bad = np.zeros(len(t_s), dtype=bool)
     held = np.searchsorted(t_s, t_s + _HELD_S)  # the first that is so much later
     before = np.searchsorted(t_s, t_s - _BEFORE_S)
-    stays = np.append(
-        np.linalg.norm(places_m[held[held < len(t_s)]] - places_m[held < len(t_s)], axis=1) < 2.0 * _NOISE_M, False
-    )
+    there = held[held < len(t_s)]
+    stays = np.append(np.linalg.norm(places_m[there] - places_m[: len(there)], axis=1) < 2.0 * _NOISE_M, False)
     first = 0
-    while first < len(t_s) and held[first] < len(t_s):
+    while first < len(there):
         if not stays[first] or held[first] - first < _FEWEST:
             first += 1
             continue
         after = _gone(places_m, first, int(held[first]))
         if after == len(t_s) or known[first:after].any():
             first = after
+        elif after <= held[first]:  # it was on its way
+            first += 1
         elif (
-            after > held[first]
-            and _stopped_at_once(t_s, places_m, first, _UNDER_WAY_MPS)
-            and _hangs(t_s[: after + 1], places_m[: after + 1], first, after)
+            _stopped_at_once(t_s, places_m, first, _UNDER_WAY_MPS)
+            and _leaps(t_s, places_m, first, after)
+            and _under_way(t_s, places_m, np.arange(after, np.searchsorted(t_s, t_s[after] + _BEFORE_S)))
         ):
             bad[first + 1 : after] = True
             first = after
-        elif after > held[first] and np.linalg.norm(places_m[before[first]] - places_m[first]) < 2.0 * _NOISE_M:
-            first = after  # it was here before: at rest
         else:
-            first += 1
+            at_rest = np.linalg.norm(places_m[before[first]] - places_m[first]) < 2.0 * _NOISE_M  # it was here before
+            first = after if at_rest else first + 1
     return bad
 
 
@@ -94,18 +95,34 @@ def _gone(places_m: Array, first: int, held: int) -> int:
 
 def _hangs(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     """Whether the stretch of one place from `first` on hangs; at `after` it says another place, or the run has ended."""
-    before = _before(t_s, first)
-    if len(before) < 2:
-        return False
     if after < len(t_s):
-        leap = float(np.linalg.norm(places_m[after] - places_m[first]))
         silent_s = t_s[after] - t_s[after - 1]
-        set_off_m = _BRAKES_MPS2 * silent_s**2 / 2.0  # from rest, while it said nothing
-        if silent_s < _HELD_S or leap > set_off_m:
-            speed, sigma = _speed(t_s[way := np.append(before, first)], places_m[way])
-            least_m = max(_LEAP_M, set_off_m, _SHARE * speed * (t_s[after] - t_s[first]))
-            return speed - _SIGMAS * sigma > _UNDER_WAY_MPS and leap > least_m
+        leap_m = float(np.linalg.norm(places_m[after] - places_m[first]))
+        if silent_s < _HELD_S or leap_m > _set_off_m(silent_s):
+            return _leaps(t_s, places_m, first, after)
     return _stopped_at_once(t_s, places_m, first, _STOPS_MPS)
+
+
+def _leaps(t_s: Array, places_m: Array, first: int, after: int) -> bool:
+    """Whether it was under way, and is a good part of the way further on at once."""
+    way = np.append(_before(t_s, first), first)
+    if not _under_way(t_s, places_m, way):
+        return False
+    speed, _ = _speed(t_s[way], places_m[way])
+    least_m = max(_LEAP_M, _set_off_m(t_s[after] - t_s[after - 1]), _SHARE * speed * (t_s[after] - t_s[first]))
+    return bool(float(np.linalg.norm(places_m[after] - places_m[first])) > least_m)
+
+
+def _set_off_m(silent_s: float) -> float:
+    """How far it may have gone from rest, while it said nothing."""
+    return _BRAKES_MPS2 * silent_s**2 / 2.0
+
+
+def _under_way(t_s: Array, places_m: Array, of: NDArray[np.int64]) -> bool:
+    if len(of) < _FEWEST:
+        return False
+    speed, sigma = _speed(t_s[of], places_m[of])
+    return bool(speed - _SIGMAS * sigma > _UNDER_WAY_MPS)
 
 
 def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) -> bool:
@@ -121,7 +138,8 @@ def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) 
 
 
 def _before(t_s: Array, first: int) -> NDArray[np.int64]:
-    return np.flatnonzero((t_s[:first] >= t_s[first] - _BEFORE_S) & (t_s[:first] < t_s[first]))
+    """The fixes before this one that tell how fast it was."""
+    return np.arange(*np.searchsorted(t_s, [t_s[first] - _BEFORE_S, t_s[first]]))
 
 
 def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:

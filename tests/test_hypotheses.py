@@ -182,10 +182,16 @@ def test_matches_that_are_refused_together_are_said() -> None:
 def test_few_or_brief_ones_are_no_news() -> None:
     stamps_ns, weights = np.arange(40) * 1_000_000_000, np.ones(40)
     weights[10:17] = 0.0
-    assert refused_together("tags", stamps_ns, weights, 0.02)
-    assert not refused_together("aerial", stamps_ns, weights, 0.4)  # 0.4 ** 7 * 40 is 0.07
-    assert not refused_together("tags", stamps_ns // 10, weights, 0.02)  # within 0.6 s
-    assert not refused_together("tags", stamps_ns, np.zeros(40), 0.02)  # all: said otherwise
+    rare, usual = np.full(40, 0.02), np.full(40, 0.4)
+    assert refused_together("tags", stamps_ns, weights, rare)
+    assert not refused_together("aerial", stamps_ns, weights, usual)  # 0.4 ** 7 * 40 is 0.07
+    assert not refused_together("tags", stamps_ns // 10, weights, rare)  # within 0.6 s
+    assert not refused_together("tags", stamps_ns, np.zeros(40), rare)  # all: said otherwise
+    doubtful = np.where(weights > 0.5, 0.02, 0.9)
+    assert not refused_together("aerial", stamps_ns, weights, doubtful)  # so they said themselves
+    brief = np.concatenate([stamps_ns, stamps_ns[-1] + 1 + np.arange(30) * 1_000_000])
+    (line,) = refused_together("tags", brief, np.append(weights, np.zeros(30)), np.full(70, 0.02))
+    assert "all its 7 measurements in 6 s" in line  # 30 more within 30 ms are no longer row
 
 
 def test_long_outage_does_not_lock_the_matches_out() -> None:

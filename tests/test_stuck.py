@@ -102,10 +102,12 @@ def test_a_place_that_scatters_hangs_as_well(
     assert found.max() < held_s[1]
 
 
-@pytest.mark.parametrize("hz", [1.0, 5.0])
+@pytest.mark.parametrize("hz", [1.0, 5.0, 10.0])
 @pytest.mark.parametrize(
     "way",
     [
+        lambda t: rests(2.0, t) + 6.0 * (t > 24.0),  # brakes, and multipath jumps soon after
+        lambda t: rests(4.0, t) + 10.0 * (t > 25.0),
         lambda t: rests(4.0, t) + 12.0 * (t > 40.0),  # at rest, and then multipath jumps
         lambda t: rests(0.6, t) + 5.0 * (t > 24.0),  # at the quay, soon after
         lambda t: 2.0 * np.minimum(t, 20.0) + 3.0 * np.maximum(t - 26.0, 0.0),  # sets off again

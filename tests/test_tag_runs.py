@@ -425,6 +425,15 @@ def test_a_camera_whose_mount_is_measured_by_hand_serves_as_well(kind: str) -> N
     assert abs(mount.value[-1, yaw] + 3.0) < min(3.0 * mount.sigma[-1, yaw], 0.9)
 
 
+def test_a_tag_is_found_by_the_mount_that_the_run_has_found() -> None:
+    """By the configured one, 3 deg off, it was 0.3 m beside its place, stated to 0.05 m."""
+    about = Rotation.from_euler("z", 3.0, degrees=True).as_matrix()
+    views = unlisted(voyage("fixed"), 228, 0.3)
+    docked = dock(change=turned(3.0), views=tuple(replace(v, R_body_camera=about @ v.R_body_camera) for v in views))
+    (tag,) = docked.run.tags
+    np.testing.assert_allclose(tag.xyz_m, [73.4, 96.0, 1.5], atol=0.08)
+
+
 @pytest.mark.parametrize("sigma_deg", [1.0, 0.0])
 def test_a_camera_whose_mount_is_turned_is_named(sigma_deg: float) -> None:
     """It looks ahead, and the configuration has it look to port: what it truly is, is said, whether estimated or refused."""

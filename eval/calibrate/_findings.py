@@ -84,7 +84,7 @@ class Calibration:
 
 def _number(value: float, sigma: float = np.inf) -> str:
     """Three digits, or as many as its sigma tells: clocks may be years apart, and known to milliseconds."""
-    digits = max(3, 4 if abs(value) >= 1000.0 else 3)
+    digits = 4 if abs(value) >= 1000.0 else 3
     if value and 0.0 < sigma < abs(value):
         digits = max(digits, 2 + int(np.floor(np.log10(abs(value) / sigma))))
     return f"{value:.{digits}g}"

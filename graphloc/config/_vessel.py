@@ -32,7 +32,7 @@ class TimelineConfig(Block):
 
     rate_hz: Annotated[float, Field(gt=0.5, le=200.0)] = 10.0
     """States a second; a state moves onto a measurement's stamp where one is near."""
-    slow_period_s: Annotated[float, Field(ge=0.05, le=1e6)] = 1.0
+    slow_period_s: Annotated[float, Field(ge=0.05, le=60.0)] = 1.0
     """Time between two states of the slow quantities (IMU bias, GNSS error), s."""
     leg_s: Annotated[float, Field(ge=60.0)] = 1800.0
     """Offline, a longer run is solved in legs of about so long that overlap by two minutes: memory grows with a leg, s."""

@@ -92,7 +92,7 @@ class Turned:
             return False
         if abs(off_rad) > _TURNED_RAD:
             up = newest.pose.rotation().matrix()[2]
-            told = self._off_rad(lag, newest, up * float(up @ newest.bias.gyroscope()))
+            told = self._off_rad(lag, newest, up * float(up @ lag.problem.R_body_imu @ newest.bias.gyroscope()))
             off_rad = told if told is not None and abs(told) <= _TURNED_RAD else off_rad
         known = (
             float(

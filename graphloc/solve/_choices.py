@@ -94,7 +94,7 @@ def without_its_ends(problem: Problem, settled: Settled, prior: StartPrior) -> t
         stamps = [m.stamp_ns for m in stream.measurements]
         for end_ns in (stamps[0], stamps[-1]):
             away_s = {(stream.number, i): abs(stamp - end_ns) * 1e-9 for i, stamp in enumerate(stamps)}
-            if all(others[key].weight > 0.5 for key, s in away_s.items() if s <= _AROUND_S):
+            if all(settled.verdicts[key].weight > 0.5 for key, s in away_s.items() if s <= _AROUND_S):
                 continue
             for key, s in away_s.items():
                 if s <= _STRETCH_S:

@@ -30,10 +30,8 @@ _FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-
 _GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_DEG = 2.5, 25.0, 45.0
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
 _FAR_OFF = 3.0
-_TOGETHER_S, _BY_CHANCE = (
-    5.0,
-    1e-3,
-)  # false ones that last as long, and so many of which are seldom false in a row, are said
+_TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
+_BY_CHANCE = 1e-3
 _NEAR_BERTH_M = 60.0
 NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
 
@@ -306,15 +304,21 @@ def disagreeing(sensor: str, weights: Array) -> list[str]:
     return [f"{sensor}: {100 * share:.0f} % of its measurements disagree with the rest"]
 
 
-def refused_together(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, false_fraction: float) -> list[str]:
-    """Say where more measurements (N,) in a row are refused than false ones come together by chance: a line, or none."""
-    refused = np.flatnonzero(np.diff((weights < AGREES).astype(int), prepend=0, append=0))
-    if not len(refused):
-        return []
-    begin, end = refused.reshape(-1, 2)[np.argmax(np.diff(refused.reshape(-1, 2)))]
-    lasts_s = (stamps_ns[end - 1] - stamps_ns[begin]) * 1e-9
-    by_chance = len(weights) * false_fraction ** (end - begin)
-    if end - begin == len(weights) or by_chance > _BY_CHANCE or lasts_s < _TOGETHER_S:
+def refused_together(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, false: Array) -> list[str]:
+    """Say where more measurements (N,) in a row are refused than false ones come together by chance: a line, or none.
+
+    Args:
+        false: (N,) probability of each that it is false.
+    """
+    edges = np.flatnonzero(np.diff((weights < AGREES).astype(int), prepend=0, append=0)).reshape(-1, 2)
+    chance = np.concatenate([[0.0], np.cumsum(np.log(np.maximum(false, 1e-6)))])
+    rows = [
+        ((stamps_ns[end - 1] - stamps_ns[begin]) * 1e-9, begin, end)
+        for begin, end in edges
+        if end - begin < len(weights) and np.log(len(weights)) + chance[end] - chance[begin] < np.log(_BY_CHANCE)
+    ]
+    lasts_s, begin, end = max(rows, default=(0.0, 0, 0))
+    if lasts_s < _TOGETHER_S:
         return []
     since = utc_text(int(stamps_ns[begin]))
     return [
@@ -364,10 +368,10 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
             warnings.append(alone(stream.name, stream.left_out))
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
         warnings += disagreeing(stream.name, weights)
-        if stream.row.false is not None and stream.measurements:
+        if stream.row.false is not None:
             stamps_ns = np.array([m.stamp_ns for m in stream.measurements])
-            usual = stream.row.false(stream.measurements[0], stream.config).probability
-            warnings += refused_together(stream.name, stamps_ns, weights, usual)
+            false = np.array([stream.row.false(m, stream.config).probability for m in stream.measurements])
+            warnings += refused_together(stream.name, stamps_ns, weights, false)
     return SolveStats(
         passes=result.passes,
         iterations=result.iterations,
