@@ -57,7 +57,7 @@ def _stuck_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_]) 
     held = np.searchsorted(t_s, t_s + _HELD_S)  # the first that is so much later
     before = np.searchsorted(t_s, t_s - _BEFORE_S)
     there = held[held < len(t_s)]
-    stays = np.append(np.linalg.norm(places_m[there] - places_m[: len(there)], axis=1) < 2.0 * _NOISE_M, False)
+    stays = np.linalg.norm(places_m[there] - places_m[: len(there)], axis=1) < 2.0 * _NOISE_M
     first = 0
     while first < len(there):
         if not stays[first] or held[first] - first < _FEWEST:
