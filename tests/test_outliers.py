@@ -17,6 +17,7 @@ from graphloc.frames import Geodetic, wrap_angle
 from graphloc.graph import Residual
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
 from graphloc.solve._decide import _by_kernel
+from graphloc.solve._solution import leaps
 
 
 def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
@@ -62,6 +63,44 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one() -> None:
     off_deg = np.degrees(np.abs(wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad)))
     assert off_deg.max() < 3.0
     assert solved.ledger.counts()["aerial"]["used"] > 30
+
+
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+@pytest.mark.parametrize(("speed_mps", "turn_radps"), [(2.0, 0.1), (15.0, 0.4), (0.0, 0.0)])
+def test_a_receiver_that_leaps_is_said(hz: float, speed_mps: float, turn_radps: float) -> None:
+    """Off by 8 m for 20 s; a craft that turns as a car does, or is silent for a while, leaps nowhere."""
+    t = np.arange(0.0, 80.0, 1.0 / hz)
+    course = turn_radps * np.clip(t - 20.0, 0.0, 10.0)
+    way = np.cumsum(speed_mps / hz * np.column_stack([np.cos(course), np.sin(course)]), axis=0)
+    way += np.random.default_rng(2).normal(0.0, 0.2, way.shape)
+    stamps_ns = np.round(t * 1e9).astype(np.int64)
+    assert leaps("gnss", stamps_ns, way) == []
+    heard = (t < 50.0) | (t > 58.0)
+    assert leaps("gnss", stamps_ns[heard], way[heard]) == []
+    (line,) = leaps("gnss", stamps_ns, way + np.outer((t >= 40.0) & (t < 60.0), [0.0, 8.0]))
+    assert line.startswith(("gnss: leaps by 8 m at 1970-01-01T00:00:40", "gnss: leaps by 8 m at 1970-01-01T00:01:00"))
+    assert ", and 1 times more:" in line
+
+
+def test_a_receiver_alone_that_leaps_is_said_in_the_run() -> None:
+    run = simulate(Scenario(path="loops", duration_s=50.0, noise="drift", pose_hz=0.0, compass_hz=5.0), 1)
+    begin_ns = int(run.truth.stamps_ns[0])
+    config = run.config.model_copy(
+        update={"sensors": {k: v for k, v in run.config.sensors.items() if k in ("imu", "gnss", "compass")}}
+    )
+
+    def struck(m: Measurement) -> Measurement:
+        if not isinstance(m, GnssPosition) or not 20.0 <= (m.stamp_ns - begin_ns) * 1e-9 < 30.0:
+            return m
+        return replace(m, position=Geodetic(m.position[0] + 1e-4, *m.position[1:]))  # 11 m north
+
+    recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
+    said = {
+        name: app.smooth_recording(of, config).solution.stats.warnings
+        for name, of in (("usual", run.recording), ("struck", recording))
+    }
+    assert not any("leaps" in line for line in said["usual"])
+    assert sum(line.startswith(("gnss: leaps by 11 m", "gnss: leaps by 12 m")) for line in said["struck"]) == 1
 
 
 def test_a_sensor_that_lies_by_more_than_numbers_hold_is_an_outlier() -> None:

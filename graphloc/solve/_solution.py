@@ -30,6 +30,7 @@ _FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-
 _GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_DEG = 2.5, 25.0, 45.0
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
 _FAR_OFF = 3.0
+_LEAP_M, _LEAP, _FEWEST_PLACES = 3.0, 10.0, 10  # m; times what is usual; fewer do not tell what that is
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3
 _NEAR_BERTH_M = 60.0
@@ -296,6 +297,30 @@ def alone(sensor: str, slow: SlowProcess) -> str:
     )
 
 
+def leaps(sensor: str, stamps_ns: NDArray[np.int64], places_m: Array) -> list[str]:
+    """Say where places (N, 2) of one sensor are a leap apart, unlike those before and after: a line, or none.
+
+    Nothing else told the place, so the track went along, and looks as if the IMU were wrong.
+    """
+    if len(stamps_ns) < _FEWEST_PLACES:
+        return []
+    steps, dt = np.diff(places_m, axis=0), np.diff(stamps_ns)
+    off_m = np.linalg.norm(steps[1:-1] - (steps[:-2] + steps[2:]) / 2.0, axis=1)
+    beside = np.maximum(
+        off_m, np.maximum(np.append(off_m[1:], 0.0), np.append(0.0, off_m[:-1]))
+    )  # they feel half of it
+    even = np.maximum(np.maximum(dt[:-2], dt[1:-1]), dt[2:]) < 1.5 * np.median(
+        dt
+    )  # in a silence it may have gone anywhere
+    far = np.flatnonzero(even & (off_m == beside) & (off_m > max(_LEAP_M, _LEAP * float(np.median(off_m)))))
+    if not len(far):
+        return []
+    n = int(far[np.argmax(off_m[far])])
+    where = f"{off_m[n]:.0f} m at {utc_text(int(stamps_ns[n + 2]))}"
+    others = f", and {len(far) - 1} times more" if len(far) > 1 else ""
+    return [f"{sensor}: leaps by {where}{others}: the track follows, and the IMU and the compass may look wrong there"]
+
+
 def disagreeing(sensor: str, weights: Array) -> list[str]:
     """Say where most measurements (N,) of a sensor disagree with the rest: a line, or none."""
     share = float((weights < AGREES).mean()) if len(weights) else 0.0
@@ -366,6 +391,11 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
                     )
         if stream.left_out is not None:
             warnings.append(alone(stream.name, stream.left_out))
+            places = [stream.row.hint(m, 0.0, problem.datum).p_world_m for m in stream.measurements]
+            stamps_ns = np.array(
+                [m.stamp_ns for m, p in zip(stream.measurements, places, strict=True) if p is not None]
+            )
+            warnings += leaps(stream.name, stamps_ns, np.array([p[:2] for p in places if p is not None]))
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
         warnings += disagreeing(stream.name, weights)
         if stream.row.false is not None:
