@@ -5,9 +5,10 @@
     P_i = c + d + Exp(w) (Q_i - c),   Q_i = S_i + e_k + f_k x (S_i - m_k)
     seen further out from its tag's middle, by b px at each edge
 
-p, R: camera in world; R_b: body in world; M: the camera's mount, which is off by u; t_i: the stamp, late by l; both are constants of the run; S_i: a corner as surveyed, its frame at rest; e_k, f_k: what the survey errs about tag k, its middle
-m_k, a constant of the run; d, w: motion and small turn about c of the floating dock that the tag rides on, a slow state
-(D has neither); b: what detector, light, print and focal length make tags seem wider than they are, a slow state as well.
+p, R: camera in world; R_b: body in world; M: the camera's mount, which is off by u; t_i: the stamp, late by l; u and l are
+constants of the run; S_i: a corner as surveyed, its frame at rest; e_k, f_k: what the survey errs about tag k, its middle m_k,
+constants too; d, w: motion and small turn about c of the floating dock that the tag rides on, a slow state (D has neither);
+b: what detector, light, print and focal length make tags seem wider than they are, a slow state as well.
 Taken for noise of each sighting instead, such errors average out over hundreds of them, and the bounds are too small:
 three tags that hang 0.2 deg forward lift a vessel 20 m away by 7 cm in every image; tags 12 px wide whose edges are
 off by 0.04 px hold one 35 m away 0.2 m too near.
