@@ -45,7 +45,8 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
         m for m in recording.measurements if isinstance(m, TagSighting) and track.covers(np.array([m.stamp_ns]))[0]
     ]
     said_of_mounts = list(_estimated_mounts(sightings, solution))
-    found = {(m.sensor, m.camera): mount_off(solution, m.sensor, m.camera).as_matrix() for m in sightings}
+    cameras = {(m.sensor, m.camera) for m in sightings}
+    found = {camera: mount_off(solution, *camera).as_matrix() for camera in cameras}
     sightings = [replace(m, R_body_camera=found[m.sensor, m.camera] @ m.R_body_camera) for m in sightings]
     turned = _turned_mounts(sightings, rows, solution)
     if turned:  # then nothing else that tags say can be judged

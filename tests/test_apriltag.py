@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -323,6 +323,32 @@ def test_what_the_survey_errs_about_a_tag_is_a_constant() -> None:
     np.testing.assert_allclose(constant, off, atol=1e-4)  # the turn is taken to first order
 
 
+def slow_found(
+    m: TagSighting,
+    config: AprilTagConfig,
+    mode: int,
+    attach: Callable[[Array], Attachment],
+    prior: Array,
+    sigmas: Array,
+    times: int = 6,
+) -> Array:
+    """What a sighting says of the slow state where the vessel is known: so many Gauss-Newton steps from the prior."""
+    slow = prior
+    for _ in range(times):
+        at = attach(slow)
+        update = ROW.factors(m, config, at, Decision(mode=mode))
+        values = gtsam.Values()
+        values.insert(1, at.T_world_body)
+        values.insert(3, slow)
+        for key, value in update.guesses:
+            values.insert(key, value)
+        known = gtsam.PriorFactorPose3(1, at.T_world_body, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
+        loose = gtsam.PriorFactorVector(3, prior, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+        leaf = [key for key, _ in update.guesses]
+        slow = step([*update.factors, known, loose], values, (1, 3, *leaf)).atVector(3)
+    return np.asarray(slow)
+
+
 BOW = {"bow": CameraConfig(topic="/images", stamp_sigma_s=0.0)}
 
 
@@ -337,20 +363,8 @@ def test_what_a_mount_is_off_is_found_where_the_vessel_is_known(on_a_dock: bool)
     seen = moved_sighting(MOTION, true) if on_a_dock else sighting(true)
     m = replace(seen, R_body_camera=Rotation.from_rotvec(-off).as_matrix() @ seen.R_body_camera)
     mode = nearest_mode(m.modes, true.rotation().matrix() @ AHEAD)
-    none, slow = np.concatenate([docks, np.zeros(7)]), np.concatenate([docks, np.zeros(7)])
-    for _ in range(6):
-        at = attached(true, slow)
-        update = ROW.factors(m, config, at, Decision(mode=mode))
-        values = gtsam.Values()
-        values.insert(1, true)
-        values.insert(3, slow)
-        for key, value in update.guesses:
-            values.insert(key, value)
-        known = gtsam.PriorFactorPose3(1, true, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
-        sigmas = np.concatenate([np.full(len(docks), 1e-7), np.full(6, 30.0), [1e-7]])
-        loose = gtsam.PriorFactorVector(3, none, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-        leaf = [key for key, _ in update.guesses]
-        slow = step([*update.factors, known, loose], values, (1, 3, *leaf)).atVector(3)
+    sigmas = np.concatenate([np.full(len(docks), 1e-7), np.full(6, 30.0), [1e-7]])
+    slow = slow_found(m, config, mode, lambda at_slow: attached(true, at_slow), np.append(docks, np.zeros(7)), sigmas)
     np.testing.assert_allclose(slow, np.concatenate([docks, np.zeros(3), off, [0.0]]), atol=1e-4)
     np.testing.assert_allclose(ROW.residuals(m, config, attached(true, slow))[mode].raw, 0.0, atol=5e-3)
     as_given = config.model_copy(update={"cameras": {"bow": BOW["bow"].model_copy(update={"mount_sigma_deg": 0.0})}})
@@ -384,19 +398,8 @@ def test_by_how_much_stamps_are_late_is_found_where_the_vessel_is_known(on_a_doc
         gtsam.Rot3.Expmap(0.2 * world_radps).compose(then.rotation()),
         then.translation() + 0.2 * (at.v_world_mps + at.dv_world_mps),
     )
-    none = slow = np.concatenate([docks, np.zeros(2)])
-    for _ in range(6):
-        update = ROW.factors(m, config, under_way(now, slow), Decision(mode=mode))
-        values = gtsam.Values()
-        values.insert(1, now)
-        values.insert(3, slow)
-        for key, value in update.guesses:
-            values.insert(key, value)
-        known = gtsam.PriorFactorPose3(1, now, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
-        sigmas = np.concatenate([np.full(len(docks), 1e-7), [30.0, 1e-7]])
-        loose = gtsam.PriorFactorVector(3, none, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-        leaf = [key for key, _ in update.guesses]
-        slow = step([*update.factors, known, loose], values, (1, 3, *leaf)).atVector(3)
+    sigmas = np.concatenate([np.full(len(docks), 1e-7), [30.0, 1e-7]])
+    slow = slow_found(m, config, mode, lambda at_slow: under_way(now, at_slow), np.append(docks, np.zeros(2)), sigmas)
     assert slow[-2] == pytest.approx(0.2, abs=0.01)  # to first order
 
 
@@ -527,21 +530,9 @@ def test_edges_that_are_seen_too_far_out_explain_a_tag_that_looks_too_large(on_a
     true = gtsam.Pose3(near.rotation(), near.translation() + PIER_M) if on_a_dock else near
     config, docks = (DOCKED, MOTION) if on_a_dock else (FIXED, np.zeros(0))
     m = wider(moved_sighting(MOTION, true) if on_a_dock else sighting(true), 0.3)
-    slow = np.append(docks, 0.0)
     assert np.abs(m.rays - sighting(true).rays).max() > 0.2 * PX or on_a_dock
-    for _ in range(3):
-        at = attached(true, slow)
-        update = ROW.factors(m, config, at, Decision(mode=nearest_mode(m.modes, true.rotation().matrix() @ AHEAD)))
-        values = gtsam.Values()
-        values.insert(1, true)
-        values.insert(3, slow)
-        for key, value in update.guesses:
-            values.insert(key, value)
-        known = gtsam.PriorFactorPose3(1, true, gtsam.noiseModel.Isotropic.Sigma(6, 1e-7))
-        sigmas = np.append(np.full(len(docks), 1e-7), 30.0)
-        loose = gtsam.PriorFactorVector(3, np.append(docks, 0.0), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-        leaf = [key for key, _ in update.guesses]
-        slow = step([*update.factors, known, loose], values, (1, 3, *leaf)).atVector(3)
+    mode, sigmas = nearest_mode(m.modes, true.rotation().matrix() @ AHEAD), np.append(np.full(len(docks), 1e-7), 30.0)
+    slow = slow_found(m, config, mode, lambda at_slow: attached(true, at_slow), np.append(docks, 0.0), sigmas, times=3)
     assert slow[-1] == pytest.approx(0.3, rel=1e-3)
 
 
