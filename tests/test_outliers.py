@@ -66,13 +66,16 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one() -> None:
 
 
 @pytest.mark.parametrize("hz", [1.0, 5.0])
-@pytest.mark.parametrize(("speed_mps", "turn_radps"), [(2.0, 0.1), (15.0, 0.4), (0.0, 0.0)])
-def test_a_receiver_that_leaps_is_said(hz: float, speed_mps: float, turn_radps: float) -> None:
-    """Off by 8 m for 20 s; a craft that turns as a car does, or is silent for a while, leaps nowhere."""
+@pytest.mark.parametrize(("speed_mps", "turn_radps", "noise_m"), [(2.0, 0.1, 0.05), (15.0, 0.4, 0.2), (0.0, 0.0, 0.05)])
+def test_a_receiver_that_leaps_is_said(hz: float, speed_mps: float, turn_radps: float, noise_m: float) -> None:
+    """Off by 8 m for 20 s; a craft that turns as a car does, or is silent for a while, leaps nowhere.
+
+    Where noise is low, the steps beside a leap stand out as well, and are no leaps of their own.
+    """
     t = np.arange(0.0, 80.0, 1.0 / hz)
     course = turn_radps * np.clip(t - 20.0, 0.0, 10.0)
     way = np.cumsum(speed_mps / hz * np.column_stack([np.cos(course), np.sin(course)]), axis=0)
-    way += np.random.default_rng(2).normal(0.0, 0.05, way.shape)  # so little that the steps beside a leap feel it, too
+    way += np.random.default_rng(2).normal(0.0, noise_m, way.shape)
     stamps_ns = np.round(t * 1e9).astype(np.int64)
     assert leaps("gnss", stamps_ns, way) == []
     heard = (t < 50.0) | (t > 58.0)
