@@ -264,21 +264,25 @@ def _tie(seen: _Seen, dock: DockConfig, config: AprilTagConfig, at: Attachment) 
     assert at.slow_key is not None
     n = len(seen.own)
     picked = seen.placed(np.eye(n))
-    share, dt_s = (0.0, 0.0) if at.slow_next is None else at.slow_next[2:]
-    swing, swing_s = _swing(dock)
-    still, edge = [0.0] * (3 * seen.mounted + seen.timed), [config.edge_sigma_px / np.sqrt(_EDGE_S)] * seen.edges
-    step = np.concatenate([swing / np.sqrt(swing_s), still, edge])
+    sigma, time_s = _swing(dock)
+    still = 3 * seen.mounted + seen.timed
+    sigma = np.concatenate([sigma, np.zeros(still), [config.edge_sigma_px] * seen.edges])
+    time_s = np.concatenate([time_s, np.full(still, np.inf), [_EDGE_S] * seen.edges])
     tie = np.array(_TIE_DOCK + _TIE_MOUNT * seen.mounted + _TIE_LATE * seen.timed + _TIE_EDGE * seen.edges)
-    # Where there is no next node yet, it has gone on by itself.
-    steps_s = at.slow_age_s if at.slow_next is None else dt_s * share * (1.0 - share)
-    bridge = step * np.sqrt(2.0 * steps_s)
+    if at.slow_next is None:  # it has gone on by itself
+        kept = np.exp(-at.slow_age_s / time_s)
+        expected, bridge = kept * np.asarray(at.slow_value)[seen.own], sigma * np.sqrt(1.0 - kept**2)
+    else:
+        _, _, share, dt_s = at.slow_next
+        kept = np.full(n, 1.0 - share)
+        expected, bridge = seen.slow, sigma * np.sqrt(2.0 / time_s * dt_s * share * (1.0 - share))
     residual = Residual(
-        raw=np.zeros(n), cov=np.diag(np.maximum(bridge, tie) ** 2), jacobian=lambda: np.zeros((n, 6)), prior=1.0,
+        raw=seen.slow - expected, cov=np.diag(np.maximum(bridge, tie) ** 2), jacobian=lambda: np.zeros((n, 6)), prior=1.0,
         size_m=None, size_deg=None,
     )  # fmt: skip
     terms = [
         Term(at.leaf_keys[0], seen.slow, np.eye(n)),
-        Term(at.slow_key, np.array(at.slow_value), -(1.0 - share) * picked),
+        Term(at.slow_key, np.array(at.slow_value), -kept[:, None] * picked),
     ]
     if at.slow_next is not None:
         terms.append(Term(at.slow_next[0], np.array(at.slow_next[1]), -share * picked))
@@ -337,7 +341,8 @@ def slow(config: AprilTagConfig) -> SlowProcess | None:
     """Return how the docks that carry tags move, what the cameras' mounts are off, and how far out edges are seen.
 
     A dock that swings with period T and RMS s moves at 2 pi s / T; the Markov process that steps as far in 1 s has a time
-    constant of T^2 / 2 pi^2. How far it wanders is taken for two sigmas.
+    constant of T^2 / 2 pi^2. How far it wanders is taken for two sigmas. Waves tilt and lift it where they sway the vessel,
+    too: what the model denies the dock there, it gives to the camera's mount and stamps (docs/decisions/0007).
     """
     docks = [dock for name in _docks(config.surveyed) if (dock := config.surveyed.dock(name)) is not None]
     cameras = config.cameras if config.surveyed.tags else {}
@@ -368,10 +373,18 @@ def slow(config: AprilTagConfig) -> SlowProcess | None:
 
 def _swing(dock: DockConfig) -> tuple[Array, Array]:
     """Sigmas (6,) of a dock's motion, m and rad, and their time constants (6,), s."""
+    wander_s, wave_s = (max(period_s**2 / (2.0 * np.pi**2), 1.0) for period_s in (dock.period_s, dock.wave_period_s))
     turns = np.radians([dock.tilts_deg, dock.tilts_deg, dock.moves_deg])
-    moves = np.concatenate([[dock.moves_m, dock.moves_m, dock.rises_m], turns]) / 2.0
-    swing_s = max(dock.period_s**2 / (2.0 * np.pi**2), 1.0)
-    return np.maximum(moves, _LEAST), np.array([swing_s, swing_s, _TIDE_S, swing_s, swing_s, swing_s])
+    sigma = np.maximum(np.concatenate([[dock.moves_m, dock.moves_m, dock.rises_m], turns]) / 2.0, _LEAST)
+    sigma[2], rise_s = _both((sigma[2], _TIDE_S), (dock.heaves_m / 2.0, wave_s))
+    return sigma, np.array([wander_s, wander_s, rise_s, wave_s, wave_s, wander_s])
+
+
+def _both(slow: tuple[float, float], quick: tuple[float, float]) -> tuple[float, float]:
+    """Sigma and time constant of one Markov process for the sum of two: steps as far, and averages out as slowly."""
+    step = sum(sigma**2 / time_s for sigma, time_s in (slow, quick))
+    lasting = sum(sigma**2 * time_s for sigma, time_s in (slow, quick))
+    return float((step * lasting) ** 0.25), float(np.sqrt(lasting / step))
 
 
 def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:

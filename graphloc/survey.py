@@ -89,11 +89,15 @@ class DockConfig(Block):
     moves_deg: NonNegative = 1.5
     """How far it turns, either way, deg."""
     tilts_deg: NonNegative = 1.0
-    """How far it rolls or pitches (load, waves), either way, deg."""
+    """How far it rolls or pitches in waves, either way, deg."""
     rises_m: NonNegative = 1.0
     """How far it may ride above or below what `xyz_m` says (tide), m."""
     period_s: Positive = 25.0
     """About how long it takes to wander there and back, s."""
+    heaves_m: NonNegative = 0.05
+    """How far waves lift and lower it, m."""
+    wave_period_s: Positive = 4.0
+    """Period of these waves, s."""
 
 
 class BerthConfig(Block):

@@ -10,6 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from graphloc import keys
@@ -299,7 +300,12 @@ def test_a_dock_goes_on_while_its_next_node_is_not_there_yet() -> None:
     keep = np.exp(-0.8 / process.time_constant_s[0])
     step_m = float(process.sigma[0] * np.sqrt(1.0 - keep**2))
     assert set(tie.keys()) == {3, 4}
-    assert tie.error(values) == pytest.approx(0.5 * (0.02 / step_m) ** 2, rel=0.05)
+    assert tie.error(values) == pytest.approx(0.5 * (0.02 / step_m) ** 2, rel=1e-6)
+    away = np.array([0.1, -0.05, 0.3, 0.01, 0.0, -0.02])
+    back = ROW.factors(m, DOCKED, replace(at, slow_value=away), Decision()).factors[0]
+    values.update(3, away)
+    values.update(4, away * np.exp(-0.8 / process.time_constant_s[:6]))  # it returns to its place at rest
+    assert back.error(values) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_what_the_survey_errs_about_a_tag_is_a_constant() -> None:
@@ -432,8 +438,8 @@ def test_slow_states_and_constants() -> None:
     assert process is not None
     assert process.axes == (*(f"pier {a}" for a in ("east", "north", "up", "roll", "pitch", "yaw")), "outwards")
     assert process.units == ("m", "m", "m", "deg", "deg", "deg", "px")
-    np.testing.assert_allclose(process.scale * process.sigma, [0.3, 0.3, 1.0, 0.5, 0.5, 1.5, config.edge_sigma_px])
-    assert process.time_constant_s[2] > 1000.0  # the tide
+    sigmas = np.delete(process.scale * process.sigma, 2)  # up: a test of its own
+    np.testing.assert_allclose(sigmas, [0.3, 0.3, 0.5, 0.5, 1.5, config.edge_sigma_px])
     first, second = ROW.constants(config)
     np.testing.assert_allclose(first.sigma, [0.03] * 3 + [np.radians(0.5)] * 3)
     assert (second.sigma > 0.0).all()
@@ -458,22 +464,42 @@ def test_slow_states_and_constants() -> None:
     assert ROW.slow(AprilTagConfig()) is None
 
 
+def chain(sigma: float, time_constant_s: float, count: int = 20000) -> Array:
+    """A Markov process, a second at a time."""
+    keep = np.exp(-1.0 / time_constant_s)
+    white = sigma * np.sqrt(1.0 - keep**2) * np.random.default_rng(0).normal(size=count)
+    return np.asarray(lfilter([1.0], [1.0, -keep], white))
+
+
+def of_dock(**keys: float) -> tuple[Array, Array]:
+    """Sigma and time constant of the six ways in which a dock moves."""
+    tag = {**TAG, "frame": "pier", "sigma_m": 0.0, "sigma_deg": 0.0}
+    survey = Survey.model_validate({"tags": [tag], "docks": [{"name": "pier", **keys}]})
+    process = ROW.slow(AprilTagConfig(survey=survey))
+    assert process is not None
+    return process.sigma[:6], process.time_constant_s[:6]
+
+
 @pytest.mark.parametrize("period_s", [8.0, 25.0, 60.0])
 def test_a_dock_steps_as_far_in_a_second_as_a_swing_of_its_period(period_s: float) -> None:
     """Simulated: the Markov chain of `slow`, and a sinusoid of the same RMS; their RMS steps agree."""
-    tag = {**TAG, "frame": "pier", "sigma_m": 0.0, "sigma_deg": 0.0}
-    survey = Survey.model_validate({"tags": [tag], "docks": [{"name": "pier", "moves_m": 0.5, "period_s": period_s}]})
-    process = ROW.slow(AprilTagConfig(survey=survey))
-    assert process is not None
-    sigma, tau = float(process.sigma[0]), float(process.time_constant_s[0])
-    assert sigma == pytest.approx(0.25)  # half of how far it wanders
-    rng = np.random.default_rng(0)
-    keep = np.exp(-1.0 / tau)
-    x = np.zeros(20000)
-    for k in range(1, len(x)):
-        x[k] = keep * x[k - 1] + sigma * np.sqrt(1.0 - keep**2) * rng.normal()
-    swing = sigma * np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(20000) / period_s)
-    assert np.diff(x).std() == pytest.approx(np.diff(swing).std(), rel=0.06)
+    sigmas, times_s = of_dock(moves_m=0.5, tilts_deg=2.0, period_s=period_s, wave_period_s=period_s)
+    for axis, half in ((0, 0.25), (3, np.radians(1.0))):
+        assert sigmas[axis] == pytest.approx(half)  # half of how far it wanders, or tilts
+        swing = half * np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(20000) / period_s)
+        assert np.diff(chain(sigmas[axis], times_s[axis])).std() == pytest.approx(np.diff(swing).std(), rel=0.06)
+
+
+def test_a_dock_rises_with_the_tide_and_heaves_with_the_waves() -> None:
+    """In a second as far as waves and tide lift it; over a quarter of an hour, as far off as the tide takes it."""
+    (*_, sigma, _, _, _), (*_, time_s, _, _, _) = of_dock(rises_m=2.0, heaves_m=0.2, wave_period_s=8.0)
+    swing = 0.1 * np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(20000) / 8.0)
+    both = np.hypot(np.diff(swing).std(), np.diff(chain(1.0, 3600.0)).std())
+    assert np.diff(chain(sigma, time_s)).std() == pytest.approx(both, rel=0.06)
+    means = chain(sigma, time_s, 900 * 1000).reshape(1000, 900).mean(axis=1)
+    assert 0.9 < means.std() < 2.0
+    (*_, calm, _, _, _), (*_, calm_s, _, _, _) = of_dock(rises_m=2.0, heaves_m=0.0)
+    assert (calm, calm_s) == pytest.approx((1.0, 3600.0))
 
 
 def heading_off_deg(seed: int, count: int, gaussian: bool, bearing_deg: float = 3.0, range_m: float = 20.0) -> float:

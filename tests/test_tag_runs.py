@@ -413,12 +413,13 @@ def turned(by_deg: float, axis: str = "z") -> Change:
     return lambda m: replace(m, R_body_camera=about @ m.R_body_camera) if isinstance(m, TagSighting) else m
 
 
-@pytest.mark.parametrize("kind", ["fixed", "floating"])
-def test_a_camera_whose_mount_is_measured_by_hand_serves_as_well(kind: str) -> None:
+@pytest.mark.parametrize(("kind", "costs_m"), [("fixed", 0.02), ("floating", 0.10)])
+def test_a_camera_whose_mount_is_measured_by_hand_serves_as_well(kind: str, costs_m: float) -> None:
     """By 3 deg it is off; that was 1.8 m at the berth, where every sighting was refused, and 2.7 deg of heading."""
     right, docked = dock(kind), dock(kind, change=turned(3.0))
     assert docked.outcomes() == right.outcomes()
-    assert docked.number("berth_p95_m") < 1.2 * right.number("berth_p95_m") + 0.01
+    assert docked.number("berth_p95_m") < right.number("berth_p95_m") + costs_m
+    assert docked.number("berth_p95_m") < 0.25  # at the dock 0.38 m while waves could not lift it, exact mount or not
     assert np.abs(docked.heading_error_deg()).max() < 1.5
     mount = docked.run.solution.slow["tags"]
     yaw = mount.axes.index("camera mount yaw")
