@@ -71,7 +71,7 @@ def _stuck_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_]) 
         elif (
             _stopped_at_once(t_s, places_m, first, _UNDER_WAY_MPS)
             and _leaps(t_s, places_m, first, after)
-            and _under_way(t_s, places_m, np.arange(after, np.searchsorted(t_s, t_s[after] + _BEFORE_S)))
+            and _under_way(t_s, places_m, np.arange(after, np.searchsorted(t_s, t_s[after] + _BEFORE_S))) is not None
         ):
             bad[first + 1 : after] = True
             first = after
@@ -105,10 +105,9 @@ def _hangs(t_s: Array, places_m: Array, first: int, after: int) -> bool:
 
 def _leaps(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     """Whether it was under way, and is a good part of the way further on at once."""
-    way = np.append(_before(t_s, first), first)
-    if not _under_way(t_s, places_m, way):
+    speed = _under_way(t_s, places_m, np.append(_before(t_s, first), first))
+    if speed is None:
         return False
-    speed, _ = _speed(t_s[way], places_m[way])
     least_m = max(_LEAP_M, _set_off_m(t_s[after] - t_s[after - 1]), _SHARE * speed * (t_s[after] - t_s[first]))
     return bool(float(np.linalg.norm(places_m[after] - places_m[first])) > least_m)
 
@@ -118,11 +117,12 @@ def _set_off_m(silent_s: float) -> float:
     return _BRAKES_MPS2 * silent_s**2 / 2.0
 
 
-def _under_way(t_s: Array, places_m: Array, of: NDArray[np.int64]) -> bool:
+def _under_way(t_s: Array, places_m: Array, of: NDArray[np.int64]) -> float | None:
+    """Speed of a vessel that is surely under way in these; None of one that may not be."""
     if len(of) < _FEWEST:
-        return False
+        return None
     speed, sigma = _speed(t_s[of], places_m[of])
-    return bool(speed - _SIGMAS * sigma > _UNDER_WAY_MPS)
+    return speed if speed - _SIGMAS * sigma > _UNDER_WAY_MPS else None
 
 
 def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) -> bool:

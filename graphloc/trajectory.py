@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,17 @@ class Trajectory:
     def yaw_rad(self) -> Array:
         """Yaw (N,): direction of the body's x axis in the world's horizontal plane."""
         return np.asarray(np.arctan2(self.R_world_body[:, 1, 0], self.R_world_body[:, 0, 0]))
+
+    def where(self, kept: NDArray[np.bool_] | slice) -> Trajectory:
+        """Return some of its poses: (N,) which, or a slice."""
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[kept],
+            p_world_m=self.p_world_m[kept],
+            R_world_body=self.R_world_body[kept],
+            v_world_mps=None if self.v_world_mps is None else self.v_world_mps[kept],
+            cov=None if self.cov is None else self.cov[kept],
+        )
 
     def covers(self, stamps_ns: NDArray[np.int64], max_gap_s: float = 1.0) -> NDArray[np.bool_]:
         """Return (M,) whether each stamp lies inside the span and between poses at most `max_gap_s` apart."""

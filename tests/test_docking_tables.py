@@ -31,14 +31,6 @@ def track(p: Array, heading_deg: Array | float = 0.0, hz: float = 10.0) -> Traje
     )
 
 
-def cut(whole: Trajectory, first: int, stop: int) -> Trajectory:
-    return Trajectory(
-        stamps_ns=whole.stamps_ns[first:stop],
-        p_world_m=whole.p_world_m[first:stop],
-        R_world_body=whole.R_world_body[first:stop],
-    )
-
-
 def test_range_is_horizontal_and_to_the_nearest_tag() -> None:
     one = track(np.array([[-5.0, -4.0, 9.0], [2.0, -3.0, 0.0], [0.0, 0.0, 0.0]]))
     assert tag_range_m(one, QUAY) == pytest.approx([5.0, 3.0, 2.0])
@@ -98,7 +90,7 @@ def test_nothing_counts_before_the_first_sighting() -> None:
 
 def test_what_is_not_covered_is_none() -> None:
     truth = _approach()
-    far = cut(truth, 0, 150)  # ends at 15.1 m
+    far = truth.where(slice(0, 150))  # ends at 15.1 m
     elsewhere = Trajectory(
         stamps_ns=truth.stamps_ns + 10**12, p_world_m=truth.p_world_m, R_world_body=truth.R_world_body
     )
@@ -116,7 +108,7 @@ def test_dnv_counts_what_is_missing_as_missed(good: int, met: float) -> None:
     truth = _approach()
     first = int(np.flatnonzero(truth.p_world_m[:, 1] > -5.05)[0])
     assert len(truth) - first == 101
-    estimate = cut(truth, first, first + good)
+    estimate = truth.where(slice(first, first + good))
     table = docking_table([("a", estimate)], truth, QUAY, truth.stamps_ns[[50]]).as_dict()["a"]
     assert table["position_p95_0_to_5_m"] == 0.0
     assert table["dnv_met"] == met
@@ -155,7 +147,7 @@ def test_lost_and_wrong_side(
 
 def test_table_is_like_the_others() -> None:
     truth = _approach()
-    table = docking_table([("graphloc", truth), ("none", cut(truth, 0, 3))], truth, QUAY, truth.stamps_ns[[50]])
+    table = docking_table([("graphloc", truth), ("none", truth.where(slice(0, 3)))], truth, QUAY, truth.stamps_ns[[50]])
     assert [name for name, _ in table.rows] == ["graphloc", "none"]
     assert all(len(values) == len(table.columns) for _, values in table.rows)
     assert "berth_p95_m" in table.as_text()

@@ -67,16 +67,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 def part(track: Trajectory, first_ns: float, last_ns: float) -> Trajectory:
     """The poses of a track in a time, each as it is in the whole one."""
-    kept = (track.stamps_ns >= first_ns) & (track.stamps_ns <= last_ns)
-    assert track.cov is not None
-    return replace(
-        track,
-        stamps_ns=track.stamps_ns[kept],
-        p_world_m=track.p_world_m[kept],
-        R_world_body=track.R_world_body[kept],
-        v_world_mps=None if track.v_world_mps is None else track.v_world_mps[kept],
-        cov=track.cov[kept],
-    )
+    return track.where((track.stamps_ns >= first_ns) & (track.stamps_ns <= last_ns))
 
 
 def test_a_bag_is_matched_as_written_out(run: Run, matched: list[Matched]) -> None:

@@ -118,17 +118,8 @@ def _own(leg: Solution, begin_ns: int, end_ns: int, before: Solution | None) -> 
     def mine(stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         return np.asarray((stamps_ns >= begin_ns) & (stamps_ns < end_ns))
 
-    track, own = leg.trajectory, mine(leg.trajectory.stamps_ns)
-    assert track.v_world_mps is not None
-    assert track.cov is not None
-    kept = replace(
-        track,
-        stamps_ns=track.stamps_ns[own],
-        p_world_m=track.p_world_m[own],
-        R_world_body=track.R_world_body[own],
-        v_world_mps=track.v_world_mps[own],
-        cov=track.cov[own],
-    )
+    own = mine(leg.trajectory.stamps_ns)
+    kept = leg.trajectory.where(own)
     since = {name: s[own] for name, s in leg.since_agreed_s.items()}
     if before is not None:
         gone_s = (kept.stamps_ns - before.trajectory.stamps_ns[-1]) / NS_PER_S
