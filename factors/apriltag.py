@@ -87,7 +87,7 @@ class _Seen:
         off, ago_s = self.slow[6 * self.rides :][:3], self.slow[6 * self.rides + 3 * self.mounted :][: len(late)]
         if self.timed:
             rate = R_world_body @ at.gyro_radps
-            self.by_late = -np.concatenate([at.v_world_mps + at.dv_world_mps + np.cross(rate, arm), rate])
+            self.by_late = -np.concatenate([at.v_world_mps + at.dv_world_mps + skew(rate) @ arm, rate])
             self.p = self.p + self.by_late[:3] * ago_s
             R_world_body = gtsam.Rot3.Expmap(self.by_late[3:] * ago_s).matrix() @ R_world_body
         if self.mounted:
