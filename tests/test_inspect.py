@@ -186,6 +186,21 @@ def test_without_gravity_the_turns_tell_up_from_down(tmp_path: Path) -> None:
     np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, np.diag([1.0, -1.0, -1.0]), atol=1e-6)
 
 
+@pytest.mark.parametrize("upright", [True, False], ids=["upright", "on its back"])
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0, -90.0])
+def test_without_gravity_the_motion_tells_the_yaw(yaw_deg: float, upright: bool, tmp_path: Path) -> None:
+    """It was taken as aligned, whatever the motion said, and the heading was a quarter turn off by the draft."""
+    make = Messages(2)
+    mount = rotation_z(yaw_deg) @ np.diag([1.0, 1.0, 1.0] if upright else [1.0, -1.0, -1.0])
+    items = drive(make, mount)
+    for topic, _, message in items:
+        if topic == "/imu":
+            message.linear_acceleration.z -= G if upright else -G
+    found, config, _ = look(tmp_path, items, make)
+    assert found.imus[0].gravity == "removed"
+    np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, mount, atol=1e-6)
+
+
 def test_standard_receiver_gets_a_slow_error(tmp_path: Path) -> None:
     make = Messages(2)
     found, config, _ = look(tmp_path, drive(make, status=1, sigma_m=1.2, seconds=60), make)
