@@ -474,6 +474,26 @@ def test_sensors_on_other_clocks_are_judged_by_each_other(topic: str, behind_s: 
     assert config.sensors["gnss"].time_offset_s == pytest.approx(offset_s, abs=0.1)
 
 
+@pytest.mark.parametrize(("moves", "usable"), [(True, True), (False, False)])
+def test_a_heading_receiver_that_says_an_imu_does_not_hang(moves: bool, usable: bool, tmp_path: Path) -> None:
+    """Two antennas: their driver fills the orientation of an Imu alone. It was a compass, and nothing of it could be used."""
+    make = Messages(2)
+    items: list[Item] = []
+    for topic, at, m in drive(make, seconds=120 if moves else 10):
+        if topic == "/compass":
+            yaw = np.pi / 2.0 - 2.0 * np.arctan2(m.quaternion.z, m.quaternion.w)
+            q = (0.0, 0.0, np.sin(yaw / 2.0), np.cos(yaw / 2.0))
+            items.append(("/heading", at, make.imu(at, (0, 0, 0), orientation=q, orientation_covariance=np.zeros(9))))
+        else:
+            items.append((topic, at, m))
+    found, config, _ = look(tmp_path, items, make)
+    assert ("compass" in config.sensors) is usable
+    said = [w for w in found.warnings if w.startswith("/heading")]
+    assert not any("hangs" in w for w in said)
+    assert len(said) == (0 if usable else 1)
+    assert all("neither accelerations nor rates" in w for w in said)
+
+
 @pytest.mark.parametrize(("status", "said"), [(-1, "say 'no fix'"), (0, "lie at 0, 0")])
 def test_topics_that_give_nothing_are_said(status: int, said: str, tmp_path: Path) -> None:
     make = Messages(2)
