@@ -22,7 +22,8 @@ LASTS_S = 200.0
 _LEAP_M, _LEAP, _FEWEST = 3.0, 10.0, 10  # m; times what is usual; fewer do not tell what that is
 _SIGMAS, _JERK_MPS3 = 10.0, 10.0  # of what is stated; a car that brakes at once
 _EVEN = 1.5  # a step longer or shorter by more than this is none as those beside it
-_KEPT = 100
+_BURST_S = 1.0  # fixes that are off for no longer are outliers
+_KEPT = 200
 
 
 def told_alone(stream: Any, absolute: Collection[Any]) -> bool:
@@ -39,7 +40,7 @@ def leaps(
 ) -> tuple[NDArray[np.int64], Array]:
     """Return stamps (K,) and sizes (K,), m, of steps between places (N, 2) that are a leap, unlike those before and after.
 
-    A single fix that is off is none: it has not drawn the track along.
+    A fix that is off by itself, or a burst of them, is none: it has not drawn the track along.
 
     Args:
         sigma_m: (N,) as stated. allowed: the bounds allow for a slow error; then metres count.
@@ -49,8 +50,9 @@ def leaps(
     steps, dt = np.diff(places_m, axis=0), np.diff(stamps_ns) / NS_PER_S
     usual_s = float(np.median(dt))
     # Where stamps tell when a place was measured its step goes by time, where they are those of arrival it does not.
-    by_time = _off(steps * (usual_s / np.maximum(dt, 1e-9))[:, None])
-    off_m = np.minimum(_off(steps), by_time)
+    by_time = _parts(steps * (usual_s / np.maximum(dt, 1e-9))[:, None])
+    parts = _parts(steps)
+    off_m = np.minimum(np.linalg.norm(parts, axis=1), np.linalg.norm(by_time, axis=1))
     padded = np.pad(off_m, 1)
     beside = np.maximum(padded[:-2], padded[2:])  # they feel half of it
     # Two steps together, beside those before and after: a fix that is off by itself goes there and back.
@@ -65,12 +67,16 @@ def leaps(
         least_m = np.maximum(least_m, _SIGMAS * window(sigma_m, 4).max(axis=1))
     least_m = np.maximum(least_m, _LEAP * float(np.median(off_m)))
     far = np.flatnonzero(even & (off_m >= beside) & (off_m > least_m) & (both > off_m / 2.0))
+    far = far[(far > 0) & (far < len(off_m) - 1)]  # beside an end a fix that is off may look like half a leap
+    near = np.abs(np.subtract.outer(stamps_ns[far], stamps_ns[far])) <= _BURST_S * NS_PER_S
+    back = np.linalg.norm(parts[far][:, None] + parts[far][None], axis=2) < off_m[far] / 2.0
+    far = far[~(near & back).any(axis=1)]
     return stamps_ns[far + 2], off_m[far]
 
 
-def _off(steps_m: Array) -> Array:
-    """How far each step (N, 2) but the first and last is from the mean of those beside it (N - 2,)."""
-    return np.asarray(np.linalg.norm(steps_m[1:-1] - (steps_m[:-2] + steps_m[2:]) / 2.0, axis=1))
+def _parts(steps_m: Array) -> Array:
+    """How each step (N, 2) but the first and last parts from the mean of those beside it (N - 2, 2)."""
+    return np.asarray(steps_m[1:-1] - (steps_m[:-2] + steps_m[2:]) / 2.0)
 
 
 def leaps_said(sensor: str, stamps_ns: NDArray[np.int64], off_m: Array, *, allowed: bool) -> list[str]:
@@ -97,7 +103,7 @@ def why_in_doubt(sensor: str) -> str:
 
 
 class LeapWatch:
-    """The same of one receiver as its fixes come: a leap is seen two fixes later."""
+    """The same of one receiver as its fixes come: a leap is seen a second later, three fixes at least."""
 
     def __init__(self) -> None:
         self._seen: deque[tuple[int, Array, float]] = deque(maxlen=_KEPT)
@@ -114,8 +120,9 @@ class LeapWatch:
             return none
         stamps_ns, sigmas_m = np.array([at for at, _, _ in self._seen]), np.array([s for _, _, s in self._seen])
         at_ns, off_m = leaps(stamps_ns, np.array([p for _, p, _ in self._seen]), sigmas_m, allowed=allowed)
-        new = (at_ns > self._judged_ns) & (at_ns < stamps_ns[-2])  # a later one may yet be a single fix that is off
-        self._judged_ns = int(stamps_ns[-3])
+        until_ns = min(stamps_ns[-3], stamp_ns - int(_BURST_S * NS_PER_S))  # a later one may yet be a burst
+        new = (at_ns > self._judged_ns) & (at_ns <= until_ns)
+        self._judged_ns = max(int(until_ns), self._judged_ns)
         if not new.any():
             return none
         again = self.doubtful(stamp_ns)
