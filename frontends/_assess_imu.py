@@ -54,7 +54,7 @@ def mount_guess(
         note = "" if size < 2.0 or tilt < 20.0 else f", BUT gravity is then {tilt:.0f} deg off body z: check"
         return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"/tf_static knows it{note}")
     if size < 0.5 * STANDARD_GRAVITY_MPS2:
-        return MountGuess(rpy_deg=(0.0, 0.0, 0.0), tf_frame=None, evidence="no gravity to level by: taken as aligned")
+        return _turned(imu, accel, gyro, motion, np.eye(3), "no gravity to level by: taken as level")
     axis = up / size
     snapped = np.zeros(3)
     k = int(np.argmax(np.abs(axis)))
@@ -65,6 +65,11 @@ def mount_guess(
     said = (
         f"gravity is on {name} of the sensor" if aligned else f"gravity is {np.round(axis, 2).tolist()} in the sensor"
     )
+    return _turned(imu, accel, gyro, motion, level, said)
+
+
+def _turned(imu: Stream, accel: Array, gyro: Array, motion: Motion | None, level: Array, said: str) -> MountGuess:
+    """Return the mount of a sensor that `level` (3, 3) levels, turned by motion; `said`: how that is known."""
     yaw, evidence = _mount_yaw(imu, accel @ level.T, gyro @ level.T, motion)
     turn = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
     rpy = vec(np.round(np.degrees(rpy_from_rotation(turn @ level)), 1) + 0.0)
@@ -160,11 +165,8 @@ def _righted(
     pose = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
     against = "its gyro turns against the courses of the fixes"
     if pose is None and sense < 0 and report.gravity == "removed":
-        mount = MountGuess(
-            rpy_deg=(180.0, 0.0, 0.0),
-            tf_frame=None,
-            evidence=f"{against}: taken as lying on its back; no gravity to tell",
-        )
+        why = f"{against}: taken as lying on its back; no gravity to tell"
+        mount = _turned(imu, accel, gyro, motion, np.diag([1.0, -1.0, -1.0]), why)
         return replace(report, mount=mount)
     if pose is None and sense < 0:
         why = f"{against}: its accelerations look inverted, or its axes are left-handed; check the sensor"

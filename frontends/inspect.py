@@ -126,6 +126,12 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     found_imus.sort(key=lambda i: i.gyro_noise_mdps)
     turning = turning_of(heard[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
     candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU, *NUMBERS)]
+    found_compasses = [(c, s) for s in candidates if (c := compass_report(s, courses, turning))]
+    used = (
+        {g.topic for g in found_gnss}
+        | {i.topic for i in found_imus}
+        | {c.topic for c, _ in found_compasses if c.usable}
+    )
     return Inspection(
         source=source,
         topics=tuple(
@@ -139,8 +145,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         gnss=tuple(found_gnss),
         compasses=tuple(
             _asked_together(_timed(c, s, by_topic[s.topic], turning), s, [(i, heard[i.topic]) for i in found_imus])
-            for s in candidates
-            if (c := compass_report(s, courses, turning))
+            for c, s in found_compasses
         ),
         odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first, antenna)) for s in poses),
         velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
@@ -154,7 +159,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         warnings=(
             *warnings,
             *(g.hangs for g in found_gnss if g.hangs),
-            *_useless(streams, {g.topic for g in found_gnss} | {i.topic for i in found_imus}),
+            *_useless(streams, used),
         ),
     )
 
@@ -255,6 +260,8 @@ def _useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
             why += f", {len(stream) - plausible} have a stamp that repeats, runs backwards or is far from the recording time"
         elif stream.msgtype in _FIXES:
             why += f", {int((stream.rows[:, 3] < 0).sum()) if len(stream) else 0} say 'no fix', the others lie at 0, 0 or are NaN"
+        elif len(stream) and not stream.rows[:, :6].any():
+            why = "they hold neither accelerations nor rates, an orientation at most"
         elif len(stream) and (hangs := samples_of(stream)[1]):
             why = hangs[0].removeprefix(f"{stream.topic}: ")
         lines.append(f"{stream.topic}: nothing of its {total} messages can be used: {why}")

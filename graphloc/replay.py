@@ -45,6 +45,7 @@ _WARNS = (
     "no second sensor",
     "the heading is off",
     "it hangs",
+    ": leaps by ",
     _GUESS,
 )  # of events, that a reader must see
 _BUSY = "not tried: the scan before it was still being matched"

@@ -186,6 +186,21 @@ def test_without_gravity_the_turns_tell_up_from_down(tmp_path: Path) -> None:
     np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, np.diag([1.0, -1.0, -1.0]), atol=1e-6)
 
 
+@pytest.mark.parametrize("upright", [True, False], ids=["upright", "on its back"])
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0, -90.0])
+def test_without_gravity_the_motion_tells_the_yaw(yaw_deg: float, upright: bool, tmp_path: Path) -> None:
+    """It was taken as aligned, whatever the motion said, and the heading was a quarter turn off by the draft."""
+    make = Messages(2)
+    mount = rotation_z(yaw_deg) @ np.diag([1.0, 1.0, 1.0] if upright else [1.0, -1.0, -1.0])
+    items = drive(make, mount)
+    for topic, _, message in items:
+        if topic == "/imu":
+            message.linear_acceleration.z -= G if upright else -G
+    found, config, _ = look(tmp_path, items, make)
+    assert found.imus[0].gravity == "removed"
+    np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, mount, atol=1e-6)
+
+
 def test_standard_receiver_gets_a_slow_error(tmp_path: Path) -> None:
     make = Messages(2)
     found, config, _ = look(tmp_path, drive(make, status=1, sigma_m=1.2, seconds=60), make)
@@ -457,6 +472,26 @@ def test_sensors_on_other_clocks_are_judged_by_each_other(topic: str, behind_s: 
     assert compass.samples > 100
     offset_s = behind_s if topic == "/fix" else -behind_s
     assert config.sensors["gnss"].time_offset_s == pytest.approx(offset_s, abs=0.1)
+
+
+@pytest.mark.parametrize(("moves", "usable"), [(True, True), (False, False)])
+def test_a_heading_receiver_that_says_an_imu_does_not_hang(moves: bool, usable: bool, tmp_path: Path) -> None:
+    """Two antennas: their driver fills the orientation of an Imu alone. It was a compass, and nothing of it could be used."""
+    make = Messages(2)
+    items: list[Item] = []
+    for topic, at, m in drive(make, seconds=120 if moves else 10):
+        if topic == "/compass":
+            yaw = np.pi / 2.0 - 2.0 * np.arctan2(m.quaternion.z, m.quaternion.w)
+            q = (0.0, 0.0, np.sin(yaw / 2.0), np.cos(yaw / 2.0))
+            items.append(("/heading", at, make.imu(at, (0, 0, 0), orientation=q, orientation_covariance=np.zeros(9))))
+        else:
+            items.append((topic, at, m))
+    found, config, _ = look(tmp_path, items, make)
+    assert ("compass" in config.sensors) is usable
+    said = [w for w in found.warnings if w.startswith("/heading")]
+    assert not any("hangs" in w for w in said)
+    assert len(said) == (0 if usable else 1)
+    assert all("neither accelerations nor rates" in w for w in said)
 
 
 @pytest.mark.parametrize(("status", "said"), [(-1, "say 'no fix'"), (0, "lie at 0, 0")])

@@ -7,17 +7,20 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from graphloc import app
-from graphloc.config import KernelConfig
+from graphloc.config import KernelConfig, SlowErrorConfig
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, simulate
-from graphloc.frames import Geodetic, wrap_angle
+from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.graph import Residual
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
+from graphloc.replay import replay
+from graphloc.solution import Health
 from graphloc.solve._decide import _by_kernel
-from graphloc.solve._solution import leaps
+from graphloc.solve._leaps import LeapWatch, leaps, leaps_said
 
 
 def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
@@ -65,9 +68,12 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one() -> None:
     assert solved.ledger.counts()["aerial"]["used"] > 30
 
 
+@pytest.mark.parametrize("allowed", [True, False])
 @pytest.mark.parametrize("hz", [1.0, 5.0])
 @pytest.mark.parametrize(("speed_mps", "turn_radps", "noise_m"), [(2.0, 0.1, 0.05), (15.0, 0.4, 0.2), (0.0, 0.0, 0.05)])
-def test_a_receiver_that_leaps_is_said(hz: float, speed_mps: float, turn_radps: float, noise_m: float) -> None:
+def test_a_receiver_that_leaps_is_said(
+    allowed: bool, hz: float, speed_mps: float, turn_radps: float, noise_m: float
+) -> None:
     """Off by 8 m for 20 s; a craft that turns as a car does, or is silent for a while, leaps nowhere.
 
     Where noise is low, the steps beside a leap stand out as well, and are no leaps of their own.
@@ -76,13 +82,86 @@ def test_a_receiver_that_leaps_is_said(hz: float, speed_mps: float, turn_radps: 
     course = turn_radps * np.clip(t - 20.0, 0.0, 10.0)
     way = np.cumsum(speed_mps / hz * np.column_stack([np.cos(course), np.sin(course)]), axis=0)
     way += np.random.default_rng(2).normal(0.0, noise_m, way.shape)
-    stamps_ns = np.round(t * 1e9).astype(np.int64)
-    assert leaps("gnss", stamps_ns, way) == []
-    heard = (t < 50.0) | (t > 58.0)
-    assert leaps("gnss", stamps_ns[heard], way[heard]) == []
-    (line,) = leaps("gnss", stamps_ns, way + np.outer((t >= 40.0) & (t < 60.0), [0.0, 8.0]))
+    stamps_ns, sigma_m = np.round(t * 1e9).astype(np.int64), np.full(len(t), noise_m)
+
+    def said(heard: NDArray[np.bool_], off_m: Array | float = 0.0, *, allowed: bool) -> list[str]:
+        return leaps_said(
+            "gnss", *leaps(stamps_ns[heard], (way + off_m)[heard], sigma_m[heard], allowed=allowed), allowed=allowed
+        )
+
+    everywhere = np.full(len(t), fill_value=True)
+    assert said(everywhere, allowed=allowed) == []
+    assert said((t < 50.0) | (t > 58.0), allowed=allowed) == []
+    (line,) = said(everywhere, np.outer((t >= 40.0) & (t < 60.0), [0.0, 8.0]), allowed=allowed)
     assert line.startswith(("gnss: leaps by 8 m at 1970-01-01T00:00:40", "gnss: leaps by 8 m at 1970-01-01T00:01:00"))
     assert ", and 1 times more:" in line
+
+
+RTK_NS = np.arange(0, 60_000_000_000, 200_000_000)
+RTK_S: Array = np.linspace(0.0, 60.0, len(RTK_NS), endpoint=False)
+
+
+def rtk(off_m: NDArray[Any], sigma_m: NDArray[Any] | float = 0.015) -> tuple[Array, Array]:
+    """Places and their sigmas of a receiver that is good to 1 cm on a craft that goes at 20 m/s."""
+    way = np.outer(RTK_S, [20.0, 0.0]) + np.random.default_rng(3).normal(0.0, 0.01, (len(RTK_NS), 2))
+    return way + np.outer(off_m, [0.6, 0.8]), np.broadcast_to(sigma_m, len(RTK_NS)).astype(float)
+
+
+def test_a_receiver_that_is_believed_leaps_by_less_than_metres() -> None:
+    """A wrong fix of 0.6 m for 20 s, stated to 15 mm: nothing was said. A fix by itself, or two, a float that says so, and stamps
+    that come late now and then leap nowhere."""
+    t = RTK_S
+    wrong = 0.6 * ((t >= 20.0) & (t < 40.0))
+    at_ns, off_m = leaps(RTK_NS, *rtk(wrong), allowed=False)
+    assert at_ns.tolist() == [20_000_000_000, 40_000_000_000]
+    assert off_m == pytest.approx([0.6, 0.6], abs=0.1)
+    assert not len(leaps(RTK_NS, *rtk(wrong), allowed=True)[0])
+    for burst in (100,), (100, 101), (100, 101, 102):
+        assert not len(leaps(RTK_NS, *rtk(0.6 * np.isin(np.arange(len(t)), burst)), allowed=False)[0])
+    assert not len(leaps(RTK_NS, *rtk(wrong, 0.015 + 0.5 * wrong), allowed=False)[0])
+    late_ns = RTK_NS + 60_000_000 * (np.arange(len(t)) % 40 == 0)
+    way, sigma_m = rtk(np.zeros(len(t)))
+    assert not len(leaps(late_ns, way, sigma_m, allowed=False)[0])
+    assert not len(leaps(late_ns, way + np.outer(late_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
+
+
+def test_a_leap_is_seen_as_it_comes_and_said_once_for_long() -> None:
+    t = RTK_S
+    watch, said = LeapWatch(), []
+    for at_ns, place_m, sigma_m in zip(RTK_NS.tolist(), *rtk(0.6 * ((t >= 20.0) & (t < 40.0))), strict=True):
+        said += watch.note(at_ns, place_m, sigma_m, allowed=False)[0].tolist()
+        assert watch.doubtful(at_ns) == (at_ns >= 21_000_000_000)
+    assert said == [20_000_000_000]
+    assert not watch.doubtful(300_000_000_000)
+
+
+def test_a_run_beside_a_believed_receiver_that_leaps_is_not_called_good() -> None:
+    """Its bound was 2 cm, and its health good, where it was 0.6 m off."""
+    scenario = Scenario(
+        path="loops", duration_s=45.0, pose_hz=0.0, compass_hz=5.0, gnss_hz=5.0, gnss_sigma_m=0.01, gnss_reported_sigma_m=0.02
+    )  # fmt: skip
+    run = simulate(scenario, 1)
+    gnss = run.config.sensors["gnss"].model_copy(update={"slow_error": SlowErrorConfig(enabled=False)})
+    kept = {k: v for k, v in run.config.sensors.items() if k in ("imu", "compass")} | {"gnss": gnss}
+    config = run.config.model_copy(update={"sensors": kept})
+    begin_ns = int(run.truth.stamps_ns[0])
+
+    def struck(m: Measurement) -> Measurement:
+        if not isinstance(m, GnssPosition) or not 20.0 <= (m.stamp_ns - begin_ns) * 1e-9 < 35.0:
+            return m
+        return replace(m, position=Geodetic(m.position[0] + 0.6 / 111_000.0, *m.position[1:]))
+
+    wrong = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
+    usual, leapt = (app.smooth_recording(of, config).solution for of in (run.recording, wrong))
+    assert not any("leaps" in line for line in usual.stats.warnings)
+    assert "gnss leaps, and nothing else tells the place" not in usual.health_reason
+    assert any(line.startswith("gnss: leaps by 0.") for line in leapt.stats.warnings)
+    assert Health.GOOD in usual.health
+    assert Health.GOOD not in leapt.health
+    usual_live, live = (replay(of, config) for of in (run.recording, wrong))
+    assert not any("leaps" in line for line in usual_live.solution.stats.warnings)
+    assert any("gnss: leaps by 0." in line for line in live.solution.stats.warnings)
+    assert live.solution.health[-1] != Health.GOOD == usual_live.solution.health[-1]
 
 
 def test_a_receiver_alone_that_leaps_is_said_in_the_run() -> None:

@@ -16,7 +16,6 @@ import numpy as np
 
 from graphloc.config import KernelConfig
 from graphloc.errors import SolveError
-from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
@@ -28,6 +27,7 @@ from graphloc.online._window import Window
 from graphloc.solve._best_chain import best_chain
 from graphloc.solve._decide import Verdict, by_hypotheses
 from graphloc.solve._hypotheses import log_evidence_of
+from graphloc.solve._leaps import largest_sigma, leaps_said, told_alone
 from graphloc.solve._solution import AGREES
 
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
@@ -58,6 +58,7 @@ class Judge:
         self._leafed_s: dict[str, float] = {}  # and when
         self._refuted: set[str] = set()  # sensors of which something new was judged false
         self._tried: dict[str, frozenset[tuple[int, int | None]]] = {}
+        self._leapt: list[str] = []
 
     def take(self, m: Measurement) -> None:
         """Stage a measurement whose stamp lies within the states; one with hypotheses waits for `judge`.
@@ -94,13 +95,19 @@ class Judge:
         newest, parting, parted = self._states.newest, stream.parting, stream.parting.parted
         timeline = self._problem.timeline
         at_s = timeline.seconds(m.stamp_ns)
+        sigma_m = largest_sigma(residual.cov)
+        if told_alone(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
+            allowed = stream.left_out is not None
+            self._leapt += leaps_said(
+                stream.name, *stream.leaping.note(m.stamp_ns, told_m, sigma_m, allowed=allowed), allowed=allowed
+            )
         parting.note(
             at_s,
             told_m,
             np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2],
-            _largest(residual.cov),
+            sigma_m,
             newest.velocity[:2],
-            _largest(newest.velocity_cov),
+            largest_sigma(newest.velocity_cov),
         )
         if parting.parted and not parted:
             self._agreement.forget_refused()
@@ -111,6 +118,11 @@ class Judge:
         if parting.for_long(at_s):
             self._agreement.note(stream, m, None)
         return parting.parted
+
+    def leapt(self) -> list[str]:
+        """Return a line on each receiver that has leapt since this was last asked."""
+        said, self._leapt = self._leapt, []
+        return said
 
     def judge(self) -> None:
         """Stage what is to be decided, anew or again."""
@@ -269,8 +281,3 @@ class Judge:
         """Minus the log of the probability of the window, all hypotheses of a stream summed over."""
         evidence = log_evidence_of(stream, [e.index for e in own], self._met(own)[1])
         return self._window.error([e.held for e in own if e.held is not None]) - evidence
-
-
-def _largest(cov: Array) -> float:
-    """The largest sigma of the first two axes."""
-    return float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))

@@ -25,6 +25,7 @@ from graphloc.online._judge import Judge
 from graphloc.online._live import LiveProblem
 from graphloc.online._states import Newest, States
 from graphloc.online._window import Window
+from graphloc.solve._leaps import why_in_doubt
 
 _STEP_COST = (
     1.0  # of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10
@@ -149,6 +150,16 @@ class Lag:
     def parted(self) -> set[str]:
         """Receivers that hang (see `_parting.py`)."""
         return {name for name, stream in self.problem.streams.items() if stream.parting.parted}
+
+    def leapt(self) -> list[str]:
+        """Return a line on each receiver that has leapt since this was last asked (see `solve/_leaps.py`)."""
+        return self._judge.leapt()
+
+    def in_doubt(self, stamp_ns: int) -> str:
+        """Why no pose can be called good as long as a receiver has leapt that alone tells the place; empty where none has."""
+        streams = self.problem.streams.items()  # where one is left out, the bounds allow for it
+        doubtful = [n for n, s in streams if s.left_out is None and s.leaping.doubtful(stamp_ns)]
+        return "; ".join(why_in_doubt(n) for n in doubtful)
 
     def gone(self) -> list[LedgerRow]:
         """Return rows of measurements that have left since this was last asked."""

@@ -20,6 +20,7 @@ from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProc
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._habit import Habit
 from graphloc.online._parting import Parting
+from graphloc.solve._leaps import LeapWatch
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
@@ -185,6 +186,7 @@ class LiveStream:
     gyro_radps: Tape[Array] = field(default_factory=Tape)
     scatter: Scatter = field(default_factory=Scatter)
     parting: Parting = field(default_factory=Parting)
+    leaping: LeapWatch = field(default_factory=LeapWatch)
 
 
 @dataclass(slots=True, eq=False)

@@ -256,6 +256,7 @@ class OnlineSmoother:
             if self._turned.look(self._lag):
                 self._say(self._turned.said)
             self._say_parted(self._lag.parted)
+            self._events += self._lag.leapt()
             if self._lag.refused_s > _LOST_S:
                 return self._start_over(self._lag)
             if said := self._noise.contradicted(self._lag):
@@ -359,7 +360,7 @@ class OnlineSmoother:
             self._read(lag)
             now = ahead(lag.problem, newest, odometry, stamp_ns)
         agreed = {**self._agreed_ns, **lag.agreed_ns}
-        doubt = "; ".join(why for why in (self._turned.said, self._doubt) if why)
+        doubt = "; ".join(why for why in (self._turned.said, self._doubt, lag.in_doubt(now.stamp_ns)) if why)
         return estimate_of(now, lag, odometry, agreed_ns=agreed, absolute=self._absolute, doubt=doubt)
 
     def window(self) -> Trajectory | None:
@@ -473,7 +474,7 @@ class OnlineSmoother:
         agreed = {} if self._lag is None else self._lag.agreed_ns
         if self._lag is not None:
             for name, stream in self._lag.problem.streams.items():
-                problem.streams[name].scatter = stream.scatter
+                problem.streams[name].scatter, problem.streams[name].leaping = stream.scatter, stream.leaping
         self._lag = Lag(problem, anchor, self._lag_s, guess)
         self._lag.agreed_ns.update(agreed)
         self._book.begin()

@@ -20,6 +20,7 @@ from graphloc.recording import Recording
 from graphloc.solution import Health, SlowEstimate, Solution, SolveStats
 from graphloc.solve._batch import BatchResult, expected_cost
 from graphloc.solve._decide import Verdict
+from graphloc.solve._leaps import LASTS_S, largest_sigma, leaps, leaps_said, told_alone, why_in_doubt
 from graphloc.solve._passes import outliers_cost
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory, bounds_95
@@ -30,7 +31,6 @@ _FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-
 _GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_DEG = 2.5, 25.0, 45.0
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
 _FAR_OFF = 3.0
-_LEAP_M, _LEAP, _FEWEST_PLACES = 3.0, 10.0, 10  # m; times what is usual; fewer do not tell what that is
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3
 _NEAR_BERTH_M = 60.0
@@ -61,7 +61,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     trajectory.cov[:, :3, :3] += left_out(problem.streams)
     since = {s.name: _since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = _stats(problem, result)
-    health, reasons = _health(trajectory, since, _misfit(stats, result))
+    health, reasons = _health(trajectory, since, _misfits(problem, result, stats))
     ledger = _ledger(problem, recording, result.verdicts)
     return Solution(
         datum=problem.datum,
@@ -148,13 +148,31 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where})"
 
 
-def _misfit(stats: SolveStats, result: BatchResult) -> str:
-    """Why no part of the run can be called good; empty where nothing speaks against it."""
+def _misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
+    """Why each state cannot be called good; empty where nothing speaks against it."""
+    stamps_ns, why = problem.timeline.stamps_ns, ""
     if not result.converged:
-        return "the solver did not converge"
-    if result.noise_scale > NO_NOISE or stats.cost > _NO_FIT * max(stats.expected_cost, 1.0):
-        return "the measurements contradict each other"
-    return ""
+        why = "the solver did not converge"
+    elif result.noise_scale > NO_NOISE or stats.cost > _NO_FIT * max(stats.expected_cost, 1.0):
+        why = "the measurements contradict each other"
+    said = [why] * len(stamps_ns)
+    for stream in problem.streams:
+        if not why and stream.left_out is None:  # else the bounds allow for a slow error
+            for at_ns in _leaps(problem, result, stream)[0]:
+                for k in np.flatnonzero(np.abs(stamps_ns - at_ns) < LASTS_S * 1e9):
+                    said[int(k)] = why_in_doubt(stream.name)
+    return said
+
+
+def _leaps(problem: Problem, result: BatchResult, stream: Stream) -> tuple[NDArray[np.int64], Array]:
+    """Stamps and sizes of the leaps of a stream that alone tells the place."""
+    if not told_alone(stream, [s for s in problem.streams if s.row.absolute]):
+        return np.zeros(0, dtype=np.int64), np.zeros(0)
+    places = [stream.row.hint(m, 0.0, problem.datum).p_world_m for m in stream.measurements]
+    told = [(i, p[:2]) for i, p in enumerate(places) if p is not None and np.isfinite(p[:2]).all()]
+    stamps_ns = np.array([stream.measurements[i].stamp_ns for i, _ in told], dtype=np.int64)
+    sigma_m = np.array([largest_sigma(result.verdicts[(stream.number, i)].residual.cov) for i, _ in told])
+    return leaps(stamps_ns, np.array([p for _, p in told]), sigma_m, allowed=stream.left_out is not None)
 
 
 def world_covariance(cov_body: Any, R: Array, lever_m: Array) -> Array:
@@ -212,11 +230,14 @@ def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
     return np.where(np.isfinite(since), since, (first - stamps_ns) * 1e-9)
 
 
-def _health(trajectory: Trajectory, since: dict[str, Array], misfit: str) -> tuple[tuple[Health, ...], tuple[str, ...]]:
+def _health(
+    trajectory: Trajectory, since: dict[str, Array], misfits: Sequence[str]
+) -> tuple[tuple[Health, ...], tuple[str, ...]]:
     assert trajectory.cov is not None
     away = {name: _or_until(s, trajectory.stamps_ns) for name, s in since.items()}
     found = [
-        health_of(cov, {name: float(s[k]) for name, s in away.items()}, misfit) for k, cov in enumerate(trajectory.cov)
+        health_of(cov, {name: float(s[k]) for name, s in away.items()}, misfits[k])
+        for k, cov in enumerate(trajectory.cov)
     ]
     return tuple(health for health, _ in found), tuple(why for _, why in found)
 
@@ -226,7 +247,7 @@ def health_of(cov: Array, away_s: Mapping[str, float], misfit: str = "") -> tupl
 
     Args:
         cov: (6, 6) as in `Trajectory`. away_s: s to where each absolute sensor agrees.
-        misfit: what speaks against all of the run.
+        misfit: what else speaks against it.
     """
     bound_m, _, heading_deg = (float(v) for v in bounds_95(cov[None])[0])
     silent = [name for name, s in away_s.items() if s > _SILENT_S]
@@ -295,30 +316,6 @@ def alone(sensor: str, slow: SlowProcess) -> str:
         f"{sensor}: no second sensor can tell its slow error (multipath) from motion; the bounds allow "
         f"{slow.sigma[0]:.1f} m (1 sigma) for it; slow_error.enabled: false where there is none"
     )
-
-
-def leaps(sensor: str, stamps_ns: NDArray[np.int64], places_m: Array) -> list[str]:
-    """Say where places (N, 2) of one sensor are a leap apart, unlike those before and after: a line, or none.
-
-    Nothing else told the place, so the track went along, and looks as if the IMU were wrong.
-    """
-    if len(stamps_ns) < _FEWEST_PLACES:
-        return []
-    steps, dt = np.diff(places_m, axis=0), np.diff(stamps_ns)
-    off_m = np.linalg.norm(steps[1:-1] - (steps[:-2] + steps[2:]) / 2.0, axis=1)
-    beside = np.maximum(
-        off_m, np.maximum(np.append(off_m[1:], 0.0), np.append(0.0, off_m[:-1]))
-    )  # they feel half of it
-    even = np.maximum(np.maximum(dt[:-2], dt[1:-1]), dt[2:]) < 1.5 * np.median(
-        dt
-    )  # in a silence it may have gone anywhere
-    far = np.flatnonzero(even & (off_m == beside) & (off_m > max(_LEAP_M, _LEAP * float(np.median(off_m)))))
-    if not len(far):
-        return []
-    n = int(far[np.argmax(off_m[far])])
-    where = f"{off_m[n]:.0f} m at {utc_text(int(stamps_ns[n + 2]))}"
-    others = f", and {len(far) - 1} times more" if len(far) > 1 else ""
-    return [f"{sensor}: leaps by {where}{others}: the track follows, and the IMU and the compass may look wrong there"]
 
 
 def disagreeing(sensor: str, weights: Array) -> list[str]:
@@ -391,11 +388,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
                     )
         if stream.left_out is not None:
             warnings.append(alone(stream.name, stream.left_out))
-            places = [stream.row.hint(m, 0.0, problem.datum).p_world_m for m in stream.measurements]
-            stamps_ns = np.array(
-                [m.stamp_ns for m, p in zip(stream.measurements, places, strict=True) if p is not None]
-            )
-            warnings += leaps(stream.name, stamps_ns, np.array([p[:2] for p in places if p is not None]))
+        warnings += leaps_said(stream.name, *_leaps(problem, result, stream), allowed=stream.left_out is not None)
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
         warnings += disagreeing(stream.name, weights)
         if stream.row.false is not None:

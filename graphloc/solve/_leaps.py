@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A receiver that leaps, by multipath or in another mode, where no other sensor tells the place: the track goes along.
+
+Its sigma knows nothing of that: a wrong RTK fix is stated to a centimetre as a right one is. Seen in the places themselves, before
+and after each step: no craft changes its acceleration so fast.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+from graphloc.time import NS_PER_S, utc_text
+
+LASTS_S = 200.0
+"""For so long before and after a leap either side of it may be the wrong one: as a slow error lasts."""
+_LEAP_M, _LEAP, _FEWEST = 3.0, 10.0, 10  # m; times what is usual; fewer do not tell what that is
+_SIGMAS, _JERK_MPS3 = 10.0, 10.0  # of what is stated; a car that brakes at once
+_EVEN = 1.5  # a step longer or shorter by more than this is none as those beside it
+_BURST_S = 1.0  # fixes that are off for no longer are outliers
+_KEPT = 200
+
+
+def told_alone(stream: Any, absolute: Collection[Any]) -> bool:
+    """Return whether nothing but this stream's single places tells where the craft is, and it has no slow error that may leap.
+
+    Args:
+        absolute: the absolute streams of the run.
+    """
+    return len(absolute) == 1 and stream.row.absolute and stream.row.false is None and stream.slow is None
+
+
+def leaps(
+    stamps_ns: NDArray[np.int64], places_m: Array, sigma_m: Array, *, allowed: bool
+) -> tuple[NDArray[np.int64], Array]:
+    """Return stamps (K,) and sizes (K,), m, of steps between places (N, 2) that are a leap, unlike those before and after.
+
+    A fix that is off by itself, or a burst of them, is none: it has not drawn the track along.
+
+    Args:
+        sigma_m: (N,) as stated. allowed: the bounds allow for a slow error; then metres count.
+    """
+    if len(stamps_ns) < _FEWEST:
+        return np.zeros(0, dtype=np.int64), np.zeros(0)
+    steps, dt = np.diff(places_m, axis=0), np.diff(stamps_ns) / NS_PER_S
+    usual_s = float(np.median(dt))
+    # Where stamps tell when a place was measured its step goes by time, where they are those of arrival it does not.
+    by_time = _parts(steps * (usual_s / np.maximum(dt, 1e-9))[:, None])
+    parts = _parts(steps)
+    off_m = np.minimum(np.linalg.norm(parts, axis=1), np.linalg.norm(by_time, axis=1))
+    padded = np.pad(off_m, 1)
+    beside = np.maximum(padded[:-2], padded[2:])  # they feel half of it
+    # Two steps together, beside those before and after: a fix that is off by itself goes there and back.
+    both = np.linalg.norm(steps[1:-2] + steps[2:-1] - steps[:-3] - steps[3:], axis=1)
+    both = np.minimum(np.append(both, np.inf), np.append(np.inf, both))
+    window = np.lib.stride_tricks.sliding_window_view
+    even = (window(dt, 3).max(axis=1) < _EVEN * usual_s) & (window(dt, 3).min(axis=1) * _EVEN > usual_s)
+    # In a silence it may have gone anywhere.
+    least_m = np.full(len(off_m), _LEAP_M)
+    if not allowed:
+        least_m = np.minimum(least_m, _JERK_MPS3 * usual_s**3 / 2.0)
+        least_m = np.maximum(least_m, _SIGMAS * window(sigma_m, 4).max(axis=1))
+    least_m = np.maximum(least_m, _LEAP * float(np.median(off_m)))
+    far = np.flatnonzero(even & (off_m >= beside) & (off_m > least_m) & (both > off_m / 2.0))
+    far = far[(far > 0) & (far < len(off_m) - 1)]  # beside an end a fix that is off may look like half a leap
+    near = np.abs(np.subtract.outer(stamps_ns[far], stamps_ns[far])) <= _BURST_S * NS_PER_S
+    back = np.linalg.norm(parts[far][:, None] + parts[far][None], axis=2) < off_m[far] / 2.0
+    far = far[~(near & back).any(axis=1)]
+    return stamps_ns[far + 2], off_m[far]
+
+
+def _parts(steps_m: Array) -> Array:
+    """How each step (N, 2) but the first and last parts from the mean of those beside it (N - 2, 2)."""
+    return np.asarray(steps_m[1:-1] - (steps_m[:-2] + steps_m[2:]) / 2.0)
+
+
+def leaps_said(sensor: str, stamps_ns: NDArray[np.int64], off_m: Array, *, allowed: bool) -> list[str]:
+    """Return a line on what `leaps` found, or none."""
+    if not len(stamps_ns):
+        return []
+    n = int(np.argmax(off_m))
+    size = f"{off_m[n]:.0f}" if off_m[n] >= 1.0 else f"{off_m[n]:.1g}"
+    others = f", and {len(off_m) - 1} times more" if len(off_m) > 1 else ""
+    bounds = "" if allowed else "; the bounds do not allow for it: its slow_error is switched off"
+    where = f"{size} m at {utc_text(int(stamps_ns[n]))}{others}"
+    said = f"{sensor}: leaps by {where}: the track follows, and the IMU and the compass may look wrong there"
+    return [f"{said}{bounds}"]
+
+
+def largest_sigma(cov: Array) -> float:
+    """Return the largest sigma of the first two axes."""
+    return float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+
+
+def why_in_doubt(sensor: str) -> str:
+    """Say why a pose near a leap is not good."""
+    return f"{sensor} leaps, and nothing else tells the place"
+
+
+class LeapWatch:
+    """The same of one receiver as its fixes come: a leap is seen a second later, three fixes at least."""
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[int, Array, float]] = deque(maxlen=_KEPT)
+        self._judged_ns = 0
+        self._last_ns: int | None = None
+
+    def note(self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed: bool) -> tuple[NDArray[np.int64], Array]:
+        """Take in a fix; one that is late is passed over. Return as `leaps` what it shows; of one after another the first only."""
+        none = np.zeros(0, dtype=np.int64), np.zeros(0)
+        if self._seen and stamp_ns <= self._seen[-1][0]:
+            return none
+        self._seen.append((stamp_ns, np.array(place_m), sigma_m))
+        if len(self._seen) < _FEWEST:
+            return none
+        stamps_ns, sigmas_m = np.array([at for at, _, _ in self._seen]), np.array([s for _, _, s in self._seen])
+        at_ns, off_m = leaps(stamps_ns, np.array([p for _, p, _ in self._seen]), sigmas_m, allowed=allowed)
+        until_ns = min(stamps_ns[-3], stamp_ns - int(_BURST_S * NS_PER_S))  # a later one may yet be a burst
+        new = (at_ns > self._judged_ns) & (at_ns <= until_ns)
+        self._judged_ns = max(int(until_ns), self._judged_ns)
+        if not new.any():
+            return none
+        again = self.doubtful(stamp_ns)
+        self._last_ns = int(at_ns[new][-1])
+        return none if again else (at_ns[new], off_m[new])
+
+    def doubtful(self, stamp_ns: int) -> bool:
+        """Return whether it has leapt lately."""
+        return self._last_ns is not None and 0 <= stamp_ns - self._last_ns < LASTS_S * NS_PER_S
