@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from graphloc import app
+from graphloc.eval.calibrate import Calibration, Suggestion
 from graphloc.eval.ekf import FilterResult
 from graphloc.eval.metrics import Table
 from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verdict
@@ -52,6 +53,25 @@ def moved(track: Trajectory, share: float, by_m: float) -> Trajectory:
     p = track.p_world_m.copy()
     p[: round(share * len(p)), 0] += by_m
     return replace(track, p_world_m=p, v_world_mps=None)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "late_s", "said"),
+    [("gnss", 0.9, True), ("gnss", 0.3, False), ("compass", 0.9, False)],  # a compass tells no place
+)
+def test_stamps_that_the_bounds_know_nothing_of_are_said(
+    data: ReportData, sensor: str, late_s: float, *, said: bool
+) -> None:
+    found = Suggestion(
+        sensor=sensor, key=f"sensors.{sensor}.time_offset_s", unit="s", configured=0.1, suggested=0.1 - late_s, sigma=0.01, z=-30.0,
+        evidence="", action="",
+    )  # fmt: skip
+    track = data.solution.trajectory
+    going = replace(track, v_world_mps=np.tile([0.0, 4.0, 0.0], (len(track), 1)))  # bounds: 2.45 m of 1 m sigma
+    solution = replace(data.solution, trajectory=going)
+    (offline, _) = verdict(replace(data, solution=solution, calibration=Calibration(suggestions=(found,)))).tracks
+    assert offline.trust is (Trust.WITH_CARE if said else Trust.YES)
+    assert any(f"up to {4.0 * late_s:.2f} m behind or ahead" in r.text for r in offline.reasons) == said
 
 
 @pytest.mark.parametrize(

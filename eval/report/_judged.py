@@ -23,6 +23,7 @@ _FAR_OFF = 3.0  # cost over its expectation; `degraded` from there on
 _TOO_SURE = 4.0  # NEES: errors are 1.4 times what the covariance says
 # Of the time in which online's 95 % bounds hold the offline position: that one is better informed, so honest ones do for 95 %.
 _HOLDS_OFFLINE = 0.9
+_PLACES = ("gnss", "pose", "aerial")
 _WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
 
 
@@ -77,8 +78,8 @@ def worst(of: Iterator[Trust]) -> Trust:
 def judged(data: ReportData, solution: Solution) -> Judged:
     """Judge a track of a run."""
     reasons = (
-        *_bounds(data, solution), *_beside(data, solution), *_from_offline(data, solution), *_compared(data, solution),
-        *_solved(data, solution),
+        *_bounds(data, solution), *_late(data, solution), *_beside(data, solution), *_from_offline(data, solution),
+        *_compared(data, solution), *_solved(data, solution),
     )  # fmt: skip
     return Judged(name=solution.name, accuracy=_accuracy(data, solution.name), reasons=reasons)
 
@@ -106,6 +107,22 @@ def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
     if headed is not None:
         trust = Trust.WITH_CARE if headed < _COVERED else Trust.YES
         yield Reason(trust=trust, text=f"Its heading bounds held the truth for {headed:.0%} of the time.")
+
+
+def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """Places that are read at another time than they were measured: the track is ahead or behind, and no bound knows it."""
+    track = solution.trajectory
+    if data.calibration is None or track.cov is None or track.v_world_mps is None:
+        return
+    speed_mps, bound_m = _rms(_away(track.v_world_mps)), float(np.median(bounds_95(track.cov)[:, 0]))
+    for found in data.calibration.suggestions:
+        off_s = abs(found.suggested - found.configured)
+        if found.unit == "s" and data.config.sensors[found.sensor].kind in _PLACES and off_s * speed_mps > bound_m:
+            yield Reason(
+                trust=Trust.WITH_CARE,
+                text=f"{found.sensor} and the IMU are {off_s:.2g} s apart (Calibration, below): at this run's {speed_mps:.1f} m/s the "
+                f"track is up to {off_s * speed_mps:.2f} m behind or ahead, and its bounds, {bound_m:.2f} m (median), know nothing of it.",
+            )
 
 
 def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
