@@ -79,6 +79,12 @@ def test_one_that_moves_otherwise_may_be_right() -> None:
     assert parted(lambda t, n: 0.2 * n - 4.0 * V * max(t - 20.0, 0.0), 5.0 * V) == []
 
 
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+def test_one_that_goes_as_fast_another_way_may_be_right_however_noisy(hz: float) -> None:
+    """The estimate turned about, as where the IMU is mounted the other way round than is configured."""
+    assert parted(lambda t, n: 0.5 * n - 2.0 * V * max(t - 20.0, 0.0), -V, hz=hz, sigma_m=2.0, until_s=120.0) == []
+
+
 def test_at_the_start_it_may_be_the_estimate_that_is_wrong() -> None:
     assert parted(lambda t, n: 0.2 * n - V * t * (t < 8.0), V, until_s=16.0) == []
 

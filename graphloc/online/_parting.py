@@ -77,6 +77,8 @@ class Parting:
         if self._along_s is None and speed < 0.5 * least:
             self._along_s = at_s
         along = self._along_s is not None and at_s - self._along_s > _ALONG_S
+        # Few fixes, or noisy ones, tell one that stands from none: it may as well move as the vessel does.
+        stands &= float(np.linalg.norm(moves)) < max(_STANDS_MPS, _SHARE * float(np.linalg.norm(v_mps)))
         self.parted = along and stands and speed > least and rms < _LINE * speed * float(t[-1] - t[0])
         if self.parted:  # without it the estimate is another one
             self._parted_s = at_s
