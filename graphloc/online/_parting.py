@@ -65,9 +65,11 @@ class Parting:
         if len(t) < _FEWEST or t[-1] - t[0] < PARTING_S:
             return
         told, off = (np.array([row[k] for row in self._seen]) for k in (1, 2))
-        (moves, noise), (parts, steady) = _slope(t[late := t > t[-1] - 0.5 * PARTING_S], told[late]), _slope(t, off)
+        parts, steady = _slope(t, off)
         left = off - off.mean(axis=0) - np.outer(t - t.mean(), parts)
         rms, speed = float(np.sqrt((left**2).sum(axis=1).mean())), float(np.linalg.norm(parts))
+        late = t > t[-1] - (0.5 if self.parted else 1.0) * PARTING_S  # it moves along: to be seen soon
+        moves, noise = _slope(t[late], told[late])
         stands = float(np.linalg.norm(moves)) < _STANDS_MPS + _SIGMAS * sigma_m * noise
         least = max(_PARTS_MPS, _SHARE * float(np.linalg.norm(v_mps)))
         if self.parted:  # that the velocity is known ever less without it does not make it move
