@@ -145,3 +145,53 @@ def test_it_is_told_beforehand_where_the_solver_linearises_anew() -> None:
             assert window.linearised_at(keys.pose(k)).equals(at, 1e-9)
             moved += not was.equals(at, 1e-9)
     assert moved > 20
+
+
+def test_a_step_from_the_oldest_pose_costs_what_it_costs_the_solver() -> None:
+    """Places come that lie aside and turned: as dear as to a graph that forgets nothing. The solver holds the oldest pose as it was."""
+    params = gtsam.PreintegrationParams.MakeSharedU(9.81)
+    params.setAccelerometerCovariance(1e-6 * np.eye(3))
+    params.setGyroscopeCovariance(1e-8 * np.eye(3))
+    params.setIntegrationCovariance(1e-10 * np.eye(3))
+    pim = gtsam.PreintegratedImuMeasurements(params, gtsam.imuBias.ConstantBias())
+    for _ in range(20):
+        pim.integrateMeasurement(np.array([0.0, 0.0, 9.81]), np.array([0.0, 0.0, 0.02]), 1.0 / HZ / 20.0)
+    loose = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01, 0.01, 0.3, 1.0, 1.0, 0.5]))
+    sure = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05]))
+    bias, at = keys.bias(0), gtsam.NavState(gtsam.Pose3(), np.array([1.0, 0.0, 0.0]))
+    window, whole, guess = Window(LAG_S), gtsam.NonlinearFactorGraph(), gtsam.Values()
+
+    def add(*factors: Any) -> None:
+        window.add(factors)
+        for factor in factors:
+            whole.add(factor)
+
+    for k in range(STEPS):
+        at = pim.predict(at, gtsam.imuBias.ConstantBias()) if k else at
+        for key, value in ((keys.pose(k), at.pose()), (keys.velocity(k), at.velocity())):
+            window.guess(key, value, float(np.ceil(k / HZ)))
+            guess.insert(key, value)
+        if k:
+            add(gtsam.ImuFactor(keys.pose(k - 1), keys.velocity(k - 1), keys.pose(k), keys.velocity(k), bias, pim))
+        else:
+            window.guess(bias, gtsam.imuBias.ConstantBias(), 0.0)
+            guess.insert(bias, gtsam.imuBias.ConstantBias())
+            exact, slow = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6), gtsam.noiseModel.Isotropic.Sigma(3, 0.5)
+            add(
+                gtsam.PriorFactorConstantBias(bias, gtsam.imuBias.ConstantBias(), exact),
+                gtsam.PriorFactorPose3(keys.pose(0), at.pose(), loose),
+                gtsam.PriorFactorVector(keys.velocity(0), at.velocity(), slow),
+            )
+        window.touch(bias, float(np.ceil(k / HZ)))
+        window.commit()
+    aside = gtsam.Pose3(gtsam.Rot3.Yaw(0.1), np.array([0.0, 1.0, 0.0]))
+    before = window.error()
+    add(
+        *(
+            gtsam.PriorFactorPose3(keys.pose(k), guess.atPose3(keys.pose(k)).compose(aside), sure)
+            for k in range(STEPS - 15, STEPS)
+        )
+    )
+    window.settle(5)
+    cost = whole.error(gtsam.LevenbergMarquardtOptimizer(whole, guess).optimize())
+    assert window.error() - before == pytest.approx(cost, abs=0.5)

@@ -238,7 +238,27 @@ class Window:
 
     def error(self, without: Iterable[Held] = ()) -> float:
         """Return the cost of the graph at the estimate (half of the weighted squares), less that of some factors."""
-        return float(self._solver.getFactorsUnsafe().error(self.values)) - sum(self.errors_of(without))
+        graph = self._solver.getFactorsUnsafe()
+        return float(graph.error(self.values)) - self._bent(graph) - sum(self.errors_of(without))
+
+    def _bent(self, graph: gtsam.NonlinearFactorGraph) -> float:
+        """What steps from the oldest poses seem to cost beyond what they cost in the solver, which never linearises these anew.
+
+        Half a metre from where they were linearised the IMU's own step from there costs tens: whatever moves the end of the lag
+        would be refused.
+        """
+        solver = self._solver
+        held, slots = solver.getFixedVariables(), solver.getVariableIndex()
+        oldest = [key for key in self._alive if is_pose(key) and held.count(key)]
+        point, step = solver.getLinearizationPoint(), solver.getDelta()
+        steps = [graph.at(slot) for slot in {slot for key in oldest for slot in slots.at(key)}]
+        # A linear factor costs the same either way; a robust one is another loss where it is linear.
+        bent = [
+            f
+            for f in steps
+            if isinstance(f, gtsam.NoiseModelFactor) and not isinstance(f.noiseModel(), gtsam.noiseModel.Robust)
+        ]
+        return float(sum(f.error(self.values) - f.linearize(point).error(step) for f in bent))
 
     def errors_of(self, parts: Iterable[Held]) -> list[float]:
         """Return the share of the cost that committed factors have, together as they went in."""
