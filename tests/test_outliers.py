@@ -142,6 +142,9 @@ def test_a_receiver_that_is_believed_leaps_by_less_than_metres() -> None:
     way, sigma_m = rtk(np.zeros(len(t)))
     assert not len(leaps(late_ns, way, sigma_m, allowed=False)[0])
     assert not len(leaps(late_ns, way + np.outer(late_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
+    waits_ns = RTK_NS + 80_000_000 * (t >= 30.0)  # one step takes longer: by its stamps, or in truth
+    assert not len(leaps(waits_ns, way, sigma_m, allowed=False)[0])
+    assert not len(leaps(waits_ns, way + np.outer(waits_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
 
 
 def test_a_leap_is_seen_as_it_comes_and_said_once_for_long() -> None:
@@ -149,6 +152,7 @@ def test_a_leap_is_seen_as_it_comes_and_said_once_for_long() -> None:
     watch, said = LeapWatch(), []
     for at_ns, place_m, sigma_m in zip(RTK_NS.tolist(), *rtk(0.6 * ((t >= 20.0) & (t < 40.0))), strict=True):
         said += watch.note(at_ns, place_m, sigma_m, allowed=False)[0].tolist()
+        assert not len(watch.note(at_ns - 300_000_000, place_m + 5.0, sigma_m, allowed=False)[0])  # late
         assert watch.doubtful(at_ns) == (at_ns >= 21_000_000_000)
     assert said == [20_000_000_000]
     assert not watch.doubtful(300_000_000_000)
