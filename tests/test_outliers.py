@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from graphloc import app
-from graphloc.config import KernelConfig, SlowErrorConfig
+from graphloc.config import KernelConfig, SlowErrorConfig, VesselConfig
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.graph import Residual
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
+from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.solution import Health
 from graphloc.solve._decide import _by_kernel
@@ -97,6 +98,24 @@ def test_a_receiver_that_leaps_is_said(
     assert ", and 1 times more:" in line
 
 
+@pytest.mark.parametrize("allowed", [True, False])
+@pytest.mark.parametrize("every_s", [2.0, 5.0])
+@pytest.mark.parametrize(("speed_mps", "turn_radps"), [(2.0, 0.5), (8.0, 0.4), (15.0, 0.2)])
+def test_a_turn_between_fixes_that_are_seconds_apart_is_no_leap(
+    speed_mps: float, turn_radps: float, every_s: float, *, allowed: bool
+) -> None:
+    """Every quarter of a circle was one, and health degraded for minutes."""
+    t = np.arange(0.0, 600.0, 0.01)
+    course = np.cumsum(turn_radps * 0.01 * (t % 100.0 < np.pi / 2.0 / turn_radps))
+    way = np.cumsum(0.01 * speed_mps * np.column_stack([np.cos(course), np.sin(course)]), axis=0)
+    told = slice(0, None, int(100 * every_s))
+    places_m = way[told] + np.random.default_rng(0).normal(0.0, 0.01, way[told].shape)
+    stamps_ns, sigma_m = np.round(t[told] * 1e9).astype(np.int64), np.full(len(places_m), 0.015)
+    assert not len(leaps(stamps_ns, places_m, sigma_m, allowed=allowed)[0])
+    leapt = places_m + np.outer(t[told] >= 350.0, [0.0, 5.0 * every_s**2])
+    assert len(leaps(stamps_ns, leapt, sigma_m, allowed=allowed)[0]) == 1
+
+
 RTK_NS = np.arange(0, 60_000_000_000, 200_000_000)
 RTK_S: Array = np.linspace(0.0, 60.0, len(RTK_NS), endpoint=False)
 
@@ -123,6 +142,9 @@ def test_a_receiver_that_is_believed_leaps_by_less_than_metres() -> None:
     way, sigma_m = rtk(np.zeros(len(t)))
     assert not len(leaps(late_ns, way, sigma_m, allowed=False)[0])
     assert not len(leaps(late_ns, way + np.outer(late_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
+    waits_ns = RTK_NS + 80_000_000 * (t >= 30.0)  # one step takes longer: by its stamps, or in truth
+    assert not len(leaps(waits_ns, way, sigma_m, allowed=False)[0])
+    assert not len(leaps(waits_ns, way + np.outer(waits_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
 
 
 def test_a_leap_is_seen_as_it_comes_and_said_once_for_long() -> None:
@@ -130,13 +152,14 @@ def test_a_leap_is_seen_as_it_comes_and_said_once_for_long() -> None:
     watch, said = LeapWatch(), []
     for at_ns, place_m, sigma_m in zip(RTK_NS.tolist(), *rtk(0.6 * ((t >= 20.0) & (t < 40.0))), strict=True):
         said += watch.note(at_ns, place_m, sigma_m, allowed=False)[0].tolist()
+        assert not len(watch.note(at_ns - 300_000_000, place_m + 5.0, sigma_m, allowed=False)[0])  # late
         assert watch.doubtful(at_ns) == (at_ns >= 21_000_000_000)
     assert said == [20_000_000_000]
     assert not watch.doubtful(300_000_000_000)
 
 
-def test_a_run_beside_a_believed_receiver_that_leaps_is_not_called_good() -> None:
-    """Its bound was 2 cm, and its health good, where it was 0.6 m off."""
+def believed(off_m: float, last_s: float) -> tuple[Recording, Recording, VesselConfig]:
+    """A run whose place one receiver tells, good to 1 cm, and the same where it is off from 20 s on."""
     scenario = Scenario(
         path="loops", duration_s=45.0, pose_hz=0.0, compass_hz=5.0, gnss_hz=5.0, gnss_sigma_m=0.01, gnss_reported_sigma_m=0.02
     )  # fmt: skip
@@ -147,21 +170,38 @@ def test_a_run_beside_a_believed_receiver_that_leaps_is_not_called_good() -> Non
     begin_ns = int(run.truth.stamps_ns[0])
 
     def struck(m: Measurement) -> Measurement:
-        if not isinstance(m, GnssPosition) or not 20.0 <= (m.stamp_ns - begin_ns) * 1e-9 < 35.0:
+        if not isinstance(m, GnssPosition) or not 20.0 <= (m.stamp_ns - begin_ns) * 1e-9 < last_s:
             return m
-        return replace(m, position=Geodetic(m.position[0] + 0.6 / 111_000.0, *m.position[1:]))
+        return replace(m, position=Geodetic(m.position[0] + off_m / 111_000.0, *m.position[1:]))
 
     wrong = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
-    usual, leapt = (app.smooth_recording(of, config).solution for of in (run.recording, wrong))
+    return run.recording, wrong, config
+
+
+def test_a_run_beside_a_believed_receiver_that_leaps_is_not_called_good() -> None:
+    """Its bound was 2 cm, and its health good, where it was 0.6 m off."""
+    right, wrong, config = believed(0.6, last_s=35.0)
+    usual, leapt = (app.smooth_recording(of, config).solution for of in (right, wrong))
     assert not any("leaps" in line for line in usual.stats.warnings)
     assert "gnss leaps, and nothing else tells the place" not in usual.health_reason
     assert any(line.startswith("gnss: leaps by 0.") for line in leapt.stats.warnings)
     assert Health.GOOD in usual.health
     assert Health.GOOD not in leapt.health
-    usual_live, live = (replay(of, config) for of in (run.recording, wrong))
+    usual_live, live = (replay(of, config) for of in (right, wrong))
     assert not any("leaps" in line for line in usual_live.solution.stats.warnings)
     assert any("gnss: leaps by 0." in line for line in live.solution.stats.warnings)
     assert live.solution.health[-1] != Health.GOOD == usual_live.solution.health[-1]
+
+
+def test_a_leap_is_not_forgotten_where_it_has_online_start_anew() -> None:
+    """Off by 100 m it was refused for 15 s, and then called good where it was 100 m off."""
+    _, wrong, config = believed(100.0, last_s=np.inf)
+    live = replay(wrong, config).solution
+    assert any("starts anew" in line for line in live.stats.warnings)
+    late = live.trajectory.stamps_ns > live.trajectory.stamps_ns[0] + 20_000_000_000
+    assert late[-1]
+    assert Health.GOOD in [h for h, k in zip(live.health, late, strict=True) if not k]
+    assert Health.GOOD not in [h for h, k in zip(live.health, late, strict=True) if k]
 
 
 def test_a_receiver_alone_that_leaps_is_said_in_the_run() -> None:

@@ -41,6 +41,7 @@ from graphloc.online._start import Started, try_start
 from graphloc.online._turned import Turned
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
+from graphloc.solve._leaps import LeapWatch
 from graphloc.solve._solution import alone
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
@@ -95,6 +96,7 @@ class OnlineSmoother:
         self._lag: Lag | None = None
         self._odometry: Odometry | None = None
         self._agreed_ns: dict[str, int] = {}
+        self._leaping: dict[str, LeapWatch] = {}  # a start anew puts no leap right
         self._heights_m: Mapping[str, float] = {}
         self._doubt = ""
         self._noise = ImuNoise(adapt=bool(imu) and imu[self._imu_name].adapt_noise)
@@ -227,7 +229,7 @@ class OnlineSmoother:
     def _forget_clock(self, back_s: float, stamp_ns: int) -> None:
         """Start anew by a clock that was set back."""
         self._restart(f"the IMU's clock was set back by {back_s:.1f} s")
-        self._agreed_ns = {}
+        self._agreed_ns, self._leaping = {}, {}
         if self._odometry is not None:
             self._odometry.stamp_ns = stamp_ns
 
@@ -474,7 +476,9 @@ class OnlineSmoother:
         agreed = {} if self._lag is None else self._lag.agreed_ns
         if self._lag is not None:
             for name, stream in self._lag.problem.streams.items():
-                problem.streams[name].scatter, problem.streams[name].leaping = stream.scatter, stream.leaping
+                problem.streams[name].scatter = stream.scatter
+        for name, stream in problem.streams.items():
+            stream.leaping = self._leaping.setdefault(name, stream.leaping)
         self._lag = Lag(problem, anchor, self._lag_s, guess)
         self._lag.agreed_ns.update(agreed)
         self._book.begin()

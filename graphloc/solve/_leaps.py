@@ -19,7 +19,8 @@ from graphloc.time import NS_PER_S, utc_text
 
 LASTS_S = 200.0
 """For so long before and after a leap either side of it may be the wrong one: as a slow error lasts."""
-_LEAP_M, _LEAP, _FEWEST = 3.0, 10.0, 10  # m; times what is usual; fewer do not tell what that is
+# m, as far as 4 m/s^2 that come and go within three seconds; times what is usual; fewer do not tell what that is.
+_LEAP_M, _LEAP, _FEWEST = 3.0, 10.0, 10
 _SIGMAS, _JERK_MPS3 = 10.0, 10.0  # of what is stated; a car that brakes at once
 _EVEN = 1.5  # a step longer or shorter by more than this is none as those beside it
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
@@ -60,8 +61,8 @@ def leaps(
     both = np.minimum(np.append(both, np.inf), np.append(np.inf, both))
     window = np.lib.stride_tricks.sliding_window_view
     even = (window(dt, 3).max(axis=1) < _EVEN * usual_s) & (window(dt, 3).min(axis=1) * _EVEN > usual_s)
-    # In a silence it may have gone anywhere.
-    least_m = np.full(len(off_m), _LEAP_M)
+    # In a silence it may have gone anywhere; where fixes are seconds apart, any turn and any stop is metres off.
+    least_m = np.full(len(off_m), _LEAP_M * max(usual_s, 1.0) ** 2)
     if not allowed:
         least_m = np.minimum(least_m, _JERK_MPS3 * usual_s**3 / 2.0)
         least_m = np.maximum(least_m, _SIGMAS * window(sigma_m, 4).max(axis=1))
