@@ -147,6 +147,18 @@ def test_a_receiver_that_is_believed_leaps_by_less_than_metres() -> None:
     assert not len(leaps(waits_ns, way + np.outer(waits_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
 
 
+@pytest.mark.parametrize("hz", [2.0, 3.0, 5.0])
+def test_a_car_that_brakes_in_an_emergency_does_not_leap(hz: float) -> None:
+    """8 m/s^2, built up at 30 m/s^3, until it stands; 30 times in ten minutes."""
+    t = np.arange(0.0, 600.0, 0.001)
+    accel = np.clip(30.0 * (t % 20.0 - 10.0), 0.0, 8.0) * (t % 20.0 < 12.5) - 20.0 / 10.0 * (t % 20.0 < 10.0)
+    speed = np.maximum(-np.cumsum(accel - accel.mean()) * 0.001, 0.0)
+    told = np.round(np.arange(0.0, 600.0, 1.0 / hz) * 1000.0).astype(int)
+    way = np.outer(np.cumsum(speed)[told] * 0.001, [1.0, 0.0])
+    way += np.random.default_rng(0).normal(0.0, 0.005, way.shape)
+    assert not len(leaps(told * 1_000_000, way, np.full(len(told), 0.005), allowed=False)[0])
+
+
 def test_a_leap_is_seen_as_it_comes_and_said_once_for_long() -> None:
     t = RTK_S
     watch, said = LeapWatch(), []

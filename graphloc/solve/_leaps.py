@@ -2,7 +2,7 @@
 """A receiver that leaps, by multipath or in another mode, where no other sensor tells the place: the track goes along.
 
 Its sigma knows nothing of that: a wrong RTK fix is stated to a centimetre as a right one is. Seen in the places themselves, before
-and after each step: no craft changes its acceleration so fast.
+and after each step: no craft changes its acceleration by so much at once.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LASTS_S = 200.0
 """For so long before and after a leap either side of it may be the wrong one: as a slow error lasts."""
 # m, as far as 4 m/s^2 that come and go within three seconds; times what is usual; fewer do not tell what that is.
 _LEAP_M, _LEAP, _FEWEST = 3.0, 10.0, 10
-_SIGMAS, _JERK_MPS3 = 10.0, 10.0  # of what is stated; a car that brakes at once
+_SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # of what is stated; a car that brakes in an emergency, and then stands
 _EVEN = 1.5  # a step longer or shorter by more than this is none as those beside it
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
 _KEPT = 200
@@ -64,7 +64,7 @@ def leaps(
     # In a silence it may have gone anywhere; where fixes are seconds apart, any turn and any stop is metres off.
     least_m = np.full(len(off_m), _LEAP_M * max(usual_s, 1.0) ** 2)
     if not allowed:
-        least_m = np.minimum(least_m, _JERK_MPS3 * usual_s**3 / 2.0)
+        least_m = np.minimum(least_m, _BRAKES_MPS2 * usual_s**2 / 2.0)
         least_m = np.maximum(least_m, _SIGMAS * window(sigma_m, 4).max(axis=1))
     least_m = np.maximum(least_m, _LEAP * float(np.median(off_m)))
     far = np.flatnonzero(even & (off_m >= beside) & (off_m > least_m) & (both > off_m / 2.0))
