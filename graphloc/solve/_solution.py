@@ -34,6 +34,7 @@ _FAR_OFF = 3.0
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3
 _NEAR_BERTH_M = 60.0
+Leaps = tuple[NDArray[np.int64], Array]  # stamps and sizes
 NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
 
 
@@ -60,8 +61,9 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     assert trajectory.cov is not None
     trajectory.cov[:, :3, :3] += left_out(problem.streams)
     since = {s.name: _since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
-    stats = _stats(problem, result)
-    health, reasons = _health(trajectory, since, _misfits(problem, result, stats))
+    leapt = {s.name: _leaps(problem, result, s) for s in problem.streams}
+    stats = _stats(problem, result, leapt)
+    health, reasons = _health(trajectory, since, _misfits(problem, result, stats, leapt))
     ledger = _ledger(problem, recording, result.verdicts)
     return Solution(
         datum=problem.datum,
@@ -148,7 +150,7 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where})"
 
 
-def _misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
+def _misfits(problem: Problem, result: BatchResult, stats: SolveStats, leapt: Mapping[str, Leaps]) -> list[str]:
     """Why each state cannot be called good; empty where nothing speaks against it."""
     stamps_ns, why = problem.timeline.stamps_ns, ""
     if not result.converged:
@@ -158,13 +160,13 @@ def _misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[s
     said = [why] * len(stamps_ns)
     for stream in problem.streams:
         if not why and stream.left_out is None:  # else the bounds allow for a slow error
-            for at_ns in _leaps(problem, result, stream)[0]:
+            for at_ns in leapt[stream.name][0]:
                 for k in np.flatnonzero(np.abs(stamps_ns - at_ns) < LASTS_S * 1e9):
                     said[int(k)] = why_in_doubt(stream.name)
     return said
 
 
-def _leaps(problem: Problem, result: BatchResult, stream: Stream) -> tuple[NDArray[np.int64], Array]:
+def _leaps(problem: Problem, result: BatchResult, stream: Stream) -> Leaps:
     """Stamps and sizes of the leaps of a stream that alone tells the place."""
     if not told_alone(stream, [s for s in problem.streams if s.row.absolute]):
         return np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -348,7 +350,7 @@ def refused_together(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, 
     ]
 
 
-def _stats(problem: Problem, result: BatchResult) -> SolveStats:
+def _stats(problem: Problem, result: BatchResult, leapt: Mapping[str, Leaps]) -> SolveStats:
     expected = expected_cost(problem, result.verdicts)
     warnings = list(problem.warnings)
     if not result.converged:
@@ -388,7 +390,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
                     )
         if stream.left_out is not None:
             warnings.append(alone(stream.name, stream.left_out))
-        warnings += leaps_said(stream.name, *_leaps(problem, result, stream), allowed=stream.left_out is not None)
+        warnings += leaps_said(stream.name, *leapt[stream.name], allowed=stream.left_out is not None)
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
         warnings += disagreeing(stream.name, weights)
         if stream.row.false is not None:
