@@ -99,6 +99,7 @@ def slow(config: GnssConfig) -> SlowProcess | None:
         sigma=np.array([s.horizontal_sigma_m, s.horizontal_sigma_m, s.vertical_sigma_m]),
         time_constant_s=np.full(3, s.time_constant_s),
         jumps=s.jumps,
+        far=("east", "north") if s.jumps else (),
         needs_company=s.enabled is None,
     )
 

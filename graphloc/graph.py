@@ -140,7 +140,7 @@ class SlowProcess:
         name: for outputs. offset: what its constants are together, where it has others beside them. axes: k names. units: k of them. scale: (k,) from the state's units to these.
         sigma: (k,) standing size. time_constant_s: (k,) correlation time; inf for a constant.
         no_tails: axes of constants that are never far from zero; a mount may be turned by any angle.
-        jumps: put a robust loss on its steps.
+        jumps: put a robust loss on its steps. far: axes that together may stand much farther off than sigma; tails of their prior.
         needs_company: leave it out where no second sensor can tell it from motion; its size is then
             added to the bounds.
     """
@@ -154,6 +154,7 @@ class SlowProcess:
     offset: str = ""
     no_tails: tuple[str, ...] = ()
     jumps: bool = False
+    far: tuple[str, ...] = ()
     needs_company: bool = False
 
 

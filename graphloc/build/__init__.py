@@ -11,7 +11,7 @@ solution is moved to the body's origin at the end (`graphloc.solve`).
 """
 
 from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state, state_of
-from graphloc.build._chains import CHAIN_END, CONSTANT_TAILS, JUMP, bias_step, slow_begin, slow_end, slow_step
+from graphloc.build._chains import CONSTANT_TAILS, JUMP, bias_step, closing_variance, slow_begin, slow_end, slow_step
 from graphloc.build._graph import Decisions, Past, StartPrior, build_graph, state_keys
 from graphloc.build._problem import (
     Mounts,
@@ -25,7 +25,6 @@ from graphloc.build._problem import (
 )
 
 __all__ = [
-    "CHAIN_END",
     "CONSTANT_TAILS",
     "JUMP",
     "Carry",
@@ -40,6 +39,7 @@ __all__ = [
     "bias_step",
     "bridged",
     "build_graph",
+    "closing_variance",
     "company_of",
     "constant_keys",
     "make_problem",

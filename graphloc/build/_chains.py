@@ -4,7 +4,8 @@
 A slow state is a chain of first-order Gauss-Markov steps, from native factors. Its path measure,
 exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both ends, is a random walk with a
 standing prior at each node: exact as the node period goes to 0, and the steps stay free for a robust loss (a
-`JacobianFactor` with the decay in it takes none).
+`JacobianFactor` with the decay in it takes none). So do the priors: what may stand far off (`SlowProcess.far`) has
+tails, w = 1 / (1 + x^2 / (F s)^2) on all of its part of the measure, so that of two levels one is the usual one.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.config import KernelConfig
@@ -22,9 +24,10 @@ from graphloc.graph import InertialLink, SlowProcess
 
 # A step of a slow state is believed to be a jump beyond this many sigmas.
 JUMP = KernelConfig(kind="cauchy", scale=2.0)
+_FAR = 2.0  # sigmas from which on an error that may stand far off is believed to
 CONSTANT_TAILS = 9.0  # of a constant's prior: squared sigmas that double its variance
 _NOTHING = 1e6  # sigmas: a prior that says nothing
-CHAIN_END = 2.0  # times its variance: the prior at either end of a slow chain
+_CHAIN_END = 2.0  # times its variance: the prior at either end of a slow chain
 
 
 def bias_step(links: InertialLink, j: int, dt_s: float) -> Any:
@@ -33,33 +36,63 @@ def bias_step(links: InertialLink, j: int, dt_s: float) -> Any:
     return gtsam.BetweenFactorConstantBias(keys.bias(j), keys.bias(j + 1), gtsam.imuBias.ConstantBias(), model)
 
 
-def slow_begin(slow: SlowProcess, key: int, known: Array) -> Any:
-    """Return the prior of a chain's first node; `known`: its estimate, for the tails of what is constant."""
+def slow_begin(slow: SlowProcess, key: int, known: Array, *, jumps: bool = True) -> Iterator[Any]:
+    """Yield the priors of a chain's first node; `known`: its estimate, for the tails of what is constant."""
     constant = ~np.isfinite(slow.time_constant_s)
-    # Why tails: see `_add_constants` in `_graph.py`.
-    tails = np.sqrt(1.0 + (known / slow.sigma) ** 2 / CONSTANT_TAILS)
-    tails[[axis in slow.no_tails for axis in slow.axes]] = 1.0
-    ends = slow.sigma * np.where(constant, tails, np.sqrt(CHAIN_END))
-    return gtsam.PriorFactorVector(key, np.zeros(len(ends)), gtsam.noiseModel.Diagonal.Sigmas(ends))
+    if constant.any():
+        # Why tails: see `_add_constants` in `_graph.py`.
+        tails = np.sqrt(1.0 + (known / slow.sigma) ** 2 / CONSTANT_TAILS)
+        tails[[axis in slow.no_tails for axis in slow.axes]] = 1.0
+        yield _prior(key, slow.sigma * np.where(constant, tails, _NOTHING))
+    yield from _standing(slow, key, np.full(len(constant), _CHAIN_END), jumps=jumps)
 
 
 def slow_step(slow: SlowProcess, key: int, following: int, dt_s: float, *, jumps: bool = True) -> Iterator[Any]:
     """Yield the factors of the step from one node to the next, `dt_s` later."""
-    constant, zero = ~np.isfinite(slow.time_constant_s), np.zeros(len(slow.sigma))
+    constant = ~np.isfinite(slow.time_constant_s)
     # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
     step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt_s / slow.time_constant_s))
     model: Any = gtsam.noiseModel.Diagonal.Sigmas(step)
     if slow.jumps and jumps:
-        model = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(JUMP.scale), model)
-    yield gtsam.BetweenFactorVector(key, following, zero, model)
-    if not constant.all():
-        standing = slow.sigma * np.where(constant, _NOTHING, np.sqrt(2.0 * slow.time_constant_s / dt_s))
-        yield gtsam.PriorFactorVector(following, zero, gtsam.noiseModel.Diagonal.Sigmas(standing))
+        model = _with_tails(model, JUMP.scale)
+    yield gtsam.BetweenFactorVector(key, following, np.zeros(len(step)), model)
+    yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps)
 
 
-def slow_end(slow: SlowProcess, key: int) -> Iterator[Any]:
+def slow_end(slow: SlowProcess, key: int, *, jumps: bool = True) -> Iterator[Any]:
     """Yield what closes a chain at its last node."""
-    constant = ~np.isfinite(slow.time_constant_s)
-    if not constant.all():
-        last = np.where(constant, _NOTHING, np.sqrt(CHAIN_END)) * slow.sigma
-        yield gtsam.PriorFactorVector(key, np.zeros(len(last)), gtsam.noiseModel.Diagonal.Sigmas(last))
+    yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps)
+
+
+def closing_variance(slow: SlowProcess, value: Array) -> Array:
+    """Variance (k,) of what closes a chain, as it weighs where its last node is `value`; inf for constants."""
+    far = _far(slow)
+    square = float(((value[far] / slow.sigma[far]) ** 2).sum())
+    tails = np.where(far, 1.0 + square / _FAR**2, 1.0)
+    return np.where(np.isfinite(slow.time_constant_s), _CHAIN_END * slow.sigma**2 * tails, np.inf)
+
+
+def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool) -> Iterator[Any]:
+    """Yield the priors that hold a node where the process stands, `times` (k,) its variance; constants are not held.
+
+    What may stand far off has a prior of its own: heights above another zero must not set places free.
+    """
+    held, far = np.isfinite(slow.time_constant_s), _far(slow) & jumps
+    for part in (held & ~far, held & far):
+        if part.any():
+            tails = _FAR / float(np.sqrt(times[part].max())) if far[part].all() else None
+            yield _prior(key, slow.sigma * np.where(part, np.sqrt(times), _NOTHING), tails)
+
+
+def _far(slow: SlowProcess) -> NDArray[np.bool_]:
+    return np.array([axis in slow.far for axis in slow.axes])
+
+
+def _prior(key: int, sigmas: Array, tails: float | None = None) -> Any:
+    """Return a prior at zero; `tails`: sigmas from which on it has those of Cauchy's."""
+    model: Any = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    return gtsam.PriorFactorVector(key, np.zeros(len(sigmas)), model if tails is None else _with_tails(model, tails))
+
+
+def _with_tails(model: Any, scale: float) -> Any:
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(scale), model)

@@ -166,9 +166,10 @@ def _add_slow_chain(
         if (given := prior.slow.get(stream.number)) is not None:
             graph.add(gtsam.PriorFactorVector(key[0], given[0], gtsam.noiseModel.Gaussian.Covariance(given[1])))
         else:
-            graph.add(slow_begin(slow, key[0], np.atleast_1d(values.atVector(key[0]))))
+            for factor in slow_begin(slow, key[0], np.atleast_1d(values.atVector(key[0])), jumps=jumps):
+                graph.add(factor)
     for n, j in enumerate(nodes[:-1]):
         for factor in slow_step(slow, key[n], key[n + 1], _node_dt_s(problem, j), jumps=jumps):
             graph.add(factor)
-    for factor in slow_end(slow, key[-1]):
+    for factor in slow_end(slow, key[-1], jumps=jumps):
         graph.add(factor)

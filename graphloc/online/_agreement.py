@@ -13,6 +13,8 @@ from graphloc.solve._solution import AGREES
 
 _CREDIBLE = 6.0  # sigmas of a slow error: beyond, a sensor that agrees does so by an error that it does not have
 _FEW = 8  # measurements of absolute sensors in a row that disagree: not yet a sign
+_LOST_S = 15.0  # of disagreement, until the estimate is
+_STRAINED_S, _DENIES = 60.0, 3  # if all agree, but by such an error; what of a sensor in a row disagrees in spite of it
 
 
 class Agreement:
@@ -26,34 +28,44 @@ class Agreement:
         self._timeline = timeline
         self.agreed_ns: dict[str, int] = {}
         self._refused: list[int] = []  # stamps of absolute measurements since the last that agreed: the first few
+        self._denied: dict[str, int] = {}  # by sensor: how many in a row disagreed, by whatever error it may have
 
     def note(self, stream: LiveStream, m: Measurement, verdict: Verdict | None) -> None:
         """Remember how a measurement was judged; None: it was refused unjudged."""
         if not stream.row.absolute:
             return
-        if verdict is not None and verdict.weight >= AGREES and _credible(stream, verdict.at):
+        agrees = verdict is not None and verdict.weight >= AGREES
+        self._denied[stream.name] = 0 if agrees else self._denied.get(stream.name, 0) + 1
+        if verdict is not None and agrees and _credible(stream, verdict.at):
             self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
             self._refused = [stamp for stamp in self._refused if stamp > m.stamp_ns]
-        elif len(self._refused) < _FEW:
+            return
+        if len(self._refused) < _FEW:
             self._refused.append(m.stamp_ns)
 
     def forget_refused(self) -> None:
         """Of what disagreed, a receiver is known to be wrong: nothing says any more that it is elsewhere."""
         self._refused = []
 
-    def marked(self) -> tuple[dict[str, int], list[int]]:
+    def marked(self) -> tuple[dict[str, int], list[int], dict[str, int]]:
         """Return what is remembered, for `back_to`."""
-        return dict(self.agreed_ns), list(self._refused)
+        return dict(self.agreed_ns), list(self._refused), dict(self._denied)
 
-    def back_to(self, mark: tuple[dict[str, int], list[int]]) -> None:
+    def back_to(self, mark: tuple[dict[str, int], list[int], dict[str, int]]) -> None:
         """Forget what was noted since: it agreed with what has been given up."""
-        self.agreed_ns, self._refused = mark
+        self.agreed_ns, self._refused, self._denied = mark
 
-    def refused_s(self, now_ns: int) -> float:
-        """For how long absolute sensors have said, more than a few times, that it is elsewhere, and none that it is here."""
+    def lost_s(self, now_ns: int) -> float:
+        """For how long absolute sensors have said that the estimate is elsewhere, and none that it is here; 0: not for so long that it is lost.
+
+        A jump of a receiver's error to 20 m ends within a minute, and till then the estimate is right.
+        """
         if len(self._refused) < _FEW:
             return 0.0
-        return self._timeline.seconds(now_ns) - self._timeline.seconds(self._refused[0])
+        seconds = self._timeline.seconds
+        for_s = seconds(now_ns) - seconds(self._refused[0])
+        denied = any(in_a_row >= _DENIES for in_a_row in self._denied.values())
+        return for_s if for_s > (_LOST_S if denied else _STRAINED_S) else 0.0
 
 
 def _credible(stream: LiveStream, at: Attachment) -> bool:

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from graphloc.build import StartPrior
+from graphloc import keys
+from graphloc.build import Past, Problem, StartPrior, constant_keys
 from graphloc.frames import Array
 
 _CORE = 15  # pose, velocity, bias
@@ -54,6 +56,74 @@ class Anchor:
         cov[:6, :6], cov[6:9, 6:9], cov[9:, 9:] = prior.pose_cov, prior.velocity_cov, prior.bias_cov
         bias = np.concatenate([prior.bias.accelerometer(), prior.bias.gyroscope()])
         return cls(stamp_ns=stamp_ns, pose=prior.pose, velocity=np.asarray(prior.velocity), bias=bias, cov=cov)
+
+    @classmethod
+    def of_joint(
+        cls,
+        stamp_ns: int,
+        point: tuple[gtsam.Pose3, Array, Array],
+        mean: Array,
+        cov: Array,
+        slow: Mapping[str, int],
+        constants: Mapping[tuple[str, int], int],
+    ) -> Anchor:
+        """Return what a joint Gaussian says.
+
+        Args:
+            point: pose, velocity, bias (6,) that it is about.
+            mean: (n,) steps from there (pose in the tangent), and then the slow states and constants themselves, in turn.
+            cov: (n, n). slow, constants: how many rows each has.
+        """
+        ends = np.cumsum([_CORE, *slow.values(), *constants.values()])
+        own = [np.arange(a, b) for a, b in pairwise(ends)]
+        pose, velocity, bias = point
+        beside_pose = {
+            name: _beside_pose(mean[rows], cov[np.ix_([*range(6), *rows], [*range(6), *rows])])
+            for name, rows in zip(slow, own, strict=False)
+        }
+        # Not given the pose: a constant's prior, when it is seen again, does not have that.
+        alone = {
+            number: Beside(value=mean[rows], gain=np.zeros((len(rows), 6)), cov=cov[np.ix_(rows, rows)])
+            for number, rows in zip(constants, own[len(slow) :], strict=True)
+        }
+        return cls(
+            stamp_ns=stamp_ns,
+            pose=pose.retract(mean[:6]),
+            velocity=np.asarray(velocity) + mean[6:9],
+            bias=bias + mean[9:_CORE],
+            cov=cov[:_CORE, :_CORE],
+            slow=beside_pose,
+            constants=alone,
+        )
+
+    @classmethod
+    def of_past(cls, problem: Problem, values: gtsam.Values, past: Past, k: int) -> Anchor:
+        """Return what all that was before says of state `k` of a solved run.
+
+        Raises:
+            numpy.linalg.LinAlgError: it says too little.
+        """
+        j = int(problem.timeline.slow_of[k])
+        slow = {s.name: keys.slow(s.number, j) for s in problem.streams if s.slow is not None}
+        constants = {
+            (s.name, n): key for s in problem.streams for n, key in enumerate(constant_keys(s)) if key in past.known
+        }
+        order = gtsam.Ordering()
+        for key in (keys.pose(k), keys.velocity(k), keys.bias(j), *slow.values(), *constants.values()):
+            order.push_back(key)
+        A, b = past.factors.linearize(values).jacobian(order)
+        Q, R = np.linalg.qr(A)
+        root = np.linalg.solve(R, np.eye(len(R)))
+        vectors = {name: np.atleast_1d(values.atVector(key)) for name, key in [*slow.items(), *constants.items()]}
+        bias = values.atConstantBias(keys.bias(j))
+        return cls.of_joint(
+            int(problem.timeline.stamps_ns[k]),
+            (values.atPose3(keys.pose(k)), values.atVector(keys.velocity(k)), bias.vector()),
+            root @ (Q.T @ b) + np.concatenate([np.zeros(_CORE), *vectors.values()]),
+            root @ root.T,
+            {name: len(vectors[name]) for name in slow},
+            {number: len(vectors[number]) for number in constants},
+        )
 
     def factors(self, pose: int, velocity: int, bias: int) -> list[Any]:
         """Return the prior of the state, by its keys."""
@@ -110,12 +180,10 @@ class Anchor:
         )
 
 
-def beside(value: Array, joint: Array) -> Beside:
+def _beside_pose(value: Array, joint: Array) -> Beside:
     """Return what a joint covariance of pose and vector (6 + k, 6 + k) says of the vector given the pose."""
     gain = np.linalg.solve(sound(joint[:6, :6]), joint[:6, 6:]).T
-    return Beside(
-        value=np.asarray(value), gain=np.asarray(gain, dtype=np.float64), cov=joint[6:, 6:] - gain @ joint[:6, 6:]
-    )
+    return Beside(value=value, gain=np.asarray(gain, dtype=np.float64), cov=joint[6:, 6:] - gain @ joint[:6, 6:])
 
 
 def without_prior(mean: Array, cov: Array, rows: Array, variance: Array) -> tuple[Array, Array]:

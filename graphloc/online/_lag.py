@@ -142,9 +142,9 @@ class Lag:
         return self._agreement.agreed_ns
 
     @property
-    def refused_s(self) -> float:
-        """For how long absolute sensors have said, more than a few times, that it is elsewhere, and none that it is here."""
-        return self._agreement.refused_s(self.newest.stamp_ns)
+    def lost_s(self) -> float:
+        """For how long it has been lost, by what absolute sensors say; 0: it is not (see `_agreement.py`)."""
+        return self._agreement.lost_s(self.newest.stamp_ns)
 
     @property
     def parted(self) -> set[str]:

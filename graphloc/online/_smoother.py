@@ -47,7 +47,7 @@ from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
-_LOST_S, _AGAIN_S = 15.0, 6.0  # of disagreement, until it starts anew; with the data of so long
+_AGAIN_S = 6.0  # of data, with which a lost estimate starts anew
 _AHEAD_S = 60.0  # of the IMU: a stamp of another clock
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _PENDING = 10_000
@@ -259,7 +259,7 @@ class OnlineSmoother:
                 self._say(self._turned.said)
             self._say_parted(self._lag.parted)
             self._events += self._lag.leapt()
-            if self._lag.refused_s > _LOST_S:
+            if self._lag.lost_s:
                 return self._start_over(self._lag)
             if said := self._noise.contradicted(self._lag):
                 self._rebuild(said)
@@ -416,7 +416,14 @@ class OnlineSmoother:
         reached = [m for m in others if m.stamp_ns <= newest.stamp_ns]
         try:
             started = try_start(
-                self._at_start, self._rows, self._inertial, self._mounts, _series(samples), reached, self._datum
+                self._at_start,
+                self._rows,
+                self._inertial,
+                self._mounts,
+                _series(samples),
+                reached,
+                self._datum,
+                self._lag_s,
             )
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             started = f"a start that can be solved: {in_one_line(error)}"
@@ -431,7 +438,7 @@ class OnlineSmoother:
         return self._try_estimate()
 
     def _take_over(self, started: Started, samples: list[ImuSample], others: list[Measurement]) -> None:
-        """Build the lag where the data begin, and bring it to now."""
+        """Build the lag where the start says, and bring it to now."""
         self._at_start = self._config.model_copy(
             update={"start": self._config.start.model_copy(update={"heading_deg": None})}
         )
@@ -443,6 +450,8 @@ class OnlineSmoother:
         self._pending = others
         self._begin(started.anchor, samples, (started.pose, started.velocity, started.bias))
         assert self._lag is not None
+        self._book.enter(started.rows)
+        self._pending = [m for m in others if not self._book.has(m)]
         while self._pending and self._pending[0].stamp_ns < self._lag.first_ns:
             self._book.drop(self._pending.pop(0), Outcome.REJECTED, "no IMU data at this stamp")
         self._recent.begin([*samples, *self._pending])
@@ -539,7 +548,7 @@ class OnlineSmoother:
         again = [m for m in self._recent if m.stamp_ns >= since_ns and not self._book.has(m)]
         self._close(lag, again)
         self._agreed_ns.update(lag.agreed_ns)
-        self._say(f"no absolute sensor agreed for {lag.refused_s:.0f} s: starts anew")
+        self._say(f"no absolute sensor agreed for {lag.lost_s:.0f} s: starts anew")
         self._wait("the next IMU sample")
         # Samples have their rows already.
         for m in again:

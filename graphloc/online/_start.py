@@ -2,7 +2,8 @@
 """The start: wait until place and heading can be told, and solve what has come as the batch would.
 
 The lag then begins where the data do, with what was known before them, at the solution: what the start chose
-among matches stays open for as long as they are in the lag.
+among matches stays open for as long as they are in the lag. Where the start had to wait for longer than a lag - for a
+heading from the way alone - it begins a lag ago, with what the solution says of that state by what was before.
 """
 
 from __future__ import annotations
@@ -14,17 +15,21 @@ import gtsam
 import numpy as np
 
 from graphloc import keys, origin
-from graphloc.build import company_of, make_problem, mount_of
+from graphloc.build import build_graph, company_of, make_problem, mount_of
 from graphloc.config import VesselConfig
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
 from graphloc.graph import Hint, InertialRow, Sensor
+from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.recording import Recording
 from graphloc.solve._align import MOVED_M
-from graphloc.solve._batch import solve_batch
-from graphloc.solve._solution import AGREES, world_covariance
+from graphloc.solve._batch import BatchResult, solve_batch
+from graphloc.solve._decide import decisions
+from graphloc.solve._solution import AGREES, row_of, world_covariance
+from graphloc.solve._stretch import StretchStep, past_at
+from graphloc.time import duration_ns
 
 LEAST_S = 5.0  # of inertial data: gyro bias, roll and pitch of a vessel in waves
 _HEADING_RAD = np.radians(15.0)  # 1 sigma: from farther off a lag does not come back soon
@@ -40,11 +45,11 @@ class Started:
 
     Attributes:
         datum: origin of world.
-        anchor: the first state, by what was known before any measurement: all that came is judged again in the lag.
+        anchor: the first state, by what was known before what is measured from there on: all that is judged again in the lag.
         pose, velocity, bias: of that state, as it was solved: (gtsam.Pose3), (3,), (6,).
         heights_m: of each sensor that the configuration makes itself, what it says.
         doubt: why the pose cannot be called good. noise_scale: of the IMU.
-        notes: what the alignment went by.
+        notes: what the alignment went by. rows: of what was measured before the first state.
     """
 
     datum: Datum
@@ -56,6 +61,7 @@ class Started:
     doubt: str
     noise_scale: float
     notes: tuple[str, ...]
+    rows: tuple[LedgerRow, ...]
 
 
 def try_start(
@@ -66,6 +72,7 @@ def try_start(
     imu: ImuSeries,
     measurements: Sequence[Measurement],
     datum: Datum | None,
+    lag_s: float,
 ) -> Started | str:
     """Return the start, or what it waits for."""
     span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 if len(imu) else 0.0
@@ -87,7 +94,7 @@ def try_start(
     if missing := _missing(config, rows, recording, datum):
         return missing
     try:
-        return _solved(config, rows, inertial, recording, datum)
+        return _solved(config, rows, inertial, recording, datum, lag_s)
     except SolveError as error:
         return f"a start that can be solved: {error}"
 
@@ -114,7 +121,12 @@ def _missing(config: VesselConfig, rows: Sequence[Sensor], recording: Recording,
 
 
 def _solved(
-    config: VesselConfig, rows: Sequence[Sensor], inertial: InertialRow, recording: Recording, datum: Datum
+    config: VesselConfig,
+    rows: Sequence[Sensor],
+    inertial: InertialRow,
+    recording: Recording,
+    datum: Datum,
+    lag_s: float,
 ) -> Started | str:
     whole = origin.with_synthetic(recording, config, datum, rows)
     problem = make_problem(whole, config, datum, rows, inertial, company_of(config, rows))
@@ -142,15 +154,39 @@ def _solved(
         if row.synthetic is not None
         for name, sensor in config.of_kind(row.kind).items()
     }
-    held = result.values.atConstantBias(keys.bias(0))
+    k, anchor = _anchor(result, lag_s)
+    before = [
+        row_of(stream, m, stream.config.topic, result.verdicts[stream.number, i])
+        for stream in result.problem.streams
+        for i, m in enumerate(stream.measurements)
+        if stream.state[i] < k and m.seq >= 0
+    ]
     return Started(
         datum=datum,
-        anchor=Anchor.of_start(int(problem.timeline.stamps_ns[0]), result.prior),
-        pose=result.values.atPose3(keys.pose(0)),
-        velocity=np.asarray(result.values.atVector(keys.velocity(0))),
-        bias=np.concatenate([held.accelerometer(), held.gyroscope()]),
+        anchor=anchor,
+        pose=result.values.atPose3(keys.pose(k)),
+        velocity=np.asarray(result.values.atVector(keys.velocity(k))),
+        bias=result.values.atConstantBias(keys.bias(int(result.problem.timeline.slow_of[k]))).vector(),
         heights_m=heights,
         doubt=doubt,
         noise_scale=result.noise_scale,
         notes=result.notes,
+        rows=tuple(before),
     )
+
+
+def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:
+    """Return the state that the lag begins at, and what is known of it by what was before.
+
+    Begun farther back, a heading that half a minute of way has told would be told again by ten seconds of it at a time.
+    """
+    problem, values = result.problem, result.values
+    timeline, last = problem.timeline, len(problem.timeline) - 1
+    back = timeline.floor(int(timeline.stamps_ns[last]) - duration_ns(lag_s))
+    k = int(np.searchsorted(timeline.slow_of, timeline.slow_of[back]))
+    if k == 0:
+        return 0, Anchor.of_start(int(timeline.stamps_ns[0]), result.prior)
+    made: dict[tuple[int, int], range] = {}
+    graph, guess = build_graph(problem, values, decisions(result.verdicts), 0, last, result.prior, made=made)
+    past = past_at(problem, StretchStep(guess, graph, made, 0, 0.0, 0.0), k)
+    return k, Anchor.of_past(problem, values, past, k)

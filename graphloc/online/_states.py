@@ -4,18 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import CHAIN_END, bias_step, nav_state, slow_begin, slow_end, slow_step
+from graphloc.build import bias_step, closing_variance, nav_state, slow_begin, slow_end, slow_step
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Going, Residual
-from graphloc.online._anchor import Anchor, Beside, beside, without_prior
+from graphloc.online._anchor import Anchor, without_prior
 from graphloc.online._constants import Constants
 from graphloc.online._habit import UNSURE_MPS, Moving
 from graphloc.online._live import LiveProblem, LiveStream
@@ -92,7 +92,7 @@ class States:
                 if known is not None and len(known.value) != len(stream.slow.sigma):
                     raise SolveError(f"{stream.name}: its slow error is of another size")
                 window.guess(key, np.zeros(len(stream.slow.sigma)) if known is None else known.value, 0.0)
-                window.add([slow_begin(stream.slow, key, np.zeros(len(stream.slow.sigma)))]
+                window.add(slow_begin(stream.slow, key, np.zeros(len(stream.slow.sigma)))
                            if known is None else [anchor.beside(known, state[0], key)])  # fmt: skip
                 self._ends[stream.name] = window.add(slow_end(stream.slow, key))
         window.commit()
@@ -250,34 +250,24 @@ class States:
         every = [*core, *slow.values(), *constants.values()]
         joint = window.covariance(every)
         vectors = [np.atleast_1d(window.values.atVector(key)) for key in every[3:]]
-        ends = np.cumsum([6, 3, 6, *map(len, vectors)])
-        rows = {key: np.arange(a, b) for key, a, b in zip(every, [0, *ends], ends, strict=False)}
-        bias = window.values.atConstantBias(core[2])
-        mean = np.concatenate([np.zeros(15), *vectors])  # of the state as steps from the estimate
-        for name, key in slow.items():
+        mean = np.concatenate([np.zeros(15), *vectors])
+        ends = np.cumsum([15, *map(len, vectors)])
+        for name, value, first in zip(slow, vectors, ends, strict=False):
             process = streams[name].slow
             assert process is not None
-            closed = np.flatnonzero(np.isfinite(process.time_constant_s))
-            mean, joint = without_prior(mean, joint, rows[key][closed], CHAIN_END * process.sigma[closed] ** 2)
-
-        def known(key: int) -> Beside:
-            own = rows[key]
-            picked = np.concatenate([rows[core[0]], own])
-            return beside(mean[own], joint[np.ix_(picked, picked)])
-
-        def alone(key: int) -> Beside:  # not given the pose: its prior, when it is seen again, does not have that
-            own = rows[key]
-            return Beside(value=mean[own], gain=np.zeros((len(own), 6)), cov=joint[np.ix_(own, own)])
-
-        return Anchor(
-            stamp_ns=timeline.stamps_ns[k],
-            pose=window.values.atPose3(core[0]).retract(mean[:6]),
-            velocity=np.asarray(window.values.atVector(core[1])) + mean[6:9],
-            bias=np.concatenate([bias.accelerometer(), bias.gyroscope()]) + mean[9:15],
-            cov=joint[:15, :15],
-            slow={name: known(key) for name, key in slow.items()},
-            constants={**self._constants.remembered(), **{name: alone(key) for name, key in constants.items()}},
+            variance = closing_variance(process, value)
+            closed = np.isfinite(variance)
+            mean, joint = without_prior(mean, joint, first + np.flatnonzero(closed), variance[closed])
+        bias = window.values.atConstantBias(core[2])
+        anchor = Anchor.of_joint(
+            timeline.stamps_ns[k],
+            (window.values.atPose3(core[0]), window.values.atVector(core[1]), bias.vector()),
+            mean,
+            joint,
+            dict(zip(slow, map(len, vectors), strict=False)),
+            dict(zip(constants, map(len, vectors[len(slow) :]), strict=True)),
         )
+        return replace(anchor, constants={**self._constants.remembered(), **anchor.constants})
 
     def track(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
         """Return stamps (N,), places (N, 3), attitudes (N, 3, 3) and velocities (N, 3) of the body's origin."""

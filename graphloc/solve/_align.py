@@ -29,6 +29,7 @@ _STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine
 _STILL_SPEED_MPS = 0.15
 _USUAL_SPEED_MPS = 10.0  # where nothing is known of it
 _BLOCK_S, _SWELL_S = 0.5, 10.0
+_CARRIED_RAD = np.radians(20.0)  # 1 sigma of the gyro's bias: a heading that comes later is no heading of the start
 MOVED_M = 15.0  # travel from which a heading can be told without a heading sensor
 
 
@@ -85,10 +86,13 @@ def align(problem: Problem) -> Start:
         )
     still = _standstill(problem, track, yaws)
     bias, bias_sigma, notes = _gyro_bias(problem, origin, window, still, yaws)
-    turn = _turns(problem, window + 10.0 if yaws else 180.0, bias)
+    early = {name: rows for name, rows in yaws.items() if rows[0, 0] * bias_sigma[2] < _CARRIED_RAD}
+    if early or _moved_at(track) is not None:
+        yaws = early
+    turn = _turns(problem, max([window, *(rows[0, 0] for rows in yaws.values())]) + 10.0 if yaws else 180.0, bias)
     at_start = still if still is not None and still[0] == 0.0 else None
     R_level, tilt_sigma, tilt_note = _level(problem, origin, window, at_start, turn, track)
-    heading = _headings(problem, origin, track, yaws, turn)
+    heading = _headings(problem, track, yaws, turn)
     p0, p_sigma, v0, v_sigma = _position_and_velocity(hints, track, at_start)
     return Start(
         R_level_body=R_level,
@@ -274,7 +278,7 @@ def _level(
 
 
 def _headings(
-    problem: Problem, origin: int, track: _Track, yaws: dict[str, Array], turn: Callable[[float], Array]
+    problem: Problem, track: _Track, yaws: dict[str, Array], turn: Callable[[float], Array]
 ) -> tuple[tuple[float, ...], float, float, str]:
     """Candidates for the yaw at the start, their sigma, the window that tells them apart, a note."""
     config = problem.config.start
@@ -299,19 +303,24 @@ def _headings(
             max(window, config.window_s if len(apart) > 1 else 0.0),
             ("heading from " + ", ".join(sources)),
         )
-    moved = np.hypot(*(track.p[:, :2] - np.median(track.p[:5, :2], axis=0)).T)
-    noise = 5.0 * float(np.nanmedian(track.sigma[:, :2]))
-    far = np.flatnonzero(moved > max(MOVED_M, noise))
-    if not len(far):
+    moved_s = _moved_at(track)
+    if moved_s is None:
         return (0.0,), np.pi, window, "heading unknown: no sensor tells it and the vessel does not move"
     course = np.arange(8) * np.pi / 4.0
-    until = float(track.t[far[0]]) + 10.0
     return (
         tuple(wrap_angle(np.asarray(course, dtype=np.float64))),
         float(np.radians(60.0)),
-        until,
+        moved_s + 10.0,
         "heading from the motion alone, eight starts tried",
     )
+
+
+def _moved_at(track: _Track) -> float | None:
+    """When the vessel has moved so far that its way tells a heading, s; None: it does not."""
+    moved = np.hypot(*(track.p[:, :2] - np.median(track.p[:5, :2], axis=0)).T)
+    noise = 5.0 * float(np.nanmedian(track.sigma[:, :2]))
+    far = np.flatnonzero(moved > max(MOVED_M, noise))
+    return float(track.t[far[0]]) if len(far) else None
 
 
 def _turned(R: Array) -> float:
