@@ -17,9 +17,9 @@ from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import TruthMetrics, compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
-from graphloc.frames import Datum, Geodetic
+from graphloc.frames import Datum, Geodetic, wrap_angle
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, HeightPrior, Measurement
+from graphloc.measurements import CompassHeading, GnssPosition, HeightPrior, Measurement, PoseFix
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.solve._align import align
@@ -392,6 +392,25 @@ def test_level_and_bias_at_a_tilted_start() -> None:
     start = align(problem)
     np.testing.assert_allclose(start.gyro_bias_radps, bias, atol=1e-3)
     np.testing.assert_allclose(start.R_level_body[2], tilt[2], atol=0.01)
+
+
+def test_a_heading_that_comes_late_is_not_the_starts() -> None:
+    """Fixes from the start, and matches with a heading after 50 s of turns, no compass: carried back, they say anything."""
+    run = simulate(replace(BASE, duration_s=75.0, pose_hz=1.0, false_fraction=0.0, imu_hz=50.0, gnss_hz=2.0), 1)
+    begin_ns = run.truth.stamps_ns[0]
+    late = tuple(
+        m
+        for m in run.recording.measurements
+        if isinstance(m, GnssPosition | HeightPrior) or (isinstance(m, PoseFix) and m.stamp_ns - begin_ns > 50e9)
+    )
+    recording = only(run.recording, late)
+    problem = make_problem(recording, run.config, app.choose_datum(recording, run.config), SENSORS, INERTIAL)
+    R = run.truth.R_world_body[0]
+    assert np.abs(wrap_angle(np.array(align(problem).yaws_rad) - np.arctan2(R[1, 0], R[0, 0]))).min() < np.radians(25.0)
+    solved = app.smooth_recording(recording, run.config).solution
+    off = compare_to_truth(solved.trajectory, run.truth)
+    assert off.heading_rmse_deg < 3.0
+    assert off.position_rmse_m < 1.5
 
 
 @pytest.mark.parametrize("axes", [("roll",), ("x", "y", "pitch")])

@@ -13,15 +13,15 @@ import pytest
 from scipy.stats import chi2
 
 from graphloc import app
-from graphloc.config import ImuConfig, PoseConfig, TimelineConfig
+from graphloc.config import GnssConfig, ImuConfig, PoseConfig, TimelineConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.eval.simulate._scenario import harbour_scenarios
 from graphloc.factors import INERTIAL, SENSORS
-from graphloc.frames import Array
+from graphloc.frames import Array, wrap_angle
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix, PoseMode
 from graphloc.online import OnlineSmoother
-from graphloc.trajectory import Trajectory
+from graphloc.trajectory import Trajectory, bounds_95
 from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, delayed, feed, finish
 from tests.tagfactory import sighted
 
@@ -60,6 +60,11 @@ def apart_m(a: Trajectory, b: Trajectory) -> Array:
     stamps = a.stamps_ns[(a.stamps_ns >= b.stamps_ns[0]) & (a.stamps_ns <= b.stamps_ns[-1])]
     off = a.at(stamps).p_world_m - b.at(stamps).p_world_m
     return np.hypot(off[:, 0], off[:, 1])
+
+
+def yaw_of(track: Trajectory, at_ns: int) -> float:
+    R = track.at(np.array([at_ns])).R_world_body[0]
+    return float(np.arctan2(R[1, 0], R[0, 0]))
 
 
 def without(arrivals: Arrivals, gone: Callable[[Arrival], bool]) -> Arrivals:
@@ -256,9 +261,41 @@ def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
     first = run.truth.at(np.array([arrivals[0].true_ns, fed.true_ns[0]])).p_world_m
     assert np.hypot(*(first[1] - first[0])[:2]) > 10.0
     assert fed.errors_m[-1] < 3.0
-    yaw = fed.estimates[-1].yaw_rad
-    R = run.truth.at(np.array([fed.true_ns[-1]])).R_world_body[0]
-    assert abs(np.angle(np.exp(1j * (yaw - np.arctan2(R[1, 0], R[0, 0]))))) < fed.estimates[-1].heading_bound_95_rad
+    begun = fed.estimates[0]
+    assert abs(wrap_angle(begun.yaw_rad - yaw_of(run.truth, fed.true_ns[0]))) < begun.heading_bound_95_rad
+
+
+def test_a_start_that_waited_longer_than_the_lag_keeps_what_it_found() -> None:
+    """Fixes good to 1.5 m tell a heading in half a minute: told again by ten seconds of them at a time, it is another one."""
+    run = slowly(
+        simulate(
+            replace(Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0, gnss_sigma_m=1.5),
+            1,
+        )
+    )
+    arrivals = without(arrivals_of(run), lambda a: isinstance(a.m, (PoseFix, CompassHeading)))
+    online, fed = smoother(run), Fed()
+    n = next(n for n, a in enumerate(arrivals) if feed(online, run, [a], fed).estimates)
+    assert complaints(arrivals[: n + 1], finish(online, fed)) == []
+    (begun,), end_ns = fed.estimates, fed.true_ns[0]
+    imu, gnss = run.recording.imu, run.config.sensors["gnss"]
+    assert imu is not None
+    assert isinstance(gnss, GnssConfig)
+    assert end_ns - imu.stamps_ns[0] > 25e9
+    told = gnss.model_copy(update={"slow_error": gnss.slow_error.model_copy(update={"enabled": True})})
+    kept = imu.stamps_ns <= end_ns
+    whole = app.smooth_recording(
+        replace(
+            run.recording,
+            imu=replace(imu, stamps_ns=imu.stamps_ns[kept], accel_mps2=imu.accel_mps2[kept],
+                        gyro_radps=imu.gyro_radps[kept], seqs=imu.seqs[kept]),
+            measurements=tuple(m for m in run.recording.measurements if m.sensor == "gnss" and m.stamp_ns <= end_ns),
+        ),
+        run.config.model_copy(update={"sensors": {"imu": run.config.sensors["imu"], "gnss": told}}),
+    ).solution.trajectory  # fmt: skip
+    assert whole.cov is not None
+    assert np.degrees(abs(wrap_angle(begun.yaw_rad - yaw_of(whole, end_ns)))) < 10.0
+    assert np.degrees(begun.heading_bound_95_rad) == pytest.approx(bounds_95(whole.cov)[-1, 2], rel=0.25)
 
 
 def test_starts_from_given_poses() -> None:

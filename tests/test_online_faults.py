@@ -135,7 +135,7 @@ def test_what_agreed_with_a_choice_that_was_given_up_does_not_count(
     judge, agreement = online._lag._judge, online._lag._agreement  # noqa: SLF001
     stream = online._lag.problem.streams["aerial"]  # noqa: SLF001
     own = judge._chapter(stream)  # noqa: SLF001
-    agreement.back_to(({}, []))
+    agreement.back_to(({}, [], {}))
     for entry in own:
         agreement.note(stream, entry.measurement, None)
     refused = agreement.marked()
@@ -144,6 +144,30 @@ def test_what_agreed_with_a_choice_that_was_given_up_does_not_count(
     judge._try(stream, own, [e.verdict for e in own])  # noqa: SLF001
     assert (agreement.marked() == refused) is not kept
     assert ("aerial" in agreement.agreed_ns) is kept
+
+
+@pytest.mark.parametrize(("error_m", "denies", "lost_after_s"), [(3.0, False, 90), (20.0, False, 60), (20.0, True, 15)])
+def test_a_receiver_that_is_far_off_is_waited_for(error_m: float, denies: bool, lost_after_s: int) -> None:
+    """It agrees by an error that it should not have: a jump, that ends. Where matches deny the estimate besides, it is lost."""
+    online = smoother(run_of())
+    feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
+    assert online._lag is not None  # noqa: SLF001
+    lag = online._lag  # noqa: SLF001
+    fix, match = (lag.problem.streams[name] for name in ("gnss", "aerial"))
+    a_fix, a_match = (lag._judge._chapter(stream)[-1].measurement for stream in (fix, match))  # noqa: SLF001
+    verdict = lag._judge._chapter(match)[-1].verdict  # noqa: SLF001
+    agrees = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([error_m, 0.0, 0.0])))
+    agreement, begin_ns = lag._agreement, lag.newest.stamp_ns  # noqa: SLF001
+    agreement.back_to(({}, [], {}))
+    lost_s = []
+    for t_s in range(90):
+        now_ns = begin_ns + t_s * 1_000_000_000
+        agreement.note(fix, replace(a_fix, stamp_ns=now_ns), agrees)
+        if denies or t_s in (5, 6):
+            agreement.note(match, replace(a_match, stamp_ns=now_ns), None)
+        if agreement.lost_s(now_ns):
+            lost_s.append(t_s)
+    assert [*lost_s, 90][0] == pytest.approx(lost_after_s, abs=1)
 
 
 @pytest.mark.parametrize("opened", [True, False])
@@ -162,7 +186,7 @@ def test_what_was_let_in_agrees_when_it_is_asked_again(opened: bool, monkeypatch
 
     monkeypatch.setattr(judge, "_by_kernel", lets_in)
     monkeypatch.setattr(judge, "_ask_again", lambda *_: None)
-    agreement.back_to(({}, []))
+    agreement.back_to(({}, [], {}))
     feed(online, run_of(), base[now:soon])
     assert ("gnss" in agreement.agreed_ns) is not opened
     monkeypatch.undo()
@@ -191,8 +215,8 @@ def test_a_lost_estimate_starts_anew() -> None:
     )  # 15 s of disagreement, and a start that waits for matches at 1 Hz to agree
 
 
-def test_a_receiver_alone_that_jumps_is_not_overshot() -> None:
-    """20 m for 20 s, and nothing to tell it from motion: it may be followed, but not left behind."""
+def test_a_receiver_alone_that_jumps_is_not_followed() -> None:
+    """20 m for 20 s, and nothing to tell it from motion but the IMU: such a jump ends, and till then it is not followed."""
     run = _seldom(replace(bl_scenario(1, "clean"), duration_s=45.0), 1)
     base = [a for a in arrivals_of(run) if not isinstance(a.m, PoseFix)]
     begin, end = base[at_s(base, 12.0)].true_ns, base[at_s(base, 32.0)].true_ns
@@ -203,7 +227,8 @@ def test_a_receiver_alone_that_jumps_is_not_overshot() -> None:
         for a in base
     ]  # fmt: skip
     fed = finish(online := smoother(run), feed(online, run, jumped))
-    assert max(fed.errors_m) < 20.0
+    assert max(fed.errors_m) < 5.0
+    assert not [e for e in fed.events if "starts anew" in e]
     assert max(np.linalg.norm(e.v_world_mps) for e in fed.estimates) < 8.0  # the vessel goes 4 m/s
     assert fed.recovered_s(end) < 5.0
 

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A receiver that is far off for a while: of two levels that differ by a jump, one is where its error usually stands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.build import closing_variance, slow_begin, slow_end, slow_step
+from graphloc.config import GnssConfig, VelocityConfig, VesselConfig
+from graphloc.eval.metrics import TruthMetrics, compare_to_truth
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors.gnss import slow
+from graphloc.frames import Array
+from graphloc.graph import SlowProcess
+from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, PoseFix
+from graphloc.recording import Recording
+from graphloc.replay import replay
+
+PLACE, FIRST = 10_000, 0
+
+
+def process(*, jumps: bool = True) -> SlowProcess:
+    config = GnssConfig.model_validate({"topic": "/fix", "slow_error": {"enabled": True, "jumps": jumps}})
+    found = slow(config)
+    assert found is not None
+    return found
+
+
+def chain(
+    of: SlowProcess, fixes: Array, *, jumps: bool
+) -> tuple[gtsam.Values, gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """A place that nothing else tells, and a fix a second (N, 3) that is off from it by the slow error; where it begins: the mean."""
+    graph, begin = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    begin.insert(PLACE, fixes.mean(axis=0))
+    n = len(fixes)
+    for j, fix in enumerate(fixes):
+        begin.insert(j, fix - fixes.mean(axis=0))
+        graph.add(gtsam.BetweenFactorVector(PLACE, j, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e6)))
+        graph.add(_off_by(j, fix))
+    for factor in slow_begin(of, 0, np.zeros(3), jumps=jumps):
+        graph.add(factor)
+    for j in range(n - 1):
+        for factor in slow_step(of, j, j + 1, 1.0, jumps=jumps):
+            graph.add(factor)
+    for factor in slow_end(of, n - 1, jumps=jumps):
+        graph.add(factor)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(500)
+    return gtsam.LevenbergMarquardtOptimizer(graph, begin, parameters).optimize(), graph, begin
+
+
+def _off_by(j: int, fix: Array) -> gtsam.NonlinearFactor:
+    """place + error = fix, to 0.1 m."""
+    make = gtsam.JacobianFactor
+    linear = make(PLACE, np.eye(3) / 0.1, j, np.eye(3) / 0.1, fix / 0.1, gtsam.noiseModel.Unit.Create(3))
+    point = gtsam.Values()
+    point.insert(PLACE, np.zeros(3))
+    point.insert(j, np.zeros(3))
+    return gtsam.LinearContainerFactor(linear, point)
+
+
+def levels(first_s: int, second_s: int, jump: Sequence[float]) -> Array:
+    return np.vstack([np.zeros((first_s, 3)), np.tile(jump, (second_s, 1))])
+
+
+def test_of_two_levels_the_longer_one_is_the_usual_one() -> None:
+    """46 s and 14 s, 11 m apart, nothing else: halfway between is what a Gaussian makes of it."""
+    fixes = levels(46, 14, (8.0, -7.6, 0.0))
+    with_tails = chain(process(), fixes, jumps=True)[0].atVector(PLACE)
+    without = chain(process(), fixes, jumps=False)[0].atVector(PLACE)
+    assert np.hypot(*without[:2]) > 4.0
+    assert np.hypot(*with_tails[:2]) < 2.5
+    assert (
+        np.hypot(*chain(process(), levels(14, 46, (8.0, -7.6, 0.0)), jumps=True)[0].atVector(PLACE)[:2] - (8.0, -7.6))
+        < 2.5
+    )
+
+
+def test_a_height_far_off_does_not_set_the_place_free() -> None:
+    """Fixes above another zero, 40 m: east and north are known as well as ever."""
+    told = []
+    for up in (0.0, 40.0):
+        solved, graph, _ = chain(process(), levels(30, 30, (1.0, 1.0, 0.0)) + np.array([0.0, 0.0, up]), jumps=True)
+        told.append(gtsam.Marginals(graph, solved).marginalCovariance(PLACE)[:2, :2])
+    np.testing.assert_allclose(told[1], told[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize("value", [(0.0, 0.0, 0.0), (1.0, -2.0, 3.0), (12.0, 5.0, -40.0)])
+def test_what_closes_a_chain_is_taken_out_as_it_weighs(value: tuple[float, float, float]) -> None:
+    """`closing_variance` is one over the information of `slow_end`, linearised where the chain ends."""
+    at, of = gtsam.Values(), process()
+    at.insert(FIRST, np.array(value))
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in slow_end(of, FIRST):
+        graph.add(factor)
+    information = graph.linearize(at).hessian()[0]
+    np.testing.assert_allclose(np.diagonal(information), 1.0 / closing_variance(of, np.array(value)), rtol=1e-6)
+
+
+def jumped(begin_s: float, end_s: float, seed: int) -> tuple[SimulatedRun, Recording, VesselConfig]:
+    """Fixes, compass and velocities (0.1 m/s); the fixes 11 m off for a while."""
+    run = simulate(
+        Scenario(path="loops", duration_s=60.0, noise="clean", imu_hz=50.0, gnss_hz=4.0, compass_hz=4.0), seed
+    )
+    imu, truth, rng = run.recording.imu, run.truth, np.random.default_rng(seed)
+    assert imu is not None
+    kept: list[Measurement] = []
+    for m in run.recording.measurements:
+        t_s = (m.stamp_ns - imu.stamps_ns[0]) * 1e-9
+        if isinstance(m, GnssPosition):
+            if begin_s < t_s < end_s:
+                north = m.position.latitude_deg + 11.0 / 111_300.0
+                m = replace(m, position=m.position._replace(latitude_deg=north))
+            kept.append(m)
+            lever = run.config.sensors["gnss"].mount.t_body_sensor_m
+            there = truth.at(np.array([m.stamp_ns - 10_000_000, m.stamp_ns + 10_000_000]))
+            moved = np.diff(there.p_world_m + there.R_world_body @ lever, axis=0)[0] / 0.02
+            kept.append(
+                GnssVelocity(stamp_ns=m.stamp_ns, sensor="velocity", seq=-1, cov_m2ps2=np.eye(3) * 0.01,
+                             v_world_mps=moved + rng.normal(0.0, 0.1, 3))
+            )  # fmt: skip
+        elif not isinstance(m, PoseFix):
+            kept.append(m)
+    ordered = sorted(kept, key=lambda m: (m.stamp_ns, m.sensor))
+    measurements = tuple(replace(m, seq=len(imu) + i) for i, m in enumerate(ordered))
+    velocity = VelocityConfig(topic="/velocity", mount=run.config.sensors["gnss"].mount)
+    sensors = {n: s for n, s in run.config.sensors.items() if n != "aerial"} | {"velocity": velocity}
+    recording = replace(run.recording, measurements=measurements, message_count=len(imu) + len(measurements))
+    return run, recording, run.config.model_copy(update={"sensors": sensors})
+
+
+@pytest.mark.parametrize(("begin_s", "end_s"), [(44.0, 60.0), (20.0, 34.0)])
+def test_fixes_and_velocities_do_not_follow_a_jump(begin_s: float, end_s: float) -> None:
+    """At the end of the run, where nothing says that it ends, and in its middle; offline and online."""
+    run, recording, config = jumped(begin_s, end_s, 3)
+    batch = app.smooth_recording(recording, config).solution
+    online = replay(recording, config).solution
+    for found in (batch, online):
+        off: TruthMetrics = compare_to_truth(found.trajectory, run.truth)
+        assert off.position_rmse_m < 2.5
+        assert off.coverage_95 is not None
+        assert off.coverage_95 > 0.95
