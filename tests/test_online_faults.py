@@ -159,6 +159,9 @@ def test_a_receiver_that_is_far_off_is_waited_for(error_m: float, denies: bool, 
     agrees = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([error_m, 0.0, 0.0])))
     agreement, begin_ns = lag._agreement, lag.newest.stamp_ns  # noqa: SLF001
     agreement.back_to(({}, [], {}))
+    for _ in range(5):  # what denied it before it agreed again is past
+        agreement.note(match, replace(a_match, stamp_ns=begin_ns), None)
+    agreement.note(fix, replace(a_fix, stamp_ns=begin_ns), replace(agrees, at=verdict.at))
     lost_s = []
     for t_s in range(90):
         now_ns = begin_ns + t_s * 1_000_000_000

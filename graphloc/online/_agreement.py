@@ -39,6 +39,7 @@ class Agreement:
         if verdict is not None and agrees and _credible(stream, verdict.at):
             self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
             self._refused = [stamp for stamp in self._refused if stamp > m.stamp_ns]
+            self._denied.clear()
             return
         if len(self._refused) < _FEW:
             self._refused.append(m.stamp_ns)
