@@ -35,9 +35,11 @@ def process(*, jumps: bool = True) -> SlowProcess:
 def chain(
     of: SlowProcess, fixes: Array, *, jumps: bool
 ) -> tuple[gtsam.Values, gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """A place that nothing else tells, and a fix a second (N, 3) that is off from it by the slow error; where it begins: the mean."""
+    """A place that nothing else tells but its height, and a fix a second (N, 3) that is off from it by the slow error; where it begins: the mean."""
     graph, begin = gtsam.NonlinearFactorGraph(), gtsam.Values()
     begin.insert(PLACE, fixes.mean(axis=0))
+    waterline = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e6, 1e6, 0.1]))  # else the place goes up with the fixes
+    graph.add(gtsam.PriorFactorVector(PLACE, np.zeros(3), waterline))
     n = len(fixes)
     for j, fix in enumerate(fixes):
         begin.insert(j, fix - fixes.mean(axis=0))
