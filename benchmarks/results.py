@@ -21,6 +21,7 @@ import batch
 import calibration
 import compass
 import docking
+import drawn
 import drills
 import fuzz
 import matcher
@@ -66,6 +67,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "F.5": drills.both,
     "F.6": sweep.workers,
     "F.cal": calibration.figures,
+    "F.drawn": drawn.figures,
 }
 
 

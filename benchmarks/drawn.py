@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of vessels drawn by chance (`_vessels.py`): batch, online and the filters on the same runs.
+
+Its own main measures some seeds one by one, and says which differ from an earlier version's:
+
+    python benchmarks/drawn.py 0 40 --out now.jsonl --before then.jsonl
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _rows import Row, row
+from _vessels import DrawnRun, drawn_run
+
+from graphloc import app
+from graphloc.errors import GraphlocError
+from graphloc.eval import ekf
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.replay import replay
+from graphloc.solution import Solution
+from graphloc.trajectory import Trajectory
+
+SEEDS = range(1000, 1080)  # none was looked at when a model or a number was chosen
+Found = dict[str, Any]
+_TOO_SURE = 6.0  # NEES of three axes: three where the covariance is true
+
+
+def _judged(track: Trajectory, truth: Trajectory) -> Found:
+    m = compare_to_truth(track, truth)
+    return {
+        "rmse_m": m.position_rmse_m, "max_m": m.position_max_m, "heading_deg": m.heading_rmse_deg,
+        "nees": m.nees, "coverage": m.coverage_95, "heading_coverage": m.heading_coverage_95,
+    }  # fmt: skip
+
+
+def _tried(solve: Callable[[], Solution], run: DrawnRun) -> Found:
+    try:
+        solution = solve()
+    except GraphlocError as error:
+        return {"refused": str(error)}
+    return _judged(solution.trajectory, run.truth) | {"warnings": list(solution.stats.warnings)}
+
+
+def measured(seed: int) -> Found:
+    run = drawn_run(seed)
+    datum = app.choose_datum(run.recording, run.config)
+    return {
+        "drawn": run.drawn,
+        "batch": _tried(lambda: app.smooth_recording(run.recording, run.config).solution, run),
+        "online": _tried(lambda: replay(run.recording, run.config, late_ns=run.late_ns).solution, run),
+        **{f.name: _judged(f.trajectory, run.truth) for f in ekf.run_all(run.recording, run.config, datum)},
+    }
+
+
+def _column(found: list[Found], way: str, key: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([f[way][key] for f in found if f.get(way, {}).get(key) is not None], dtype=float)
+
+
+def figures(pool: ProcessPoolExecutor) -> list[Row]:
+    found = list(pool.map(measured, SEEDS))
+    label = f"{len(found)} drawn vessels"
+    rows = []
+    for way in ("batch", "online", "honest EKF", "BL EKF"):
+        rmse = _column(found, way, "rmse_m")
+        rows += [
+            row("F.drawn", f"{label}, {way}: position RMSE, mean", rmse.mean(), "m"),
+            row("F.drawn", f"{label}, {way}: position RMSE, median", np.median(rmse), "m"),
+            row("F.drawn", f"{label}, {way}: position RMSE, 90 % of runs below", np.percentile(rmse, 90), "m"),
+            row("F.drawn", f"{label}, {way}: heading RMSE, median", np.median(_column(found, way, "heading_deg")), "deg"),
+        ]  # fmt: skip
+        if way in ("batch", "online"):
+            nees = _column(found, way, "nees")
+            rows += [
+                row("F.drawn", f"{label}, {way}: no track", len(found) - len(rmse), "runs"),
+                row("F.drawn", f"{label}, {way}: 95 % coverage, mean", _column(found, way, "coverage").mean() * 100, "%"),
+                row("F.drawn", f"{label}, {way}: 95 % coverage of the heading, mean", _column(found, way, "heading_coverage").mean() * 100, "%"),
+                row("F.drawn", f"{label}, {way}: NEES (3 when true), median", np.median(nees), ""),
+                row("F.drawn", f"{label}, {way}: NEES above {_TOO_SURE:g}", np.sum(nees > _TOO_SURE), "runs"),
+            ]  # fmt: skip
+    for way in ("batch", "online"):
+        both = [f for f in found if "rmse_m" in f[way] and "honest EKF" in f]
+        better = sum(f[way]["rmse_m"] < f["honest EKF"]["rmse_m"] for f in both)
+        rows.append(row("F.drawn", f"{label}: {way} better than the honest EKF, of {len(both)}", better, "runs"))
+    return rows
+
+
+def _line(found: Found, before: Found | None) -> str:
+    said = [f"{found['drawn']['seed']:5}"]
+    for way in ("batch", "online", "honest EKF"):
+        now, then = found.get(way, {}), (before or {}).get(way, {})
+        if "rmse_m" not in now:
+            said.append(f"{way}: {now.get('refused', 'none')}")
+            continue
+        was = f" ({then['rmse_m']:.2f} m, {then['nees'] or 0:.1f})" if "rmse_m" in then and way != "honest EKF" else ""
+        said.append(f"{way} {now['rmse_m']:.2f} m, NEES {now['nees'] or 0:.1f}{was}")
+    return " | ".join(said)
+
+
+def _differs(found: Found, before: Found) -> bool:
+    for way in ("batch", "online"):
+        now, then = found[way].get("rmse_m", np.inf), before[way].get("rmse_m", np.inf)
+        if now != then and abs(now - then) > max(0.05, 0.08 * then):
+            return True
+    return False
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("first", type=int)
+    parser.add_argument("end", type=int)
+    parser.add_argument("--out", type=Path, help="a line of JSON for each run")
+    parser.add_argument("--before", type=Path, help="an earlier --out: only runs that differ are shown")
+    asked = parser.parse_args()
+    lines = asked.before.read_text().splitlines() if asked.before else []
+    before = {f["drawn"]["seed"]: f for f in map(json.loads, lines)}
+    done = []
+    for seed in range(asked.first, asked.end):
+        found = measured(seed)
+        done.append(found)
+        then = before.get(seed)
+        if then is None or _differs(found, then):
+            print(_line(found, then), flush=True)
+        if asked.out:
+            with asked.out.open("a") as stream:
+                stream.write(json.dumps(found) + "\n")
+    same = [f for f in done if not before or f["drawn"]["seed"] in before]
+    for name, some in (("before", [before[f["drawn"]["seed"]] for f in same] if before else []), ("now", same)):
+        for way in ("batch", "online") if some else ():
+            rmse, nees = _column(some, way, "rmse_m"), _column(some, way, "nees")
+            print(
+                f"{way}, {name}: {len(rmse)} runs, RMSE mean {rmse.mean():.3f} median {np.median(rmse):.3f} m, "
+                f"NEES median {np.median(nees):.2f}, above {_TOO_SURE:g} in {np.sum(nees > _TOO_SURE)}, "
+                f"coverage {_column(some, way, 'coverage').mean():.3f}"
+            )
+
+
+if __name__ == "__main__":
+    main()
