@@ -29,6 +29,7 @@ from graphloc.frontends.decode import (
     POSE,
     QUATERNION,
     TWIST,
+    UNSTAMPED,
     VECTOR,
     nav_sat_status,
     stamp_ns_of,
@@ -168,7 +169,7 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
         if len(t.msgtypes) == 1 and t.msgtypes[0] in ROWS and (t.msgtypes[0] not in NUMBERS or _HEADING.search(t.topic))
     }
     tree = StaticTree()
-    mixed = {t.topic for t in bag.topics.values() if t.msgtypes == (NMEA,)}
+    mixed = {t.topic for t in bag.topics.values() if len(t.msgtypes) == 1 and t.msgtypes[0] in NMEA}
     wanted = set(streams) | mixed | ({TF_STATIC} & set(bag.topics))
     for raw in bag.messages(wanted) if wanted else ():
         msg: Any = None
@@ -187,7 +188,7 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
             if stamp_ns is None:
                 stream.no_stamp += 1
                 continue
-            if raw.msgtype not in NUMBERS:
+            if raw.msgtype not in UNSTAMPED:
                 stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
             stream.add(stamp_ns, raw.log_ns, row, raw.file)
     return list(streams.values()), tree
@@ -200,9 +201,10 @@ def _plain(raw: RawMessage, msg: Any, streams: dict[str, Stream]) -> list[tuple[
 def _sentences(topic: str, msg: Any, streams: dict[str, Stream]) -> list[tuple[Stream, Row | None]]:
     """The stream of each sentence, made where it is the first one."""
     said: list[tuple[Stream, Row | None]] = []
-    for talker, kind in nmea.identities(msg.sentence):
+    text = nmea.text_of(msg)
+    for talker, kind in nmea.identities(text):
         if kind in SENTENCES:
             msgtype, row_of = SENTENCES[kind]
             name = f"{topic} {talker}{kind}"
-            said.append((streams.setdefault(name, Stream(name, msgtype)), row_of(msg.sentence, talker + kind)))
+            said.append((streams.setdefault(name, Stream(name, msgtype)), row_of(text, talker + kind)))
     return said

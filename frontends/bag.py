@@ -35,10 +35,10 @@ from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, To
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import turn_warnings
 from graphloc.frontends.decode import (
-    NUMBERS,
     ODOMETRY,
     PLAIN_POSE,
     POSE,
+    UNSTAMPED,
     Decoded,
     decoder_of,
     header_stamp_ns,
@@ -319,7 +319,7 @@ def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) 
         f"{r.sensor}: {_or(topics[r.config.topic].msgtypes)} has no stamp: its messages count from when they were recorded; "
         "time_offset_s (negative) where that was late"
         for r in sensors
-        if set(topics[r.config.topic].msgtypes) & set(NUMBERS)
+        if set(topics[r.config.topic].msgtypes) & set(UNSTAMPED)
     ]
 
 

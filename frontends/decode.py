@@ -49,8 +49,10 @@ PLAIN_TWIST = "geometry_msgs/msg/TwistStamped"
 VECTOR = "geometry_msgs/msg/Vector3Stamped"
 PLAIN_POSE = "geometry_msgs/msg/PoseStamped"
 GPS_FIXES = ("gps_msgs/msg/GPSFix", "gps_common/msg/GPSFix")
-NMEA = "nmea_msgs/msg/Sentence"
-NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")  # they have no stamp
+NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
+_STRING = "std_msgs/msg/String"
+NMEA = ("nmea_msgs/msg/Sentence", _STRING)
+UNSTAMPED = (*NUMBERS, _STRING)
 TF = "tf2_msgs/msg/TFMessage"
 
 _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
@@ -88,7 +90,7 @@ def header_stamp_ns(msg: Any) -> int | None:
 
 def stamp_ns_of(msg: Any, msgtype: str, log_ns: int) -> int | None:
     """Return the stamp of a message, ns: its header's, or of a type that has none when it was recorded; None where there is none."""
-    return log_ns if msgtype in NUMBERS else header_stamp_ns(msg)
+    return log_ns if msgtype in UNSTAMPED else header_stamp_ns(msg)
 
 
 def covariance_translation_first(values: ArrayLike) -> Array:
@@ -183,7 +185,7 @@ def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) ->
 
 
 def _gnss_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:
-    fix = nmea.fix(msg.sentence, config.nmea)
+    fix = nmea.fix(nmea.text_of(msg), config.nmea)
     if isinstance(fix, Rejection):
         return fix
     status = NMEA_STATUS.get(fix.quality, 0)
@@ -252,7 +254,7 @@ def _compass_imu(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Compass
 
 
 def _compass_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
-    heading = nmea.heading_deg(msg.sentence, config.nmea)
+    heading = nmea.heading_deg(nmea.text_of(msg), config.nmea)
     if isinstance(heading, Rejection):
         return heading
     yaw = float(wrap_angle(np.radians(90.0 - heading)))
@@ -288,7 +290,7 @@ def _velocity_vector(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Vel
 
 
 def _velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
-    v = nmea.velocity_mps(msg.sentence, config.nmea)
+    v = nmea.velocity_mps(nmea.text_of(msg), config.nmea)
     if isinstance(v, Rejection):
         return v
     return _moving((*v, 0.0), np.diag([0.0, 0.0, _NO_CLIMB_MPS2]), stamp_ns, seq, sensor, config)
@@ -348,15 +350,15 @@ DECODERS: dict[tuple[str, str], Decoder] = {
     ("imu", IMU): _imu,
     ("gnss", NAV_SAT_FIX): _gnss,
     **{("gnss", msgtype): _gnss for msgtype in GPS_FIXES},
-    ("gnss", NMEA): _gnss_nmea,
+    **{("gnss", msgtype): _gnss_nmea for msgtype in NMEA},
     ("compass", QUATERNION): _compass_quaternion,
     ("compass", IMU): _compass_imu,
-    ("compass", NMEA): _compass_nmea,
+    **{("compass", msgtype): _compass_nmea for msgtype in NMEA},
     **{("compass", msgtype): _compass_number for msgtype in NUMBERS},
     ("gnss_velocity", TWIST): _velocity,
     ("gnss_velocity", PLAIN_TWIST): _velocity,
     ("gnss_velocity", VECTOR): _velocity_vector,
-    ("gnss_velocity", NMEA): _velocity_nmea,
+    **{("gnss_velocity", msgtype): _velocity_nmea for msgtype in NMEA},
     ("pose", POSE): _pose,
     ("pose", PLAIN_POSE): _pose,
     ("pose", ODOMETRY): _pose,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sentence of NMEA 0183 says (`nmea_msgs/Sentence`): a place, a heading, a velocity over ground.
+"""What a sentence of NMEA 0183 says (`nmea_msgs/Sentence`, `std_msgs/String`): a place, a heading, a velocity over ground.
 
 Reading the fields is left to pynmeagps. A sentence that was not asked for is not read at all.
 """
@@ -16,7 +16,7 @@ from pynmeagps import VALCKSUM, NMEAReader, exceptions
 
 from graphloc.frontends._rejections import Rejection, ignored, malformed, rejected
 
-PLACES = ("GGA", "GNS", "RMC")
+PLACES = ("GGA", "GNS", "RMC", "GLL")
 HEADINGS = ("HDT", "THS", "HDG", "HDM")
 VELOCITIES = ("VTG", "RMC")
 _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
@@ -27,7 +27,7 @@ _UNREADABLE = (
 )  # fmt: skip
 _KNOT_MPS, _KM_PER_H_MPS = 1852.0 / 3600.0, 1.0 / 3.6
 _SLOW_MPS = 0.1  # below it a receiver may leave the course out
-# Quality of a fix as GGA has it, from the mode letters of GNS and RMC.
+# Quality of a fix as GGA has it, from the mode letters of GNS, RMC and GLL.
 _QUALITIES = {"N": 0, "A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
 _NOT_MEASURED = {0: "no fix", 6: "dead reckoned by the receiver", 7: "typed in by hand", 8: "simulated by the receiver"}
 
@@ -41,6 +41,11 @@ class Fix:
     height_m: float
     quality: int
     hdop: float
+
+
+def text_of(msg: Any) -> str:
+    """Return what a message of either type says."""
+    return str(msg.sentence if hasattr(msg, "sentence") else msg.data)
 
 
 def identities(text: str) -> list[tuple[str, str]]:

@@ -12,7 +12,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from graphloc.app import smooth_recording
-from graphloc.config import load_config
+from graphloc.config import CompassConfig, GnssConfig, load_config
 from graphloc.errors import ConfigError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
@@ -53,6 +53,7 @@ def test_a_place_is_above_the_ellipsoid() -> None:
 @pytest.mark.parametrize(
     ("body", "quality"),
     [("GNGNS,122310.2,3722.425671,N,12258.856215,W,DN,14,0.9,1005.543,6.5,,", 2),
+     ("GPGLL,3722.425671,N,12258.856215,W,122310,A,D", 2),
      ("GNRMC,122310.2,A,3722.425671,N,12258.856215,W,5.0,90.0,230324,,,R", 4),
      ("GPRMC,122310.2,A,3722.425671,N,12258.856215,W,5.0,90.0,230324,003.1,W", 1)],
 )  # fmt: skip
@@ -61,7 +62,7 @@ def test_other_sentences_say_places_too(body: str, quality: int) -> None:
     assert isinstance(said, nmea.Fix)
     assert said.quality == quality
     assert said.latitude_deg == pytest.approx(37.0 + 22.425671 / 60.0, abs=1e-9)
-    assert isnan(said.height_m) == ("RMC" in body)
+    assert isnan(said.height_m) == ("GNS" not in body)
 
 
 @pytest.mark.parametrize(
@@ -214,6 +215,31 @@ def test_a_bag_of_sentences_is_read_as_drafted(run: SimulatedRun, bag: Path, tmp
     tracks = [smooth_recording(r, measured).solution.trajectory for r in (read_recording(bag, measured), run.recording)]
     assert np.abs(tracks[0].p_world_m - tracks[1].p_world_m).max() < 0.01
     assert all(m.cov_m2ps2[2, 2] >= 1e6 for m in recording.measurements if isinstance(m, GnssVelocity))
+
+
+def test_lines_in_plain_strings_count_from_when_they_were_recorded(tmp_path: Path) -> None:
+    """As loggers write them, bursts among them; a topic of strings that says something else is no instrument."""
+    make, items = Messages(2), []
+    begin_ns = 1_700_000_000 * S
+    for k in range(40):
+        place = f"{minutes(57.7 + 1e-5 * k, 'NS', 2)},{minutes(11.9, 'EW', 3)}"
+        burst = "\r\n".join(sealed(b) for b in (f"GPGLL,{place},120000,A,A", f"HEHDT,{10.0 + k:.1f},T"))
+        items += [
+            ("/line", begin_ns + k * S, make.text(burst)),
+            ("/status", begin_ns + k * S, make.text("under way")),
+        ]
+    bag, drafted = write_bag(tmp_path / "run", make, items), tmp_path / "vessel.yaml"
+    drafted.write_text(draft_config(inspect_bag(bag)))
+    config = load_config(drafted, KINDS)
+    lines = {(s.topic, s.nmea) for s in config.sensors.values() if isinstance(s, GnssConfig | CompassConfig)}
+    assert lines == {("/line", ("GPGLL",)), ("/line", ("HEHDT",))}
+    recording = read_recording(bag, config)
+    fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)]
+    assert [m.stamp_ns for m in fixes] == [begin_ns + k * S for k in range(40)]
+    assert [m.position.latitude_deg for m in fixes] == pytest.approx([57.7 + 1e-5 * k for k in range(40)], abs=1e-8)
+    headings = [m for m in recording.measurements if isinstance(m, CompassHeading)]
+    assert [np.degrees(m.yaw_rad) for m in headings] == pytest.approx([80.0 - k for k in range(40)])
+    assert sum("has no stamp" in w for w in recording.warnings) == 2
 
 
 def test_messages_of_other_packages_say_the_same(tmp_path: Path) -> None:

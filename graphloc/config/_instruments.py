@@ -84,7 +84,7 @@ class ImuConfig(SensorConfig):
 
 
 _TALKER = "^([A-Z]{2})?"
-Places = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(GGA|GNS|RMC)$")], ...], Field(min_length=1)]
+Places = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(GGA|GNS|RMC|GLL)$")], ...], Field(min_length=1)]
 Headings = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(HDT|THS|HDG|HDM)$")], ...], Field(min_length=1)]
 Velocities = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(VTG|RMC)$")], ...], Field(min_length=1)]
 
@@ -106,7 +106,7 @@ class SlowErrorConfig(Block):
 
 
 class GnssConfig(SensorConfig):
-    """GNSS position (`sensor_msgs/NavSatFix`, `gps_msgs/GPSFix`, `nmea_msgs/Sentence`)."""
+    """GNSS position (`sensor_msgs/NavSatFix`, `gps_msgs/GPSFix`, NMEA in `nmea_msgs/Sentence` or `std_msgs/String`)."""
 
     kind: Literal["gnss"] = "gnss"
     """Which row of the sensor table reads this block."""
@@ -125,11 +125,11 @@ class GnssConfig(SensorConfig):
     slow_error: SlowErrorConfig = SlowErrorConfig()
     """The modelled slow error."""
     nmea: Places = ("GGA",)
-    """Sentences that are read of an `nmea_msgs/Sentence` topic, of one talker (`GPGGA`) or of any (`GGA`): GGA, GNS, RMC."""
+    """Sentences that are read of a topic of NMEA, of one talker (`GPGGA`) or of any (`GGA`): GGA, GNS, RMC, GLL."""
 
 
 class CompassConfig(SensorConfig):
-    """Heading: `geometry_msgs/QuaternionStamped`, orientation of `sensor_msgs/Imu`, `nmea_msgs/Sentence`, `std_msgs/Float64` or `Float32`."""
+    """Heading: `geometry_msgs/QuaternionStamped`, orientation of `sensor_msgs/Imu`, NMEA (as `gnss`), `std_msgs/Float64` or `Float32`."""
 
     kind: Literal["compass"] = "compass"
     """Which row of the sensor table reads this block."""
@@ -152,11 +152,11 @@ class CompassConfig(SensorConfig):
     wander_time_constant_s: Positive = 60.0
     """How long such an error lasts, s."""
     nmea: Headings = ("HDT", "THS")
-    """Sentences that are read of an `nmea_msgs/Sentence` topic, of one talker (`HEHDT`) or of any (`HDT`): HDT, THS, HDG, HDM."""
+    """Sentences that are read of a topic of NMEA, of one talker (`HEHDT`) or of any (`HDT`): HDT, THS, HDG, HDM."""
 
 
 class VelocityConfig(SensorConfig):
-    """GNSS velocity in ENU (`geometry_msgs/TwistWithCovarianceStamped`, `TwistStamped`, `Vector3Stamped`, `nmea_msgs/Sentence`)."""
+    """GNSS velocity in ENU (`geometry_msgs/TwistWithCovarianceStamped`, `TwistStamped`, `Vector3Stamped`, NMEA as `gnss`)."""
 
     kind: Literal["gnss_velocity"] = "gnss_velocity"
     """Which row of the sensor table reads this block."""
@@ -165,7 +165,7 @@ class VelocityConfig(SensorConfig):
     default_sigma_mps: Positive = 0.3
     """Taken where the message reports no covariance, m/s."""
     nmea: Velocities = ("VTG",)
-    """Sentences that are read of an `nmea_msgs/Sentence` topic, of one talker (`GPVTG`) or of any (`VTG`): VTG, RMC."""
+    """Sentences that are read of a topic of NMEA, of one talker (`GPVTG`) or of any (`VTG`): VTG, RMC."""
 
 
 class HeightConfig(SensorConfig):
