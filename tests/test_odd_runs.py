@@ -413,6 +413,16 @@ def test_a_heading_that_comes_late_is_not_the_starts() -> None:
     assert off.position_rmse_m < 1.5
 
 
+def test_a_late_heading_is_the_starts_where_no_place_was_told_before() -> None:
+    """Poses from 50 s on, and nothing else: eight starts would be tried, on a way that tells nothing before the heading comes."""
+    run = simulate(replace(BASE, duration_s=75.0, pose_hz=1.0, false_fraction=0.0, imu_hz=50.0), 1)
+    begin_ns = run.truth.stamps_ns[0]
+    late = tuple(m for m in run.recording.measurements if isinstance(m, PoseFix) and m.stamp_ns - begin_ns > 50e9)
+    recording = only(run.recording, late)
+    problem = make_problem(recording, run.config, app.choose_datum(run.recording, run.config), SENSORS, INERTIAL)
+    assert len(align(problem).yaws_rad) == 1
+
+
 @pytest.mark.parametrize("axes", [("roll",), ("x", "y", "pitch")])
 def test_roll_or_pitch_alone_is_refused(axes: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match="roll and pitch go together"):

@@ -298,6 +298,57 @@ def test_a_start_that_waited_longer_than_the_lag_keeps_what_it_found() -> None:
     assert np.degrees(begun.heading_bound_95_rad) == pytest.approx(bounds_95(whole.cov)[-1, 2], rel=0.25)
 
 
+def test_a_start_that_waited_uses_what_came_just_before_its_first_state() -> None:
+    """Fixes 60 ms before the states that they are tied to: of the one tied to the first state of the lag, too, the start has made use."""
+    run = slowly(simulate(replace(Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0), 1))
+    arrivals = [
+        replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns - 60_000_000)) if isinstance(a.m, GnssPosition) else a
+        for a in without(arrivals_of(run), lambda a: isinstance(a.m, (PoseFix, CompassHeading)))
+    ]
+    fed = feed(online := smoother(run, lag_s=4.0), run, arrivals)
+    assert complaints(arrivals, finish(online, fed)) == []
+    refused = [row for row in fed.rows if row.sensor == "gnss" and row.outcome is Outcome.REJECTED]
+    imu = run.recording.imu
+    assert imu is not None
+    assert [row.seq for row in refused if row.stamp_ns > imu.stamps_ns[0]] == []
+
+
+def test_what_closes_a_slow_chain_counts_once_after_a_start_that_waited() -> None:
+    """Slow states as far apart as the lag is long, or farther: the last of them is not the first of the lag."""
+    run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0), 1)
+    gnss, kept = run.config.sensors["gnss"], ("imu", "gnss")
+    assert isinstance(gnss, GnssConfig)
+    told = gnss.model_copy(update={"slow_error": gnss.slow_error.model_copy(update={"enabled": True})})
+    run = replace(run, config=run.config.model_copy(update={
+        "timeline": TimelineConfig(rate_hz=5.0, slow_period_s=4.0),
+        "sensors": {name: told if name == "gnss" else run.config.sensors[name] for name in kept},
+    }))  # fmt: skip
+    arrivals = without(arrivals_of(run), lambda a: a.m.sensor not in kept)
+    sigmas_m = []
+    for lag_s in (1.0, 12.0):
+        online, fed = smoother(run, lag_s=lag_s), Fed()
+        next(a for a in arrivals if feed(online, run, [a], fed).estimates)
+        sigmas_m.append(np.sqrt(np.diagonal(fed.estimates[0].cov)[:3]))
+        finish(online, fed)
+    np.testing.assert_allclose(sigmas_m[0][2], sigmas_m[1][2], rtol=0.05)
+
+
+def test_a_start_whose_heading_is_a_guess_is_no_surer_of_its_place_than_the_receiver() -> None:
+    """Fixes whose slow error is 2 m and no compass: a heading that goes on turning in the lag tells no place."""
+    run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=50.0, gnss_hz=2.0, imu_hz=50.0), 1)
+    gnss, kept = run.config.sensors["gnss"], ("imu", "gnss")
+    assert isinstance(gnss, GnssConfig)
+    told = gnss.model_copy(update={"slow_error": gnss.slow_error.model_copy(update={"enabled": True})})
+    run = slowly(
+        replace(run, config=run.config.model_copy(update={"sensors": {"imu": run.config.sensors["imu"], "gnss": told}}))
+    )
+    fed = feed(online := smoother(run), run, without(arrivals_of(run), lambda a: a.m.sensor not in kept))
+    finish(online, fed)
+    for estimate in (fed.estimates[0], fed.estimates[-1]):
+        assert np.sqrt(np.diagonal(estimate.cov)[:2]).min() > 0.9 * told.slow_error.horizontal_sigma_m
+    assert fed.errors_m[-1] < 1.0
+
+
 def test_starts_from_given_poses() -> None:
     """Four poses and the IMU: place and heading are known, and then dead reckoned."""
     run = drift()

@@ -173,6 +173,26 @@ def test_a_receiver_that_is_far_off_is_waited_for(error_m: float, denies: bool, 
     assert [*lost_s, 90][0] == pytest.approx(lost_after_s, abs=1)
 
 
+def test_what_denied_and_was_found_to_hang_does_not_hurry_a_start_anew() -> None:
+    """A receiver that is far off is waited for, whatever one that hangs has said before that was seen."""
+    online = smoother(run_of())
+    feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
+    assert online._lag is not None  # noqa: SLF001
+    lag = online._lag  # noqa: SLF001
+    fix, match = (lag.problem.streams[name] for name in ("gnss", "aerial"))
+    a_fix = lag._judge._chapter(fix)[-1].measurement  # noqa: SLF001
+    verdict = lag._judge._chapter(match)[-1].verdict  # noqa: SLF001
+    far_off = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([20.0, 0.0, 0.0])))
+    agreement, begin_ns = lag._agreement, lag.newest.stamp_ns  # noqa: SLF001
+    agreement.back_to(({}, [], {}))
+    for _ in range(5):
+        agreement.note(match, replace(a_fix, stamp_ns=begin_ns, sensor="aerial"), None)
+    agreement.forget_refused()
+    for t_s in range(50):
+        agreement.note(fix, replace(a_fix, stamp_ns=begin_ns + t_s * 1_000_000_000), far_off)
+    assert not agreement.lost_s(begin_ns + 50 * 1_000_000_000)
+
+
 @pytest.mark.parametrize("opened", [True, False])
 def test_what_was_let_in_agrees_when_it_is_asked_again(opened: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fix 300 m off, let in once a second as the prediction was unsure, put off the new start of a lost estimate."""

@@ -47,6 +47,7 @@ class Agreement:
     def forget_refused(self) -> None:
         """Of what disagreed, a receiver is known to be wrong: nothing says any more that it is elsewhere."""
         self._refused = []
+        self._denied.clear()
 
     def marked(self) -> tuple[dict[str, int], list[int], dict[str, int]]:
         """Return what is remembered, for `back_to`."""

@@ -77,6 +77,10 @@ class Anchor:
         ends = np.cumsum([_CORE, *slow.values(), *constants.values()])
         own = [np.arange(a, b) for a, b in pairwise(ends)]
         pose, velocity, bias = point
+        # The tangent turns along with the pose: where the heading is a guess, by tens of degrees.
+        there, turn = pose.retract(mean[:6]), np.eye(len(mean))
+        turn[:3, :3] = turn[3:6, 3:6] = there.rotation().matrix().T @ pose.rotation().matrix()
+        cov = turn @ cov @ turn.T
         beside_pose = {
             name: _beside_pose(mean[rows], cov[np.ix_([*range(6), *rows], [*range(6), *rows])])
             for name, rows in zip(slow, own, strict=False)
@@ -88,7 +92,7 @@ class Anchor:
         }
         return cls(
             stamp_ns=stamp_ns,
-            pose=pose.retract(mean[:6]),
+            pose=there,
             velocity=np.asarray(velocity) + mean[6:9],
             bias=bias + mean[9:_CORE],
             cov=cov[:_CORE, :_CORE],
@@ -126,28 +130,47 @@ class Anchor:
         )
 
     def factors(self, pose: int, velocity: int, bias: int) -> list[Any]:
-        """Return the prior of the state, by its keys."""
-        whiten = np.linalg.inv(np.linalg.cholesky(sound(self.cov)))
-        blocks = (whiten[:, :6], whiten[:, 6:9], whiten[:, 9:])
-        unit = gtsam.noiseModel.Unit.Create(_CORE)
-        make: Any = gtsam.JacobianFactor
-        linear = make(pose, blocks[0], velocity, blocks[1], bias, blocks[2], np.zeros(_CORE), unit)
-        point = gtsam.Values()
-        point.insert(pose, self.pose)
-        point.insert(velocity, self.velocity)
-        point.insert(bias, gtsam.imuBias.ConstantBias(self.bias[:3], self.bias[3:]))
-        return [gtsam.LinearContainerFactor(linear, point)]
+        """Return the prior of the state, by its keys; linear in world, as in `beside`."""
+        R0, p0, turn = self.pose.rotation(), self.pose.translation(), np.eye(_CORE)
+        turn[:3, :3] = turn[3:6, 3:6] = self.pose.rotation().matrix()
+        whiten = np.linalg.inv(np.linalg.cholesky(sound(turn @ self.cov @ turn.T)))
+
+        def error(this: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
+            own, fast, held = this.keys()
+            R, p = values.atPose3(own).rotation(), values.atPose3(own).translation()
+            if H is not None:
+                H[0] = np.asfortranarray(whiten[:, :6] @ np.kron(np.eye(2), R.matrix()))
+                H[1], H[2] = np.asfortranarray(whiten[:, 6:9]), np.asfortranarray(whiten[:, 9:])
+            moved = np.concatenate([gtsam.Rot3.Logmap(R.compose(R0.inverse())), p - p0])
+            v, b = values.atVector(fast) - self.velocity, values.atConstantBias(held).vector() - self.bias
+            return np.asarray(whiten @ np.concatenate([moved, v, b]))
+
+        return [gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(_CORE), [pose, velocity, bias], error)]
 
     def beside(self, known: Beside, pose: int, key: int) -> Any:
-        """Return the prior of a vector, given the pose."""
+        """Return the prior of a vector, given the pose.
+
+        Linear in world: a place that is hardly known is known to centimetres together with a slow error. In tangents of a
+        heading that turns on by 20 deg, that would be another sum, and both sums together would tell the place.
+        """
         whiten = np.linalg.inv(np.linalg.cholesky(sound(known.cov)))
-        make: Any = gtsam.JacobianFactor
-        size = len(known.value)
-        linear = make(pose, -whiten @ known.gain, key, whiten, np.zeros(size), gtsam.noiseModel.Unit.Create(size))
-        point = gtsam.Values()
-        point.insert(pose, self.pose)
-        point.insert(key, known.value)
-        return gtsam.LinearContainerFactor(linear, point)
+        R0, p0, gain = (
+            self.pose.rotation(),
+            self.pose.translation(),
+            known.gain.reshape(-1, 2, 3) @ self.pose.rotation().matrix().T,
+        )
+        gain = whiten @ gain.reshape(-1, 6)
+
+        def error(this: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
+            own, other = this.keys()
+            R, p = values.atPose3(own).rotation(), values.atPose3(own).translation()
+            if H is not None:
+                turn = np.kron(np.eye(2), R.matrix())
+                H[0], H[1] = np.asfortranarray(-gain @ turn), np.asfortranarray(whiten)
+            moved = np.concatenate([gtsam.Rot3.Logmap(R.compose(R0.inverse())), p - p0])
+            return np.asarray(whiten @ (np.atleast_1d(values.atVector(other)) - known.value) - gain @ moved)
+
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(known.value)), [pose, key], error)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""

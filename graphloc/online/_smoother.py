@@ -453,7 +453,7 @@ class OnlineSmoother:
         self._book.enter(started.rows)
         self._pending = [m for m in others if not self._book.has(m)]
         while self._pending and self._pending[0].stamp_ns < self._lag.first_ns:
-            self._book.drop(self._pending.pop(0), Outcome.REJECTED, "came before the first state")
+            self._book.drop(self._pending.pop(0), Outcome.REJECTED, "no IMU data at this stamp")
         self._recent.begin([*samples, *self._pending])
         self._step(self._lag)
         self._keep_anchor(self._lag)

@@ -159,7 +159,7 @@ def _solved(
         row_of(stream, m, stream.config.topic, result.verdicts[stream.number, i])
         for stream in result.problem.streams
         for i, m in enumerate(stream.measurements)
-        if stream.state[i] < k and m.seq >= 0
+        if m.stamp_ns < anchor.stamp_ns and m.seq >= 0
     ]
     return Started(
         datum=datum,
@@ -183,10 +183,14 @@ def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:
     problem, values = result.problem, result.values
     timeline, last = problem.timeline, len(problem.timeline) - 1
     back = timeline.floor(int(timeline.stamps_ns[last]) - duration_ns(lag_s))
-    k = int(np.searchsorted(timeline.slow_of, timeline.slow_of[back]))
+    # Not at the last node: what closes the slow chains there would be in what was before, and count twice.
+    k = int(np.searchsorted(timeline.slow_of, min(timeline.slow_of[back], timeline.slow_of[last] - 1)))
     if k == 0:
         return 0, Anchor.of_start(int(timeline.stamps_ns[0]), result.prior)
     made: dict[tuple[int, int], range] = {}
     graph, guess = build_graph(problem, values, decisions(result.verdicts), 0, last, result.prior, made=made)
-    past = past_at(problem, StretchStep(guess, graph, made, 0, 0.0, 0.0), k)
+    # What came before the state may be tied to it; the lag takes only what comes from its stamp on.
+    stamps_ns = {s.number: [m.stamp_ns for m in s.measurements] for s in problem.streams}
+    after = {at: found for at, found in made.items() if stamps_ns[at[0]][at[1]] >= timeline.stamps_ns[k]}
+    past = past_at(problem, StretchStep(guess, graph, after, 0, 0.0, 0.0), k)
     return k, Anchor.of_past(problem, values, past, k)

@@ -87,7 +87,8 @@ def align(problem: Problem) -> Start:
     still = _standstill(problem, track, yaws)
     bias, bias_sigma, notes = _gyro_bias(problem, origin, window, still, yaws)
     early = {name: rows for name, rows in yaws.items() if rows[0, 0] * bias_sigma[2] < _CARRIED_RAD}
-    if early or _moved_at(track) is not None:
+    moved_s = _moved_at(track)
+    if early or (moved_s is not None and moved_s < min((rows[0, 0] for rows in yaws.values()), default=np.inf)):
         yaws = early
     turn = _turns(problem, max([window, *(rows[0, 0] for rows in yaws.values())]) + 10.0 if yaws else 180.0, bias)
     at_start = still if still is not None and still[0] == 0.0 else None
