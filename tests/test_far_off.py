@@ -105,10 +105,12 @@ def test_what_closes_a_chain_is_taken_out_as_it_weighs(value: tuple[float, float
     np.testing.assert_allclose(np.diagonal(information), 1.0 / closing_variance(of, np.array(value)), rtol=1e-6)
 
 
-def jumped(begin_s: float, end_s: float, seed: int) -> tuple[SimulatedRun, Recording, VesselConfig]:
+def jumped(
+    begin_s: float, end_s: float, seed: int, length_s: float = 60.0
+) -> tuple[SimulatedRun, Recording, VesselConfig]:
     """Fixes, compass and velocities (0.1 m/s); the fixes 11 m off for a while."""
     run = simulate(
-        Scenario(path="loops", duration_s=60.0, noise="clean", imu_hz=50.0, gnss_hz=4.0, compass_hz=4.0), seed
+        Scenario(path="loops", duration_s=length_s, noise="clean", imu_hz=50.0, gnss_hz=4.0, compass_hz=4.0), seed
     )
     imu, truth, rng = run.recording.imu, run.truth, np.random.default_rng(seed)
     assert imu is not None
@@ -148,3 +150,25 @@ def test_fixes_and_velocities_do_not_follow_a_jump(begin_s: float, end_s: float)
         assert off.position_rmse_m < 2.5
         assert off.coverage_95 is not None
         assert off.coverage_95 > 0.95
+
+
+@pytest.mark.parametrize(("end_s", "right"), [(14.0, True), (35.0, False)])
+def test_a_run_that_begins_in_a_jump(end_s: float, right: bool) -> None:
+    """The level that is held longest is no jump, wherever the run begins; where that is the wrong one, the bounds allow for it."""
+    run, recording, config = jumped(0.0, end_s, 3)
+    found = app.smooth_recording(recording, config).solution
+    off = compare_to_truth(found.trajectory, run.truth)
+    assert off.coverage_95 is not None
+    assert off.coverage_95 > 0.95
+    assert (off.position_rmse_m < 2.5) is right
+    assert any("held longest" in w for w in found.stats.warnings)
+
+
+def test_online_the_end_of_a_jump_is_not_taken_for_one_for_ever() -> None:
+    """It begins in a jump of 20 s: a minute after that it begins anew, where the fixes are since."""
+    run, recording, config = jumped(0.0, 20.0, 3, length_s=100.0)
+    track = replay(recording, config).solution.trajectory
+    off_m = np.hypot(*(track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[:, :2].T)
+    late = track.stamps_ns > run.truth.stamps_ns[0] + int(90e9)
+    assert off_m[~late].max() > 8.0
+    assert off_m[late].max() < 2.5

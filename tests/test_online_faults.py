@@ -22,6 +22,7 @@ from graphloc.keys import is_pose
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix
 from graphloc.online import OnlineSmoother
+from graphloc.online._agreement import Agreement
 from graphloc.online._live import live_problem
 from graphloc.online._window import Window
 from tests.faults import FAULTS, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
@@ -135,7 +136,7 @@ def test_what_agreed_with_a_choice_that_was_given_up_does_not_count(
     judge, agreement = online._lag._judge, online._lag._agreement  # noqa: SLF001
     stream = online._lag.problem.streams["aerial"]  # noqa: SLF001
     own = judge._chapter(stream)  # noqa: SLF001
-    agreement.back_to(({}, [], {}))
+    agreement.back_to(Agreement(online._lag.problem.timeline).marked())  # noqa: SLF001
     for entry in own:
         agreement.note(stream, entry.measurement, None)
     refused = agreement.marked()
@@ -158,7 +159,7 @@ def test_a_receiver_that_is_far_off_is_waited_for(error_m: float, denies: bool, 
     verdict = lag._judge._chapter(match)[-1].verdict  # noqa: SLF001
     agrees = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([error_m, 0.0, 0.0])))
     agreement, begin_ns = lag._agreement, lag.newest.stamp_ns  # noqa: SLF001
-    agreement.back_to(({}, [], {}))
+    agreement.back_to(Agreement(lag.problem.timeline).marked())
     for _ in range(5):  # what denied it before it agreed again is past
         agreement.note(match, replace(a_match, stamp_ns=begin_ns), None)
     agreement.note(fix, replace(a_fix, stamp_ns=begin_ns), replace(agrees, at=verdict.at))
@@ -173,6 +174,36 @@ def test_a_receiver_that_is_far_off_is_waited_for(error_m: float, denies: bool, 
     assert [*lost_s, 90][0] == pytest.approx(lost_after_s, abs=1)
 
 
+@pytest.mark.parametrize(
+    ("usual_s", "error_m", "lost_after_s"), [(20, 8.0, 60), (100, 8.0, 100), (400, 8.0, 200), (100, 5.0, 300)]
+)
+def test_a_jump_that_lasts_longer_than_what_was_before_was_none(
+    usual_s: int, error_m: float, lost_after_s: int
+) -> None:
+    """A run that begins in a jump takes its end for one: the level that is held longer is the right one. 3 sigmas are 6 m."""
+    online = smoother(run_of())
+    feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
+    assert online._lag is not None  # noqa: SLF001
+    lag = online._lag  # noqa: SLF001
+    fix = lag.problem.streams["gnss"]
+    entry = lag._judge._chapter(fix)[-1]  # noqa: SLF001
+    agreement, begin_ns = Agreement(lag.problem.timeline), lag.newest.stamp_ns
+
+    def agrees(t_s: int, off_m: float) -> None:
+        at = replace(entry.verdict.at, slow_value=np.array([0.0, off_m, 40.0]))  # above another zero
+        m = replace(entry.measurement, stamp_ns=begin_ns + t_s * 1_000_000_000)
+        agreement.note(fix, m, replace(entry.verdict, weight=1.0, at=at))
+
+    for t_s in range(usual_s):
+        agrees(t_s, 1.0)
+    lost_s = []
+    for t_s in range(usual_s, usual_s + 300):
+        agrees(t_s, error_m)
+        if agreement.lost_s(begin_ns + t_s * 1_000_000_000):
+            lost_s.append(t_s - usual_s)
+    assert [*lost_s, 300][0] == pytest.approx(lost_after_s, abs=1)
+
+
 def test_what_denied_and_was_found_to_hang_does_not_hurry_a_start_anew() -> None:
     """A receiver that is far off is waited for, whatever one that hangs has said before that was seen."""
     online = smoother(run_of())
@@ -184,7 +215,7 @@ def test_what_denied_and_was_found_to_hang_does_not_hurry_a_start_anew() -> None
     verdict = lag._judge._chapter(match)[-1].verdict  # noqa: SLF001
     far_off = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([20.0, 0.0, 0.0])))
     agreement, begin_ns = lag._agreement, lag.newest.stamp_ns  # noqa: SLF001
-    agreement.back_to(({}, [], {}))
+    agreement.back_to(Agreement(lag.problem.timeline).marked())
     for _ in range(5):
         agreement.note(match, replace(a_fix, stamp_ns=begin_ns, sensor="aerial"), None)
     agreement.forget_refused()
@@ -209,7 +240,7 @@ def test_what_was_let_in_agrees_when_it_is_asked_again(opened: bool, monkeypatch
 
     monkeypatch.setattr(judge, "_by_kernel", lets_in)
     monkeypatch.setattr(judge, "_ask_again", lambda *_: None)
-    agreement.back_to(({}, [], {}))
+    agreement.back_to(Agreement(online._lag.problem.timeline).marked())  # noqa: SLF001
     feed(online, run_of(), base[now:soon])
     assert ("gnss" in agreement.agreed_ns) is not opened
     monkeypatch.undo()

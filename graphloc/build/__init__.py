@@ -11,7 +11,16 @@ solution is moved to the body's origin at the end (`graphloc.solve`).
 """
 
 from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state, state_of
-from graphloc.build._chains import CONSTANT_TAILS, JUMP, bias_step, closing_variance, slow_begin, slow_end, slow_step
+from graphloc.build._chains import (
+    CONSTANT_TAILS,
+    JUMP,
+    bias_step,
+    closing_variance,
+    slow_begin,
+    slow_end,
+    slow_step,
+    standing_cost,
+)
 from graphloc.build._graph import Decisions, Past, StartPrior, build_graph, state_keys
 from graphloc.build._problem import (
     Mounts,
@@ -48,6 +57,7 @@ __all__ = [
     "slow_begin",
     "slow_end",
     "slow_step",
+    "standing_cost",
     "state_keys",
     "state_of",
     "with_noise_scale",

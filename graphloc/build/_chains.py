@@ -72,6 +72,19 @@ def closing_variance(slow: SlowProcess, value: Array) -> Array:
     return np.where(np.isfinite(slow.time_constant_s), _CHAIN_END * slow.sigma**2 * tails, np.inf)
 
 
+def standing_cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
+    """What a whole chain costs, in nats, by where it stands; of what may stand far off alone.
+
+    Args:
+        path: (N, k) nodes. dt_s: (N - 1,) between them.
+    """
+    far = _far(slow)
+    square = ((path[:, far] / slow.sigma[far]) ** 2).sum(axis=1)
+    held = np.concatenate([[1.0 / _CHAIN_END], dt_s / (2.0 * float(slow.time_constant_s[far].max()))])
+    held[-1] += 1.0 / _CHAIN_END
+    return float(held @ np.log1p(square / _FAR**2)) * _FAR**2 / 2.0
+
+
 def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool) -> Iterator[Any]:
     """Yield the priors that hold a node where the process stands, `times` (k,) its variance; constants are not held.
 

@@ -548,7 +548,7 @@ class OnlineSmoother:
         again = [m for m in self._recent if m.stamp_ns >= since_ns and not self._book.has(m)]
         self._close(lag, again)
         self._agreed_ns.update(lag.agreed_ns)
-        self._say(f"no absolute sensor agreed for {lag.lost_s:.0f} s: starts anew")
+        self._say(f"no absolute sensor agreed, but by a jump of its error, for {lag.lost_s:.0f} s: starts anew")
         self._wait("the next IMU sample")
         # Samples have their rows already.
         for m in again:

@@ -6,7 +6,8 @@
    are new in a window are judged by the prediction without them, with its covariance (`_grow`).
 3. Passes over the whole run: modes and weights re-chosen until they stand (`_passes`).
 4. Look for other choices that are more probable (`_choices`), and pass again where there are any.
-5. A Bayes tree of the last graph gives the covariances of every state.
+5. Where receivers jump and nothing else tells the place, take the level that is the usual one (`_levels`).
+6. A Bayes tree of the last graph gives the covariances of every state.
 
 An inertial sensor that contradicts the rest gets more noise, and 3 and 4 are done again, from gentle losses on.
 """
@@ -20,11 +21,13 @@ import gtsam
 import numpy as np
 
 from graphloc.build import Problem, StartPrior, bridged, with_noise_scale
+from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
 from graphloc.solve._choices import by_best_chains, judged_by_the_rest, take_more_probable, without_its_ends
 from graphloc.solve._decide import Verdicts, weigh
 from graphloc.solve._grow import grow, solve_start
+from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import Settled, expected_cost, open_passes, outliers_cost, settle
 
@@ -49,6 +52,9 @@ class BatchResult:
     noise_scale: float
     prior: StartPrior
     headings: int  # that explained the start as well as the one that was taken, and this one
+    levels_cov: (
+        Array  # (3, 3) of the place, m^2: levels of receivers that may be the usual ones as well (see `_levels`)
+    )
     notes: tuple[str, ...]
 
     def lightened(self) -> BatchResult:
@@ -79,11 +85,14 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         ratio = cost / max(expected_cost(problem, settled.verdicts), 1.0)
         if ratio < CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
+    settled, levels_cov = at_usual_level(problem, settled, prior, progress, _LAST_PASSES)
+    if settled.values is not estimate:
+        passes, iterations = passes + settled.passes, iterations + settled.iterations
     return BatchResult(
         problem=problem,
-        values=estimate,
+        values=settled.values,
         verdicts=settled.verdicts,
-        tree=bayes_tree(settled.graph, estimate),
+        tree=bayes_tree(settled.graph, settled.values),
         graph=settled.graph,
         passes=passes,
         iterations=iterations,
@@ -91,6 +100,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         noise_scale=problem.noise_scale,
         prior=prior,
         headings=headings,
+        levels_cov=levels_cov,
         notes=start.notes,
     )
 

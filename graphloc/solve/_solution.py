@@ -33,6 +33,7 @@ _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
 _FAR_OFF = 3.0
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3
+_LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
 _NEAR_BERTH_M = 60.0
 Leaps = tuple[NDArray[np.int64], Array]  # stamps and sizes
 NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
@@ -59,7 +60,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         cov=np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k], lever) for k in range(n)]),
     )
     assert trajectory.cov is not None
-    trajectory.cov[:, :3, :3] += left_out(problem.streams)
+    trajectory.cov[:, :3, :3] += left_out(problem.streams) + result.levels_cov
     since = {s.name: _since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     leapt = {s.name: _leaps(problem, result, s) for s in problem.streams}
     stats = _stats(problem, result, leapt)
@@ -373,6 +374,11 @@ def _stats(problem: Problem, result: BatchResult, leapt: Mapping[str, Leaps]) ->
         warnings.append(
             f"the cost is {cost / expected:.1f} times its expectation: noise is configured too small, or a "
             "mount, a unit or a time offset is wrong"
+        )
+    if (beside_m := largest_sigma(result.levels_cov)) > _LEVELS_M:
+        warnings.append(
+            "the fixes jump, and nothing else tells which of their levels is right: the one that is held longest is taken, "
+            f"and the bounds allow {beside_m:.1f} m (1 sigma) for the others"
         )
     for stream in problem.streams:
         far, said = _far_from_prior(stream, result)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""At which of its levels the error of a receiver usually stands, where nothing but such errors tells the place.
+
+A run grows from its first level, and no single step of the solver leads from one to another. So the levels that jumps lead
+to are compared: by where the errors would stand, and for how long far off, for a jump ends within a minute.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from graphloc import keys
+from graphloc.build import Problem, StartPrior, Stream, standing_cost
+from graphloc.frames import Array
+from graphloc.graph import SlowProcess
+from graphloc.recording import Progress
+from graphloc.solve._decide import Verdicts, weigh
+from graphloc.solve._passes import Settled, settle
+from graphloc.time import NS_PER_S
+
+_JUMP = 1.0  # sigmas from one node to the next: ten times what an error drifts
+_FAR = 2.0  # sigmas: nearer, it is where it usually is
+_LASTS_S = 30.0  # a jump, in the mean
+
+
+def at_usual_level(
+    problem: Problem, settled: Settled, prior: StartPrior, progress: Progress, most: int
+) -> tuple[Settled, Array]:
+    """Return the solution with the most probable of the levels as the usual one, settled in `most` passes, and what the others leave.
+
+    The latter is a covariance (3, 3) of the place, m^2, in world.
+    """
+    alone = np.zeros((3, 3))
+    streams = [s for s in problem.streams if s.slow is not None and s.slow.far]
+    paths = [_path(problem, settled.values, s) for s in streams]
+    levels = [level for s, path in zip(streams, paths, strict=True) for level in _levels(s.slow, path)]
+    if not levels or _told_otherwise(problem, settled.verdicts):
+        return settled, alone
+    levels.insert(0, np.zeros(3))
+    dt_s = np.diff(problem.timeline.slow_stamps_ns) / NS_PER_S
+    cost = np.array([
+        sum(_cost(s.slow, path - level, dt_s) for s, path in zip(streams, paths, strict=True)) for level in levels
+    ])  # fmt: skip
+    usual = int(np.argmin(cost))
+    share = np.exp(cost[usual] - cost)
+    beside = np.array(levels) - levels[usual]
+    others = np.einsum("n,ni,nj->ij", share / share.sum(), beside, beside)
+    if usual == 0:
+        return settled, others
+    values = _moved(problem, settled.values, streams, -levels[usual])
+    verdicts = weigh(problem, values, first=0, last=len(problem.timeline) - 1, stage="final")
+    other = settle(problem, values, verdicts, prior, progress, most)
+    if _error(other) - _error(settled) > cost[0] - cost[usual]:
+        return settled, alone  # something else holds the place
+    return other, others
+
+
+def _error(settled: Settled) -> float:
+    return float(settled.graph.error(settled.values))
+
+
+def _told_otherwise(problem: Problem, verdicts: Verdicts) -> bool:
+    """Whether a sensor without such an error tells the place, too."""
+    others = {s.number for s in problem.streams if s.row.absolute and (s.slow is None or not s.slow.far)}
+    return any(number in others and v.weight > 0.5 for (number, _), v in verdicts.items())
+
+
+def _path(problem: Problem, values: gtsam.Values, stream: Stream) -> Array:
+    """How an error goes (N, 3) from node to node, m."""
+    nodes = range(len(problem.timeline.slow_stamps_ns))
+    return np.array([np.atleast_1d(values.atVector(keys.slow(stream.number, j))) for j in nodes])
+
+
+def _levels(slow: SlowProcess | None, path: Array) -> list[Array]:
+    """Where an error (N, 3) stands from one jump to the next, (3,) each, m: but where it usually is, and each level once."""
+    assert slow is not None
+    held = path * [axis in slow.far for axis in slow.axes]
+    jumps = 1 + np.flatnonzero(np.linalg.norm(np.diff(held / slow.sigma, axis=0), axis=1) > _JUMP)
+    found: list[Array] = []
+    for part in np.split(held, jumps) if len(jumps) else []:
+        level = np.median(part, axis=0)
+        if all(np.linalg.norm((level - other) / slow.sigma) > _FAR for other in (np.zeros(3), *found)):
+            found.append(level)
+    return found
+
+
+def _cost(slow: SlowProcess | None, path: Array, dt_s: Array) -> float:
+    """Of an error that goes so (N, 3), nats: where it stands, and the time that it is far off."""
+    assert slow is not None
+    far = [axis in slow.far for axis in slow.axes]
+    away = np.linalg.norm(path[:, far] / slow.sigma[far], axis=1) > _FAR
+    return standing_cost(slow, path, dt_s) + float(dt_s @ away[1:]) / _LASTS_S
+
+
+def _moved(problem: Problem, values: gtsam.Values, streams: list[Stream], by_m: Array) -> gtsam.Values:
+    """The same run so far (3,) away in world, and as far from what these streams say of it."""
+    moved = gtsam.Values(values)
+    for k in range(len(problem.timeline)):
+        pose = values.atPose3(keys.pose(k))
+        moved.update(keys.pose(k), gtsam.Pose3(pose.rotation(), pose.translation() + by_m))
+    for stream in streams:
+        for j in range(len(problem.timeline.slow_stamps_ns)):
+            key = keys.slow(stream.number, j)
+            moved.update(key, np.atleast_1d(values.atVector(key)) + by_m)
+    return moved
