@@ -16,12 +16,12 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.graph import Residual
+from graphloc.leaps import LeapWatch, leaps, leaps_said
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
 from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.solution import Health
 from graphloc.solve._decide import _by_kernel
-from graphloc.solve._leaps import LeapWatch, leaps, leaps_said
 
 
 def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
@@ -235,6 +235,26 @@ def test_a_receiver_alone_that_leaps_is_said_in_the_run() -> None:
     }
     assert not any("leaps" in line for line in said["usual"])
     assert sum(line.startswith(("gnss: leaps by 11 m", "gnss: leaps by 12 m")) for line in said["struck"]) == 1
+
+
+def test_a_receiver_alone_that_leaps_is_not_followed_where_the_imu_denies_it() -> None:
+    """12 m for 30 s, and back: no drift is told from motion, a leap is. It was followed, 11 m off, and left its bounds."""
+    run = simulate(Scenario(path="loops", duration_s=100.0, noise="clean", pose_hz=0.0, compass_hz=5.0, imu_hz=50.0), 1)
+    begin_ns = int(run.truth.stamps_ns[0])
+    sensors = {k: v for k, v in run.config.sensors.items() if k in ("imu", "gnss", "compass")}
+
+    def struck(m: Measurement) -> Measurement:
+        if not isinstance(m, GnssPosition) or not 40.0 <= (m.stamp_ns - begin_ns) * 1e-9 < 70.0:
+            return m
+        return replace(m, position=Geodetic(m.position[0] + 12.0 / 111_300.0, *m.position[1:]))
+
+    recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
+    found = app.smooth_recording(recording, run.config.model_copy(update={"sensors": sensors})).solution
+    off = compare_to_truth(found.trajectory, run.truth)
+    assert off.coverage_95 is not None
+    assert off.coverage_95 > 0.95
+    assert off.position_max_m < 3.0
+    assert any("leaps by 12 m" in w and "taken for its error" in w for w in found.stats.warnings)
 
 
 def test_a_sensor_that_lies_by_more_than_numbers_hold_is_an_outlier() -> None:

@@ -139,6 +139,18 @@ def _add_constants(
             graph.add(gtsam.PriorFactorVector(key, np.zeros(len(constant.sigma)), model))
 
 
+def _leaps_m(problem: Problem, stream: Stream) -> dict[int, float]:
+    """By slow node: how far the places leap, m, before the next one; from the last place before to the first one after."""
+    found: dict[int, float] = {}
+    nodes_ns = problem.timeline.slow_stamps_ns
+    stamps_ns = [m.stamp_ns for m in stream.measurements]
+    for at_ns, off_m in zip(*stream.leapt, strict=True):
+        before_ns = stamps_ns[max(int(np.searchsorted(stamps_ns, at_ns)) - 1, 0)]
+        first, last = np.searchsorted(nodes_ns, [before_ns, at_ns], side="right") - 1
+        found |= dict.fromkeys(range(int(first), int(last) + 1), float(off_m))
+    return found
+
+
 def _node_dt_s(problem: Problem, j: int) -> float:
     stamps = problem.timeline.slow_stamps_ns
     return float((stamps[j + 1] - stamps[j]) * 1e-9)
@@ -168,8 +180,10 @@ def _add_slow_chain(
         else:
             for factor in slow_begin(slow, key[0], np.atleast_1d(values.atVector(key[0])), jumps=jumps):
                 graph.add(factor)
+    leaps_m = _leaps_m(problem, stream)
     for n, j in enumerate(nodes[:-1]):
-        for factor in slow_step(slow, key[n], key[n + 1], _node_dt_s(problem, j), jumps=jumps):
+        dt_s = _node_dt_s(problem, j)
+        for factor in slow_step(slow, key[n], key[n + 1], dt_s, jumps=jumps, leap_m=leaps_m.get(j, 0.0)):
             graph.add(factor)
     for factor in slow_end(slow, key[-1], jumps=jumps):
         graph.add(factor)

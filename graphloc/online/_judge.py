@@ -17,6 +17,7 @@ import numpy as np
 from graphloc.config import KernelConfig
 from graphloc.errors import SolveError
 from graphloc.graph import Attachment, Decision, Residual
+from graphloc.leaps import largest_sigma, leaps_said, told_alone
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
 from graphloc.online._entries import Entries, Entry
@@ -27,7 +28,6 @@ from graphloc.online._window import Window
 from graphloc.solve._best_chain import best_chain
 from graphloc.solve._decide import Verdict, by_hypotheses
 from graphloc.solve._hypotheses import log_evidence_of
-from graphloc.solve._leaps import largest_sigma, leaps_said, told_alone
 from graphloc.solve._solution import AGREES
 
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.frames import Array
+from graphloc.leaps import why_in_doubt
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
@@ -25,7 +26,6 @@ from graphloc.online._judge import Judge
 from graphloc.online._live import LiveProblem
 from graphloc.online._states import Newest, States
 from graphloc.online._window import Window
-from graphloc.solve._leaps import why_in_doubt
 
 _STEP_COST = (
     1.0  # of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10
@@ -152,7 +152,7 @@ class Lag:
         return {name for name, stream in self.problem.streams.items() if stream.parting.parted}
 
     def leapt(self) -> list[str]:
-        """Return a line on each receiver that has leapt since this was last asked (see `solve/_leaps.py`)."""
+        """Return a line on each receiver that has leapt since this was last asked (see `leaps.py`)."""
         return self._judge.leapt()
 
     def in_doubt(self, stamp_ns: int) -> str:

@@ -17,10 +17,10 @@ from graphloc.chi2 import chi2_median
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.leaps import LeapWatch
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._habit import Habit
 from graphloc.online._parting import Parting
-from graphloc.solve._leaps import LeapWatch
 from graphloc.time import duration_ns
 
 T = TypeVar("T")

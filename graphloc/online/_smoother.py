@@ -23,6 +23,7 @@ from graphloc.estimate import Estimate
 from graphloc.frames import Array, Datum
 from graphloc.graph import InertialRow, Sensor
 from graphloc.hangs import WHY
+from graphloc.leaps import LeapWatch
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._ahead import ahead, carry_on, no_further
@@ -41,7 +42,6 @@ from graphloc.online._start import Started, try_start
 from graphloc.online._turned import Turned
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
-from graphloc.solve._leaps import LeapWatch
 from graphloc.solve._solution import alone
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory

@@ -14,13 +14,13 @@ from graphloc.berths import Berth, BerthTrack, rates, seen_from
 from graphloc.build import Judged, Problem, Stream, constant_keys
 from graphloc.frames import Array, skew
 from graphloc.graph import SlowProcess
+from graphloc.leaps import LASTS_S, largest_sigma, leaps_said, why_in_doubt
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import Measurement
 from graphloc.recording import Recording
 from graphloc.solution import Health, SlowEstimate, Solution, SolveStats
 from graphloc.solve._batch import BatchResult, expected_cost
 from graphloc.solve._decide import Verdict
-from graphloc.solve._leaps import LASTS_S, largest_sigma, leaps, leaps_said, told_alone, why_in_doubt
 from graphloc.solve._passes import outliers_cost
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory, bounds_95
@@ -35,7 +35,6 @@ _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are 
 _BY_CHANCE = 1e-3
 _LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
 _NEAR_BERTH_M = 60.0
-Leaps = tuple[NDArray[np.int64], Array]  # stamps and sizes
 NO_NOISE, _NO_FIT = 10.0, 3.0  # no IMU is so much noisier than configured; nor does noise alone cost so much
 
 
@@ -62,9 +61,8 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     assert trajectory.cov is not None
     trajectory.cov[:, :3, :3] += left_out(problem.streams) + result.levels_cov
     since = {s.name: _since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
-    leapt = {s.name: _leaps(problem, result, s) for s in problem.streams}
-    stats = _stats(problem, result, leapt)
-    health, reasons = _health(trajectory, since, _misfits(problem, result, stats, leapt))
+    stats = _stats(problem, result)
+    health, reasons = _health(trajectory, since, _misfits(problem, result, stats))
     ledger = _ledger(problem, recording, result.verdicts)
     return Solution(
         datum=problem.datum,
@@ -151,7 +149,7 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where})"
 
 
-def _misfits(problem: Problem, result: BatchResult, stats: SolveStats, leapt: Mapping[str, Leaps]) -> list[str]:
+def _misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
     """Why each state cannot be called good; empty where nothing speaks against it."""
     stamps_ns, why = problem.timeline.stamps_ns, ""
     if not result.converged:
@@ -160,22 +158,11 @@ def _misfits(problem: Problem, result: BatchResult, stats: SolveStats, leapt: Ma
         why = "the measurements contradict each other"
     said = [why] * len(stamps_ns)
     for stream in problem.streams:
-        if not why and stream.left_out is None:  # else the bounds allow for a slow error
-            for at_ns in leapt[stream.name][0]:
+        if not why and stream.left_out is None and stream.slow is None:  # else the bounds allow for a slow error
+            for at_ns in stream.leapt[0]:
                 for k in np.flatnonzero(np.abs(stamps_ns - at_ns) < LASTS_S * 1e9):
                     said[int(k)] = why_in_doubt(stream.name)
     return said
-
-
-def _leaps(problem: Problem, result: BatchResult, stream: Stream) -> Leaps:
-    """Stamps and sizes of the leaps of a stream that alone tells the place."""
-    if not told_alone(stream, [s for s in problem.streams if s.row.absolute]):
-        return np.zeros(0, dtype=np.int64), np.zeros(0)
-    places = [stream.row.hint(m, 0.0, problem.datum).p_world_m for m in stream.measurements]
-    told = [(i, p[:2]) for i, p in enumerate(places) if p is not None and np.isfinite(p[:2]).all()]
-    stamps_ns = np.array([stream.measurements[i].stamp_ns for i, _ in told], dtype=np.int64)
-    sigma_m = np.array([largest_sigma(result.verdicts[(stream.number, i)].residual.cov) for i, _ in told])
-    return leaps(stamps_ns, np.array([p for _, p in told]), sigma_m, allowed=stream.left_out is not None)
 
 
 def world_covariance(cov_body: Any, R: Array, lever_m: Array) -> Array:
@@ -351,7 +338,7 @@ def refused_together(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, 
     ]
 
 
-def _stats(problem: Problem, result: BatchResult, leapt: Mapping[str, Leaps]) -> SolveStats:
+def _stats(problem: Problem, result: BatchResult) -> SolveStats:
     expected = expected_cost(problem, result.verdicts)
     warnings = list(problem.warnings)
     if not result.converged:
@@ -396,7 +383,8 @@ def _stats(problem: Problem, result: BatchResult, leapt: Mapping[str, Leaps]) ->
                     )
         if stream.left_out is not None:
             warnings.append(alone(stream.name, stream.left_out))
-        warnings += leaps_said(stream.name, *leapt[stream.name], allowed=stream.left_out is not None)
+        allowed = stream.left_out is not None
+        warnings += leaps_said(stream.name, *stream.leapt, allowed=allowed, followed=stream.slow is None)
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
         warnings += disagreeing(stream.name, weights)
         if stream.row.false is not None:

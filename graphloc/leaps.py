@@ -80,8 +80,10 @@ def _parts(steps_m: Array) -> Array:
     return np.asarray(steps_m[1:-1] - (steps_m[:-2] + steps_m[2:]) / 2.0)
 
 
-def leaps_said(sensor: str, stamps_ns: NDArray[np.int64], off_m: Array, *, allowed: bool) -> list[str]:
-    """Return a line on what `leaps` found, or none."""
+def leaps_said(
+    sensor: str, stamps_ns: NDArray[np.int64], off_m: Array, *, allowed: bool, followed: bool = True
+) -> list[str]:
+    """Return a line on what `leaps` found, or none; `followed`: by the track, else they are taken for the receiver's error."""
     if not len(stamps_ns):
         return []
     n = int(np.argmax(off_m))
@@ -89,6 +91,8 @@ def leaps_said(sensor: str, stamps_ns: NDArray[np.int64], off_m: Array, *, allow
     others = f", and {len(off_m) - 1} times more" if len(off_m) > 1 else ""
     bounds = "" if allowed else "; the bounds do not allow for it: its slow_error is switched off"
     where = f"{size} m at {utc_text(int(stamps_ns[n]))}{others}"
+    if not followed:
+        return [f"{sensor}: leaps by {where}: taken for its error as far as the IMU denies it"]
     said = f"{sensor}: leaps by {where}: the track follows, and the IMU and the compass may look wrong there"
     return [f"{said}{bounds}"]
 
