@@ -21,6 +21,7 @@ LASTS_S = 200.0
 """For so long before and after a leap either side of it may be the wrong one: as a slow error lasts."""
 # m, as far as 4 m/s^2 that come and go within three seconds; times what is usual; fewer do not tell what that is.
 _LEAP_M, _LEAP, _FEWEST = 3.0, 10.0, 10
+_AROUND = 0.75  # around a step it is usually more than that of what it is over all
 _SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # of what is stated; a car that brakes in an emergency, and then stands
 _EVEN = 1.5  # a step longer or shorter by more than this is none as those beside it
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
@@ -63,10 +64,10 @@ def leaps(
     even = (window(dt, 3).max(axis=1) < _EVEN * usual_s) & (window(dt, 3).min(axis=1) * _EVEN > usual_s)
     # In a silence it may have gone anywhere; where fixes are seconds apart, any turn and any stop is metres off.
     least_m = np.full(len(off_m), _LEAP_M * max(usual_s, 1.0) ** 2)
-    if not allowed:
-        least_m = np.minimum(least_m, _BRAKES_MPS2 * usual_s**2 / 2.0)
-        least_m = np.maximum(least_m, _SIGMAS * window(sigma_m, 4).max(axis=1))
-    least_m = np.maximum(least_m, _LEAP * float(np.median(off_m)))
+    if not allowed:  # what is said where the bounds allow for it is said where they do not, too
+        believed_m = np.maximum(_BRAKES_MPS2 * usual_s**2 / 2.0, _SIGMAS * window(sigma_m, 4).max(axis=1))
+        least_m = np.minimum(least_m, believed_m)
+    least_m = np.maximum(least_m, _LEAP * _usual(off_m))
     far = np.flatnonzero(even & (off_m >= beside) & (off_m > least_m) & (both > off_m / 2.0))
     far = far[(far > 0) & (far < len(off_m) - 1)]  # beside an end a fix that is off may look like half a leap
     near = np.abs(np.subtract.outer(stamps_ns[far], stamps_ns[far])) <= _BURST_S * NS_PER_S
@@ -78,6 +79,12 @@ def leaps(
 def _parts(steps_m: Array) -> Array:
     """How each step (N, 2) but the first and last parts from the mean of those beside it (N - 2, 2)."""
     return np.asarray(steps_m[1:-1] - (steps_m[:-2] + steps_m[2:]) / 2.0)
+
+
+def _usual(off_m: Array) -> Array:
+    """What is usual (N,): over all, or most of what is around each where that is more: for a while a receiver may scatter more."""
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(off_m, _FEWEST, mode="reflect"), 2 * _FEWEST + 1)
+    return np.asarray(np.maximum(np.median(around, axis=1) * _AROUND, np.median(off_m)))
 
 
 def leaps_said(

@@ -147,6 +147,35 @@ def test_a_receiver_that_is_believed_leaps_by_less_than_metres() -> None:
     assert not len(leaps(waits_ns, way + np.outer(waits_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
 
 
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+@pytest.mark.parametrize("sigma_m", [1.2, 1.35])
+def test_a_believed_receiver_of_metres_leaps_by_what_any_other_does(hz: float, sigma_m: float) -> None:
+    """Ten of its sigmas were asked for: 12 m were followed for 30 s, and called good, that were said with a slow error."""
+    t = np.arange(0.0, 120.0, 1.0 / hz)
+    places_m = np.outer(t, [5.0, 0.0]) + np.random.default_rng(4).normal(0.0, 0.3, (len(t), 2))
+    places_m += np.outer((t >= 50.0) & (t < 80.0), [0.0, 12.0])
+    stamps_ns, sigmas_m = np.round(t * 1e9).astype(np.int64), np.full(len(t), sigma_m)
+    for allowed in (True, False):
+        at_ns, off_m = leaps(stamps_ns, places_m, sigmas_m, allowed=allowed)
+        assert at_ns.tolist() == [50_000_000_000, 80_000_000_000]
+        assert off_m == pytest.approx([12.0, 12.0], abs=2.0)
+        watch = LeapWatch()
+        said = [
+            watch.note(*fix, allowed=allowed)[0] for fix in zip(stamps_ns.tolist(), places_m, sigmas_m, strict=True)
+        ]
+        assert np.concatenate(said).tolist() == [50_000_000_000]
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+def test_a_receiver_that_scatters_more_for_a_while_does_not_leap(hz: float, *, allowed: bool) -> None:
+    """RTK that is lost for 40 s now and then, and says so: noise of a metre, beside the usual centimetre, were leaps."""
+    t = np.arange(0.0, 600.0, 1.0 / hz)
+    sigma_m = np.where(t % 100.0 > 60.0, 1.2, 0.015)
+    places_m = np.outer(t, [5.0, 0.0]) + np.random.default_rng(0).normal(0.0, 0.8, (len(t), 2)) * sigma_m[:, None]
+    assert not len(leaps(np.round(t * 1e9).astype(np.int64), places_m, sigma_m, allowed=allowed)[0])
+
+
 @pytest.mark.parametrize("hz", [2.0, 3.0, 5.0])
 def test_a_car_that_brakes_in_an_emergency_does_not_leap(hz: float) -> None:
     """8 m/s^2, built up at 30 m/s^3, until it stands; 30 times in ten minutes."""
