@@ -10,6 +10,7 @@ import re
 
 log = logging.getLogger(__name__)
 _LONGEST = 1500
+_UNDETERMINED = "Indeterminate linear system"  # all that GTSAM has to say of data, NaN among them
 
 
 class GraphlocError(Exception):
@@ -39,10 +40,12 @@ class SolveError(GraphlocError):
 
 
 def not_solved(what: str, error: Exception) -> SolveError:
-    """Return the error of a solver that gave up; its own words, of keys and options of GTSAM, go to the log."""
+    """Return the error of a solver that gave up; where data can do that, its own words, of keys and options of GTSAM, go to the log."""
     log.debug("%s: %s", what, error)
     if isinstance(error, MemoryError):
         return SolveError(f"{what}: no memory is left")
+    if _UNDETERMINED not in str(error):
+        return SolveError(f"{what}: a fault in graphloc, not in the data; please report it: {in_one_line(error)}")
     return SolveError(
         f"{what}: the measurements leave something undetermined, or contradict each other beyond all bounds; look for a wrong "
         "unit, mount, sign or clock (`graphloc inspect`)"

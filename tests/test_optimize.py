@@ -50,6 +50,16 @@ def test_a_state_that_nothing_holds_is_said() -> None:
     assert not any(word in str(error.value).lower() for word in ("variable", "gtsam", "exception"))  # its own words
 
 
+def test_a_fault_of_ours_is_not_put_on_the_data() -> None:
+    """A graph that asks for a state which nobody has guessed."""
+    graph, guess = loop(1.0)
+    graph.add(gtsam.BetweenFactorPose2(0, 99, gtsam.Pose2(), gtsam.noiseModel.Unit.Create(3)))
+    for solve in (lambda: full_step(graph, guess), lambda: bayes_tree(graph, guess)):
+        with pytest.raises(SolveError, match=r": a fault in graphloc, not in the data; .* RuntimeError: .*99") as error:
+            solve()
+        assert not any(word in str(error.value) for word in ("undetermined", "measurements", "inspect"))
+
+
 def test_full_step_solves_a_linear_problem_and_gives_its_covariance() -> None:
     graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(gtsam.PriorFactorVector(0, np.array([1.0, 2.0]), gtsam.noiseModel.Isotropic.Sigma(2, 0.5)))

@@ -195,3 +195,17 @@ def test_a_step_from_the_oldest_pose_costs_what_it_costs_the_solver() -> None:
     window.settle(5)
     cost = whole.error(gtsam.LevenbergMarquardtOptimizer(whole, guess).optimize())
     assert window.error() - before == pytest.approx(cost, abs=0.5)
+
+
+def test_two_errors_that_nothing_else_hangs_on_are_linearised_anew() -> None:
+    """The solver then orders these two alone, and what comes last among two is no third group."""
+    window = ours(drive(0))
+    window.settle(5)
+    slow, own = (keys.slow(1, 0), keys.slow(1, 1)), gtsam.noiseModel.Isotropic.Sigma(1, 0.1)
+    for key in slow:
+        window.guess(key, np.ones(1), float(np.ceil((STEPS - 1) / HZ)))
+    window.add([gtsam.PriorFactorVector(slow[0], np.zeros(1), own), gtsam.BetweenFactorVector(*slow, np.zeros(1), own)])
+    window.commit()
+    assert window.relinearise()
+    window.commit()
+    np.testing.assert_allclose([window.values.atVector(key) for key in slow], 0.0, atol=1e-9)

@@ -23,7 +23,6 @@ from graphloc.errors import SolveError, not_solved
 from graphloc.frames import Array
 from graphloc.keys import is_leaf, is_pose
 
-_GOES, _STAYS, _NEWEST = range(3)  # groups of keys, in the order of elimination
 _RELINEARIZE = 0.02  # of any tangent: m, rad, m/s; the gap to the batch is millimetres
 _NEVER = 1_000_000_000  # updates
 
@@ -281,11 +280,15 @@ def _listed(keys: Iterable[int]) -> Any:
     return found
 
 
-def _groups(alive: Iterable[int], gone: Iterable[int], newest: Collection[int]) -> Any:
-    """The order of elimination: what leaves, what stays, what is asked and added next."""
+def _groups(alive: Iterable[int], gone: Collection[int], newest: Collection[int]) -> Any:
+    """The order of elimination: what leaves, what stays, what is asked and added next.
+
+    CCOLAMD fails at a group whose number is not below that of the keys that it orders: where nothing leaves these are two, or one.
+    """
+    stays = 1 if gone else 0
     groups = gtsam.KeyGroupMap()
     for key in gone:
-        groups.insert2(key, _GOES)
+        groups.insert2(key, 0)
     for key in alive:  # what has a group keeps it
-        groups.insert2(key, _NEWEST if key in newest else _STAYS)
+        groups.insert2(key, stays + 1 if key in newest else stays)
     return groups
