@@ -21,6 +21,7 @@ from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, 
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
 from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, ODOMETRY, PLAIN_POSE, POSE, QUATERNION, yaw_of_x_axis
+from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.stuck import stuck, stuck_warning
 from graphloc.time import NS_PER_S
 
@@ -141,6 +142,21 @@ def courses_of(stamps_ns: NDArray[np.int64], p_m: Array, noise_m: float) -> Cour
     return Courses(np.array(at, dtype=np.int64), np.array(course))
 
 
+def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
+    """Return the courses of one receiver's fixes, in any order; none of fewer than twenty."""
+    fixes = sorted(fixes, key=lambda m: m.stamp_ns)
+    if len(fixes) < 20:
+        return Courses(np.zeros(0, dtype=np.int64), np.zeros(0))
+    p = world_from_fixes(fixes, Datum(fixes[0].position))[:, :2]
+    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(_scatter(p).max()))
+
+
+def _scatter(p_m: Array) -> Array:
+    """Return the white noise of each axis of places (N, k), m."""
+    # Third differences remove position, velocity and acceleration; those of white noise have 20 x its variance.
+    return np.asarray(1.4826 * np.median(np.abs(np.diff(p_m, n=3, axis=0)), axis=0) / np.sqrt(20.0))
+
+
 def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
     """Return status, spread and a guess on slow errors; None where there is no fix at all."""
     stamps, p, rows = track(fixes)
@@ -149,10 +165,9 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
     status, counts = np.unique(fixes.rows[:, 3].astype(int), return_counts=True)
     known = (rows[:, 4] > 0) & np.isfinite(rows[:, 5:8]).all(axis=1) & (rows[:, 5:8] > 0.0).all(axis=1)
     sigma = np.sqrt(np.median(rows[known, 5:8], axis=0)) if known.any() else None
-    # Third differences remove position, velocity and acceleration; those of white noise have 20 x its variance.
     bad = stuck(stamps, rows[:, :2], p[:, :2])
     own = p[~bad]
-    scatter = 1.4826 * np.median(np.abs(np.diff(own, n=3, axis=0)), axis=0) / np.sqrt(20.0) if len(own) > 10 else None
+    scatter = _scatter(own) if len(own) > 10 else None
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
     precise = sigma is not None and float(sigma[:2].max()) < 0.1 and float(np.median(rows[:, 3])) >= 2.0
     if precise:

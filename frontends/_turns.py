@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc.config import ImuConfig
+from graphloc.errors import InputError
 from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading, ImuSeries
 from graphloc.time import NS_PER_S
@@ -23,7 +25,11 @@ _LEAP_DEG, _SMOOTH_DEG = 120.0, 15.0  # beyond the one, which way it turned is a
 SCATTERED = (
     "parts from most headings beside it, by the gyroscope and without: a course over ground at rest is no heading"
 )
+Yaws = tuple[NDArray[np.int64], Array]  # stamps (N,), ns, and yaw (N,), rad
 _PART_DEG, _PART = 3.0, 3.0  # least RMS that is said; times the sigma that is claimed
+_LONG_S = 12.0  # over which courses are no noise (as in `_assess_imu.py`)
+_UNIT, _UNIT_CLEAR, _BY_CHANCE = 2.3, 0.8, 5.0
+"""Turns are another unit's within this factor; correlation, and that over what it is by chance (Student's t), from which that is clear."""
 
 
 def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading], convention: str) -> list[str]:
@@ -35,7 +41,7 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
         headings: of one compass, as the configuration reads them. convention: by which it does.
     """
     together, power, apart, turns = 0.0, 0.0, [], []
-    for _, turned, yaw, at_s in _blocks(imu, headings):
+    for _, turned, yaw, at_s in _blocks(imu, _said(headings)):
         step = max(1, round(_STEP_S / max(float(np.median(np.diff(at_s))), 1e-3)))
         if len(at_s) < 20 or step >= len(at_s):
             continue
@@ -61,6 +67,53 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
     ]
 
 
+def refuse_unit(imu: ImuSeries, config: ImuConfig, told: Mapping[str, Yaws]) -> None:
+    """Refuse rates in another unit than is configured: they turn as headings do, by 57 times as little, or as much.
+
+    The solver would take what is missing of a turn for a bias, and the heading for known.
+
+    Args:
+        told: headings or courses, by what they are called.
+
+    Raises:
+        InputError: they are.
+    """
+    wrong, right = ("less", "rad/s") if config.gyro_unit == "deg/s" else ("more", "deg/s")
+    for source, yaws in told.items():
+        times = _times_turned(imu, yaws)
+        off = times * np.radians(1.0) if wrong == "less" else times / np.radians(1.0)
+        if 1.0 / _UNIT < off < _UNIT:
+            raise InputError(
+                f"{imu.sensor}: by its rates it turns {max(times, 1.0 / times):.0f} times {wrong} than by {source}, and at the same "
+                f"times: angular_velocity of {config.topic} is {right}; set gyro_unit: {right} of sensors.{imu.sensor}"
+            )
+
+
+def _times_turned(imu: ImuSeries, yaws: Yaws) -> float:
+    """How many times as far headings turn as the gyroscope, to whichever side; 0 where they have nothing clear in common."""
+    by_gyro, by_heading, alone = [np.zeros(0)], [np.zeros(0)], 0.0
+    for _, turned, yaw, at_s in _blocks(imu, yaws):
+        if len(at_s) < 20 or at_s[-1] - at_s[0] <= _LONG_S:
+            continue
+        yaw, later = np.unwrap(yaw), np.searchsorted(at_s, at_s + _LONG_S)
+        begins = np.flatnonzero(later < len(at_s))
+        by_gyro.append(turned[later[begins]] - turned[begins])
+        by_heading.append(yaw[later[begins]] - yaw[begins])
+        alone += (at_s[-1] - at_s[0]) / _LONG_S
+    a, b = np.concatenate(by_gyro), np.concatenate(by_heading)
+    if alone <= 2.0:
+        return 0.0
+    a, b = a - a.mean(), b - b.mean()  # a gyro's bias is in the mean
+    largest = max(float(np.sqrt(np.mean(a**2))), float(np.sqrt(np.mean(b**2))))
+    power = float(np.sqrt((a**2).sum() * (b**2).sum()))
+    if np.degrees(largest) < _TURNS_DEG or power == 0.0:
+        return 0.0
+    clear = min(abs(float(a @ b)) / power, 1.0 - 1e-9)
+    if clear < _UNIT_CLEAR or clear * np.sqrt((alone - 2.0) / (1.0 - clear**2)) < _BY_CHANCE:
+        return 0.0
+    return float(np.sqrt((b**2).sum() / (a**2).sum()))
+
+
 def scattered(imu: ImuSeries, headings: Sequence[CompassHeading]) -> NDArray[np.bool_]:
     """Return (N,) which headings agree with less than half of those beside them, whether the craft turned or not.
 
@@ -68,7 +121,7 @@ def scattered(imu: ImuSeries, headings: Sequence[CompassHeading]) -> NDArray[np.
     What the gyroscope alone speaks against is left in, be it a pivot: its unit, or the headings' convention, may be wrong.
     """
     bad = np.zeros(len(headings), dtype=bool)
-    for own, turned, yaw, at_s in _blocks(imu, headings):
+    for own, turned, yaw, at_s in _blocks(imu, _said(headings)):
         apart = np.full((2 * _ASKED, len(own)), np.nan)
         for lag in range(1, min(_ASKED, len(own) - 1) + 1):
             turns = wrap_angle(yaw[lag:] - yaw[:-lag])
@@ -95,22 +148,24 @@ def _smooth(yaw: Array, at_s: Array) -> NDArray[np.bool_]:
     return np.asarray((n > _FEW) & (leaps[last - 1] == leaps[first]) & (rest < np.radians(_SMOOTH_DEG)))
 
 
-def _blocks(
-    imu: ImuSeries, headings: Sequence[CompassHeading]
-) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
-    """Yield places in `headings`, turned angle by the gyroscope, yaw, and time (s), at the headings of each block without a hole in the IMU."""
+def _said(headings: Sequence[CompassHeading]) -> Yaws:
+    return np.array([m.stamp_ns for m in headings], dtype=np.int64), np.array([m.yaw_rad for m in headings])
+
+
+def _blocks(imu: ImuSeries, yaws: Yaws) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
+    """Yield places in `yaws`, turned angle by the gyroscope, yaw, and time (s), at the yaws of each block without a hole in the IMU."""
     up = np.median(imu.accel_mps2, axis=0) if len(imu.stamps_ns) else np.zeros(3)
     size = float(np.linalg.norm(up))
-    if size < 5.0 or len(headings) < 20:  # m/s^2: no gravity in it
+    if size < 5.0 or len(yaws[0]) < 20:  # m/s^2: no gravity in it
         return
     t = (imu.stamps_ns - imu.stamps_ns[0]) / NS_PER_S
     rate = imu.gyro_radps @ (up / size)
     turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
     holes: NDArray[np.intp] = np.flatnonzero(np.diff(t) > _HOLE_S)
-    stamps = np.array([m.stamp_ns for m in headings], dtype=np.int64)
+    stamps, yaw = yaws
     order = np.argsort(stamps, kind="stable")
     at = (stamps[order] - imu.stamps_ns[0]) / NS_PER_S
-    yaw = np.array([m.yaw_rad for m in headings])[order]
+    yaw = yaw[order]
     # A block ends where the next hole begins, and after two minutes.
     part = np.searchsorted(t[holes], at)
     block = part * (1 + int(t[-1] / _BLOCK_S)) + np.clip(at // _BLOCK_S, 0, t[-1] // _BLOCK_S).astype(int)

@@ -13,9 +13,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from graphloc.config import CompassConfig, VesselConfig
+import numpy as np
+
+from graphloc.config import CompassConfig, ImuConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array
+from graphloc.frontends._assess import courses_of_fixes
 from graphloc.frontends._beside import Beside, check_speed, true_trajectory
 from graphloc.frontends._part import Bags
 from graphloc.frontends._readings import (
@@ -33,7 +36,7 @@ from graphloc.frontends._readings import (
 from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turns import turn_warnings
+from graphloc.frontends._turns import Yaws, refuse_unit, turn_warnings
 from graphloc.frontends.decode import (
     ODOMETRY,
     PLAIN_POSE,
@@ -46,7 +49,7 @@ from graphloc.frontends.decode import (
     supported_types,
 )
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import CompassHeading, ImuSeries, Measurement
+from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Progress, Recording, Span
 from graphloc.time import duration_ns, utc_text
 
@@ -103,6 +106,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
             rows += reject_scattered(imu, readings, warnings)
             measurements += [v for v in readings.values if isinstance(v, Measurement)]
     if imu is not None:
+        _refuse_unit(imu, sensors)
         warnings += _turn_warnings(imu, sensors)
     warnings += _silent(sensors, rows, topics) + _unstamped(sensors, topics)
     return Recording(
@@ -302,6 +306,27 @@ def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str
         for name, sensor in config.sensors.items()
         if sensor.enabled and sensor.mount.tf_frame
     }
+
+
+def _refuse_unit(imu: ImuSeries, sensors: Sequence[Readings]) -> None:
+    (config,) = (r.config for r in sensors if r.sensor == imu.sensor and isinstance(r.config, ImuConfig))
+    told: dict[str, Yaws] = {}
+    for readings in sensors:
+        yaw = np.array([_yaw_of(v) for v in readings.values])
+        fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
+        if np.isfinite(yaw).any():
+            told[f"the headings of {readings.sensor}"] = readings.stamps()[np.isfinite(yaw)], yaw[np.isfinite(yaw)]
+        elif fixes:
+            courses = courses_of_fixes(fixes)
+            told[f"the courses of {readings.sensor}"] = courses.stamps_ns, courses.course_rad
+    refuse_unit(imu, config, told)
+
+
+def _yaw_of(value: Decoded) -> float:
+    """What a compass says, or a pose by its likeliest mode; NaN of anything else."""
+    if isinstance(value, PoseFix) and "yaw" in value.axes:
+        return float(max(value.modes, key=lambda mode: mode.probability).value[value.axes.index("yaw")])
+    return value.yaw_rad if isinstance(value, CompassHeading) else float("nan")
 
 
 def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:

@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from graphloc.config import ImuConfig
+from graphloc.errors import InputError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array
-from graphloc.frontends._turns import scattered, turn_warnings
+from graphloc.frontends._assess import courses_of_fixes
+from graphloc.frontends._turns import Yaws, refuse_unit, scattered, turn_warnings
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag
-from graphloc.measurements import CompassHeading, ImuSeries
+from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag_bad_input import accounted, rows_of, vessel
 
@@ -92,6 +95,72 @@ def test_without_turns_or_gravity_nothing_is_said(run: SimulatedRun) -> None:
     assert turn_warnings(replace(imu, gyro_radps=0.0 * imu.gyro_radps), "compass", wrong, "enu") == []
     level = replace(imu, accel_mps2=imu.accel_mps2 - np.median(imu.accel_mps2, axis=0))
     assert turn_warnings(level, "compass", wrong, "enu") == []
+
+
+def imu_config(unit: str) -> ImuConfig:
+    return ImuConfig.model_validate({"topic": "/imu", "gyro_unit": unit})
+
+
+def told_by(run: SimulatedRun, source: str) -> Yaws:
+    """Headings of the compass, or courses of the fixes."""
+    if source == "compass":
+        _, headings = of(run)
+        return np.array([m.stamp_ns for m in headings]), np.array([m.yaw_rad for m in headings])
+    courses = courses_of_fixes([m for m in run.recording.measurements if isinstance(m, GnssPosition)])
+    return courses.stamps_ns, courses.course_rad
+
+
+@pytest.mark.parametrize("source", ["compass", "gnss"])
+@pytest.mark.parametrize(("configured", "told"), [("deg/s", "rad/s"), ("rad/s", "deg/s")])
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_rates_in_another_unit_are_refused(
+    sense: float, configured: str, told: str, source: str, run: SimulatedRun
+) -> None:
+    """180 / pi times too small, or too large; the compass may count the other way beside. The right unit is left alone."""
+    imu, _ = of(run)
+    stamps, yaw = told_by(run, source)
+    times = np.radians(1.0) if configured == "deg/s" else np.degrees(1.0)
+    with pytest.raises(InputError, match=rf"set gyro_unit: {told} of sensors\.imu"):
+        refuse_unit(
+            replace(imu, gyro_radps=times * imu.gyro_radps), imu_config(configured), {source: (stamps, sense * yaw)}
+        )
+    refuse_unit(imu, imu_config(configured), {source: (stamps, sense * yaw)})
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_headings_that_wander_say_nothing_of_a_unit(seed: int, run: SimulatedRun) -> None:
+    """A craft that goes straight on: the gyroscope has its noise, courses wander by 57 times as much."""
+    imu, _ = of(run)  # at 100 Hz
+    rng = np.random.default_rng(seed)
+    rates = np.cumsum(rng.normal(size=(len(imu), 3)), axis=0)
+    rates *= 1e-3 / np.abs(rates).max()
+    turned, wander = (np.cumsum(rates[:, 2]) / 100.0)[::100], np.cumsum(rng.normal(size=len(imu) // 100))
+    turned = turned[: len(wander)]
+    wander *= 57.0 * np.std(turned[12:] - turned[:-12]) / np.std(wander[12:] - wander[:-12])
+    stamps = imu.stamps_ns[::100][: len(wander)]
+    refuse_unit(replace(imu, gyro_radps=rates), imu_config("deg/s"), {"gnss": (stamps, wander)})
+
+
+@pytest.mark.parametrize("told", ["compass", "pose", "gnss"])
+def test_a_bag_in_another_unit_is_refused(told: str, tmp_path: Path) -> None:
+    """100 s at 2 m/s, with turns of 115 deg to and fro, told in rad/s and read as deg/s."""
+    make = Messages(2)
+    items: list[Item] = []
+    east = north = 0.0
+    for k in range(5000):
+        stamp, yaw = START_NS + k * S // 50, 1.0 - np.cos(0.2 * k / 50.0)
+        east, north = east + np.cos(yaw) * 2.0 / 50.0, north + np.sin(yaw) * 2.0 / 50.0
+        items.append(("/imu", stamp, make.imu(stamp, accel=(0, 0, 9.8), gyro=(0, 0, 0.2 * np.sin(0.2 * k / 50.0)))))
+        if k % 10 == 0:
+            q = (0.0, 0.0, np.sin(yaw / 2.0), np.cos(yaw / 2.0))
+            items.append(("/compass", stamp, make.compass(stamp, q)))
+            items.append(("/pose", stamp, make.pose(stamp, (east, north, 0.0), q)))
+            items.append(("/gnss", stamp, make.fix(stamp, north / 111e3, east / 111e3)))
+    path = write_bag(tmp_path / "run", make, items, "mcap")
+    sensors = {"gnss": None, told: {"topic": f"/{told}"}}
+    read_recording(path, vessel(**sensors, imu={"topic": "/imu"}))
+    with pytest.raises(InputError, match=rf"{told}, and at the same times.* set gyro_unit: rad/s of sensors\.imu"):
+        read_recording(path, vessel(**sensors, imu={"topic": "/imu", "gyro_unit": "deg/s"}))
 
 
 def test_a_bag_is_looked_at(tmp_path: object) -> None:
