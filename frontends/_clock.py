@@ -22,6 +22,7 @@ EPOCH_LIMIT_S = 1.0
 
 _SET_BACK_S = 0.5
 _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
+_IN_ORDER = 0.8  # of those that follow, at the least: others come late
 
 
 def usual_latency_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
@@ -76,7 +77,10 @@ def set_backs(stamps_ns: Stamps) -> list[int]:
     tries = np.flatnonzero(np.diff(stamps_ns) < -duration_ns(_SET_BACK_S)) + 1
     for i in tries[:_MOST_TRIED].tolist():
         after, before = stamps_ns[i : i + _FOLLOW], stamps_ns[found[-1] if found else 0 : i]
-        if len(after) < _FOLLOW or (np.diff(after) <= 0).any():
+        if len(after) < _FOLLOW:
+            continue
+        after = after[longest_increasing(after)]
+        if len(after) < _IN_ORDER * _FOLLOW:
             continue
         again = int(((before >= after[1]) & (before <= after[-1])).sum())
         if again >= _FOLLOW // 2:
