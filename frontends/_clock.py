@@ -22,6 +22,8 @@ EPOCH_LIMIT_S = 1.0
 
 _SET_BACK_S = 0.5
 _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
+_HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing, as online
+_IN_ORDER = 0.8  # of those that follow, at the least: others come late
 
 
 def usual_latency_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
@@ -67,6 +69,25 @@ def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
     return keep
 
 
+def in_order_or_late(stamps_ns: Stamps) -> NDArray[np.bool_]:
+    """Return (N,) which samples of an IMU to keep: those that arrived in order, and those that came late into their holes.
+
+    A stamp that lies closer to another is repeated, or of another clock.
+    """
+    keep = longest_increasing(stamps_ns)
+    kept, late = stamps_ns[keep], np.flatnonzero(~keep)
+    if len(kept) < 2:
+        return keep
+    hole_ns = _HOLE * np.quantile(np.diff(kept), 0.1)
+    late = late[np.argsort(stamps_ns[late], kind="stable")]
+    taken_ns = 0
+    for i, n in zip(late.tolist(), np.searchsorted(kept, stamps_ns[late]).tolist(), strict=True):
+        stamp_ns = int(stamps_ns[i])
+        if 0 < n < len(kept) and min(stamp_ns - max(kept[n - 1], taken_ns), kept[n] - stamp_ns) >= hole_ns:
+            keep[i], taken_ns = True, stamp_ns
+    return keep
+
+
 def set_backs(stamps_ns: Stamps) -> list[int]:
     """Return where, in order of arrival, a clock was set back: from there on it goes through times that it said before.
 
@@ -76,7 +97,10 @@ def set_backs(stamps_ns: Stamps) -> list[int]:
     tries = np.flatnonzero(np.diff(stamps_ns) < -duration_ns(_SET_BACK_S)) + 1
     for i in tries[:_MOST_TRIED].tolist():
         after, before = stamps_ns[i : i + _FOLLOW], stamps_ns[found[-1] if found else 0 : i]
-        if len(after) < _FOLLOW or (np.diff(after) <= 0).any():
+        if len(after) < _FOLLOW:
+            continue
+        after = after[longest_increasing(after)]
+        if len(after) < _IN_ORDER * _FOLLOW:
             continue
         again = int(((before >= after[1]) & (before <= after[-1])).sum())
         if again >= _FOLLOW // 2:

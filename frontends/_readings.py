@@ -54,10 +54,18 @@ class Readings:
     def drop(self, bad: NDArray[np.bool_], rejection: Rejection) -> list[LedgerRow]:
         """Take readings out; return their rows."""
         rows = [self.row(self.seqs[i], self.stamps_ns[i], rejection) for i in np.flatnonzero(bad)]
-        columns: tuple[list[Any], ...] = (self.seqs, self.stamps_ns, self.logs_ns, self.values, self.files)
-        for column in columns if rows else ():
+        for column in self._columns() if rows else ():
             column[:] = list(compress(column, ~bad))
         return rows
+
+    def sort(self) -> None:
+        """Put the readings in the order of their stamps."""
+        order = np.argsort(self.stamps(), kind="stable").tolist()
+        for column in self._columns():
+            column[:] = [column[i] for i in order]
+
+    def _columns(self) -> tuple[list[Any], ...]:
+        return self.seqs, self.stamps_ns, self.logs_ns, self.values, self.files
 
     def row(self, seq: int, stamp_ns: int, rejection: Rejection) -> LedgerRow:
         """Return the ledger row of a message that gave no measurement."""
@@ -147,14 +155,15 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
 
 
 def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | None, list[LedgerRow]]:
-    """Return the samples in strictly increasing time, and rows of those that are not.
+    """Return the samples in strictly increasing time, those that came late in their places, and rows of what has none.
 
     Raises:
         InputError: their rates cannot be rad/s.
     """
     assert isinstance(readings.config, ImuConfig)
-    bad = ~_clock.longest_increasing(readings.stamps())
+    bad = ~_clock.in_order_or_late(readings.stamps())
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
+    readings.sort()
     rows += _drop_hanging(readings, warnings)
     samples = [v for v in readings.values if isinstance(v, ImuSample)]
     if not samples:

@@ -387,6 +387,24 @@ def test_repeated_and_backward_imu_stamps(tmp_path: Path) -> None:
     assert first < second  # of repeated stamps the first arrival stays
 
 
+def test_imu_samples_that_come_late_are_sorted_in(tmp_path: Path) -> None:
+    """One in ten comes 50 ms late, one twice; of another clock, between two samples, one is none of the run's."""
+    items: list[Item] = []
+    for k in range(200):
+        stamp = START_NS + k * S // 50
+        way_ns = S // 20 if k % 10 == 3 else 0
+        items.append(("/imu", stamp + LATER_NS + way_ns, MAKE.imu(stamp, gyro=(1e-6 * k, 0.0, 0.0))))
+    twice, between = START_NS + 13 * S // 50, START_NS + 61 * S // 100
+    items.append(("/imu", twice + LATER_NS + S, MAKE.imu(twice)))
+    items.append(("/imu", between + LATER_NS + S, MAKE.imu(between)))
+    recording = read_recording(write_bag(tmp_path / "run", MAKE, items), vessel(gnss=None))
+    assert recording.imu is not None
+    np.testing.assert_array_equal(recording.imu.stamps_ns, START_NS + np.arange(200) * S // 50)
+    np.testing.assert_allclose(recording.imu.gyro_radps[:, 0], 1e-6 * np.arange(200), atol=1e-12)
+    assert (np.diff(recording.imu.seqs) < 0).sum() == 20  # numbered as they arrived
+    assert sorted(r.stamp_ns for r in rows_of(recording, "imu")) == [twice, between]
+
+
 def test_one_stamp_that_ran_ahead_costs_one_sample(tmp_path: Path) -> None:
     """Keeping each sample that is later than the last kept one would lose three seconds here."""
     items = still_run(MAKE)

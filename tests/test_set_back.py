@@ -20,13 +20,18 @@ MAKE = Messages(2)
 LATE_NS = 10_000_000
 
 
-def run(tmp_path: Path, at_s: float, back_s: float, seconds: float = 20.0) -> Recording:
-    """A craft that goes north at 1 m/s by /truth; all clocks are set back at a time."""
+def run(tmp_path: Path, at_s: float, back_s: float, seconds: float = 20.0, held_up: int = 0) -> Recording:
+    """A craft that goes north at 1 m/s by /truth; all clocks are set back at a time.
+
+    Args:
+        held_up: one in so many IMU messages comes 50 ms late.
+    """
     items: list[Item] = []
     for k in range(round(seconds * 50)):
         true = START_NS + k * S // 50
         stamp = true - (round(back_s * S) if k >= at_s * 50 else 0)
-        items.append(("/imu", true + LATE_NS, MAKE.imu(stamp, gyro=(1e-6 * (k % 2), 0.0, 0.0))))
+        way_ns = S // 20 if held_up and k % held_up == held_up - 1 else 0
+        items.append(("/imu", true + LATE_NS + way_ns, MAKE.imu(stamp, gyro=(1e-6 * (k % 2), 0.0, 0.0))))
         if k % 10 == 0:
             items.append(("/fix", true + LATE_NS, MAKE.fix(stamp, lat=57.7 + k * 1.8e-7)))
             items.append(("/truth", true + LATE_NS, MAKE.odometry(stamp, xyz=(0.0, k / 50, 0.0))))
@@ -55,6 +60,21 @@ def test_the_longer_part_is_kept_of_all(tmp_path: Path, at_s: float, first_s: fl
     assert np.abs(north).max() < 1e-6
 
 
+@pytest.mark.parametrize(("at_s", "first_s", "last_s"), [(14.0, 0.0, 14.0), (5.0, 5.0, 20.0)])
+def test_the_longer_part_is_kept_where_samples_come_late(
+    tmp_path: Path, at_s: float, first_s: float, last_s: float
+) -> None:
+    """One in 25, the last before the clock is set back among them: it arrives after that."""
+    recording = run(tmp_path, at_s, 3.0, held_up=25)
+    assert recording.imu is not None
+    begin_ns = START_NS + round((first_s - (3.0 if first_s else 0.0)) * S)
+    assert abs(recording.imu.stamps_ns[0] - begin_ns) <= S // 50
+    assert abs(recording.imu.stamps_ns[-1] - begin_ns - (last_s - first_s) * S) <= S // 20
+    assert len(recording.measurements) == (last_s - first_s) * 5
+    assert all("set back by 3.0 s" in w for w in recording.warnings if "its clock" in w or w.startswith("gnss: "))
+    assert any(w.startswith("gnss: ") and "set back by 3.0 s" in w for w in recording.warnings)
+
+
 def test_steady_clocks_late_samples_and_lone_stamps_are_left_alone() -> None:
     steady = np.arange(1000, dtype=np.int64) * (S // 100)
     assert set_backs(steady) == []
@@ -65,6 +85,11 @@ def test_steady_clocks_late_samples_and_lone_stamps_are_left_alone() -> None:
     assert set_backs(lone) == []
     assert set_backs(np.concatenate([steady[:600], steady[300:]])) == [600]
     assert set_backs(np.concatenate([steady[:600], steady[300:500], steady[400:]])) == [600, 800]
+    back = np.where(steady >= 6 * S, steady - 3 * S, steady)
+    arrived = steady + np.where(np.arange(1000) % 25 == 24, 5 * (S // 100) + 1, 0)
+    assert set_backs(back[np.argsort(arrived)]) == [599]
+    woven = np.stack([steady[500:900], steady[100:500]], axis=1).ravel()  # of two clocks at once
+    assert set_backs(np.concatenate([steady[:500], woven])) == []
 
 
 def parts(tmp_path: Path, second_s: tuple[float, float], back_s: float) -> list[Path]:
