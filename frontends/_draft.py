@@ -40,12 +40,10 @@ def draft_config(inspection: Inspection) -> str:
         f"body_frame: {inspection.body_frame}"
         + ("" if inspection.body_frame == "base_link" else "  # guess: the body, by /tf_static"),
         _datum_line(inspection.odometry),
-        "sensors:",
+        "sensors:" if inspection.usable else "sensors: {}  # nothing in this bag can be used",
     ]
     blocks = [_with_offset(block, inspection) for block in _blocks(inspection)]
     lines += [f"  {line}" for block in blocks for line in block]
-    if not blocks:
-        lines[-1] = "sensors: {}  # nothing in this bag can be used"
     lines += _beside(inspection.odometry)
     return "\n".join(lines) + "\n"
 

@@ -186,6 +186,13 @@ class Inspection:
     body_frame: str = "base_link"
     warnings: tuple[str, ...] = ()
 
+    @property
+    def usable(self) -> bool:
+        """Whether any of it can be a sensor."""
+        poses = any(o.role == "pose" for o in self.odometry)
+        compasses = any(c.usable for c in self.compasses)
+        return bool(self.imus or self.gnss or compasses or poses or self.velocities or self.lidars or self.cameras)
+
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain data for JSON; numbers that are not finite become None."""
         tree = plain(asdict(self))

@@ -251,21 +251,33 @@ def _useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
         if stream.topic in used or stream.msgtype not in (IMU, *_FIXES):
             continue
         total = len(stream) + stream.undecodable + stream.no_stamp
-        if not total:
-            lines.append(f"{stream.topic}: not a message on it")
-            continue
-        plausible = len(sane(stream)) if len(stream) else 0
-        why = f"{stream.undecodable} cannot be decoded, {stream.no_stamp} have no stamp"
-        if plausible < len(stream):
-            why += f", {len(stream) - plausible} have a stamp that repeats, runs backwards or is far from the recording time"
-        elif stream.msgtype in _FIXES:
-            why += f", {int((stream.rows[:, 3] < 0).sum()) if len(stream) else 0} say 'no fix', the others lie at 0, 0 or are NaN"
-        elif len(stream) and not stream.rows[:, :6].any():
-            why = "they hold neither accelerations nor rates, an orientation at most"
-        elif len(stream) and (hangs := samples_of(stream)[1]):
-            why = hangs[0].removeprefix(f"{stream.topic}: ")
-        lines.append(f"{stream.topic}: nothing of its {total} messages can be used: {why}")
+        why = _why_useless(stream)
+        lines.append(
+            f"{stream.topic}: nothing of its {total} messages can be used: {why}"
+            if total
+            else f"{stream.topic}: not a message on it"
+        )
     return lines
+
+
+def _why_useless(stream: Stream) -> str:
+    rows = stream.rows[sane(stream)] if len(stream) else np.zeros((0, 8))
+    if stream.msgtype == IMU and len(rows) and not rows[:, :6].any():
+        return "they hold neither accelerations nor rates, an orientation at most"
+    if stream.msgtype == IMU and len(rows) and (hangs := samples_of(stream)[1]):
+        return hangs[0].removeprefix(f"{stream.topic}: ")
+    counts = {
+        "cannot be decoded": stream.undecodable,
+        "have no stamp": stream.no_stamp,
+        "have a stamp that repeats, runs backwards or is far from the recording time": len(stream) - len(rows),
+    }
+    if stream.msgtype in _FIXES:
+        without = int((rows[:, 3] < 0).sum())
+        counts |= {"say 'no fix'": without, "lie at 0, 0 or are NaN": len(rows) - without}
+    else:
+        finite = int(np.isfinite(rows[:, :6]).all(axis=1).sum())
+        counts |= {"hold an acceleration or a rate that is NaN": len(rows) - finite, "are too few": finite}
+    return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
 
 
 def _known(stream: Stream, tree: StaticTree, body: str) -> str | None:

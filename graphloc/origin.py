@@ -18,6 +18,7 @@ from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
 
 _FAR_M = 200e3
+_FIXES = ("NavSatFix", "GPSFix")  # as types of topics are named
 
 
 def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sensor]) -> Datum:
@@ -66,12 +67,28 @@ def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:
 def _why_no_fix(recording: Recording, config: VesselConfig) -> str:
     receivers = config.of_kind("gnss")
     if not receivers:
-        return "no GNSS sensor to take a datum from; set datum: in vessel.yaml"
-    reasons = Counter(f"{row.sensor}: {row.reason}" for row in recording.rows if row.sensor in receivers)
+        return f"no GNSS sensor to take a datum from{_why_no_receiver(recording, config)}"
+    reasons: Counter[str] = Counter()
+    for row in recording.rows:
+        if row.sensor in receivers:  # when each was recorded is no reason of its own
+            reasons[f"{row.sensor}: {row.reason.partition(', recorded at ')[0]}"] += row.count
     if not reasons:
         return f"no GNSS fix from {', '.join(receivers)}: the topic holds no message"
     (reason, count), *_ = reasons.most_common(1)
     return f"no usable GNSS fix: {count} messages of {reason}"
+
+
+def _why_no_receiver(recording: Recording, config: VesselConfig) -> str:
+    if not config.sensors:
+        return "; vessel.yaml names no sensor at all: `graphloc inspect` writes a first one"
+    off = [name for name, sensor in config.sensors.items() if getattr(sensor, "kind", None) == "gnss"]
+    if off:
+        return f": {', '.join(off)} is switched off (enabled: false); switch it on, or set datum: in vessel.yaml"
+    unread = sorted({row.topic for row in recording.rows if not row.sensor and any(f in row.reason for f in _FIXES)})
+    if unread:
+        told = "`graphloc inspect` says whether its fixes can be used"
+        return f": vessel.yaml has none for {', '.join(unread)}; {told}. Add it, or set datum: in vessel.yaml"
+    return "; set datum: in vessel.yaml"
 
 
 def refuse_world_without_datum(config: VesselConfig, where: str, rows: Sequence[Sensor]) -> None:

@@ -18,6 +18,7 @@ from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
 from graphloc.measurements import CompassHeading, GnssVelocity
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.commands import called
 from tests.test_bag import HUSKY, KINDS
 
 DATUM = Datum(Geodetic(57.7, 11.9, 40.0))
@@ -504,6 +505,25 @@ def test_topics_that_give_nothing_are_said(status: int, said: str, tmp_path: Pat
     assert "gnss" not in config.sensors
     assert any("/fix" in w and said in w for w in found.warnings)
     assert "nothing of its 20 messages" in render(found)
+
+
+def test_a_bag_that_no_sensor_can_be_made_of_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It ended well, with a vessel.yaml that has no sensors; what stamps of zero and NaN were counted as was left to guess."""
+    make = Messages(2)
+    nan = (float("nan"),) * 3
+    items: list[Item] = []
+    for k in range(30):
+        at = START_NS + k * S
+        items += [("/imu", at, make.imu(at, nan)), ("/fix", at, make.fix(0, 57.7, 11.9)), ("/note", at, make.text("a"))]
+    where, draft = write_bag(tmp_path / "run", make, items, "mcap"), tmp_path / "vessel.yaml"
+    assert called(monkeypatch, "inspect", where, "-o", draft) == 2
+    assert not draft.exists()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no sensor can be made of it" in line
+    assert "/imu: nothing of its 30 messages can be used: 30 hold an acceleration or a rate that is NaN" in line
+    assert "/fix: nothing of its 30 messages can be used: 30 have no stamp" in line
 
 
 def test_a_receiver_without_a_message_and_damaged_transforms_are_said(tmp_path: Path) -> None:

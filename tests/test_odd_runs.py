@@ -197,6 +197,31 @@ def test_no_usable_fix_says_why() -> None:
         app.choose_datum(recording, VesselConfig(sensors={"gnss": GnssConfig(topic="/fix")}))
 
 
+def test_no_receiver_to_take_a_datum_from_says_why() -> None:
+    """An empty vessel.yaml, a receiver that is switched off and one that it does not name were told to set a datum."""
+    reason = "no sensor reads this topic (sensor_msgs/msg/NavSatFix)"
+    unread = LedgerRow(seq=-1, stamp_ns=0, sensor="", topic="/fix", outcome=Outcome.IGNORED, reason=reason, count=30)
+    recording = Recording(source="my.bag", imu=None, measurements=(), rows=(unread,))
+    for sensors, said in (
+        ({}, "; vessel.yaml names no sensor at all"),
+        ({"rtk": GnssConfig(topic="/fix", enabled=False)}, ": rtk is switched off"),
+        ({"height": HeightConfig()}, ": vessel.yaml has none for /fix; `graphloc inspect` says"),
+    ):
+        with pytest.raises(InputError, match="no GNSS sensor to take a datum from" + said):
+            app.choose_datum(recording, VesselConfig(sensors=sensors))
+
+
+def test_fixes_without_a_stamp_are_counted_by_their_reason() -> None:
+    """When each was recorded is no reason of its own, and a row may stand for many: '1 messages' were said."""
+    rows = tuple(
+        LedgerRow(seq=k, stamp_ns=0, sensor="gnss", topic="/fix", outcome=Outcome.MALFORMED, reason=f"no stamp, recorded at {k}", count=2)
+        for k in range(30)
+    )  # fmt: skip
+    recording = Recording(source="my.bag", imu=None, measurements=(), rows=rows)
+    with pytest.raises(InputError, match=r"no usable GNSS fix: 60 messages of gnss: no stamp$"):
+        app.choose_datum(recording, VesselConfig(sensors={"gnss": GnssConfig(topic="/fix")}))
+
+
 def test_truth_on_another_clock_is_said_and_left_out() -> None:
     run = simulate(replace(BASE, duration_s=8.0), 1)
     truth = run.truth

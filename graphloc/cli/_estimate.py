@@ -39,11 +39,14 @@ def inspect(
     as_json: JsonOption = False,
 ) -> None:
     """Print what a bag holds and write a first vessel.yaml, every guess marked."""
-    from graphloc.errors import OutputError
+    from graphloc.errors import InputError, OutputError
     from graphloc.frontends import inspect as inspection
 
     found = inspection.inspect_bag(bag)
     typer.echo(json.dumps(found.as_dict(), indent=2) if as_json else inspection.render(found))
+    if not found.usable:
+        why = "; ".join(found.warnings) or "no topic of it is a sensor's"
+        raise InputError(f"{found.source}: no sensor can be made of it, so {config} is not written: {why}")
     if config.exists() and not overwrite:
         raise OutputError(f"{config}: exists already; give --write another name, or --overwrite")
     try:
