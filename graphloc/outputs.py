@@ -243,9 +243,11 @@ def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None
 
 
 def _geojson(path: Path, solution: Solution, picked: Array) -> None:
-    """RFC 7946: the track as a line, longitude first."""
+    """RFC 7946: the track as a line, longitude first; as several where it crosses the date line."""
     geodetic = solution.datum.geodetic_from_enu(solution.trajectory.p_world_m[picked])
-    line = [[round(float(lon), 9), round(float(lat), 9), round(float(h), 3)] for lat, lon, h in geodetic]
+    cut = _cut(geodetic[:, [1, 0, 2]])
+    lines = [[[round(lon, 9), round(lat, 9), round(h, 3)] for lon, lat, h in part.tolist()] for part in cut]
+    one = len(lines) == 1
     stamps = solution.trajectory.stamps_ns
     properties = {
         "name": "graphloc",
@@ -255,10 +257,25 @@ def _geojson(path: Path, solution: Solution, picked: Array) -> None:
     }
     feature = {
         "type": "Feature",
-        "geometry": {"type": "LineString", "coordinates": line},
+        "geometry": {
+            "type": "LineString" if one else "MultiLineString",
+            "coordinates": lines[0] if one else lines,
+        },
         "properties": properties,
     }
     path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}), encoding="utf-8")
+
+
+def _cut(places: Array) -> list[Array]:
+    """Longitudes, latitudes and heights (N, 3) in parts that end and begin on the date line (RFC 7946, 3.1.9)."""
+    parts, begin, first = [], places[:0], 0
+    for k in np.flatnonzero(np.abs(np.diff(places[:, 0])) > 180.0).tolist():
+        side = float(np.copysign(180.0, places[k, 0]))
+        step = places[k + 1] - places[k] + [2.0 * side, 0.0, 0.0]
+        met = places[k] + step * ((side - places[k, 0]) / step[0] if step[0] else 0.0)
+        parts.append(np.vstack([begin, places[first : k + 1], met]))
+        begin, first = met[None] * [0.0, 1.0, 1.0] - [side, 0.0, 0.0], k + 1
+    return [*parts, np.vstack([begin, places[first:]])]
 
 
 _LEDGER_COLUMNS = ["utc", *(f.name for f in fields(LedgerRow))]

@@ -26,12 +26,16 @@ COV = np.diag([0.04, 0.09, 0.25, 1e-4, 4e-4, 9e-4])
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("outputs"), Geodetic(57.7, 11.9, 40.0))
+
+
+def written(out: Path, origin: Geodetic) -> Path:
     n = 21
     stamps = START_NS + 100_000_000 * np.arange(n, dtype=np.int64)
     R = Rotation.from_euler("ZYX", [YAW, PITCH, ROLL]).as_matrix()
     p = np.array([100.0, -40.0, 3.0]) + np.arange(n)[:, None] * V * 0.1
     solution = Solution(
-        datum=Datum(Geodetic(57.7, 11.9, 40.0)),
+        datum=Datum(origin),
         trajectory=Trajectory(
             stamps_ns=stamps,
             p_world_m=p,
@@ -67,7 +71,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ),
         stats=SolveStats(passes=1, iterations=2, states=n, factors=4, cost=5.0, expected_cost=6.0, converged=True),
     )  # fmt: skip
-    out = tmp_path_factory.mktemp("outputs")
     outputs.write_run(out, solution, VesselConfig(), inputs={"a.bag": "00"}, command="test", metrics={})
     return out
 
@@ -151,3 +154,19 @@ def test_geojson_is_longitude_first(folder: Path) -> None:
     assert line[0][0] == pytest.approx(11.9, abs=0.01)
     assert line[0][1] == pytest.approx(57.7, abs=0.01)
     assert line[0][2] == pytest.approx(43.0, abs=0.01)
+
+
+def test_geojson_is_cut_at_the_date_line(tmp_path: Path) -> None:
+    """101.5 m east of a datum that lies 101.5 m west of it; as one line it led once around the globe."""
+    per_m = np.degrees(1.0 / (6_378_137.0 * np.cos(np.radians(-16.8))))
+    folder = written(tmp_path, Geodetic(-16.8, 180.0 - 101.5 * per_m, 40.0))
+    geometry = json.loads((folder / "track.geojson").read_text())["features"][0]["geometry"]
+    assert geometry["type"] == "MultiLineString"
+    west, east = (np.array(part) for part in geometry["coordinates"])
+    assert np.all((west[:, 0] > 179.9) & (west[:, 0] <= 180.0))
+    assert np.all((east[:, 0] < -179.9) & (east[:, 0] >= -180.0))
+    assert (west[-1, 0], east[0, 0]) == (180.0, -180.0)
+    assert west[-1, 1:].tolist() == east[0, 1:].tolist()
+    east[:, 0] += 360.0
+    slope = np.diff(np.vstack([west, east[1:]])[:, :2], axis=0)
+    np.testing.assert_allclose(slope[:, 1], slope[0, 1] / slope[0, 0] * slope[:, 0], atol=3e-9)  # it goes straight on
