@@ -27,6 +27,11 @@ _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset a
 _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
+_RTK_M = (
+    0.05,
+    0.1,
+)  # horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error
+_RTK_SCATTER_M = 0.1
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
 
@@ -210,6 +215,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
             lines.append(
                 f"  default_vertical_sigma_m: {times * default.default_vertical_sigma_m:.1f}  # guess: as many times"
             )
+    lines += _rtk_lines(gnss)
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
     if wanders:
         lines.append(f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m")
@@ -219,8 +225,25 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3) if wanders else None
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
         more = f"vertical_sigma_m: {vertical:.1f}" if vertical else ""
-        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}")
+        off = "; {enabled: false} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
+        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{off}")
     return lines
+
+
+def _rtk_lines(gnss: GnssReport) -> list[str]:
+    """What is seen of RTK that reports no covariance, which would count as good to metres; NMEA tells it by its quality."""
+    augmented = set(gnss.statuses) - {"no fix"} == {"gbas"}
+    if not augmented or gnss.reported_sigma_m or gnss.scatter_m is None or " " in gnss.topic:
+        return []
+    seen_m = max(gnss.scatter_m[:2]), gnss.scatter_m[2]
+    if seen_m[0] > _RTK_SCATTER_M:
+        return []
+    horizontal, vertical = (max(least, seen) for least, seen in zip(_RTK_M, seen_m, strict=True))
+    said = f"guess: status gbas (RTK, or DGPS), and fixes scatter by {seen_m[0]:.3f} m from one to the next"
+    return [
+        f"  default_horizontal_sigma_m: {horizontal:.2f}  # {said}",
+        f"  default_vertical_sigma_m: {vertical:.2f}  # guess: likewise, {seen_m[1]:.3f} m",
+    ]
 
 
 def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None) -> list[str]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from graphloc.app import smooth_recording
+from graphloc.config import GnssConfig, load_config
 from graphloc.eval.ekf._honest import run_honest
 from graphloc.eval.metrics import held_out_errors
 from graphloc.eval.simulate import Scenario, simulate
@@ -22,6 +23,7 @@ from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.test_bag import KINDS
 from tests.test_bag_bad_input import accounted, rows_of, vessel
 
 MAKE = Messages(2)
@@ -135,6 +137,33 @@ def test_noise_of_a_receiver_that_claims_none(hz: int, noise_m: float, expected:
     ]
     assert len(said) == len(found) == (expected is not None)
     assert found == pytest.approx([expected] if expected else [], rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("noise_m", "status", "claims", "expected"),
+    [
+        (0.01, 2, False, 0.05),  # a floor: scatter holds no slow error
+        (0.08, 2, False, 0.08),
+        (0.3, 2, False, None),  # a float, or DGPS
+        (0.01, 0, False, None),  # smoothed by the receiver
+        (0.01, 2, True, None),
+    ],
+)
+def test_rtk_that_claims_nothing_is_drafted_as_it_scatters(
+    noise_m: float, status: int, claims: bool, expected: float | None, tmp_path: Path
+) -> None:
+    """It counted as good to 1.5 m: bounds of half a metre, where 3 cm was true. Its slow error stays on, for DGPS says the same."""
+    items = fixes(10, noise_m=noise_m, sigma_m=0.5, seconds=200)
+    for _, _, message in items:
+        message.status.status = status
+        message.position_covariance_type = 2 if claims else 0
+    read(tmp_path, items)
+    (tmp_path / "drafted.yaml").write_text(draft_config(inspect_bag(tmp_path / "run")))
+    gnss = load_config(tmp_path / "drafted.yaml", KINDS).sensors["gnss"]
+    usual = GnssConfig()
+    assert gnss.default_horizontal_sigma_m == pytest.approx(expected or usual.default_horizontal_sigma_m, rel=0.15)
+    assert (gnss.default_vertical_sigma_m < usual.default_vertical_sigma_m) == (expected is not None)
+    assert gnss.slow_error == usual.slow_error
 
 
 @pytest.mark.parametrize(("hz", "sigma_m", "said"), [(10, 1e4, 1), (2, 1e4, 1), (10, 20.0, 0)])
