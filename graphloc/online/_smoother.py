@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from graphloc.config import VesselConfig
-from graphloc.errors import in_one_line
+from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate
 from graphloc.frames import Array, Datum
 from graphloc.graph import InertialRow, Sensor
@@ -508,7 +508,7 @@ class OnlineSmoother:
 
     def _rebuild(self, error: Exception | str) -> None:
         """Build the lag anew: with all that is in it; if that fails too, from the last anchor without what came since; or start anew."""
-        why = error if isinstance(error, str) else f"the solver failed ({in_one_line(error)})"
+        why = error if isinstance(error, str) else _failure(error)
         log.warning("online: %s", why)
         assert self._lag is not None
         old, recent, book = self._lag, self._recent, self._book
@@ -525,7 +525,7 @@ class OnlineSmoother:
                 self._step(fresh)
                 fresh.settle()
             except Exception as another:  # noqa: BLE001 - as in `_advance`
-                why = f"the solver failed ({in_one_line(another)})"
+                why = _failure(another)
                 book.back_to(mark)
                 continue
             if without:
@@ -613,6 +613,11 @@ class OnlineSmoother:
         self._say(f"resumed from a snapshot {age_s:.1f} s old")
         for m in waiting:
             self.feed(m)
+
+
+def _failure(error: Exception) -> str:
+    said = in_one_line(error)
+    return said if isinstance(error, SolveError) else f"the solver failed ({said})"
 
 
 def _series(samples: Sequence[ImuSample]) -> ImuSeries:
