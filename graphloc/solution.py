@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,3 +117,12 @@ class Solution:
     def name(self) -> str:
         """What tables and pictures call it."""
         return "graphloc online" if self.stats.online else "graphloc"
+
+    def doubted(self, why: str) -> Solution:
+        """Return it with no pose called good."""
+        good = [health is Health.GOOD for health in self.health]
+        return replace(
+            self,
+            health=tuple(Health.DEGRADED if g else health for g, health in zip(good, self.health, strict=True)),
+            health_reason=tuple(why if g else reason for g, reason in zip(good, self.health_reason, strict=True)),
+        )

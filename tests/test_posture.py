@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from graphloc import app
 from graphloc.eval.posture import posture_warnings
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.solution import Health
 from graphloc.trajectory import Trajectory
 
 QUICK = Scenario(path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, gnss_sigma_m=0.1)
@@ -68,8 +69,14 @@ def test_a_track_that_lies_still_says_nothing(run: SimulatedRun) -> None:
 def test_an_imu_turned_in_the_file_is_said_in_the_report(run: SimulatedRun) -> None:
     """No sensor speaks against it but the compass, whose offset is blamed; the course names the mount."""
     imu: Any = run.config.sensors["imu"]
+    gnss: Any = run.config.sensors["gnss"]
+    trusted = gnss.model_copy(update={"slow_error": gnss.slow_error.model_copy(update={"enabled": False})})
+    usual = run.config.model_copy(update={"sensors": {**run.config.sensors, "gnss": trusted}})
     wrong = imu.model_copy(update={"mount": imu.mount.model_copy(update={"rpy_deg": (2.0, -1.0, 0.0)})})
-    config = run.config.model_copy(update={"sensors": {**run.config.sensors, "imu": wrong}})
-    said = app.smooth_recording(run.recording, config).recording.warnings
-    assert any("unless the craft goes sideways" in line for line in said)
-    assert app.smooth_recording(run.recording, run.config).recording.warnings == run.recording.warnings
+    config = usual.model_copy(update={"sensors": {**usual.sensors, "imu": wrong}})
+    found, right = (app.smooth_recording(run.recording, c) for c in (config, usual))
+    assert any("unless the craft goes sideways" in line for line in found.recording.warnings)
+    assert Health.GOOD not in found.solution.health
+    assert any(why.startswith("the course is more than 45 deg off") for why in found.solution.health_reason)
+    assert right.recording.warnings == run.recording.warnings
+    assert Health.GOOD in right.solution.health

@@ -91,7 +91,10 @@ def smooth_recording(
         beside = ekf.FilterResult(name=online.name, trajectory=online.trajectory, ledger=online.ledger)
         filters = (beside, *filters)
     tags, said = found_tags.about_tags(recording, config, solution)
-    said += [*_track_warnings(solution, recording, config), *([never] if never else [])]
+    postures, apart = _track_warnings(solution, recording, config)
+    if postures:
+        solution = solution.doubted(postures[0].partition(":")[0])
+    said += [*postures, *apart, *([never] if never else [])]
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
         filters=filters, online=online, pictures=tuple(gallery.pictures()), tags=tags,
@@ -120,10 +123,10 @@ def _filters(
     return filters
 
 
-def _track_warnings(solution: Solution, recording: Recording, config: VesselConfig) -> list[str]:
-    """What a solved track, offline or online, tells of the configuration."""
+def _track_warnings(solution: Solution, recording: Recording, config: VesselConfig) -> tuple[list[str], list[str]]:
+    """What a solved track, offline or online, tells of the configuration: of how the craft lies and goes, and of its sensors."""
     track = solution.trajectory
-    return posture_warnings(track, recording, config) + apart_warnings(track, solution.datum, recording, config)
+    return posture_warnings(track, recording, config), apart_warnings(track, solution.datum, recording, config)
 
 
 def _online(
@@ -149,7 +152,8 @@ def replay_recording(
     """Run a recording through the online mode (see `graphloc.replay`)."""
     replayed = replay(recording, config, scans=scans, rate=rate, lag_s=lag_s, stoppable=True, status=status)
     recording, solution = replayed.recording, replayed.solution
-    said = suspect_tags(recording, config, solution) + _track_warnings(solution, recording, config)
+    postures, apart = _track_warnings(solution, recording, config)
+    said = [*suspect_tags(recording, config, solution), *postures, *apart]
     run = Run(recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution)
     return made_comparable(_with_underlay(run, scans))
 
