@@ -20,7 +20,7 @@ from scipy.stats import chi2
 
 from graphloc import app
 from graphloc.berths import seen_from
-from graphloc.build import make_problem
+from graphloc.build import make_problem, thinned
 from graphloc.config import VesselConfig
 from graphloc.eval import digerud, ekf
 from graphloc.eval.docking import tag_range_m
@@ -116,17 +116,17 @@ def _at_the_time(recording: Recording, config: VesselConfig) -> dict[int, int]:
     datum = app.choose_datum(recording, config)
     whole = app.with_synthetic(recording, config, datum)
     problem = make_problem(whole, app.seen_frames(config, whole), datum, SENSORS, INERTIAL)
-    chosen: dict[int, int] = {}
+    few, chosen = thinned(problem).problem, dict[int, int]()
 
     def watch(_last: int, verdicts: Verdicts) -> None:
-        for stream in problem.streams:
+        for stream in few.streams:
             for i, m in enumerate(stream.measurements):
                 verdict = verdicts.get((stream.number, i))
                 if isinstance(m, TagSighting) and verdict is not None:
                     chosen.setdefault(m.seq, verdict.mode)
 
-    values, prior, known, *_ = solve_start(problem, align(problem), lambda *_: None)
-    grow(problem, values, prior, known, lambda *_: None, chunk_s=_STEP_S, overlap_s=_LAG_S, watch=watch)
+    values, prior, known, *_ = solve_start(few, align(problem), lambda *_: None)
+    grow(few, values, prior, known, lambda *_: None, chunk_s=_STEP_S, overlap_s=_LAG_S, watch=watch)
     return chosen
 
 

@@ -18,6 +18,7 @@ of roll and pitch and 5 deg of correction). Not handled: pitch near +-90 deg.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -32,14 +33,17 @@ _DEVIATION = ("B", "C", "D", "E")
 _SHARES = (1.0, 1.0, 0.5, 0.5)  # B and C come of permanent magnetism; D and E, of soft iron, are smaller
 
 
-def _axes(config: CompassConfig) -> tuple[Array, Array]:
-    """Standing sigmas (6,) of A to E and of the wander, rad, 0 where there is none; and their time constants, s."""
-    mount, deviation, wander = np.radians(
-        [config.mount_offset_sigma_deg, config.deviation_sigma_deg, config.wander_sigma_deg]
-    )
-    trusted = mount == 0.0
-    sigma = np.array([mount, *(0.0 if trusted else deviation * share for share in _SHARES), 0.0 if trusted else wander])
-    return sigma, np.array([np.inf] * 5 + [config.wander_time_constant_s])
+def _sigmas(config: CompassConfig) -> Array:
+    """Standing sigmas (6,) of A to E and of the wander, rad, 0 where there is none."""
+    return _sigmas_of(config.mount_offset_sigma_deg, config.deviation_sigma_deg, config.wander_sigma_deg)
+
+
+@lru_cache
+def _sigmas_of(mount_deg: float, deviation_deg: float, wander_deg: float) -> Array:
+    beside = (0.0,) * 5 if mount_deg == 0.0 else (*(deviation_deg * share for share in _SHARES), wander_deg)
+    sigmas = np.radians([mount_deg, *beside])
+    sigmas.setflags(write=False)
+    return sigmas
 
 
 def _yaw_jacobian(R: Array, x_body: Array, x_world: Array) -> Array:
@@ -62,7 +66,7 @@ def _read(at: Attachment, config: CompassConfig, yaw: float) -> tuple[float, Arr
     if at.slow_value is None:
         return yaw, np.zeros(0), 1.0
     s, c = math.sin(yaw), math.cos(yaw)
-    there = _axes(config)[0] > 0.0
+    there = _sigmas(config) > 0.0
     terms = np.array([1.0, c, s, 2.0 * s * c, s * s - c * c, 1.0])[there]
     slopes = np.array([0.0, -s, c, 2.0 * (c * c - s * s), 4.0 * s * c, 0.0])[there]
     return yaw + float(terms @ at.slow_value), terms, 1.0 + float(slopes @ at.slow_value)
@@ -98,7 +102,7 @@ def factors(m: CompassHeading, config: CompassConfig, at: Attachment, decision: 
 
 def slow(config: CompassConfig) -> SlowProcess | None:
     """Return mount offset, deviation and wander, as far as the configuration asks for them."""
-    sigma, time_constant_s = _axes(config)
+    sigma, time_constant_s = _sigmas(config), np.array([np.inf] * 5 + [config.wander_time_constant_s])
     there = sigma > 0.0
     if not there.any():
         return None

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc import gauss
 from graphloc.berths import Berth
 from graphloc.config import KernelConfig, SensorConfig
 from graphloc.frames import Array, Datum
@@ -98,10 +99,7 @@ class Residual:
 
     def nis(self, inflation: Array | None = None) -> float:
         """Squared residual normalised by `cov` (+ `inflation`)."""
-        s = self.cov if inflation is None else self.cov + inflation
-        if len(self.raw) == 1:
-            return float(self.raw[0]) ** 2 / float(s[0, 0])
-        return float(self.raw @ np.linalg.solve(s, self.raw))
+        return gauss.square(self.raw, self.cov if inflation is None else self.cov + inflation)
 
     def normalised(self, inflation: Array | None = None) -> Array:
         """The residual (k,) by a root of `cov` (+ `inflation`): its square is `nis`."""
@@ -112,9 +110,8 @@ class Residual:
 
     def log_density(self, inflation: Array | None = None) -> float:
         """Log of prior x Gaussian density of the residual, covariance `cov` (+ `inflation`)."""
-        s = self.cov if inflation is None else self.cov + inflation
-        logdet = np.linalg.slogdet(2.0 * np.pi * s)[1]
-        return float(np.log(self.prior) - 0.5 * (self.nis(inflation) + logdet))
+        cov = self.cov if inflation is None else self.cov + inflation
+        return float(np.log(self.prior)) + gauss.log_density(self.raw, cov)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,7 +129,7 @@ class Decision:
     kernel: KernelConfig | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SlowProcess:
     """A slow state: per axis a first-order Gauss-Markov process.
 

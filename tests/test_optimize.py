@@ -8,7 +8,6 @@ from graphloc import keys
 from graphloc.errors import SolveError
 from graphloc.solve import _on_deep_stack
 from graphloc.solve._optimize import bayes_tree, full_step, optimize
-from graphloc.solve._ordering import along_nodes, nodes_last
 from graphloc.solve._stretch import moved
 
 
@@ -87,37 +86,6 @@ def test_a_step_that_came_out_as_promised_is_the_last() -> None:
         near = gtsam.Values()
         near.insert(0, bent.values.atVector(0) + np.array([way, 0.0]))
         assert graph.error(near) > bent.error
-
-
-def test_the_order_along_nodes_finds_the_same() -> None:
-    """The last three of five slow nodes of four states, positions measured at two states; a leaf at one of them."""
-    slow_of, first = np.repeat(np.arange(5), 4), 8
-    graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    unit = gtsam.noiseModel.Unit.Create(3)
-    for k, j in list(enumerate(slow_of.tolist()))[first:]:
-        guess.insert(keys.pose(k), np.full(3, 0.1 * k))
-        graph.add(gtsam.BetweenFactorVector(keys.bias(j), keys.pose(k), np.ones(3), unit))
-        if k > first:
-            graph.add(gtsam.BetweenFactorVector(keys.pose(k - 1), keys.pose(k), np.full(3, 0.7), unit))
-    for j in range(2, 5):
-        guess.insert(keys.bias(j), np.zeros(3))
-    leaf = keys.leaves(13)[0]
-    guess.insert(leaf, np.zeros(3))
-    graph.add(gtsam.BetweenFactorVector(keys.pose(13), leaf, np.zeros(3), unit))
-    for key in (leaf, keys.pose(10)):
-        graph.add(gtsam.PriorFactorVector(key, np.array([4.0, 5.0, 6.0]), unit))
-    order = along_nodes(guess, slow_of)
-    names = [order.at(n) for n in range(order.size())]
-    assert sorted(names) == sorted(guess.keys())
-    between = [keys.pose(k) for k in range(first, 20) if k % 4]
-    assert names[:10] == [leaf, *between]
-    ours, theirs = (optimize(graph, guess, 5, order=o).values for o in (order, None))
-    for name in names:
-        np.testing.assert_allclose(ours.atVector(name), theirs.atVector(name), atol=1e-9)
-    cov = bayes_tree(graph, guess).marginalCovariance(keys.pose(15))
-    np.testing.assert_allclose(
-        bayes_tree(graph, guess, nodes_last(guess, slow_of)).marginalCovariance(keys.pose(15)), cov, atol=1e-12
-    )
 
 
 def test_moved_counts_a_radian_as_ten_metres() -> None:

@@ -32,6 +32,7 @@ from graphloc.build._problem import (
     mount_of,
     with_noise_scale,
 )
+from graphloc.build._thinned import Thinned, thinned
 
 __all__ = [
     "CONSTANT_TAILS",
@@ -44,6 +45,7 @@ __all__ = [
     "Problem",
     "StartPrior",
     "Stream",
+    "Thinned",
     "attach",
     "bias_step",
     "bridged",
@@ -60,5 +62,6 @@ __all__ = [
     "standing_cost",
     "state_keys",
     "state_of",
+    "thinned",
     "with_noise_scale",
 ]

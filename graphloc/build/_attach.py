@@ -185,6 +185,8 @@ def _next_slow(
 
 def constants_of(stream: Attaching, values: gtsam.Values) -> tuple[tuple[int, Array], ...]:
     """Keys and estimates; what no factor had yet is zero."""
+    if not stream.constants:
+        return ()
     return tuple(
         (key, np.atleast_1d(values.atVector(key)) if values.exists(key) else np.zeros(len(constant.sigma)))
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import gtsam
@@ -139,6 +140,12 @@ def _add_constants(
             graph.add(gtsam.PriorFactorVector(key, np.zeros(len(constant.sigma)), model))
 
 
+@lru_cache(maxsize=1 << 14)
+def _step(slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool, leap_m: float) -> tuple[Any, ...]:
+    """Factors of a step, made once: they do not depend on the estimate, so every graph shares them."""
+    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, leap_m=leap_m))
+
+
 def _leaps_m(problem: Problem, stream: Stream) -> dict[int, float]:
     """By slow node: how far the places leap, m, before the next one; from the last place before to the first one after."""
     found: dict[int, float] = {}
@@ -182,8 +189,7 @@ def _add_slow_chain(
                 graph.add(factor)
     leaps_m = _leaps_m(problem, stream)
     for n, j in enumerate(nodes[:-1]):
-        dt_s = _node_dt_s(problem, j)
-        for factor in slow_step(slow, key[n], key[n + 1], dt_s, jumps=jumps, leap_m=leaps_m.get(j, 0.0)):
+        for factor in _step(slow, key[n], key[n + 1], _node_dt_s(problem, j), jumps, leaps_m.get(j, 0.0)):
             graph.add(factor)
     for factor in slow_end(slow, key[-1], jumps=jumps):
         graph.add(factor)

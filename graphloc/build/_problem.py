@@ -44,7 +44,6 @@ class Stream:
         measurements: M of them by stamp. state: (M,) its state (`state_of`). carry: per measurement the
             preintegrated motion from the state before it, or None where it stands on a state.
         gyro_radps: (M, 3) raw rate at each measurement, body axes.
-        sparse: (M,) true for the first measurement at each slow node.
     """
 
     number: int
@@ -60,7 +59,6 @@ class Stream:
     state: NDArray[np.int64]
     carry: tuple[tuple[int, Any] | None, ...]
     gyro_radps: Array
-    sparse: NDArray[np.bool_]
 
     def between(self, first: int, last: int) -> range:
         """Indices of the measurements that attach to states first..last (inclusive)."""
@@ -256,11 +254,13 @@ def _inertial(timeline: Timeline, links: InertialLink, preintegrated: Sequence[A
 def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
     """Return the problem with the IMU's noise densities scaled."""
     links = problem.relink(noise_scale)
-    preintegrated = _preintegrate(problem.timeline, links)
-    return replace(
-        problem, links=links, noise_scale=noise_scale, preintegrated=preintegrated,
-        inertial=_inertial(problem.timeline, links, preintegrated),
-    )  # fmt: skip
+    return with_links(replace(problem, links=links, noise_scale=noise_scale), _preintegrate(problem.timeline, links))
+
+
+def with_links(problem: Problem, preintegrated: tuple[Any, ...]) -> Problem:
+    """Return the problem with the motion from each state to the next, and the factors of that."""
+    inertial = _inertial(problem.timeline, problem.links, preintegrated)
+    return replace(problem, preintegrated=preintegrated, inertial=inertial)
 
 
 def bridged(problem: Problem, values: gtsam.Values) -> Problem:
@@ -322,5 +322,4 @@ def _stream(
         np.array(state, dtype=np.int64),
         tuple(carry),
         links.gyro_at(np.array([m.stamp_ns for m in measurements])),
-        np.diff(timeline.slow_of[state], prepend=-1) > 0,
     )

@@ -3,7 +3,8 @@
 
 1. Align over a window; try each candidate heading on it and keep the cheapest (`_align`, `_grow`).
 2. Grow, some seconds at a time, each window solved with a prior from what was before. Hypotheses that
-   are new in a window are judged by the prediction without them, with its covariance (`_grow`).
+   are new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
+   thinned run (`graphloc.build.thinned`).
 3. Passes over the whole run: modes and weights re-chosen until they stand (`_passes`).
 4. Look for other choices that are more probable (`_choices`), and pass again where there are any.
 5. Where receivers jump and nothing else tells the place, take the level that is the usual one (`_levels`).
@@ -20,11 +21,11 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from graphloc.build import Problem, StartPrior, bridged, with_noise_scale
+from graphloc.build import Problem, StartPrior, Thinned, bridged, thinned, with_noise_scale
 from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
-from graphloc.solve._choices import by_best_chains, judged_by_the_rest, take_more_probable, without_its_ends
+from graphloc.solve._choices import other_choices, take_more_probable
 from graphloc.solve._decide import Verdicts, weigh
 from graphloc.solve._grow import grow, solve_start
 from graphloc.solve._levels import at_usual_level
@@ -68,18 +69,21 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     Raises:
         SolveError: it could not be started, or the linear algebra failed.
     """
-    start = align(problem)
-    grown, prior, known, iterations, headings = solve_start(problem, start, progress)
-    iterations += grow(problem, grown, prior, known, progress)
-    problem = bridged(problem, grown)
-    passes, estimate, ratio = 0, grown, 1.0
+    start, few = align(problem), thinned(problem)
+    grown, prior, known, iterations, headings = solve_start(few.problem, start, progress)
+    iterations += grow(few.problem, grown, prior, known, progress)
+    passes, estimate, ratio = 0, few.filled(problem, grown), 1.0
+    if problem.links.gaps():
+        problem = bridged(problem, estimate)
+        few = thinned(problem)
     for attempt in range(_MAX_NOISE_ROUNDS):
         if attempt > 0:
             scale = problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0))
             problem = bridged(with_noise_scale(problem, scale), estimate)
+            few = thinned(problem)
             estimate, used, passed = open_passes(problem, estimate, prior, progress)
             passes, iterations = passes + passed, iterations + used
-        settled = _final_passes(problem, estimate, prior, progress)
+        settled = _final_passes(problem, few, estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
         cost = 2.0 * float(settled.graph.error(estimate)) - outliers_cost(settled.verdicts)
         ratio = cost / max(expected_cost(problem, settled.verdicts), 1.0)
@@ -105,7 +109,9 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     )
 
 
-def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress) -> Settled:
+def _final_passes(
+    problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
+) -> Settled:
     """Re-choose modes and weights over the whole run until they stand, and look for better choices.
 
     Choices confirm themselves: the estimate follows them. So three others are tried: the most probable chain of
@@ -117,8 +123,7 @@ def _final_passes(problem: Problem, estimate: gtsam.Values, prior: StartPrior, p
         problem, estimate, weigh(problem, estimate, first=0, last=last, stage="final"), prior, progress, _FIRST_PASSES
     )
     changed, iterations = False, settled.iterations
-    for other in (by_best_chains, judged_by_the_rest, without_its_ends):
-        others, used = other(problem, settled, prior)
+    for others, used in other_choices(problem, few, settled, prior):
         changed = take_more_probable(problem, settled, others, prior) or changed
         iterations += used
     if settled.converged and not changed:

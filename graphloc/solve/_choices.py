@@ -8,14 +8,15 @@ what is believed at the ends.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
-from graphloc.build import Problem, StartPrior, build_graph
-from graphloc.graph import Decision
+from graphloc.build import Decisions, Problem, StartPrior, Thinned, attach, build_graph
+from graphloc.graph import Attachment, Decision
 from graphloc.solve._decide import (
     Verdict,
     Verdicts,
@@ -23,11 +24,9 @@ from graphloc.solve._decide import (
     decisions,
     log_evidence,
     predicted_covariance,
-    thinned,
     weigh,
 )
 from graphloc.solve._optimize import bayes_tree
-from graphloc.solve._ordering import nodes_last
 from graphloc.solve._passes import SETTLED_M, SETTLED_WEIGHT, Settled, changed
 from graphloc.solve._stretch import copy_states, solve_until_written_there, update_states, weak_prior
 
@@ -40,25 +39,30 @@ _AROUND_S = 20.0
 _AROUND_PASSES = 6
 
 
-def by_best_chains(problem: Problem, settled: Settled, prior: StartPrior) -> tuple[Verdicts, int]:
-    return along_best_chains(problem, settled.values, settled.verdicts), 0
+def other_choices(
+    problem: Problem, few: Thinned, settled: Settled, prior: StartPrior
+) -> Iterator[tuple[Verdicts, int]]:
+    """Each of the three, with the iterations it took, made of what `settled` is by then."""
+    yield along_best_chains(problem, settled.values, settled.verdicts), 0
+    yield _judged_by_the_rest(few, settled, prior)
+    yield _without_its_ends(problem, settled), 0
 
 
-def judged_by_the_rest(problem: Problem, settled: Settled, prior: StartPrior) -> tuple[Verdicts, int]:
-    """Weigh each stretch's hypotheses by the solution of the run without them and their neighbours.
+def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tuple[Verdicts, int]:
+    """Weigh each stretch's hypotheses by the solution of the thinned run without them and their neighbours.
 
     Hypotheses that took part in the estimate speak for themselves, and a wrong choice confirms itself. Every
     third stretch is judged at once, so three solutions do for the whole run.
     """
-    last, start_ns = len(problem.timeline) - 1, int(problem.timeline.stamps_ns[0])
-    judged, iterations = dict(settled.verdicts), 0
+    problem, values = few.problem, few.of(settled.values)
+    start_ns = int(problem.timeline.stamps_ns[0])
     at_s = {  # time of each hypothesis in the run
         (s.number, i): (m.stamp_ns - start_ns) * 1e-9
         for s in problem.streams
         if s.row.false is not None
         for i, m in enumerate(s.measurements)
     }
-    everything = thinned(problem, judged)
+    judged, everything, iterations = dict(settled.verdicts), _decided(few, settled.verdicts, values), 0
     for third in range(3):
         own = {key for key, t in at_s.items() if int(t / _STRETCH_S) % 3 == third}
         around = {
@@ -66,23 +70,36 @@ def judged_by_the_rest(problem: Problem, settled: Settled, prior: StartPrior) ->
         }
         if not own or len(around) == len(at_s):  # nothing to judge, or nothing to judge it by
             continue
-        rest = _without(problem, settled.values, everything, prior, around)
+        rest = _without(problem, values, everything, prior, around)
         fresh = weigh(
             problem,
             rest.values,
             first=0,
-            last=last,
+            last=len(problem.timeline) - 1,
             stage="final",
             covariance=predicted_covariance(rest.tree),
             only=own,
         )
-        judged.update({key: _decisive(v) for key, v in fresh.items()})
+        for (number, i), verdict in fresh.items():
+            key = number, int(few.chosen[number][i])
+            judged[key] = _decisive(verdict, judged[key].at)
         iterations += 1
         del rest  # and its tree, before the next one is made
     return judged, iterations
 
 
-def without_its_ends(problem: Problem, settled: Settled, prior: StartPrior) -> tuple[Verdicts, int]:
+def _decided(few: Thinned, verdicts: Verdicts, values: gtsam.Values) -> Decisions:
+    """What is decided of the measurements of a thinned run by verdicts about the whole one."""
+    decided: dict[tuple[int, int], tuple[Decision, Attachment] | None] = {}
+    for stream in few.problem.streams:
+        for i, whole in enumerate(few.chosen[stream.number].tolist()):
+            decision = verdicts[stream.number, whole].decision
+            at = None if decision is None else attach(few.problem, stream, i, values)
+            decided[stream.number, i] = None if decision is None or at is None else (decision, at)
+    return decided
+
+
+def _without_its_ends(problem: Problem, settled: Settled) -> Verdicts:
     """Refuse what is believed at either end of a sensor's measurements, where others near by are refused.
 
     There only one side speaks against a few false ones that agree.
@@ -99,7 +116,7 @@ def without_its_ends(problem: Problem, settled: Settled, prior: StartPrior) -> t
             for key, s in away_s.items():
                 if s <= _STRETCH_S:
                     others[key] = replace(others[key], decision=None, weight=0.0)
-    return others, 0
+    return others
 
 
 class _Rest(NamedTuple):
@@ -110,19 +127,18 @@ class _Rest(NamedTuple):
 
 
 def _without(
-    problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior, left_out: set[tuple[int, int]]
+    problem: Problem, estimate: gtsam.Values, decided: Decisions, prior: StartPrior, left_out: set[tuple[int, int]]
 ) -> _Rest:
-    """One step of the whole run, thinned, without what is left out."""
-    decided, last = decisions(verdicts, left_out), len(problem.timeline) - 1
-    graph, guess = build_graph(problem, estimate, decided, 0, last, prior)
-    tree = bayes_tree(graph, guess, nodes_last(guess, problem.timeline.slow_of))
+    """One step of the whole run without what is left out."""
+    kept = {key: found for key, found in decided.items() if key not in left_out}
+    tree = bayes_tree(*build_graph(problem, estimate, kept, 0, len(problem.timeline) - 1, prior))
     return _Rest(gtsam.Values(tree.calculateBestEstimate()), tree)
 
 
-def _decisive(verdict: Verdict) -> Verdict:
+def _decisive(verdict: Verdict, at: Attachment) -> Verdict:
     """All or nothing: half a belief in each of several that repeat each other is enough to bend the estimate to them."""
     sure = verdict.weight > _SURE
-    return replace(verdict, decision=Decision(mode=verdict.mode) if sure else None, weight=float(sure))
+    return replace(verdict, decision=Decision(mode=verdict.mode) if sure else None, weight=float(sure), at=at)
 
 
 def take_more_probable(problem: Problem, settled: Settled, others: Verdicts, prior: StartPrior) -> bool:
@@ -195,7 +211,7 @@ def _solve_around(
     """Solve a stretch until its choices stand; None where they become those of `unlike`."""
     local = copy_states(problem, values, max(first - 1, 0), min(last + 1, len(problem.timeline) - 1))
     for _ in range(_AROUND_PASSES):
-        step = solve_until_written_there(problem, local, first, last, prior, decisions(verdicts), tol=1e-3, thin=False)
+        step = solve_until_written_there(problem, local, first, last, prior, decisions(verdicts), tol=1e-3)
         used, verdicts = verdicts, weigh(problem, local, first=first, last=last, stage="final")
         if unlike is not None and all(_alike(v, unlike[key]) for key, v in verdicts.items()):
             return None

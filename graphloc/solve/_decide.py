@@ -87,7 +87,6 @@ def weigh(
     stage: str,
     covariance: PredictedCovariance = lambda _state, _key: None,
     hypotheses: bool = True,
-    sparse: bool = False,
     only: Container[tuple[int, int]] | None = None,
 ) -> Verdicts:
     """Decide about the measurements of states first..last.
@@ -99,7 +98,6 @@ def weigh(
         covariance: (state, key) -> covariance of the key's prediction (a pose's in the body tangent), or None.
         hypotheses: weigh sensors that can be false by their hypotheses; else by the stage's kernel, on the
             nearest mode.
-        sparse: thin sensors without hypotheses to one measurement for each slow node.
         only: decide about these alone, all of sensors that can be false.
     """
     verdicts: Verdicts = {}
@@ -107,9 +105,7 @@ def weigh(
         several = stream.row.false is not None
         if only is not None and not several:
             continue
-        indices = [i for i in stream.between(first, last) if several or not sparse or stream.sparse[i]]
-        if only is not None:
-            indices = [i for i in indices if (stream.number, i) in only]
+        indices = [i for i in stream.between(first, last) if only is None or (stream.number, i) in only]
         if not indices:
             continue
         attached = [attach(problem, stream, i, values) for i in indices]
@@ -154,8 +150,9 @@ def _by_kernel(
         spread = min(spread, _spread(pairs, dof)) if len(pairs) >= dof + 4 else spread
     scale = min(own.scale * spread * float(np.sqrt(dof)), _WIDEST)
     kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=scale)
+    decided = {m: Decision(mode=m, kernel=kernel) for m in set(mode)}
     return [
-        Verdict(Decision(mode=m, kernel=kernel), kernel.weight(n), 1.0, found[m], m, at)
+        Verdict(decided[m], kernel.weight(n), 1.0, found[m], m, at)
         for m, n, found, at in zip(mode, best, residuals, attached, strict=True)
     ]
 
@@ -247,16 +244,6 @@ def along_best_chains(problem: Problem, values: gtsam.Values, verdicts: Verdicts
             kept = None if mode is None else Decision(mode=mode)
             changed[(stream.number, i)] = Verdict(kept, float(mode is not None), 1.0, residuals[chosen], chosen, at)
     return changed
-
-
-def thinned(problem: Problem, verdicts: Verdicts) -> Verdicts:
-    """Return the verdicts of the measurements that `weigh(sparse=True)` would keep."""
-    streams = {s.number: s for s in problem.streams}
-    return {
-        (number, i): v
-        for (number, i), v in verdicts.items()
-        if streams[number].row.false is not None or streams[number].sparse[i]
-    }
 
 
 def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> Decisions:

@@ -17,6 +17,7 @@ from graphloc.frames import wrap_angle
 from graphloc.recording import Progress
 from graphloc.solve._align import Start, start_pose
 from graphloc.solve._decide import PredictedCovariance, Verdicts, decisions, predicted_covariance, weigh
+from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._stretch import (
     StretchStep,
     dead_reckon,
@@ -24,7 +25,6 @@ from graphloc.solve._stretch import (
     past_at,
     solve_stretch,
     solve_until_written_there,
-    thin_tree,
 )
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
@@ -141,9 +141,7 @@ def _solve_candidate(problem: Problem, candidate: _Candidate, last: int) -> tupl
     iterations, error = 0, 0.0
     for stage, limit, settled_m, hypotheses in _START_STAGES:
         for _ in range(limit):
-            verdicts = weigh(
-                problem, candidate.values, first=0, last=last, stage=stage, hypotheses=hypotheses, sparse=True
-            )
+            verdicts = weigh(problem, candidate.values, first=0, last=last, stage=stage, hypotheses=hypotheses)
             decided, jumps = decisions(verdicts), stage != "far"
             step = solve_stretch(problem, candidate.values, 0, last, candidate.prior, decided, jumps=jumps, tol=1e-4)
             iterations, error = iterations + step.iterations, step.error
@@ -176,7 +174,7 @@ def grow(
     """
     stamps, slow_of, end = problem.timeline.stamps_ns, problem.timeline.slow_of, len(problem.timeline) - 1
     prior: StartPrior | Past = start
-    verdicts = weigh(problem, estimate, first=0, last=known, stage="final", sparse=True)
+    verdicts = weigh(problem, estimate, first=0, last=known, stage="final")
     step = solve_stretch(problem, estimate, 0, known, prior, decisions(verdicts))
     iterations, first = step.iterations, 0
     while known < end:
@@ -206,17 +204,17 @@ def _solve_grown(
     fresh = {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
     iterations = 0
     for stage in ("final", *["far"] * _MAX_FAR_ROUNDS, "final"):
-        verdicts = weigh(problem, values, first=first, last=last, stage=stage, sparse=True)
+        verdicts = weigh(problem, values, first=first, last=last, stage=stage)
         step = solve_stretch(problem, values, first, last, prior, decisions(verdicts, fresh), jumps=stage != "far")
         iterations += step.iterations
         if step.moved_m < _FAR_SETTLED_M:
             break
     if not fresh:
         return iterations, step, verdicts
-    predicted = predicted_covariance(thin_tree(problem, step))
+    predicted = predicted_covariance(bayes_tree(step.graph, step.values))
     covariance: PredictedCovariance = lambda k, key: predicted(k, key) if k > known else None
     for _ in range(2):
-        verdicts = weigh(problem, values, first=first, last=last, stage="final", covariance=covariance, sparse=True)
+        verdicts = weigh(problem, values, first=first, last=last, stage="final", covariance=covariance)
         step = solve_until_written_there(problem, values, first, last, prior, decisions(verdicts))
         iterations += step.iterations
         covariance = lambda _state, _key: None

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc import gauss
 from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
@@ -107,17 +108,12 @@ def log_evidence_of(stream: Judged, indices: Sequence[int], residuals: Sequence[
     return sequence_of(stream, indices, residuals, [None] * len(seen), seen).log_evidence()
 
 
-def _log_gauss(raw: Array, cov: Array) -> float:
-    logdet = np.linalg.slogdet(2.0 * np.pi * cov)[1]
-    return float(-0.5 * (raw @ np.linalg.solve(cov, raw) + logdet))
-
-
 def _log_right_and_false(modes: tuple[Residual, ...], P: Array | None, model: FalseModel) -> tuple[float, float]:
     """Log of prior x density of any mode being right, and of all being false. The prediction's covariance widens both."""
     right = np.logaddexp.reduce([r.log_density(P) for r in modes])
     around = model.cov if P is None else model.cov + P
     share = np.log([r.prior for r in modes]) - np.log(sum(r.prior for r in modes))
-    logs = share + np.array([_log_gauss(r.raw, r.cov + around) for r in modes])
+    logs = share + np.array([gauss.log_density(r.raw, r.cov + around) for r in modes])
     return float(right), float(np.log(model.probability) + np.logaddexp.reduce(logs))
 
 
@@ -129,5 +125,9 @@ def log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...], walked: 
     if len(before[0].raw) != len(now[0].raw):
         return -np.inf
     total = np.log(sum(r.prior for r in before) * sum(r.prior for r in now))
-    logs = [np.log(a.prior * b.prior) + _log_gauss(a.raw - b.raw, a.cov + b.cov + walked) for a in before for b in now]
+    logs = [
+        np.log(a.prior * b.prior) + gauss.log_density(a.raw - b.raw, a.cov + b.cov + walked)
+        for a in before
+        for b in now
+    ]
     return float(np.logaddexp.reduce(logs) - total)

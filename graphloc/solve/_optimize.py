@@ -27,7 +27,6 @@ def optimize(
     guess: gtsam.Values,
     max_iterations: int,
     relative_tol: float = 1e-4,
-    order: gtsam.Ordering | None = None,
 ) -> Optimized:
     """Minimise with Gauss-Newton, and with Levenberg-Marquardt where that does not come down.
 
@@ -38,12 +37,11 @@ def optimize(
     Args:
         relative_tol: of the error; done where a step brings less than this, or where it brought what its linear model
             said to a tenth of it: there is no curvature then that another step could make good.
-        order: of elimination; by default GTSAM's.
 
     Raises:
         SolveError: the linear algebra failed (a state that nothing holds, or a value that is not finite).
     """
-    order = graph.orderingCOLAMD() if order is None else order
+    order = graph.orderingCOLAMD()
     initial = last = float(graph.error(guess))
     values, best, lowest, used = guess, guess, initial, 0
     try:
@@ -101,13 +99,8 @@ def full_step(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> gtsam.V
         raise not_solved("the solver failed", error) from error
 
 
-def bayes_tree(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: gtsam.KeyGroupMap | None = None
-) -> gtsam.ISAM2:
+def bayes_tree(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.ISAM2:
     """Return an ISAM2 that holds the graph linearised at `values`, for covariances (`Marginals` has no QR).
-
-    Args:
-        last: which keys are eliminated after the others (group 0, then 1); by default as GTSAM chooses.
 
     Raises:
         SolveError: a state is not determined.
@@ -117,7 +110,7 @@ def bayes_tree(
     params.cacheLinearizedFactors = False  # nothing is updated a second time
     tree = gtsam.ISAM2(params)
     try:
-        tree.update(graph, values, constrainedKeys=last)
+        tree.update(graph, values)
     except RuntimeError as error:
         raise not_solved("the covariance could not be computed", error) from error
     return tree

@@ -21,8 +21,7 @@ from graphloc.build import (
     state_keys,
 )
 from graphloc.frames import Array
-from graphloc.solve._optimize import bayes_tree, optimize
-from graphloc.solve._ordering import along_nodes, nodes_last
+from graphloc.solve._optimize import optimize
 
 _MOVED_M, _MOST_TIMES = 0.3, 4  # a solution so far from where it was written is written anew, at most so often
 
@@ -51,16 +50,11 @@ def solve_stretch(
     *,
     jumps: bool = True,
     tol: float = 3e-3,
-    thin: bool = True,
 ) -> StretchStep:
-    """Optimise states first..last in place, roughly: what it leaves, the passes over the whole run take up.
-
-    `thin`: sensors are thinned (`weigh`), which another order of elimination suits.
-    """
+    """Optimise states first..last in place, roughly: what it leaves, the passes over the whole run take up."""
     made: dict[tuple[int, int], range] = {}
     graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps, made=made)
-    order = along_nodes(guess, problem.timeline.slow_of) if thin else None
-    solved = optimize(graph, guess, 15, tol, order)
+    solved = optimize(graph, guess, 15, tol)
     moved_m = moved(guess, solved.values)
     update_states(problem, values, solved.values, first, last)
     return StretchStep(solved.values, graph, made, solved.iterations, solved.error, moved_m)
@@ -75,7 +69,6 @@ def solve_until_written_there(
     decided: Decisions,
     *,
     tol: float = 3e-3,
-    thin: bool = True,
 ) -> StretchStep:
     """`solve_stretch`, again and again while it moves away from where its factors were written.
 
@@ -84,7 +77,7 @@ def solve_until_written_there(
     """
     begin, iterations = values.extract(state_keys(problem, first, last)), 0
     for _ in range(_MOST_TIMES):
-        step = solve_stretch(problem, values, first, last, prior, decided, tol=tol, thin=thin)
+        step = solve_stretch(problem, values, first, last, prior, decided, tol=tol)
         iterations += step.iterations
         if step.moved_m < _MOVED_M:
             break
@@ -169,11 +162,6 @@ def weak_prior(problem: Problem, values: gtsam.Values, k: int) -> StartPrior:
         bias_cov=np.diag([0.05**2] * 3 + [0.002**2] * 3),
         slow={s.number: (slow[s.number], np.diag(s.slow.sigma**2)) for s in problem.streams if s.slow is not None},
     )
-
-
-def thin_tree(problem: Problem, step: StretchStep) -> gtsam.ISAM2:
-    """The covariances of a thinned stretch."""
-    return bayes_tree(step.graph, step.values, nodes_last(step.values, problem.timeline.slow_of))
 
 
 def past_at(problem: Problem, step: StretchStep, k: int) -> Past:

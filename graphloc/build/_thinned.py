@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run with few states and measurements: enough to find about where it went, and what of the rest to believe.
+
+Sensors without hypotheses keep one measurement for each slow node; those with them keep all. States that none of these
+needs are held by the IMU alone, and one link from state to state says the same as ten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc import keys
+from graphloc.build._attach import constant_keys, nav_state
+from graphloc.build._problem import Problem, Stream, with_links
+from graphloc.time import duration_ns
+from graphloc.timeline import Timeline
+
+_LONGEST_NS = duration_ns(1.0)  # of a link: so far a bias that is off is corrected well enough to first order
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thinned:
+    """A thinned run, and what of the whole one is in it.
+
+    Attributes:
+        problem: the run; its slow nodes are those of the whole one.
+        states: (N,) number of each of its states in the whole run.
+        chosen: by the sensor's number, (M,) index of each of its measurements in the whole run.
+    """
+
+    problem: Problem
+    states: NDArray[np.int64]
+    chosen: Mapping[int, NDArray[np.int64]]
+
+    def of(self, values: gtsam.Values) -> gtsam.Values:
+        """Return the values of the thinned run from those of the whole one."""
+        nodes = range(len(self.problem.timeline.slow_stamps_ns))
+        kept = values.extract(_shared_keys(self.problem, nodes, values))
+        for k, whole in enumerate(self.states.tolist()):
+            kept.insert(keys.pose(k), values.atPose3(keys.pose(whole)))
+            kept.insert(keys.velocity(k), values.atVector(keys.velocity(whole)))
+        return kept
+
+    def filled(self, whole: Problem, values: gtsam.Values) -> gtsam.Values:
+        """Return the values of the whole run from those of this one: what lies between two states is dead-reckoned."""
+        nodes = range(len(whole.timeline.slow_stamps_ns))
+        filled = values.extract(_shared_keys(whole, nodes, values))
+        for k, (first, following) in enumerate(pairwise([*self.states.tolist(), len(whole.timeline)])):
+            state = nav_state(values, k)
+            bias = values.atConstantBias(keys.bias(int(whole.timeline.slow_of[first])))
+            for at in range(first, following):
+                if at > first:
+                    state = whole.preintegrated[at - 1].predict(state, bias)
+                filled.insert(keys.pose(at), state.pose())
+                filled.insert(keys.velocity(at), np.asarray(state.velocity()))
+        return filled
+
+
+def thinned(problem: Problem) -> Thinned:
+    """Return a run without what is not needed to find about where it went."""
+    chosen = {stream.number: _chosen(problem, stream) for stream in problem.streams}
+    states = _states(problem, chosen)
+    timeline = problem.timeline
+    few = Timeline(timeline.stamps_ns[states], timeline.slow_of[states], timeline.slow_stamps_ns)
+    links = tuple(
+        problem.preintegrated[a]
+        if b == a + 1
+        else problem.links.integrate(
+            int(timeline.stamps_ns[a]), int(timeline.stamps_ns[b]), gtsam.imuBias.ConstantBias()
+        )
+        for a, b in pairwise(states.tolist())
+    )
+    streams = tuple(_thin(stream, chosen[stream.number], states) for stream in problem.streams)
+    return Thinned(with_links(replace(problem, timeline=few, streams=streams), links), states, chosen)
+
+
+def _chosen(problem: Problem, stream: Stream) -> NDArray[np.int64]:
+    """Indices of the measurements that stay."""
+    if stream.row.false is not None:
+        return np.arange(len(stream.measurements))
+    return np.flatnonzero(np.diff(problem.timeline.slow_of[stream.state], prepend=-1) > 0)
+
+
+def _states(problem: Problem, chosen: Mapping[int, NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Numbers of the states that stay: at both ends, where measurements are or are carried from, at the nodes, and in holes."""
+    timeline, last = problem.timeline, len(problem.timeline) - 1
+    second = (timeline.stamps_ns - timeline.stamps_ns[0]) // _LONGEST_NS
+    kept = [np.array([0, last]), *(np.flatnonzero(np.diff(n, prepend=-1) > 0) for n in (timeline.slow_of, second))]
+    for stream in problem.streams:
+        indices = chosen[stream.number]
+        kept.append(stream.state[indices])
+        kept.append(np.array([c[0] for i in indices.tolist() if (c := stream.carry[i]) is not None], dtype=np.int64))
+    for start_ns, stop_ns in problem.links.gaps():  # bridged link by link
+        kept.append(np.arange(timeline.floor(start_ns), min(timeline.floor(stop_ns) + 1, last) + 1))
+    return np.unique(np.concatenate(kept))
+
+
+def _thin(stream: Stream, indices: NDArray[np.int64], states: NDArray[np.int64]) -> Stream:
+    """A stream with the measurements that stay, on the states that stay."""
+    few = indices.tolist()
+    carried = [stream.carry[i] for i in few]
+    return replace(
+        stream,
+        measurements=tuple(stream.measurements[i] for i in few),
+        state=np.searchsorted(states, stream.state[indices]),
+        carry=tuple(None if c is None else (int(np.searchsorted(states, c[0])), c[1]) for c in carried),
+        gyro_radps=stream.gyro_radps[indices],
+    )
+
+
+def _shared_keys(problem: Problem, nodes: range, values: gtsam.Values) -> list[int]:
+    """Keys that are the same in the whole run and the thinned one: of slow nodes and constants."""
+    names = [keys.bias(j) for j in nodes]
+    names += [keys.slow(s.number, j) for s in problem.streams if s.slow is not None for j in nodes]
+    return names + [key for s in problem.streams for key in constant_keys(s) if values.exists(key)]
