@@ -26,7 +26,7 @@ from graphloc.config import VesselConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Residual, Sensor
 from graphloc.ledger import Outcome
-from graphloc.measurements import GnssVelocity, Measurement
+from graphloc.measurements import Measurement
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 
@@ -136,8 +136,10 @@ def _nis(m: Measurement, config: object, row: Sensor, at: Attachment, there: _Th
         at = replace(at, slow_key=0, slow_value=np.zeros(len(slow.sigma)))
     found = row.residuals(m, config, at)
     shared = [r.jacobian() @ there.P_tangent @ r.jacobian().T for r in found]
-    if isinstance(m, GnssVelocity):
-        shared = [s + there.v_cov for s in shared]
+    shared = [
+        s if (V := r.velocity_jacobian) is None else s + V() @ there.v_cov @ V().T
+        for s, r in zip(shared, found, strict=True)
+    ]
     for k in range(0 if slow is None else len(slow.sigma)):
         assert slow is not None
         step = np.zeros(len(slow.sigma))

@@ -7,12 +7,14 @@ Or it comes in a package of its own, which names its row as an entry point (docs
 from graphloc.config import SensorConfig
 from graphloc.errors import ConfigError
 from graphloc.extras import added
-from graphloc.factors import aerial, apriltag, compass, gnss, height, imu, pose, velocity
+from graphloc.factors import aerial, apriltag, body_velocity, compass, gnss, height, imu, pose, velocity
 from graphloc.graph import Sensor
 
 GROUP = "graphloc.sensors"  # of entry points: their name is the kind
 INERTIAL = imu.ROW
-_OURS: tuple[Sensor, ...] = (gnss.ROW, compass.ROW, velocity.ROW, pose.ROW, aerial.ROW, apriltag.ROW, height.ROW)
+_OURS: tuple[Sensor, ...] = (
+    gnss.ROW, compass.ROW, velocity.ROW, body_velocity.ROW, pose.ROW, aerial.ROW, apriltag.ROW, height.ROW,
+)  # fmt: skip
 
 
 def _theirs() -> tuple[Sensor, ...]:

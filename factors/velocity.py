@@ -41,6 +41,7 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
             raw=raw,
             cov=with_floors(m.cov_m2ps2, config.min_sigma_mps**2),
             jacobian=lambda: _attitude_jacobian(at),
+            velocity_jacobian=lambda: np.eye(3),
             prior=1.0,
             size_m=None,
             size_deg=None,

@@ -11,7 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SensorConfig, VelocityConfig, VesselConfig
+from graphloc.config import (
+    BodyVelocityConfig,
+    CompassConfig,
+    GnssConfig,
+    ImuConfig,
+    SensorConfig,
+    VelocityConfig,
+    VesselConfig,
+)
 from graphloc.frontends import _clock, _fixes, _sanity
 from graphloc.frontends._beside import Beside
 from graphloc.frontends._rejections import Rejection, rejected
@@ -19,7 +27,7 @@ from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.decode import Decoded, ImuSample
 from graphloc.hangs import WHY, hanging, hanging_warning
 from graphloc.ledger import LedgerRow
-from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
+from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
 from graphloc.time import NS_PER_S, utc_text
 
 
@@ -202,7 +210,7 @@ def reject_repeats(readings: Readings) -> list[LedgerRow]:
 
 def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     """Drop fixes that a driver only repeats; say so, and where stamps are cut or the claimed noise is far too small."""
-    if isinstance(readings.config, (GnssConfig, CompassConfig, VelocityConfig)):
+    if isinstance(readings.config, (GnssConfig, CompassConfig, VelocityConfig, BodyVelocityConfig)):
         warnings += _fixes.stamp_warning(readings.sensor, readings.stamps())
     if not isinstance(readings.config, GnssConfig):
         return []
@@ -232,6 +240,8 @@ def _content(value: Decoded) -> object:
             return value.yaw_rad
         case GnssVelocity():
             return tuple(value.v_world_mps)
+        case BodyVelocity():
+            return tuple(value.value)
         case PoseFix():
             return tuple(value.modes[0].value)
         case _:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import (
     STANDARD_GRAVITY_MPS2,
+    BodyVelocityConfig,
     CompassConfig,
     GnssConfig,
     ImuConfig,
@@ -30,6 +31,7 @@ from graphloc.frontends._rejections import Rejection, malformed, rejected
 from graphloc.measurements import (
     AXES,
     NO_HEIGHT_M2,
+    BodyVelocity,
     CompassHeading,
     GnssPosition,
     GnssVelocity,
@@ -60,6 +62,7 @@ _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # of NavSatStatus, by quality of GGA: differential, RTK
 _RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # horizontal, vertical, at a dilution of 1: fixed, float
 MOST_TURNS = 20  # of a heading that is counted on from turn to turn
+_UNIT_MPS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "knots": 1852.0 / 3600.0}
 _NO_CLIMB_MPS2 = 1e6  # variance of a vertical velocity that is not told, m^2/s^2
 # Beyond these no sensor of a vessel measures; they are finite, and a sum or a square of them need not be.
 _MOST_INERTIAL = 1e4  # in the unit of the bag: 1000 g; 30 turns a second in deg/s
@@ -277,11 +280,16 @@ def _compass_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Comp
     )
 
 
-def _velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
+def _twist(msg: Any) -> tuple[tuple[float, float, float], Array]:
+    """Linear velocity of a message, and its covariance (3, 3): zero where it has none."""
     with_covariance = hasattr(msg.twist, "covariance")
     v = msg.twist.twist.linear if with_covariance else msg.twist.linear
     cov = covariance_translation_first(msg.twist.covariance)[:3, :3] if with_covariance else np.zeros((3, 3))
-    return _moving((v.x, v.y, v.z), cov, stamp_ns, seq, sensor, config)
+    return (v.x, v.y, v.z), cov
+
+
+def _velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
+    return _moving(*_twist(msg), stamp_ns, seq, sensor, config)
 
 
 def _velocity_vector(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
@@ -300,14 +308,57 @@ def _moving(
     v_mps: tuple[float, float, float], cov: Array, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig
 ) -> Decoded:
     value = np.array(v_mps, dtype=float)
-    if not np.isfinite(value).all():
-        return malformed("velocity is NaN")
-    if np.abs(value).max() > MOST_SPEED_MPS:
-        return malformed(f"velocity is beyond {MOST_SPEED_MPS:g} m/s")
+    if trouble := _no_velocity(value):
+        return trouble
     default = np.full(3, config.default_sigma_mps**2)
     return GnssVelocity(
         stamp_ns=stamp_ns, sensor=sensor, seq=seq, v_world_mps=value, cov_m2ps2=usable_covariance(cov, default)
     )
+
+
+def _no_velocity(value: Array) -> Rejection | None:
+    if not np.isfinite(value).all():
+        return malformed("velocity is NaN")
+    if np.abs(value).max() > MOST_SPEED_MPS:
+        return malformed(f"velocity is beyond {MOST_SPEED_MPS:g} m/s")
+    return None
+
+
+def _body_velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
+    return _along(*_twist(msg), stamp_ns, seq, sensor, config)
+
+
+def _body_velocity_vector(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
+    v = msg.vector
+    return _along((v.x, v.y, v.z), np.zeros((3, 3)), stamp_ns, seq, sensor, config)
+
+
+def _body_velocity_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
+    speed = float(msg.data) * _UNIT_MPS[config.unit]
+    return _along((speed,), np.zeros((1, 1)), stamp_ns, seq, sensor, config)
+
+
+def _body_velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
+    speed = nmea.water_speed_mps(nmea.text_of(msg), config.nmea)
+    if isinstance(speed, Rejection):
+        return speed
+    return _along((speed,), np.zeros((1, 1)), stamp_ns, seq, sensor, config)
+
+
+def _along(
+    v_mps: tuple[float, ...], cov: Array, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig
+) -> Decoded:
+    """Velocity along the first axes of the sensor, of which those are taken that the configuration asks for."""
+    axes = tuple(axis for axis in "xyz"[: len(v_mps)] if axis in config.axes)
+    if not axes:
+        return rejected(f"it tells the speed along x alone, and axes is [{', '.join(config.axes)}]")
+    picked = ["xyz".index(axis) for axis in axes]
+    value = np.array(v_mps, dtype=float)[picked]
+    if trouble := _no_velocity(value):
+        return trouble
+    reported = cov[np.ix_(picked, picked)] if config.use_reported_sigma else np.zeros((len(axes), len(axes)))
+    usable = usable_covariance(reported, np.full(len(axes), config.sigma_mps**2))
+    return BodyVelocity(stamp_ns=stamp_ns, sensor=sensor, seq=seq, axes=axes, value=value, cov=usable)
 
 
 def is_unit(quaternion: Array) -> bool:
@@ -359,6 +410,12 @@ DECODERS: dict[tuple[str, str], Decoder] = {
     ("gnss_velocity", PLAIN_TWIST): _velocity,
     ("gnss_velocity", VECTOR): _velocity_vector,
     **{("gnss_velocity", msgtype): _velocity_nmea for msgtype in NMEA},
+    ("body_velocity", ODOMETRY): _body_velocity,
+    ("body_velocity", TWIST): _body_velocity,
+    ("body_velocity", PLAIN_TWIST): _body_velocity,
+    ("body_velocity", VECTOR): _body_velocity_vector,
+    **{("body_velocity", msgtype): _body_velocity_nmea for msgtype in NMEA},
+    **{("body_velocity", msgtype): _body_velocity_number for msgtype in NUMBERS},
     ("pose", POSE): _pose,
     ("pose", PLAIN_POSE): _pose,
     ("pose", ODOMETRY): _pose,

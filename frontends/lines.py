@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.blocks import Block, Finite, Triple, nearest
 from graphloc.config import (
+    BodyVelocityConfig,
     CompassConfig,
     GnssConfig,
     ImuConfig,
@@ -188,10 +189,23 @@ class VelocityLine(_Line):
 
     def measured(self, at: _At, config: VelocityConfig) -> Measurement | Rejection:
         """Return the velocity."""
-        cov = np.zeros((6, 6))
-        cov[:3, :3] = _covariance(self.cov_enu_m2ps2, self.sigma_mps or _ZERO)
-        twist = SimpleNamespace(twist=SimpleNamespace(linear=_xyz(self.v_enu_mps)), covariance=cov)
-        return _decoded(TWIST, SimpleNamespace(twist=twist), at, config)
+        cov = _covariance(self.cov_enu_m2ps2, self.sigma_mps or _ZERO)
+        return _decoded(TWIST, _twist(self.v_enu_mps, cov), at, config)
+
+
+class BodyVelocityLine(_Line):
+    """Velocity along the sensor's axes x, y, z, of which those are read that its configuration has."""
+
+    kind = "body_velocity"
+    at_most_one_of = (("sigma_mps", "cov_m2ps2"),)
+    type: Literal["body_velocity"]
+    v_mps: Triple
+    sigma_mps: Deviations | None = None
+    cov_m2ps2: Matrix3 | None = None
+
+    def measured(self, at: _At, config: BodyVelocityConfig) -> Measurement | Rejection:
+        """Return the velocity."""
+        return _decoded(TWIST, _twist(self.v_mps, _covariance(self.cov_m2ps2, self.sigma_mps or _ZERO)), at, config)
 
 
 class ModeSaid(_Said):
@@ -241,12 +255,13 @@ class PredictLine(_Stamped):
     type: Literal["predict"]
 
 
-_Any = ImuLine | GnssLine | HeadingLine | VelocityLine | PoseLine | PredictLine
+_Any = ImuLine | GnssLine | HeadingLine | VelocityLine | BodyVelocityLine | PoseLine | PredictLine
 _LINES: dict[str, type[_Any]] = {
     "imu": ImuLine,
     "gnss": GnssLine,
     "heading": HeadingLine,
     "velocity": VelocityLine,
+    "body_velocity": BodyVelocityLine,
     "pose": PoseLine,
     "predict": PredictLine,
 }
@@ -337,6 +352,13 @@ def _decoded(msgtype: str, msg: SimpleNamespace, at: _At, config: SensorConfig) 
 def _xyz(values: Sequence[float]) -> SimpleNamespace:
     """A vector of three, or a quaternion, as ROS has them."""
     return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
+
+
+def _twist(v_mps: Sequence[float], cov: Array) -> SimpleNamespace:
+    """Return a `geometry_msgs/TwistWithCovarianceStamped` of a velocity with covariance (3, 3)."""
+    full = np.zeros((6, 6))
+    full[:3, :3] = cov
+    return SimpleNamespace(twist=SimpleNamespace(twist=SimpleNamespace(linear=_xyz(v_mps)), covariance=full))
 
 
 def _covariance(full: Sequence[Sequence[float]] | None, sigmas: Sequence[float]) -> Array:

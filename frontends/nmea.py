@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sentence of NMEA 0183 says (`nmea_msgs/Sentence`, `std_msgs/String`): a place, a heading, a velocity over ground.
+"""What a sentence of NMEA 0183 says (`nmea_msgs/Sentence`, `std_msgs/String`): a place, a heading, a velocity, a speed.
 
-Reading the fields is left to pynmeagps. A sentence that was not asked for is not read at all.
+Velocities are over ground, speeds through the water. Reading the fields is left to pynmeagps. A sentence that was not asked for is not read at all.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from graphloc.frontends._rejections import Rejection, ignored, malformed, reject
 PLACES = ("GGA", "GNS", "RMC", "GLL")
 HEADINGS = ("HDT", "THS", "HDG", "HDM")
 VELOCITIES = ("VTG", "RMC")
+SPEEDS = ("VHW",)
 _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
 _FOREIGN = re.compile(r"!|\$P")
 _UNREADABLE = (
@@ -108,6 +109,16 @@ def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Re
         return rejected(f"{said.msgID}: no {'course' if isfinite(speed) else 'speed'}")
     east = radians(course if isfinite(course) else 0.0)
     return speed * sin(east), speed * cos(east)
+
+
+def water_speed_mps(text: str, wanted: Collection[str]) -> float | Rejection:
+    """Return the speed through the water, ahead, m/s."""
+    said = _read(text, wanted, SPEEDS, "speed through the water")
+    if isinstance(said, Rejection):
+        return said
+    knots, km_per_h = _number(said, "spdN"), _number(said, "spdK")
+    speed = _KNOT_MPS * knots if isfinite(knots) else _KM_PER_H_MPS * km_per_h
+    return speed if isfinite(speed) else rejected(f"{said.msgID}: no speed")
 
 
 def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str) -> Any | Rejection:

@@ -83,6 +83,7 @@ class Residual:
         raw: (k,) in m, rad or m/s. cov: (k, k) of the measurement.
         jacobian: gives (k, 6) d raw / d (body tangent of the state's pose), for the predicted covariance.
         slow_jacobian: gives (k, n) d raw / d (slow state), for the same; None: it has no part in that.
+        velocity_jacobian: gives (k, 3) d raw / d (velocity in world), for the same; None: it has no part in that.
         rows: of the factor, where these are others than `raw`; 0: the same.
         prior: prior probability of this hypothesis.
         size_m, size_deg: physical size, for the ledger.
@@ -95,6 +96,7 @@ class Residual:
     size_m: float | None
     size_deg: float | None
     slow_jacobian: Callable[[], Array] | None = None
+    velocity_jacobian: Callable[[], Array] | None = None
     rows: int = 0
 
     def nis(self, inflation: Array | None = None) -> float:

@@ -105,6 +105,25 @@ class GnssVelocity(Measurement):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BodyVelocity(Measurement):
+    """Velocity along axes of the sensor, in any subset of x, y, z: over ground, or through the water.
+
+    Attributes:
+        axes: which of x, y, z are measured, in this order. value: (k,) m/s. cov: (k, k) m^2/s^2.
+    """
+
+    axes: tuple[str, ...]
+    value: Array
+    cov: Array
+
+    def __post_init__(self) -> None:
+        if not self.axes or [a for a in "xyz" if a in self.axes] != list(self.axes):
+            raise ValueError("axes must be some of x, y, z, in this order")
+        object.__setattr__(self, "value", _frozen(self.value, (len(self.axes),), "value"))
+        object.__setattr__(self, "cov", _frozen_covariance(self.cov, len(self.axes), "cov"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseMode:
     """One hypothesis of a pose measurement, over the measurement's `axes`, in their order.
 

@@ -18,7 +18,9 @@ RNG = np.random.default_rng(3)
 
 
 def config_of(row: Sensor) -> Any:
-    """Defaults; and tags that stand in world and ride on a dock, so that they have slow states."""
+    """Defaults; tags that stand in world and ride on a dock, so that they have slow states; a Doppler log in a current."""
+    if row.kind == "body_velocity":
+        return row.config.model_validate({"kind": row.kind, "axes": ["x", "y", "z"], "through": "water"})
     if row.kind != "apriltag":
         return row.config(kind=row.kind)
     tags = [

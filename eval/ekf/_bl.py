@@ -11,7 +11,7 @@ from graphloc.config import VesselConfig
 from graphloc.eval.ekf._inputs import Interval
 from graphloc.eval.ekf._planar import SILENT_Q, FilterResult, advance, run_filter, transition
 from graphloc.frames import Array, Datum
-from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, PoseFix
+from graphloc.measurements import BodyVelocity, GnssPosition, GnssVelocity, Measurement, PoseFix
 from graphloc.recording import Recording
 
 
@@ -66,7 +66,7 @@ def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: Bl
         if isinstance(m, PoseFix):
             away = float(np.linalg.norm(r[H[:, :2].any(axis=1)]))
             return o.a3 * R if away < o.gate_m else f"outside the {o.gate_m:g} m gate"
-        if isinstance(m, GnssVelocity):
+        if isinstance(m, GnssVelocity | BodyVelocity):
             return "BL's filter has no velocity"
         lost = o.loss_ns is not None and o.loss_ns[0] <= m.stamp_ns < o.loss_ns[1]
         a2 = o.a2_in_loss if lost else o.a2

@@ -12,6 +12,7 @@ from graphloc.config import VesselConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array, Datum, skew
 from graphloc.measurements import (
+    BodyVelocity,
     CompassHeading,
     GnssPosition,
     GnssVelocity,
@@ -76,7 +77,10 @@ def events_of(recording: Recording, config: VesselConfig) -> list[Event]:
         sensor = config.sensors.get(m.sensor)
         if isinstance(m, TagSighting) and sensor:
             m = as_pose(m, sensor.surveyed)
-        if isinstance(m, GnssPosition | GnssVelocity | CompassHeading | PoseFix) and sensor and sensor.enabled:
+        if isinstance(m, BodyVelocity) and not {"x", "y"} & set(m.axes):
+            continue  # up and down: not in the plane
+        planar = GnssPosition | GnssVelocity | BodyVelocity | CompassHeading | PoseFix
+        if isinstance(m, planar) and sensor and sensor.enabled:
             t, R = mount_of(m.sensor, sensor, recording.mounts)
             events.append(Event(m, t, float(np.arctan2(R[1, 0], R[0, 0]))))
     return events

@@ -13,7 +13,15 @@ from graphloc.config import VesselConfig
 from graphloc.eval.ekf._inputs import Event, Interval, events_of, intervals_of, start_of
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.ledger import Ledger, LedgerRow, Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, Measurement, PoseFix, world_from_fixes
+from graphloc.measurements import (
+    BodyVelocity,
+    CompassHeading,
+    GnssPosition,
+    GnssVelocity,
+    Measurement,
+    PoseFix,
+    world_from_fixes,
+)
 from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
@@ -39,8 +47,14 @@ def _measurement(event: Event, x: Array, rate: float, datum: Datum) -> tuple[Arr
     m, lever = event.m, event.lever
     c, s = np.cos(x[4]), np.sin(x[4])
     turn = np.array([[c, -s], [s, c]])
+    swing = rate * np.array([-lever[1], lever[0]])
+    if isinstance(m, BodyVelocity):
+        c, s = np.cos(event.mount_yaw), np.sin(event.mount_yaw)
+        level = [n for n, axis in enumerate(m.axes) if axis != "z"]
+        H = np.zeros((len(level), 5))
+        H[:, 2:4] = np.array([[c, s], [-s, c]])[["xy".index(m.axes[n]) for n in level]]
+        return m.value[level] - H[:, 2:4] @ (x[2:4] + swing), H, np.array(m.cov[np.ix_(level, level)])
     if isinstance(m, GnssVelocity):
-        swing = rate * np.array([-lever[1], lever[0]])
         H = np.zeros((2, 5))
         H[:, 2:4], H[:, 4] = turn, np.array([[-s, -c], [c, -s]]) @ (x[2:4] + swing)
         return m.v_world_mps[:2] - turn @ (x[2:4] + swing), H, np.array(m.cov_m2ps2[:2, :2])

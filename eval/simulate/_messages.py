@@ -15,7 +15,7 @@ from graphloc.eval.simulate._lens import Image
 from graphloc.eval.simulate.lidar import Scan
 from graphloc.eval.simulate.rig import CameraConfig
 from graphloc.frames import Array
-from graphloc.measurements import AXES, CompassHeading, GnssPosition, PoseFix
+from graphloc.measurements import AXES, BodyVelocity, CompassHeading, GnssPosition, PoseFix
 
 TF = "tf2_msgs/msg/TFMessage"
 _JPEG_QUALITY = 90
@@ -73,6 +73,16 @@ class Messages:
         quaternion = self._quaternion(Rotation.from_euler("z", m.yaw_rad))
         return self._t["geometry_msgs/msg/QuaternionStamped"](
             header=self._header(m.stamp_ns, "gnss"), quaternion=quaternion
+        )
+
+    def speed(self, m: BodyVelocity) -> Any:
+        """A `TwistWithCovarianceStamped` in the sensor's axes."""
+        picked, full, v = ["xyz".index(axis) for axis in m.axes], np.zeros((6, 6)), np.zeros(3)
+        full[np.ix_(picked, picked)], v[picked] = m.cov, m.value
+        twist = self._t["geometry_msgs/msg/Twist"](linear=self._vector(v), angular=self._vector(np.zeros(3)))
+        inner = self._t["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=full.reshape(36))
+        return self._t["geometry_msgs/msg/TwistWithCovarianceStamped"](
+            header=self._header(m.stamp_ns, "log"), twist=inner
         )
 
     def pose(self, m: PoseFix) -> Any:

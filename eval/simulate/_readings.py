@@ -11,7 +11,15 @@ from graphloc.eval.simulate._scenario import Scenario
 from graphloc.eval.simulate._truth import Motion
 from graphloc.eval.simulate.noise import gnss_error_m, reported_sigma_m
 from graphloc.frames import Array, Datum, Geodetic, wrap_angle
-from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix, PoseMode
+from graphloc.measurements import (
+    BodyVelocity,
+    CompassHeading,
+    GnssPosition,
+    ImuSeries,
+    Measurement,
+    PoseFix,
+    PoseMode,
+)
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -85,6 +93,22 @@ def compass_headings(s: Scenario, motion: Motion, rng: np.random.Generator) -> l
         CompassHeading(stamp_ns=int(n), sensor="compass", seq=0, yaw_rad=float(wrap_angle(y)), sigma_rad=sigma)
         for n, y, at in zip(stamps(t), yaw, t, strict=True)
         if at < s.compass_until_s
+    ]
+
+
+def log_speeds(s: Scenario, motion: Motion, rng: np.random.Generator) -> list[Measurement]:
+    """Speed ahead, of the body's origin, over ground or through the water."""
+    if s.log_hz == 0.0:
+        return []
+    t = times(s.duration_s - 0.05, s.log_hz) + 0.029
+    _, R, v = motion.pose(t)
+    if s.log_through == "water":
+        v = v - np.array([s.current_east_mps, s.current_north_mps, 0.0])
+    ahead = (1.0 + s.log_scale_error) * np.einsum("ni,ni->n", R[:, :, 0], v) + rng.normal(0.0, s.log_sigma_mps, len(t))
+    cov = np.array([[s.log_sigma_mps**2]])
+    return [
+        BodyVelocity(stamp_ns=int(n), sensor="log", seq=0, axes=("x",), value=np.array([u]), cov=cov)
+        for n, u in zip(stamps(t), ahead, strict=True)
     ]
 
 

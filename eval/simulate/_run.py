@@ -11,6 +11,7 @@ import shapely
 from graphloc.config import (
     AerialConfig,
     AprilTagConfig,
+    BodyVelocityConfig,
     CameraConfig,
     CompassConfig,
     DatumConfig,
@@ -24,7 +25,15 @@ from graphloc.config import (
     VesselConfig,
 )
 from graphloc.errors import ConfigError
-from graphloc.eval.simulate._readings import compass_headings, gnss_fixes, imu_series, made_up_matches, stamps, times
+from graphloc.eval.simulate._readings import (
+    compass_headings,
+    gnss_fixes,
+    imu_series,
+    log_speeds,
+    made_up_matches,
+    stamps,
+    times,
+)
 from graphloc.eval.simulate._scenario import Scenario
 from graphloc.eval.simulate._truth import Motion
 from graphloc.eval.simulate._voyage import harbour_motion, open_motion
@@ -73,6 +82,7 @@ def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
     drafts += gnss_fixes(scenario, motion, datum, rig.gnss.t_body_sensor_m, rng)
     drafts += compass_headings(scenario, motion, rng)
     drafts += made_up_matches(scenario, motion, rng)
+    drafts += log_speeds(scenario, motion, np.random.default_rng([seed, 23]))
     drafts.sort(key=lambda m: (m.stamp_ns, m.sensor))
     measurements = tuple(replace(m, seq=len(imu) + i) for i, m in enumerate(drafts))
     p, R, v = motion.pose(t)
@@ -110,6 +120,8 @@ def _config(s: Scenario, rig: RigConfig, motion: Motion, datum: Datum) -> Vessel
         sensors["gnss"] = GnssConfig(topic="/gnss/fix", mount=rig.gnss)
     if s.compass_hz > 0.0:
         sensors["compass"] = CompassConfig(topic="/gnss/heading", sigma_deg=s.compass_sigma_deg)
+    if s.log_hz > 0.0:
+        sensors["log"] = BodyVelocityConfig(topic="/log/velocity", through=s.log_through, sigma_mps=s.log_sigma_mps)
     if s.pose_hz > 0.0:
         sensors["aerial"] = PoseConfig(topic="/aerial/pose", axes=("x", "y", "yaw"))
     elif s.harbour and s.lidar_hz > 0.0 and rig.lidars:

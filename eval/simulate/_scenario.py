@@ -30,7 +30,7 @@ class Scenario:
         case: BL case whose tables the GNSS noise follows.
         duration_s: length of the run. noise: kind of GNSS error.
         outage_s: (start, stop) without fixes and poses, or None.
-        imu_hz, gnss_hz, compass_hz, pose_hz: rates; 0 switches a sensor off.
+        imu_hz, gnss_hz, compass_hz, pose_hz, log_hz: rates; 0 switches a sensor off. The log tells the speed ahead.
         gnss_sigma_m: white noise of each axis, 1 sigma; e / sqrt(2) with BL's e = 0.3 m.
         gnss_reported_sigma_m: what the fixes claim for it, on average; 0: the truth.
         gnss_reported_spread: how far the claims wander about that: 1 sigma of their logarithm.
@@ -38,6 +38,8 @@ class Scenario:
         false_stays: probability that a false match repeats in the next scan.
         pose_modes: modes of each match; the false ones lie around the right one.
         gyro_bias_radps: size of the gyro bias (random direction); accel_bias_mps2: same.
+        log_sigma_mps: white. log_scale_error: share by which it reads too much. log_through: what it moves over or through.
+        current_east_mps, current_north_mps: of the water.
         compass_sigma_deg: white. compass_offset_deg: constant offset of the compass.
         compass_until_s: the compass falls silent then. start_heading_error_deg: error of the start
             heading written to the configuration; None writes none.
@@ -58,6 +60,7 @@ class Scenario:
     gnss_hz: float = 10.0
     compass_hz: float = 10.0
     pose_hz: float = 1.0
+    log_hz: float = 0.0
     gnss_sigma_m: float = 0.3 / float(np.sqrt(2.0))
     gnss_reported_sigma_m: float = 0.0
     gnss_reported_spread: float = 0.0
@@ -70,6 +73,11 @@ class Scenario:
     accel_noise_ug_per_sqrt_hz: float = 300.0
     gyro_bias_radps: float = 0.003
     accel_bias_mps2: float = 0.03
+    log_sigma_mps: float = 0.05
+    log_scale_error: float = 0.02
+    log_through: Literal["ground", "water"] = "water"
+    current_east_mps: float = 0.3
+    current_north_mps: float = -0.2
     compass_sigma_deg: float = 1.5 / float(np.sqrt(2.0))
     compass_offset_deg: float = 0.0
     compass_until_s: float = float("inf")
@@ -174,7 +182,7 @@ def _refuse_nonsense(s: Scenario) -> None:
     limits |= {"false_fraction": (0.0, 1.0), "false_stays": (0.0, 1.0), "tide_m": (-10.0, 10.0), "case": (1, 3)}
     limits |= {"imu_hz": (10.0, 2000.0), "duration_s": (2.0, _LONGEST_S), "route_s": (2.0, _LONGEST_S)}
     limits |= {"pose_modes": (1, 20), "compass_sigma_deg": (1e-3, 90.0), "compass_offset_deg": (-180.0, 180.0)}
-    limits |= {"gnss_reported_spread": (0.0, 2.0)}
+    limits |= {"gnss_reported_spread": (0.0, 2.0), "log_sigma_mps": (1e-3, 100.0), "log_scale_error": (-0.5, 0.5)}
     for key, (low, high) in limits.items():
         value = getattr(s, key)
         if not low <= value <= high:

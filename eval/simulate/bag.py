@@ -30,7 +30,7 @@ from graphloc.eval.simulate.docks import survey, tag_pose
 from graphloc.eval.simulate.lidar import scan
 from graphloc.eval.simulate.rig import CameraConfig, LidarConfig
 from graphloc.eval.simulate.scene import Scene, scene_of
-from graphloc.measurements import CompassHeading, GnssPosition, PoseFix
+from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, PoseFix
 from graphloc.outputs import fresh_folder
 from graphloc.recording import Progress, quiet
 
@@ -225,6 +225,8 @@ def _small(run: SimulatedRun, make: Messages) -> list[_Item]:
             add(m.stamp_ns, "/gnss/fix", "sensor_msgs/msg/NavSatFix", make.fix(m))
         elif isinstance(m, CompassHeading):
             add(m.stamp_ns, "/gnss/heading", "geometry_msgs/msg/QuaternionStamped", make.heading(m))
+        elif isinstance(m, BodyVelocity):
+            add(m.stamp_ns, "/log/velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", make.speed(m))
         elif isinstance(m, PoseFix):
             add(m.stamp_ns, "/aerial/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", make.pose(m))
     t = np.arange(round(run.scenario.duration_s * _TRUTH_HZ)) / _TRUTH_HZ

@@ -8,6 +8,7 @@ is generated from them. Which sensor kinds exist is not known here: the caller h
 from graphloc.config._file import effective, load_config, parse_config, with_changes
 from graphloc.config._instruments import (
     STANDARD_GRAVITY_MPS2,
+    BodyVelocityConfig,
     CompassConfig,
     GnssConfig,
     HeightConfig,
@@ -24,6 +25,7 @@ __all__ = [
     "AerialConfig",
     "AnyPoseConfig",
     "AprilTagConfig",
+    "BodyVelocityConfig",
     "CameraConfig",
     "CompassConfig",
     "DatumConfig",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors that say one thing at a time: inertial, GNSS, compass, velocity, height.
+"""Sensors that say one thing at a time: inertial, GNSS, compass, velocities, height.
 
 Data-sheet units live here only, and become SI in the properties.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from graphloc.blocks import Block, Finite, NonNegative, Positive
 from graphloc.config._sensor import KernelConfig, SensorConfig
@@ -87,6 +87,8 @@ _TALKER = "^([A-Z]{2})?"
 Places = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(GGA|GNS|RMC|GLL)$")], ...], Field(min_length=1)]
 Headings = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(HDT|THS|HDG|HDM)$")], ...], Field(min_length=1)]
 Velocities = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(VTG|RMC)$")], ...], Field(min_length=1)]
+Speeds = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "VHW$")], ...], Field(min_length=1)]
+SpeedAxes = Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)]
 
 
 class SlowErrorConfig(Block):
@@ -166,6 +168,42 @@ class VelocityConfig(SensorConfig):
     """Taken where the message reports no covariance, m/s."""
     nmea: Velocities = ("VTG",)
     """Sentences that are read of a topic of NMEA, of one talker (`GPVTG`) or of any (`VTG`): VTG, RMC."""
+
+
+class BodyVelocityConfig(SensorConfig):
+    """Velocity along the vessel, of wheels, a Doppler log or a speed log: twist of `nav_msgs/Odometry` or of `gnss_velocity`'s types.
+
+    Also `std_msgs/Float64` or `Float32`, and VHW in NMEA as `gnss`. All along the axes of the sensor.
+    """
+
+    kind: Literal["body_velocity"] = "body_velocity"
+    """Which row of the sensor table reads this block."""
+    axes: SpeedAxes = ("x",)
+    """Axes of the sensor along which it measures; of a number and of VHW x alone. Wheels that do not slip sideways: [x, y];
+    a Doppler log: [x, y, z]."""
+    through: Literal["ground", "water"] = "ground"
+    """What it moves over or through. Water has a current, which is estimated."""
+    unit: Literal["m/s", "km/h", "knots"] = "m/s"
+    """Of a number; of other messages it is known."""
+    use_reported_sigma: bool = True
+    """Take the covariance of a message where it is positive and finite."""
+    sigma_mps: Positive = 0.1
+    """Noise along each axis, 1 sigma, m/s. Used where the message carries no covariance."""
+    min_sigma_mps: Positive = 0.1
+    """Floor of the sigma, m/s: wheels slip and water eddies for longer than a message, and drivers claim too little."""
+    scale_sigma: Annotated[float, Field(ge=0.0, le=0.5)] = 0.05
+    """Unknown but constant error of the scale (radius of a wheel, calibration of a log), 1 sigma, as a share; 0: exact."""
+    current_sigma_mps: Positive = 0.5
+    """Standing size of the current, each of east and north, 1 sigma, m/s."""
+    current_time_constant_s: Positive = 600.0
+    """How long a current stays the same, s."""
+    nmea: Speeds = ("VHW",)
+    """Sentences that are read of a topic of NMEA, of one talker (`VWVHW`) or of any (`VHW`): VHW."""
+
+    @field_validator("axes")
+    @classmethod
+    def _ordered(cls, axes: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(axis for axis in "xyz" if axis in axes)
 
 
 class HeightConfig(SensorConfig):

@@ -74,6 +74,10 @@ def prediction_of(residual: Residual, at: Attachment, P: Array, velocity_cov: Ar
     # The symmetric root is one that changes little where P does, so that those of two states go together.
     values, vectors = np.linalg.eigh(turn @ P @ turn.T)
     root = J @ turn.T @ (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    if residual.velocity_jacobian is not None:  # what pose and velocity err together is left out: it is little
+        values, vectors = np.linalg.eigh(velocity_cov)
+        by_velocity = residual.velocity_jacobian() @ (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+        root = np.hstack([root, by_velocity])
     squared = float(np.trace(P[3:6, 3:6]) / max(np.trace(velocity_cov), 1e-12))
     return Prediction(root, min(float(np.sqrt(max(squared, 0.0))), _LASTS_S))
 

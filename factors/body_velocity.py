@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Velocity along the axes of the sensor: wheels, a Doppler log, a speed log.
+
+    z = (1 + s) S u + w,   u = Q^T (R^T (v + dv - c) + omega x l),   w ~ N(0, C)
+
+v: velocity of body in world at the state; dv: what the IMU says it gains until the measurement; c: the water's current,
+east and north, a first-order Gauss-Markov process (over ground: none); R: body in world; omega: body rate from the
+gyroscope, bias removed; l: sensor in body; Q: the sensor's axes in body; S: picks the measured axes; s: error of the scale, a
+constant of the run. With a = R^T (v + dv - c), the derivatives of u are Q^T R^T by v, -Q^T R^T by c, and Q^T [a]_x by the
+body tangent theta of R <- R Exp(theta). Not handled: slip of wheels, other than as outliers; scales that differ between axes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.config import BodyVelocityConfig
+from graphloc.factors._noise import with_floors
+from graphloc.frames import Array, Datum, skew
+from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
+from graphloc.linear import Term, linear_update, pose_term
+from graphloc.measurements import BodyVelocity
+
+_SCALE, _CURRENT = slice(0, 1), slice(1, 3)  # of the slow state, where all of it is there
+
+
+def _there(config: BodyVelocityConfig) -> NDArray[np.bool_]:
+    """Which of scale, current east and north the slow state has (3,)."""
+    return np.array([config.scale_sigma > 0.0, *[config.through == "water"] * 2])
+
+
+def _slow_value(at: Attachment, config: BodyVelocityConfig) -> Array:
+    """Error of the scale and current (3,), zero where there is none."""
+    full = np.zeros(3)
+    if at.slow_value is not None:
+        full[_there(config)] = at.slow_value
+    return full
+
+
+def _moving(at: Attachment, config: BodyVelocityConfig) -> tuple[Array, Array, Array]:
+    """Return u (3,), a (3,) and the sensor's axes in body Q (3, 3)."""
+    current = np.append(_slow_value(at, config)[_CURRENT], 0.0)
+    along = at.T_world_body.rotation().matrix().T @ (at.v_world_mps + at.dv_world_mps - current)
+    Q = at.T_state_sensor.rotation().matrix()
+    return Q.T @ (along + np.cross(at.gyro_radps, at.lever_m)), along, Q
+
+
+def residuals(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment) -> tuple[Residual, ...]:
+    """Residual predicted - measured (k,) in m/s, the sensor's axes."""
+    u, along, Q = _moving(at, config)
+    picked = ["xyz".index(axis) for axis in m.axes]
+    scale = 1.0 + float(_slow_value(at, config)[0])
+
+    def by_velocity() -> Array:
+        return np.asarray(scale * (at.T_world_body.rotation().matrix() @ Q).T[picked])
+
+    def by_pose() -> Array:
+        return np.hstack([scale * (Q.T @ skew(along))[picked], np.zeros((len(picked), 3))])
+
+    def by_slow() -> Array:
+        return np.hstack([u[picked][:, None], -by_velocity()[:, :2]])[:, _there(config)]
+
+    return (
+        Residual(
+            raw=scale * u[picked] - m.value,
+            cov=with_floors(m.cov, config.min_sigma_mps**2),
+            jacobian=by_pose,
+            slow_jacobian=by_slow,
+            velocity_jacobian=by_velocity,
+            prior=1.0,
+            size_m=None,
+            size_deg=None,
+        ),
+    )
+
+
+def factors(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment, decision: Decision) -> GraphUpdate:
+    """Return the factor of one velocity."""
+    residual = residuals(m, config, at)[0]
+    assert residual.velocity_jacobian is not None
+    terms = [pose_term(at, residual.jacobian()), Term(at.velocity_key, at.v_world_mps, residual.velocity_jacobian())]
+    if at.slow_key is not None and residual.slow_jacobian is not None:
+        terms.append(Term(at.slow_key, np.array(at.slow_value), residual.slow_jacobian()))
+    return linear_update(residual, terms, decision)
+
+
+def slow(config: BodyVelocityConfig) -> SlowProcess | None:
+    """Return the error of the scale, and the current, as far as the configuration asks for them."""
+    there = _there(config)
+    if not there.any():
+        return None
+
+    return SlowProcess(
+        name="speed error",
+        axes=tuple(np.array(["scale", "current east", "current north"])[there].tolist()),
+        units=tuple(np.array(["%", "m/s", "m/s"])[there].tolist()),
+        scale=np.array([100.0, 1.0, 1.0])[there],
+        sigma=np.array([config.scale_sigma, config.current_sigma_mps, config.current_sigma_mps])[there],
+        time_constant_s=np.array([np.inf, config.current_time_constant_s, config.current_time_constant_s])[there],
+    )
+
+
+def ideal(at: Attachment, config: BodyVelocityConfig) -> BodyVelocity:
+    """Return the velocity that the attachment's estimate would give."""
+    u, _, _ = _moving(at, config)
+    value = (1.0 + _slow_value(at, config)[0]) * u[["xyz".index(axis) for axis in config.axes]]
+    return BodyVelocity(
+        stamp_ns=0, sensor="body_velocity", seq=0, axes=config.axes, value=value, cov=np.eye(len(value)) * 0.01
+    )
+
+
+def hint(m: BodyVelocity, mount_yaw_rad: float, datum: Datum) -> Hint:
+    """Without a heading it tells no velocity in world."""
+    return Hint()
+
+
+ROW = Sensor(
+    kind="body_velocity",
+    measurement=BodyVelocity,
+    config=BodyVelocityConfig,
+    residuals=residuals,
+    factors=factors,
+    ideal=ideal,
+    hint=hint,
+    slow=slow,
+    company=True,
+)
