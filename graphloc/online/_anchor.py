@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is known at one state, to go on from: after the start, after a failure, after a kill.
 
-Kept are the joint Gaussian of pose, velocity and bias, and each slow state and constant given the pose: what is
-known of a drifting receiver is known together with the place, not apart from it.
+Kept are the joint Gaussian of pose, velocity and bias, and each slow state given these: what is known of a drifting receiver
+is known together with the place, not apart from it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -20,15 +20,25 @@ from graphloc.build import Past, Problem, StartPrior, constant_keys
 from graphloc.frames import Array
 
 _CORE = 15  # pose, velocity, bias
+_PARTS = (slice(0, 6), slice(6, 9), slice(9, _CORE))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Beside:
-    """A vector known beside a pose: value (k,) at the pose's own value, gain (k, 6) by its tangent, cov (k, k) given it."""
+    """A vector known beside a state: value (k,) at the state's own, gain (k, 15) by its pose (tangent), velocity and bias, cov (k, k) given it.
+
+    Given the pose alone, all that the velocity tells later moves the vector with the place: after a second of data a tide was so
+    known to 0.47 m of 0.5, and 0.12 m off, by nothing but the first second's heave.
+    """
 
     value: Array
     gain: Array
     cov: Array
+
+    @classmethod
+    def apart(cls, value: Array, cov: Array) -> Beside:
+        """Return what is known whatever the state is."""
+        return cls(value=value, gain=np.zeros((len(value), _CORE)), cov=cov)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,7 +47,8 @@ class Anchor:
 
     Attributes:
         stamp_ns: of the state. pose: gtsam.Pose3 of the IMU's place, body axes. velocity: (3,). bias: (6,) accelerometer first.
-        cov: (15, 15) of pose (tangent), velocity, bias.
+        step: (15,) from there to the mean: of pose (tangent), velocity, bias. Written about the mean, where that lies tens of degrees
+            from where the rest was solved, a start would not stay where it was. cov: (15, 15), so, too.
         slow: by sensor. constants: by sensor and number.
     """
 
@@ -46,6 +57,7 @@ class Anchor:
     velocity: Array
     bias: Array
     cov: Array
+    step: Array = field(default_factory=lambda: np.zeros(_CORE))
     slow: Mapping[str, Beside] = field(default_factory=dict)
     constants: Mapping[tuple[str, int], Beside] = field(default_factory=dict)
 
@@ -77,26 +89,24 @@ class Anchor:
         ends = np.cumsum([_CORE, *slow.values(), *constants.values()])
         own = [np.arange(a, b) for a, b in pairwise(ends)]
         pose, velocity, bias = point
-        # The tangent turns along with the pose: where the heading is a guess, by tens of degrees.
-        there, turn = pose.retract(mean[:6]), np.eye(len(mean))
-        turn[:3, :3] = turn[3:6, 3:6] = there.rotation().matrix().T @ pose.rotation().matrix()
-        cov = turn @ cov @ turn.T
-        beside_pose = {
-            name: _beside_pose(mean[rows], cov[np.ix_([*range(6), *rows], [*range(6), *rows])])
+        core = range(_CORE)
+        beside = {
+            name: _beside(mean[[*core, *rows]], cov[np.ix_([*core, *rows], [*core, *rows])])
             for name, rows in zip(slow, own, strict=False)
         }
-        # Not given the pose: a constant's prior, when it is seen again, does not have that.
+        # Not given the state: a constant's prior, when it is seen again, does not have that.
         alone = {
-            number: Beside(value=mean[rows], gain=np.zeros((len(rows), 6)), cov=cov[np.ix_(rows, rows)])
+            number: Beside.apart(mean[rows], cov[np.ix_(rows, rows)])
             for number, rows in zip(constants, own[len(slow) :], strict=True)
         }
         return cls(
             stamp_ns=stamp_ns,
-            pose=there,
-            velocity=np.asarray(velocity) + mean[6:9],
-            bias=bias + mean[9:_CORE],
+            pose=pose,
+            velocity=np.asarray(velocity),
+            bias=bias,
+            step=mean[:_CORE],
             cov=cov[:_CORE, :_CORE],
-            slow=beside_pose,
+            slow=beside,
             constants=alone,
         )
 
@@ -131,46 +141,48 @@ class Anchor:
 
     def factors(self, pose: int, velocity: int, bias: int) -> list[Any]:
         """Return the prior of the state, by its keys; linear in world, as in `beside`."""
-        R0, p0, turn = self.pose.rotation(), self.pose.translation(), np.eye(_CORE)
+        turn = np.eye(_CORE)
         turn[:3, :3] = turn[3:6, 3:6] = self.pose.rotation().matrix()
-        whiten = np.linalg.inv(np.linalg.cholesky(sound(turn @ self.cov @ turn.T)))
+        whiten, mean = np.linalg.inv(np.linalg.cholesky(sound(turn @ self.cov @ turn.T))), turn @ self.step
 
         def error(this: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
-            own, fast, held = this.keys()
-            R, p = values.atPose3(own).rotation(), values.atPose3(own).translation()
+            off, steps = self._off(this.keys(), values)
             if H is not None:
-                H[0] = np.asfortranarray(whiten[:, :6] @ np.kron(np.eye(2), R.matrix()))
-                H[1], H[2] = np.asfortranarray(whiten[:, 6:9]), np.asfortranarray(whiten[:, 9:])
-            moved = np.concatenate([gtsam.Rot3.Logmap(R.compose(R0.inverse())), p - p0])
-            v, b = values.atVector(fast) - self.velocity, values.atConstantBias(held).vector() - self.bias
-            return np.asarray(whiten @ np.concatenate([moved, v, b]))
+                for n, (part, step) in enumerate(zip(_PARTS, steps, strict=True)):
+                    H[n] = np.asfortranarray(whiten[:, part] @ step)
+            return np.asarray(whiten @ (off - mean))
 
         return [gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(_CORE), [pose, velocity, bias], error)]
 
-    def beside(self, known: Beside, pose: int, key: int) -> Any:
-        """Return the prior of a vector, given the pose.
+    def beside(self, known: Beside, state: Sequence[int], key: int) -> Any:
+        """Return the prior of a vector, given the state, by the keys of its pose, velocity and bias.
 
         Linear in world: a place that is hardly known is known to centimetres together with a slow error. In tangents of a
         heading that turns on by 20 deg, that would be another sum, and both sums together would tell the place.
         """
-        whiten = np.linalg.inv(np.linalg.cholesky(sound(known.cov)))
-        R0, p0, gain = (
-            self.pose.rotation(),
-            self.pose.translation(),
-            known.gain.reshape(-1, 2, 3) @ self.pose.rotation().matrix().T,
-        )
-        gain = whiten @ gain.reshape(-1, 6)
+        whiten, turn = np.linalg.inv(np.linalg.cholesky(sound(known.cov))), np.eye(_CORE)
+        turn[:3, :3] = turn[3:6, 3:6] = self.pose.rotation().matrix()
+        gain = whiten @ known.gain @ turn.T
 
         def error(this: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
-            own, other = this.keys()
-            R, p = values.atPose3(own).rotation(), values.atPose3(own).translation()
+            *own, other = this.keys()
+            off, steps = self._off(own, values)
             if H is not None:
-                turn = np.kron(np.eye(2), R.matrix())
-                H[0], H[1] = np.asfortranarray(-gain @ turn), np.asfortranarray(whiten)
-            moved = np.concatenate([gtsam.Rot3.Logmap(R.compose(R0.inverse())), p - p0])
-            return np.asarray(whiten @ (np.atleast_1d(values.atVector(other)) - known.value) - gain @ moved)
+                for n, (part, step) in enumerate(zip(_PARTS, steps, strict=True)):
+                    H[n] = np.asfortranarray(-gain[:, part] @ step)
+                H[len(_PARTS)] = np.asfortranarray(whiten)
+            return np.asarray(whiten @ (np.atleast_1d(values.atVector(other)) - known.value) - gain @ off)
 
-        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(known.value)), [pose, key], error)
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(known.value)), [*state, key], error)
+
+    def _off(self, state: Sequence[int], values: gtsam.Values) -> tuple[Array, tuple[Array, ...]]:
+        """By how far a state is off this one (15,), its pose in world, and the Jacobians of its parts."""
+        pose, velocity, bias = state
+        R, p = values.atPose3(pose).rotation(), values.atPose3(pose).translation()
+        turned = gtsam.Rot3.Logmap(R.compose(self.pose.rotation().inverse()))
+        v, b = values.atVector(velocity) - self.velocity, values.atConstantBias(bias).vector() - self.bias
+        off = np.concatenate([turned, p - self.pose.translation(), v, b])
+        return off, (np.asarray(np.kron(np.eye(2), R.matrix()), dtype=np.float64), np.eye(3), np.eye(6))
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""
@@ -179,6 +191,7 @@ class Anchor:
             "pose": self.pose.matrix().tolist(),
             "velocity": self.velocity.tolist(),
             "bias": self.bias.tolist(),
+            "step": self.step.tolist(),
             "cov": self.cov.tolist(),
             "slow": {name: _plain(b) for name, b in self.slow.items()},
             "constants": [[name, k, _plain(b)] for (name, k), b in self.constants.items()],
@@ -197,16 +210,19 @@ class Anchor:
             pose=gtsam.Pose3(gtsam.Rot3.ClosestTo(matrix[:3, :3]), matrix[:3, 3]),
             velocity=_array(raw["velocity"], (3,)),
             bias=_array(raw["bias"], (6,)),
+            step=_array(raw["step"], (_CORE,)),
             cov=_array(raw["cov"], (_CORE, _CORE)),
-            slow={str(name): _beside(b) for name, b in raw["slow"].items()},
-            constants={(str(name), int(k)): _beside(b) for name, k, b in raw["constants"]},
+            slow={str(name): _read(b) for name, b in raw["slow"].items()},
+            constants={(str(name), int(k)): _read(b) for name, k, b in raw["constants"]},
         )
 
 
-def _beside_pose(value: Array, joint: Array) -> Beside:
-    """Return what a joint covariance of pose and vector (6 + k, 6 + k) says of the vector given the pose."""
-    gain = np.linalg.solve(sound(joint[:6, :6]), joint[:6, 6:]).T
-    return Beside(value=value, gain=np.asarray(gain, dtype=np.float64), cov=joint[6:, 6:] - gain @ joint[:6, 6:])
+def _beside(mean: Array, joint: Array) -> Beside:
+    """Return what a joint Gaussian of a state's step and a vector (15 + k,) says of the vector given the state."""
+    gain = np.linalg.solve(sound(joint[:_CORE, :_CORE]), joint[:_CORE, _CORE:]).T
+    cov = joint[_CORE:, _CORE:] - gain @ joint[:_CORE, _CORE:]
+    value = mean[_CORE:] - gain @ mean[:_CORE]
+    return Beside(value=value, gain=np.asarray(gain, dtype=np.float64), cov=cov)
 
 
 def without_prior(mean: Array, cov: Array, rows: Array, variance: Array) -> tuple[Array, Array]:
@@ -231,10 +247,12 @@ def _plain(b: Beside) -> dict[str, Any]:
     return {"value": b.value.tolist(), "gain": b.gain.tolist(), "cov": b.cov.tolist()}
 
 
-def _beside(raw: Mapping[str, Any]) -> Beside:
+def _read(raw: Mapping[str, Any]) -> Beside:
     size = len(raw["value"])
     return Beside(
-        value=_array(raw["value"], (size,)), gain=_array(raw["gain"], (size, 6)), cov=_array(raw["cov"], (size, size))
+        value=_array(raw["value"], (size,)),
+        gain=_array(raw["gain"], (size, _CORE)),
+        cov=_array(raw["cov"], (size, size)),
     )
 
 

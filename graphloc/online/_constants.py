@@ -65,7 +65,7 @@ class Constants:
         """Remember those that the next commit lets go."""
         for key in self._window.leaving([key for _, key in self._keys()], now_s):
             value = np.atleast_1d(self._window.values.atVector(key))
-            self._known[key] = Beside(value=value, gain=np.zeros((len(value), 6)), cov=self._window.covariance([key]))
+            self._known[key] = Beside.apart(value, self._window.covariance([key]))
 
     def seen(self) -> dict[Number, int]:
         """Return the keys of those that are in the graph."""
