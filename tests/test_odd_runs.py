@@ -10,19 +10,19 @@ from scipy.spatial.transform import Rotation
 
 from graphloc import app
 from graphloc.blocks import MountConfig
-from graphloc.build import make_problem
+from graphloc.build import Level, make_problem
 from graphloc.config import DatumConfig, GnssConfig, HeightConfig, PoseConfig, VesselConfig
 from graphloc.errors import InputError, SolveError
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import TruthMetrics, compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
-from graphloc.frames import Datum, Geodetic, wrap_angle
+from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, HeightPrior, Measurement, PoseFix
 from graphloc.recording import Recording
 from graphloc.solution import Solution
-from graphloc.solve._align import align
+from graphloc.solve._align import _level, _turns, align
 from graphloc.solve._parts import _join_stats
 from graphloc.trajectory import Trajectory, bounds_95
 
@@ -417,6 +417,28 @@ def test_level_and_bias_at_a_tilted_start() -> None:
     start = align(problem)
     np.testing.assert_allclose(start.gyro_bias_radps, bias, atol=1e-3)
     np.testing.assert_allclose(start.R_level_body[2], tilt[2], atol=0.01)
+
+
+def test_a_levelling_is_that_of_its_biases() -> None:
+    """Which way is up changes with either bias as it says, on a vessel that turns and an IMU that is mounted turned."""
+    run = simulate(replace(BASE, duration_s=10.0, path="loops", imu_hz=50.0), 1)
+    recording = run.recording
+    problem = make_problem(recording, run.config, app.choose_datum(recording, run.config), SENSORS, INERTIAL)
+    at = np.array([0.0, 0.0, 0.0, 0.004, -0.003, 0.002])
+
+    def levelled(bias: Array) -> Level:
+        imu = replace(problem.imu, accel_mps2=problem.imu.accel_mps2 - bias[:3])
+        other, own = replace(problem, imu=imu), problem.R_body_imu @ bias[3:]
+        found = _level(other, 10.0, None, _turns(other, 20.0, own), own)[2]
+        assert found is not None
+        return found
+
+    by_bias = levelled(at).by_bias
+    for axis, step in enumerate([0.05] * 3 + [1e-3] * 3):
+        by = step * np.eye(6)[axis]
+        changed = (levelled(at + by).up - levelled(at - by).up) / (2.0 * step)
+        largest = np.abs(by_bias[:, :3] if axis < 3 else by_bias[:, 3:]).max()
+        np.testing.assert_allclose(by_bias[:, axis], changed, atol=0.02 * largest)
 
 
 def test_a_heading_that_comes_late_is_not_the_starts() -> None:

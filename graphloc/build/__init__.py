@@ -21,7 +21,7 @@ from graphloc.build._chains import (
     slow_step,
     standing_cost,
 )
-from graphloc.build._graph import Decisions, Past, StartPrior, build_graph, state_keys
+from graphloc.build._graph import Decisions, Level, Past, StartPrior, build_graph, state_keys
 from graphloc.build._problem import (
     Mounts,
     Problem,
@@ -40,6 +40,7 @@ __all__ = [
     "Carry",
     "Decisions",
     "Judged",
+    "Level",
     "Mounts",
     "Past",
     "Problem",

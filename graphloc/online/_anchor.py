@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 
 from graphloc import keys
-from graphloc.build import Past, Problem, StartPrior, constant_keys
+from graphloc.build import Level, Past, Problem, StartPrior, constant_keys
 from graphloc.frames import Array
 
 _CORE = 15  # pose, velocity, bias
@@ -48,7 +48,7 @@ class Anchor:
     Attributes:
         stamp_ns: of the state. pose: gtsam.Pose3 of the IMU's place, body axes. velocity: (3,). bias: (6,) accelerometer first.
         step: (15,) from there to the mean: of pose (tangent), velocity, bias. Written about the mean, where that lies tens of degrees
-            from where the rest was solved, a start would not stay where it was. cov: (15, 15), so, too.
+            from where the rest was solved, a start would not stay where it was. cov: (15, 15), so, too. level: what a start says beside, which no snapshot has.
         slow: by sensor. constants: by sensor and number.
     """
 
@@ -60,6 +60,7 @@ class Anchor:
     step: Array = field(default_factory=lambda: np.zeros(_CORE))
     slow: Mapping[str, Beside] = field(default_factory=dict)
     constants: Mapping[tuple[str, int], Beside] = field(default_factory=dict)
+    level: Level | None = None
 
     @classmethod
     def of_start(cls, stamp_ns: int, prior: StartPrior) -> Anchor:
@@ -67,7 +68,8 @@ class Anchor:
         cov = np.zeros((_CORE, _CORE))
         cov[:6, :6], cov[6:9, 6:9], cov[9:, 9:] = prior.pose_cov, prior.velocity_cov, prior.bias_cov
         bias = np.concatenate([prior.bias.accelerometer(), prior.bias.gyroscope()])
-        return cls(stamp_ns=stamp_ns, pose=prior.pose, velocity=np.asarray(prior.velocity), bias=bias, cov=cov)
+        velocity = np.asarray(prior.velocity)
+        return cls(stamp_ns=stamp_ns, pose=prior.pose, velocity=velocity, bias=bias, cov=cov, level=prior.level)
 
     @classmethod
     def of_joint(
@@ -152,7 +154,8 @@ class Anchor:
                     H[n] = np.asfortranarray(whiten[:, part] @ step)
             return np.asarray(whiten @ (off - mean))
 
-        return [gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(_CORE), [pose, velocity, bias], error)]
+        found = [gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(_CORE), [pose, velocity, bias], error)]
+        return found if self.level is None else [*found, _upright(self.level, pose, bias)]
 
     def beside(self, known: Beside, state: Sequence[int], key: int) -> Any:
         """Return the prior of a vector, given the state, by the keys of its pose, velocity and bias.
@@ -215,6 +218,22 @@ class Anchor:
             slow={str(name): _read(b) for name, b in raw["slow"].items()},
             constants={(str(name), int(k)): _read(b) for name, k, b in raw["constants"]},
         )
+
+
+def _upright(level: Level, pose: int, bias: int) -> Any:
+    """Return the factor of a levelling."""
+
+    def error(this: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
+        own, held = this.keys()
+        off, by_turn, by_bias = level.error(
+            values.atPose3(own).rotation().matrix(), values.atConstantBias(held).vector()
+        )
+        if H is not None:
+            H[0] = np.asfortranarray(np.hstack([by_turn, np.zeros((2, 3))]))
+            H[1] = np.asfortranarray(by_bias)
+        return off
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(2), [pose, bias], error)
 
 
 def _beside(mean: Array, joint: Array) -> Beside:

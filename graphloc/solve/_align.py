@@ -18,10 +18,10 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from graphloc.build import Problem
+from graphloc.build import Level, Problem
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.errors import SolveError
-from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
+from graphloc.frames import Array, skew, wrap_angle, yaw_from_heading_deg
 from graphloc.graph import Hint
 from graphloc.time import duration_ns, utc_text
 
@@ -30,6 +30,7 @@ _STILL_SPEED_MPS = 0.15
 _USUAL_SPEED_MPS = 10.0  # where nothing is known of it
 _BLOCK_S, _SWELL_S = 0.5, 10.0
 _CARRIED_RAD = np.radians(20.0)  # 1 sigma of the gyro's bias: a heading that comes later is no heading of the start
+_OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, before any force is felt
 MOVED_M = 15.0  # travel from which a heading can be told without a heading sensor
 
 
@@ -38,7 +39,7 @@ class Start:
     """A start: level attitude without heading, and candidates for the heading.
 
     Attributes:
-        R_level_body: (3, 3) attitude with yaw 0. tilt_sigma_rad: of roll and pitch.
+        R_level_body: (3, 3) attitude with yaw 0. tilt_sigma_rad: of roll and pitch, where `level` says nothing of them.
         yaws_rad: candidates. yaw_sigma_rad: of each (wide where it is a guess).
         p_world_m, p_sigma_m, v_world_mps, v_sigma_mps: (3,) each.
         gyro_bias_radps, gyro_bias_sigma_radps: (3,) in IMU axes.
@@ -48,6 +49,7 @@ class Start:
 
     R_level_body: Array
     tilt_sigma_rad: float
+    level: Level | None
     yaws_rad: tuple[float, ...]
     yaw_sigma_rad: float
     p_world_m: Array
@@ -92,12 +94,13 @@ def align(problem: Problem) -> Start:
         yaws = early
     turn = _turns(problem, max([window, *(rows[0, 0] for rows in yaws.values())]) + 10.0 if yaws else 180.0, bias)
     at_start = still if still is not None and still[0] == 0.0 else None
-    R_level, tilt_sigma, tilt_note = _level(problem, origin, window, at_start, turn, track)
+    R_level, tilt_sigma, level, tilt_note = _level(problem, window, at_start, turn, bias)
     heading = _headings(problem, track, yaws, turn)
     p0, p_sigma, v0, v_sigma = _position_and_velocity(hints, track, at_start)
     return Start(
         R_level_body=R_level,
         tilt_sigma_rad=tilt_sigma,
+        level=level,
         yaws_rad=heading[0],
         yaw_sigma_rad=heading[1],
         p_world_m=p0,
@@ -258,24 +261,38 @@ def _turns(problem: Problem, span_s: float, bias: Array) -> Callable[[float], Ar
 
 def _level(
     problem: Problem,
-    origin: int,
     window: float,
     still: tuple[float, float] | None,
     turn: Callable[[float], Array],
-    track: _Track,
-) -> tuple[Array, float, str]:
-    """Roll and pitch at the start, as R (3, 3) with yaw 0; their sigma; a note."""
+    bias: Array,
+) -> tuple[Array, float, Level | None, str]:
+    """Roll and pitch at the start, as R (3, 3) with yaw 0; their sigma; what they go by; a note.
+
+    Args:
+        turn: t -> R_body0_body(t), by the gyroscope less its bias (3,), in body axes.
+    """
     if getattr(problem.config.sensors[problem.imu.sensor], "gravity", "included") == "removed":
-        return np.eye(3), 0.1, "roll and pitch unknown (gravity removed by the driver): taken level"
-    stop = still[1] if still else min(window, 10.0)
-    t, f, _ = _samples(problem, 0.0, stop)
-    up = np.mean([turn(s) @ force for s, force in zip(t, f, strict=True)], axis=0)
-    up /= np.linalg.norm(up)
+        return np.eye(3), 0.1, None, "roll and pitch unknown (gravity removed by the driver): taken level"
+    t, f, _ = _samples(problem, 0.0, still[1] if still else min(window, 10.0))
+    span = float(np.ptp(t))  # online, a start comes before ten seconds have
+    R = np.array([turn(s) for s in t])
+    forces = np.einsum("nij,nj->ni", R, f)
+    force = float(np.linalg.norm(forces.mean(axis=0)))
+    up = forces.mean(axis=0) / force
+    turned = np.cumsum(R[:-1] * np.diff(t)[:, None, None], axis=0)  # by a rate of 1 rad/s about each axis of the body
+    by_gyro = np.einsum("nij,njk->ik", [skew(v) for v in forces[1:]], turned) / len(t)
+    by_bias = np.hstack([-R.mean(axis=0), by_gyro]) @ np.kron(np.eye(2), problem.R_body_imu) / force
     pitch, roll = np.arctan2(-up[0], np.hypot(up[1], up[2])), np.arctan2(up[1], up[2])
-    R = Rotation.from_euler("xyz", [roll, pitch, 0.0]).as_matrix()
     # What a change of speed over the window does to the mean force: 2 m/s over its length.
-    sigma = 0.01 if still else float(np.clip(2.0 / STANDARD_GRAVITY_MPS2 / max(stop, 1.0), 0.02, 0.1))
-    return np.asarray(R), sigma, f"roll and pitch from {stop:.0f} s of specific force"
+    sigma = 0.01 if still else float(np.clip(2.0 / STANDARD_GRAVITY_MPS2 / max(span, 1.0), 0.02, 0.1))
+    level = Level(
+        up=up,
+        by_bias=(np.eye(3) - np.outer(up, up)) @ by_bias,
+        bias=np.concatenate([np.zeros(3), problem.R_body_imu.T @ bias]),
+        sigma_rad=sigma,
+    )
+    note = f"roll and pitch from {span:.0f} s of specific force"
+    return Rotation.from_euler("xyz", [roll, pitch, 0.0]).as_matrix(), _OWN_TILT_RAD, level, note
 
 
 def _headings(

@@ -119,6 +119,7 @@ def _start_prior(problem: Problem, start: Start, yaw: float) -> StartPrior:
         velocity_cov=np.diag(start.v_sigma_mps**2),
         bias=gtsam.imuBias.ConstantBias(np.zeros(3), start.gyro_bias_radps),
         bias_cov=bias_cov,
+        level=start.level,
     )
 
 
