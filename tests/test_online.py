@@ -106,6 +106,19 @@ def test_false_matches_are_rejected_with_a_reason() -> None:
     assert right >= 15
 
 
+def test_a_right_match_that_comes_alone_refutes_false_ones_that_agree() -> None:
+    """After an outage two false ones of six in a row agree with each other, 1.4 m off, and are believed: GNSS may have jumped.
+
+    The next right one agrees with those before them; alone, it was no other choice, and was judged false.
+    """
+    scenario = replace(Scenario(path="loops", noise="drift"), duration_s=132.0, outage_s=(60.0, 120.0))
+    run = simulate(scenario, 19)
+    fed = feed(smoother(run), run, arrivals_of(run))
+    t_s, off = (np.array(fed.true_ns) - run.truth.stamps_ns[0]) * 1e-9, np.array(fed.errors_m)
+    assert off[(t_s > 130.0) & (t_s < 131.4)].min() > 1.0  # else this shows nothing
+    assert off[t_s > 131.55].max() < 0.6
+
+
 def test_the_end_agrees_with_the_batch() -> None:
     """On the same data, in a lag that holds all of it. What differs: the batch sees at once how wide a sensor scatters."""
     _, lag = whole(drift(), arrivals_of(drift()), lag_s=60.0)

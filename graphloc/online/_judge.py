@@ -242,10 +242,11 @@ class Judge:
                 continue
             attached, found = self._met(own)
             chain = best_chain(stream, [e.index for e in own], found)
-            differ = [e for e, mode in zip(own, chain, strict=True)
-                      if mode is not None and (e.held is None or mode != e.verdict.mode)]  # fmt: skip
+            believed = [e.verdict.mode if e.held is not None and e.verdict.weight >= AGREES else None for e in own]
+            others = [mode for mode, held in zip(chain, believed, strict=True) if mode != held]
             tried = frozenset((e.index, mode) for e, mode in zip(own, chain, strict=True))
-            if len(differ) < _CHAIN or tried == self._tried.get(name):
+            # One that comes alone may agree with some of what is believed, and refute the rest.
+            if len(others) < _CHAIN or all(mode is None for mode in others) or tried == self._tried.get(name):
                 continue
             self._tried[name] = tried
             moved = True
