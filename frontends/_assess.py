@@ -20,23 +20,29 @@ from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
-from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, ODOMETRY, PLAIN_POSE, POSE, QUATERNION, yaw_of_x_axis
+from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE, QUATERNION, yaw_of_x_axis
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.stuck import stuck, stuck_warning
 from graphloc.time import NS_PER_S
 
+_TURNS_DEG, _SAME_DEG = 5.0, 0.2
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
-_WINDOW_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """How the craft moved: times (N,) s since `origin_ns`, speed (N,) m/s (signed where the source knows)."""
+    """How the craft moved: times (N,) s since `origin_ns`, speed (N,) m/s (signed where the source knows).
+
+    `way_m`: (N,) its places, m, east + i north, about any origin; None where the source tells the speed only.
+    `rests`: whether its speed is precise enough to tell that the craft stands.
+    """
 
     source: str
     origin_ns: int
     t_s: Array
     speed_mps: Array
+    way_m: NDArray[np.complex128] | None = None
+    rests: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +57,11 @@ def vec(values: ArrayLike) -> Vec:
     """Return three numbers as a tuple."""
     a, b, c = (float(v) for v in np.asarray(values))
     return (a, b, c)
+
+
+def summed(t_s: Array, values: NDArray[Any]) -> NDArray[Any]:
+    """Return the running integral (N,) of values (N,) over times (N,), by trapezia; real or complex."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(t_s))])
 
 
 def topic_report(stream: Stream, count: int) -> TopicReport:
@@ -196,34 +207,6 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
     )
 
 
-def motion_of(odometry: list[Stream], twists: list[Stream], fixes: list[Stream]) -> Motion | None:
-    """Return the speed of the craft from wheels, or a velocity, or else from fixes that are precise enough."""
-    for stream in odometry:
-        keep = sane(stream)
-        if stream.msgtype == ODOMETRY and len(keep) > 20:
-            speed = stream.rows[keep, 7]
-            if np.isfinite(speed).all() and float(np.ptp(speed)) > 0.2:
-                t = (stream.stamps_ns[keep] - stream.stamps_ns[keep[0]]) / NS_PER_S
-                return Motion(stream.topic, int(stream.stamps_ns[keep[0]]), t, speed)
-    for stream in twists:
-        keep = sane(stream)
-        keep = keep[np.isfinite(stream.rows[keep, :2]).all(axis=1)] if len(keep) else keep  # NaN: before the first fix
-        speed = np.hypot(stream.rows[keep, 0], stream.rows[keep, 1]) if len(keep) > 20 else np.zeros(0)
-        if len(speed) and float(np.percentile(speed, 90)) > 0.5:
-            t = (stream.stamps_ns[keep] - stream.stamps_ns[keep[0]]) / NS_PER_S
-            return Motion(stream.topic, int(stream.stamps_ns[keep[0]]), t, speed)
-    for stream in fixes:
-        stamps, p, _ = track(stream)
-        if len(stamps) > 20:
-            t = (stamps - stamps[0]) / NS_PER_S
-            lag = max(1, round(_WINDOW_S / float(np.median(np.diff(t)))))
-            v = (p[lag:, :2] - p[:-lag, :2]) / (t[lag:] - t[:-lag])[:, None]
-            speed = np.hypot(v[:, 0], v[:, 1])
-            if float(np.percentile(speed, 90)) > 2.0:
-                return Motion(stream.topic, int(stamps[0]), (t[lag:] + t[:-lag]) / 2.0, speed)
-    return None
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Turning:
     """How the craft turned: times (N,) s since `origin_ns`, and the integral (N,) of its rate about up, rad."""
@@ -279,6 +262,24 @@ def headings(stream: Stream) -> tuple[NDArray[np.int64], Array]:
     yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in _quaternions(stream, stream.rows[keep])]
     good = np.array([not isinstance(y, Rejection) for y in yaw], dtype=bool)
     return stream.stamps_ns[keep][good], np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
+
+
+def says_the_same(first: Stream, second: Stream, *, mirrored: bool) -> bool:
+    """Return whether two headings are one, but for an offset: two devices never agree so closely while the craft turns.
+
+    Args:
+        mirrored: whether one of them grows as the other falls.
+    """
+    (at, a), (there, b) = headings(first), headings(second)
+    if len(at) < 10:
+        return False
+    inside = (there >= at[0]) & (there <= at[-1])
+    there, b = there[inside], b[inside]
+    if len(there) < 10:
+        return False
+    a = np.interp((there - at[0]) / NS_PER_S, (at - at[0]) / NS_PER_S, a)
+    turns, apart = (_middle_deg(v)[1] for v in (b, a + b if mirrored else a - b))
+    return turns > _TURNS_DEG and apart < _SAME_DEG
 
 
 def _middle_deg(angle: Array) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
-from graphloc.frontends._assess import Courses, Motion, Turning, against_turning, sane, vec
+from graphloc.frontends._assess import Courses, Motion, Turning, against_turning, sane, summed, vec
 from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import NEVER_STILL_RADPS, without_gravity
 from graphloc.frontends._streams import Stream
@@ -24,6 +25,9 @@ _WINDOW_S = 1.0
 _COURSE_S, _COURSE_CLEAR = 12.0, 0.6
 _UPSIDE_DOWN_DEG = 150.0
 _MIN_COHERENCE = 0.25  # and 4 / sqrt(windows), four times what chance gives
+# Half the time over which an acceleration is asked: short, a car's fits best; longer, waves and the noise of fixes are less.
+_HALF_S = (0.5, 1.0, 2.0, 4.0)
+_FEWEST, _MOVES_M = 20, 1.0  # windows; a shorter way has no direction
 
 
 def samples_of(imu: Stream) -> tuple[NDArray[np.intp], list[str]]:
@@ -34,12 +38,12 @@ def samples_of(imu: Stream) -> tuple[NDArray[np.intp], list[str]]:
 
 
 def mount_guess(
-    imu: Stream, accel: Array, gyro: Array, motion: Motion | None, tree: StaticTree, body: str
+    imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion], tree: StaticTree, body: str
 ) -> MountGuess:
     """Return how an IMU sits in the body: from /tf_static, else levelled by gravity and turned by motion.
 
     Levelled, with unknown yaw psi, the horizontal acceleration as complex number a = ax + i ay meets that of
-    the craft, m = dv/dt + i v w_z, as m = exp(i psi) a. So psi = arg sum(conj(a) m), and
+    the craft, m, forward + i to port, as m = exp(i psi) a. So psi = arg sum(conj(a) m), and
     |sum| / sqrt(sum |a|^2 sum |m|^2) says how far the data support it. Snapped to quarter turns.
 
     Args:
@@ -54,7 +58,7 @@ def mount_guess(
         note = "" if size < 2.0 or tilt < 20.0 else f", BUT gravity is then {tilt:.0f} deg off body z: check"
         return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"/tf_static knows it{note}")
     if size < 0.5 * STANDARD_GRAVITY_MPS2:
-        return _turned(imu, accel, gyro, motion, np.eye(3), "no gravity to level by: taken as level")
+        return _turned(imu, accel, gyro, motions, np.eye(3), "no gravity to level by: taken as level")
     axis = up / size
     snapped = np.zeros(3)
     k = int(np.argmax(np.abs(axis)))
@@ -65,12 +69,12 @@ def mount_guess(
     said = (
         f"gravity is on {name} of the sensor" if aligned else f"gravity is {np.round(axis, 2).tolist()} in the sensor"
     )
-    return _turned(imu, accel, gyro, motion, level, said)
+    return _turned(imu, accel, gyro, motions, level, said)
 
 
-def _turned(imu: Stream, accel: Array, gyro: Array, motion: Motion | None, level: Array, said: str) -> MountGuess:
+def _turned(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion], level: Array, said: str) -> MountGuess:
     """Return the mount of a sensor that `level` (3, 3) levels, turned by motion; `said`: how that is known."""
-    yaw, evidence = _mount_yaw(imu, accel @ level.T, gyro @ level.T, motion)
+    yaw, evidence = _mount_yaw(imu, accel @ level.T, gyro @ level.T, motions)
     turn = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
     rpy = vec(np.round(np.degrees(rpy_from_rotation(turn @ level)), 1) + 0.0)
     return MountGuess(rpy_deg=rpy, tf_frame=None, evidence=f"{said}; {evidence}")
@@ -87,34 +91,64 @@ def _level(axis: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(angle * cross / sine).as_matrix())
 
 
-def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motion: Motion | None) -> tuple[float, str]:
+def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion]) -> tuple[float, str]:
     """Return the quarter turn (deg) that fits the motion, and the evidence; `accel`, `gyro` are levelled."""
-    if motion is None:
+    if not motions:
         return 0.0, "no motion to tell its yaw by: taken as 0"
-    t = (imu.stamps_ns[samples_of(imu)[0]] - motion.origin_ns) / NS_PER_S
-    edges = np.arange(max(t[0], motion.t_s[0]), min(t[-1], motion.t_s[-1]), _WINDOW_S)
-    if len(edges) < 20:
+    stamps = imu.stamps_ns[samples_of(imu)[0]]
+    t = (stamps - stamps[0]) / NS_PER_S
+    turned = summed(t, gyro[:, 2])
+    a = accel[:, 0] + 1j * accel[:, 1]
+    a = a - np.median(a.real) - 1j * np.median(a.imag)
+    felt = summed(t, summed(t, a * np.exp(1j * turned)))
+    tried = []
+    for motion in motions:
+        at = motion.t_s + (motion.origin_ns - stamps[0]) / NS_PER_S
+        tried += [(found, motion.source) for h in _HALF_S if (found := _yaw_by(t, turned, felt, at, motion, h))]
+    if not tried:
         return 0.0, "too little motion to tell its yaw by: taken as 0"
+    (psi, coherence, chance), source = max(tried, key=lambda tried: tried[0][1] / tried[0][2])
+    if coherence < max(_MIN_COHERENCE, 4.0 * chance):
+        return 0.0, f"motion of {source} does not tell its yaw (coherence {coherence:.2f}): taken as 0"
+    quarter = float(np.degrees(wrap_angle(np.radians(90.0 * round(psi / 90.0)))))
+    return quarter, f"yaw by the motion of {source}: {psi:.0f} deg (coherence {coherence:.2f})"
 
-    def mean(columns: Array) -> Array:
-        """Mean over each window, from the running integral."""
-        total = np.concatenate([[0.0], np.cumsum(0.5 * (columns[1:] + columns[:-1]) * np.diff(t))])
-        return np.asarray(np.diff(np.interp(edges, t, total)) / _WINDOW_S)
 
-    v = np.interp(edges, motion.t_s, motion.speed_mps)
-    m = np.diff(v) / _WINDOW_S + 1j * 0.5 * (v[1:] + v[:-1]) * mean(gyro[:, 2])
-    a = mean(accel[:, 0]) + 1j * mean(accel[:, 1])
-    a, m = a - np.median(a.real) - 1j * np.median(a.imag), m - m.mean()
-    power = float(np.sqrt((np.abs(a) ** 2).sum() * (np.abs(m) ** 2).sum()))
-    product = complex((np.conj(a) * m).sum())
+def _yaw_by(
+    t_s: Array, turned: Array, felt: NDArray[np.complex128], at_s: Array, motion: Motion, half_s: float
+) -> tuple[float, float, float] | None:
+    """Return by how much (deg) a levelled sensor is turned in the craft, how clear that is (0 to 1), and what chance makes.
+
+    Places p tell the mean acceleration about t as p(t + h) - 2 p(t) + p(t - h), and p(t + h) - p(t - h) where the craft
+    heads; so does the sensor, in its own axes at t.
+
+    Args:
+        t_s, turned, felt: (N,) of the sensor: times, how far it has turned, rad, and where its accelerations lead, m, in
+            the axes of its beginning. at_s: (M,) the motion's times. half_s: h.
+    """
+    there = np.interp(at_s, t_s, turned)
+    along = motion.way_m is None
+    way = summed(at_s, motion.speed_mps * np.exp(1j * there)) if motion.way_m is None else motion.way_m
+    middle = np.arange(max(t_s[0], at_s[0]) + half_s, min(t_s[-1], at_s[-1]) - half_s, _WINDOW_S / 2.0)
+
+    def bent(times: Array, places: NDArray[np.complex128]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """The second difference of places, and the first, over twice as long."""
+        behind, here, ahead = (np.interp(middle + k * half_s, times, places) for k in (-1, 0, 1))
+        return ahead - 2.0 * here + behind, ahead - behind
+
+    (moved, chord), (f, _) = bent(at_s, way), bent(t_s, felt)
+    faced = np.exp(1j * np.interp(middle, t_s, turned))
+    good = np.abs(chord) > _MOVES_M
+    windows = good.sum() * _WINDOW_S / 2.0 / half_s
+    if windows < _FEWEST:
+        return None
+    m = (moved * np.conj(faced if along else chord / np.maximum(np.abs(chord), _MOVES_M)))[good]
+    f = (f * np.conj(faced))[good]
+    m, f = m - m.mean(), f - f.mean()
+    power = float(np.sqrt((np.abs(f) ** 2).sum() * (np.abs(m) ** 2).sum()))
+    product = complex((np.conj(f) * m).sum())
     coherence = abs(product) / power if power > 0.0 else 0.0
-    psi = float(np.degrees(np.angle(product)))
-    if coherence < max(_MIN_COHERENCE, 4.0 / float(np.sqrt(len(a)))):
-        return 0.0, f"motion of {motion.source} does not tell its yaw (coherence {coherence:.2f}): taken as 0"
-    quarter = float(wrap_angle(np.radians(90.0 * round(psi / 90.0))))
-    return float(
-        np.degrees(quarter)
-    ), f"yaw by the motion of {motion.source}: {psi:.0f} deg (coherence {coherence:.2f})"
+    return float(np.degrees(np.angle(product))), coherence, 1.0 / float(np.sqrt(windows))
 
 
 def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Turning | None:
@@ -129,8 +163,7 @@ def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> T
     rate = ((gyro - (report.gyro_bias_radps or (0.0, 0.0, 0.0))) @ R.T)[:, 2]
     origin = int(imu.stamps_ns[keep[0]])
     t = (imu.stamps_ns[keep] - origin) / NS_PER_S
-    turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
-    return Turning(origin, t, turned)
+    return Turning(origin, t, summed(t, rate))
 
 
 def _against_courses(imu: Stream, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str) -> int:
@@ -145,7 +178,7 @@ def _righted(
     report: ImuReport,
     imu: Stream,
     samples: tuple[Array, Array],
-    motion: Motion | None,
+    motions: Sequence[Motion],
     courses: Courses | None,
     tree: StaticTree,
     body: str,
@@ -166,11 +199,11 @@ def _righted(
     against = "its gyro turns against the courses of the fixes"
     if pose is None and sense < 0 and report.gravity == "removed":
         why = f"{against}: taken as lying on its back; no gravity to tell"
-        mount = _turned(imu, accel, gyro, motion, np.diag([1.0, -1.0, -1.0]), why)
+        mount = _turned(imu, accel, gyro, motions, np.diag([1.0, -1.0, -1.0]), why)
         return replace(report, mount=mount)
     if pose is None and sense < 0:
         why = f"{against}: its accelerations look inverted, or its axes are left-handed; check the sensor"
-        mount = mount_guess(imu, -accel, gyro, motion, tree, body)
+        mount = mount_guess(imu, -accel, gyro, motions, tree, body)
         mount = replace(mount, evidence=f"with accelerations inverted, {mount.evidence}")
         return replace(report, gravity="inverted", mount=mount, why=(*report.why, why))
     if pose is None:
@@ -188,7 +221,7 @@ def _righted(
 
 
 def imu_report(
-    imu: Stream, motion: Motion | None, courses: Courses | None, tree: StaticTree, body: str
+    imu: Stream, motions: Sequence[Motion], courses: Courses | None, tree: StaticTree, body: str
 ) -> ImuReport | None:
     """Return units, gravity, standstill, noise and mount of an IMU."""
     keep, hangs = samples_of(imu)
@@ -215,7 +248,7 @@ def imu_report(
     accel = accel * (STANDARD_GRAVITY_MPS2 if accel_unit == "g" else 1.0)
     gyro = gyro * (np.pi / 180.0 if gyro_unit == "deg/s" else 1.0)
     up = np.median(accel, axis=0)
-    still = _standstill(stamps, accel, gyro, motion)
+    still = _standstill(stamps, accel, gyro, next((m for m in motions if m.rests), None))
     root_dt = float(np.sqrt(np.median(np.diff(stamps)) / NS_PER_S))
     quiet = still.sum() > 20
 
@@ -244,9 +277,9 @@ def imu_report(
         gyro_noise_mdps=density(gyro) / mdps,
         reported_accel_ug=reported(10, ug),
         reported_gyro_mdps=reported(11, mdps),
-        mount=mount_guess(imu, accel, gyro, motion, tree, body),
+        mount=mount_guess(imu, accel, gyro, motions, tree, body),
     )
-    return _righted(report, imu, (accel, gyro), motion, courses, tree, body)
+    return _righted(report, imu, (accel, gyro), motions, courses, tree, body)
 
 
 def _standstill(stamps: NDArray[np.int64], accel: Array, gyro: Array, motion: Motion | None) -> NDArray[np.bool_]:

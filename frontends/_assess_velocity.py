@@ -1,45 +1,137 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judging a velocity by the GNSS track: are its axes east and north, as the graph takes them?"""
+"""Judging velocities by the GNSS track: in which axes are they, and which of them tells how the craft moves?"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import sane
-from graphloc.frontends._reports import VelocityReport
+from graphloc.frontends._assess import Motion, sane, summed, track
+from graphloc.frontends._reports import BODY_AXES, EAST_AXES, NORTH_AXES, OdometryReport, Vec, VelocityReport
 from graphloc.frontends._streams import Stream
+from graphloc.frontends.decode import ODOMETRY, VECTOR
 from graphloc.time import NS_PER_S
 
+_WINDOW_S = 1.0
 _CHORD_S = 2.0
 _FITS = 0.4  # largest error of an axis convention that fits, as a share of the speed
-_AXES = ("east, north, up", "north, east, down", "forward, left, up (body)")
+_AXES = (EAST_AXES, NORTH_AXES, BODY_AXES)
+_FEWEST, _FAST_MPS = 20, 2.0
 
 
-def velocity_report(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, tf_frame: str | None) -> VelocityReport:
-    """Compare mean velocities with chords of the track.
+def axes_of(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array) -> tuple[str | None, str]:
+    """Return the axes in which the velocities of a stream fit chords of a track, and the evidence in words.
+
+    The axes are None where nothing tells, 'unknown' where none fits.
 
     Args:
-        stream: the twists. stamps_ns: (N,) of the track. p_m: (N, 3) the track, east, north, up.
-        tf_frame: the stream's frame, where /tf_static knows it.
+        stream: velocities in its last three columns. stamps_ns: (N,) of the track. p_m: (N, 3) the track, east, north, up.
     """
-
-    def report(axes: str | None, why: str) -> VelocityReport:
-        return VelocityReport(topic=stream.topic, axes=axes, why=why, tf_frame=tf_frame)
-
     keep = sane(stream)
-    keep = keep[np.isfinite(stream.rows[keep]).all(axis=1)] if len(keep) else keep
-    chords, mean = _pairs(stream.stamps_ns[keep], stream.rows[keep], stamps_ns, p_m)
+    v = stream.rows[keep, -3:] if len(keep) else np.zeros((0, 3))
+    good = np.isfinite(v).all(axis=1)
+    chords, mean = _pairs(stream.stamps_ns[keep][good], v[good], stamps_ns, p_m)
     speed = float(np.sqrt((chords**2).sum(axis=1).mean())) if len(chords) else 0.0
     if len(chords) < 10 or speed < 0.5:
-        return report(None, "no GNSS track in motion to check it by")
+        return None, "no GNSS track in motion to check it by"
     forward = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
-    along = np.column_stack([forward[:, 0] * mean[:, 0], forward[:, 1] * mean[:, 0]])  # body x laid along the track
+    # Body x laid along the track, either way: a craft may go astern.
+    along = forward * np.abs(mean[:, :1])
     errors = [float(np.sqrt(((v - chords) ** 2).sum(axis=1).mean())) for v in (mean[:, :2], mean[:, 1::-1], along)]
     best = int(np.argmin(errors))
     why = f"differs from the GNSS track by {errors[best]:.2f} m/s RMS, {errors[0]:.2f} m/s as east, north, up"
-    return report(_AXES[best] if errors[best] < _FITS * speed else "unknown", why)
+    return (_AXES[best] if errors[best] < _FITS * speed else "unknown"), why
+
+
+def velocity_report(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, tf_frame: str | None) -> VelocityReport:
+    """Return the axes of a twist or vector; `tf_frame`: its frame, where /tf_static knows it; else as `axes_of`."""
+    axes, why = axes_of(stream, stamps_ns, p_m)
+    return VelocityReport(topic=stream.topic, msgtype=stream.msgtype, axes=axes, why=why, tf_frame=tf_frame)
+
+
+def odometry_report(
+    stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, origin: Vec | None, world: str
+) -> OdometryReport:
+    """Guess what an odometry or pose topic is, by its name and whether it reports the speed of the craft.
+
+    Args:
+        origin, world: of its frame, as `origin_of` tells them; else as `axes_of`.
+    """
+    rows = stream.rows[sane(stream)]
+    speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
+    name = stream.topic.lower()
+    if any(word in name for word in ("truth", "groundtruth", "/gt")):
+        role, why = "truth", "its name says so"
+    elif stream.msgtype != ODOMETRY or speed <= 0.05:
+        role, why = "pose", "it reports poses and no speed"
+    else:
+        axes, fit = axes_of(stream, stamps_ns, p_m)
+        role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: looks like wheel odometry"
+        if axes not in (None, BODY_AXES):
+            role, why = "pose", f"its speeds are none along the craft: {fit}"
+    return OdometryReport(
+        topic=stream.topic,
+        msgtype=stream.msgtype,
+        frame_id=stream.frame_id,
+        role=role,
+        max_speed_mps=speed,
+        why=why,
+        origin=origin,
+        world=world,
+    )
+
+
+def motions_of(
+    wheels: Sequence[Stream], twists: Sequence[tuple[Stream, VelocityReport]], fixes: Sequence[Stream]
+) -> list[Motion]:
+    """Return how the craft moved, by wheels, by velocities and by fixes: what tells its speed best first.
+
+    Args:
+        wheels: odometry that reports the speed along the craft. twists: velocities, and in which axes they are: what fits
+            the track in none is something else, as a `Vector3Stamped` may be anything.
+    """
+    found = [m for s in wheels if (m := _told(s, BODY_AXES)) and float(np.ptp(m.speed_mps)) > 0.2]
+    for stream, report in twists:
+        if report.axes == "unknown" or (stream.msgtype == VECTOR and report.axes not in (EAST_AXES, NORTH_AXES)):
+            continue
+        motion = _told(stream, report.axes or EAST_AXES)
+        if motion is not None and float(np.percentile(np.abs(motion.speed_mps), 90)) > 0.5:
+            found.append(motion)
+    return found + [m for s in fixes if (m := _driven(s))]
+
+
+def _told(stream: Stream, axes: str) -> Motion | None:
+    """The motion that a stream of velocities tells; NaN: before the first fix."""
+    keep = sane(stream)
+    keep = keep[np.isfinite(stream.rows[keep, -3:-1]).all(axis=1)] if len(keep) else keep
+    if len(keep) <= _FEWEST:
+        return None
+    v = stream.rows[keep, -3:]
+    origin = int(stream.stamps_ns[keep[0]])
+    t = (stream.stamps_ns[keep] - origin) / NS_PER_S
+    if axes == BODY_AXES:
+        return Motion(stream.topic, origin, t, v[:, 0])
+    east, north = (v[:, 1], v[:, 0]) if axes == NORTH_AXES else (v[:, 0], v[:, 1])
+    return Motion(stream.topic, origin, t, np.hypot(east, north), summed(t, east + 1j * north))
+
+
+def _driven(fixes: Stream) -> Motion | None:
+    """The motion that fixes tell: slow, their noise hides whether the craft stands."""
+    stamps, p, _ = track(fixes)
+    if len(stamps) <= _FEWEST:
+        return None
+    t = (stamps - stamps[0]) / NS_PER_S
+    step = max(1, round(_WINDOW_S / float(np.median(np.diff(t)))))
+    if len(t) <= step + 1:
+        return None
+    v = (p[step:, :2] - p[:-step, :2]) / (t[step:] - t[:-step])[:, None]
+    middle = (t[step:] + t[:-step]) / 2.0
+    speed = np.interp(t, middle, np.hypot(v[:, 0], v[:, 1]))
+    fast = float(np.percentile(speed, 90)) > _FAST_MPS
+    return Motion(fixes.topic, int(stamps[0]), t, speed, p[:, 0] + 1j * p[:, 1], rests=fast)
 
 
 def _pairs(stamps_ns: NDArray[np.int64], v: Array, track_ns: NDArray[np.int64], p_m: Array) -> tuple[Array, Array]:
@@ -56,7 +148,6 @@ def _pairs(stamps_ns: NDArray[np.int64], v: Array, track_ns: NDArray[np.int64], 
     begin, end = (index[at[end] - at[begin] < 2.0 * _CHORD_S] for index in (begin, end))
     if not len(begin):
         return none
-    travelled = np.vstack([np.zeros(3), np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t)[:, None], axis=0)])
-    there = np.column_stack([np.interp(at, t, travelled[:, k]) for k in range(3)])
+    there = np.column_stack([np.interp(at, t, summed(t, v[:, k])) for k in range(3)])
     span = (at[end] - at[begin])[:, None]
     return (p_m[end, :2] - p_m[begin, :2]) / span, (there[end] - there[begin]) / span

@@ -11,6 +11,7 @@ from graphloc.config import GnssConfig, ImuConfig, SlowErrorConfig
 from graphloc.frontends._clock import EPOCH_LIMIT_S
 from graphloc.frontends._fixes import SCATTERS
 from graphloc.frontends._reports import (
+    EAST_AXES,
     CompassReport,
     GnssReport,
     ImuReport,
@@ -18,8 +19,9 @@ from graphloc.frontends._reports import (
     MountedTopic,
     OdometryReport,
     VelocityReport,
+    filtered,
 )
-from graphloc.frontends.decode import IMU
+from graphloc.frontends.decode import IMU, VECTOR
 
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
@@ -32,6 +34,9 @@ _RTK_M = (
     0.1,
 )  # horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error
 _RTK_SCATTER_M = 0.1
+_FILTERED = (
+    "by its name a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
+)
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
 
@@ -62,12 +67,11 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     seen: set[str] = set()
     for k, compass in enumerate(compasses):
         name = compass.topic.partition(" ")[0]
-        yield _compass_block(_numbered("compass", k), compass, enabled=name not in seen)
+        yield _compass_block(_numbered("compass", k), compass, again=name in seen)
         seen.add(name)
     for compass in (c for c in inspection.compasses if not c.usable):
         yield [f"# orientation of {compass.topic}: left out as a compass; {compass.why}"]
-    for k, twist in enumerate(inspection.velocities):
-        yield _velocity_block(_numbered("gnss_velocity", k), twist, next(iter(inspection.gnss), None))
+    yield from _velocities(inspection)
     for k, item in enumerate(o for o in inspection.odometry if o.role == "pose"):
         yield [
             f"{_numbered('pose', k)}:",
@@ -199,22 +203,15 @@ def _noise_lines(imu: ImuReport) -> list[str]:
 def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     lines = [f"{name}:", "  kind: gnss", *_topic_lines(gnss.topic)]
     if not enabled:
-        lines.append("  enabled: false  # guess: the receiver with most fixes is used")
+        why = _FILTERED if filtered(gnss.topic) else "the receiver with most fixes is used"
+        lines.append(f"  enabled: false  # guess: {why}")
+    else:
+        lines += _filtered_lines(gnss.topic)
     if gnss.tf_frame is not None:
         lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # /tf_static knows it")
     else:
         lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
-    default = GnssConfig()
-    claimed = max(gnss.reported_sigma_m[:2]) if gnss.reported_sigma_m else default.default_horizontal_sigma_m
-    if gnss.white_m is not None and gnss.white_m > SCATTERS * claimed:
-        scatter, times = f"guess: fixes scatter by {gnss.white_m:.2f} m from one to the next", gnss.white_m / claimed
-        if gnss.reported_sigma_m:
-            lines.append(f"  sigma_scale: {times:.1f}  # {scatter}, and claim {claimed:.2f} m")
-        else:
-            lines.append(f"  default_horizontal_sigma_m: {gnss.white_m:.1f}  # {scatter}, and claim nothing")
-            lines.append(
-                f"  default_vertical_sigma_m: {times * default.default_vertical_sigma_m:.1f}  # guess: as many times"
-            )
+    lines += _scatter_lines(gnss)
     lines += _rtk_lines(gnss)
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
     if wanders:
@@ -228,6 +225,19 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         off = "; {enabled: false} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
         lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{off}")
     return lines
+
+
+def _scatter_lines(gnss: GnssReport) -> list[str]:
+    """What the fixes scatter by, where they claim far less."""
+    default = GnssConfig()
+    claimed = max(gnss.reported_sigma_m[:2]) if gnss.reported_sigma_m else default.default_horizontal_sigma_m
+    if gnss.white_m is None or gnss.white_m <= SCATTERS * claimed:
+        return []
+    scatter, times = f"guess: fixes scatter by {gnss.white_m:.2f} m from one to the next", gnss.white_m / claimed
+    if gnss.reported_sigma_m:
+        return [f"  sigma_scale: {times:.1f}  # {scatter}, and claim {claimed:.2f} m"]
+    vertical = f"  default_vertical_sigma_m: {times * default.default_vertical_sigma_m:.1f}  # guess: as many times"
+    return [f"  default_horizontal_sigma_m: {gnss.white_m:.1f}  # {scatter}, and claim nothing", vertical]
 
 
 def _rtk_lines(gnss: GnssReport) -> list[str]:
@@ -246,12 +256,33 @@ def _rtk_lines(gnss: GnssReport) -> list[str]:
     ]
 
 
-def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None) -> list[str]:
+def _velocities(inspection: Inspection) -> Iterator[list[str]]:
+    """Velocities, of which one is used: of two that a device says of itself, neither tells what the other does not."""
+    gnss = next(iter(inspection.gnss), None)
+    known = [v for v in inspection.velocities if v.axes != "unknown"]
+    told = [v for v in known if v.axes == EAST_AXES] or [v for v in known if v.axes is None and v.msgtype != VECTOR]
+    used = min(told, key=lambda v: filtered(v.topic), default=None)
+    for k, twist in enumerate(known):
+        off = None
+        if twist.axes not in (None, EAST_AXES):
+            off = f"east, north, up is wanted, its axes look {twist.axes}; {twist.why}"
+        elif twist.axes is None and twist.msgtype == VECTOR:
+            off = f"nothing tells that it is a velocity; {twist.why}"
+        elif twist is not used:
+            off = f"true if it comes of another receiver than {used.topic if used else 'that'}; {twist.why}"
+        yield _velocity_block(_numbered("gnss_velocity", k), twist, gnss, off)
+    for twist in inspection.velocities:
+        if twist not in known:
+            yield [f"# {twist.topic}: left out, it is no velocity of the craft; {twist.why}"]
+
+
+def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, off: str | None) -> list[str]:
     lines = [f"{name}:", "  kind: gnss_velocity", *_topic_lines(twist.topic)]
-    if twist.axes not in (None, "east, north, up"):
-        lines.append(f"  enabled: false  # guess: east, north, up is wanted, its axes look {twist.axes}; {twist.why}")
+    if off is not None:
+        lines.append(f"  enabled: false  # guess: {off}")
     else:
         lines[-1] += f"  # guess: a velocity in east, north, up; {twist.why}"
+        lines += _filtered_lines(twist.topic)
     frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
     evidence = "/tf_static knows it" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
     if frame is not None:
@@ -261,7 +292,11 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None) -
     return lines
 
 
-def _compass_block(name: str, compass: CompassReport, *, enabled: bool) -> list[str]:
+def _filtered_lines(topic: str) -> list[str]:
+    return [f"  # guess: {_FILTERED}"] if filtered(topic) else []
+
+
+def _compass_block(name: str, compass: CompassReport, *, again: bool) -> list[str]:
     lines = [
         f"{name}:",
         "  kind: compass",
@@ -270,7 +305,9 @@ def _compass_block(name: str, compass: CompassReport, *, enabled: bool) -> list[
     ]
     if compass.unit is not None:
         lines.append(f"  unit: {compass.unit}  # guess: by how large its numbers are")
-    if not enabled:
+    if compass.like:
+        lines.append(f"  enabled: false  # guess: it says what {compass.like} says, and counts no second time")
+    elif again:
         lines.append(
             "  enabled: false  # guess: another heading of the same topic is used, a true one before a magnetic one"
         )

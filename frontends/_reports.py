@@ -3,12 +3,21 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from graphloc.plain import plain
 
 Vec = tuple[float, float, float]
+# Of MAVROS, microstrain_inertial, robot_localization, xsens_mti: what an EKF makes of receiver and IMU.
+_FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
+EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
+
+
+def filtered(topic: str) -> bool:
+    """Return whether a place or velocity is a filter's output, by the name of its topic."""
+    return bool(_FILTERED.search(topic))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,6 +121,7 @@ class CompassReport:
         usable: whether it fits the course; convention: the better one.
         offset_deg: mean of yaw minus course; scatter_deg: its circular standard deviation.
         samples: courses compared; why: the judgement in words. unit: of bare numbers, else None.
+        like: an orientation that says the same, of the same device, else ''.
     """
 
     topic: str
@@ -123,13 +133,15 @@ class CompassReport:
     samples: int
     why: str
     unit: str | None = None
+    like: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityReport:
-    """A velocity topic: the axes that fit the GNSS track (None: nothing to judge by), and why."""
+    """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why."""
 
     topic: str
+    msgtype: str
     axes: str | None
     why: str
     tf_frame: str | None

@@ -20,14 +20,14 @@ from graphloc.frontends._assess import (
     courses_of,
     gnss_report,
     headings,
-    motion_of,
     on_one_clock,
     sane,
+    says_the_same,
     topic_report,
     track,
 )
 from graphloc.frontends._assess_imu import imu_report, samples_of, turning_of
-from graphloc.frontends._assess_velocity import velocity_report
+from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import origin_of
 from graphloc.frontends._clock import refuse_woven
 from graphloc.frontends._draft import draft_config
@@ -43,6 +43,7 @@ from graphloc.frontends._reports import (
     TopicReport,
     Vec,
     VelocityReport,
+    filtered,
 )
 from graphloc.frontends._source import Bag
 from graphloc.frontends._streams import Stream, read_streams
@@ -110,23 +111,27 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     heard = {s.topic: s for s in filled}
     fixes = [s for s in filled if s.msgtype in _FIXES]
     poses = [s for s in filled if s.msgtype in (ODOMETRY, POSE, PLAIN_POSE)]
-    wheels = [s for s in poses if _role(s)[0] == "check_speed"]
-    twists = [s for s in filled if s.msgtype in (TWIST, PLAIN_TWIST, VECTOR)]
-    motion = motion_of(wheels, twists, fixes)
     body = tree.body()
     # The best first: what they say is what the others are judged by.
     found_gnss = [g for s in fixes if (g := gnss_report(by_topic[s.topic], _known(s, tree, body)))]
-    found_gnss.sort(key=lambda g: (-g.fixes, g.without_height))
+    found_gnss.sort(key=lambda g: (filtered(g.topic), -g.fixes, g.without_height))
     stamps, p_m, scatter_m, first = _best_track(heard, found_gnss)
     frame = found_gnss[0].tf_frame if found_gnss else None
     mount = tree.resolve(body, frame) if frame else None
     antenna = None if mount is None else mount[0]
     courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
-    found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motion, courses, tree, body))]
+    told = [(s, odometry_report(s, stamps, p_m, *origin_of(s, stamps, p_m, first, antenna))) for s in poses]
+    twists = [
+        (s, velocity_report(s, stamps, p_m, _known(s, tree, body)))
+        for s in filled
+        if s.msgtype in (TWIST, PLAIN_TWIST, VECTOR)
+    ]
+    motions = motions_of([s for s, report in told if report.role == "check_speed"], twists, fixes)
+    found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motions, courses, tree, body))]
     found_imus.sort(key=lambda i: i.gyro_noise_mdps)
     turning = turning_of(heard[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
     candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU, *NUMBERS)]
-    found_compasses = [(c, s) for s in candidates if (c := compass_report(s, courses, turning))]
+    found_compasses = _without_echoes([(c, s) for s in candidates if (c := compass_report(s, courses, turning))])
     used = (
         {g.topic for g in found_gnss}
         | {i.topic for i in found_imus}
@@ -147,8 +152,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             _asked_together(_timed(c, s, by_topic[s.topic], turning), s, [(i, heard[i.topic]) for i in found_imus])
             for c, s in found_compasses
         ),
-        odometry=tuple(_odometry_report(s, *origin_of(s, stamps, p_m, first, antenna)) for s in poses),
-        velocities=tuple(velocity_report(s, stamps, p_m, _known(s, tree, body)) for s in twists),
+        odometry=tuple(report for _, report in told),
+        velocities=tuple(report for _, report in twists),
         lidars=_mounted(clouds, tree, body),
         cameras=tuple(
             replace(camera, listed=bool(set(LISTS) & set(topics[camera.topic].msgtypes)))
@@ -162,6 +167,21 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             *_useless(streams, used),
         ),
     )
+
+
+def _without_echoes(compasses: Sequence[tuple[CompassReport, Stream]]) -> list[tuple[CompassReport, Stream]]:
+    """The compasses, those that have no stamp last; of those that say what one before them says, what that is."""
+    own: list[tuple[CompassReport, Stream]] = []
+    found = []
+    for report, stream in sorted(compasses, key=lambda pair: pair[1].msgtype in NUMBERS):
+        for other, heard in own if report.usable else ():
+            if says_the_same(heard, stream, mirrored=report.convention != other.convention):
+                report = replace(report, like=other.topic)
+                break
+        else:
+            own += [(report, stream)] if report.usable else []
+        found.append((report, stream))
+    return found
 
 
 def _timed(report: CompassReport, stream: Stream, told: Stream, turning: Turning | None) -> CompassReport:
@@ -295,32 +315,6 @@ def _best_track(
     stamps, p, rows = track(by_topic[best.topic])
     good = ~stuck(stamps, rows[:, :2], p[:, :2])
     return stamps[good], p[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first
-
-
-def _role(stream: Stream) -> tuple[str, float, str]:
-    """Guess what an odometry or pose topic is, by its name and whether it reports a speed; say the speed and why."""
-    rows = stream.rows[sane(stream)]
-    speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
-    name = stream.topic.lower()
-    if any(word in name for word in ("truth", "groundtruth", "/gt")):
-        return "truth", speed, "its name says so"
-    if stream.msgtype == ODOMETRY and speed > 0.05:
-        return "check_speed", speed, f"it reports forward speeds up to {speed:.1f} m/s: looks like wheel odometry"
-    return "pose", speed, "it reports poses and no speed"
-
-
-def _odometry_report(stream: Stream, origin: Vec | None, world: str) -> OdometryReport:
-    role, speed, why = _role(stream)
-    return OdometryReport(
-        topic=stream.topic,
-        msgtype=stream.msgtype,
-        frame_id=stream.frame_id,
-        role=role,
-        max_speed_mps=speed,
-        why=why,
-        origin=origin,
-        world=world,
-    )
 
 
 def render(inspection: Inspection) -> str:

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`inspect` on bags of drivers that say much: what is a velocity, whose output a filter's is, what says the same twice."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphloc.config import VesselConfig
+from graphloc.frames import Array
+from graphloc.frontends.inspect import Inspection
+from tests.bagfactory import START_NS, Item, Messages, S
+from tests.test_inspect import DATUM, drive, look, rotation_z
+
+WAVE_S, WAVE_RAD = 3.0, 0.03
+
+
+def boat(make: Messages, yaw_deg: float) -> list[Item]:
+    """At 1.2 m/s in waves, turning to and fro; an IMU at 50 Hz turned by `yaw_deg`, fixes at 5 Hz that scatter by 0.3 m.
+
+    Waves of 0.03 rad put 0.3 m/s^2 of gravity into the horizontal accelerations; the turns are worth 0.12 m/s^2.
+    """
+    rng, dt = np.random.default_rng(3), 0.02
+    t = np.arange(0.0, 200.0, dt)
+    rate = 0.1 * np.sin(2.0 * np.pi * t / 40.0)
+    yaw = 0.1 * 40.0 / (2.0 * np.pi) * (1.0 - np.cos(2.0 * np.pi * t / 40.0))
+    way = np.cumsum(1.2 * np.exp(1j * yaw)) * dt
+    phase = 2.0 * np.pi * t / WAVE_S
+    accel = np.column_stack(
+        [-9.81 * WAVE_RAD * np.sin(phase + 1.0), 1.2 * rate + 9.81 * WAVE_RAD * np.sin(phase), 0 * t]
+    )
+    gyro = np.column_stack([0 * t, 0 * t, rate])
+    accel += np.array([0.0, 0.0, 9.81]) + rng.normal(0, 0.02, accel.shape)
+    gyro += rng.normal(0, 1e-3, gyro.shape)
+    places = np.column_stack([way.real, way.imag, 0 * t]) + 0.3 * rng.normal(size=(len(t), 3))
+    lla, R = DATUM.geodetic_from_enu(places), rotation_z(yaw_deg)
+    items: list[Item] = []
+    for k in range(len(t)):
+        stamp = START_NS + k * S // 50
+        items.append(("/imu", stamp, make.imu(stamp, R.T @ accel[k], R.T @ gyro[k])))
+        if k % 10 == 0:
+            items.append(("/fix", stamp, make.fix(stamp, *lla[k])))
+    return items
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0, -90.0])
+def test_fixes_of_a_slow_craft_in_waves_tell_the_yaw_of_its_imu(yaw_deg: float, tmp_path: Path) -> None:
+    found, _, _ = look(tmp_path, boat(Messages(2), yaw_deg), Messages(2))
+    mount = found.imus[0].mount
+    assert "yaw by the motion of /fix" in mount.evidence
+    assert abs((mount.rpy_deg[2] - yaw_deg + 180.0) % 360.0 - 180.0) < 0.5
+
+
+def beside(make: Messages, told: Callable[[int, Array, float], list[tuple[str, Any]]]) -> list[Item]:
+    """`drive` without wheels, its IMU turned by 90 deg, and what `told` says at each fix of stamp, velocity in ENU and yaw."""
+    items = [item for item in drive(make, rotation_z(90.0)) if item[0] != "/wheel/odom"]
+    fixes = [m for topic, _, m in items if topic == "/fix"]
+    places = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for m in fixes]).T)
+    stamps = np.array([m.header.stamp.sec * S + m.header.stamp.nanosec for m in fixes])
+    v = np.gradient(places, (stamps - stamps[0]) * 1e-9, axis=0)
+    yaw = np.unwrap(np.arctan2(v[:, 1], v[:, 0]))
+    for stamp, speed, angle in zip(stamps.tolist(), v, yaw.tolist(), strict=True):
+        items += [(topic, stamp + 1_000_000, m) for topic, m in told(stamp, speed, angle)]
+    return sorted(items, key=lambda item: item[1])
+
+
+def vector(make: Messages, stamp: int, xyz: Any) -> Any:
+    return make.t["geometry_msgs/msg/Vector3Stamped"](header=make.header(stamp), vector=make.vector(xyz))
+
+
+def plain_twist(make: Messages, stamp: int, v: Any) -> Any:
+    twist = make.t["geometry_msgs/msg/Twist"](linear=make.vector(v), angular=make.vector((0, 0, 0)))
+    return make.t["geometry_msgs/msg/TwistStamped"](header=make.header(stamp), twist=twist)
+
+
+def seen(
+    tmp_path: Path, told: Callable[[Messages, int, Array, float], list[tuple[str, Any]]]
+) -> tuple[Inspection, VesselConfig, str]:
+    make = Messages(2)
+    return look(tmp_path, beside(make, lambda *what: told(make, *what)), make)
+
+
+def test_a_vector_that_is_no_velocity_is_neither_fused_nor_the_motion(tmp_path: Path) -> None:
+    """Drivers of Xsens and of the UM7 say magnetic field, angles and more as `Vector3Stamped`."""
+
+    def told(make: Messages, stamp: int, v: Array, yaw: float) -> list[tuple[str, Any]]:
+        field = 2.0 * np.array([np.cos(1.0 - yaw), np.sin(1.0 - yaw), 0.0])
+        return [("/imu/mag", vector(make, stamp, field)), ("/velocity", vector(make, stamp, v))]
+
+    found, config, text = seen(tmp_path, told)
+    assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
+    assert [s.topic for s in config.of_kind("gnss_velocity").values()] == ["/velocity"]
+    assert config.sensors["gnss_velocity"].enabled
+    assert "# /imu/mag: left out" in text
+
+
+def test_a_vector_that_nothing_tells_to_be_a_velocity_is_not_fused(tmp_path: Path) -> None:
+    make = Messages(2)
+    items = [item for item in drive(make, seconds=9) if item[0] != "/wheel/odom"]  # at rest
+    items += [("/imu/mag", at, vector(make, at, (0.3, 0.1, -0.8))) for topic, at, _ in items if topic == "/fix"]
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert not config.sensors["gnss_velocity"].enabled
+
+
+def test_a_filter_is_no_receiver_and_counts_no_second_time(tmp_path: Path) -> None:
+    """MAVROS: what the autopilot's filter makes of receiver and IMU comes more often, and its velocity beside the receiver's."""
+
+    make = Messages(2)
+
+    def told(stamp: int, v: Array, yaw: float) -> list[tuple[str, Any]]:
+        return [
+            (topic, plain_twist(make, stamp, v))
+            for topic in ("/mavros/local_position/velocity_local", "/mavros/raw/gps_vel")
+        ]
+
+    items = beside(make, told)
+    often = []
+    for topic, at, m in items:
+        if topic == "/fix":
+            for more in (0, 50_000_000):
+                later = make.fix(at + more, m.latitude, m.longitude, m.altitude)
+                often.append(("/mavros/global_position/global", at + more, later))
+    _, config, text = look(tmp_path, sorted([*items, *often], key=lambda item: item[1]), make)
+    used = {s.topic for s in config.sensors.values() if s.enabled and s.kind in ("gnss", "gnss_velocity")}
+    assert used == {"/fix", "/mavros/raw/gps_vel"}
+    assert "a filter's output" in text
+
+
+def test_odometry_in_east_and_north_is_no_speed_along_the_craft(tmp_path: Path) -> None:
+    """MAVROS `global_position/local`: its twist is that of the world, whatever nav_msgs says."""
+
+    def told(make: Messages, stamp: int, v: Array, yaw: float) -> list[tuple[str, Any]]:
+        return [("/local", make.odometry(stamp, v=v.tolist()))]
+
+    found, config, _ = seen(tmp_path, told)
+    assert found.odometry[0].role == "pose"
+    assert config.check_speed_topic is None
+    assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
+
+
+@pytest.mark.parametrize(("noise_deg", "both"), [(0.0, False), (1.0, True)], ids=["the same", "another device"])
+def test_a_heading_that_is_said_twice_counts_once(noise_deg: float, both: bool, tmp_path: Path) -> None:
+    """MAVROS says its heading in `imu/data` and, clockwise from north and without a stamp, in `compass_hdg`."""
+    rng = np.random.default_rng(1)
+
+    def told(make: Messages, stamp: int, v: Array, yaw: float) -> list[tuple[str, Any]]:
+        own = yaw + np.radians(noise_deg) * rng.normal()
+        heading = make.t["std_msgs/msg/Float64"](data=float((90.0 - np.degrees(own)) % 360.0))
+        attitude = make.compass(stamp, (0.0, 0.0, np.sin(yaw / 2.0), np.cos(yaw / 2.0)))
+        return [("/attitude", attitude), ("/hdg", heading)]
+
+    _, config, text = seen(tmp_path, told)
+    used = {s.topic for s in config.of_kind("compass").values() if s.enabled}
+    assert used == {"/compass", "/attitude", *(["/hdg"] if both else [])}
+    assert ("it says what /attitude says" in text) is not both
