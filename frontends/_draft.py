@@ -9,7 +9,7 @@ from pathlib import Path
 
 from graphloc.config import GnssConfig, ImuConfig, SlowErrorConfig
 from graphloc.frontends._clock import EPOCH_LIMIT_S
-from graphloc.frontends._fixes import SCATTERS
+from graphloc.frontends._fixes import NOTHING_M, SCATTERS
 from graphloc.frontends._reports import (
     EAST_AXES,
     CompassReport,
@@ -228,9 +228,13 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
 
 
 def _scatter_lines(gnss: GnssReport) -> list[str]:
-    """What the fixes scatter by, where they claim far less."""
+    """What the fixes scatter by, where they claim far less; what they are taken for, where they claim next to nothing."""
     default = GnssConfig()
     claimed = max(gnss.reported_sigma_m[:2]) if gnss.reported_sigma_m else default.default_horizontal_sigma_m
+    if claimed > NOTHING_M:
+        taken = max(default.default_horizontal_sigma_m, max(gnss.scatter_m[:2]) if gnss.scatter_m else 0.0)
+        said = f"guess: fixes claim {claimed:.0f} m, which looks like a placeholder: taken as good to {taken:.1f} m"
+        return [f"  sigma_scale: {taken / claimed:.2g}  # {said}"]
     if gnss.white_m is None or gnss.white_m <= SCATTERS * claimed:
         return []
     scatter, times = f"guess: fixes scatter by {gnss.white_m:.2f} m from one to the next", gnss.white_m / claimed

@@ -18,7 +18,8 @@ _HELD_S = 2.5
 _OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp again, from which a line is due
 _FAST_S, _SLOW_S, _EVEN, _FEWEST = 0.25, 1.5, 0.2, 100  # steps: motion hides in none, in few, how even, how many tell
 _UNSTEADY_MPS2 = 4.0  # of slow ones, twice what a craft's acceleration changes by from step to step, most of the time
-_NOTHING_M = 100.0  # 1 sigma, from which a fix is none
+NOTHING_M = 100.0
+"""1 sigma from which a fix is none."""
 SCATTERS = 2.0
 """Scatter over the claim from which the claim is not believed."""
 
@@ -84,7 +85,7 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
     claimed = max(
         config.sigma_scale * float(np.sqrt(np.median(variances, axis=0).max())), config.min_horizontal_sigma_m
     )
-    if claimed > _NOTHING_M:
+    if claimed > NOTHING_M:
         scatter = "" if found is None else f", though they scatter by {found:.2f} m from one to the next"
         said = f"{sensor}: its fixes count as good to {claimed:.0f} m only, and so next to nothing{scatter}"
         return [f"{said}: by the covariance of its messages, and sigma_scale; look at what the driver writes there"]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphloc.config import VesselConfig
+from graphloc.config import GnssConfig, VesselConfig
 from graphloc.frames import Array
 from graphloc.frontends.inspect import Inspection
 from tests.bagfactory import START_NS, Item, Messages, S
@@ -155,3 +155,11 @@ def test_a_heading_that_is_said_twice_counts_once(noise_deg: float, both: bool, 
     used = {s.topic for s in config.of_kind("compass").values() if s.enabled}
     assert used == {"/compass", "/attitude", *(["/hdg"] if both else [])}
     assert ("it says what /attitude says" in text) is not both
+
+
+def test_a_covariance_that_is_a_placeholder_is_told_from_one(tmp_path: Path) -> None:
+    """Drivers that know none write 99999 m^2: such fixes would tell next to nothing."""
+    _, config, _ = look(tmp_path, drive(Messages(2), status=0, sigma_m=316.0), Messages(2))
+    gnss = config.sensors["gnss"]
+    assert isinstance(gnss, GnssConfig)
+    assert gnss.sigma_scale * 316.0 == pytest.approx(gnss.default_horizontal_sigma_m, rel=0.02)
