@@ -26,6 +26,7 @@ from graphloc.stuck import stuck, stuck_warning
 from graphloc.time import NS_PER_S
 
 _TURNS_DEG, _SAME_DEG = 5.0, 0.2
+_WINDOW_S, _FAST_MPS = 1.0, 2.0
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
 
 
@@ -160,6 +161,28 @@ def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
         return Courses(np.zeros(0, dtype=np.int64), np.zeros(0))
     p = world_from_fixes(fixes, Datum(fixes[0].position))[:, :2]
     return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(_scatter(p).max()))
+
+
+def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> Motion | None:
+    """Return the motion of one receiver's fixes, in any order; None of fewer than twenty."""
+    if len(fixes) < 20:
+        return None
+    moments = {m.stamp_ns: m for m in fixes}
+    ordered = [moments[stamp_ns] for stamp_ns in sorted(moments)]
+    p = world_from_fixes(ordered, Datum(ordered[0].position))
+    return motion_of_places(source, np.array([m.stamp_ns for m in ordered], dtype=np.int64), p)
+
+
+def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> Motion | None:
+    """Return the motion that places (N, 3), m, tell: of a slow craft, their noise hides whether it stands; None of few."""
+    t = (stamps_ns - stamps_ns[0]) / NS_PER_S if len(stamps_ns) else np.zeros(0)
+    step = max(1, round(_WINDOW_S / float(np.median(np.diff(t))))) if len(t) > 1 else 1
+    if len(t) < max(20, step + 2):
+        return None
+    v = (p_m[step:, :2] - p_m[:-step, :2]) / (t[step:] - t[:-step])[:, None]
+    speed = np.interp(t, (t[step:] + t[:-step]) / 2.0, np.hypot(v[:, 0], v[:, 1]))
+    fast = float(np.percentile(speed, 90)) > _FAST_MPS
+    return Motion(source, int(stamps_ns[0]), t, speed, p_m[:, 0] + 1j * p_m[:, 1], rests=fast)
 
 
 def _scatter(p_m: Array) -> Array:

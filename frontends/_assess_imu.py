@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import Courses, Motion, Turning, against_turning, sane, summed, vec
+from graphloc.frontends._mount_yaw import yaw_in_craft
 from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import NEVER_STILL_RADPS, without_gravity
 from graphloc.frontends._streams import Stream
@@ -20,14 +21,10 @@ from graphloc.frontends._tf import StaticTree
 from graphloc.hangs import hanging, hanging_warning
 from graphloc.time import NS_PER_S
 
-_WINDOW_S = 1.0
 # Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
 _COURSE_S, _COURSE_CLEAR = 12.0, 0.6
 _UPSIDE_DOWN_DEG = 150.0
-_MIN_COHERENCE = 0.25  # and 4 / sqrt(windows), four times what chance gives
-# Half the time over which an acceleration is asked: short, a car's fits best; longer, waves and the noise of fixes are less.
-_HALF_S = (0.5, 1.0, 2.0, 4.0)
-_FEWEST, _MOVES_M = 20, 1.0  # windows; a shorter way has no direction
+_ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, or an antenna far ahead, make less
 
 
 def samples_of(imu: Stream) -> tuple[NDArray[np.intp], list[str]]:
@@ -42,10 +39,6 @@ def mount_guess(
 ) -> MountGuess:
     """Return how an IMU sits in the body: from /tf_static, else levelled by gravity and turned by motion.
 
-    Levelled, with unknown yaw psi, the horizontal acceleration as complex number a = ax + i ay meets that of
-    the craft, m, forward + i to port, as m = exp(i psi) a. So psi = arg sum(conj(a) m), and
-    |sum| / sqrt(sum |a|^2 sum |m|^2) says how far the data support it. Snapped to quarter turns.
-
     Args:
         accel: (N, 3) m/s^2; gyro: (N, 3) rad/s, of the samples that are kept.
     """
@@ -56,6 +49,10 @@ def mount_guess(
         rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
         tilt = float(np.degrees(np.arccos(np.clip((pose[1] @ up)[2] / max(size, 1e-9), -1.0, 1.0))))
         note = "" if size < 2.0 or tilt < 20.0 else f", BUT gravity is then {tilt:.0f} deg off body z: check"
+        if not note and motions:
+            body_axes = accel @ pose[1].T, gyro @ pose[1].T
+            turned = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], *body_axes, motions)
+            note = f", BUT {turned.said}: check" if turned is not None and turned.astray else ""
         return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"/tf_static knows it{note}")
     if size < 0.5 * STANDARD_GRAVITY_MPS2:
         return _turned(imu, accel, gyro, motions, np.eye(3), "no gravity to level by: taken as level")
@@ -92,63 +89,22 @@ def _level(axis: Array) -> Array:
 
 
 def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion]) -> tuple[float, str]:
-    """Return the quarter turn (deg) that fits the motion, and the evidence; `accel`, `gyro` are levelled."""
+    """Return the turn (deg) that fits the motion, and the evidence; `accel`, `gyro` are levelled.
+
+    A quarter turn, unless the motion tells clearly that it is none.
+    """
     if not motions:
         return 0.0, "no motion to tell its yaw by: taken as 0"
-    stamps = imu.stamps_ns[samples_of(imu)[0]]
-    t = (stamps - stamps[0]) / NS_PER_S
-    turned = summed(t, gyro[:, 2])
-    a = accel[:, 0] + 1j * accel[:, 1]
-    a = a - np.median(a.real) - 1j * np.median(a.imag)
-    felt = summed(t, summed(t, a * np.exp(1j * turned)))
-    tried = []
-    for motion in motions:
-        at = motion.t_s + (motion.origin_ns - stamps[0]) / NS_PER_S
-        tried += [(found, motion.source) for h in _HALF_S if (found := _yaw_by(t, turned, felt, at, motion, h))]
-    if not tried:
+    found = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], accel, gyro, motions)
+    if found is None:
         return 0.0, "too little motion to tell its yaw by: taken as 0"
-    (psi, coherence, chance), source = max(tried, key=lambda tried: tried[0][1] / tried[0][2])
-    if coherence < max(_MIN_COHERENCE, 4.0 * chance):
-        return 0.0, f"motion of {source} does not tell its yaw (coherence {coherence:.2f}): taken as 0"
-    quarter = float(np.degrees(wrap_angle(np.radians(90.0 * round(psi / 90.0)))))
-    return quarter, f"yaw by the motion of {source}: {psi:.0f} deg (coherence {coherence:.2f})"
-
-
-def _yaw_by(
-    t_s: Array, turned: Array, felt: NDArray[np.complex128], at_s: Array, motion: Motion, half_s: float
-) -> tuple[float, float, float] | None:
-    """Return by how much (deg) a levelled sensor is turned in the craft, how clear that is (0 to 1), and what chance makes.
-
-    Places p tell the mean acceleration about t as p(t + h) - 2 p(t) + p(t - h), and p(t + h) - p(t - h) where the craft
-    heads; so does the sensor, in its own axes at t.
-
-    Args:
-        t_s, turned, felt: (N,) of the sensor: times, how far it has turned, rad, and where its accelerations lead, m, in
-            the axes of its beginning. at_s: (M,) the motion's times. half_s: h.
-    """
-    there = np.interp(at_s, t_s, turned)
-    along = motion.way_m is None
-    way = summed(at_s, motion.speed_mps * np.exp(1j * there)) if motion.way_m is None else motion.way_m
-    middle = np.arange(max(t_s[0], at_s[0]) + half_s, min(t_s[-1], at_s[-1]) - half_s, _WINDOW_S / 2.0)
-
-    def bent(times: Array, places: NDArray[np.complex128]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """The second difference of places, and the first, over twice as long."""
-        behind, here, ahead = (np.interp(middle + k * half_s, times, places) for k in (-1, 0, 1))
-        return ahead - 2.0 * here + behind, ahead - behind
-
-    (moved, chord), (f, _) = bent(at_s, way), bent(t_s, felt)
-    faced = np.exp(1j * np.interp(middle, t_s, turned))
-    good = np.abs(chord) > _MOVES_M
-    windows = good.sum() * _WINDOW_S / 2.0 / half_s
-    if windows < _FEWEST:
-        return None
-    m = (moved * np.conj(faced if along else chord / np.maximum(np.abs(chord), _MOVES_M)))[good]
-    f = (f * np.conj(faced))[good]
-    m, f = m - m.mean(), f - f.mean()
-    power = float(np.sqrt((np.abs(f) ** 2).sum() * (np.abs(m) ** 2).sum()))
-    product = complex((np.conj(f) * m).sum())
-    coherence = abs(product) / power if power > 0.0 else 0.0
-    return float(np.degrees(np.angle(product))), coherence, 1.0 / float(np.sqrt(windows))
+    if not found.clear:
+        said = f"motion of {found.source} does not tell its yaw (coherence {found.coherence:.2f})"
+        return 0.0, f"{said}: taken as 0"
+    quarter = 90.0 * round(found.yaw_deg / 90.0)
+    askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
+    yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter))))
+    return yaw, f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
 
 
 def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Turning | None:

@@ -9,17 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import Motion, sane, summed, track
+from graphloc.frontends._assess import Motion, motion_of_places, sane, summed, track
 from graphloc.frontends._reports import BODY_AXES, EAST_AXES, NORTH_AXES, OdometryReport, Vec, VelocityReport
 from graphloc.frontends._streams import Stream
 from graphloc.frontends.decode import ODOMETRY, VECTOR
 from graphloc.time import NS_PER_S
 
-_WINDOW_S = 1.0
 _CHORD_S = 2.0
 _FITS = 0.4  # largest error of an axis convention that fits, as a share of the speed
 _AXES = (EAST_AXES, NORTH_AXES, BODY_AXES)
-_FEWEST, _FAST_MPS = 20, 2.0
+_FEWEST = 20
 
 
 def axes_of(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array) -> tuple[str | None, str]:
@@ -100,7 +99,8 @@ def motions_of(
         motion = _told(stream, report.axes or EAST_AXES)
         if motion is not None and float(np.percentile(np.abs(motion.speed_mps), 90)) > 0.5:
             found.append(motion)
-    return found + [m for s in fixes if (m := _driven(s))]
+    ways = [(s, *track(s)[:2]) for s in fixes]
+    return found + [m for s, at, p in ways if (m := motion_of_places(s.topic, at, p))]
 
 
 def _told(stream: Stream, axes: str) -> Motion | None:
@@ -116,22 +116,6 @@ def _told(stream: Stream, axes: str) -> Motion | None:
         return Motion(stream.topic, origin, t, v[:, 0])
     east, north = (v[:, 1], v[:, 0]) if axes == NORTH_AXES else (v[:, 0], v[:, 1])
     return Motion(stream.topic, origin, t, np.hypot(east, north), summed(t, east + 1j * north))
-
-
-def _driven(fixes: Stream) -> Motion | None:
-    """The motion that fixes tell: slow, their noise hides whether the craft stands."""
-    stamps, p, _ = track(fixes)
-    if len(stamps) <= _FEWEST:
-        return None
-    t = (stamps - stamps[0]) / NS_PER_S
-    step = max(1, round(_WINDOW_S / float(np.median(np.diff(t)))))
-    if len(t) <= step + 1:
-        return None
-    v = (p[step:, :2] - p[:-step, :2]) / (t[step:] - t[:-step])[:, None]
-    middle = (t[step:] + t[:-step]) / 2.0
-    speed = np.interp(t, middle, np.hypot(v[:, 0], v[:, 1]))
-    fast = float(np.percentile(speed, 90)) > _FAST_MPS
-    return Motion(fixes.topic, int(stamps[0]), t, speed, p[:, 0] + 1j * p[:, 1], rests=fast)
 
 
 def _pairs(stamps_ns: NDArray[np.int64], v: Array, track_ns: NDArray[np.int64], p_m: Array) -> tuple[Array, Array]:

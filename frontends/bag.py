@@ -17,9 +17,10 @@ import numpy as np
 
 from graphloc.config import CompassConfig, ImuConfig, VesselConfig
 from graphloc.errors import InputError
-from graphloc.frames import Array
-from graphloc.frontends._assess import courses_of_fixes
+from graphloc.frames import Array, rpy_from_rotation, wrap_angle
+from graphloc.frontends._assess import courses_of_fixes, motion_of_fixes
 from graphloc.frontends._beside import Beside, check_speed, true_trajectory
+from graphloc.frontends._mount_yaw import yaw_in_craft
 from graphloc.frontends._part import Bags
 from graphloc.frontends._readings import (
     Readings,
@@ -95,6 +96,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
     rows += reject_far_poses(sensors, warnings)
     rows += reject_set_back(sensors, [b for b in (truth, check) if b], warnings)
     warnings += clock_warnings(sensors)
+    mounts = _mounts(config, tree, bag.name)
     imu: ImuSeries | None = None
     measurements: list[Measurement] = []
     for readings in sorted(sensors, key=lambda r: r.config.kind != "imu"):
@@ -107,7 +109,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
             measurements += [v for v in readings.values if isinstance(v, Measurement)]
     if imu is not None:
         _refuse_unit(imu, sensors)
-        warnings += _turn_warnings(imu, sensors)
+        warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, sensors, mounts, config)
     warnings += _silent(sensors, rows, topics) + _unstamped(sensors, topics)
     return Recording(
         source=bag.name if span is None else f"{bag.name}, {span.start_s:g} s to {span.end_s:g} s",
@@ -116,7 +118,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         rows=tuple(sorted(rows, key=lambda r: (r.seq < 0, r.seq, r.topic))),
         message_count=sum(len(r.values) for r in sensors) + sum(r.count for r in rows),
         topics={r.sensor: r.config.topic for r in sensors},
-        mounts=_mounts(config, tree, bag.name),
+        mounts=mounts,
         truth=true_trajectory(truth, warnings) if truth else None,
         check_speed=check_speed(check) if check else None,
         warnings=tuple(warnings),
@@ -336,6 +338,25 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
             headings = [v for v in readings.values if isinstance(v, CompassHeading)]
             lines += turn_warnings(imu, readings.sensor, headings, readings.config.convention)
     return lines
+
+
+def _mount_warnings(
+    imu: ImuSeries, sensors: Sequence[Readings], mounts: Mapping[str, tuple[Array, Array]], config: VesselConfig
+) -> list[str]:
+    """Say where the IMU is turned in the craft by how the fixes move: sensors that tell the heading would not contradict."""
+    mount = config.sensors[imu.sensor].mount
+    R = mounts[imu.sensor][1] if imu.sensor in mounts else mount.R_body_sensor
+    told = {r.sensor: [v for v in r.values if isinstance(v, GnssPosition)] for r in sensors}
+    motions = [m for sensor, fixes in told.items() if (m := motion_of_fixes(sensor, fixes))]
+    found = (
+        yaw_in_craft(imu.stamps_ns, imu.accel_mps2 @ R.T, imu.gyro_radps @ R.T, motions) if len(imu.stamps_ns) else None
+    )
+    if found is None or not found.astray:
+        return []
+    wanted = float(np.degrees(wrap_angle(rpy_from_rotation(R)[2] + np.radians(found.yaw_deg))))
+    key = f"mount of {mount.tf_frame} in /tf_static" if mount.tf_frame else f"mount.rpy_deg of sensors.{imu.sensor}"
+    said = f"{imu.sensor}: {found.said}: by that the yaw in {key} would be {wanted:.0f}"
+    return [f"{said} deg; it is right as it is only of a craft that goes astern or sideways"]
 
 
 def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) -> list[str]:

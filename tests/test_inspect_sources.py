@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphloc.config import GnssConfig, VesselConfig
+from graphloc.config import GnssConfig, VesselConfig, parse_config
 from graphloc.frames import Array
+from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import Inspection
-from tests.bagfactory import START_NS, Item, Messages, S
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.test_bag import KINDS
 from tests.test_inspect import DATUM, drive, look, rotation_z
 
 WAVE_S, WAVE_RAD = 3.0, 0.03
@@ -51,6 +53,40 @@ def test_fixes_of_a_slow_craft_in_waves_tell_the_yaw_of_its_imu(yaw_deg: float, 
     mount = found.imus[0].mount
     assert "yaw by the motion of /fix" in mount.evidence
     assert abs((mount.rpy_deg[2] - yaw_deg + 180.0) % 360.0 - 180.0) < 0.5
+
+
+def test_an_imu_that_sits_askew_is_not_taken_for_straight(tmp_path: Path) -> None:
+    """It was snapped to a quarter turn, and 40 deg were lost."""
+    found, _, _ = look(tmp_path, drive(Messages(2), rotation_z(40.0)), Messages(2))
+    assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 40.0), abs=2.0)
+
+
+def test_a_mount_in_tf_static_that_the_motion_denies_is_said(tmp_path: Path) -> None:
+    make = Messages(2)
+    transforms = make.transforms([("base_link", "imu_link", (0, 0, 0), (0, 0, 0, 1))])
+    items = [("/tf_static", START_NS, transforms), *drive(make, rotation_z(90.0))]
+    found, _, text = look(tmp_path, items, make)
+    assert found.imus[0].mount.tf_frame == "imu_link"
+    assert "BUT what it feels fits how /wheel/odom moves only turned by +9" in text
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 90.0])
+def test_a_mount_that_the_fixes_deny_is_said_when_a_bag_is_read(turned_deg: float, tmp_path: Path) -> None:
+    """A compass that tells the right heading leaves the course right: nothing else was said, and the track was metres off."""
+    make = Messages(2)
+    path = write_bag(tmp_path / "run", make, drive(make, rotation_z(90.0 + turned_deg), status=0, sigma_m=1.0))
+    sensors = {
+        "imu": {"kind": "imu", "topic": "/imu", "mount": {"rpy_deg": [0, 0, 90]}},
+        "gnss": {"kind": "gnss", "topic": "/fix"},
+        "compass": {"kind": "compass", "topic": "/compass", "convention": "ned"},
+    }
+    said = [
+        w
+        for w in read_recording(path, parse_config({"sensors": sensors}, KINDS, "test")).warnings
+        if "what it feels" in w
+    ]
+    assert len(said) == (turned_deg != 0.0)
+    assert all("mount.rpy_deg of sensors.imu would be 180 deg" in w or "would be -180 deg" in w for w in said)
 
 
 def beside(make: Messages, told: Callable[[int, Array, float], list[tuple[str, Any]]]) -> list[Item]:

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How an IMU is turned in the craft about the vertical, by what it feels and how the craft moves.
+
+Levelled, with unknown yaw psi, the horizontal acceleration as complex number a = ax + i ay meets that of the craft, m,
+forward + i to port, as m = exp(i psi) a. So psi = arg sum(conj(a) m), and |sum| / sqrt(sum |a|^2 sum |m|^2) says how far
+the data support it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+from graphloc.frontends._assess import Motion, summed
+from graphloc.time import NS_PER_S
+
+# Half the time over which an acceleration is asked: short, a car's fits best; longer, waves and the noise of fixes are less.
+_HALF_S = (0.5, 1.0, 2.0, 4.0)
+_STEP_S = 0.5  # between two times at which it is asked
+_FEWEST, _MOVES_M = 20, 1.0  # windows; a shorter way has no direction
+_MIN_COHERENCE, _CLEAR = 0.25, 4.0  # and so many times what chance gives
+_ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
+
+
+@dataclass(frozen=True, slots=True)
+class YawInCraft:
+    """The turn from the craft's forward to the sensor's x, to port, deg; how clear it is, 0 to 1, and what chance makes."""
+
+    source: str
+    yaw_deg: float
+    coherence: float
+    chance: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether chance would not have it."""
+        return self.coherence >= max(_MIN_COHERENCE, _CLEAR * self.chance)
+
+    @property
+    def sigma_deg(self) -> float:
+        """1 sigma of the turn, of a phase of so many windows."""
+        return float(np.degrees(self.chance * np.sqrt(0.5 * (1.0 - self.coherence**2)) / self.coherence))
+
+    @property
+    def astray(self) -> bool:
+        """Whether a sensor that should not be turned is, clearly."""
+        return self.clear and abs(self.yaw_deg) > max(_ASTRAY_DEG, _CLEAR * self.sigma_deg)
+
+    @property
+    def said(self) -> str:
+        """What is astray, in words."""
+        return (
+            f"what it feels fits how {self.source} moves only turned by {self.yaw_deg:+.0f} deg about the vertical, to port "
+            f"(coherence {self.coherence:.2f})"
+        )
+
+
+def yaw_in_craft(
+    stamps_ns: NDArray[np.int64], accel: Array, gyro: Array, motions: Sequence[Motion]
+) -> YawInCraft | None:
+    """Return what is told most clearly by any motion over any time; None where none is long enough.
+
+    Args:
+        stamps_ns: (N,), increasing. accel, gyro: (N, 3) m/s^2, rad/s, levelled.
+    """
+    t = (stamps_ns - stamps_ns[0]) / NS_PER_S
+    turned = summed(t, gyro[:, 2])
+    a = accel[:, 0] + 1j * accel[:, 1]
+    a = a - np.median(a.real) - 1j * np.median(a.imag)
+    felt = summed(t, summed(t, a * np.exp(1j * turned)))
+    tried = []
+    for motion in motions:
+        at = motion.t_s + (motion.origin_ns - stamps_ns[0]) / NS_PER_S
+        tried += [found for half_s in _HALF_S if (found := _yaw_by(t, turned, felt, at, motion, half_s))]
+    return max(tried, key=lambda found: found.coherence / found.chance, default=None)
+
+
+def _yaw_by(
+    t_s: Array, turned: Array, felt: NDArray[np.complex128], at_s: Array, motion: Motion, half_s: float
+) -> YawInCraft | None:
+    """Return what a motion tells over one time.
+
+    Places p tell the mean acceleration about t as p(t + h) - 2 p(t) + p(t - h), and p(t + h) - p(t - h) where the craft
+    heads; so does the sensor, in its own axes at t.
+
+    Args:
+        t_s, turned, felt: (N,) of the sensor: times, how far it has turned, rad, and where its accelerations lead, m, in
+            the axes of its beginning. at_s: (M,) the motion's times. half_s: h.
+    """
+    there = np.interp(at_s, t_s, turned)
+    along = motion.way_m is None
+    way = summed(at_s, motion.speed_mps * np.exp(1j * there)) if motion.way_m is None else motion.way_m
+    middle = np.arange(max(t_s[0], at_s[0]) + half_s, min(t_s[-1], at_s[-1]) - half_s, _STEP_S)
+
+    def bent(times: Array, places: NDArray[np.complex128]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """The second difference of places, and the first, over twice as long."""
+        behind, here, ahead = (np.interp(middle + k * half_s, times, places) for k in (-1, 0, 1))
+        return ahead - 2.0 * here + behind, ahead - behind
+
+    (moved, chord), (f, _) = bent(at_s, way), bent(t_s, felt)
+    faced = np.exp(1j * np.interp(middle, t_s, turned))
+    good = np.abs(chord) > _MOVES_M
+    windows = good.sum() * _STEP_S / half_s
+    if windows < _FEWEST:
+        return None
+    m = (moved * np.conj(faced if along else chord / np.maximum(np.abs(chord), _MOVES_M)))[good]
+    f = (f * np.conj(faced))[good]
+    m, f = m - m.mean(), f - f.mean()
+    power = float(np.sqrt((np.abs(f) ** 2).sum() * (np.abs(m) ** 2).sum()))
+    product = complex((np.conj(f) * m).sum())
+    coherence = abs(product) / power if power > 0.0 else 0.0
+    psi = float(np.degrees(np.angle(product)))
+    return YawInCraft(motion.source, psi, max(coherence, 1e-6), 1.0 / float(np.sqrt(windows)))
