@@ -51,9 +51,17 @@ def bag(run: SimulatedRun, request: pytest.FixtureRequest, tmp_path_factory: pyt
     return write_bag(tmp_path_factory.mktemp("numbers") / "run", make, sorted(items, key=lambda i: i[1]))
 
 
+def both(bag: Path) -> str:
+    """The draft, with that heading switched on which only repeats the other."""
+    draft = draft_config(inspect_bag(bag))
+    echo = f"enabled: false  # guess: it says what {YAW} says"
+    assert echo in draft
+    return draft.replace(echo, "enabled: true  #")
+
+
 def test_they_are_drafted_and_read_as_what_they_are(run: SimulatedRun, bag: Path, tmp_path: Path) -> None:
     drafted = tmp_path / "vessel.yaml"
-    drafted.write_text(draft_config(inspect_bag(bag)))
+    drafted.write_text(both(bag))
     config = load_config(drafted, KINDS)
     found = {s.topic: s for s in config.sensors.values() if s.kind == "compass"}
     assert set(found) == {HEADING, YAW}
@@ -81,7 +89,7 @@ def test_a_number_that_no_course_confirms_is_left_out(bag: Path) -> None:
 
 def test_the_wrong_unit_is_named(bag: Path, tmp_path: Path) -> None:
     drafted = tmp_path / "vessel.yaml"
-    drafted.write_text(draft_config(inspect_bag(bag)).replace("unit: deg", "unit: rad"))
+    drafted.write_text(both(bag).replace("unit: deg", "unit: rad"))
     recording = read_recording(bag, load_config(drafted, KINDS))
     reasons = {r.reason for r in recording.rows if r.topic == HEADING}
     assert any("is beyond 20 turns: is it in another unit?" in reason for reason in reasons)
