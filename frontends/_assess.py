@@ -223,6 +223,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         first=vec(rows[0, :3]),
         without_height=int(np.isnan(fixes.rows[np.isfinite(fixes.rows[:, :2]).all(axis=1), 2]).sum()),
         white_m=scatter_m(stamps[~bad], own[:, :2]),
+        spans_s=float(stamps[-1] - stamps[0]) / NS_PER_S,
         hangs="".join(stuck_warning(fixes.topic, stamps, bad)),
         slow_error=not precise,
         why=why,

@@ -15,7 +15,7 @@ from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import Courses, Motion, Turning, against_turning, sane, summed, vec
 from graphloc.frontends._mount_yaw import yaw_in_craft
 from graphloc.frontends._reports import ImuReport, MountGuess
-from graphloc.frontends._sanity import NEVER_STILL_RADPS, without_gravity
+from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, without_gravity
 from graphloc.frontends._streams import Stream
 from graphloc.frontends._tf import StaticTree
 from graphloc.hangs import hanging, hanging_warning
@@ -190,6 +190,9 @@ def imu_report(
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     rate = float(np.median(np.linalg.norm(gyro, axis=1)))
     why = hangs
+    missing = missing_half(accel, gyro)
+    if missing:
+        why.append(f"all its {missing} are 0: {HALF}")
     gravity = "removed" if without_gravity(accel) else "included"
     accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
     gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS else "rad/s"
@@ -234,6 +237,7 @@ def imu_report(
         reported_accel_ug=reported(10, ug),
         reported_gyro_mdps=reported(11, mdps),
         mount=mount_guess(imu, accel, gyro, motions, tree, body),
+        missing=missing,
     )
     return _righted(report, imu, (accel, gyro), motions, courses, tree, body)
 

@@ -54,10 +54,8 @@ def origin_of(
     apart = float(np.median(np.hypot(*(p - q - offset)[:, :2].T)))
     away = float(np.linalg.norm(offset))
     if away > _FAR_M:
-        return (
-            None,
-            f"its origin is {away / 1e3:.0f} km from the fixes: looks like a map grid (UTM), which is not east-north-up",
-        )
+        kind = "earth-centred axes" if abs(offset[2]) > _FAR_M else "a map grid (UTM)"
+        return None, f"its origin is {away / 1e3:.0f} km from the fixes: looks like {kind}, which is not east-north-up"
     # What the fixes' scatter, and an antenna whose place is not known, can turn a track of this extent by.
     tolerance = np.degrees((_SLACK_M if antenna_m is None else 1.0) / extent) + 0.2
     if abs(turned) > tolerance or apart > max(_APART_M, _APART * extent):

@@ -60,7 +60,7 @@ def draft_config(inspection: Inspection) -> str:
 
 def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     for k, imu in enumerate(inspection.imus):
-        yield _imu_block(_numbered("imu", k), imu, enabled=k == 0)
+        yield _imu_block(_numbered("imu", k), imu, enabled=k == 0 and not imu.missing)
     for k, gnss in enumerate(inspection.gnss):
         yield _gnss_block(_numbered("gnss", k), gnss, enabled=k == 0)
     compasses = sorted((c for c in inspection.compasses if c.usable), key=lambda c: c.topic.endswith(_MAGNETIC))
@@ -169,9 +169,10 @@ def _numbered(name: str, k: int) -> str:
 
 def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
     lines = [f"{name}:", "  kind: imu", f"  topic: {imu.topic}"]
-    if not enabled:
-        lines.append("  enabled: false  # guess: one IMU is used, the one with least gyro noise")
     reason = "; ".join(imu.why)
+    if not enabled:
+        why = reason if imu.missing else "one IMU is used: a whole one, with gravity in it, and with least gyro noise"
+        lines.append(f"  enabled: false  # guess: {why}")
     if imu.accel_unit != "m/s^2":
         lines.append(f"  accel_unit: {imu.accel_unit}  # guess: {reason}")
     if imu.gyro_unit != "rad/s":
@@ -203,7 +204,9 @@ def _noise_lines(imu: ImuReport) -> list[str]:
 def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     lines = [f"{name}:", "  kind: gnss", *_topic_lines(gnss.topic)]
     if not enabled:
-        why = _FILTERED if filtered(gnss.topic) else "the receiver with most fixes is used"
+        why = (
+            _FILTERED if filtered(gnss.topic) else "one receiver is used: RTK throughout, or else that with most fixes"
+        )
         lines.append(f"  enabled: false  # guess: {why}")
     else:
         lines += _filtered_lines(gnss.topic)

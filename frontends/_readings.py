@@ -166,7 +166,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     """Return the samples in strictly increasing time, those that came late in their places, and rows of what has none.
 
     Raises:
-        InputError: their rates cannot be rad/s.
+        InputError: their rates cannot be rad/s, or they are half an IMU.
     """
     assert isinstance(readings.config, ImuConfig)
     bad = ~_clock.in_order_or_late(readings.stamps())
@@ -183,6 +183,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
         gyro_radps=np.array([s.gyro_radps for s in samples]),
         seqs=np.array(readings.seqs, dtype=np.int64),
     )
+    _sanity.refuse_half(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     _sanity.refuse_degrees(readings.sensor, series.stamps_ns, series.accel_mps2, series.gyro_radps, readings.config)
     warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     return series, rows

@@ -65,6 +65,7 @@ class ImuReport:
         still_s: standstill found; gyro_bias_radps is from it (None without).
         accel_noise_ug, gyro_noise_mdps: noise densities, of the worst axis, at rest or in motion.
         reported_accel_ug, reported_gyro_mdps: densities that the messages' covariances amount to.
+        missing: 'rates' or 'accelerations' where all of these are 0: half an IMU, as some drivers publish it; else ''.
     """
 
     topic: str
@@ -81,6 +82,7 @@ class ImuReport:
     reported_accel_ug: float | None
     reported_gyro_mdps: float | None
     mount: MountGuess
+    missing: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,6 +93,7 @@ class GnssReport:
         statuses: fixes by status name; known_covariance: share of fixes that report one.
         reported_sigma_m: median sigma east, north, up; scatter_m: the white part seen in the data, the same.
         white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
+        spans_s: time from its first fix to its last.
         hangs: where it says one place while the craft goes on, in words; '' where it does not.
         without_height: messages with a place and no height. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
@@ -111,6 +114,7 @@ class GnssReport:
     white_m: float | None = None
     hangs: str = ""
     without_height: int = 0
+    spans_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

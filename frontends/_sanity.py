@@ -17,6 +17,8 @@ FAR_M = 100e3
 """A fix this far from the middle of its run is not believed."""
 NEVER_STILL_RADPS = 0.5
 """Median rate that no vessel keeps up for a whole run (29 deg/s)."""
+HALF = "half an IMU, and both halves must come in one message (RealSense: unite_imu_method)"
+_FEWEST = 100  # samples, that are not all 0 by chance
 _SWING_NS, _NO_SWING_RAD = 5_000_000_000, 1.5
 _STEP_S = 0.2  # at most, of a step that rates are integrated over
 
@@ -50,6 +52,29 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
     if config.gyro_unit == "rad/s" and rate > NEVER_STILL_RADPS:
         lines.append(f"{sensor}: median angular rate is {rate:.2f} rad/s: looks like deg/s; set gyro_unit: deg/s")
     return lines
+
+
+def missing_half(accel: Array, gyro: Array) -> str:
+    """Return 'rates' or 'accelerations' where all of samples (N, 3), (N, 3) are 0, as where a driver publishes halves; else ''.
+
+    A simulated IMU without noise has no rates at rest, but then steady accelerations.
+    """
+    if len(accel) < _FEWEST:
+        return ""
+    if not accel.any():
+        return "accelerations"
+    return "rates" if not gyro.any() and (np.diff(accel, axis=0) != 0.0).any(axis=1).mean() > 0.5 else ""
+
+
+def refuse_half(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> None:
+    """Refuse samples (N, 3), (N, 3) that are half an IMU: the other half would be believed to be 0.
+
+    Raises:
+        InputError: they are.
+    """
+    missing = missing_half(accel_mps2, gyro_radps)
+    if missing:
+        raise InputError(f"{sensor}: all {missing} of {config.topic} are 0: {HALF}; name a topic that holds both")
 
 
 def refuse_degrees(

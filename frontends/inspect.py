@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
@@ -21,7 +22,6 @@ from graphloc.frontends._assess import (
     gnss_report,
     headings,
     on_one_clock,
-    sane,
     says_the_same,
     topic_report,
     track,
@@ -45,10 +45,11 @@ from graphloc.frontends._reports import (
     VelocityReport,
     filtered,
 )
-from graphloc.frontends._source import Bag
+from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import SCATTERED, scattered
+from graphloc.frontends._useless import useless
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import (
     GPS_FIXES,
@@ -85,6 +86,9 @@ __all__ = [
 
 _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MOST_TRIED = 200  # messages of a topic that cannot be decoded
+_KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
+_MOST_NAMED = 6
+_COVERS = 0.8  # of the run, from which a receiver is there throughout
 
 
 def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
@@ -114,7 +118,10 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     body = tree.body()
     # The best first: what they say is what the others are judged by.
     found_gnss = [g for s in fixes if (g := gnss_report(by_topic[s.topic], _known(s, tree, body)))]
-    found_gnss.sort(key=lambda g: (filtered(g.topic), -g.fixes, g.without_height))
+    longest_s = max((g.spans_s for g in found_gnss), default=0.0)
+    found_gnss.sort(
+        key=lambda g: (filtered(g.topic), g.slow_error or g.spans_s < _COVERS * longest_s, -g.fixes, g.without_height)
+    )
     stamps, p_m, scatter_m, first = _best_track(heard, found_gnss)
     frame = found_gnss[0].tf_frame if found_gnss else None
     mount = tree.resolve(body, frame) if frame else None
@@ -128,7 +135,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     ]
     motions = motions_of([s for s, report in told if report.role == "check_speed"], twists, fixes)
     found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motions, courses, tree, body))]
-    found_imus.sort(key=lambda i: i.gyro_noise_mdps)
+    found_imus.sort(key=lambda i: (bool(i.missing), i.gravity == "removed", i.gyro_noise_mdps))
     turning = turning_of(heard[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
     candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU, *NUMBERS)]
     found_compasses = _without_echoes([(c, s) for s in candidates if (c := compass_report(s, courses, turning))])
@@ -164,9 +171,31 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         warnings=(
             *warnings,
             *(g.hangs for g in found_gnss if g.hangs),
-            *_useless(streams, used),
+            *useless(streams, used),
+            *_lacking(found_imus, found_gnss, [report for _, report in told], bool(clouds or images), topics, by_topic),
         ),
     )
+
+
+def _lacking(
+    imus: Sequence[ImuReport],
+    gnss: Sequence[GnssReport],
+    odometry: Sequence[OdometryReport],
+    sees: bool,
+    topics: Mapping[str, TopicSummary],
+    read: Container[str],
+) -> list[str]:
+    """Say what no run can do without, and which topics are of no type that is read: it may be there."""
+    lines = []
+    if not any(not imu.missing for imu in imus):
+        lines.append("no whole IMU in it: smooth, replay and compare need one")
+    if not gnss and not sees and not any(report.role == "pose" for report in odometry):
+        lines.append("nothing in it tells the place: no GNSS fix that can be used, no pose")
+    others = [t for t in topics.values() if t.topic not in read and not _KNOWN.match(t.msgtypes[0])]
+    if lines and others:
+        named = ", ".join(f"{t.topic} ({' or '.join(t.msgtypes).replace('/msg/', '/')})" for t in others[:_MOST_NAMED])
+        lines.append(f"of no type that is read here: {named}{', ...' if len(others) > _MOST_NAMED else ''}")
+    return lines
 
 
 def _without_echoes(compasses: Sequence[tuple[CompassReport, Stream]]) -> list[tuple[CompassReport, Stream]]:
@@ -258,46 +287,6 @@ def _frames_of(bag: Bag, topics: Sequence[str]) -> dict[str, str]:
             except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; a later one will do
                 continue
     return found
-
-
-def _useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
-    """Say which IMU and GNSS topics gave nothing, and why: silence would read as if they were not there."""
-    lines = (
-        []
-        if any(len(s) or s.undecodable or s.no_stamp for s in streams)
-        else ["the bag holds no message of a known type"]
-    )
-    for stream in streams:
-        if stream.topic in used or stream.msgtype not in (IMU, *_FIXES):
-            continue
-        total = len(stream) + stream.undecodable + stream.no_stamp
-        why = _why_useless(stream)
-        lines.append(
-            f"{stream.topic}: nothing of its {total} messages can be used: {why}"
-            if total
-            else f"{stream.topic}: not a message on it"
-        )
-    return lines
-
-
-def _why_useless(stream: Stream) -> str:
-    rows = stream.rows[sane(stream)] if len(stream) else np.zeros((0, 8))
-    if stream.msgtype == IMU and len(rows) and not rows[:, :6].any():
-        return "they hold neither accelerations nor rates, an orientation at most"
-    if stream.msgtype == IMU and len(rows) and (hangs := samples_of(stream)[1]):
-        return hangs[0].removeprefix(f"{stream.topic}: ")
-    counts = {
-        "cannot be decoded": stream.undecodable,
-        "have no stamp": stream.no_stamp,
-        "have a stamp that repeats, runs backwards or is far from the recording time": len(stream) - len(rows),
-    }
-    if stream.msgtype in _FIXES:
-        without = int((rows[:, 3] < 0).sum())
-        counts |= {"say 'no fix'": without, "lie at 0, 0 or are NaN": len(rows) - without}
-    else:
-        finite = int(np.isfinite(rows[:, :6]).all(axis=1).sum())
-        counts |= {"hold an acceleration or a rate that is NaN": len(rows) - finite, "are too few": finite}
-    return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
 
 
 def _known(stream: Stream, tree: StaticTree, body: str) -> str | None:

@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 
 from graphloc.config import GnssConfig, VesselConfig, parse_config
+from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import Inspection
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag import KINDS
-from tests.test_inspect import DATUM, drive, look, rotation_z
+from tests.test_inspect import DATUM, G, drive, look, rotation_z
 
 WAVE_S, WAVE_RAD = 3.0, 0.03
 
@@ -199,3 +201,70 @@ def test_a_covariance_that_is_a_placeholder_is_told_from_one(tmp_path: Path) -> 
     gnss = config.sensors["gnss"]
     assert isinstance(gnss, GnssConfig)
     assert gnss.sigma_scale * 316.0 == pytest.approx(gnss.default_horizontal_sigma_m, rel=0.02)
+
+
+def halves(make: Messages) -> list[Item]:
+    """`drive`, and beside its IMU the two topics of a RealSense: accelerations without rates, rates without accelerations."""
+    items = drive(make)
+    for _, at, m in [item for item in items if item[0] == "/imu"]:
+        a, w = m.linear_acceleration, m.angular_velocity
+        items.append(("/camera/accel/sample", at, make.imu(at, (a.x, a.y, a.z), (0, 0, 0))))
+        items.append(("/camera/gyro/sample", at, make.imu(at, (0, 0, 0), (w.x, w.y, w.z))))
+    return sorted(items, key=lambda item: item[1])
+
+
+def test_half_an_imu_is_not_taken_for_one(tmp_path: Path) -> None:
+    """Without noise in its rates it was the one with least of it, and drafted."""
+    make = Messages(2)
+    found, config, _ = look(tmp_path, halves(make), make)
+    assert [s.topic for s in config.of_kind("imu").values() if s.enabled] == ["/imu"]
+    assert {i.topic: i.missing for i in found.imus} == {
+        "/imu": "",
+        "/camera/accel/sample": "rates",
+        "/camera/gyro/sample": "accelerations",
+    }
+
+
+@pytest.mark.parametrize(("topic", "said"), [("accel", "all rates"), ("gyro", "all accelerations")])
+def test_half_an_imu_is_refused_when_a_bag_is_read(topic: str, said: str, tmp_path: Path) -> None:
+    make = Messages(2)
+    path = write_bag(tmp_path / "run", make, halves(make))
+    sensors = {"imu": {"kind": "imu", "topic": f"/camera/{topic}/sample"}, "gnss": {"kind": "gnss", "topic": "/fix"}}
+    with pytest.raises(InputError, match=f"{said} of /camera/{topic}/sample are 0"):
+        read_recording(path, parse_config({"sensors": sensors}, KINDS, "test"))
+
+
+def test_an_imu_with_gravity_is_taken_before_one_without(tmp_path: Path) -> None:
+    make = Messages(2)
+    items = drive(make)
+    for _, at, m in [item for item in items if item[0] == "/imu"]:
+        a, w = m.linear_acceleration, m.angular_velocity
+        items.append(("/a/linear", at, make.imu(at, (a.x, a.y, a.z - G), (w.x, w.y, w.z))))
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert [s.topic for s in config.of_kind("imu").values() if s.enabled] == ["/imu"]
+
+
+@pytest.mark.parametrize(("lasts_s", "used"), [(60.0, "/rtk"), (30.0, "/fix")])
+def test_rtk_is_taken_before_a_receiver_that_says_more(lasts_s: float, used: str, tmp_path: Path) -> None:
+    """Five fixes a second that are good to a metre are less than one that is good to a centimetre, if that is there throughout."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=1.0)
+    for _, at, m in [item for item in items if item[0] == "/fix"][::5]:
+        if at < START_NS + lasts_s * S:
+            cov = (1e-4 * np.eye(3)).ravel()
+            items.append(("/rtk", at, make.fix(at, m.latitude, m.longitude, m.altitude, 2, cov)))
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == [used]
+
+
+def test_what_no_run_can_do_without_is_said(tmp_path: Path) -> None:
+    """A draft of an IMU alone was all that came of a bag whose places are in messages of another kind."""
+    make = Messages(2)
+    make.store.register(get_types_from_msg("float64 latitude\nfloat64 longitude", "foxglove_msgs/msg/LocationFix"))
+    items = [item for item in drive(make, seconds=10) if item[0] == "/imu"]
+    place = make.t["foxglove_msgs/msg/LocationFix"](latitude=57.7, longitude=11.9)
+    found, _, _ = look(tmp_path, [*items, ("/location", items[-1][1], place)], make)
+    said = " | ".join(found.warnings)
+    assert "nothing in it tells the place" in said
+    assert "/location (foxglove_msgs/LocationFix)" in said
+    assert "IMU" not in said

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which IMU and GNSS topics of a bag give nothing, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+
+import numpy as np
+
+from graphloc.frontends._assess import sane
+from graphloc.frontends._assess_imu import samples_of
+from graphloc.frontends._streams import Stream
+from graphloc.frontends.decode import GPS_FIXES, IMU, NAV_SAT_FIX
+
+_FIXES = (NAV_SAT_FIX, *GPS_FIXES)
+
+
+def useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
+    """Say which IMU and GNSS topics gave nothing, and why: silence would read as if they were not there."""
+    lines = (
+        []
+        if any(len(s) or s.undecodable or s.no_stamp for s in streams)
+        else ["the bag holds no message of a known type"]
+    )
+    for stream in streams:
+        if stream.topic in used or stream.msgtype not in (IMU, *_FIXES):
+            continue
+        total = len(stream) + stream.undecodable + stream.no_stamp
+        why = _why_useless(stream)
+        lines.append(
+            f"{stream.topic}: nothing of its {total} messages can be used: {why}"
+            if total
+            else f"{stream.topic}: not a message on it"
+        )
+    return lines
+
+
+def _why_useless(stream: Stream) -> str:
+    rows = stream.rows[sane(stream)] if len(stream) else np.zeros((0, 8))
+    if stream.msgtype == IMU and len(rows) and not rows[:, :6].any():
+        return "they hold neither accelerations nor rates, an orientation at most"
+    if stream.msgtype == IMU and len(rows) and (hangs := samples_of(stream)[1]):
+        return hangs[0].removeprefix(f"{stream.topic}: ")
+    counts = {
+        "cannot be decoded": stream.undecodable,
+        "have no stamp": stream.no_stamp,
+        "have a stamp that repeats, runs backwards or is far from the recording time": len(stream) - len(rows),
+    }
+    if stream.msgtype in _FIXES:
+        without = int((rows[:, 3] < 0).sum())
+        counts |= {"say 'no fix'": without, "lie at 0, 0 or are NaN": len(rows) - without}
+    else:
+        finite = int(np.isfinite(rows[:, :6]).all(axis=1).sum())
+        counts |= {"hold an acceleration or a rate that is NaN": len(rows) - finite, "are too few": finite}
+    return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
