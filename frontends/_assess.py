@@ -27,6 +27,7 @@ from graphloc.time import NS_PER_S
 
 _TURNS_DEG, _SAME_DEG = 5.0, 0.2
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
+_BLOCK_S = 30
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
 
 
@@ -314,6 +315,16 @@ def _middle_deg(angle: Array) -> tuple[float, float]:
     return float(np.degrees(wrap_angle(middle))), float(np.degrees(scatter))
 
 
+def _wanders_deg(stamps_ns: NDArray[np.int64], angle: Array) -> float | None:
+    """Return how far the middle of angles (N,), rad, differs from block to block, 1 sigma, deg; None of fewer than three."""
+    block = (stamps_ns - stamps_ns[0]) // (_BLOCK_S * NS_PER_S)
+    own = [angle[block == k] for k in np.unique(block)]
+    middles = np.radians([_middle_deg(part)[0] for part in own if len(part) >= 5])
+    if len(middles) < 3:
+        return None
+    return float(np.degrees(np.std(wrap_angle(middles - middles[0]), ddof=1)))
+
+
 def compass_report(stream: Stream, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
     """Return whether an orientation is a heading, and in which convention; None where there is none."""
     keep = sane(stream)
@@ -359,6 +370,7 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
     else:
         convention = min(fits, key=lambda c: fits[c][1])
     offset, scatter = fits[convention]
+    apart = (measured if convention == "enu" else np.pi / 2.0 - measured) - courses.course_rad
     usable = scatter < 15.0
     why = f"yaw minus GNSS course: {offset:+.0f} deg, scatter {scatter:.0f} deg over {len(measured)} courses"
     if not usable:
@@ -373,6 +385,7 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
         convention=convention,
         offset_deg=offset,
         scatter_deg=scatter,
+        leeway_deg=_wanders_deg(courses.stamps_ns, apart),
         samples=len(measured),
         why=why,
     )

@@ -24,6 +24,7 @@ from graphloc.frontends._reports import (
 from graphloc.frontends.decode import IMU, VECTOR
 
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
+_TURNED_DEG = 10.0  # off the course, from which a compass is taken for turned in the craft
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
 _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
@@ -318,29 +319,34 @@ def _compass_block(name: str, compass: CompassReport, *, again: bool) -> list[st
         lines.append(
             "  enabled: false  # guess: another heading of the same topic is used, a true one before a magnetic one"
         )
-    if compass.offset_deg is not None and abs(compass.offset_deg) > 10.0:
-        quarter = 90.0 * round(compass.offset_deg / 90.0)
-        rest = abs(compass.offset_deg - quarter)
-        yaw, sigma = (quarter, rest) if rest < 15.0 else (round(compass.offset_deg), _LEEWAY_DEG)
-        astern = ", unless the craft goes astern most of the time: then 0" if abs(yaw) > _ASTERN_DEG else ""
-        lines.append(
-            f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course{astern}"
-        )
-        if sigma > _COMPASS_SIGMA_DEG:
-            lines.append(f"  mount_offset_sigma_deg: {sigma:.1f}  # guess: a course is no heading, and tells no more")
-    elif compass.offset_deg is not None and abs(compass.offset_deg) > _COMPASS_SIGMA_DEG:
-        lines.append(
-            f"  mount_offset_sigma_deg: {abs(compass.offset_deg):.1f}  # guess: as far as it is off the GNSS course"
-        )
-    elif compass.offset_deg is None:
-        lines.append(
-            f"  mount_offset_sigma_deg: {_UNKNOWN_DEG:.1f}  # guess: no course tells; declination, or a mount, may be in it; 1 for "
-            "a true heading whose mount is known"
-        )
+    lines += _mount_lines(compass)
     lines.append("  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass")
     lines.append("  wander_sigma_deg: 0.5  # guess: a harbour's iron turns it for a while; 0.2 for a GNSS compass")
     if compass.msgtype == IMU:
         lines.append("  use_reported_sigma: false  # guess: drivers' orientation covariances are seldom measured")
+    return lines
+
+
+def _mount_lines(compass: CompassReport) -> list[str]:
+    """By how much the course says that a compass is turned in the craft, and how well a course tells it."""
+    if compass.offset_deg is None:
+        said = "no course tells; declination, or a mount, may be in it; 1 for a true heading whose mount is known"
+        return [f"  mount_offset_sigma_deg: {_UNKNOWN_DEG:.1f}  # guess: {said}"]
+    lines = []
+    sigma, why = abs(compass.offset_deg), "as far as it is off the GNSS course"
+    if sigma > _TURNED_DEG:
+        quarter = 90.0 * round(compass.offset_deg / 90.0)
+        rest = abs(compass.offset_deg - quarter)
+        yaw, sigma = (quarter, rest) if rest < 15.0 else (round(compass.offset_deg), _LEEWAY_DEG)
+        why = "a course is no heading, and tells no more"
+        astern = ", unless the craft goes astern most of the time: then 0" if abs(yaw) > _ASTERN_DEG else ""
+        lines.append(
+            f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course{astern}"
+        )
+    if compass.leeway_deg is not None and compass.leeway_deg > sigma:
+        sigma, why = compass.leeway_deg, "as far as its offset to the GNSS course wanders: leeway, or the compass"
+    if sigma > _COMPASS_SIGMA_DEG:
+        lines.append(f"  mount_offset_sigma_deg: {sigma:.1f}  # guess: {why}")
     return lines
 
 

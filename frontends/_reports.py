@@ -124,6 +124,7 @@ class CompassReport:
     Attributes:
         usable: whether it fits the course; convention: the better one.
         offset_deg: mean of yaw minus course; scatter_deg: its circular standard deviation.
+        leeway_deg: how far that wanders, from half minute to half minute: leeway, or the compass; None where it is not told.
         samples: courses compared; why: the judgement in words. unit: of bare numbers, else None.
         like: an orientation that says the same, of the same device, else ''.
     """
@@ -138,6 +139,7 @@ class CompassReport:
     why: str
     unit: str | None = None
     like: str = ""
+    leeway_deg: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

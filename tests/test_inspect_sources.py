@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from graphloc.config import GnssConfig, VesselConfig, parse_config
+from graphloc.config import CompassConfig, GnssConfig, VesselConfig, parse_config
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
@@ -268,3 +268,23 @@ def test_what_no_run_can_do_without_is_said(tmp_path: Path) -> None:
     assert "nothing in it tells the place" in said
     assert "/location (foxglove_msgs/LocationFix)" in said
     assert "IMU" not in said
+
+
+@pytest.mark.parametrize("leeway_deg", [0.0, 6.0])
+def test_a_course_that_wanders_about_the_heading_tells_no_compass_to_a_degree(
+    leeway_deg: float, tmp_path: Path
+) -> None:
+    """Of a craft that is set sideways now and then; its mean offset was 2 deg, and taken for all that could be wrong."""
+    make = Messages(2)
+    items = [item for item in drive(make, seconds=200) if item[0] != "/compass"]
+    for k, (_, at, m) in enumerate([item for item in drive(make, seconds=200) if item[0] == "/compass"]):
+        own = 2.0 * np.arctan2(m.quaternion.z, m.quaternion.w) + np.radians(leeway_deg) * np.sin(
+            2.0 * np.pi * k / 5.0 / 90.0
+        )
+        items.append(("/compass", at, make.compass(at, (0.0, 0.0, np.sin(own / 2.0), np.cos(own / 2.0)))))
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    compass = config.sensors["compass"]
+    assert isinstance(compass, CompassConfig)
+    # A sine of 6 deg, the mean taken over each third of its period: 6 sinc(1/3) / sqrt(2) = 3.5 deg.
+    assert compass.mount_offset_sigma_deg == (pytest.approx(3.5, abs=1.0) if leeway_deg else 1.0)
+    assert ("its offset to the GNSS course wanders" in text) == bool(leeway_deg)
