@@ -11,7 +11,9 @@ from graphloc.config import GnssConfig, ImuConfig, SlowErrorConfig
 from graphloc.frontends._clock import EPOCH_LIMIT_S
 from graphloc.frontends._fixes import NOTHING_M, SCATTERS
 from graphloc.frontends._reports import (
+    BODY_AXES,
     EAST_AXES,
+    NORTH_AXES,
     CompassReport,
     GnssReport,
     ImuReport,
@@ -268,12 +270,14 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
     """Velocities, of which one is used: of two that a device says of itself, neither tells what the other does not."""
     gnss = next(iter(inspection.gnss), None)
     known = [v for v in inspection.velocities if v.axes != "unknown"]
-    told = [v for v in known if v.axes == EAST_AXES] or [v for v in known if v.axes is None and v.msgtype != VECTOR]
+    told = [v for v in known if v.axes in (EAST_AXES, NORTH_AXES)] or [
+        v for v in known if v.axes is None and v.msgtype != VECTOR
+    ]
     used = min(told, key=lambda v: filtered(v.topic), default=None)
     for k, twist in enumerate(known):
         off = None
-        if twist.axes not in (None, EAST_AXES):
-            off = f"east, north, up is wanted, its axes look {twist.axes}; {twist.why}"
+        if twist.axes == BODY_AXES:
+            off = f"east, north, up (or north, east, down) is wanted, its axes look {twist.axes}; {twist.why}"
         elif twist.axes is None and twist.msgtype == VECTOR:
             off = f"nothing tells that it is a velocity; {twist.why}"
         elif twist is not used:
@@ -289,8 +293,10 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, o
     if off is not None:
         lines.append(f"  enabled: false  # guess: {off}")
     else:
-        lines[-1] += f"  # guess: a velocity in east, north, up; {twist.why}"
+        lines[-1] += f"  # guess: a velocity in {twist.axes or EAST_AXES}; {twist.why}"
         lines += _filtered_lines(twist.topic)
+    if twist.axes == NORTH_AXES:
+        lines.append("  convention: ned  # guess: by the GNSS track")
     frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
     evidence = "/tf_static knows it" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
     if frame is not None:

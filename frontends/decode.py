@@ -63,6 +63,7 @@ NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # of NavSatStatus, by quality of GGA: di
 _RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # horizontal, vertical, at a dilution of 1: fixed, float
 MOST_TURNS = 20  # of a heading that is counted on from turn to turn
 _UNIT_MPS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "knots": 1852.0 / 3600.0}
+_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _NO_CLIMB_MPS2 = 1e6  # variance of a vertical velocity that is not told, m^2/s^2
 # Beyond these no sensor of a vessel measures; they are finite, and a sum or a square of them need not be.
 _MOST_INERTIAL = 1e4  # in the unit of the bag: 1000 g; 30 turns a second in deg/s
@@ -289,12 +290,21 @@ def _twist(msg: Any) -> tuple[tuple[float, float, float], Array]:
 
 
 def _velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
-    return _moving(*_twist(msg), stamp_ns, seq, sensor, config)
+    return _moving(*_in_enu(*_twist(msg), config), stamp_ns, seq, sensor, config)
 
 
 def _velocity_vector(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
     v = msg.vector
-    return _moving((v.x, v.y, v.z), np.zeros((3, 3)), stamp_ns, seq, sensor, config)
+    return _moving(*_in_enu((v.x, v.y, v.z), np.zeros((3, 3)), config), stamp_ns, seq, sensor, config)
+
+
+def _in_enu(
+    v: tuple[float, float, float], cov: Array, config: VelocityConfig
+) -> tuple[tuple[float, float, float], Array]:
+    """A velocity and its covariance in east, north, up."""
+    if config.convention == "enu":
+        return v, cov
+    return (v[1], v[0], -v[2]), _ENU_FROM_NED @ cov @ _ENU_FROM_NED.T
 
 
 def _velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:

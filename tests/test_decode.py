@@ -137,6 +137,17 @@ def test_velocity() -> None:
     refused(MAKE.twist(T, (np.nan, 0, 0)), VelocityConfig(), Outcome.MALFORMED, "NaN")
 
 
+def test_velocity_in_north_east_down() -> None:
+    """East is the second, north the first, up the third turned round; so are the covariances, of north with down too."""
+    cov = np.zeros((6, 6))
+    cov[:3, :3] = [[0.04, 0.01, 0.02], [0.01, 0.09, 0.03], [0.02, 0.03, 0.16]]
+    ned = VelocityConfig(convention="ned")
+    for msg in (MAKE.twist(T, (1, 2, 3), cov), MAKE.twist(T, (1, 2, 3))):
+        np.testing.assert_allclose(decode(msg, ned).v_world_mps, [2, 1, -3])
+    told = decode(MAKE.twist(T, (1, 2, 3), cov), ned).cov_m2ps2
+    np.testing.assert_allclose(told, [[0.09, 0.01, -0.03], [0.01, 0.04, -0.02], [-0.03, -0.02, 0.16]])
+
+
 def test_pose_axes_and_covariance_order() -> None:
     """ROS: x, y, z, then rotations about x, y, z. Entry (i, j) is 10 i + j off the diagonal, scaled small."""
     cov = np.array([[1e-4 * (10 * min(i, j) + max(i, j)) for j in range(6)] for i in range(6)])

@@ -287,10 +287,10 @@ def test_tf_static_beats_guessing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("axes", "said", "enabled"),
-    [("enu", "east, north, up", True), ("ned", "north, east, down", False), ("body", "forward, left, up", False)],
+    [("enu", "east, north, up", True), ("ned", "north, east, down", True), ("body", "forward, left, up", False)],
 )
 def test_axes_of_a_velocity(axes: str, said: str, enabled: bool, tmp_path: Path) -> None:
-    """A velocity that is not in east, north, up is found out by the track, and left out."""
+    """The axes of a velocity are found out by the track; one along the body is left out."""
     make, items = Messages(2), []
     fixes = [(topic, at, m) for topic, at, m in drive(make, sigma_m=0.02) if topic == "/fix"]
     places = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for _, _, m in fixes]).T)
@@ -302,6 +302,10 @@ def test_axes_of_a_velocity(axes: str, said: str, enabled: bool, tmp_path: Path)
     found, config, _ = look(tmp_path, sorted([*drive(make), *items], key=lambda item: item[1]), make)
     assert (found.velocities[0].axes or "").startswith(said)
     assert config.sensors["gnss_velocity"].enabled is enabled
+    if enabled:
+        recording = read_recording(tmp_path / "run", config)
+        read = [m.v_world_mps for m in recording.measurements if isinstance(m, GnssVelocity)]
+        np.testing.assert_allclose(read, v)
 
 
 @pytest.mark.parametrize("body", ["vessel", "hull"])

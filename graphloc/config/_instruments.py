@@ -158,10 +158,12 @@ class CompassConfig(SensorConfig):
 
 
 class VelocityConfig(SensorConfig):
-    """GNSS velocity in ENU (`geometry_msgs/TwistWithCovarianceStamped`, `TwistStamped`, `Vector3Stamped`, NMEA as `gnss`)."""
+    """GNSS velocity over ground (`geometry_msgs/TwistWithCovarianceStamped`, `TwistStamped`, `Vector3Stamped`, NMEA as `gnss`)."""
 
     kind: Literal["gnss_velocity"] = "gnss_velocity"
     """Which row of the sensor table reads this block."""
+    convention: Literal["enu", "ned"] = "enu"
+    """Axes of the message: `enu` east, north, up; `ned` north, east, down. Of NMEA they are known."""
     min_sigma_mps: Positive = 0.03
     """Floor of the velocity sigma, m/s."""
     default_sigma_mps: Positive = 0.3
