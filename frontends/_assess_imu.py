@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import Courses, Motion, Turning, against_turning, sane, summed, vec
-from graphloc.frontends._mount_yaw import yaw_in_craft
+from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
 from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, without_gravity
 from graphloc.frontends._streams import Stream
@@ -109,17 +109,34 @@ def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion]
 
 def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Turning | None:
     """Return how the craft turned, by an IMU whose mount is known or guessed; its gyro bias taken off where found."""
+    said = _in_body(imu, report, tree, body)
+    if said is None:
+        return None
+    stamps, _, gyro = said
+    t = (stamps - stamps[0]) / NS_PER_S
+    return Turning(int(stamps[0]), t, summed(t, gyro[:, 2]))
+
+
+def felt_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Felt | None:
+    """Return what an IMU felt whose mount is known or guessed, in the axes of the craft."""
+    said = _in_body(imu, report, tree, body)
+    return None if said is None else Felt.of(*said)
+
+
+def _in_body(
+    imu: Stream, report: ImuReport, tree: StaticTree, body: str
+) -> tuple[NDArray[np.int64], Array, Array] | None:
+    """Stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the craft; None of few samples."""
     keep, _ = samples_of(imu)
     keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)] if len(keep) else keep
     if len(keep) < 20:
         return None
     known = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
     R = known[1] if known else Rotation.from_euler("xyz", report.mount.rpy_deg, degrees=True).as_matrix()
+    unit = STANDARD_GRAVITY_MPS2 if report.accel_unit == "g" else 1.0
+    accel = imu.rows[keep, :3] * (-unit if report.gravity == "inverted" else unit)
     gyro = imu.rows[keep, 3:6] * (np.pi / 180.0 if report.gyro_unit == "deg/s" else 1.0)
-    rate = ((gyro - (report.gyro_bias_radps or (0.0, 0.0, 0.0))) @ R.T)[:, 2]
-    origin = int(imu.stamps_ns[keep[0]])
-    t = (imu.stamps_ns[keep] - origin) / NS_PER_S
-    return Turning(origin, t, summed(t, rate))
+    return imu.stamps_ns[keep], accel @ R.T, (gyro - (report.gyro_bias_radps or (0.0, 0.0, 0.0))) @ R.T
 
 
 def _against_courses(imu: Stream, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str) -> int:

@@ -146,18 +146,27 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
 
 
 def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
-    """Add a time offset where the recording times say that a receiver's clock is off; poses may take their time."""
+    """Add a time offset where a receiver's clock is off by the recording times, or its stamps are late by the motion.
+
+    Poses may take their time.
+    """
     latency = {t.topic.partition(" ")[0]: t.latency_s[1] for t in inspection.topics if t.latency_s is not None}
     reference = next((latency[i.topic] for i in inspection.imus if i.topic in latency), None)
     kind = next((line.split()[1] for line in block if line.startswith("  kind:")), "")
     topic = next((line.split()[1] for line in block if line.startswith("  topic:")), "")
     if reference is None or kind not in ("gnss", "gnss_velocity", "compass") or topic not in latency:
         return block
+    told = inspection.gnss if kind == "gnss" else inspection.velocities if kind == "gnss_velocity" else ()
+    late = next((r.late_s for r in told if r.topic.partition(" ")[0] == topic and r.late_s), None)
+    offset_s, why = 0.0, []
     behind = latency[topic] - reference
-    if abs(behind) <= EPOCH_LIMIT_S:
-        return block
-    side = "behind" if behind > 0 else "ahead of"
-    return [*block, f"  time_offset_s: {behind:.3f}  # guess: its clock is {side} the IMU's, by the recording times"]
+    if abs(behind) > EPOCH_LIMIT_S:
+        offset_s += behind
+        why.append(f"its clock is {'behind' if behind > 0 else 'ahead of'} the IMU's, by the recording times")
+    if late is not None:
+        offset_s += late[0]
+        why.append(f"what the IMU feels fits its motion {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
+    return [*block, f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else block
 
 
 def _topic_lines(topic: str) -> list[str]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether headings are stamped early or late, told by the gyroscope."""
+"""Whether headings are stamped early or late, told by the gyroscope, and whether fixes are, told by the accelerometer."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import Turning
+from graphloc.frontends._assess import Motion, Turning
+from graphloc.frontends._mount_yaw import FEWEST, HALF_S, MOVES_M, STEP_S, Felt, bent
 from graphloc.time import NS_PER_S
 
 _BLOCK_S = 20.0
 _CLEAR, _LEAST_S = 4.0, 0.02  # sigmas, s
+_MOST_S, _APART_S, _LEAST_OF_WAY_S = 1.5, 0.05, 0.1  # how far, and how closely, is looked; from which it is said
 
 
 def lag(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[float, float] | None:
@@ -49,3 +51,54 @@ def lag(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[f
     sigma = float(np.sqrt((len(up) - 1) / len(up) * ((without - without.mean()) ** 2).sum()))
     clear = abs(value) > max(_CLEAR * sigma, _LEAST_S)
     return (value, sigma) if clear else None
+
+
+def lag_of_way(felt: Felt, motion: Motion) -> tuple[float, float] | None:
+    """Return what should be added to the stamps of a way, s, and its sigma; None where the accelerometer does not tell.
+
+    Of the accelerations that places tell those along the way are asked: across it, an antenna ahead of the IMU looks as if it
+    were early. Where c is their correlation, N (c^2 - c0^2) / (1 - c^2) is by how much (of chi square) another time fits
+    better, of N windows.
+
+    Args:
+        felt: of an IMU in the axes of the craft. motion: of places, or of a velocity over ground.
+    """
+    if motion.way_m is None:
+        return None
+    t, at = felt.t_s, felt.times_of(motion)
+    lags = np.arange(-_MOST_S, _MOST_S + 0.5 * _APART_S, _APART_S)
+    found: list[tuple[float, float, float]] = []
+    for half_s in HALF_S:
+        margin = half_s + _MOST_S
+        middle = np.arange(max(t[0], at[0]) + margin, min(t[-1], at[-1]) - margin, STEP_S)
+        moved, chord = bent(at, motion.way_m, middle, half_s)
+        good = np.abs(chord) > MOVES_M
+        windows = float(good.sum() * STEP_S / half_s)
+        if windows < FEWEST:
+            continue
+        middle = middle[good]
+        along = (moved * np.conj(chord / np.maximum(np.abs(chord), MOVES_M)))[good].real
+        c = np.array([_together(along, _felt_along(felt, middle + lag, half_s)) for lag in lags])
+        k = int(c.argmax())
+        bend = 0.0 if k in (0, len(c) - 1) else float(2.0 * c[k] - c[k - 1] - c[k + 1]) / _APART_S**2
+        if bend <= 0.0 or c[k] <= 0.0:
+            continue
+        value = float(lags[k]) + float(c[k + 1] - c[k - 1]) / (2.0 * _APART_S * bend)
+        left = max(1.0 - float(c[k]) ** 2, 1e-9)
+        better = windows * (float(c[k]) ** 2 - float(np.interp(0.0, lags, c)) ** 2) / left
+        found.append((better, value, float(np.sqrt(left / (windows * c[k] * bend)))))
+    better, value, sigma = max(found, default=(0.0, 0.0, 1.0))
+    clear = better > _CLEAR**2 and abs(value) > max(_CLEAR * sigma, _LEAST_OF_WAY_S)
+    return (value, sigma) if clear else None
+
+
+def _felt_along(felt: Felt, middle_s: Array, half_s: float) -> Array:
+    """The sensor's own acceleration ahead, times the square of `half_s`."""
+    moved, _ = bent(felt.t_s, felt.way_m, middle_s, half_s)
+    return np.asarray((moved * np.exp(-1j * np.interp(middle_s, felt.t_s, felt.turned))).real)
+
+
+def _together(a: Array, b: Array) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    power = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / power if power > 0.0 else 0.0

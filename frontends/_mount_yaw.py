@@ -19,9 +19,9 @@ from graphloc.frontends._assess import Motion, summed
 from graphloc.time import NS_PER_S
 
 # Half the time over which an acceleration is asked: short, a car's fits best; longer, waves and the noise of fixes are less.
-_HALF_S = (0.5, 1.0, 2.0, 4.0)
-_STEP_S = 0.5  # between two times at which it is asked
-_FEWEST, _MOVES_M = 20, 1.0  # windows; a shorter way has no direction
+HALF_S = (0.5, 1.0, 2.0, 4.0)
+STEP_S = 0.5  # between two times at which it is asked
+FEWEST, MOVES_M = 20, 1.0  # windows; a shorter way has no direction
 _MIN_COHERENCE, _CLEAR = 0.25, 4.0  # and so many times what chance gives
 _ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
 
@@ -59,6 +59,32 @@ class YawInCraft:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Felt:
+    """What a levelled IMU felt: times (N,) s since `origin_ns`, how far it has turned, rad, and where its accelerations lead.
+
+    That is (N,) m, x + i y, in the axes of its beginning.
+    """
+
+    origin_ns: int
+    t_s: Array
+    turned: Array
+    way_m: NDArray[np.complex128]
+
+    @classmethod
+    def of(cls, stamps_ns: NDArray[np.int64], accel: Array, gyro: Array) -> Felt:
+        """Of samples: stamps (N,), increasing; accelerations (N, 3) m/s^2 and rates (N, 3) rad/s, levelled."""
+        t = (stamps_ns - stamps_ns[0]) / NS_PER_S
+        turned = summed(t, gyro[:, 2])
+        a = accel[:, 0] + 1j * accel[:, 1]
+        a = a - np.median(a.real) - 1j * np.median(a.imag)
+        return cls(int(stamps_ns[0]), t, turned, summed(t, summed(t, a * np.exp(1j * turned))))
+
+    def times_of(self, motion: Motion) -> Array:
+        """A motion's times (M,) as these are counted, s."""
+        return np.asarray(motion.t_s + (motion.origin_ns - self.origin_ns) / NS_PER_S)
+
+
 def yaw_in_craft(
     stamps_ns: NDArray[np.int64], accel: Array, gyro: Array, motions: Sequence[Motion]
 ) -> YawInCraft | None:
@@ -67,51 +93,40 @@ def yaw_in_craft(
     Args:
         stamps_ns: (N,), increasing. accel, gyro: (N, 3) m/s^2, rad/s, levelled.
     """
-    t = (stamps_ns - stamps_ns[0]) / NS_PER_S
-    turned = summed(t, gyro[:, 2])
-    a = accel[:, 0] + 1j * accel[:, 1]
-    a = a - np.median(a.real) - 1j * np.median(a.imag)
-    felt = summed(t, summed(t, a * np.exp(1j * turned)))
-    tried = []
-    for motion in motions:
-        at = motion.t_s + (motion.origin_ns - stamps_ns[0]) / NS_PER_S
-        tried += [found for half_s in _HALF_S if (found := _yaw_by(t, turned, felt, at, motion, half_s))]
+    felt = Felt.of(stamps_ns, accel, gyro)
+    tried = [found for motion in motions for half_s in HALF_S if (found := _yaw_by(felt, motion, half_s))]
     return max(tried, key=lambda found: found.coherence / found.chance, default=None)
 
 
-def _yaw_by(
-    t_s: Array, turned: Array, felt: NDArray[np.complex128], at_s: Array, motion: Motion, half_s: float
-) -> YawInCraft | None:
+def _yaw_by(felt: Felt, motion: Motion, half_s: float) -> YawInCraft | None:
     """Return what a motion tells over one time.
 
     Places p tell the mean acceleration about t as p(t + h) - 2 p(t) + p(t - h), and p(t + h) - p(t - h) where the craft
-    heads; so does the sensor, in its own axes at t.
-
-    Args:
-        t_s, turned, felt: (N,) of the sensor: times, how far it has turned, rad, and where its accelerations lead, m, in
-            the axes of its beginning. at_s: (M,) the motion's times. half_s: h.
+    heads; so does the sensor, in its own axes at t. h: `half_s`.
     """
-    there = np.interp(at_s, t_s, turned)
-    along = motion.way_m is None
-    way = summed(at_s, motion.speed_mps * np.exp(1j * there)) if motion.way_m is None else motion.way_m
-    middle = np.arange(max(t_s[0], at_s[0]) + half_s, min(t_s[-1], at_s[-1]) - half_s, _STEP_S)
-
-    def bent(times: Array, places: NDArray[np.complex128]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """The second difference of places, and the first, over twice as long."""
-        behind, here, ahead = (np.interp(middle + k * half_s, times, places) for k in (-1, 0, 1))
-        return ahead - 2.0 * here + behind, ahead - behind
-
-    (moved, chord), (f, _) = bent(at_s, way), bent(t_s, felt)
-    faced = np.exp(1j * np.interp(middle, t_s, turned))
-    good = np.abs(chord) > _MOVES_M
-    windows = good.sum() * _STEP_S / half_s
-    if windows < _FEWEST:
+    t, at = felt.t_s, felt.times_of(motion)
+    there = np.interp(at, t, felt.turned)
+    way = summed(at, motion.speed_mps * np.exp(1j * there)) if motion.way_m is None else motion.way_m
+    middle = np.arange(max(t[0], at[0]) + half_s, min(t[-1], at[-1]) - half_s, STEP_S)
+    (moved, chord), (f, _) = bent(at, way, middle, half_s), bent(t, felt.way_m, middle, half_s)
+    faced = np.exp(1j * np.interp(middle, t, felt.turned))
+    good = np.abs(chord) > MOVES_M
+    windows = good.sum() * STEP_S / half_s
+    if windows < FEWEST:
         return None
-    m = (moved * np.conj(faced if along else chord / np.maximum(np.abs(chord), _MOVES_M)))[good]
-    f = (f * np.conj(faced))[good]
+    heads = faced if motion.way_m is None else chord / np.maximum(np.abs(chord), MOVES_M)
+    m, f = (moved * np.conj(heads))[good], (f * np.conj(faced))[good]
     m, f = m - m.mean(), f - f.mean()
     power = float(np.sqrt((np.abs(f) ** 2).sum() * (np.abs(m) ** 2).sum()))
     product = complex((np.conj(f) * m).sum())
     coherence = abs(product) / power if power > 0.0 else 0.0
     psi = float(np.degrees(np.angle(product)))
     return YawInCraft(motion.source, psi, max(coherence, 1e-6), 1.0 / float(np.sqrt(windows)))
+
+
+def bent(
+    times_s: Array, places: NDArray[np.complex128], middle_s: Array, half_s: float
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return the second difference of places about some times, and the first, over twice as long."""
+    behind, here, ahead = (np.interp(middle_s + k * half_s, times_s, places) for k in (-1, 0, 1))
+    return ahead - 2.0 * here + behind, ahead - behind

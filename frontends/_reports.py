@@ -93,7 +93,8 @@ class GnssReport:
         statuses: fixes by status name; known_covariance: share of fixes that report one.
         reported_sigma_m: median sigma east, north, up; scatter_m: the white part seen in the data, the same.
         white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
-        spans_s: time from its first fix to its last.
+        spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
+            1 sigma; None where that does not tell.
         hangs: where it says one place while the craft goes on, in words; '' where it does not.
         without_height: messages with a place and no height. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
@@ -115,6 +116,7 @@ class GnssReport:
     hangs: str = ""
     without_height: int = 0
     spans_s: float = 0.0
+    late_s: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,13 +146,14 @@ class CompassReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityReport:
-    """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why."""
+    """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why; `late_s` as of a receiver."""
 
     topic: str
     msgtype: str
     axes: str | None
     why: str
     tf_frame: str | None
+    late_s: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,12 +26,12 @@ from graphloc.frontends._assess import (
     topic_report,
     track,
 )
-from graphloc.frontends._assess_imu import imu_report, samples_of, turning_of
+from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import origin_of
 from graphloc.frontends._clock import refuse_woven
 from graphloc.frontends._draft import draft_config
-from graphloc.frontends._lag import lag
+from graphloc.frontends._lag import lag, lag_of_way
 from graphloc.frontends._reports import (
     CompassReport,
     GnssReport,
@@ -137,6 +137,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motions, courses, tree, body))]
     found_imus.sort(key=lambda i: (bool(i.missing), i.gravity == "removed", i.gyro_noise_mdps))
     turning = turning_of(heard[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
+    felt = felt_of(heard[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
+    late = {m.source: lag_of_way(felt, m) for m in motions} if felt else {}
     candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU, *NUMBERS)]
     found_compasses = _without_echoes([(c, s) for s in candidates if (c := compass_report(s, courses, turning))])
     used = (
@@ -154,13 +156,13 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         )
         + tuple(topic_report(s, len(s)) for s in streams if s.topic not in topics),
         imus=tuple(found_imus),
-        gnss=tuple(found_gnss),
+        gnss=tuple(replace(g, late_s=late.get(g.topic)) for g in found_gnss),
         compasses=tuple(
             _asked_together(_timed(c, s, by_topic[s.topic], turning), s, [(i, heard[i.topic]) for i in found_imus])
             for c, s in found_compasses
         ),
         odometry=tuple(report for _, report in told),
-        velocities=tuple(report for _, report in twists),
+        velocities=tuple(replace(report, late_s=late.get(report.topic)) for _, report in twists),
         lidars=_mounted(clouds, tree, body),
         cameras=tuple(
             replace(camera, listed=bool(set(LISTS) & set(topics[camera.topic].msgtypes)))

@@ -288,3 +288,18 @@ def test_a_course_that_wanders_about_the_heading_tells_no_compass_to_a_degree(
     # A sine of 6 deg, the mean taken over each third of its period: 6 sinc(1/3) / sqrt(2) = 3.5 deg.
     assert compass.mount_offset_sigma_deg == (pytest.approx(3.5, abs=1.0) if leeway_deg else 1.0)
     assert ("its offset to the GNSS course wanders" in text) == bool(leeway_deg)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.4, -0.4])
+def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path) -> None:
+    """Drivers of serial lines stamp when they hear. The IMU tells it where the craft brakes, whatever the antenna's lever."""
+    make = Messages(2)
+    items = [item for item in drive(make, seconds=120, noise_m=0.05, status=0, sigma_m=1.0) if item[0] != "/wheel/odom"]
+    late_ns = round(late_s * S)
+    for k, (topic, at, m) in enumerate(items):
+        if topic == "/fix":
+            later = make.fix(at + late_ns, m.latitude, m.longitude, m.altitude, 0, np.eye(3).ravel())
+            items[k] = (topic, at + late_ns, later)
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(-late_s, abs=0.1)
+    assert (config.sensors["gnss"].time_offset_s != 0.0) == (late_s != 0.0)
