@@ -24,6 +24,7 @@ from graphloc.time import NS_PER_S
 # Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
 _COURSE_S, _COURSE_CLEAR = 12.0, 0.6
 _UPSIDE_DOWN_DEG = 150.0
+_QUIET_S = 2
 _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, or an antenna far ahead, make less
 
 
@@ -260,13 +261,20 @@ def imu_report(
 
 
 def _standstill(stamps: NDArray[np.int64], accel: Array, gyro: Array, motion: Motion | None) -> NDArray[np.bool_]:
-    """Return (N,) whether a sample lies in a quiet second (and the speed, where known, is zero)."""
+    """Return (N,) whether a sample lies in quiet seconds in a row (and the speed, where known, is zero).
+
+    A vessel that rolls is quiet for a second where she turns back, and what she does then is no bias.
+    """
     second = (stamps - stamps[0]) // NS_PER_S
-    still = np.zeros(len(stamps), dtype=bool)
+    quiet = np.zeros(int(second[-1]) + 1, dtype=bool)
     for s in np.unique(second):
         part = second == s
-        quiet = float(gyro[part].std(axis=0).max()) < 0.03 and float(accel[part].std(axis=0).max()) < 0.2
-        still[part] = quiet and float(np.abs(gyro[part].mean(axis=0)).max()) < 0.02
+        calm = float(gyro[part].std(axis=0).max()) < 0.03 and float(accel[part].std(axis=0).max()) < 0.2
+        quiet[s] = calm and float(np.abs(gyro[part].mean(axis=0)).max()) < 0.02
+    edges = np.flatnonzero(np.diff(quiet, prepend=False, append=False))
+    for first, after in edges.reshape(-1, 2):
+        quiet[first:after] &= after - first >= _QUIET_S
+    still: NDArray[np.bool_] = quiet[second]
     if motion is not None:
         t = (stamps - motion.origin_ns) / NS_PER_S
         still[np.abs(np.interp(t, motion.t_s, motion.speed_mps)) > 0.05] = False

@@ -49,6 +49,21 @@ def boat(make: Messages, yaw_deg: float) -> list[Item]:
     return items
 
 
+def test_a_second_in_which_a_rolling_vessel_turns_back_is_no_standstill(tmp_path: Path) -> None:
+    """What she turned then was taken for the gyroscope's bias, and off the turns by which compasses are judged."""
+    make = Messages(2)
+    t = np.arange(0.0, 60.0, 0.02)
+    roll = 0.05 * np.sin(2.0 * np.pi * t / 5.0)  # rad/s
+    items: list[Item] = []
+    for k, rate in enumerate(roll.tolist()):
+        at = START_NS + k * S // 50
+        items.append(("/imu", at, make.imu(at, (0.01 * (k % 3), 0.0, 9.81), (rate, 0.0, 0.01))))
+    items.append(("/fix", items[-1][1], make.fix(items[-1][1])))
+    found, _, _ = look(tmp_path, items, make)
+    assert found.imus[0].still_s == 0.0
+    assert found.imus[0].gyro_bias_radps is None
+
+
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0, -90.0])
 def test_fixes_of_a_slow_craft_in_waves_tell_the_yaw_of_its_imu(yaw_deg: float, tmp_path: Path) -> None:
     found, _, _ = look(tmp_path, boat(Messages(2), yaw_deg), Messages(2))
