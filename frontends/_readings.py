@@ -30,6 +30,9 @@ from graphloc.ledger import LedgerRow
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
 from graphloc.time import NS_PER_S, utc_text
 
+_HEADINGS_APART_NS = 45_000_000  # 20 a second stay, though their stamps jitter
+THINNED = "less than 0.05 s after the heading before: what a compass errs lasts longer, so that it tells nothing new"
+
 
 @dataclass(slots=True)
 class Readings:
@@ -222,6 +225,22 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     warnings += _fixes.height_warning(readings.sensor, fixes)
     warnings += _fixes.scatter_warning(readings.sensor, fixes, readings.config)
     return rows
+
+
+def thin_headings(readings: Readings) -> list[LedgerRow]:
+    """Drop headings that come faster than a compass errs anew: an orientation at 500 Hz costs four times the memory of all else.
+
+    They must be in order of their stamps to be dropped evenly; those that are not stay.
+    """
+    if not isinstance(readings.config, CompassConfig) or len(readings.values) < 2:
+        return []
+    stamps = readings.stamps()
+    bad = np.zeros(len(stamps), dtype=bool)
+    last_ns = int(stamps[0])
+    for i, stamp_ns in enumerate(stamps[1:].tolist(), start=1):
+        bad[i] = 0 < stamp_ns - last_ns < _HEADINGS_APART_NS
+        last_ns = last_ns if bad[i] else stamp_ns
+    return readings.drop(bad, rejected(THINNED))
 
 
 def reject_scattered(imu: ImuSeries | None, readings: Readings, warnings: list[str]) -> list[LedgerRow]:

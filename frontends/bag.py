@@ -33,6 +33,7 @@ from graphloc.frontends._readings import (
     reject_repeats,
     reject_scattered,
     reject_set_back,
+    thin_headings,
 )
 from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
@@ -105,7 +106,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
             rows += more
         else:
             rows += reject_repeats(readings) + reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
-            rows += reject_scattered(imu, readings, warnings)
+            rows += thin_headings(readings) + reject_scattered(imu, readings, warnings)
             measurements += [v for v in readings.values if isinstance(v, Measurement)]
     if imu is not None:
         _refuse_unit(imu, sensors)

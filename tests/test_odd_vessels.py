@@ -15,6 +15,7 @@ from graphloc import app
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, rpy_from_rotation
+from graphloc.frontends._readings import THINNED
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.measurements import GnssPosition
 from graphloc.trajectory import Trajectory
@@ -103,7 +104,8 @@ def test_from_a_draft_to_a_track(kind: str, heading_deg: float, tmp_path: Path) 
     solved = app.smooth_recording(recording, config)
     ours = compare_to_truth(solved.solution.trajectory, world_of(solved, run))
     counts = solved.solution.ledger.counts()[kind]
-    assert counts["used"] > 0.9 * sum(counts.values())
+    thinned = sum(row.reason == THINNED for row in recording.rows)  # of an orientation at 100 Hz
+    assert counts["used"] > 0.9 * (sum(counts.values()) - thinned)
     assert solved.solution.stats.converged
     assert ours.position_rmse_m < 0.3
     assert ours.heading_rmse_deg < heading_deg
