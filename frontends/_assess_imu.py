@@ -51,10 +51,10 @@ def mount_guess(
     if pose is not None:
         rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
         tilt = float(np.degrees(np.arccos(np.clip((pose[1] @ up)[2] / max(size, 1e-9), -1.0, 1.0))))
-        note = "" if size < 2.0 or tilt < 20.0 else f", BUT gravity is then {tilt:.0f} deg off body z: check"
-        return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"/tf_static knows it{note}")
+        note = "" if size < 2.0 or tilt < 20.0 else f"; but then gravity is {tilt:.0f} deg off body z: check it"
+        return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"from /tf_static{note}")
     if size < 0.5 * STANDARD_GRAVITY_MPS2:
-        return _turned(imu, accel, gyro, motion, np.eye(3), "no gravity to level by: taken as level")
+        return _turned(imu, accel, gyro, motion, np.eye(3), "no gravity to find the level from: taken as level")
     axis = up / size
     snapped = np.zeros(3)
     k = int(np.argmax(np.abs(axis)))
@@ -90,11 +90,11 @@ def _level(axis: Array) -> Array:
 def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motion: Motion | None) -> tuple[float, str]:
     """Return the quarter turn (deg) that fits the motion, and the evidence; `accel`, `gyro` are levelled."""
     if motion is None:
-        return 0.0, "no motion to tell its yaw by: taken as 0"
+        return 0.0, "no motion to find its yaw from: taken as 0"
     t = (imu.stamps_ns[samples_of(imu)[0]] - motion.origin_ns) / NS_PER_S
     edges = np.arange(max(t[0], motion.t_s[0]), min(t[-1], motion.t_s[-1]), _WINDOW_S)
     if len(edges) < 20:
-        return 0.0, "too little motion to tell its yaw by: taken as 0"
+        return 0.0, "too little motion to find its yaw from: taken as 0"
 
     def mean(columns: Array) -> Array:
         """Mean over each window, from the running integral."""
@@ -110,7 +110,7 @@ def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motion: Motion | None) ->
     coherence = abs(product) / power if power > 0.0 else 0.0
     psi = float(np.degrees(np.angle(product)))
     if coherence < max(_MIN_COHERENCE, 4.0 / float(np.sqrt(len(a)))):
-        return 0.0, f"motion of {motion.source} does not tell its yaw (coherence {coherence:.2f}): taken as 0"
+        return 0.0, f"motion of {motion.source} does not show its yaw (coherence {coherence:.2f}): taken as 0"
     quarter = float(wrap_angle(np.radians(90.0 * round(psi / 90.0))))
     return float(
         np.degrees(quarter)
@@ -165,7 +165,7 @@ def _righted(
     pose = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
     against = "its gyro turns against the courses of the fixes"
     if pose is None and sense < 0 and report.gravity == "removed":
-        why = f"{against}: taken as lying on its back; no gravity to tell"
+        why = f"{against}: taken as lying on its back, as there is no gravity to check by"
         mount = _turned(imu, accel, gyro, motion, np.diag([1.0, -1.0, -1.0]), why)
         return replace(report, mount=mount)
     if pose is None and sense < 0:
@@ -182,7 +182,7 @@ def _righted(
         return replace(report, why=(*report.why, why))
     if upside_down and report.gravity == "included":
         why = "with the mount in /tf_static its gyro turns as the fixes do, but gravity points down: accelerations look inverted"
-        mount = replace(report.mount, evidence="/tf_static knows it")
+        mount = replace(report.mount, evidence="from /tf_static")
         return replace(report, gravity="inverted", mount=mount, why=(*report.why, why))
     return report
 

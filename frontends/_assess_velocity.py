@@ -33,7 +33,7 @@ def velocity_report(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, tf
     chords, mean = _pairs(stream.stamps_ns[keep], stream.rows[keep], stamps_ns, p_m)
     speed = float(np.sqrt((chords**2).sum(axis=1).mean())) if len(chords) else 0.0
     if len(chords) < 10 or speed < 0.5:
-        return report(None, "no GNSS track in motion to check it by")
+        return report(None, "no GNSS track in motion to check it against")
     forward = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
     along = np.column_stack([forward[:, 0] * mean[:, 0], forward[:, 1] * mean[:, 0]])  # body x laid along the track
     errors = [float(np.sqrt(((v - chords) ** 2).sum(axis=1).mean())) for v in (mean[:, :2], mean[:, 1::-1], along)]

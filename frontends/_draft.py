@@ -81,7 +81,7 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     if inspection.cameras:
         yield _tags_block(inspection.cameras)
     if inspection.gnss:
-        yield ["height:", "  enabled: false  # guess: set to true for a craft that floats"]
+        yield ["height:", "  enabled: false  # guess: true for a vessel that floats"]
 
 
 def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
@@ -91,7 +91,7 @@ def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
         "  enabled: false  # guess: true once there is a map: `image`, `vector`, or both",
         "  image: ''  # an aerial image of the place: GeoTIFF, MBTiles, or a folder of tiles",
         "  vector: ''  # GeoJSON of quays and piers",
-        "  hull_m: []  # guess: corners of the vessel's outline, [forward, port], m: what is within is its own",
+        "  hull_m: []  # guess: corners of the vessel's outline, [forward, port], m: points inside are its own",
         "  waterline_m: 0.0  # guess: height of the waterline in the body frame, m",
         "  lidars:",
     ]
@@ -99,7 +99,7 @@ def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
         lines.append(f"    {_numbered('lidar', k)}:")
         lines.append(f"      topic: {lidar.topic}")
         if lidar.tf_frame is not None:
-            lines.append(f"      mount: {{tf_frame: {json.dumps(lidar.tf_frame)}}}  # /tf_static knows it")
+            lines.append(f"      mount: {{tf_frame: {json.dumps(lidar.tf_frame)}}}  # from /tf_static")
         else:
             lines.append(
                 f"      mount: {{xyz_m: [0.0, 0.0, 0.0]}}  # guess: where '{lidar.frame_id}' sits is not in the bag; measure it"
@@ -112,12 +112,10 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
         "tags:",
         "  kind: apriltag",
         "  enabled: false  # guess: true once there is a survey of the tags",
-        "  survey: tags.yaml  # which tags stand where, and how large they are: docs/tags.md",
+        "  survey: tags.yaml  # positions and sizes of the tags: docs/tags.md",
     ]
     if any(camera.listed for camera in cameras):
-        lines.append(
-            f"  edge_sigma_px: {_LISTED_EDGE_PX}  # guess: another's detector, which sees white creep into black (gamma)"
-        )
+        lines.append(f"  edge_sigma_px: {_LISTED_EDGE_PX}  # guess: an external detector, on images with gamma")
     lines.append("  cameras:")
     for k, camera in enumerate(cameras):
         lines.append(f"    {_numbered('camera', k)}:")
@@ -128,7 +126,7 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
             lines.append("      info_topic: ''  # guess: there is no CameraInfo beside it; name its topic")
         if camera.tf_frame is not None:
             lines.append(
-                f"      mount: {{tf_frame: {json.dumps(camera.tf_frame)}}}  # /tf_static knows it; it must be the optical frame"
+                f"      mount: {{tf_frame: {json.dumps(camera.tf_frame)}}}  # from /tf_static; it must be the optical frame"
             )
         else:
             lines.append(
@@ -201,19 +199,19 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     if not enabled:
         lines.append("  enabled: false  # guess: the receiver with most fixes is used")
     if gnss.tf_frame is not None:
-        lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # /tf_static knows it")
+        lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # from /tf_static")
     else:
         lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
     default = GnssConfig()
     claimed = max(gnss.reported_sigma_m[:2]) if gnss.reported_sigma_m else default.default_horizontal_sigma_m
     if gnss.white_m is not None and gnss.white_m > SCATTERS * claimed:
-        scatter, times = f"guess: fixes scatter by {gnss.white_m:.2f} m from one to the next", gnss.white_m / claimed
+        scatter, times = f"guess: consecutive fixes scatter by {gnss.white_m:.2f} m", gnss.white_m / claimed
         if gnss.reported_sigma_m:
-            lines.append(f"  sigma_scale: {times:.1f}  # {scatter}, and claim {claimed:.2f} m")
+            lines.append(f"  sigma_scale: {times:.1f}  # {scatter} but claim {claimed:.2f} m")
         else:
-            lines.append(f"  default_horizontal_sigma_m: {gnss.white_m:.1f}  # {scatter}, and claim nothing")
+            lines.append(f"  default_horizontal_sigma_m: {gnss.white_m:.1f}  # {scatter} and report no sigma")
             lines.append(
-                f"  default_vertical_sigma_m: {times * default.default_vertical_sigma_m:.1f}  # guess: as many times"
+                f"  default_vertical_sigma_m: {times * default.default_vertical_sigma_m:.1f}  # guess: scaled likewise"
             )
     lines += _rtk_lines(gnss)
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
@@ -239,7 +237,7 @@ def _rtk_lines(gnss: GnssReport) -> list[str]:
     if seen_m[0] > _RTK_SCATTER_M:
         return []
     horizontal, vertical = (max(least, seen) for least, seen in zip(_RTK_M, seen_m, strict=True))
-    said = f"guess: status gbas (RTK, or DGPS), and fixes scatter by {seen_m[0]:.3f} m from one to the next"
+    said = f"guess: status gbas (RTK, or DGPS), and consecutive fixes scatter by {seen_m[0]:.3f} m"
     return [
         f"  default_horizontal_sigma_m: {horizontal:.2f}  # {said}",
         f"  default_vertical_sigma_m: {vertical:.2f}  # guess: likewise, {seen_m[1]:.3f} m",
@@ -253,7 +251,7 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None) -
     else:
         lines[-1] += f"  # guess: a velocity in east, north, up; {twist.why}"
     frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
-    evidence = "/tf_static knows it" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
+    evidence = "from /tf_static" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
     if frame is not None:
         lines.append(f"  mount: {{tf_frame: {json.dumps(frame)}}}  # {evidence}")
     else:
@@ -269,7 +267,7 @@ def _compass_block(name: str, compass: CompassReport, *, enabled: bool) -> list[
         f"  convention: {compass.convention}  # guess: {compass.why}",
     ]
     if compass.unit is not None:
-        lines.append(f"  unit: {compass.unit}  # guess: by how large its numbers are")
+        lines.append(f"  unit: {compass.unit}  # guess: by the size of its numbers")
     if not enabled:
         lines.append(
             "  enabled: false  # guess: another heading of the same topic is used, a true one before a magnetic one"
@@ -278,23 +276,25 @@ def _compass_block(name: str, compass: CompassReport, *, enabled: bool) -> list[
         quarter = 90.0 * round(compass.offset_deg / 90.0)
         rest = abs(compass.offset_deg - quarter)
         yaw, sigma = (quarter, rest) if rest < 15.0 else (round(compass.offset_deg), _LEEWAY_DEG)
-        astern = ", unless the craft goes astern most of the time: then 0" if abs(yaw) > _ASTERN_DEG else ""
+        astern = ", unless the vessel goes astern most of the time: then 0" if abs(yaw) > _ASTERN_DEG else ""
         lines.append(
             f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course{astern}"
         )
         if sigma > _COMPASS_SIGMA_DEG:
-            lines.append(f"  mount_offset_sigma_deg: {sigma:.1f}  # guess: a course is no heading, and tells no more")
+            lines.append(
+                f"  mount_offset_sigma_deg: {sigma:.1f}  # guess: a course is not a heading, so no better known"
+            )
     elif compass.offset_deg is not None and abs(compass.offset_deg) > _COMPASS_SIGMA_DEG:
         lines.append(
-            f"  mount_offset_sigma_deg: {abs(compass.offset_deg):.1f}  # guess: as far as it is off the GNSS course"
+            f"  mount_offset_sigma_deg: {abs(compass.offset_deg):.1f}  # guess: its offset from the GNSS course"
         )
     elif compass.offset_deg is None:
         lines.append(
-            f"  mount_offset_sigma_deg: {_UNKNOWN_DEG:.1f}  # guess: no course tells; declination, or a mount, may be in it; 1 for "
-            "a true heading whose mount is known"
+            f"  mount_offset_sigma_deg: {_UNKNOWN_DEG:.1f}  # guess: no course to compare with, so declination or a mount offset may "
+            "be in it; 1 for a true heading with a known mount"
         )
     lines.append("  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass")
-    lines.append("  wander_sigma_deg: 0.5  # guess: a harbour's iron turns it for a while; 0.2 for a GNSS compass")
+    lines.append("  wander_sigma_deg: 0.5  # guess: passing errors near iron; 0.2 for a GNSS compass")
     if compass.msgtype == IMU:
         lines.append("  use_reported_sigma: false  # guess: drivers' orientation covariances are seldom measured")
     return lines
