@@ -114,7 +114,7 @@ def test_a_run_that_never_starts_says_what_it_waited_for(run: SimulatedRun) -> N
         run.recording, measurements=tuple(m for m in run.recording.measurements if not isinstance(m, GnssPosition))
     )
     alone = replace(without, measurements=tuple(m for m in without.measurements if m.sensor == "compass"))
-    with pytest.raises(SolveError, match="waited for a place"):
+    with pytest.raises(SolveError, match="waiting for a position"):
         replay(alone, run.config)
 
 
