@@ -105,7 +105,9 @@ def _to_batch(job: Case) -> Any:
     for a in bad.arrivals_of(run):
         smoother.feed(a.m)
     window = smoother.window()
-    unheard = {row.seq for row in smoother.finish() if row.reason == "the run ended before a state there"}
+    unheard = {
+        row.seq for row in smoother.finish() if row.reason == "the run ended before there was a state at its stamp"
+    }
     heard = tuple(m for m in run.recording.measurements if m.seq not in unheard)
     batch = app.simulated(replace(run, recording=replace(run.recording, measurements=heard))).solution.trajectory
     assert window is not None

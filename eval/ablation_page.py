@@ -23,9 +23,9 @@ _DIFFERENT_M = 0.02  # differences below are not worth a word
 
 _BASIS = {
     "truth": "Errors are against truth, which was not fused.",
-    "held": "No truth: errors are at GNSS fixes that were kept out of all runs; their own noise is part of them.",
-    "full": "No truth and no held-out fixes: distances are from the run with all sensors, which is no measure of accuracy. "
-    "How the 95 % bounds grow says what a sensor is worth; --hold-out every:5 would measure.",
+    "held": "No truth: errors are at GNSS fixes held out of all runs; they include the fixes' own noise.",
+    "full": "No truth and no held-out fixes: distances are from the run with all sensors, which does not measure accuracy. "
+    "The growth of the 95 % bounds shows what a sensor contributes; --hold-out every:5 would measure it.",
 }
 
 
@@ -114,8 +114,8 @@ def grids(ablated: Ablated) -> list[Grid]:
         note=(
             f"{_BASIS[ablated.basis]}{' The antenna is compared, so headings are not.' if held else ''} Bounds: the solution's own, "
             "median. Contradiction: how far the sensor's measurements are from the run without it, in sigmas of both together; "
-            f"1 or less where all is well, above {CONTRADICTS:g} something is wrong with it or with what is left. A bad "
-            "sensor: without it errors or the cost fall. Without a count: the configuration makes its measurements."
+            f"1 or less if all is well, above {CONTRADICTS:g} something is wrong with it or with the others. A bad "
+            "sensor: without it errors or the cost fall. No count: its measurements come from the configuration."
         ),
     )  # fmt: skip
     names = [e.without for e in ablated.effects if any(other.fits.get(e.without) for other in every)]
@@ -125,8 +125,8 @@ def grids(ablated: Ablated) -> list[Grid]:
         if not e.why_not
     )
     note = (
-        "Median of what is used of a sensor, in its own sigmas: 1 where its noise is configured right; a fit that gets better "
-        "where another sensor is left out points at that one."
+        "Median residual of a sensor's used measurements, in its own sigmas: 1 where its noise is configured right. A fit that "
+        "improves when another sensor is left out points at that one."
     )
     return [bought, Grid(title="How well each sensor fits", head=("", *names), rows=fits, note=note)]
 

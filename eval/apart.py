@@ -51,9 +51,9 @@ def apart_warnings(track: Trajectory, datum: Datum, recording: Recording, config
         if size**2 >= chi2_95(2) * _mean_variance(process.horizontal_sigma_m, process.time_constant_s, lasts_s):
             towards = float(heading_deg_from_yaw(np.arctan2(mean[1], mean[0])))
             lines.append(
-                f"{name} stands {size:.1f} m (towards {towards:.0f} deg) off what {', '.join(others)} says, all the while; its slow "
-                f"error of {process.horizontal_sigma_m:.1f} m (1 sigma) does not explain that: a map, a survey, the datum or a "
-                "lever is off by as much, or the receiver is; the track follows the others"
+                f"{name} has a constant offset of {size:.1f} m (towards {towards:.0f} deg) from {', '.join(others)}, more than its slow "
+                f"error of {process.horizontal_sigma_m:.1f} m (1 sigma) explains: the map, the survey, the datum or a lever arm is "
+                "off by that much, or the receiver is; the track follows the others"
             )
         if any(not m.has_height for m in fixes):
             continue
@@ -63,8 +63,9 @@ def apart_warnings(track: Trajectory, datum: Datum, recording: Recording, config
             process.vertical_sigma_m, process.time_constant_s, lasts_s
         ):
             lines.append(
-                f"{name} stands {size:.1f} m ({'up' if mean[0] > 0.0 else 'down'}) off what {', '.join(others)} says, all the "
-                f"while; its slow error of {process.vertical_sigma_m:.1f} m in height (1 sigma) does not explain that: one of them may be above the geoid, and the other above the ellipsoid"
+                f"{name} has a constant offset of {size:.1f} m ({'up' if mean[0] > 0.0 else 'down'}) from {', '.join(others)}, more "
+                f"than its slow error of {process.vertical_sigma_m:.1f} m in height (1 sigma) explains: one may be above the geoid, "
+                "the other above the ellipsoid"
             )
     return lines
 

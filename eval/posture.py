@@ -35,8 +35,8 @@ def _tilted(track: Trajectory) -> str:
     if tilt_deg < _TILTED_DEG or track.planar:
         return ""
     return (
-        f"the craft is tilted by {tilt_deg:.0f} deg for most of the run: as configured, the IMU lies so; check its "
-        "mount.rpy_deg, and the sign of its accelerations"
+        f"the vessel is tilted by {tilt_deg:.0f} deg for most of the run: check the IMU's mount.rpy_deg and the sign of its "
+        "accelerations"
     )
 
 
@@ -55,15 +55,15 @@ def _sideways(track: Trajectory, recording: Recording, config: VesselConfig) -> 
         return ""
     said = (
         f"the course is more than {_SIDEWAYS_DEG:.0f} deg off the solved heading for {share:.0%} of the {way_m.sum():.0f} m "
-        f"made above {_MOVES_MPS:.0f} m/s: unless the craft goes sideways or astern"
+        f"made above {_MOVES_MPS:.0f} m/s: unless the vessel goes sideways or astern"
     )
     mean = complex((way_m * np.exp(1j * off)).sum() / way_m.sum())
     if abs(mean) < _STEADY or recording.imu is None or recording.imu.sensor not in config.sensors:
-        return f"{said}, the heading is wrong: check the IMU's axes (mount, signs of its rates and accelerations), and compasses"
+        return f"{said}, the heading is wrong: check the IMU's axes (mount, signs of its rates and accelerations) and the compasses"
     _, R_body_imu = mount_of(recording.imu.sensor, config.sensors[recording.imu.sensor], recording.mounts)
     yaw_deg = float(np.degrees(rpy_from_rotation(R_body_imu)[2]))
     turned = float(np.degrees(wrap_angle(np.radians(yaw_deg) - np.angle(mean))))
     return (
-        f"{said}, {recording.imu.sensor}.mount.rpy_deg[2] is about {turned:.0f} instead of {yaw_deg:.0f}, or the heading that "
-        "a compass, a pose sensor or start.heading_deg gives is turned by as much"
+        f"{said}, {recording.imu.sensor}.mount.rpy_deg[2] should be about {turned:.0f} instead of {yaw_deg:.0f}, or the heading from "
+        "a compass, a pose sensor or start.heading_deg is off by that much"
     )

@@ -9,16 +9,16 @@ LABELS = {
     "position_max_m": "horizontal error, largest, m",
     "heading_rmse_deg": "heading error, RMSE, degrees",
     "coverage_95": "share of the time in which the 95 % region holds the truth",
-    "horizontal_rmse_m": "horizontal error at fixes that were kept out, RMSE, m",
-    "horizontal_max_m": "horizontal error at fixes that were kept out, largest, m",
+    "horizontal_rmse_m": "horizontal error at held-out fixes, RMSE, m",
+    "horizontal_max_m": "horizontal error at held-out fixes, largest, m",
     "outage_drift_m": "largest error in a gap, RMS over the gaps, m",
     "sighted_rmse_m": "horizontal error from the first sighting on, RMSE, m",
     "berth_p95_m": "horizontal error in the last 5 s, 95 %, m",
     "lost": "lost at the end: 1 yes, 0 no",
     "wrong_side": "on the wrong side of a tag at the end: 1 yes, 0 no",
     "dnv_met": "0.10 m at 95 % within 5 m of the tags: 1 yes, 0 no",
-    "mean_mps": "forward speed less the one that was not fused, mean, m/s",
-    "std_mps": "forward speed less the one that was not fused, standard deviation, m/s",
+    "mean_mps": "forward speed minus the measured one (not fused), mean, m/s",
+    "std_mps": "forward speed minus the measured one (not fused), standard deviation, m/s",
 }
 """What a number is, in words; docs/outputs.md says it at length."""
 

@@ -349,9 +349,9 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
     spoke_ns = stream.stamps_ns[keep][good]
     heard = 0 if courses is None else int(np.searchsorted(courses.stamps_ns, spoke_ns[[0, -1]]) @ [-1, 1])
     if courses is None or heard < 20:
-        why = "no GNSS course in motion to check it by" + (", the convention by the gyro" if by_gyro else "")
+        why = "no GNSS course in motion to check it against" + (", convention from the gyro" if by_gyro else "")
         if courses is not None and not heard and stream.msgtype in NUMBERS:
-            why = "no GNSS course in motion while it speaks: it has no stamp, and was recorded at another time"
+            why = "no GNSS course in motion at the times it was recorded (it has no stamp)"
         return CompassReport(
             **plain, usable=named, convention=by_gyro or "enu", offset_deg=None, scatter_deg=None, samples=0, why=why
         )
@@ -374,9 +374,9 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
     usable = scatter < 15.0
     why = f"yaw minus GNSS course: {offset:+.0f} deg, scatter {scatter:.0f} deg over {len(measured)} courses"
     if not usable:
-        why += ": only relative, or disturbed"
+        why += ": a relative or a disturbed heading"
     elif by_gyro:
-        why += "; the convention by the gyro"
+        why += "; convention from the gyro"
     elif turned < 20.0:
         why += ", on a nearly straight track: the convention is not certain"
     return CompassReport(

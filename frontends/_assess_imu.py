@@ -49,14 +49,14 @@ def mount_guess(
     if pose is not None:
         rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
         tilt = float(np.degrees(np.arccos(np.clip((pose[1] @ up)[2] / max(size, 1e-9), -1.0, 1.0))))
-        note = "" if size < 2.0 or tilt < 20.0 else f", BUT gravity is then {tilt:.0f} deg off body z: check"
+        note = "" if size < 2.0 or tilt < 20.0 else f"; but then gravity is {tilt:.0f} deg off body z: check it"
         if not note and motions:
             body_axes = accel @ pose[1].T, gyro @ pose[1].T
             turned = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], *body_axes, motions)
-            note = f", BUT {turned.said}: check" if turned is not None and turned.astray else ""
-        return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"/tf_static knows it{note}")
+            note = f"; but {turned.said}: check it" if turned is not None and turned.astray else ""
+        return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"from /tf_static{note}")
     if size < 0.5 * STANDARD_GRAVITY_MPS2:
-        return _turned(imu, accel, gyro, motions, np.eye(3), "no gravity to level by: taken as level")
+        return _turned(imu, accel, gyro, motions, np.eye(3), "no gravity to find the level from: taken as level")
     axis = up / size
     snapped = np.zeros(3)
     k = int(np.argmax(np.abs(axis)))
@@ -95,12 +95,12 @@ def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion]
     A quarter turn, unless the motion tells clearly that it is none.
     """
     if not motions:
-        return 0.0, "no motion to tell its yaw by: taken as 0"
+        return 0.0, "no motion to find its yaw from: taken as 0"
     found = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], accel, gyro, motions)
     if found is None:
-        return 0.0, "too little motion to tell its yaw by: taken as 0"
+        return 0.0, "too little motion to find its yaw from: taken as 0"
     if not found.clear:
-        said = f"motion of {found.source} does not tell its yaw (coherence {found.coherence:.2f})"
+        said = f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
         return 0.0, f"{said}: taken as 0"
     quarter = 90.0 * round(found.yaw_deg / 90.0)
     askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
@@ -172,7 +172,7 @@ def _righted(
     pose = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
     against = "its gyro turns against the courses of the fixes"
     if pose is None and sense < 0 and report.gravity == "removed":
-        why = f"{against}: taken as lying on its back; no gravity to tell"
+        why = f"{against}: taken as lying on its back, as there is no gravity to check by"
         mount = _turned(imu, accel, gyro, motions, np.diag([1.0, -1.0, -1.0]), why)
         return replace(report, mount=mount)
     if pose is None and sense < 0:
@@ -189,7 +189,7 @@ def _righted(
         return replace(report, why=(*report.why, why))
     if upside_down and report.gravity == "included":
         why = "with the mount in /tf_static its gyro turns as the fixes do, but gravity points down: accelerations look inverted"
-        mount = replace(report.mount, evidence="/tf_static knows it")
+        mount = replace(report.mount, evidence="from /tf_static")
         return replace(report, gravity="inverted", mount=mount, why=(*report.why, why))
     return report
 

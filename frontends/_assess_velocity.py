@@ -35,7 +35,7 @@ def axes_of(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array) -> tuple[s
     chords, mean = _pairs(stream.stamps_ns[keep][good], v[good], stamps_ns, p_m)
     speed = float(np.sqrt((chords**2).sum(axis=1).mean())) if len(chords) else 0.0
     if len(chords) < 10 or speed < 0.5:
-        return None, "no GNSS track in motion to check it by"
+        return None, "no GNSS track in motion to check it against"
     forward = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
     # Body x laid along the track, either way: a craft may go astern.
     along = forward * np.abs(mean[:, :1])

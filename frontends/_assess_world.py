@@ -34,7 +34,7 @@ def origin_of(
     keep = sane(poses)
     keep = keep[np.isfinite(poses.rows[keep, :3]).all(axis=1)] if len(keep) else keep
     if first_fix is None or len(keep) < 10 or len(stamps_ns) < 10:
-        return None, "no GNSS track to place its frame by"
+        return None, "no GNSS track to check its frame against"
     at, q = poses.stamps_ns[keep], poses.rows[keep, :3]
     if antenna_m is not None:  # the antenna by the poses' own attitude
         q = q + Rotation.from_quat(_quaternions(poses.rows[keep, 3:7])).apply(antenna_m)
@@ -43,10 +43,10 @@ def origin_of(
     p, q = p_m[inside], np.column_stack([np.interp(there, t, q[:, k]) for k in range(3)])
     extent = float(np.hypot(*np.ptp(p[:, :2], axis=0))) if len(p) else 0.0
     if len(p) < 10 or extent < _EXTENT_M:
-        return None, f"the GNSS track is too short ({extent:.0f} m) to place its frame by"
+        return None, f"the GNSS track is too short ({extent:.0f} m) to check its frame against"
     moved = float(np.hypot(*np.ptp(q[:, :2], axis=0)))
     if moved < _STANDS * extent:
-        return None, f"it moves by {moved:.1f} m while the fixes move by {extent:.0f} m: another body than the craft"
+        return None, f"it moves by {moved:.1f} m while the fixes move by {extent:.0f} m: not a pose of this vessel"
     # As complex numbers about their means, p = exp(i turned) q where the frames differ by a turn.
     a, b = (v[:, 0] - v[:, 0].mean() + 1j * (v[:, 1] - v[:, 1].mean()) for v in (q, p))
     turned = float(np.degrees(np.angle(np.vdot(a, b))))
@@ -61,8 +61,8 @@ def origin_of(
     if abs(turned) > tolerance or apart > max(_APART_M, _APART * extent):
         return None, f"its frame is not east-north-up: turned by {turned:+.1f} deg, {apart:.1f} m apart from the fixes"
     place = Datum(Geodetic(*first_fix)).geodetic_from_enu(offset[None, :])[0]
-    still = "" if antenna_m is not None else "the antenna's place on the craft, and "
-    return vec(place), f"fits the fixes to {apart:.1f} m; {still}their slow error is in it, and so in every latitude"
+    lever = "" if antenna_m is not None else " and the antenna's unknown lever arm"
+    return vec(place), f"fits the fixes to {apart:.1f} m; their slow error{lever} is in it, and in every latitude"
 
 
 def _quaternions(rows: Array) -> Array:

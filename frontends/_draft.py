@@ -88,7 +88,7 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     if inspection.cameras:
         yield _tags_block(inspection.cameras)
     if inspection.gnss:
-        yield ["height:", "  enabled: false  # guess: set to true for a craft that floats"]
+        yield ["height:", "  enabled: false  # guess: true for a vessel that floats"]
 
 
 def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
@@ -98,7 +98,7 @@ def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
         "  enabled: false  # guess: true once there is a map: `image`, `vector`, or both",
         "  image: ''  # an aerial image of the place: GeoTIFF, MBTiles, or a folder of tiles",
         "  vector: ''  # GeoJSON of quays and piers",
-        "  hull_m: []  # guess: corners of the vessel's outline, [forward, port], m: what is within is its own",
+        "  hull_m: []  # guess: corners of the vessel's outline, [forward, port], m: points inside are its own",
         "  waterline_m: 0.0  # guess: height of the waterline in the body frame, m",
         "  lidars:",
     ]
@@ -106,7 +106,7 @@ def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
         lines.append(f"    {_numbered('lidar', k)}:")
         lines.append(f"      topic: {lidar.topic}")
         if lidar.tf_frame is not None:
-            lines.append(f"      mount: {{tf_frame: {json.dumps(lidar.tf_frame)}}}  # /tf_static knows it")
+            lines.append(f"      mount: {{tf_frame: {json.dumps(lidar.tf_frame)}}}  # from /tf_static")
         else:
             lines.append(
                 f"      mount: {{xyz_m: [0.0, 0.0, 0.0]}}  # guess: where '{lidar.frame_id}' sits is not in the bag; measure it"
@@ -119,12 +119,10 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
         "tags:",
         "  kind: apriltag",
         "  enabled: false  # guess: true once there is a survey of the tags",
-        "  survey: tags.yaml  # which tags stand where, and how large they are: docs/tags.md",
+        "  survey: tags.yaml  # positions and sizes of the tags: docs/tags.md",
     ]
     if any(camera.listed for camera in cameras):
-        lines.append(
-            f"  edge_sigma_px: {_LISTED_EDGE_PX}  # guess: another's detector, which sees white creep into black (gamma)"
-        )
+        lines.append(f"  edge_sigma_px: {_LISTED_EDGE_PX}  # guess: an external detector, on images with gamma")
     lines.append("  cameras:")
     for k, camera in enumerate(cameras):
         lines.append(f"    {_numbered('camera', k)}:")
@@ -135,7 +133,7 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
             lines.append("      info_topic: ''  # guess: there is no CameraInfo beside it; name its topic")
         if camera.tf_frame is not None:
             lines.append(
-                f"      mount: {{tf_frame: {json.dumps(camera.tf_frame)}}}  # /tf_static knows it; it must be the optical frame"
+                f"      mount: {{tf_frame: {json.dumps(camera.tf_frame)}}}  # from /tf_static; it must be the optical frame"
             )
         else:
             lines.append(
@@ -223,7 +221,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     else:
         lines += _filtered_lines(gnss.topic)
     if gnss.tf_frame is not None:
-        lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # /tf_static knows it")
+        lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # from /tf_static")
     else:
         lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
     lines += _scatter_lines(gnss)
@@ -268,7 +266,7 @@ def _rtk_lines(gnss: GnssReport) -> list[str]:
     if seen_m[0] > _RTK_SCATTER_M:
         return []
     horizontal, vertical = (max(least, seen) for least, seen in zip(_RTK_M, seen_m, strict=True))
-    said = f"guess: status gbas (RTK, or DGPS), and fixes scatter by {seen_m[0]:.3f} m from one to the next"
+    said = f"guess: status gbas (RTK, or DGPS), and consecutive fixes scatter by {seen_m[0]:.3f} m"
     return [
         f"  default_horizontal_sigma_m: {horizontal:.2f}  # {said}",
         f"  default_vertical_sigma_m: {vertical:.2f}  # guess: likewise, {seen_m[1]:.3f} m",
@@ -307,7 +305,7 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, o
     if twist.axes == NORTH_AXES:
         lines.append("  convention: ned  # guess: by the GNSS track")
     frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
-    evidence = "/tf_static knows it" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
+    evidence = "from /tf_static" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
     if frame is not None:
         lines.append(f"  mount: {{tf_frame: {json.dumps(frame)}}}  # {evidence}")
     else:
@@ -327,16 +325,16 @@ def _compass_block(name: str, compass: CompassReport, *, again: bool) -> list[st
         f"  convention: {compass.convention}  # guess: {compass.why}",
     ]
     if compass.unit is not None:
-        lines.append(f"  unit: {compass.unit}  # guess: by how large its numbers are")
+        lines.append(f"  unit: {compass.unit}  # guess: by the size of its numbers")
     if compass.like:
-        lines.append(f"  enabled: false  # guess: it says what {compass.like} says, and counts no second time")
+        lines.append(f"  enabled: false  # guess: it repeats {compass.like}, and must not count twice")
     elif again:
         lines.append(
             "  enabled: false  # guess: another heading of the same topic is used, a true one before a magnetic one"
         )
     lines += _mount_lines(compass)
     lines.append("  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass")
-    lines.append("  wander_sigma_deg: 0.5  # guess: a harbour's iron turns it for a while; 0.2 for a GNSS compass")
+    lines.append("  wander_sigma_deg: 0.5  # guess: passing errors near iron; 0.2 for a GNSS compass")
     if compass.msgtype == IMU:
         lines.append("  use_reported_sigma: false  # guess: drivers' orientation covariances are seldom measured")
     return lines

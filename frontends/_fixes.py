@@ -44,8 +44,8 @@ def held_warning(sensor: str, bad: NDArray[np.bool_]) -> list[str]:
     """Return a line where a driver repeats places, as `held` found."""
     if not bad.any():
         return []
-    said = f"{sensor}: {int(bad.sum())} of {len(bad)} fixes repeat the place of the one before under a new stamp, as drivers do "
-    return [f"{said}that publish faster than the receiver measures: each place counts once, at its first stamp"]
+    said = f"{sensor}: {int(bad.sum())} of {len(bad)} fixes repeat the previous position under a new stamp: the driver "
+    return [f"{said}publishes faster than the receiver measures; each position is used once, at its first stamp"]
 
 
 def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
@@ -54,11 +54,9 @@ def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
     if len(moments) < 3 or 1.0 - len(moments) / len(stamps_ns) < _CUT:
         return []
     step_s = float(np.median(np.diff(moments))) / NS_PER_S
-    said = (
-        f"{sensor}: {len(stamps_ns)} measurements have {len(moments)} stamps, {step_s:g} s apart: the driver cuts them"
-    )
+    said = f"{sensor}: {len(stamps_ns)} measurements have {len(moments)} stamps, {step_s:g} s apart: the driver truncates them"
     return [
-        f"{said}; times are off by up to that, places by that times the speed, and no bound knows of it: mend the driver"
+        f"{said}; times are off by up to that, positions by that times the speed, which no bound includes: fix the driver"
     ]
 
 
@@ -67,10 +65,10 @@ def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:
     flat = sum(not m.has_height for m in fixes)
     if not flat:
         return []
-    said = f"{sensor}: {flat} of {len(fixes)} fixes have no height (altitude is NaN) and count as horizontal ones"
+    said = f"{sensor}: {flat} of {len(fixes)} fixes have no height (altitude is NaN) and are used as horizontal fixes"
     if flat < len(fixes):
         return [said]
-    return [f"{said}: the track's height comes from elsewhere (kind: height, poses, tags), or is a guess"]
+    return [f"{said}: without another source of height (kind: height, poses, tags) the track's height is a guess"]
 
 
 def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConfig) -> list[str]:
@@ -86,12 +84,12 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
         config.sigma_scale * float(np.sqrt(np.median(variances, axis=0).max())), config.min_horizontal_sigma_m
     )
     if claimed > NOTHING_M:
-        scatter = "" if found is None else f", though they scatter by {found:.2f} m from one to the next"
-        said = f"{sensor}: its fixes count as good to {claimed:.0f} m only, and so next to nothing{scatter}"
-        return [f"{said}: by the covariance of its messages, and sigma_scale; look at what the driver writes there"]
+        scatter = "" if found is None else f", though consecutive fixes scatter by {found:.2f} m"
+        said = f"{sensor}: its fixes claim a sigma of {claimed:.0f} m, so they have almost no weight{scatter}"
+        return [f"{said}: check the covariance that the driver writes, and sigma_scale"]
     if found is None or found < SCATTERS * claimed:
         return []
-    said = f"{sensor}: its fixes scatter by {found:.2f} m from one to the next, and count as good to {claimed:.2f} m"
+    said = f"{sensor}: consecutive fixes scatter by {found:.2f} m but claim a sigma of {claimed:.2f} m"
     return [f"{said}: set sigma_scale: {config.sigma_scale * found / claimed:.1f}"]
 
 

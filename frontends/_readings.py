@@ -130,7 +130,7 @@ def reject_set_back(sensors: Sequence[Readings], beside: Sequence[Beside], warni
         where = ", ".join(
             f"by {(stamps[k - 1] - stamps[k]) / NS_PER_S:.1f} s at {utc_text(int(logs[k]))}" for k in cuts
         )
-        why = f"the clock of {imu.sensor} was set back {where}, recording time; only the longest part between is kept, but for scans and images, which are not cut: split the bag there"
+        why = f"the clock of {imu.sensor} was set back {where}, recording time; only the longest part between is used (scans and images are not cut): split the bag there"
         rows = []
         for readings in sensors:
             outside = (readings.logs() < first) | (readings.logs() > last)
@@ -160,7 +160,7 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
         if abs(behind) > _clock.EPOCH_LIMIT_S:
             lines.append(
                 f"{sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "
-                f"{reference}, judged by the recording times; if so, add {behind:.3f} to its time_offset_s"
+                f"{reference}, by the recording times; if that is right, add {behind:.3f} to its time_offset_s"
             )
     return lines
 
@@ -220,7 +220,7 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
         return []
     bad = _fixes.held([v for v in readings.values if isinstance(v, GnssPosition)])
     warnings += _fixes.held_warning(readings.sensor, bad)
-    rows = readings.drop(bad, rejected("repeats the place of the fix before under a new stamp: no new evidence"))
+    rows = readings.drop(bad, rejected("repeats the position of the previous fix under a new stamp: no new evidence"))
     fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
     warnings += _fixes.height_warning(readings.sensor, fixes)
     warnings += _fixes.scatter_warning(readings.sensor, fixes, readings.config)

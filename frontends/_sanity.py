@@ -100,7 +100,7 @@ def refuse_degrees(
     swing = float(np.median(np.linalg.norm(swings, axis=1)))
     if swing > _NO_SWING_RAD:
         raise InputError(
-            f"{sensor}: it rolls and pitches by {np.degrees(swing):.0f} deg within 5 s (median of {config.topic}), which no craft "
+            f"{sensor}: it rolls and pitches by {np.degrees(swing):.0f} deg within 5 s (median of {config.topic}), which no vessel "
             f"does for long: angular_velocity looks like deg/s; set gyro_unit: deg/s of sensors.{sensor}"
         )
 

@@ -23,7 +23,7 @@ _NEAR_S, _ASKED, _FEW, _LOST_DEG = 2.0, 20, 3, 30.0
 bias of 3 deg/s is 6 deg by then, a craft in a sharp turn 30 deg off what it was."""
 _LEAP_DEG, _SMOOTH_DEG = 120.0, 15.0  # beyond the one, which way it turned is a guess; RMS from a steady turn
 SCATTERED = (
-    "parts from most headings beside it, by the gyroscope and without: a course over ground at rest is no heading"
+    "differs from most headings around it, with and without the gyro: a course over ground at rest is no heading"
 )
 Yaws = tuple[NDArray[np.int64], Array]  # stamps (N,), ns, and yaw (N,), rad
 _PART_DEG, _PART = 3.0, 3.0  # least RMS that is said; times the sigma that is claimed
@@ -61,9 +61,9 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
     claimed, part = float(np.degrees(np.median([m.sigma_rad for m in headings]))), float(np.degrees(_rms(apart)))
     if part < max(_PART_DEG, _PART * claimed):
         return []
-    said = f"{sensor}: its headings part by {part:.0f} deg (RMS) from the turns of {imu.sensor}, and claim {claimed:.1f} deg: "
+    said = f"{sensor}: its headings differ by {part:.0f} deg (RMS) from the integrated gyro of {imu.sensor} but claim {claimed:.1f} deg: "
     return [
-        f"{said}magnetic deviation, headings that stick or come late (enabled: false may be better); or the unit of {imu.sensor}'s rates"
+        f"{said}magnetic deviation, frozen or late headings (enabled: false may be better); or the unit of {imu.sensor}'s rates"
     ]
 
 
@@ -84,8 +84,8 @@ def refuse_unit(imu: ImuSeries, config: ImuConfig, told: Mapping[str, Yaws]) -> 
         off = times * np.radians(1.0) if wrong == "less" else times / np.radians(1.0)
         if 1.0 / _UNIT < off < _UNIT:
             raise InputError(
-                f"{imu.sensor}: by its rates it turns {max(times, 1.0 / times):.0f} times {wrong} than by {source}, and at the same "
-                f"times: angular_velocity of {config.topic} is {right}; set gyro_unit: {right} of sensors.{imu.sensor}"
+                f"{imu.sensor}: its gyro turns {max(times, 1.0 / times):.0f} times {wrong} than {source}, in step with them: "
+                f"angular_velocity of {config.topic} is in {right}; set gyro_unit: {right} of sensors.{imu.sensor}"
             )
 
 

@@ -363,8 +363,8 @@ def _mount_warnings(
 def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) -> list[str]:
     """Say which sensors' messages have no stamp."""
     return [
-        f"{r.sensor}: {_or(topics[r.config.topic].msgtypes)} has no stamp: its messages count from when they were recorded; "
-        "time_offset_s (negative) where that was late"
+        f"{r.sensor}: {_or(topics[r.config.topic].msgtypes)} has no stamp: recording times are used; set time_offset_s (negative) "
+        "if they are late"
         for r in sensors
         if set(topics[r.config.topic].msgtypes) & set(UNSTAMPED)
     ]

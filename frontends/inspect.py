@@ -332,7 +332,7 @@ def render(inspection: Inspection) -> str:
             lines += ["", *(f"{m.topic}: {counts[m.topic]} {what}" for m in mounted)]
             lines.append(f"  read by a sensor of kind {kind}, which the draft has switched off until there is {need}")
     if inspection.tf_frames:
-        lines += ["", f"/tf_static knows: {', '.join(inspection.tf_frames)}"]
+        lines += ["", f"frames in /tf_static: {', '.join(inspection.tf_frames)}"]
     lines += [f"warning: {w}" for w in inspection.warnings]
     return "\n".join(lines)
 
@@ -396,7 +396,7 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         f"  track {gnss.travelled_m:.0f} m in a box of {east_m:.0f} x {north_m:.0f} m, height {gnss.height_range_m:.1f} m",
     ]
     if gnss.without_height:
-        lines.append(f"  {gnss.without_height} messages have no height (NaN) and count as horizontal fixes")
+        lines.append(f"  {gnss.without_height} messages have no height (NaN) and are used as horizontal fixes")
     if gnss.reported_sigma_m is not None:
         lines.append(f"  reported sigma east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
     if gnss.scatter_m is not None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 from pydantic import BaseModel
@@ -26,25 +27,46 @@ _BLOCKS = (
     DatumConfig, TimelineConfig, StartConfig, OutputConfig, MountConfig, KernelConfig, SlowErrorConfig, LidarConfig, CameraConfig,
 )  # fmt: skip
 
+_HEAD = (
+    "Made by `graphloc config --docs`. An unknown key is an error that names the nearest known one. Each key of `sensors` "
+    "is a name of your choice; its `kind` selects the table below."
+)
+_EXAMPLE = """```yaml
+vessel: my launch
+datum: {latitude_deg: 57.7, longitude_deg: 11.7, height_m: 36.0}
+sensors:
+  imu: {kind: imu, topic: /imu/data, mount: {rpy_deg: [180, 0, 0]}}
+  gnss: {kind: gnss, topic: /gnss/fix, mount: {xyz_m: [-1.5, 0.3, 2.3]}, slow_error: {time_constant_s: 100}}
+  compass: {kind: compass, topic: /gnss/heading, kernel: {kind: huber}}
+  height: {kind: height}
+```"""
+
 
 def render(kinds: Mapping[str, type[SensorConfig]]) -> str:
     """Return the reference of all keys as Markdown."""
     parts = [
         "# Configuration: `vessel.yaml`",
         "",
-        "Made by `graphloc config --docs`. A key that is not listed is an error that names its nearest neighbour.",
+        _HEAD,
+        "",
+        _EXAMPLE,
         "",
         "## Top level",
         _table(VesselConfig),
     ]
     for block in _BLOCKS:
-        parts += [f"## Block `{block.__name__.removesuffix('Config').lower()}`", _doc(block), "", _table(block)]
+        parts += [f"## Block `{_key(block)}`", _doc(block), "", _table(block)]
     for kind, config in kinds.items():
         parts += [f"## Sensor kind `{kind}`", _doc(config), "", _table(config)]
     parts += ["# The survey: `tags.yaml`", "", _table(Survey)]
     for entry in (TagConfig, DockConfig, BerthConfig):
         parts += [f"## Entry of `{entry.__name__.removesuffix('Config').lower()}s`", _doc(entry), "", _table(entry)]
     return "\n".join(parts)
+
+
+def _key(block: type[BaseModel]) -> str:
+    """Name of a block as it stands in the file: `slow_error` of `SlowErrorConfig`."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", block.__name__.removesuffix("Config")).lower()
 
 
 def _doc(model: type[BaseModel]) -> str:

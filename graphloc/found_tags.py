@@ -42,7 +42,7 @@ def about_tags(
     for frame in sorted({tag.frame for tag in found}):
         names = ", ".join(every.called(tag.family, tag.id) for tag in found if tag.frame == frame)
         where = (
-            "where the run puts it is" if frame == WORLD else f"seen only beside tags of {frame}, as if it rode on that"
+            "its estimated pose is" if frame == WORLD else f"seen only beside tags of {frame}, so placed on that dock"
         )
         said.append(f"{names}: not in the survey; {where} in {FILE}")
     return tuple(found), [*said, *left]

@@ -130,11 +130,11 @@ def with_sightings(recording: Recording, config: VesselConfig, bags: Bags, progr
         gathered.sensor(name, dict.fromkeys(infos, f"read by {name} for its lens") | dict.fromkeys(cameras, read))
         if total and without == total:
             gathered.said.append(
-                f"{name}: none of {total} images or lists shows a tag of the survey: look at one, at its ids and family"
+                f"{name}: none of {total} images or detection messages shows a tag of the survey: check ids and family there"
             )
         if shown["doubtful"] > _DOUBTFUL * shown["tags"]:  # else a limit does what it is there for
             gathered.said.append(
-                f"{name}: {shown['doubtful']} of {shown['tags']} images with tags show one that is refused, most often: "
+                f"{name}: {shown['doubtful']} of {shown['tags']} images with tags have a rejected detection, most often: "
                 f"{doubts.most_common(1)[0][0]}"
             )
         gathered.said += [f"{name}: {why} ({count} times)" for why, count in reasons.most_common(_REASONS)]
@@ -150,8 +150,8 @@ def _take_sized(gathered: Gathering, name: str, sightings: Sequence[TagSighting]
         off = 100.0 * abs(1.0 / factor - 1.0)
         reasons[frame] = f"sizes in tags.yaml disagree with the spacing of the tags by {off:.0f} %"
         gathered.said.append(
-            f"{name}: {reasons[frame]}: measure one, and how far apart they hang (in {frame} size_m times {factor:.2f} would "
-            "do; it is the black square without its white margin); until then no sighting of them is used"
+            f"{name}: {reasons[frame]}: measure a tag (the black square without its white margin) and the spacing; in {frame} "
+            f"size_m times {factor:.2f} would agree. Until then no sighting of these tags is used"
         )
     for m in sightings:
         if m.frame in reasons:

@@ -19,7 +19,7 @@ LEAST_S, FEWEST = 0.2, 10
 measure, and quantised readings at rest, repeat for less."""
 RATES_LEAST_S, RATES_FEWEST = 1.0, 50
 """The same of the three rates alone: fewer axes are the same more easily."""
-WHY = "it repeats one sample, or its rates, to the last bit, under stamps that move on: the sensor or its driver hangs"
+WHY = "frozen: it repeats one sample (or its three rates) bit for bit while the stamps advance; check the sensor and its driver"
 
 
 def hanging(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
@@ -53,7 +53,7 @@ def hanging_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.b
         return []
     where = stretches(stamps_ns, bad)
     return [
-        f"{sensor}: for {where} {WHY}; {int(bad.sum())} samples are not believed, and nothing is known of the motion there"
+        f"{sensor}: for {where} {WHY}; {int(bad.sum())} samples rejected, the motion there is bridged as in an IMU gap"
     ]
 
 

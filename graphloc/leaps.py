@@ -95,12 +95,12 @@ def leaps_said(
         return []
     n = int(np.argmax(off_m))
     size = f"{off_m[n]:.0f}" if off_m[n] >= 1.0 else f"{off_m[n]:.1g}"
-    others = f", and {len(off_m) - 1} times more" if len(off_m) > 1 else ""
-    bounds = "" if allowed else "; the bounds do not allow for it: its slow_error is switched off"
+    others = f", and {len(off_m) - 1} more" if len(off_m) > 1 else ""
+    bounds = "" if allowed else "; the bounds do not cover it, because its slow_error is switched off"
     where = f"{size} m at {utc_text(int(stamps_ns[n]))}{others}"
     if not followed:
-        return [f"{sensor}: leaps by {where}: taken for its error as far as the IMU denies it"]
-    said = f"{sensor}: leaps by {where}: the track follows, and the IMU and the compass may look wrong there"
+        return [f"{sensor}: position jump of {where}: treated as its error (multipath) where the IMU contradicts it"]
+    said = f"{sensor}: position jump of {where}: the track follows it, and the IMU and the compass may look wrong there"
     return [f"{said}{bounds}"]
 
 
@@ -111,7 +111,7 @@ def largest_sigma(cov: Array) -> float:
 
 def why_in_doubt(sensor: str) -> str:
     """Say why a pose near a leap is not good."""
-    return f"{sensor} leaps, and nothing else tells the place"
+    return f"position jump of {sensor}, and no other sensor measures position"
 
 
 class LeapWatch:

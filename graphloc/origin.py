@@ -101,7 +101,7 @@ def refuse_world_without_datum(config: VesselConfig, where: str, rows: Sequence[
     in_world += ["truth_topic"] if config.truth_topic else []
     if in_world and config.datum is None:
         raise InputError(
-            f"{where}: {', '.join(in_world)}: places in world, but nothing says where world's origin is; "
+            f"{where}: {', '.join(in_world)}: positions in the world frame, but its origin is not given; "
             "set datum: (`graphloc inspect` guesses it)"
         )
 

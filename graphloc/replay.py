@@ -39,16 +39,17 @@ Status = Callable[[float, float, Estimate | None, str], None]
 
 _GUESS = "the heading is a guess"
 _WARNS = (
-    "anew",
+    "restarts",
+    "starts without it",
     "rebuilt",
     "interrupted",
     "no second sensor",
     "the heading is off",
-    "it hangs",
-    ": leaps by ",
+    "frozen receiver",
+    ": position jump of ",
     _GUESS,
 )  # of events, that a reader must see
-_BUSY = "not tried: the scan before it was still being matched"
+_BUSY = "not tried: the previous scan was still being matched"
 
 
 def silent(_at_s: float, _whole_s: float, _estimate: Estimate | None, _waiting: str) -> None:
@@ -262,13 +263,13 @@ def replay(
     said += [(last_ns, event) for event in smoother.events()]
     if not estimates:
         lost = recording.lost(config.of_kind("imu"))
-        raise SolveError(f"{recording.source}: never started: it waited for {waiting or 'IMU data'}{lost}")
+        raise SolveError(f"{recording.source}: never started: still waiting for {waiting or 'IMU data'}{lost}")
     recording = gathering.recording()
     told_of = _timed(said, estimates)
     if len(took_s) > 1:
         p50, p99, most = (1e3 * float(np.quantile(took_s[1:], q)) for q in (0.5, 0.99, 1.0))
         told_of.append(
-            f"an update took {p50:.1f} ms (median), {p99:.0f} ms (99 %), {most:.0f} ms at most; the start {1e3 * took_s[0]:.0f} ms"
+            f"time per update: {p50:.1f} ms (median), {p99:.0f} ms (99 %), {most:.0f} ms (largest); start {1e3 * took_s[0]:.0f} ms"
         )
     behind = sum(row.reason == _BUSY for row in recording.rows)
     if behind > 0.2 * sum(row.reason == _BUSY or row.sensor in config.of_kind("aerial") for row in recording.rows):
@@ -279,11 +280,11 @@ def replay(
     rows += [row for row in recording.rows if row.seq not in told or row.seq < 0]
     if cut:
         told_of.append(
-            f"interrupted at {(estimates[-1].stamp_ns - first_ns) / 1e9:.1f} s: the run goes on, this track does not"
+            f"interrupted at {(estimates[-1].stamp_ns - first_ns) / 1e9:.1f} s: the track ends there, the run does not"
         )
         rows += [
             LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=recording.topics.get(m.sensor, ""),
-                      outcome=Outcome.IGNORED, reason="the replay was interrupted before")
+                      outcome=Outcome.IGNORED, reason="the replay was interrupted before it")
             for m in arrivals(recording) if m.seq >= 0 and m.seq not in told
         ]  # fmt: skip
     solution = _solution(estimates, Ledger(rows), smoother, told_of, config, _false_of(recording, config))
@@ -305,8 +306,8 @@ def _timed(said: Sequence[tuple[int, str]], estimates: Sequence[Estimate]) -> li
                 else f"until {(last_ns - begin_ns) / 1e9:.0f} s"
             )
             line += (
-                f"; so it stayed {until}, for {(last_ns - max(stamp_ns, begin_ns)) / 1e9:.0f} s in which it is never called good; a "
-                "compass, two antennas or start.heading_deg end it"
+                f"; it stays so {until} ({(last_ns - max(stamp_ns, begin_ns)) / 1e9:.0f} s) and is not rated good; use a "
+                "compass, a dual antenna or start.heading_deg"
             )
         lines.append(line)
     return lines

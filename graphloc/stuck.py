@@ -20,7 +20,7 @@ from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
 
-WHY = "its receiver or driver hangs: it says one place while the vessel goes on"
+WHY = "frozen receiver or driver: it repeats one position while the vessel moves"
 _HELD_S, _FEWEST = 2.5, 3  # a stretch of one place; for less a driver repeats (`frontends/_fixes.py`)
 _NOISE_M = 0.5  # how far one place may scatter
 _BEFORE_S = 3.0  # whose fixes tell how fast it was under way
@@ -155,7 +155,7 @@ def stuck_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.boo
     """Return a line on what `stuck` found."""
     if not bad.any():
         return []
-    return [f"{sensor}: for {stretches(stamps_ns, bad)} {WHY}; {int(bad.sum())} fixes are not believed"]
+    return [f"{sensor}: for {stretches(stamps_ns, bad)} {WHY}; {int(bad.sum())} fixes rejected"]
 
 
 def without_stuck(recording: Recording, datum: Datum) -> tuple[Recording, list[str]]:

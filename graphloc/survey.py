@@ -38,19 +38,19 @@ class TagConfig(Block):
     family: Annotated[Family, BeforeValidator(_family)] = "36h11"
     """Its AprilTag family."""
     size_m: Size
-    """Between the outer corners of the black square (not of the white plate), m. It scales every distance."""
+    """Side of the black square, outer edge to outer edge (not of the white plate), m. It scales every distance."""
     frame: str = WORLD
-    """`world`, or the dock that it rides on."""
+    """`world`, or the dock that it is mounted on."""
     xyz_m: Triple
-    """Its middle, in `frame`, m; in world: east, north, up of the datum."""
+    """Its centre, in `frame`, m; in world: east, north, up from the datum."""
     rpy_deg: Triple | None = None
     """Roll, pitch, yaw of its axes (x right, y up, z out of the print) in `frame`, deg; this or `facing_deg`."""
     facing_deg: Finite | None = None
-    """Of a tag that hangs upright: where its face looks, from `frame`'s y axis (in world: north), clockwise, deg."""
+    """For an upright tag: direction its face looks, from `frame`'s y axis (in world: north), clockwise, deg."""
     sigma_m: NonNegative = 0.02
-    """How well its place is known, each axis, 1 sigma, m."""
+    """Accuracy of its position, each axis, 1 sigma, m."""
     sigma_deg: NonNegative = 1.0
-    """How well its axes are known, about each, 1 sigma, deg."""
+    """Accuracy of its axes, about each, 1 sigma, deg."""
 
     @model_validator(mode="after")
     def _one_attitude(self) -> TagConfig:
@@ -76,41 +76,41 @@ class TagConfig(Block):
 
 
 class DockConfig(Block):
-    """A floating dock: it rises with the water and wanders about its place at rest."""
+    """A floating dock: it rises with the water and moves about its pose at rest."""
 
     name: Annotated[str, Field(min_length=1)]
-    """What tags and berths call it."""
+    """Name that tags and berths refer to."""
     xyz_m: Triple = (0.0, 0.0, 0.0)
-    """Its origin in world at rest, m; it turns about this."""
+    """Its origin in world at rest, m; it rotates about this point."""
     rpy_deg: Triple = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw of its axes in world at rest, deg."""
     moves_m: NonNegative = 0.3
-    """How far it wanders east and north, either way, m."""
+    """Amplitude of its drift east and north, either way, m."""
     moves_deg: NonNegative = 1.5
-    """How far it turns, either way, deg."""
+    """Amplitude of its rotation (yaw), either way, deg."""
     tilts_deg: NonNegative = 1.0
-    """How far it rolls or pitches in waves, either way, deg."""
+    """Amplitude of roll and pitch in waves, either way, deg."""
     rises_m: NonNegative = 1.0
-    """How far it may ride above or below what `xyz_m` says (tide), m."""
+    """Height above or below `xyz_m` by tide, m."""
     period_s: Positive = 25.0
-    """About how long it takes to wander there and back, s."""
+    """Approximate period of its drift, s."""
     heaves_m: NonNegative = 0.05
-    """How far waves lift and lower it, m."""
+    """Amplitude of heave in waves, m."""
     wave_period_s: Positive = 4.0
-    """Period of these waves, s; of less than 4.4 s it makes no difference."""
+    """Period of these waves, s; below 4.4 s it makes no difference."""
 
 
 class BerthConfig(Block):
-    """Where a vessel is to lie: a point of the quay's face, and where that looks."""
+    """Where a vessel is to lie: a point of the quay's face, and the direction it faces."""
 
     name: Annotated[str, Field(min_length=1)]
-    """For outputs."""
+    """Name in the outputs."""
     frame: str = WORLD
     """`world`, or the dock that it belongs to."""
     xyz_m: Triple
     """A point of the quay's face, in `frame`, m."""
     facing_deg: Finite
-    """Where the face looks (to the water), from `frame`'s y axis (in world: north), clockwise, deg."""
+    """Direction the face looks (towards the water), from `frame`'s y axis (in world: north), clockwise, deg."""
 
 
 class Survey(Block):
@@ -121,9 +121,9 @@ class Survey(Block):
     docks: tuple[DockConfig, ...] = ()
     """The floating docks."""
     other_size_m: Size | None = None
-    """Size of tags that are not listed, m; empty: it is estimated with their place."""
+    """Size of tags that are not listed, m; empty: it is estimated with their position."""
     berths: tuple[BerthConfig, ...] = ()
-    """Berths; without any, each frame's tags make one: its face goes through them."""
+    """Berths; without any, each frame's tags make one, with its face through them."""
 
     @model_validator(mode="after")
     def _adds_up(self) -> Survey:

@@ -22,7 +22,7 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 
 log = logging.getLogger(__name__)
-_OPEN = "what is left does not tell the place, the height and the heading of all of the run"
+_OPEN = "the remaining sensors do not determine position, height and heading over the whole run"
 _VOTED = 3  # suspects that are set against each other, two by two
 
 
@@ -67,7 +67,7 @@ def ablate(
     pairs = list(combinations(doubted, 2))
     without_both = _solve(run, pairs, jobs, "without two suspects", progress) if pairs else {}
     imu = next((n for n, s in config.sensors.items() if s.kind == INERTIAL.kind and s.enabled), "imu")
-    carries = "the states hang on it: it carries the motion between all other measurements"
+    carries = "every state depends on it: it gives the motion between all other measurements"
     return Ablated(
         source=recording.source,
         vessel=config.vessel,

@@ -83,7 +83,7 @@ def test_a_fix_or_two_are_no_steady_distance(run: SimulatedRun) -> None:
 
 def test_a_height_above_the_geoid_beside_one_above_the_ellipsoid_is_said(run: SimulatedRun) -> None:
     (line,) = said(run, np.zeros((60, 2)), up_m=-36.0)
-    assert "gnss stands 36.0 m (down) off what height says" in line  # matches tell none
+    assert "gnss has a constant offset of 36.0 m (down) from height" in line  # matches tell none
     assert "geoid" in line
     assert said(run, np.zeros((60, 2)), up_m=12.0) == []  # its slow error in height is 5 m, 1 sigma
 
@@ -102,9 +102,9 @@ def test_poses_all_off_by_five_metres_are_said(run: SimulatedRun) -> None:
             moved.append(m)
     recording = replace(run.recording, measurements=tuple(moved))
     for solved in (app.smooth_recording(recording, run.config), app.replay_recording(recording, run.config)):
-        lines = [w for w in solved.recording.warnings if "stands" in w]
-        found = re.search(r"gnss stands (\d\.\d) m \(towards (\d+) deg\) off what aerial says", lines[0])
+        lines = [w for w in solved.recording.warnings if "constant offset" in w]
+        found = re.search(r"gnss has a constant offset of (\d\.\d) m \(towards (\d+) deg\) from aerial", lines[0])
         assert found
         assert float(found[1]) == pytest.approx(5.0, abs=0.3)
         assert float(found[2]) == pytest.approx(180.0 + np.degrees(np.arctan2(3.0, 4.0)), abs=4.0)
-    assert not [w for w in app.simulated(run).recording.warnings if "stands" in w]
+    assert not [w for w in app.simulated(run).recording.warnings if "constant offset" in w]

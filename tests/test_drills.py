@@ -203,7 +203,7 @@ def test_only_what_the_sensors_permit_is_drilled(recording: Recording) -> None:
     said = dict(left)
     assert "no compass" in said["compass silent"]
     assert "no tags" in said["tags flipped"]
-    assert "alone" in said["no place at all"]
+    assert "a single sensor measures position" in said["no place at all"]
     assert not script(recording)[1]
 
 

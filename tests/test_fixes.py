@@ -68,7 +68,7 @@ def test_places_held_by_a_driver_count_once(tmp_path: Path) -> None:
     assert len(stamps) == 49
     held = rows_of(recording, "gnss")
     assert len(held) == 351
-    assert all(r.outcome is Outcome.REJECTED and "repeats the place" in r.reason for r in held)
+    assert all(r.outcome is Outcome.REJECTED and "repeats the position" in r.reason for r in held)
     (line,) = recording.warnings
     assert "351 of 400 fixes repeat" in line
 
@@ -171,7 +171,7 @@ def test_fixes_that_claim_to_tell_nothing_are_said(hz: int, sigma_m: float, said
     """A driver that writes 1e8 m^2: the track was 100 m off its fixes, and its bounds km, without a word."""
     lines = read(tmp_path, fixes(hz, noise_m=0.2, sigma_m=sigma_m, seconds=60)).warnings
     assert len(lines) == said
-    assert all("gnss: its fixes count as good to 10000 m only" in line for line in lines)
+    assert all("gnss: its fixes claim a sigma of 10000 m" in line for line in lines)
 
 
 @pytest.mark.parametrize("every", [1, 3])

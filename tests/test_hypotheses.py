@@ -173,10 +173,10 @@ def test_matches_that_are_refused_together_are_said() -> None:
         "batch": app.smooth_recording(recording, run.config).solution.stats.warnings,
         "online": replay(recording, run.config).solution.stats.warnings,
     }
-    assert not any("are refused" in line for line in said["usual"])
+    assert not any("are rejected" in line for line in said["usual"])
     for mode in ("batch", "online"):
-        (line,) = (line for line in said[mode] if line.startswith("aerial: all its ") and "are refused" in line)
-        assert 18 <= int(line.split("all its ")[1].split()[0]) <= 24, line
+        (line,) = (line for line in said[mode] if line.startswith("aerial: all ") and "are rejected" in line)
+        assert 18 <= int(line.split(" all ")[1].split()[0]) <= 24, line
 
 
 def test_few_or_brief_ones_are_no_news() -> None:
@@ -191,7 +191,7 @@ def test_few_or_brief_ones_are_no_news() -> None:
     assert not refused_together("aerial", stamps_ns, weights, doubtful)  # so they said themselves
     brief = np.concatenate([stamps_ns, stamps_ns[-1] + 1 + np.arange(30) * 1_000_000])
     (line,) = refused_together("tags", brief, np.append(weights, np.zeros(30)), np.full(70, 0.02))
-    assert "all its 7 measurements in 6 s" in line  # 30 more within 30 ms are no longer row
+    assert "all 7 measurements in the 6 s" in line  # 30 more within 30 ms are no longer row
 
 
 def test_long_outage_does_not_lock_the_matches_out() -> None:

@@ -229,4 +229,4 @@ def test_online_it_is_back_at_once_after_a_silence_of_everything() -> None:
     left = [a for a in arrivals_of(run) if not (begin_ns <= a.true_ns < over_ns and isinstance(a.m, Measurement))]
     fed = feed(smoother(run), run, numbered(left))
     assert fed.recovered_s(over_ns) < 1.0
-    assert not [event for event in fed.events if "anew" in event or "rebuilt" in event]
+    assert not [event for event in fed.events if "restarts" in event or "rebuilt" in event]

@@ -244,7 +244,7 @@ def test_imu_orientation_as_compass(
         assert report.convention == "enu"
         assert compass.mount.rpy_deg == pytest.approx((0.0, 0.0, mount_deg), abs=1.0)
         assert compass.mount_offset_sigma_deg == pytest.approx(sigma_deg, abs=1.0)
-        assert ("unless the craft goes astern" in text) is (mount_deg == 180.0)
+        assert ("unless the vessel goes astern" in text) is (mount_deg == 180.0)
     else:
         assert "compass" not in config.sensors
         assert "orientation of /ahrs: left out as a compass" in text
@@ -361,7 +361,7 @@ def test_a_moored_compass_is_judged_by_the_gyro(convention: str, tmp_path: Path)
     _, config, text = look(tmp_path, items, make)
     assert config.sensors["compass"].convention == convention
     assert config.sensors["compass"].mount_offset_sigma_deg == 10.0  # declination may be in it, and nothing here tells
-    assert "by the gyro" in text
+    assert "from the gyro" in text
 
 
 def test_a_map_grid_is_no_world(tmp_path: Path) -> None:
@@ -386,7 +386,7 @@ def test_another_body_is_no_truth(tmp_path: Path) -> None:
     _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     assert config.truth_topic is None
     assert config.datum is None
-    assert "another body than the craft" in text
+    assert "not a pose of this vessel" in text
 
 
 def test_the_antenna_is_taken_off_the_datum(tmp_path: Path) -> None:
@@ -494,7 +494,7 @@ def test_a_heading_receiver_that_says_an_imu_does_not_hang(moves: bool, usable: 
     found, config, _ = look(tmp_path, items, make)
     assert ("compass" in config.sensors) is usable
     said = [w for w in found.warnings if w.startswith("/heading")]
-    assert not any("hangs" in w for w in said)
+    assert not any("frozen" in w for w in said)
     assert len(said) == (0 if usable else 1)
     assert all("neither accelerations nor rates" in w for w in said)
 
@@ -525,7 +525,7 @@ def test_a_bag_that_no_sensor_can_be_made_of_is_refused(
     assert called(monkeypatch, "inspect", where, "-o", draft) == 2
     assert not draft.exists()
     (line,) = capsys.readouterr().err.splitlines()
-    assert "no sensor can be made of it" in line
+    assert "no usable sensor in it" in line
     assert "/imu: nothing of its 30 messages can be used: 30 hold an acceleration or a rate that is NaN" in line
     assert "/fix: nothing of its 30 messages can be used: 30 have no stamp" in line
 

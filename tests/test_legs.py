@@ -58,7 +58,7 @@ def legs(run: SimulatedRun) -> Solution:
 
 def test_legs_are_as_good_as_the_whole(run: SimulatedRun, whole: Solution, legs: Solution) -> None:
     (said,) = legs.stats.events
-    assert said.startswith("solved in 3 legs")
+    assert said.startswith("solved in 3 overlapping legs")
     assert legs.stats.warnings == whole.stats.warnings  # nothing is wrong
     assert whole.stats.events == ()
     one, several = (compare_to_truth(s.trajectory, run.truth) for s in (whole, legs))
@@ -71,7 +71,7 @@ def test_legs_are_as_good_as_the_whole(run: SimulatedRun, whole: Solution, legs:
     apart = np.linalg.norm(whole.trajectory.at(common).p_world_m - legs.trajectory.at(common).p_world_m, axis=1)
     assert apart.max() < 0.2
     # What is said of the seams is what the track does there: it steps by no more.
-    told_m = float(said.rpartition("they are ")[2].split(" m")[0])
+    told_m = float(said.rpartition("at most ")[2].split(" m")[0])
     assert told_m < 0.2
 
 
@@ -134,7 +134,7 @@ def test_a_leg_without_a_place_is_no_reason_to_fail(run: SimulatedRun) -> None:
     early = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < first + 20 * S)
     found = solved(run, measurements=early)
     (said,) = found.stats.events
-    assert "a leg of it could not be solved" in said
+    assert "solved in one piece, not in legs: a leg failed" in said
     assert "no position" in said
     assert found.trajectory.stamps_ns[-1] > first + 125 * S
 
@@ -165,9 +165,9 @@ def test_legs_that_lie_apart_are_a_warning(run: SimulatedRun, monkeypatch: pytes
     monkeypatch.setattr(graphloc.solve, "make_solution", shifted)
     few = tuple(m for m in run.recording.measurements if not isinstance(m, CompassHeading) or m.seq % 4 == 0)
     found = solved(run, measurements=few)
-    (said,) = [w for w in found.stats.warnings if "legs that overlap" in w]
-    assert float(said.rpartition("they are ")[2].split(" m")[0]) == pytest.approx(5.0, abs=0.3)
-    assert "do not allow" in said
+    (said,) = [w for w in found.stats.warnings if "overlapping legs" in w]
+    assert float(said.rpartition("at most ")[2].split(" m")[0]) == pytest.approx(5.0, abs=0.3)
+    assert "more than their bounds allow" in said
     assert found.stats.events == ()
 
 

@@ -109,7 +109,7 @@ def test_a_recorder_pause_cuts_the_run() -> None:
     assert ours.heading_max_deg < 2.0
     assert ours.matched == pytest.approx(40.0 / 100.0, abs=0.02)
     assert len(solved.ledger) == paused.message_count
-    assert sum("solved as a part by itself" in w for w in solved.stats.warnings) == 2
+    assert sum("solved as a separate part" in w for w in solved.stats.warnings) == 2
 
 
 def test_a_part_that_cannot_be_solved_is_left_out() -> None:
@@ -132,7 +132,7 @@ def test_an_imu_that_ends_early_is_said() -> None:
     assert imu is not None
     early = replace(run.recording, imu=imu.where(imu.stamps_ns < imu.stamps_ns[0] + 10 * 10**9))
     warnings = app.smooth_recording(early, run.config).solution.stats.warnings
-    assert any(w.startswith("gnss: 300 of 400 measurements lie outside the IMU's span") for w in warnings)
+    assert any(w.startswith("gnss: 300 of 400 measurements lie outside the IMU's time span") for w in warnings)
 
 
 def test_a_sensor_that_is_switched_off_keeps_its_rows() -> None:

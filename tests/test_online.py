@@ -284,7 +284,7 @@ def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
         arrivals_of(run), lambda a: isinstance(a.m, (PoseFix, CompassHeading)) or a.true_ns > begin + 29 * 10**9
     )
     said, fed = said_while_waiting(run, arrivals)
-    assert any(s.startswith("a heading") and "m of way" in s for s in said)
+    assert any(s.startswith("a heading") and "m of travel" in s for s in said)
     first = run.truth.at(np.array([arrivals[0].true_ns, fed.true_ns[0]])).p_world_m
     assert np.hypot(*(first[1] - first[0])[:2]) > 10.0
     assert fed.errors_m[-1] < 3.0
@@ -399,7 +399,7 @@ def test_starts_from_given_poses() -> None:
     assert fed.errors_m[0] < 0.5
     online = smoother(posed)
     feed(online, posed, imu)
-    assert online.waiting_for == "a place: a fix, a match, a tag or a pose"
+    assert online.waiting_for == "a position: a fix, a match, a tag or a pose"
 
 
 def test_starts_from_a_tag_alone() -> None:
@@ -411,7 +411,7 @@ def test_starts_from_a_tag_alone() -> None:
     arrivals = [a for a in arrivals if begin <= a.true_ns < begin + 18_000_000_000]
     said, fed = said_while_waiting(run, arrivals)
     assert complaints(arrivals, fed) == []
-    assert "a place: a fix, a match, a tag or a pose" in said
+    assert "a position: a fix, a match, a tag or a pose" in said
     assert said[-1] == ""
     assert fed.errors_m[-1] < 1.0
 

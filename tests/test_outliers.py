@@ -94,8 +94,10 @@ def test_a_receiver_that_leaps_is_said(
     assert said(everywhere, allowed=allowed) == []
     assert said((t < 50.0) | (t > 58.0), allowed=allowed) == []
     (line,) = said(everywhere, np.outer((t >= 40.0) & (t < 60.0), [0.0, 8.0]), allowed=allowed)
-    assert line.startswith(("gnss: leaps by 8 m at 1970-01-01T00:00:40", "gnss: leaps by 8 m at 1970-01-01T00:01:00"))
-    assert ", and 1 times more:" in line
+    assert line.startswith(
+        ("gnss: position jump of 8 m at 1970-01-01T00:00:40", "gnss: position jump of 8 m at 1970-01-01T00:01:00")
+    )
+    assert ", and 1 more:" in line
 
 
 @pytest.mark.parametrize("allowed", [True, False])
@@ -223,14 +225,14 @@ def test_a_run_beside_a_believed_receiver_that_leaps_is_not_called_good() -> Non
     """Its bound was 2 cm, and its health good, where it was 0.6 m off."""
     right, wrong, config = believed(0.6, last_s=35.0)
     usual, leapt = (app.smooth_recording(of, config).solution for of in (right, wrong))
-    assert not any("leaps" in line for line in usual.stats.warnings)
-    assert "gnss leaps, and nothing else tells the place" not in usual.health_reason
-    assert any(line.startswith("gnss: leaps by 0.") for line in leapt.stats.warnings)
+    assert not any("position jump" in line for line in usual.stats.warnings)
+    assert "position jump of gnss, and no other sensor measures position" not in usual.health_reason
+    assert any(line.startswith("gnss: position jump of 0.") for line in leapt.stats.warnings)
     assert Health.GOOD in usual.health
     assert Health.GOOD not in leapt.health
     usual_live, live = (replay(of, config) for of in (right, wrong))
-    assert not any("leaps" in line for line in usual_live.solution.stats.warnings)
-    assert any("gnss: leaps by 0." in line for line in live.solution.stats.warnings)
+    assert not any("position jump" in line for line in usual_live.solution.stats.warnings)
+    assert any("gnss: position jump of 0." in line for line in live.solution.stats.warnings)
     assert live.solution.health[-1] != Health.GOOD == usual_live.solution.health[-1]
 
 
@@ -238,7 +240,7 @@ def test_a_leap_is_not_forgotten_where_it_has_online_start_anew() -> None:
     """Off by 100 m it was refused for 15 s, and then called good where it was 100 m off."""
     _, wrong, config = believed(100.0, last_s=np.inf)
     live = replay(wrong, config).solution
-    assert any("starts anew" in line for line in live.stats.warnings)
+    assert any("restarts" in line for line in live.stats.warnings)
     late = live.trajectory.stamps_ns > live.trajectory.stamps_ns[0] + 20_000_000_000
     assert late[-1]
     assert Health.GOOD in [h for h, k in zip(live.health, late, strict=True) if not k]
@@ -262,8 +264,11 @@ def test_a_receiver_alone_that_leaps_is_said_in_the_run() -> None:
         name: app.smooth_recording(of, config).solution.stats.warnings
         for name, of in (("usual", run.recording), ("struck", recording))
     }
-    assert not any("leaps" in line for line in said["usual"])
-    assert sum(line.startswith(("gnss: leaps by 11 m", "gnss: leaps by 12 m")) for line in said["struck"]) == 1
+    assert not any("position jump" in line for line in said["usual"])
+    assert (
+        sum(line.startswith(("gnss: position jump of 11 m", "gnss: position jump of 12 m")) for line in said["struck"])
+        == 1
+    )
 
 
 def test_a_receiver_alone_that_leaps_is_not_followed_where_the_imu_denies_it() -> None:
@@ -283,7 +288,7 @@ def test_a_receiver_alone_that_leaps_is_not_followed_where_the_imu_denies_it() -
     assert off.coverage_95 is not None
     assert off.coverage_95 > 0.95
     assert off.position_max_m < 3.0
-    assert any("leaps by 12 m" in w and "taken for its error" in w for w in found.stats.warnings)
+    assert any("position jump of 12 m" in w and "treated as its error" in w for w in found.stats.warnings)
 
 
 def test_a_sensor_that_lies_by_more_than_numbers_hold_is_an_outlier() -> None:

@@ -34,7 +34,7 @@ def turned(track: Trajectory, axis: str, degrees: float, heading_sigma_deg: floa
 def test_the_mount_that_would_fit_is_named(degrees: float, run: SimulatedRun) -> None:
     """The simulator's IMU is mounted at a yaw of 90 deg of a body that is turned by b in the craft: at 90 + b of that."""
     (line,) = posture_warnings(turned(run.truth, "z", degrees), run.recording, run.config)
-    named = re.search(r"imu.mount.rpy_deg\[2\] is about (-?\d+) instead of 90", line)
+    named = re.search(r"imu.mount.rpy_deg\[2\] should be about (-?\d+) instead of 90", line)
     assert named
     assert (float(named[1]) - (90.0 + degrees) + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=10.0)
 
@@ -75,7 +75,7 @@ def test_an_imu_turned_in_the_file_is_said_in_the_report(run: SimulatedRun) -> N
     wrong = imu.model_copy(update={"mount": imu.mount.model_copy(update={"rpy_deg": (2.0, -1.0, 0.0)})})
     config = usual.model_copy(update={"sensors": {**usual.sensors, "imu": wrong}})
     found, right = (app.smooth_recording(run.recording, c) for c in (config, usual))
-    assert any("unless the craft goes sideways" in line for line in found.recording.warnings)
+    assert any("unless the vessel goes sideways" in line for line in found.recording.warnings)
     assert Health.GOOD not in found.solution.health
     assert any(why.startswith("the course is more than 45 deg off") for why in found.solution.health_reason)
     assert right.recording.warnings == run.recording.warnings

@@ -114,7 +114,7 @@ def test_a_run_that_never_starts_says_what_it_waited_for(run: SimulatedRun) -> N
         run.recording, measurements=tuple(m for m in run.recording.measurements if not isinstance(m, GnssPosition))
     )
     alone = replace(without, measurements=tuple(m for m in without.measurements if m.sensor == "compass"))
-    with pytest.raises(SolveError, match="waited for a place"):
+    with pytest.raises(SolveError, match="waiting for a position"):
         replay(alone, run.config)
 
 
@@ -147,11 +147,11 @@ def test_compare_has_it_beside_the_filters(run: SimulatedRun) -> None:
 def test_a_guessed_heading_is_said_with_its_times(whole: Replayed) -> None:
     """Doubted in the first 51 of the estimates, 10 a second: for 5 s."""
     estimates = whole.estimates
-    doubt = "the heading is a guess: 2 explain the way so far"
+    doubt = "the heading is a guess: 2 candidates explain the motion so far"
     first_ns = estimates[0].stamp_ns
     some = [replace(e, reason=f"95 % bound 3 m; {doubt}" if k <= 50 else "") for k, e in enumerate(estimates)]
     (line,) = _timed([(first_ns, doubt)], some)
-    assert line.startswith(f"at 0 s: {doubt}; so it stayed until 5 s, for 5 s")
+    assert line.startswith(f"at 0 s: {doubt}; it stays so until 5 s (5 s) and is not rated good")
     assert "start.heading_deg" in line
     every = [replace(e, reason=doubt) for e in estimates]
     assert "to the end of the run" in _timed([(first_ns, doubt)], every)[0]

@@ -86,8 +86,8 @@ def test_a_run_that_nothing_measures_is_not_vouched_for(data: ReportData) -> Non
     solution = replace(data.solution, stats=replace(data.solution.stats, warnings=()))
     said = verdict(replace(data, recording=recording, solution=solution, tables=()))
     assert said.trust is Trust.WITH_CARE
-    assert said.tracks[0].accuracy == "How good it is cannot be said."
-    assert any("Nothing here measures" in r.text for r in said.reasons)
+    assert said.tracks[0].accuracy == "Its accuracy was not measured."
+    assert any("Its accuracy was not measured" in r.text for r in said.reasons)
 
 
 def test_the_page_stands_by_itself(data: ReportData, tmp_path: Path) -> None:

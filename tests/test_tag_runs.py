@@ -269,7 +269,7 @@ def test_a_tag_that_is_not_surveyed_is_found(fixed: Docked, tmp_path: Path) -> N
     assert {*QUAY, 99} <= set(tags)
     np.testing.assert_allclose(tags[99].xyz_m, [73.4, 96.0, 1.5], atol=0.05)
     assert tags[99].size_m == pytest.approx(0.3, rel=0.02)
-    assert "tag 99: not in the survey; where the run puts it is in tags.found.yaml" in fixed.said
+    assert "tag 99: not in the survey; its estimated pose is in tags.found.yaml" in fixed.said
 
 
 def test_a_tag_that_is_not_surveyed_rides_on_the_dock_beside_whose_tags_it_is_seen(floating: Docked) -> None:
@@ -279,7 +279,7 @@ def test_a_tag_that_is_not_surveyed_rides_on_the_dock_beside_whose_tags_it_is_se
     assert tag.frame == true.frame == "north_dock"
     np.testing.assert_allclose(tag.xyz_m, true.xyz_m, atol=0.06)
     assert tagfactory.degrees_between(tag.R_frame_tag, true.R_frame_tag) < 2.0
-    assert "tag 99: not in the survey; seen only beside tags of north_dock, as if it rode on that in " in floating.said
+    assert "tag 99: not in the survey; seen only beside tags of north_dock, so placed on that dock in " in floating.said
 
 
 def test_the_filter_of_digerud_stands_beside_it(fixed: Docked) -> None:

@@ -267,7 +267,7 @@ def test_a_limit_that_refuses_is_said_where_it_refuses_most(tmp_path: Path, misr
     why = "tag 7: 2 bits read wrong, more than max_hamming"
     assert [row.reason for row in rows_of(recording, "tags")] == [why] * misread
     said = [line for line in recording.warnings if "bits read wrong" in line]
-    assert said == ([f"tags: {misread} of 4 images with tags show one that is refused, most often: {why}"] * warned)
+    assert said == ([f"tags: {misread} of 4 images with tags have a rejected detection, most often: {why}"] * warned)
 
 
 @pytest.mark.parametrize("size_m", [0.4, 0.5])
@@ -296,8 +296,8 @@ def test_sizes_that_cannot_be_are_refused(tmp_path: Path, size_m: float) -> None
         assert reasons == {why}
         assert used == 0
         (line,) = said
-        assert line.startswith(f"tags: {why}: measure one")
-        assert "size_m times 0.80 would do" in line
+        assert line.startswith(f"tags: {why}: measure a tag")
+        assert "size_m times 0.80 would agree" in line
     assert recording.message_count == accounted(recording)
 
 

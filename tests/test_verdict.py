@@ -117,10 +117,10 @@ def test_a_filter_that_is_nearer_is_said(data: ReportData) -> None:
     filtered = FilterResult(name="some EKF", trajectory=moved(track, 1.0, 0.1), ledger=Ledger())
     online = replace(data.online, trajectory=moved(data.online.trajectory, 1.0, 0.2))
     offline, judged = verdict(replace(data, filters=(filtered,), online=online)).tracks
-    assert not any("nearer" in r.text for r in offline.reasons)
-    (found,) = (r for r in judged.reasons if "nearer" in r.text)
+    assert not any("more accurate" in r.text for r in offline.reasons)
+    (found,) = (r for r in judged.reasons if "more accurate" in r.text)
     assert found.trust is Trust.WITH_CARE
-    assert found.text.startswith("some EKF is nearer: RMSE 0.10 m, worst 0.10 m, beside 0.20 m, worst 0.20 m")
+    assert found.text.startswith("some EKF is more accurate: RMSE 0.10 m, worst 0.10 m, against 0.20 m, worst 0.20 m")
 
 
 def test_when_it_was_less_than_good(data: ReportData) -> None:
@@ -154,6 +154,8 @@ def test_when_it_was_less_than_good(data: ReportData) -> None:
 
 
 def test_what_would_end_it_is_said_of_the_cause() -> None:
-    assert cure(Health.DEGRADED, "compass, gnss missing or not agreeing").startswith("compass, gnss back")
-    assert "start.heading_deg" in cure(Health.LOST, "95 % bound 3 m, heading 60 deg; the heading is a guess: 2 explain")
+    assert cure(Health.DEGRADED, "compass, gnss missing or not agreeing").startswith("compass, gnss agreeing again")
+    assert "start.heading_deg" in cure(
+        Health.LOST, "95 % bound 3 m, heading 60 deg; the heading is a guess: 2 candidates explain"
+    )
     assert "fix" in cure(Health.DEAD_RECKONING, "no absolute position agrees")

@@ -66,7 +66,7 @@ class Calibration:
     def table(self) -> Table:
         """Return all settings that were looked at, with what the run would add to each."""
         rows = tuple((f"{c.key}, {c.unit}", (c.configured, c.change, c.sigma)) for c in self.checks)
-        note = "change: what the run would add, were this alone wrong; sigma: its 1 sigma. Nothing of it was applied."
+        note = "change: correction that the run suggests if this alone were wrong; sigma: its 1 sigma. Nothing was applied."
         return Table("Calibration", ("configured", "change", "sigma"), rows, note)
 
     def lines(self) -> tuple[str, ...]:

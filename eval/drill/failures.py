@@ -88,7 +88,7 @@ def script(recording: Recording) -> tuple[tuple[Failure, ...], tuple[tuple[str, 
     tags = [m for m in recording.measurements if isinstance(m, TagSighting)]
     flips = "" if any(len(m.modes) > 1 for m in tags) else "no sighting with a second pose" if tags else "no tags"
     offer(no_gnss, *(_timed("GNSS outage", s, partial(_silent, kinds=_GNSS)) for s in OUTAGES_S))
-    nothing = "one sensor alone tells a place: the same as its outage" if alone else ""
+    nothing = "a single sensor measures position: the same as its outage" if alone else ""
     offer(nothing, *(_timed("no place at all", s, partial(_silent, kinds=_PLACES)) for s in OUTAGES_S[:3]))
     offer(
         no_gnss,

@@ -25,15 +25,15 @@ def said(drilled: Drilled) -> list[str]:
         lines.append("Reference: truth, which no estimator sees; the EKFs are started at it, as in the thesis.")
     else:
         lines.append(
-            "Reference: the undisturbed offline solution, as there is no truth. It shares its fixes with all that is "
-            f"judged and is itself known to {drilled.bound_m:.1f} m (its 95 % bound, median): differences below that mean "
-            "little, coverage is with its covariance added, and 'graphloc' is nearest to it by nature."
+            "Reference: the undisturbed offline solution, as there is no truth. It shares its fixes with everything that is "
+            f"judged, and its own 95 % bound is {drilled.bound_m:.1f} m (median): smaller differences mean "
+            "little, its covariance is added when coverage is judged, and 'graphloc' is nearest to it by construction."
         )
     if not drilled.windows[0].whole:
         seconds = (drilled.windows[0].end_ns - drilled.windows[0].begin_ns) / 1e9
         lines.append(
-            f"The recording is long: each failure was drilled in {len(drilled.windows)} windows of {seconds:.0f} s. Where no "
-            "sensor tells the heading, a window begins with the one that the undisturbed run had there."
+            f"The recording is long: each failure was drilled in {len(drilled.windows)} windows of {seconds:.0f} s. Without "
+            "a heading sensor, a window starts with the heading that the undisturbed run had there."
         )
     return lines
 
@@ -109,12 +109,12 @@ def grids(drilled: Drilled) -> list[Grid]:
         head=("failure", *drilled.estimators),
         rows=tuple((Cell(text=n), *(_cell(by[n, e]) for e in drilled.estimators)) for n in names),
         note=(
-            f"A cell: farthest horizontally from the reference until {TAIL_S:g} s after the failure, the worst of the times "
-            "(and what the same estimator has there undisturbed); how long after the failure's end it was back; share of "
-            f"that time in which its 95 % region held the reference. Back: for {HOLDS_S:g} s nearer than {NEAR_M:g} m, or than "
-            f"{NORMAL_TIMES:g} times the 95th percentile of what it has undisturbed, and {100 * HELD:.0f} % of these within its "
-            "own bound. 'Near, outside its bounds': near, but it does not know how far off it is. 'Never back': not near "
-            f"again in {WINDOW_TAIL_S:g} s, or before the recording ends. Nobody tells the BL EKF of a signal loss here."
+            f"A cell: largest horizontal distance from the reference until {TAIL_S:g} s after the failure, worst of the times "
+            "(in brackets: the same estimator undisturbed); how long after the failure's end it was back; share of "
+            f"that time in which its 95 % region held the reference. Back: for {HOLDS_S:g} s within {NEAR_M:g} m, or within "
+            f"{NORMAL_TIMES:g} times its undisturbed 95th percentile, and {100 * HELD:.0f} % of that time inside its "
+            "own bound. 'Near, outside its bounds': as near, but overconfident. 'Never back': not near "
+            f"again in {WINDOW_TAIL_S:g} s, or before the recording ends. The BL EKF is not told of signal losses here."
         ),
     )
     found = [table]

@@ -76,17 +76,17 @@ def said_of(solution: Solution) -> str:
 def cure(health: Health, reason: str) -> str:
     """Say what would end a state that is less than good."""
     if "heading is a guess" in reason:
-        return "a sensor of the heading (compass, two antennas), or start.heading_deg"
+        return "a heading sensor (compass, dual antenna), or start.heading_deg"
     if health is Health.LOST:
-        return "a fix, match or tag that agrees, and for a heading a compass or a way of some metres"
+        return "a fix, match or tag that agrees; for the heading, a compass or some metres of travel"
     if health is Health.DEAD_RECKONING:
         return "a fix, match or tag that agrees"
     if "missing or not agreeing" in reason:
         sensors = reason.split(" missing or not agreeing")[0]
-        return f"{sensors} back and in agreement; the ledger says what became of its measurements"
+        return f"{sensors} agreeing again; the ledger says what became of its measurements"
     if "95 % bound" in reason:
-        return "a better fix, or a second sensor of the place (match, tag)"
-    return "what the warnings name: noise, mounts, stamps"
+        return "a better fix, or a second position sensor (match, tag)"
+    return "correcting what the warnings name: noise, mounts, stamps"
 
 
 def section(solutions: Sequence[Solution], begin_ns: int) -> str:

@@ -121,7 +121,7 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
             yield Reason(
                 trust=Trust.WITH_CARE,
                 text=f"{found.sensor} and the IMU are {off_s:.2g} s apart (Calibration, below): at this run's {speed_mps:.1f} m/s the "
-                f"track is up to {off_s * speed_mps:.2f} m behind or ahead, and its bounds, {bound_m:.2f} m (median), know nothing of it.",
+                f"track is up to {off_s * speed_mps:.2f} m behind or ahead, which its bounds of {bound_m:.2f} m (median) do not include.",
             )
 
 
@@ -135,7 +135,7 @@ def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
             ours, theirs = both
             yield Reason(
                 trust=Trust.WITH_CARE,
-                text=f"{filtered.name} is nearer: RMSE {_rms(theirs):.2f} m, worst {theirs.max():.2f} m, beside "
+                text=f"{filtered.name} is more accurate: RMSE {_rms(theirs):.2f} m, worst {theirs.max():.2f} m, against "
                 f"{_rms(ours):.2f} m, worst {ours.max():.2f} m, over the time that both cover.",
             )
 
@@ -176,7 +176,7 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
     headed = float(np.mean(turned**2 <= chi2_95(1) * there.cov[:, 5, 5]))
     short = min(placed, headed) < _HOLDS_OFFLINE
     trust = Trust.NO if placed < _NOT_COVERED else Trust.WITH_CARE if short else Trust.YES
-    said = "; honest ones hold it for 95 % or more, as offline knows more: they are too small" if short else ""
+    said = "; honest bounds hold it for 95 % or more, as offline knows more: these are too small" if short else ""
     yield Reason(
         trust=trust,
         text=f"It is {_rms(off):.2f} m from the offline track (RMS), {off.max():.2f} m at most; its own 95 % bounds hold the "
@@ -187,16 +187,16 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
 def _compared(data: ReportData, solution: Solution) -> Iterator[Reason]:
     """What there was to hold it against."""
     if main_table(data) is None:
-        text = "Nothing here measures how far off it is: there is neither truth nor a fix that was kept out."
+        text = "Its accuracy was not measured: there is neither truth nor a held-out fix."
         if solution.stats.online and data.online is None:
-            text += " `graphloc compare` holds it against the offline track, which knows more."
+            text += " `graphloc compare` compares it with the offline track, which knows more."
         yield Reason(trust=Trust.WITH_CARE, text=text)
         return
     matched = of(data, solution.name, "matched")
     if matched is None or matched >= _MATCHED:
         return
     if solution.stats.online and matched >= _STARTED:
-        text = f"It covers {matched:.0%} of what it is compared with: it begins when place and heading can be told."
+        text = f"It covers {matched:.0%} of what it is compared with: it begins once position and heading are known."
         yield Reason(trust=Trust.YES, text=text)
         return
     text = f"It covers only {matched:.0%} of what it is compared with; the filters may cover more."
@@ -207,14 +207,14 @@ def _solved(data: ReportData, solution: Solution) -> Iterator[Reason]:
     """How the solver fared, and what was said on the way."""
     stats = solution.stats
     if stats.online:
-        yield Reason(trust=Trust.YES, text="Online: each pose is as it was known at its time.")
+        yield Reason(trust=Trust.YES, text="Online: each pose is what was known at that time.")
     elif not stats.converged:
         yield Reason(trust=Trust.NO, text="The solver did not converge: do not rely on this run.")
     else:
         ratio = stats.cost / max(stats.expected_cost, 1.0)
         trust = Trust.WITH_CARE if ratio > _FAR_OFF else Trust.YES
         text = (
-            f"The solver converged; the measurements disagree with it {ratio:.2f} times as much as they say they may."
+            f"The solver converged; cost over its expectation {ratio:.2f} (near 1 where the noise is configured right)."
         )
         yield Reason(trust=trust, text=text)
     about_all = len(data.recording.warnings) if solution is data.solution else 0
@@ -244,7 +244,7 @@ def _accuracy(data: ReportData, name: str) -> str:
     key = "" if found is None else found[1]
     mine = values.get(name, {}).get(key)
     if mine is None:
-        return "How good it is cannot be said."
+        return "Its accuracy was not measured."
     most = values[name].get(key.replace("rmse", "max"))
     said = f"Horizontal RMSE {mine:.2f} m" + ("" if most is None else f", worst {most:.2f} m")
     others = {n: v for n, row in values.items() if n != name and (v := row[key]) is not None}

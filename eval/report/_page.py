@@ -33,21 +33,21 @@ addEventListener("beforeprint",()=>width(690));addEventListener("afterprint",()=
 """
 _MAP = (
     "East and north of the datum, m. Points: where measurements put the vessel (a fix: its antenna), coloured by final weight; "
-    "hover or tap for the ledger row. Drag to zoom, double-click to go back; a name in the legend switches what it names."
+    "hover or tap for the ledger row. Drag to zoom, double-click to reset; click a name in the legend to hide or show it."
 )
 _NEES = (
-    "Squared horizontal error over the covariance that the estimate states. Errors hang together over time, so a run of some "
-    "minutes leaves the band for a while even where it is honest; an estimate that stays above it is too sure of itself. "
-    "Below it: how often the stated region of each size held the truth; under the diagonal: too sure."
+    "Squared horizontal error over the covariance that the estimate states. Errors are correlated over time, so even an honest "
+    "estimate leaves the band for a while in a run of some minutes; one that stays above the band is overconfident. "
+    "Below: how often the stated region of each size held the truth; under the diagonal: overconfident."
 )
 _BERTHS = (
-    "Across: from the quay's face to the vessel's origin; along: to the right for who looks at the quay from the water; "
-    "angle of the bow from straight in. Bands: 95 %. berth_*.csv has the numbers, and the rates."
+    "Across: from the quay's face to the vessel's origin; along: to the right as seen from the water; "
+    "angle: of the bow from straight in. Bands: 95 %. berth_*.csv has the numbers, and the rates."
 )
 _RESIDUALS = (
     "Residual of each measurement in its own standard deviations, before the loss, coloured by its final weight."
 )
-_SLOW = "What each sensor errs slowly (GNSS error, compass offset, offset of the image, docks) with 95 % bands, and IMU biases."
+_SLOW = "Estimated slow errors (GNSS error, compass offset, image offset, docks) with 95 % bands, and IMU biases."
 
 
 def write_report(path: Path, data: ReportData) -> None:

@@ -147,7 +147,7 @@ def calibration(data: ReportData) -> str:
     )
     head = "<tr><th></th><th>configured</th><th>change</th><th>1 sigma</th><th></th></tr>"
     return (
-        note("What the run says of levers, mounts, stamps and IMU noise. Nothing of it was applied.")
+        note("What the run tells about lever arms, mounts, time stamps and IMU noise. Nothing of it was applied.")
         + f'<ul>{wrong}</ul><div class="scroll"><table class="reason">{head}{rows}</table></div>'
     )
 
@@ -157,7 +157,7 @@ def solver(solution: Solution) -> str:
     s = solution.stats
     events = "<ul>" + "".join(f"<li>{escape(event)}</li>" for event in s.events) + "</ul>" if s.events else ""
     if s.online:
-        return f"<p>Online: {s.states} poses, each as it was known at its time.</p>{events}"
+        return f"<p>Online: {s.states} poses, each as it was known at that time.</p>{events}"
     return (
         f"<p>{s.states} states, {s.factors} factors, {s.passes} passes, {s.iterations} iterations; "
         f"{'converged' if s.converged else 'NOT converged'}. Cost {s.cost:.0f}, expected {s.expected_cost:.0f} "

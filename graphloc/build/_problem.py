@@ -234,7 +234,7 @@ def _sorted_out(
         )
     span = _span(imu)
     warnings = [
-        f"{name}: {n} of {every[name]} measurements lie outside the IMU's span ({span}): no track there"
+        f"{name}: {n} of {every[name]} measurements lie outside the IMU's time span ({span}) and are not used"
         for name, n in outside.items()
         if n > 0.02 * every[name] and n > 5
     ]

@@ -17,7 +17,7 @@ from graphloc.errors import GraphlocError
 
 app = typer.Typer(
     name="graphloc",
-    help="Factor-graph localisation for vessels where GNSS lies.",
+    help="Factor-graph localisation for vessels where GNSS cannot be trusted.",
     no_args_is_help=True,
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -38,22 +38,22 @@ def inspect(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Print what a bag holds and write a first vessel.yaml, every guess marked."""
+    """Show what a bag holds and write a first vessel.yaml, with every guess marked."""
     from graphloc.errors import InputError, OutputError
     from graphloc.frontends import inspect as inspection
 
     found = inspection.inspect_bag(bag)
     typer.echo(json.dumps(found.as_dict(), indent=2) if as_json else inspection.render(found))
     if not found.usable:
-        why = "; ".join(found.warnings) or "no topic of it is a sensor's"
-        raise InputError(f"{found.source}: no sensor can be made of it, so {config} is not written: {why}")
+        why = "; ".join(found.warnings) or "none of its topics has a supported sensor type (docs/quick-start.md)"
+        raise InputError(f"{found.source}: no usable sensor in it, so {config} is not written: {why}")
     if config.exists() and not overwrite:
         raise OutputError(f"{config}: exists already; give --write another name, or --overwrite")
     try:
         config.write_text(inspection.draft_config(found), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{config}: cannot be written ({error.strerror})") from None
-    typer.echo(f"wrote {config}: look at each line marked 'guess'", err=True)
+    typer.echo(f"wrote {config}: check each line marked 'guess'", err=True)
 
 
 def smooth(
@@ -82,7 +82,8 @@ def replay(
     start: StartOption = 0.0,
     duration: DurationOption = None,
     rate: Annotated[
-        float | None, typer.Option(min=0.01, help="Times the run's own time, as 1; by default as fast as it can.")
+        float | None,
+        typer.Option(min=0.01, help="Speed as a multiple of real time, e.g. 1; default: as fast as possible."),
     ] = None,
     lag: LagOption = 10.0,
     figures: FiguresOption = False,
@@ -90,7 +91,7 @@ def replay(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run a bag through the online mode, as a vessel would have, and write the run folder."""
+    """Run a bag through the online mode, as if live on board, and write the run folder."""
     from graphloc import app as application
 
     wanted = Wanted(
@@ -108,13 +109,14 @@ def replay(
 def stream(
     config: ConfigOption,
     rate: Annotated[
-        float | None, typer.Option("--rate", min=0.001, max=1000.0, help="Estimates a second; default: each new state.")
+        float | None,
+        typer.Option("--rate", min=0.001, max=1000.0, help="Estimates per second; default: one per new state."),
     ] = None,
-    ledger: Annotated[bool, typer.Option("--ledger", help="Write rows of the ledger, too.")] = False,
+    ledger: Annotated[bool, typer.Option("--ledger", help="Also write the rows of the ledger.")] = False,
     lag: LagOption = 10.0,
     snapshot: Annotated[Path | None, typer.Option("--snapshot", help="File to resume from after a restart.")] = None,
 ) -> None:
-    """Read measurements from standard input, write estimates to standard output: lines of JSON (docs/online-stream.md)."""
+    """Read measurements from standard input, write estimates to standard output, as JSON lines (docs/online-stream.md)."""
     from graphloc.stream import serve
 
     serve(config, rate_hz=rate, ledger=ledger, lag_s=lag, snapshot=snapshot)
@@ -129,7 +131,7 @@ def match(
     duration: DurationOption = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Match one scan to the aerial image, and draw it: scan on image, score, modes."""
+    """Match one LiDAR scan to the aerial image and draw it: scan on image, score, modes."""
     import numpy as np
 
     from graphloc import app as application

@@ -23,7 +23,7 @@ from graphloc.cli._shared import (
 )
 
 _BagsOrRuns = Annotated[
-    list[Path], typer.Argument(help="A bag (several: the parts of a split one), or the folders of finished runs.")
+    list[Path], typer.Argument(help="A bag (all files of a split one), or the folders of finished runs.")
 ]
 _ConfigIfBag = Annotated[
     Path | None, typer.Option("--config", "-c", help="The vessel.yaml of a bag; run folders need none.")
@@ -42,9 +42,9 @@ def compare(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Smooth a run, run the thesis EKF and an honest EKF on the same measurements, and report all.
+    """Smooth a run, run the online mode and the EKFs on the same measurements, and report all of them.
 
-    Given the folders of finished runs instead of a bag: put their numbers into one summary.
+    Given folders of finished runs instead of a bag: put their numbers into one summary.
     """
     from graphloc.errors import ConfigError
     from graphloc.eval.summary import is_run

@@ -25,28 +25,28 @@ class Stopped(GraphlocError):
     """Ctrl-C, and what became of the work so far."""
 
 
-BagArgument = Annotated[list[Path], typer.Argument(help="A ROS 1 or ROS 2 bag; several for the parts of a split one.")]
+BagArgument = Annotated[list[Path], typer.Argument(help="A ROS 1 or ROS 2 bag; give all files of a split one.")]
 StartOption = Annotated[
-    float, typer.Option("--start", help="Begin so many seconds after the bag's beginning, by its recording times.")
+    float, typer.Option("--start", help="Skip this many seconds at the start of the bag (recording time).")
 ]
 DurationOption = Annotated[
-    float | None, typer.Option("--duration", help="Take so many seconds of the bag; by default to its end.")
+    float | None, typer.Option("--duration", help="Use only this many seconds of the bag; default: to its end.")
 ]
 ConfigOption = Annotated[Path, typer.Option("--config", "-c", help="The vessel.yaml.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")]
 HoldOutOption = Annotated[
-    str | None, typer.Option("--hold-out", help="Keep fixes out and predict them: every:N, or gaps:COUNTxSECONDS.")
+    str | None, typer.Option("--hold-out", help="Withhold GNSS fixes and predict them: every:N or gaps:COUNTxSECONDS.")
 ]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there already.")]
-FiguresOption = Annotated[bool, typer.Option("--figures", help="Write the figures as PNG and SVG, too.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
+FiguresOption = Annotated[bool, typer.Option("--figures", help="Also write the figures as PNG and SVG.")]
 RerunOption = Annotated[
-    Path | None, typer.Option("--rerun", help="Write the run for the rerun viewer, too: out.rrd (docs/rerun.md).")
+    Path | None, typer.Option("--rerun", help="Also write the run for the rerun viewer: out.rrd (docs/rerun.md).")
 ]
-LagOption = Annotated[float, typer.Option("--lag", min=1.0, help="How long measurements are re-judged, s.")]
-JobsOption = Annotated[
-    int | None, typer.Option("--jobs", min=1, help="Processes beside each other; by default one a core.")
+LagOption = Annotated[
+    float, typer.Option("--lag", min=1.0, help="Length of the sliding window, s; a measurement may come this late.")
 ]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Same seed, same run.")]
+JobsOption = Annotated[int | None, typer.Option("--jobs", min=1, help="Parallel processes; default: one per core.")]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Random seed: the same seed gives the same run.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the numbers as JSON.")]
 
 

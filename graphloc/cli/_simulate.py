@@ -23,19 +23,22 @@ def pairs(changes: list[str]) -> dict[str, str]:
 
 
 def simulate(
-    scenario: Annotated[str, typer.Argument(help="bl1-drift, dock-fixed-fog, ...: a wrong name lists them.")],
+    scenario: Annotated[str, typer.Argument(help="E.g. bl1-drift, dock-fixed-fog; an unknown name lists them all.")],
     out: OutOption,
     seed: SeedOption = 0,
     ros: Annotated[int, typer.Option(min=1, max=2, help="ROS version of the bag.")] = 2,
-    storage: Annotated[str, typer.Option(help="mcap or sqlite3, of a ROS 2 bag.")] = "",
-    harbour: Annotated[str, typer.Option(help="Another harbour than the scenario's: a name or a file.")] = "",
-    rig: Annotated[str, typer.Option(help="Other sensors than the scenario's: a name or a file.")] = "",
+    storage: Annotated[str, typer.Option(help="Storage of a ROS 2 bag: mcap (default) or sqlite3.")] = "",
+    harbour: Annotated[
+        str, typer.Option(help="Use another harbour: a shipped name or a file (docs/simulator.md).")
+    ] = "",
+    rig: Annotated[str, typer.Option(help="Use another vessel and sensors: a shipped name or a file.")] = "",
     changes: Annotated[
-        list[str] | None, typer.Option("--set", help="Change the scenario, as in --set camera_hz=15 --set lidar_hz=0.")
+        list[str] | None,
+        typer.Option("--set", help="Change a field of the scenario: --set camera_hz=15 --set lidar_hz=0."),
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Write a simulated harbour run: bag, vessel.yaml, aerial image, tag survey, and what only a simulator knows."""
+    """Write a simulated harbour run: bag, vessel.yaml, aerial image, tag survey and ground truth."""
     from graphloc import outputs
     from graphloc.errors import ConfigError
     from graphloc.eval.simulate import find_scenario
@@ -55,7 +58,7 @@ def demo(
     out: OutOption = Path("runs/demo"),
     seed: SeedOption = 0,
 ) -> None:
-    """Simulate a harbour run with drifting GNSS and 40 % false matches, smooth it from its bag, and compare."""
+    """Simulate a harbour run with drifting GNSS and 40 % false matches, smooth its bag, and compare."""
     from graphloc.eval.simulate import harbour_scenarios
     from graphloc.eval.simulate import simulate as run_simulation
     from graphloc.eval.simulate.bag import write_bag

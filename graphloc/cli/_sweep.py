@@ -37,29 +37,29 @@ def seeds_of(text: str) -> list[int]:
 
 
 def sweep(
-    scenarios: Annotated[list[str] | None, typer.Argument(help="Scenarios of the simulator, as bl1-drift.")] = None,
+    scenarios: Annotated[list[str] | None, typer.Argument(help="Scenarios of the simulator, e.g. bl1-drift.")] = None,
     out: OutOption = Path("runs/sweep"),
-    seeds: Annotated[str | None, typer.Option(help="0:50 for the seeds 0 to 49, or 1,2,5; by default 0.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="0:50 for seeds 0 to 49, or 1,2,5; default: 0.")] = None,
     changes: Annotated[
-        list[str] | None, typer.Option("--set", help="Vary the scenario, as in --set gnss_hz=1,10.")
+        list[str] | None, typer.Option("--set", help="Vary a field of the scenario: --set gnss_hz=1,10.")
     ] = None,
     config_changes: Annotated[
         list[str] | None,
-        typer.Option("--config-set", help="Vary the configuration, as in --config-set sensors.gnss.sigma_scale=1,2."),
+        typer.Option("--config-set", help="Vary a key of vessel.yaml: --config-set sensors.gnss.sigma_scale=1,2."),
     ] = None,
     bag: Annotated[
-        list[Path] | None, typer.Option(help="Recordings instead of scenarios; all with one --config.")
+        list[Path] | None, typer.Option(help="A bag instead of scenarios; repeat for more, all with one --config.")
     ] = None,
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="The vessel.yaml of the recordings.")] = None,
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="The vessel.yaml of the bags.")] = None,
     hold_out: HoldOutOption = None,
     mode: Annotated[
-        _Mode, typer.Option(help="offline smooths, online replays, compare does both and more.")
+        _Mode, typer.Option(help="offline: smooth; online: replay; compare: both, and the EKFs.")
     ] = _Mode.offline,
     workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes on this machine.")] = 1,
-    scheduler: Annotated[str, typer.Option(help="A Dask scheduler instead, as tcp://host:8786.")] = "",
+    scheduler: Annotated[str, typer.Option(help="Use a Dask scheduler instead, e.g. tcp://host:8786.")] = "",
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Run scenarios over seeds, or bags, with parameters varied, and write one table of results."""
+    """Run many scenarios, seeds or bags with varied parameters and write one table of results."""
     from graphloc.errors import ConfigError, InputError
     from graphloc.eval.sweep_table import summary
     from graphloc.job import Job, variations

@@ -36,7 +36,7 @@ def ablate(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Smooth a run without each sensor in turn: what each is worth, and whether one contradicts the rest."""
+    """Smooth a run without each sensor in turn: what each contributes, and whether one contradicts the rest."""
     from graphloc import whatif
     from graphloc.eval import ablation_page as page
     from graphloc.eval.holdout import HoldOut
@@ -61,17 +61,17 @@ def drill(
     out: OutOption,
     start: StartOption = 0.0,
     duration: DurationOption = None,
-    times: Annotated[int, typer.Option(min=1, help="How often each failure strikes, at other times.")] = 2,
+    times: Annotated[int, typer.Option(min=1, help="How often each failure is injected, at different times.")] = 2,
     only: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Part of the names of the drills wanted, as outage; again for more."),
+        typer.Option("--set", help="Only failures whose name contains this, e.g. outage; repeat for more."),
     ] = None,
     seed: SeedOption = 0,
     jobs: JobsOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Strike a run with harbour failures: what smoother, online mode and EKFs make of them."""
+    """Inject failures (outages, jumps, false matches) into a run: do smoother, online mode and EKFs recover?"""
     from graphloc import drills
     from graphloc.eval.drill import page
 

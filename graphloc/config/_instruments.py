@@ -21,13 +21,13 @@ class ImuConfig(SensorConfig):
     """An inertial measurement unit (`sensor_msgs/Imu`)."""
 
     kind: Literal["imu"] = "imu"
-    """Which row of the sensor table reads this block."""
+    """The sensor kind."""
     accel_unit: Literal["m/s^2", "g"] = "m/s^2"
     """Unit of `linear_acceleration` in the bag (REP 103 says m/s^2; some drivers write g)."""
     gyro_unit: Literal["rad/s", "deg/s"] = "rad/s"
     """Unit of `angular_velocity` in the bag."""
     gravity: Literal["included", "removed", "inverted"] = "included"
-    """Whether `linear_acceleration` holds gravity (+g upwards at rest, the standard), or the driver removed it; `inverted`:
+    """Gravity in `linear_acceleration`: `included` (+g upwards at rest, the standard), `removed` by the driver, or `inverted`:
     the driver writes accelerations with the opposite sign (-g upwards at rest), while its gyroscope is right."""
     accel_noise_ug_per_sqrt_hz: Positive = 3000.0
     """Accelerometer white noise, ug/sqrt(Hz). The default allows for hull vibration."""
@@ -38,17 +38,17 @@ class ImuConfig(SensorConfig):
     gyro_bias_instability_deg_per_h: Positive = 20.0
     """In-run gyroscope bias instability, deg/h."""
     bias_correlation_s: Positive = 300.0
-    """Time over which a bias wanders by its instability, s."""
+    """Time over which a bias drifts by its instability, s."""
     accel_bias_sigma_mg: Positive = 10.0
     """Turn-on accelerometer bias, 1 sigma, mg."""
     gyro_bias_sigma_dps: Positive = 2.0
     """Turn-on gyroscope bias, 1 sigma, deg/s, before the start alignment has measured it."""
     adapt_noise: bool = True
-    """Scale the noise up (never down, and said in the report) where the run contradicts it several times over."""
+    """Scale the noise up (never down, and with a warning) if the run contradicts the configured noise several times over."""
     max_gap_s: Positive = 0.5
-    """A longer hole between samples is an IMU gap: bridged by a link with noise that lets a vessel do anything."""
+    """A longer interval between samples is an IMU gap: bridged with noise large enough for any motion of a vessel, s."""
     max_bridge_s: Positive = 20.0
-    """A longer gap is not bridged: the run is cut there, and its parts are solved one by one."""
+    """A longer gap is not bridged: the run is cut there and its parts are solved separately, s."""
     kernel: KernelConfig = KernelConfig(kind="none")
     """Robust loss: not used for inertial data."""
 
@@ -95,23 +95,23 @@ class SlowErrorConfig(Block):
     """The slowly varying part of the GNSS error: a first-order Gauss-Markov process per axis."""
 
     enabled: bool | None = None
-    """Off: the GNSS error is taken as white (right for RTK in the open, wrong in a harbour). Empty: on where
-    a second absolute sensor (matches, tags, another receiver) can tell it from motion, off where GNSS is alone."""
+    """false: the GNSS error is treated as white noise (right for RTK in the open, wrong in a harbour). Empty: on if a second
+    sensor (matches, tags, GNSS velocity, another receiver) can separate it from motion; else it is added to the bounds only."""
     horizontal_sigma_m: Positive = 2.0
-    """Standing size of the slow error, each horizontal axis, 1 sigma, m."""
+    """Stationary sigma of the slow error, each horizontal axis, m."""
     vertical_sigma_m: Positive = 5.0
-    """Standing size of the slow error in height, 1 sigma, m."""
+    """Stationary sigma of the slow error in height, m."""
     time_constant_s: Positive = 200.0
     """Correlation time, s."""
     jumps: bool = True
-    """Let the slow error jump (a robust loss on its steps), as multipath does."""
+    """Allow the slow error to jump (a robust loss on its steps), as multipath does."""
 
 
 class GnssConfig(SensorConfig):
     """GNSS position (`sensor_msgs/NavSatFix`, `gps_msgs/GPSFix`, NMEA in `nmea_msgs/Sentence` or `std_msgs/String`)."""
 
     kind: Literal["gnss"] = "gnss"
-    """Which row of the sensor table reads this block."""
+    """The sensor kind."""
     min_status: Literal["fix", "sbas", "gbas"] = "fix"
     """Fixes below this `NavSatStatus` are rejected. `STATUS_NO_FIX` never counts as a fix."""
     sigma_scale: Positive = 1.0
@@ -121,55 +121,54 @@ class GnssConfig(SensorConfig):
     min_vertical_sigma_m: Positive = 0.04
     """Floor of the white vertical sigma, m."""
     default_horizontal_sigma_m: Positive = 1.5
-    """Taken where the message reports no covariance (type unknown, zeros or NaN), m."""
+    """Horizontal sigma if the message reports no covariance (type unknown, zeros or NaN), m."""
     default_vertical_sigma_m: Positive = 4.0
     """The same for height, m."""
     slow_error: SlowErrorConfig = SlowErrorConfig()
     """The modelled slow error."""
     nmea: Places = ("GGA",)
-    """Sentences that are read of a topic of NMEA, of one talker (`GPGGA`) or of any (`GGA`): GGA, GNS, RMC, GLL."""
+    """NMEA sentences to read, from one talker (`GPGGA`) or any (`GGA`): GGA, GNS, RMC, GLL."""
 
 
 class CompassConfig(SensorConfig):
     """Heading: `geometry_msgs/QuaternionStamped`, orientation of `sensor_msgs/Imu`, NMEA (as `gnss`), `std_msgs/Float64` or `Float32`."""
 
     kind: Literal["compass"] = "compass"
-    """Which row of the sensor table reads this block."""
+    """The sensor kind."""
     convention: Literal["enu", "ned"] = "enu"
     """Yaw in the message: `enu` from east, counter-clockwise (REP 103); `ned` from north, clockwise. NMEA is the latter."""
     unit: Literal["deg", "rad"] = "deg"
-    """Of a number; of other messages it is known."""
+    """Unit of a plain number (`Float64`, `Float32`); other messages have a fixed one."""
     sigma_deg: Positive = 1.5
-    """Heading noise, 1 sigma, deg. Used where the message carries no covariance."""
+    """Heading noise, 1 sigma, deg, if the message carries no covariance."""
     use_reported_sigma: bool = True
-    """Take the yaw variance of an `Imu` message where it is positive and finite."""
+    """Use the yaw variance of an `Imu` message if it is positive and finite."""
     mount_offset_sigma_deg: NonNegative = 1.0
-    """Unknown but constant heading offset of the mount, 1 sigma, deg; 0 holds the mount fixed, and what is read for free of
-    deviation and wander."""
+    """Unknown constant heading offset of the mount, 1 sigma, deg. 0: no offset, and neither deviation nor wander."""
     deviation_sigma_deg: NonNegative = 1.5
-    """Magnetic deviation: coefficients B and C (of sine and cosine of the heading), 1 sigma, deg; D and E (of twice the
-    heading) are half of it. 0: none, as of a GNSS compass."""
+    """Magnetic deviation: coefficients B and C (sine and cosine of the heading), 1 sigma, deg; D and E (twice the
+    heading) get half of it. 0: none, e.g. a GNSS compass."""
     wander_sigma_deg: NonNegative = 0.5
-    """How far what is not of the vessel (a crane, a quay, the filter in the compass) turns its reading for a while, 1 sigma, deg."""
+    """Temporary heading error (a crane or quay nearby, the compass's own filter), 1 sigma, deg."""
     wander_time_constant_s: Positive = 60.0
-    """How long such an error lasts, s."""
+    """Correlation time of that error, s."""
     nmea: Headings = ("HDT", "THS")
-    """Sentences that are read of a topic of NMEA, of one talker (`HEHDT`) or of any (`HDT`): HDT, THS, HDG, HDM."""
+    """NMEA sentences to read, from one talker (`HEHDT`) or any (`HDT`): HDT, THS, HDG, HDM."""
 
 
 class VelocityConfig(SensorConfig):
     """GNSS velocity over ground (`geometry_msgs/TwistWithCovarianceStamped`, `TwistStamped`, `Vector3Stamped`, NMEA as `gnss`)."""
 
     kind: Literal["gnss_velocity"] = "gnss_velocity"
-    """Which row of the sensor table reads this block."""
+    """The sensor kind."""
     convention: Literal["enu", "ned"] = "enu"
     """Axes of the message: `enu` east, north, up; `ned` north, east, down. Of NMEA they are known."""
     min_sigma_mps: Positive = 0.03
     """Floor of the velocity sigma, m/s."""
     default_sigma_mps: Positive = 0.3
-    """Taken where the message reports no covariance, m/s."""
+    """Sigma if the message reports no covariance, m/s."""
     nmea: Velocities = ("VTG",)
-    """Sentences that are read of a topic of NMEA, of one talker (`GPVTG`) or of any (`VTG`): VTG, RMC."""
+    """NMEA sentences to read, from one talker (`GPVTG`) or any (`VTG`): VTG, RMC."""
 
 
 class BodyVelocityConfig(SensorConfig):
@@ -212,14 +211,14 @@ class HeightConfig(SensorConfig):
     """Height prior: a vessel floats, so its height is known from waterline and tide."""
 
     kind: Literal["height"] = "height"
-    """Which row of the sensor table reads this block."""
+    """The sensor kind."""
     height_m: Finite | None = None
     """Height of the body origin above the ellipsoid, m; empty: the median of the run's fixes."""
     sigma_m: Positive = 0.3
-    """Heave around it, 1 sigma, m."""
+    """Heave around that height, 1 sigma, m."""
     tide_sigma_m: NonNegative = 0.5
-    """How far tide and load may hold the vessel above or below it, for hours, 1 sigma, m; 0: not at all."""
+    """Offset by tide and load, lasting for hours, 1 sigma, m; 0: none."""
     period_s: Annotated[float, Field(ge=0.02, le=1e6)] = 1.0
     """Time between two priors, s."""
     kernel: KernelConfig = KernelConfig(kind="none")
-    """Robust loss: not used for the waterline."""
+    """Robust loss: not used for the height prior."""

@@ -20,15 +20,15 @@ class AnyPoseConfig(SensorConfig):
     axes: tuple[Literal["x", "y", "z", "roll", "pitch", "yaw"], ...] = ("x", "y", "yaw")
     """Which axes of the pose are used."""
     false_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
-    """Share of poses that are expected to be false where the front-end does not say."""
+    """Expected share of false poses, if the message or matcher does not say."""
     false_repeats: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
-    """Probability that a false pose after a false pose repeats its error (a moored boat stays)."""
+    """Probability that a false pose repeats the error of the false pose before it (a moored boat stays)."""
     min_sigma_m: Positive = 0.02
     """Floor of the position sigma, m."""
     min_sigma_deg: Positive = 0.1
     """Floor of the angle sigma, deg."""
     default_sigma_m: Positive = 0.3
-    """Taken where the message reports no covariance, m."""
+    """Position sigma if the message reports no covariance, m."""
     default_sigma_deg: Positive = 2.0
     """The same for angles, deg."""
 
@@ -48,7 +48,7 @@ class PoseConfig(AnyPoseConfig):
     """Absolute pose in world (`geometry_msgs/PoseWithCovarianceStamped`, `nav_msgs/Odometry`)."""
 
     kind: Literal["pose"] = "pose"
-    """Which row of the sensor table reads this block."""
+    """The sensor kind."""
 
 
 class LidarConfig(Block):
@@ -61,47 +61,47 @@ class LidarConfig(Block):
 
 
 class AerialConfig(AnyPoseConfig):
-    """LiDAR scans (`sensor_msgs/PointCloud2`) laid on an aerial image, drawn lines, or both."""
+    """LiDAR scans (`sensor_msgs/PointCloud2`) matched to an aerial image, drawn lines, or both."""
 
     kind: Literal["aerial"] = "aerial"
-    """Which row of the sensor table reads this block."""
+    """The sensor kind."""
     axes: tuple[Literal["x", "y", "yaw"], ...] = ("x", "y", "yaw")
     """Which axes of a match are used."""
     image: str = ""
     """A georeferenced image that GDAL reads, an MBTiles file, or a folder of tiles z/x/y.png, jpg or webp; a relative
-    path counts from the folder of vessel.yaml."""
+    path starts at the folder of vessel.yaml."""
     vector: str = ""
-    """GeoJSON of lines and polygons of quays, piers and shores; a relative path counts as that of the image."""
+    """GeoJSON of lines and polygons of quays, piers and shores; path as for `image`."""
     image_sigma_m: NonNegative = 0.3
-    """How far the image as a whole shows things from where they are, east and north, 1 sigma, m."""
+    """Misregistration of the image as a whole, east and north, 1 sigma, m."""
     lidars: dict[str, LidarConfig] = Field(default_factory=dict)
     """The LiDARs by name."""
     hull_m: tuple[tuple[Finite, Finite], ...] = ()
-    """Corners of the vessel's outline in body, forward and port, in order, m: points within are its own; none: no
+    """Corners of the vessel's outline in body, [forward, port], in order, m: points inside are ignored as its own; none: no
     point is."""
     waterline_m: Finite = 0.0
     """Height of the waterline in body, m."""
     matcher: Literal["posterior", "bl"] = "posterior"
-    """`bl`: that of Bergman & Lindell as printed (one pose, by a particle swarm), to compare with; it needs an image."""
+    """`bl`: the matcher of Bergman & Lindell as printed (one pose, by a particle swarm), for comparison; it needs an image."""
     seed: Annotated[int, Field(ge=0)] = 0
-    """Of the particle swarm."""
+    """Random seed of the particle swarm (`bl`)."""
     submap: Annotated[int, Field(ge=1, le=100)] = 1
-    """So many scans are laid on the map together, moved by the vessel's own motion between them."""
+    """Number of consecutive scans combined for one match, motion-compensated."""
     every_s: Positive = 1.0
-    """Least time between two matches, s."""
+    """Minimum time between two matches, s."""
     every_m: NonNegative = 0.5
-    """Least way between two matches, m."""
+    """Minimum distance travelled between two matches, m."""
     alike_m: NonNegative = 15.0
-    """Matches within this way of each other err alike (the same walls, the same boats), so each tells but a part of
-    news: variances grow by (1 + r) / (1 - r), r = exp(-way / alike_m), or less after a while; 0: each is news, m."""
+    """Correlation length of match errors (the same walls, the same boats), m: variances grow by (1 + r) / (1 - r),
+    r = exp(-distance / alike_m), or less after some time; 0: independent."""
     still_s: Positive = 10.0
-    """Time after which there is a match though the vessel has not moved that far, s."""
+    """Time after which a match is made although the vessel has not moved by `every_m`, s."""
     window_m: Annotated[Positive, Field(le=50.0)] = 6.5
-    """Largest half side of the search, at most 50 m; less where the estimate is surer (3 sigma)."""
+    """Largest half width of the search window, at most 50 m; smaller if 3 sigma of the estimate is."""
     window_deg: Annotated[Positive, Field(le=30.0)] = 5.0
     """The same for the heading, at most 30 deg."""
     reach_m: Annotated[Positive, Field(le=300.0)] = 100.0
-    """Points farther off are not used; at most 300 m."""
+    """Points beyond this range are not used; at most 300 m."""
 
     @field_validator("topic", "mount")
     @classmethod
@@ -134,7 +134,7 @@ class AerialConfig(AnyPoseConfig):
 
 
 class CameraConfig(Block):
-    """A camera that sees tags; or a detector that has listed them already."""
+    """A camera that sees tags, or a topic of detections made from its images."""
 
     topic: str
     """Images (`sensor_msgs/Image`, `CompressedImage`), or detections (`apriltag_msgs/AprilTagDetectionArray`, ROS 1's
@@ -142,46 +142,46 @@ class CameraConfig(Block):
     info_topic: str = ""
     """Its `sensor_msgs/CameraInfo`; empty: `camera_info` beside the images."""
     rectified: bool | None = None
-    """Whether distortion is removed from the images already (`image_rect`); empty: by the topic's name for images,
+    """Whether distortion has been removed already (`image_rect`); empty: by the topic's name for images,
     true for detections, which are made on such images."""
     mount: MountConfig = MountConfig()
     """Pose of the optical frame (x right, y down, z forward) in body: looking ahead is `rpy_deg: [-90, 0, -90]`."""
     mount_sigma_deg: NonNegative = 1.0
-    """How well its attitude on the vessel is known, about each axis, 1 sigma, deg: what it is off is estimated. A mount measured by
-    hand is off by a degree or two, and 1 deg at 20 m is 0.35 m; 0: it is taken as given."""
+    """Attitude error of the mount, about each axis, 1 sigma, deg; it is estimated. A mount measured by
+    hand is off by a degree or two, and 1 deg at 20 m is 0.35 m. 0: taken as given."""
     stamp_sigma_s: NonNegative = 0.03
-    """How well it is known by how much its stamps are late, besides `time_offset_s`, 1 sigma, s: that is estimated as well. Drivers stamp
-    images when they come, 0.02 to 0.1 s after the exposure; a vessel that rolls by 5 deg/s is turned by 0.5 deg in 0.1 s."""
+    """Unknown delay of its stamps beyond `time_offset_s`, 1 sigma, s; it is estimated. Drivers stamp images on
+    arrival, 0.02 to 0.1 s after the exposure; a vessel that rolls at 5 deg/s turns by 0.5 deg in 0.1 s."""
 
 
 class AprilTagConfig(SensorConfig):
     """AprilTags seen by cameras: the two poses of each sighting are kept, and the graph chooses."""
 
     kind: Literal["apriltag"] = "apriltag"
-    """Which row of the sensor table reads this block."""
+    """The sensor kind."""
     survey: str | Survey = ""
-    """Where the tags are: a `tags.yaml` (docs/tags.md); a relative path counts from the folder of vessel.yaml."""
+    """The survey of the tags: a `tags.yaml` (docs/tags.md); a relative path starts at the folder of vessel.yaml."""
     cameras: dict[str, CameraConfig] = Field(default_factory=dict)
     """The cameras by name."""
     max_hamming: Annotated[int, Field(ge=0, le=3)] = 1
-    """Most bits of a tag that may be read wrong."""
+    """Largest number of misread bits accepted."""
     min_margin: NonNegative = 1.5
-    """Least decision margin (AprilTag's: how far bits are from the threshold, grey levels)."""
+    """Smallest decision margin accepted (as AprilTag's: distance of the bits from the threshold, grey levels)."""
     min_corner_sigma_px: NonNegative = 0.2
-    """Floor of the corners' noise in the graph, each axis, 1 sigma, px: what calibration and stamps are off (a vessel
-    that turns by 5 deg/s moves corners by 0.5 px in 5 ms at a focal length of 1000 px)."""
+    """Floor of the corner noise in the graph, each axis, 1 sigma, px, for errors of calibration and stamps (a vessel
+    that turns at 5 deg/s moves corners by 0.5 px in 5 ms at a focal length of 1000 px)."""
     edge_sigma_px: NonNegative = 0.05
-    """How far the edges of all tags are seen too far out (or in) for half a minute: blur, light, prints, focal length, 1 sigma,
-    px. A tag 12 px wide whose edges are seen 0.05 px too far out seems 0.8 % nearer than it is, in every image; 0: not
+    """Common outward (or inward) shift of the edges of all tags, correlated over half a minute, 1 sigma, px: blur, light, print,
+    focal length. 0.05 px on a tag 12 px wide makes it appear 0.8 % too near, in every image; 0: not
     modelled."""
     corner_sigma_px: Positive = 0.5
-    """Noise of the corners of listed detections, each axis, 1 sigma, px; our own detector measures it."""
+    """Corner noise of detections from the bag, each axis, 1 sigma, px; the built-in detector measures its own."""
     false_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02
-    """Share of sightings that are expected to be false: misread, or of a tag that was moved."""
+    """Expected share of false sightings: misread, or of a tag that was moved."""
     false_repeats: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.9
-    """Probability that a false sighting after a false one repeats its error (a moved tag stays moved)."""
+    """Probability that a false sighting repeats the error of the false one before it (a moved tag stays moved)."""
     kernel: KernelConfig = KernelConfig(kind="none")
-    """Robust loss: not used; that a sighting is false is a hypothesis of its own."""
+    """Robust loss: not used; false sightings are a hypothesis of their own."""
 
     @field_validator("topic", "mount")
     @classmethod

@@ -12,12 +12,12 @@ from graphloc.blocks import Block, MountConfig, Positive
 
 
 class KernelConfig(Block):
-    """Robust loss of a sensor. The last stage of the solver re-weighs by hypotheses where modes exist."""
+    """Robust loss of a sensor. Where hypotheses exist (modes, false ones) the last stage of the solver weighs by these instead."""
 
     kind: Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"] = "cauchy"
-    """Loss. Redescending kinds (geman_mcclure, tukey) are used in the last stage only: before, Cauchy."""
+    """Loss. Redescending kinds (geman_mcclure, tukey) are used in the last stage only; before that, Cauchy."""
     scale: Positive = 1.5
-    """Where the loss bends, in standard deviations of the residual."""
+    """Where the loss bends, in standard deviations of the residual (times sqrt(dof))."""
 
     def weight(self, nis: float) -> float:
         """Weight in [0, 1] that the loss gives a squared normalised residual."""

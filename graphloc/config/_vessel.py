@@ -31,20 +31,20 @@ class TimelineConfig(Block):
     """The states of the graph."""
 
     rate_hz: Annotated[float, Field(gt=0.5, le=200.0)] = 10.0
-    """States a second; a state moves onto a measurement's stamp where one is near."""
+    """States per second; a state is moved onto the stamp of a measurement close by."""
     slow_period_s: Annotated[float, Field(ge=0.05, le=60.0)] = 1.0
-    """Time between two states of the slow quantities (IMU bias, GNSS error), s."""
+    """Time between two states of slow quantities (IMU bias, GNSS error), s."""
     leg_s: Annotated[float, Field(ge=60.0)] = 1800.0
-    """Offline, a longer run is solved in legs of about so long that overlap by two minutes: memory grows with a leg, s."""
+    """Offline, a longer run is solved in legs of about this length that overlap by two minutes; memory grows with a leg, s."""
 
 
 class StartConfig(Block):
     """How the run is started."""
 
     window_s: Positive = 20.0
-    """Span that the start alignment may look at, s."""
+    """Longest span of data for the start alignment, s."""
     heading_deg: Finite | None = None
-    """Compass heading at the start (from true north, clockwise), where no sensor tells, deg."""
+    """Heading at the start (from true north, clockwise) if no sensor measures it, deg."""
     heading_sigma_deg: Positive = 10.0
     """Its 1 sigma, deg."""
 
@@ -53,11 +53,11 @@ class OutputConfig(Block):
     """What is written to the run folder."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=1e4)] = 10.0
-    """Rows a second in the solution."""
+    """Rows per second in the solution."""
     bag: bool = True
     """Write `solution_bag/`, a bag with `nav_msgs/Odometry`."""
     map_image: str = ""
-    """Georeferenced image under the report's map, a path as that of an aerial sensor; none: that of the first such sensor."""
+    """Georeferenced image under the report's map, path as for an aerial sensor; empty: that of the first such sensor."""
 
 
 class VesselConfig(Block):
@@ -70,7 +70,7 @@ class VesselConfig(Block):
     datum: DatumConfig | None = None
     """Origin of the world frame."""
     sensors: dict[str, Any] = Field(default_factory=dict)
-    """Sensors by name; `kind` in each block picks the row of the sensor table."""
+    """Sensors by name; `kind` in each block selects the sensor kind."""
     truth_topic: str | None = None
     """Topic with the true body pose in world (`nav_msgs/Odometry`), for comparisons only; never fused."""
     check_speed_topic: str | None = None

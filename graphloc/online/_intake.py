@@ -85,7 +85,7 @@ class ImuIntake:
         if leap is not None and 0 < abs(m.stamp_ns - leap.stamp_ns) <= self._gap_ns:
             self.leap = None  # the clock went on from there
             return Taken(accepted=(leap, m) if leap.stamp_ns < m.stamp_ns else (m, leap))
-        lost = () if leap is None else ((leap, "its stamp leaps, and those after it do not follow"),)
+        lost = () if leap is None else ((leap, "its stamp jumps ahead and the next ones do not follow"),)
         if m.stamp_ns - newest.stamp_ns > self._gap_ns:
             self.leap, self._leap_age = m, 0
             return Taken(dropped=lost)
@@ -101,8 +101,8 @@ class ImuIntake:
         """Why a sample cannot be a vessel's; empty where it can."""
         force, rate = float(np.linalg.norm(m.accel_mps2)), float(np.linalg.norm(m.gyro_radps))
         if (self._floats and force < _FORCE_MPS2[0]) or force > _FORCE_MPS2[1]:
-            return f"a specific force of {force:.3g} m/s^2: another unit?"
-        return f"a rate of {rate:.3g} rad/s: another unit?" if rate > _RATE_RADPS else ""
+            return f"a specific force of {force:.3g} m/s^2, impossible for a vessel: wrong unit?"
+        return f"a rate of {rate:.3g} rad/s, impossible for a vessel: wrong unit?" if rate > _RATE_RADPS else ""
 
     def _before(self, m: ImuSample, newest: ImuSample, started: bool) -> Taken:
         """A sample before the newest: it is late where one is missing; else its clock is not to be trusted."""

@@ -42,4 +42,4 @@ class ImuNoise:
             return ""
         self._misfits = 0
         self.scale = min(self.scale * float(np.clip(np.sqrt(misfit), 1.5, 3.0)), NO_NOISE)
-        return f"the IMU contradicts the other sensors: its noise is taken for {self.scale:.1f} times as large"
+        return f"the IMU contradicts the other sensors: its noise is scaled up to {self.scale:.1f} times"

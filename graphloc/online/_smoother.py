@@ -155,7 +155,7 @@ class OnlineSmoother:
         why = (
             f"never started: waiting for {self._waiting.why}"
             if self._lag is None
-            else "the run ended before a state there"
+            else "the run ended before there was a state at its stamp"
         )
         for m in [*self._pending, *([self._intake.leap] if self._intake.leap else [])]:
             self._book.drop(m, Outcome.REJECTED, why)
@@ -203,7 +203,7 @@ class OnlineSmoother:
         if taken.absurd and self._lag is None:
             self._waiting.why = f"IMU data that a vessel can have: {taken.absurd}"
         if taken.hangs:
-            self._say(f"{m.sensor}: {WHY}; silent until it says another")
+            self._say(f"{m.sensor}: {WHY}; treated as an IMU gap until the samples change")
         if taken.late is not None:
             self._keep_late_imu(taken.late, taken.hole)
         if taken.set_back_s:
@@ -271,8 +271,10 @@ class OnlineSmoother:
 
     def _say_parted(self, parted: set[str]) -> None:
         for name in sorted(parted ^ self._parted):
-            again = "hangs no more: its places are judged as before"
-            hangs = "says the same place while the vessel moves: it hangs; its places are not believed"
+            again = "no longer frozen: its fixes are used again"
+            hangs = (
+                "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
+            )
             self._say(f"{name}: {hangs if name in parted else again}")
         self._parted = parted
 
@@ -394,13 +396,13 @@ class OnlineSmoother:
         self._snapshot.restart()
 
     def _restart(self, why: str) -> None:
-        self._say(f"{why}: {'waits' if self._lag is None else 'starts'} anew")
+        self._say(f"{why}: restarts")
         if self._lag is not None:
             self._book.enter([*self._lag.gone(), *self._lag.held()])
             self._agreed_ns.update(self._lag.agreed_ns)
         for m in self._pending:
-            self._book.drop(m, Outcome.REJECTED, "the run was cut before the IMU got there")
-        self._waiting.refuse(f"the run was cut while it waited for {self._waiting.why}")
+            self._book.drop(m, Outcome.REJECTED, "the estimate restarted before IMU data reached its stamp")
+        self._waiting.refuse(f"the estimate restarted while waiting for {self._waiting.why}")
         self._wait("the next IMU sample")
 
     def _try_to_start(self) -> Estimate | None:
@@ -426,7 +428,7 @@ class OnlineSmoother:
                 self._lag_s,
             )
         except Exception as error:  # noqa: BLE001 - as in `_advance`
-            started = f"a start that can be solved: {in_one_line(error)}"
+            started = f"data from which the start can be solved: {in_one_line(error)}"
         if isinstance(started, str):
             self._waiting.why = started
             return None
@@ -534,11 +536,11 @@ class OnlineSmoother:
                 recent.anchors = deque([anchor])
             self._close(old, again)
             age_s = (fresh.newest.stamp_ns - anchor.stamp_ns) * 1e-9
-            self._say(f"{why}: rebuilt from {age_s:.1f} s before")
+            self._say(f"{why}: the window was rebuilt from {age_s:.1f} s before")
             return
         held = {row.seq for row in old.held()}
         self._lag, self._pending = old, [m for m in recent.others() if not book.has(m) and m.seq not in held]
-        self._restart(f"{why}, and again from what was known before")
+        self._restart(f"{why}, and the window could not be rebuilt from an earlier state")
 
     def _start_over(self, lag: Lag) -> Estimate | None:
         """Start anew, with the last seconds: what measures place agrees with itself or not, but not with the estimate."""
@@ -548,7 +550,7 @@ class OnlineSmoother:
         again = [m for m in self._recent if m.stamp_ns >= since_ns and not self._book.has(m)]
         self._close(lag, again)
         self._agreed_ns.update(lag.agreed_ns)
-        self._say(f"no absolute sensor agreed, but by a jump of its error, for {lag.lost_s:.0f} s: starts anew")
+        self._say(f"for {lag.lost_s:.0f} s no absolute sensor agreed, unless its error had jumped: restarts")
         self._wait("the next IMU sample")
         # Samples have their rows already.
         for m in again:
@@ -561,7 +563,7 @@ class OnlineSmoother:
         self._book.enter([row for row in old.held() if row.seq not in taken])
         for m in self._recent.others():
             if not self._book.has(m) and m.seq not in taken:
-                self._book.drop(m, Outcome.LATE, "came before the oldest state of a lag that was built anew")
+                self._book.drop(m, Outcome.LATE, "older than the oldest state of the rebuilt window")
 
     # Snapshot
 
@@ -592,8 +594,8 @@ class OnlineSmoother:
         anchor, last = found.anchor, found.imu
         age_s = (newest.stamp_ns - anchor.stamp_ns) * 1e-9
         if not 0.0 < age_s <= self._bridge_s:
-            self._say(f"the snapshot is {age_s:.1f} s old, more than the {self._bridge_s:g} s that the IMU's "
-                                "silence is bridged for: starts anew")  # fmt: skip
+            self._say(f"the snapshot is {age_s:.1f} s old, more than the {self._bridge_s:g} s (max_bridge_s) that "
+                                "can be bridged: starts without it")  # fmt: skip
             return
         before = self._datum
         self._datum, self._noise.scale = found.datum, found.noise_scale
@@ -601,7 +603,7 @@ class OnlineSmoother:
             self._begin(anchor, [last, newest])
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             self._lag, self._datum, self._noise.scale = None, before, 1.0
-            self._say(f"the snapshot cannot be used ({in_one_line(error)}): starts anew")
+            self._say(f"the snapshot cannot be used ({in_one_line(error)}): starts without it")
             return
         self._agreed_ns = dict(found.agreed_ns)
         self._heights_m = {n: h for n, h in found.heights_m.items() if n in self._asked}

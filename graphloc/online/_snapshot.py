@@ -75,7 +75,7 @@ class Snapshot:
         """
         raw = json.loads(path.read_text(encoding="utf-8"))
         if raw["version"] != _VERSION:
-            raise ValueError("it is of another version")
+            raise ValueError("written by another version of graphloc")
         stamp, *six = raw["imu"]
         p, R = (np.array(raw["odom"][n], dtype=np.float64).reshape(shape) for n, shape in ((0, 3), (1, (3, 3))))
         heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
@@ -138,5 +138,5 @@ class SnapshotFile:
             if datum is not None and not np.allclose(found.datum.origin, datum.origin, rtol=0.0, atol=1e-9):
                 raise ValueError("its origin of world is another one")
         except Exception as error:  # noqa: BLE001 - a file that anything may have written
-            return None, f"{path}: the snapshot cannot be used ({in_one_line(error)}): starts anew"
+            return None, f"{path}: the snapshot cannot be used ({in_one_line(error)}): starts without it"
         return found, ""

@@ -86,7 +86,7 @@ def try_start(
         topics={name: sensor.topic for name, sensor in config.sensors.items()},
     )
     if datum is None and config.datum is None and len(origin.fixes_of(recording)) < _FIXES:
-        return f"{_FIXES} GNSS fixes, for an origin of world: no `datum:` is configured"
+        return f"{_FIXES} GNSS fixes to set the origin, as no `datum:` is configured"
     try:
         datum = datum or origin.choose_datum(recording, config, rows)
     except GraphlocError as error:
@@ -96,7 +96,7 @@ def try_start(
     try:
         return _solved(config, rows, inertial, recording, datum, lag_s)
     except SolveError as error:
-        return f"a start that can be solved: {error}"
+        return f"data from which the start can be solved: {error}"
 
 
 def _missing(config: VesselConfig, rows: Sequence[Sensor], recording: Recording, datum: Datum) -> str:
@@ -109,7 +109,7 @@ def _missing(config: VesselConfig, rows: Sequence[Sensor], recording: Recording,
         hints.append(by_kind[sensor.kind].hint(m, float(np.arctan2(R[1, 0], R[0, 0])), datum))
     places = [h for h in hints if np.isfinite(h.p_world_m[:2]).all()]
     if not places:
-        return "a place: a fix, a match, a tag or a pose"
+        return "a position: a fix, a match, a tag or a pose"
     if config.start.heading_deg is not None or any(np.isfinite(h.yaw_rad) for h in hints):
         return ""
     p = np.array([h.p_world_m[:2] for h in places])
@@ -117,7 +117,7 @@ def _missing(config: VesselConfig, rows: Sequence[Sensor], recording: Recording,
     wanted_m = max(MOVED_M, noise_m)
     if np.hypot(*(p - np.median(p[:5], axis=0)).T).max() > wanted_m:
         return ""
-    return f"a heading: from a sensor, from `start.heading_deg`, or from {wanted_m:.0f} m of way"
+    return f"a heading: from a sensor, from `start.heading_deg`, or from {wanted_m:.0f} m of travel"
 
 
 def _solved(
@@ -139,15 +139,15 @@ def _solved(
             doubtful = [m for m in stream.measurements if stream.row.false is not None
                         and stream.row.false(m, stream.config).probability > _DOUBTFUL]  # fmt: skip
             if len(doubtful) > 1 and (agreeing < _AGREEING or agreeing < _SHARE * len(weights)):
-                return f"{_AGREEING} of {stream.name} that agree with each other ({agreeing} of {len(weights)} do)"
+                return f"{_AGREEING} measurements of {stream.name} that agree with each other ({agreeing} of {len(weights)} do)"
     last = keys.pose(len(problem.timeline) - 1)
     R = result.values.atPose3(last).rotation().matrix()
     sigma = float(np.sqrt(world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]))
     doubt = ""
     if result.headings > 1 or sigma > _HEADING_RAD:
-        doubt = f"the heading is a guess: {result.headings} explain the way so far, 1 sigma {np.degrees(sigma):.0f} deg"
+        doubt = f"the heading is a guess: {result.headings} candidates explain the motion so far, 1 sigma {np.degrees(sigma):.0f} deg"
         if span_s < _HEADING_WAIT_S:
-            return f"a heading: {result.headings} explain the way so far; turn, or let a sensor or `start.heading_deg` tell it"
+            return f"a heading: {result.headings} candidates explain the motion so far; turn, add a heading sensor or set `start.heading_deg`"
     heights = {
         name: origin.height_m(recording, config, sensor.height_m, datum)
         for row in rows

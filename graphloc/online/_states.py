@@ -106,11 +106,11 @@ class States:
         """Read the newest state off the window, once it has been solved.
 
         Raises:
-            SolveError: the solver ran away.
+            SolveError: the solver diverged.
         """
         newest = self._read()
         if np.linalg.norm(newest.pose.translation() - self._newest.pose.translation()) > _AWAY_M:
-            raise SolveError("the solver ran away")
+            raise SolveError("the solver diverged")
         self._newest = newest
 
     def _read(self) -> Newest:

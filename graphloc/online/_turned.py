@@ -107,8 +107,8 @@ class Turned:
         was = self.said
         if self._wrong >= _IN_A_ROW:
             self.said = was or (
-                f"the heading is off by about {np.degrees(off_rad):.0f} deg: so the IMU's accelerations and the fixes of {self._sensor} "
-                "have it; check the compass (convention, mount), and the IMU's axes"
+                f"the heading is off by about {np.degrees(off_rad):.0f} deg, by the IMU's accelerations and the fixes of {self._sensor}: "
+                "check the compass (convention, mount) and the IMU's axes"
             )
         elif self._right >= _IN_A_ROW:
             self.said = ""

@@ -329,7 +329,7 @@ def _headings(
         tuple(wrap_angle(np.asarray(course, dtype=np.float64))),
         float(np.radians(60.0)),
         moved_s + 10.0,
-        "heading from the motion alone, eight starts tried",
+        "heading from the motion alone, eight start headings tried",
     )
 
 

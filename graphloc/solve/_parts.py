@@ -50,7 +50,7 @@ def solve_parts(
             (warnings if wrong else events).extend(said)
             if len(parts) > 1:
                 warnings.append(
-                    f"the IMU is silent for long before or after {start} to {stop}: solved as a part by itself"
+                    f"{start} to {stop} lies before or after a long IMU gap (imu max_bridge_s): solved as a separate part"
                 )
         except SolveError as error:
             failure = failure or error
@@ -75,10 +75,10 @@ def _in_legs(
     try:
         legs, apart = solve_legs(part, where, leg_s, solve)
     except SolveError as error:
-        return [solve(part, None)], [f"solved as a whole: a leg of it could not be solved by itself ({error})"], False
-    said = f"where these meet they are {apart.m:.2f} m and {apart.deg:.1f} deg apart at most"
-    said += "" if apart.within else ", which their bounds do not allow"
-    return legs, [f"solved in {len(legs)} legs that overlap (`timeline.leg_s`): {said}"], not apart.within
+        return [solve(part, None)], [f"solved in one piece, not in legs: a leg failed ({error})"], False
+    said = f"where they meet they differ by at most {apart.m:.2f} m and {apart.deg:.1f} deg"
+    said += "" if apart.within else ", more than their bounds allow"
+    return legs, [f"solved in {len(legs)} overlapping legs (`timeline.leg_s`): {said}"], not apart.within
 
 
 def _cut(recording: Recording, bridge_s: float) -> list[Recording]:

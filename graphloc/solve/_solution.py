@@ -275,7 +275,7 @@ def row_of(stream: Judged, m: Measurement, topic: str, verdict: Verdict) -> Ledg
     if weight >= AGREES:
         outcome, reason = Outcome.USED, ""
     elif stream.row.false is None and verdict.decision is None:
-        outcome, reason = Outcome.REJECTED, "its receiver hangs: it says the same place while the vessel moves"
+        outcome, reason = Outcome.REJECTED, "frozen receiver: it repeats one position while the vessel moves"
     elif stream.row.false is not None and weight < _FALSE:
         outcome, reason = Outcome.REJECTED, "judged false: no mode agrees with the rest"
     else:
@@ -303,8 +303,8 @@ def row_of(stream: Judged, m: Measurement, topic: str, verdict: Verdict) -> Ledg
 def alone(sensor: str, slow: SlowProcess) -> str:
     """Say what a slow error that nothing can tell from motion does to the bounds."""
     return (
-        f"{sensor}: no second sensor can tell its slow error (multipath) from motion; the bounds allow "
-        f"{slow.sigma[0]:.1f} m (1 sigma) for it; slow_error.enabled: false where there is none"
+        f"{sensor}: no second sensor can separate its slow error (multipath) from motion; the bounds include "
+        f"{slow.sigma[0]:.1f} m (1 sigma) for it; set slow_error.enabled: false if it has none (RTK in the open)"
     )
 
 
@@ -334,7 +334,7 @@ def refused_together(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, 
         return []
     since = utc_text(int(stamps_ns[begin]))
     return [
-        f"{sensor}: all its {end - begin} measurements in {lasts_s:.0f} s from {since} on are refused: they or the track are wrong there"
+        f"{sensor}: all {end - begin} measurements in the {lasts_s:.0f} s from {since} on are rejected: they or the track are wrong"
     ]
 
 
@@ -354,7 +354,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
                 "set accel_noise_ug_per_sqrt_hz and gyro_noise_mdps_per_sqrt_hz accordingly, or look for a wrong mount"
             )
             if any(stream.constants for stream in problem.streams):
-                cure += ", or for tags that are surveyed as fixed and float"
+                cure += ", or for tags on a floating dock that the survey has as fixed"
         warnings.append(f"{said}; {cure}")
     cost = 2.0 * float(result.graph.error(result.values)) - outliers_cost(result.verdicts)
     if expected > 0 and cost > _NO_FIT * expected:
@@ -364,22 +364,22 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
         )
     if (beside_m := largest_sigma(result.levels_cov)) > _LEVELS_M:
         warnings.append(
-            "the fixes jump, and nothing else tells which of their levels is right: the one that is held longest is taken, "
-            f"and the bounds allow {beside_m:.1f} m (1 sigma) for the others"
+            "the fixes jump, and no other sensor shows which level is right: the one held longest is taken, "
+            f"and the bounds include {beside_m:.1f} m (1 sigma) for the others"
         )
     for stream in problem.streams:
         far, said = _far_from_prior(stream, result)
         if far > _FAR_OFF:
             warnings.append(
-                f"{stream.name}: {said} from what the configuration allows for: check its mount and the IMU's, or raise that sigma"
+                f"{stream.name}: {said} from zero: check its mount and the IMU's, or raise the configured sigma"
             )
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
             if result.values.exists(key):
                 off = float(np.abs(np.atleast_1d(result.values.atVector(key)) / constant.sigma).max())
                 if off > _FAR_OFF:
                     warnings.append(
-                        f"{stream.name}: {constant.name} is {off:.1f} sigmas from what its survey says: survey it anew, or "
-                        "raise its sigmas"
+                        f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
+                        "its sigmas"
                     )
         if stream.left_out is not None:
             warnings.append(alone(stream.name, stream.left_out))
