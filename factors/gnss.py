@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """GNSS position: lever arm, white noise, and a slow error.
 
-    z = p + R l + d + w,   w ~ N(0, C),   d: first-order Gauss-Markov per axis
+    z = p + R l + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
 
 z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachment`); C: the reported
-covariance. The slow state holds n = -d, so that only native factors are needed: `A = p + R l` is a
-leaf (`ReferenceFrameFactor`, tied within 5 mm), and `A - N = z` is a `BetweenFactor` under the kernel.
+covariance; W: what d walks between its nodes (`Attachment.slow_walk`). The slow state holds n = -d, so that only native
+factors are needed: `A = p + R l` is a leaf (`ReferenceFrameFactor`, tied within 5 mm), and `A - N = z` is a
+`BetweenFactor` under the kernel.
 Without a slow state: `GPSFactorArm`. Not handled: correlation between axes of d.
 """
 
@@ -30,6 +31,12 @@ def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
     """Covariance (3, 3) of the white part: reported, scaled, with floors, m^2."""
     horizontal, vertical = config.min_horizontal_sigma_m**2, config.min_vertical_sigma_m**2
     return with_floors(m.cov_enu_m2 * config.sigma_scale**2, np.array([horizontal, horizontal, vertical]))
+
+
+def _covariance(m: GnssPosition, config: GnssConfig, at: Attachment) -> Array:
+    """Covariance (3, 3) of a fix about a slow error that is held between its nodes, m^2."""
+    white = white_covariance(m, config)
+    return white if at.slow_walk is None else white + np.diag(at.slow_walk)
 
 
 # A fix is asked for its place at every pass; remembered for as long as the fix itself is, however long a vessel is out.
@@ -57,7 +64,7 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
     return (
         Residual(
             raw=raw,
-            cov=white_covariance(m, config),
+            cov=_covariance(m, config, at),
             jacobian=lambda: _antenna_jacobian(at),
             slow_jacobian=lambda: -np.eye(3),
             prior=1.0,
@@ -72,7 +79,7 @@ def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decis
     """Return the factors of one fix."""
     z = _fix_world_m(m, at)
     lever = np.asarray(at.T_state_sensor.translation())
-    model = noise_model(white_covariance(m, config), decision)
+    model = noise_model(_covariance(m, config, at), decision)
     if at.slow_key is None:
         return GraphUpdate(factors=(gtsam.GPSFactorArm(at.pose_key, z, lever, model),))
     antenna_key, lever_key = at.leaf_keys

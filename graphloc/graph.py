@@ -53,6 +53,8 @@ class Attachment:
         slow_next: key and estimate of the next node of the slow state, how far from the one to the other the measurement
             is (share), and how far apart they are in s; None where there is no next (yet).
         slow_age_s: how long after its node the measurement is, at least 0.
+        slow_walk: (n,) variances: what a slow state that is held from node to node is off by, each measurement's share (see
+            `build.walk_between_nodes`); None: there is no slow state.
         constants: key and estimate of each of the sensor's constants.
         datum: origin of world.
     """
@@ -71,6 +73,7 @@ class Attachment:
     datum: Datum
     slow_next: tuple[int, Array, float, float] | None = None
     slow_age_s: float = 0.0
+    slow_walk: Array | None = None
     constants: tuple[tuple[int, Array], ...] = ()
     T_solver: Any | None = None
 

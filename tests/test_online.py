@@ -275,7 +275,9 @@ def test_starts_from_fix_and_compass() -> None:
 def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
     run = slowly(
         simulate(
-            replace(Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0, gnss_sigma_m=0.1),
+            replace(
+                Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0, gnss_sigma_m=0.05
+            ),
             0,
         )
     )

@@ -20,6 +20,7 @@ from graphloc.build._chains import (
     slow_end,
     slow_step,
     standing_cost,
+    walk_between_nodes,
 )
 from graphloc.build._graph import Decisions, Level, Past, StartPrior, build_graph, state_keys
 from graphloc.build._problem import (
@@ -64,5 +65,6 @@ __all__ = [
     "state_keys",
     "state_of",
     "thinned",
+    "walk_between_nodes",
     "with_noise_scale",
 ]

@@ -10,6 +10,8 @@ import gtsam
 import numpy as np
 
 from graphloc import keys
+from graphloc.build._chains import walk_between_nodes
+from graphloc.config import VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Attachment, Constant, Sensor, SlowProcess
 from graphloc.measurements import Measurement
@@ -58,6 +60,11 @@ class Sited(Protocol):
         """Origin of world."""
         ...
 
+    @property
+    def config(self) -> VesselConfig:
+        """The vessel."""
+        ...
+
 
 class Attaching(Protocol):
     """What `attach` needs to know of a stream (`Stream`, or a live one)."""
@@ -100,6 +107,11 @@ class Attaching(Protocol):
     @property
     def gyro_radps(self) -> Any:
         """Raw rate at each."""
+        ...
+
+    @property
+    def apart_s(self) -> Any:
+        """How long after the one before each is, s; inf for the first."""
         ...
 
 
@@ -168,8 +180,15 @@ def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> A
         datum=problem.datum,
         slow_next=None if slow_key is None else _next_slow(problem, stream, j, stream.measurements[i].stamp_ns, values),
         slow_age_s=max(int(stream.measurements[i].stamp_ns) - int(problem.timeline.slow_stamps_ns[j]), 0) * 1e-9,
+        slow_walk=_slow_walk(problem, stream, i),
         constants=constants_of(stream, values),
     )
+
+
+def _slow_walk(problem: Sited, stream: Attaching, i: int) -> Array | None:
+    if stream.slow is None:
+        return None
+    return walk_between_nodes(stream.slow, problem.config.timeline.slow_period_s, stream.apart_s[i])
 
 
 def _next_slow(

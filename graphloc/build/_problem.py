@@ -44,6 +44,7 @@ class Stream:
         measurements: M of them by stamp. state: (M,) its state (`state_of`). carry: per measurement the
             preintegrated motion from the state before it, or None where it stands on a state.
         gyro_radps: (M, 3) raw rate at each measurement, body axes.
+        apart_s: (M,) how long after the one before each is; inf for the first.
     """
 
     number: int
@@ -59,6 +60,7 @@ class Stream:
     state: NDArray[np.int64]
     carry: tuple[tuple[int, Any] | None, ...]
     gyro_radps: Array
+    apart_s: Array
 
     def between(self, first: int, last: int) -> range:
         """Indices of the measurements that attach to states first..last (inclusive)."""
@@ -287,6 +289,12 @@ def _leaps(row: Sensor, measurements: Sequence[Measurement], datum: Datum, *, al
     return leaps(stamps_ns, places_m, np.array([hint.p_sigma_m[:2].max() for _, hint in told]), allowed=allowed)
 
 
+def apart_s_of(measurements: Sequence[Measurement]) -> Array:
+    """Return how long after the one before each of M measurements is (M,), s; inf for the first."""
+    stamps_ns = [m.stamp_ns for m in measurements]
+    return np.concatenate([[np.inf], np.diff(stamps_ns) * 1e-9])[: len(stamps_ns)]
+
+
 def _stream(
     number: int,
     name: str,
@@ -322,4 +330,5 @@ def _stream(
         np.array(state, dtype=np.int64),
         tuple(carry),
         links.gyro_at(np.array([m.stamp_ns for m in measurements])),
+        apart_s_of(measurements),
     )

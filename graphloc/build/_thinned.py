@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build._attach import constant_keys, nav_state
-from graphloc.build._problem import Problem, Stream, with_links
+from graphloc.build._problem import Problem, Stream, apart_s_of, with_links
 from graphloc.time import duration_ns
 from graphloc.timeline import Timeline
 
@@ -104,13 +104,14 @@ def _states(problem: Problem, chosen: Mapping[int, NDArray[np.int64]]) -> NDArra
 def _thin(stream: Stream, indices: NDArray[np.int64], states: NDArray[np.int64]) -> Stream:
     """A stream with the measurements that stay, on the states that stay."""
     few = indices.tolist()
-    carried = [stream.carry[i] for i in few]
+    measurements, carried = tuple(stream.measurements[i] for i in few), [stream.carry[i] for i in few]
     return replace(
         stream,
-        measurements=tuple(stream.measurements[i] for i in few),
+        measurements=measurements,
         state=np.searchsorted(states, stream.state[indices]),
         carry=tuple(None if c is None else (int(np.searchsorted(states, c[0])), c[1]) for c in carried),
         gyro_radps=stream.gyro_radps[indices],
+        apart_s=apart_s_of(measurements),
     )
 
 

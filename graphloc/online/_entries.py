@@ -194,7 +194,7 @@ class Entries:
                 del self._entries[key]
         for stream in problem.streams.values():
             kept = min((i for n, i in self._entries if n == stream.number), default=len(stream.measurements))
-            for tape in (stream.measurements, stream.state, stream.carry, stream.gyro_radps):
+            for tape in (stream.measurements, stream.state, stream.carry, stream.gyro_radps, stream.apart_s):
                 tape.forget(kept)
 
     def gone(self) -> list[LedgerRow]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from graphloc.config import KernelConfig
 from graphloc.errors import SolveError
+from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
 from graphloc.leaps import largest_sigma, leaps_said, told_alone
 from graphloc.measurements import Measurement
@@ -95,7 +96,7 @@ class Judge:
         newest, parting, parted = self._states.newest, stream.parting, stream.parting.parted
         timeline = self._problem.timeline
         at_s = timeline.seconds(m.stamp_ns)
-        sigma_m = largest_sigma(residual.cov)
+        sigma_m = largest_sigma(residual.cov - _walked(residual, at))
         if told_alone(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
             allowed = stream.left_out is not None
             self._leapt += leaps_said(
@@ -282,3 +283,11 @@ class Judge:
         """Minus the log of the probability of the window, all hypotheses of a stream summed over."""
         evidence = log_evidence_of(stream, [e.index for e in own], self._met(own)[1])
         return self._window.error([e.held for e in own if e.held is not None]) - evidence
+
+
+def _walked(residual: Residual, at: Attachment) -> Array | float:
+    """What of the covariance of a residual is no noise of its own, but what its slow error walks between nodes."""
+    if at.slow_walk is None or residual.slow_jacobian is None:
+        return 0.0
+    J = residual.slow_jacobian()
+    return np.asarray(J @ np.diag(at.slow_walk) @ J.T)

@@ -184,6 +184,7 @@ class LiveStream:
     state: Tape[int] = field(default_factory=Tape)
     carry: Tape[Carry | None] = field(default_factory=Tape)
     gyro_radps: Tape[Array] = field(default_factory=Tape)
+    apart_s: Tape[float] = field(default_factory=Tape)
     scatter: Scatter = field(default_factory=Scatter)
     parting: Parting = field(default_factory=Parting)
     leaping: LeapWatch = field(default_factory=LeapWatch)
@@ -208,6 +209,8 @@ class LiveProblem:
         carry, gyro_radps = self._motion(m.stamp_ns)
         timeline = self.timeline
         floor, nearest = timeline.floor(m.stamp_ns), timeline.nearest(m.stamp_ns)
+        kept = stream.measurements.kept
+        stream.apart_s.append(abs(m.stamp_ns - kept[-1].stamp_ns) * 1e-9 if kept else np.inf)
         stream.measurements.append(m)
         stream.state.append(state_of(m, floor, nearest, timeline.stamps_ns, self.links.gaps()))
         stream.carry.append(carry)

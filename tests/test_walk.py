@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A slow error walks between its nodes: fixes good to centimetres do not tell the speed to centimetres a second."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphloc.build import walk_between_nodes
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import Scenario, bl_scenario, simulate
+from graphloc.frames import Datum
+from graphloc.graph import SlowProcess
+from graphloc.measurements import GnssPosition, world_from_fixes
+from graphloc.replay import replay
+
+SLOW = SlowProcess(
+    name="error", axes=("east", "offset"), units=("m", "m"), scale=np.ones(2), sigma=np.array([2.0, 1.0]),
+    time_constant_s=np.array([200.0, np.inf]),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("n", [2, 5, 10])
+def test_the_mean_of_those_at_one_node_is_off_by_what_it_has_walked_since_the_first(n: int) -> None:
+    """A random walk of 0.04 m^2/s; its first reading is where the node is."""
+    rng = np.random.default_rng(5)
+    steps = rng.normal(0.0, np.sqrt(0.04 / n), (200_000, n - 1))
+    walked = np.hstack([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)])
+    share, constant = walk_between_nodes(SLOW, 1.0, 1.0 / n)
+    assert share / n == pytest.approx(walked.mean(axis=1).var(), rel=0.02)
+    assert constant == 0.0
+
+
+@pytest.mark.parametrize("apart_s", [1.0, 4.0, np.inf])
+def test_one_at_each_node_is_where_the_node_is(apart_s: float) -> None:
+    assert walk_between_nodes(SLOW, 1.0, apart_s) == pytest.approx(0.0)
+
+
+def test_bounds_hold_beside_fixes_good_to_centimetres_that_walk() -> None:
+    """By 0.15 m in a second, which is less than is expected of them (0.2 m)."""
+    scenario: Scenario = replace(
+        bl_scenario(1, "clean"), duration_s=80.0, gnss_hz=5.0, gnss_sigma_m=0.03, false_fraction=0.0
+    )
+    run = simulate(scenario, 4)
+    rng, walked, fixes = np.random.default_rng(6), np.zeros(3), []
+    datum = Datum(next(m.position for m in run.recording.measurements if isinstance(m, GnssPosition)))
+    for m in run.recording.measurements:
+        if isinstance(m, GnssPosition):
+            walked = walked + rng.normal(0.0, 0.15 / np.sqrt(5.0), 3)
+            place = datum.geodetic_from_enu(world_from_fixes([m], datum) + walked)[0]
+            m = replace(m, position=type(m.position)(*place))
+        fixes.append(m)
+    track = replay(replace(run.recording, measurements=tuple(fixes)), run.config).solution.trajectory
+    found = compare_to_truth(track, run.truth)
+    assert found.nees is not None
+    assert found.nees < 4.0  # 2 when true
