@@ -44,6 +44,12 @@ class Entry:
     def state(self) -> int:
         return self.stream.state[self.index]
 
+    @property
+    def within(self) -> tuple[int, float] | None:
+        """The mode and the weight with which it is in the graph; None: it is not."""
+        decision = self.verdict.decision
+        return None if self.held is None or decision is None else (self.verdict.mode, decision.weight)
+
     def reaches(self, first: int) -> bool:
         """Whether the states that it is carried from are still there."""
         carry = self.stream.carry[self.index]

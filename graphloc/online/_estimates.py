@@ -30,13 +30,15 @@ def estimate_of(
     gyro = problem.links.gyro_at(np.array([at_ns]))[0] - problem.R_body_imu @ newest.bias.gyroscope()
     cov = world_covariance(sound(now.pose_cov), R, lever)
     cov[:3, :3] += left_out(list(problem.streams.values()))
+    others_m, others_cov = lag.others
+    cov[:3, :3] += others_cov
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
     health, reason = health_of(cov, since, doubt)
     if doubt and reason != doubt:
         reason = f"{reason}; {doubt}"
     return Estimate(
         stamp_ns=at_ns,
-        p_world_m=np.asarray(now.pose.transformFrom(lever)),
+        p_world_m=np.asarray(now.pose.transformFrom(lever)) + others_m,
         R_world_body=R,
         v_world_mps=now.velocity + R @ np.cross(gyro, lever),
         cov=cov,

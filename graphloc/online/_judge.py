@@ -9,6 +9,7 @@ hypotheses is judged as the batch does it, as a sequence, against the prediction
 from __future__ import annotations
 
 import heapq
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count
 
@@ -21,6 +22,7 @@ from graphloc.graph import Attachment, Decision, Residual
 from graphloc.leaps import largest_sigma, leaps_said, told_alone
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
+from graphloc.online._alternatives import choices
 from graphloc.online._entries import Entries, Entry
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._parting import PARTING_S
@@ -33,6 +35,8 @@ from graphloc.solve._solution import AGREES
 
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
 _LEAF_S, _SURE = 1.0, 0.9  # how often an older chapter is judged again; a weight that needs no second look
+_CERTAIN = 0.99  # a weight that leaves no doubt
+_SHOWS = 0.01  # of a covariance: what other choices must add to be worth adding
 _CHAPTER = 10  # hypotheses that are judged as one sequence
 _ROUNDS = 2  # of judging what is new
 _CHAIN = 2  # measurements that agree with each other, and not with the estimate
@@ -60,6 +64,15 @@ class Judge:
         self._refuted: set[str] = set()  # sensors of which something new was judged false
         self._tried: dict[str, frozenset[tuple[int, int | None]]] = {}
         self._leapt: list[str] = []
+        self._unsure: set[str] = set()  # sensors of which all choices are to be weighed
+        self._chosen: dict[str, frozenset[tuple[int, int | None]]] = {}
+        self._others: dict[str, tuple[Array, Array]] = {}  # mean and covariance, of each sensor
+
+    @property
+    def others(self) -> tuple[Array, Array]:
+        """What other choices of what is right, by their probability, add to the newest place in world: mean (3,) and covariance (3, 3)."""
+        means, covs = zip(*self._others.values(), strict=True) if self._others else ((), ())
+        return np.asarray(sum(means, start=np.zeros(3))), np.asarray(sum(covs, start=np.zeros((3, 3))))
 
     def take(self, m: Measurement) -> None:
         """Stage a measurement whose stamp lies within the states; one with hypotheses waits for `judge`.
@@ -137,6 +150,8 @@ class Judge:
                     self._rounds[name] = rounds - 1
             elif stream.row.false is not None and now_s >= self._leafed_s.get(name, 0.0) + _LEAF_S:
                 self._leaf_back(stream, now_s)
+                if name in self._others:
+                    self._unsure.add(name)
         due = []
         while self._again and self._again[0][0] <= now_s:
             due.append(heapq.heappop(self._again)[2])
@@ -202,6 +217,8 @@ class Judge:
                 self._agreement.note(stream, entry.measurement, verdict)
             if not entry.judged and verdict.weight < AGREES:
                 self._refuted.add(stream.name)
+            if not entry.judged and (verdict.weight < _CERTAIN or stream.name in self._others):
+                self._unsure.add(stream.name)
             verdict, differs = replace(verdict, settled=settled), entry.differs(verdict)
             unsettled |= differs if entry.judged else verdict.weight < _SURE
             entry.judged = True
@@ -251,11 +268,41 @@ class Judge:
                 continue
             self._tried[name] = tried
             moved = True
-            self._try(stream, own, [
-                Verdict(None if mode is None else Decision(mode=mode), float(mode is not None), 1.0, r[mode or 0], mode or 0, at)
-                for mode, r, at in zip(chain, found, attached, strict=True)
-            ])  # fmt: skip
+            self._try(stream, own, _along(chain, found, attached))
+        unsure, self._unsure = self._unsure, set()
+        for name in sorted(unsure):
+            moved |= self._weigh_choices(self._problem.streams[name])
         return moved
+
+    def _weigh_choices(self, stream: LiveStream) -> bool:
+        """Try the most probable choice of the newest measurements, and remember what the others leave. Tell whether any was tried.
+
+        Only one that believes something more: that all are false is also what a receiver says that hangs.
+        """
+        for tried in range(_ROUNDS):
+            self._others.pop(stream.name, None)
+            own = self._chapter(stream)
+            if not own or stream.constants:
+                return tried > 0
+            attached, found = self._met(own)
+            held = [e.within for e in own]
+            cov = self._states.joint(attached, [modes[0] for modes in found])
+            weighed = choices(stream, [e.index for e in own], found, cov, held)
+            best = weighed[0].modes
+            now = tuple(h[0] if h is not None and h[1] >= AGREES else None for h in held)
+            share, steps = np.exp([c.log for c in weighed]), np.array([c.step[:3] for c in weighed])
+            # What is not the most probable, and was refused when it was tried, does not move the place.
+            mean = share @ steps if best == now else np.zeros(3)
+            around = (share[:, None] * (steps - mean)).T @ (steps - mean)
+            if np.trace(around) > _SHOWS * np.trace(cov[:3, :3]):
+                self._others[stream.name] = mean, around
+            chosen = frozenset((e.index, mode) for e, mode in zip(own, best, strict=True))
+            gains = any(mode is not None and mode != other for mode, other in zip(best, now, strict=True))
+            if not gains or chosen == self._chosen.get(stream.name):
+                return tried > 0
+            self._chosen[stream.name] = chosen
+            self._try(stream, own, _along(best, found, attached))
+        return True
 
     def _try(self, stream: LiveStream, own: list[Entry], others: list[Verdict]) -> None:
         """Take other verdicts, settle around them, and go back if that is less probable, or if the solver runs away.
@@ -283,6 +330,16 @@ class Judge:
         """Minus the log of the probability of the window, all hypotheses of a stream summed over."""
         evidence = log_evidence_of(stream, [e.index for e in own], self._met(own)[1])
         return self._window.error([e.held for e in own if e.held is not None]) - evidence
+
+
+def _along(modes: Sequence[int | None], found: list[tuple[Residual, ...]], attached: list[Attachment]) -> list[Verdict]:
+    """Return the verdicts that believe these modes, and nothing else."""
+    return [
+        Verdict(
+            None if mode is None else Decision(mode=mode), float(mode is not None), 1.0, r[mode or 0], mode or 0, at
+        )
+        for mode, r, at in zip(modes, found, attached, strict=True)
+    ]
 
 
 def _walked(residual: Residual, at: Attachment) -> Array | float:

@@ -137,6 +137,11 @@ class Lag:
             self._states.read()
 
     @property
+    def others(self) -> tuple[Array, Array]:
+        """What other choices of what is right add to the newest place in world: mean (3,), m, and covariance (3, 3), m^2."""
+        return self._judge.others
+
+    @property
     def agreed_ns(self) -> dict[str, int]:
         """Of each absolute sensor, the stamp of the last measurement that agreed."""
         return self._agreement.agreed_ns

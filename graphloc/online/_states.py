@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -233,6 +233,24 @@ class States:
                 P, newest, at.T_world_body.rotation().matrix(), (to_ns - from_ns) * 1e-9, pim.preintMeasCov()
             )
         return prediction_of(residual, at, P, newest.velocity_cov)
+
+    def joint(self, attached: Sequence[Attachment], residuals: Sequence[Residual]) -> Array:
+        """Return the covariance of the newest place in world (3 rows), and of what residuals owe to the estimate."""
+        newest, window = keys.pose(self._problem.timeline.last), self._window
+        poses = list(dict.fromkeys([newest, *(at.pose_key for at in attached)]))
+        slow = list(dict.fromkeys(at.slow_key for at in attached if at.slow_key is not None))
+        width = len(np.atleast_1d(window.values.atVector(slow[0]))) if slow else 0
+        first = {key: 6 * n for n, key in enumerate(poses)}
+        first |= {key: 6 * len(poses) + width * n for n, key in enumerate(slow)}
+        ends = np.cumsum([3, *(len(r.raw) for r in residuals)])
+        J = np.zeros((ends[-1], 6 * len(poses) + width * len(slow)))
+        J[:3, 3:6] = window.values.atPose3(newest).rotation().matrix()
+        for n, (at, residual) in enumerate(zip(attached, residuals, strict=True)):
+            rows = slice(ends[n], ends[n + 1])
+            J[rows, first[at.pose_key] : first[at.pose_key] + 6] = residual.jacobian()
+            if at.slow_key is not None and residual.slow_jacobian is not None:
+                J[rows, first[at.slow_key] : first[at.slow_key] + width] = residual.slow_jacobian()
+        return np.asarray(J @ window.covariance([*poses, *slow]) @ J.T)
 
     def step_cost(self) -> float:
         """Return the median cost of the IMU's steps; 0 where none is in the graph."""

@@ -86,9 +86,9 @@ def sequence_of(
     densities = np.zeros((2, 2, len(models)))  # right or false, before or after
     for n, (found, prediction, seen, model) in enumerate(zip(residuals, predictions, foreseen, models, strict=True)):
         P = None if prediction is None else prediction.cov
-        densities[:, 0, n] = densities[:, 1, n] = _log_right_and_false(found, P, model)
+        densities[:, 0, n] = densities[:, 1, n] = log_right_and_false(found, P, model)
         if seen.modes is not found:
-            densities[:, 1, n] = _log_right_and_false(seen.modes, seen.cov, model)
+            densities[:, 1, n] = log_right_and_false(seen.modes, seen.cov, model)
         if not seen.possible:
             densities[0, :, n] = -np.inf
     right, fresh = densities
@@ -108,7 +108,7 @@ def log_evidence_of(stream: Judged, indices: Sequence[int], residuals: Sequence[
     return sequence_of(stream, indices, residuals, [None] * len(seen), seen).log_evidence()
 
 
-def _log_right_and_false(modes: tuple[Residual, ...], P: Array | None, model: FalseModel) -> tuple[float, float]:
+def log_right_and_false(modes: tuple[Residual, ...], P: Array | None, model: FalseModel) -> tuple[float, float]:
     """Log of prior x density of any mode being right, and of all being false. The prediction's covariance widens both."""
     right = np.logaddexp.reduce([r.log_density(P) for r in modes])
     around = model.cov if P is None else model.cov + P

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Choices among measurements are weighed as all of their joint densities say, whatever the graph holds at the time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphloc.config import PoseConfig
+from graphloc.eval.metrics import squared_over_covariance
+from graphloc.eval.simulate import bl_scenario, simulate
+from graphloc.factors import pose
+from graphloc.frames import Array
+from graphloc.graph import Residual
+from graphloc.measurements import Measurement, PoseFix, PoseMode
+from graphloc.online._alternatives import choices
+from graphloc.replay import replay
+
+SIGMA_M, FALSE_M, FALSE = 0.3, pose.FALSE_SPREAD_M, 0.2
+PRIOR = np.array([[1.0, 0.9, 0.7], [0.9, 1.1, 0.9], [0.7, 0.9, 1.3]])  # of the places x at three stamps, m^2
+TOLD_M = np.array([1.4, 1.3, -0.2])
+OFF = np.array([0.8, 1.4, 0.0])
+SECOND = 1_000_000_000
+
+
+def stream() -> Any:
+    config = PoseConfig(topic="/aerial", axes=("x",), false_fraction=FALSE, false_repeats=0.0)
+    mode = PoseMode(value=np.zeros(1), cov=np.eye(1) * SIGMA_M**2)
+    fixes = [PoseFix(stamp_ns=n * SECOND, sensor="aerial", seq=n, axes=("x",), modes=(mode,)) for n in range(3)]
+    return SimpleNamespace(row=pose.ROW, config=config, measurements=fixes)
+
+
+def log_gauss(x: Array, cov: Array) -> float:
+    return float(-0.5 * (x @ np.linalg.inv(cov) @ x + np.log(np.linalg.det(2.0 * np.pi * cov))))
+
+
+def after(right: tuple[int, ...]) -> tuple[Array, Array]:
+    """Mean and covariance of the places by the prior and the measurements that are right."""
+    rows = list(right)
+    if not rows:
+        return np.zeros(3), PRIOR
+    S = PRIOR[np.ix_(rows, rows)] + SIGMA_M**2 * np.eye(len(rows))
+    gain = PRIOR[:, rows] @ np.linalg.inv(S)
+    return gain @ TOLD_M[rows], PRIOR - gain @ PRIOR[rows]
+
+
+def probability(right: tuple[int, ...]) -> float:
+    """Prior x joint density of what is right, each other being false around its own place as known from what is right before it."""
+    log = 0.0
+    for n in range(3):
+        mean, cov = after(tuple(k for k in right if k < n))
+        r, P = np.array([mean[n] - TOLD_M[n]]), cov[n : n + 1, n : n + 1]
+        if n in right:
+            log += np.log(1.0 - FALSE) + log_gauss(r, P + SIGMA_M**2)
+        else:
+            log += np.log(FALSE) + log_gauss(r, P + SIGMA_M**2 + FALSE_M**2)
+    return float(np.exp(log))
+
+
+@pytest.mark.parametrize("held", [(), (0, 1), (2,), (0, 1, 2)])
+def test_all_choices_are_weighed_whichever_is_in_the_graph(held: tuple[int, ...]) -> None:
+    mean, cov = after(held)
+    residuals = [
+        (Residual(raw=mean[n : n + 1] - TOLD_M[n], cov=np.eye(1) * SIGMA_M**2, jacobian=lambda: np.eye(1),
+                  prior=1.0 - FALSE, size_m=None, size_deg=None),)
+        for n in range(3)
+    ]  # fmt: skip
+    place = 2  # the newest
+    J = np.vstack([np.eye(3)[place], np.eye(3)])
+    found = choices(stream(), range(3), residuals, J @ cov @ J.T, [(0, 1.0) if n in held else None for n in range(3)])
+    ways = [tuple(n for n in range(3) if bits[n]) for bits in product([False, True], repeat=3)]
+    total = sum(probability(right) for right in ways)
+    for c in found:
+        right = tuple(n for n, mode in enumerate(c.modes) if mode is not None)
+        assert np.exp(c.log) == pytest.approx(probability(right) / total, rel=1e-6)
+        assert c.step[0] == pytest.approx(after(right)[0][place] - mean[place], abs=1e-9)
+        assert c.cov[0, 0] == pytest.approx(after(right)[1][place, place], abs=1e-9)
+    assert len(found) == len(ways)
+    assert found[0].log == max(c.log for c in found)
+
+
+def test_two_false_ones_that_agree_are_within_the_bounds_and_given_up_when_a_right_one_comes() -> None:
+    """Two of them, 1.6 m off, after some seconds without any: four sigmas of what is predicted."""
+    run = simulate(replace(bl_scenario(1, "drift"), false_fraction=0.0, duration_s=32.0), 3)
+    matches = [m for m in run.recording.measurements if isinstance(m, PoseFix)]
+    start_ns = int(run.truth.stamps_ns[0])
+    silent = {m.seq for m in matches if 17.0 < (m.stamp_ns - start_ns) * 1e-9 < 21.0}
+    false = {m.seq for m in matches if 21.0 < (m.stamp_ns - start_ns) * 1e-9 < 23.0}
+    taken: list[Measurement] = []
+    for m in run.recording.measurements:
+        if isinstance(m, PoseFix) and m.seq in false:
+            taken.append(replace(m, modes=tuple(replace(mode, value=mode.value + OFF) for mode in m.modes)))
+        elif m.seq not in silent:
+            taken.append(m)
+    assert len(false) == 2
+    track = replay(replace(run.recording, measurements=tuple(taken)), run.config).solution.trajectory
+    true, at_s = run.truth.at(track.stamps_ns), (track.stamps_ns - start_ns) * 1e-9
+    off = track.p_world_m - true.p_world_m
+    assert track.cov is not None
+    squared, misled = squared_over_covariance(off, track.cov), (at_s > 21.0) & (at_s < 23.3)
+    assert np.hypot(*off[misled, :2].T).max() > 1.0  # else nothing is shown
+    assert squared[misled].max() < 25.0
+    assert np.hypot(*off[(at_s > 23.6) & (at_s < 30.0), :2].T).max() < 0.8
