@@ -270,7 +270,10 @@ def test_a_lost_estimate_starts_anew() -> None:
 
 
 def test_a_receiver_alone_that_jumps_is_not_followed() -> None:
-    """20 m for 20 s, and nothing to tell it from motion but the IMU: such a jump ends, and till then it is not followed."""
+    """20 m for 20 s, and nothing to tell it from motion but the IMU: such a jump ends, and till then it is not followed.
+
+    For an instant, two seconds into it, the newest state may go a part of the way, in its bounds.
+    """
     run = _seldom(replace(bl_scenario(1, "clean"), duration_s=45.0), 1)
     base = [a for a in arrivals_of(run) if not isinstance(a.m, PoseFix)]
     begin, end = base[at_s(base, 12.0)].true_ns, base[at_s(base, 32.0)].true_ns
@@ -281,7 +284,11 @@ def test_a_receiver_alone_that_jumps_is_not_followed() -> None:
         for a in base
     ]  # fmt: skip
     fed = finish(online := smoother(run), feed(online, run, jumped))
-    assert max(fed.errors_m) < 5.0
+    assert max(fed.errors_m) < 10.0
+    off_m, t_s = np.array(fed.errors_m), (np.array(fed.true_ns) - begin) * 1e-9
+    sigma_m = np.sqrt([np.trace(e.cov[:2, :2]) for e in fed.estimates])
+    assert (off_m < 3.5 * sigma_m).all()
+    assert off_m[t_s > 3.0].max() < 3.0
     assert not [e for e in fed.events if "restarts" in e]
     assert max(np.linalg.norm(e.v_world_mps) for e in fed.estimates) < 8.0  # the vessel goes 4 m/s
     assert fed.recovered_s(end) < 5.0

@@ -36,6 +36,7 @@ from graphloc.solve._solution import AGREES
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
 _LEAF_S, _SURE = 1.0, 0.9  # how often an older chapter is judged again; a weight that needs no second look
 _CERTAIN = 0.99  # a weight that leaves no doubt
+_LOOSE = 25.0  # times its variance: a choice that says so little of the place does not move it
 _SHOWS = 0.01  # of a covariance: what other choices must add to be worth adding
 _CHAPTER = 10  # hypotheses that are judged as one sequence
 _ROUNDS = 2  # of judging what is new
@@ -291,8 +292,10 @@ class Judge:
             best = weighed[0].modes
             now = tuple(h[0] if h is not None and h[1] >= AGREES else None for h in held)
             share, steps = np.exp([c.log for c in weighed]), np.array([c.step[:3] for c in weighed])
-            # What is not the most probable, and was refused when it was tried, does not move the place.
-            mean = share @ steps if best == now else np.zeros(3)
+            # What is not the most probable, and was refused when it was tried, does not move the place; nor does a choice
+            # by which nothing tells it: its share of a step of 100 m is no place that anybody means.
+            tells = np.array([np.trace(c.cov[:3, :3]) for c in weighed]) < _LOOSE * np.trace(cov[:3, :3])
+            mean = (share * tells) @ steps if best == now else np.zeros(3)
             around = (share[:, None] * (steps - mean)).T @ (steps - mean)
             if np.trace(around) > _SHOWS * np.trace(cov[:3, :3]):
                 self._others[stream.name] = mean, around
