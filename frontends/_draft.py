@@ -352,7 +352,7 @@ def _mount_lines(compass: CompassReport) -> list[str]:
         rest = abs(compass.offset_deg - quarter)
         yaw, sigma = (quarter, rest) if rest < 15.0 else (round(compass.offset_deg), _LEEWAY_DEG)
         why = "a course is no heading, and tells no more"
-        astern = ", unless the craft goes astern most of the time: then 0" if abs(yaw) > _ASTERN_DEG else ""
+        astern = ", unless the vessel goes astern most of the time: then 0" if abs(yaw) > _ASTERN_DEG else ""
         lines.append(
             f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course{astern}"
         )

@@ -63,9 +63,8 @@ def test_a_bad_compass_shows_without_truth(bad: tuple[SimulatedRun, Ablated]) ->
     text = "\n".join(page.said(found))
     assert "CONTRADICTION: compass" in text
     assert "does not measure accuracy" in text
-    assert (
-        "leans against compass" in text
-    )  # aerial knows the heading, too, and is as far from the compass as that from it
+    # aerial knows the heading, too, and is as far from the compass as that from it: what is left tells
+    assert "compass is the likelier culprit" in text
     assert (of(found, "gnss").contradiction or 0.0) < 1.5
 
 

@@ -84,7 +84,7 @@ def test_a_mount_in_tf_static_that_the_motion_denies_is_said(tmp_path: Path) -> 
     items = [("/tf_static", START_NS, transforms), *drive(make, rotation_z(90.0))]
     found, _, text = look(tmp_path, items, make)
     assert found.imus[0].mount.tf_frame == "imu_link"
-    assert "BUT what it feels fits how /wheel/odom moves only turned by +9" in text
+    assert "but what it feels fits how /wheel/odom moves only turned by +9" in text
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 90.0])
@@ -207,7 +207,7 @@ def test_a_heading_that_is_said_twice_counts_once(noise_deg: float, both: bool, 
     _, config, text = seen(tmp_path, told)
     used = {s.topic for s in config.of_kind("compass").values() if s.enabled}
     assert used == {"/compass", "/attitude", *(["/hdg"] if both else [])}
-    assert ("it says what /attitude says" in text) is not both
+    assert ("it repeats /attitude" in text) is not both
 
 
 def test_a_covariance_that_is_a_placeholder_is_told_from_one(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def bag(run: SimulatedRun, request: pytest.FixtureRequest, tmp_path_factory: pyt
 def both(bag: Path) -> str:
     """The draft, with that heading switched on which only repeats the other."""
     draft = draft_config(inspect_bag(bag))
-    echo = f"enabled: false  # guess: it says what {YAW} says"
+    echo = f"enabled: false  # guess: it repeats {YAW}, and must not count twice"
     assert echo in draft
     return draft.replace(echo, "enabled: true  #")
 

@@ -237,8 +237,8 @@ def test_a_run_beside_a_believed_receiver_that_leaps_is_not_called_good() -> Non
 
 
 def test_a_leap_is_not_forgotten_where_it_has_online_start_anew() -> None:
-    """Off by 100 m it was refused for 15 s, and then called good where it was 100 m off."""
-    _, wrong, config = believed(100.0, last_s=np.inf)
+    """Off by 150 m it is rejected for 15 s; then it was called good where it was 150 m off."""
+    _, wrong, config = believed(150.0, last_s=np.inf)
     live = replay(wrong, config).solution
     assert any("restarts" in line for line in live.stats.warnings)
     late = live.trajectory.stamps_ns > live.trajectory.stamps_ns[0] + 20_000_000_000
