@@ -31,10 +31,15 @@ def residuals(m: PoseFix, config: AerialConfig, at: Attachment) -> tuple[Residua
     plain = pose.residuals(m, config, at)
     if at.slow_value is None:
         return plain
-    moved = _shown_off(m.axes) @ at.slow_value
-    flat = [k for k, a in enumerate(m.axes) if a in ("x", "y")]
+    shown = _shown_off(m.axes)
+    moved, flat = shown @ at.slow_value, [k for k, a in enumerate(m.axes) if a in ("x", "y")]
     return tuple(
-        replace(r, raw=r.raw + moved, size_m=float(np.linalg.norm((r.raw + moved)[flat])) if flat else None)
+        replace(
+            r,
+            raw=r.raw + moved,
+            slow_jacobian=lambda: shown,
+            size_m=float(np.linalg.norm((r.raw + moved)[flat])) if flat else None,
+        )
         for r in plain
     )
 

@@ -191,7 +191,7 @@ def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode)
         prior=mode.probability * (1.0 - config.false_fraction),
         size_m=float(np.hypot(raw[0], raw[1])),
         size_deg=float(np.degrees(np.linalg.norm(rotation))),
-        rows=m.rays.size,
+        expected_nis=m.rays.size,
     )
 
 

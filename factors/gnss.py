@@ -61,16 +61,17 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
     d = np.zeros(3) if at.slow_value is None else -at.slow_value
     raw = at.T_world_body.transformFrom(lever) + d - _fix_world_m(m, at)
     size = float(np.hypot(raw[0], raw[1]))
+    white, cov = white_covariance(m, config), _covariance(m, config, at)
     return (
         Residual(
             raw=raw,
-            cov=_covariance(m, config, at),
+            cov=cov,
             jacobian=lambda: _antenna_jacobian(at),
             slow_jacobian=lambda: -np.eye(3),
             prior=1.0,
             size_m=size,
             size_deg=None,
-            rows=3 if m.has_height else 2,  # that tell something
+            expected_nis=float((np.diagonal(white) / np.diagonal(cov))[: 3 if m.has_height else 2].sum()),
         ),
     )
 

@@ -382,4 +382,6 @@ def _beside(odometry: tuple[OdometryReport, ...]) -> list[str]:
         lines.append(f"{off}truth_topic: {item.topic}  # guess: {item.why}; {item.world}; for comparison, never fused")
     for k, item in enumerate(o for o in odometry if o.role == "check_speed"):
         lines.append(f"{'# ' if k else ''}check_speed_topic: {item.topic}  # guess: {item.why}; compared, never fused")
+    if any(o.role == "check_speed" for o in odometry):
+        lines.append("# to fuse a speed along the vessel instead: a sensor of kind body_velocity, if it slips little")
     return lines

@@ -87,7 +87,7 @@ class Residual:
         jacobian: gives (k, 6) d raw / d (body tangent of the state's pose), for the predicted covariance.
         slow_jacobian: gives (k, n) d raw / d (slow state), for the same; None: it has no part in that.
         velocity_jacobian: gives (k, 3) d raw / d (velocity in world), for the same; None: it has no part in that.
-        rows: of the factor, where these are others than `raw`; 0: the same.
+        expected_nis: expected square of the factor, where that is another than the length of `raw`; 0: it is that.
         prior: prior probability of this hypothesis.
         size_m, size_deg: physical size, for the ledger.
     """
@@ -100,7 +100,7 @@ class Residual:
     size_deg: float | None
     slow_jacobian: Callable[[], Array] | None = None
     velocity_jacobian: Callable[[], Array] | None = None
-    rows: int = 0
+    expected_nis: float = 0.0
 
     def nis(self, inflation: Array | None = None) -> float:
         """Squared residual normalised by `cov` (+ `inflation`)."""

@@ -122,6 +122,25 @@ def _one(key: int, step: np.ndarray) -> gtsam.VectorValues:
 
 
 @pytest.mark.parametrize("row", SENSORS, ids=lambda r: r.kind)
+def test_residual_jacobian_of_the_slow_state(row: Sensor) -> None:
+    """`Residual.slow_jacobian`, by which a prediction's doubt of it counts, against differences of `Residual.raw`; none: no part in it."""
+    config = config_of(row)
+    at = attachment(row, config)
+    if at.slow_value is None:
+        return
+    m = row.ideal(at, config)
+    told = row.residuals(m, config, at)[0].slow_jacobian
+    for axis in range(len(at.slow_value)):
+        step = np.zeros(len(at.slow_value))
+        step[axis] = 1e-5
+        sides = [row.residuals(m, config, replace(at, slow_value=at.slow_value + s * step))[0].raw for s in (1.0, -1.0)]
+        column = (sides[0] - sides[1]) / 2e-5
+        np.testing.assert_allclose(
+            column, 0.0 if told is None else told()[:, axis], atol=1e-4 * max(1.0, np.abs(column).max())
+        )
+
+
+@pytest.mark.parametrize("row", SENSORS, ids=lambda r: r.kind)
 def test_residual_jacobian_of_the_pose(row: Sensor) -> None:
     """`Residual.jacobian`, which scales the gate, against differences of `Residual.raw`."""
     config = config_of(row)

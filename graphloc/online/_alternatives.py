@@ -23,7 +23,9 @@ from graphloc.solve._foreseen import taken_of
 from graphloc.solve._hypotheses import log_repeat, log_right_and_false
 
 _MOST, _LEAST = 16, 12.0  # choices that are followed; nats below the most probable one
-_LOOSEST = 1e-6  # share of a measurement's own covariance that is left where nothing else tells
+# What else tells of a measurement is known by at least such a share of what itself does. Its factor was linearised a moment ago,
+# at another place: to a hundredth or so, taken out again it may leave less than nothing, and then nothing is as loose as one likes.
+_LOOSEST = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +93,7 @@ def _without(
     rows = np.concatenate([np.arange(len(cov))[at[n]] for n, _, _ in there])
     raw = np.concatenate([residuals[n][mode].raw for n, mode, _ in there])
     root = block_diag(*(np.linalg.cholesky(residuals[n][mode].cov / weight) for n, mode, weight in there))
-    # What is left of their covariance by what else there is; rounding must not make it negative.
+    # What is left of their covariance by what else there is.
     inverse = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(np.eye(len(rows)) - inverse @ cov[np.ix_(rows, rows)] @ inverse.T)
     left = inverse.T @ vectors / np.maximum(values, _LOOSEST) @ vectors.T @ inverse

@@ -187,7 +187,7 @@ class Entries:
     def expected_cost(self) -> float:
         """Return the weighted squares that are to be expected of what is in the graph: as many as axes, by weight."""
         held = [e.verdict for e in self._entries.values() if e.held is not None]
-        return sum((v.residual.rows or len(v.residual.raw)) * v.weight for v in held)
+        return sum((v.residual.expected_nis or len(v.residual.raw)) * v.weight for v in held)
 
     # In the ledger
 

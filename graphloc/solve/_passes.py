@@ -142,7 +142,7 @@ def outliers_cost(verdicts: Verdicts) -> float:
 def expected_cost(problem: Problem, verdicts: Verdicts) -> float:
     """Degrees of freedom of the weighted problem: what 2 x its cost is expected to be."""
     n, m = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
-    expected = sum((v.residual.rows or len(v.residual.raw)) * v.weight for v in verdicts.values())
+    expected = sum((v.residual.expected_nis or len(v.residual.raw)) * v.weight for v in verdicts.values())
     expected += 9.0 * (n - 1) + 6.0 * (m - 1) + 15.0 - 9.0 * n - 6.0 * m
     for stream in problem.streams:
         if stream.slow is not None:
