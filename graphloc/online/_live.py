@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import median
 from typing import Any, Generic, TypeVar
 
 import gtsam
@@ -24,6 +27,7 @@ from graphloc.online._parting import Parting
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
+_LAST = 15  # measurements that tell a sensor's rate
 _REMEMBERED = 300  # residuals, and pairs of them, that say how wide a sensor scatters
 _LAGS_S, _GOLDEN = (2.0, 4.0), 0.618  # how far apart pairs are; its multiples, whole turns taken off, spread evenly
 _PAGE_S = 1.0  # states leave together by so much
@@ -209,8 +213,7 @@ class LiveProblem:
         carry, gyro_radps = self._motion(m.stamp_ns)
         timeline = self.timeline
         floor, nearest = timeline.floor(m.stamp_ns), timeline.nearest(m.stamp_ns)
-        kept = stream.measurements.kept
-        stream.apart_s.append(abs(m.stamp_ns - kept[-1].stamp_ns) * 1e-9 if kept else np.inf)
+        stream.apart_s.append(_apart_s([*stream.measurements.kept[-_LAST:], m]))
         stream.measurements.append(m)
         stream.state.append(state_of(m, floor, nearest, timeline.stamps_ns, self.links.gaps()))
         stream.carry.append(carry)
@@ -272,3 +275,9 @@ def live_problem(
         streams=streams,
         habit=habit,
     )
+
+
+def _apart_s(last: Sequence[Measurement]) -> float:
+    """How far apart the last measurements of a sensor are, as a rule, s, in whatever order they came; inf: of one alone."""
+    stamps_ns = sorted(m.stamp_ns for m in last)
+    return float(median(b - a for a, b in pairwise(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else math.inf
