@@ -29,7 +29,7 @@ from graphloc.trajectory import Trajectory
 
 SEEDS = range(1000, 1080)  # none was looked at when a model or a number was chosen
 Found = dict[str, Any]
-_TOO_SURE = 6.0  # NEES of three axes: three where the covariance is true
+_TOO_SURE = 6.0  # horizontal NEES: 2 where the covariance is true
 
 
 def _judged(track: Trajectory, truth: Trajectory) -> Found:
@@ -81,7 +81,7 @@ def figures(pool: ProcessPoolExecutor) -> list[Row]:
                 row("F.drawn", f"{label}, {way}: no track", len(found) - len(rmse), "runs"),
                 row("F.drawn", f"{label}, {way}: 95 % coverage, mean", _column(found, way, "coverage").mean() * 100, "%"),
                 row("F.drawn", f"{label}, {way}: 95 % coverage of the heading, mean", _column(found, way, "heading_coverage").mean() * 100, "%"),
-                row("F.drawn", f"{label}, {way}: NEES (3 when true), median", np.median(nees), ""),
+                row("F.drawn", f"{label}, {way}: NEES (2 when true), median", np.median(nees), ""),
                 row("F.drawn", f"{label}, {way}: NEES above {_TOO_SURE:g}", np.sum(nees > _TOO_SURE), "runs"),
             ]  # fmt: skip
     for way in ("batch", "online"):

@@ -21,38 +21,53 @@ _AXES = (EAST_AXES, NORTH_AXES, BODY_AXES)
 _FEWEST = 20
 
 
-def axes_of(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array) -> tuple[str | None, str]:
+def axes_of(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float = 0.0) -> tuple[str | None, str]:
     """Return the axes in which the velocities of a stream fit chords of a track, and the evidence in words.
 
     The axes are None where nothing tells, 'unknown' where none fits.
 
     Args:
         stream: velocities in its last three columns. stamps_ns: (N,) of the track. p_m: (N, 3) the track, east, north, up.
+        scatter_m: noise of its places, 1 sigma of an axis.
     """
     keep = sane(stream)
     v = stream.rows[keep, -3:] if len(keep) else np.zeros((0, 3))
     good = np.isfinite(v).all(axis=1)
     chords, mean = _pairs(stream.stamps_ns[keep][good], v[good], stamps_ns, p_m)
-    speed = float(np.sqrt((chords**2).sum(axis=1).mean())) if len(chords) else 0.0
+    noise = 2.0 * scatter_m / _CHORD_S  # of a chord between two places, both axes together, m/s
+    speed = _less(float(np.sqrt((chords**2).sum(axis=1).mean())), noise) if len(chords) else 0.0
     if len(chords) < 10 or speed < 0.5:
         return None, "no GNSS track in motion to check it against"
+    if noise > speed:
+        return None, f"the fixes scatter by {scatter_m:.1f} m, too much to check it against at {speed:.1f} m/s"
     forward = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
     # Body x laid along the track, either way: a craft may go astern.
     along = forward * np.abs(mean[:, :1])
-    errors = [float(np.sqrt(((v - chords) ** 2).sum(axis=1).mean())) for v in (mean[:, :2], mean[:, 1::-1], along)]
+    # What lies along the chords has their noise across them, too.
+    errors = [
+        _less(float(np.sqrt(((v - chords) ** 2).sum(axis=1).mean())), part * noise)
+        for v, part in ((mean[:, :2], 1.0), (mean[:, 1::-1], 1.0), (along, 0.5**0.5))
+    ]
     best = int(np.argmin(errors))
     why = f"differs from the GNSS track by {errors[best]:.2f} m/s RMS, {errors[0]:.2f} m/s as east, north, up"
     return (_AXES[best] if errors[best] < _FITS * speed else "unknown"), why
 
 
-def velocity_report(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, tf_frame: str | None) -> VelocityReport:
+def _less(rms: float, noise: float) -> float:
+    """What is left of an RMS without its noise."""
+    return float(np.sqrt(max(rms**2 - noise**2, 0.0)))
+
+
+def velocity_report(
+    stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, tf_frame: str | None, scatter_m: float = 0.0
+) -> VelocityReport:
     """Return the axes of a twist or vector; `tf_frame`: its frame, where /tf_static knows it; else as `axes_of`."""
-    axes, why = axes_of(stream, stamps_ns, p_m)
+    axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
     return VelocityReport(topic=stream.topic, msgtype=stream.msgtype, axes=axes, why=why, tf_frame=tf_frame)
 
 
 def odometry_report(
-    stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, origin: Vec | None, world: str
+    stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, origin: Vec | None, world: str, scatter_m: float = 0.0
 ) -> OdometryReport:
     """Guess what an odometry or pose topic is, by its name and whether it reports the speed of the craft.
 
@@ -67,7 +82,7 @@ def odometry_report(
     elif stream.msgtype != ODOMETRY or speed <= 0.05:
         role, why = "pose", "it reports poses and no speed"
     else:
-        axes, fit = axes_of(stream, stamps_ns, p_m)
+        axes, fit = axes_of(stream, stamps_ns, p_m, scatter_m)
         role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: looks like wheel odometry"
         if axes not in (None, BODY_AXES):
             role, why = "pose", f"its speeds are none along the craft: {fit}"

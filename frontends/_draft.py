@@ -284,8 +284,9 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
     for k, twist in enumerate(known):
         off = None
         if twist.axes == BODY_AXES:
-            off = f"east, north, up (or north, east, down) is wanted, its axes look {twist.axes}; {twist.why}"
-        elif twist.axes is None and twist.msgtype == VECTOR:
+            yield _body_velocity_block(_numbered("body_velocity", k), twist)
+            continue
+        if twist.axes is None and twist.msgtype == VECTOR:
             off = f"nothing tells that it is a velocity; {twist.why}"
         elif twist is not used:
             off = f"true if it comes of another receiver than {used.topic if used else 'that'}; {twist.why}"
@@ -293,6 +294,16 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
     for twist in inspection.velocities:
         if twist not in known:
             yield [f"# {twist.topic}: left out, it is no velocity of the craft; {twist.why}"]
+
+
+def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
+    frame = f"tf_frame: {json.dumps(twist.tf_frame)}" if twist.tf_frame else "xyz_m: [0.0, 0.0, 0.0]"
+    known = "from /tf_static" if twist.tf_frame else "guess: where it sits is not in the bag; measure it"
+    return [
+        f"{name}:", "  kind: body_velocity", *_topic_lines(twist.topic),
+        f"  enabled: false  # guess: true to fuse it, through: water for a speed log; its axes look {twist.axes}; {twist.why}",
+        f"  mount: {{{frame}}}  # {known}",
+    ]  # fmt: skip
 
 
 def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, off: str | None) -> list[str]:

@@ -127,9 +127,12 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     mount = tree.resolve(body, frame) if frame else None
     antenna = None if mount is None else mount[0]
     courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
-    told = [(s, odometry_report(s, stamps, p_m, *origin_of(s, stamps, p_m, first, antenna))) for s in poses]
+    told = [
+        (s, odometry_report(s, stamps, p_m, *origin_of(s, stamps, p_m, first, antenna), scatter_m=scatter_m))
+        for s in poses
+    ]
     twists = [
-        (s, velocity_report(s, stamps, p_m, _known(s, tree, body)))
+        (s, velocity_report(s, stamps, p_m, _known(s, tree, body), scatter_m))
         for s in filled
         if s.msgtype in (TWIST, PLAIN_TWIST, VECTOR)
     ]

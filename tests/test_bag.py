@@ -15,6 +15,7 @@ from rosbags.typesys import get_types_from_msg
 from ruamel.yaml import YAML
 
 from graphloc.config import (
+    BodyVelocityConfig,
     CompassConfig,
     GnssConfig,
     HeightConfig,
@@ -40,6 +41,7 @@ KINDS: dict[str, type[SensorConfig]] = {
     "gnss": GnssConfig,
     "compass": CompassConfig,
     "gnss_velocity": VelocityConfig,
+    "body_velocity": BodyVelocityConfig,
     "pose": PoseConfig,
     "height": HeightConfig,
 }

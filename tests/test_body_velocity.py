@@ -180,6 +180,27 @@ def test_the_better_filter_takes_it_and_the_thesis_says_why_not() -> None:
     assert all(row.reason == "BL's filter has no velocity" for row in rows)
 
 
+def test_a_current_is_no_speed_over_ground_to_the_better_filter() -> None:
+    """It has no state for a current of 0.8 m/s, so it must not be surer for the log than it is right."""
+    scenario = Scenario(
+        path="loops", noise="drift", duration_s=90.0, log_hz=5.0, current_east_mps=0.8, current_north_mps=0.0
+    )
+    run = simulate(scenario, 5)
+    datum = app.choose_datum(run.recording, run.config)
+    without = replace(
+        run.recording, measurements=tuple(m for m in run.recording.measurements if not isinstance(m, BodyVelocity))
+    )
+    told, alone = (
+        compare_to_truth(f.trajectory, run.truth)
+        for recording in (run.recording, without)
+        for f in ekf.run_all(recording, run.config, datum)
+        if f.name == "honest EKF"
+    )
+    assert told.position_rmse_m < 1.2 * alone.position_rmse_m
+    assert told.nees is not None
+    assert told.nees < 4.0
+
+
 def test_a_log_that_is_turned_on_its_mount_is_read_along_its_own_axes_by_the_filter() -> None:
     """Mounted a quarter turn to port, its y axis points astern: minus the speed ahead."""
     run = simulate(

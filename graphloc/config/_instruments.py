@@ -96,7 +96,7 @@ class SlowErrorConfig(Block):
 
     enabled: bool | None = None
     """false: the GNSS error is treated as white noise (right for RTK in the open, wrong in a harbour). Empty: on if a second
-    sensor (matches, tags, GNSS velocity, another receiver) can separate it from motion; else it is added to the bounds only."""
+    sensor (matches, tags, GNSS velocity, a speed along the vessel, another receiver) can separate it from motion; else it is added to the bounds only."""
     horizontal_sigma_m: Positive = 2.0
     """Stationary sigma of the slow error, each horizontal axis, m."""
     vertical_sigma_m: Positive = 5.0

@@ -33,7 +33,8 @@ class TimelineConfig(Block):
     rate_hz: Annotated[float, Field(gt=0.5, le=200.0)] = 10.0
     """States per second; a state is moved onto the stamp of a measurement close by."""
     slow_period_s: Annotated[float, Field(ge=0.05, le=60.0)] = 1.0
-    """Time between two states of slow quantities (IMU bias, GNSS error), s."""
+    """Time between two states of slow quantities (IMU bias, GNSS error), s. Online from some 2 s on fixes are believed much less,
+    as their slow error walks unseen in between."""
     leg_s: Annotated[float, Field(ge=60.0)] = 1800.0
     """Offline, a longer run is solved in legs of about this length that overlap by two minutes; memory grows with a leg, s."""
 

@@ -304,6 +304,7 @@ class Judge:
             if not gains or chosen == self._chosen.get(stream.name):
                 return tried > 0
             self._chosen[stream.name] = chosen
+            self._others.pop(stream.name, None)  # was about the estimate before the trial
             self._try(stream, own, _along(best, found, attached))
         return True
 

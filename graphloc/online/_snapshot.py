@@ -16,7 +16,7 @@ from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
 from graphloc.solve._solution import NO_NOISE
 
-_VERSION = 1
+_VERSION = 2
 _EVERY_S = 2.0
 
 
