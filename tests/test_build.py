@@ -9,7 +9,7 @@ import pytest
 
 from graphloc import app, keys
 from graphloc.blocks import MountConfig
-from graphloc.build import Problem, StartPrior, attach, build_graph, make_problem
+from graphloc.build import Level, Problem, StartPrior, attach, build_graph, make_problem
 from graphloc.config import GnssConfig, VelocityConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
@@ -157,3 +157,22 @@ def test_keys_are_those_of_gtsam() -> None:
     letters, numbers = keys.parts(np.array(names, dtype=np.uint64))
     assert letters.tolist() == list("xvbscl")
     assert numbers.tolist() == [3, 4, 5, 6, 8, 9]
+
+
+def test_a_levelling_changes_with_tilt_and_bias_as_it_says() -> None:
+    """Jacobians of `Level.error` against central differences: by the body's tangent R Exp(theta), and by the bias."""
+    rng = np.random.default_rng(1)
+    level = Level(up=np.array([0.02, -0.05, 0.9985]), by_bias=rng.normal(0.0, 0.1, (3, 6)), bias=rng.normal(0.0, 0.01, 6), sigma_rad=0.02)  # fmt: skip
+    R, bias = gtsam.Rot3.RzRyRx(0.1, -0.2, 2.0), rng.normal(0.0, 0.02, 6)
+    off, by_tilt, by_bias = level.error(R.matrix(), bias)
+    upright = gtsam.Rot3.RzRyRx(float(np.arctan2(-0.05, 0.9985)), float(-np.arcsin(0.02)), 0.7)
+    there, _, _ = Level(up=level.up, by_bias=level.by_bias, bias=bias, sigma_rad=0.02).error(upright.matrix(), bias)
+    assert np.abs(there).max() < 1e-1 < np.abs(off).max()  # in sigmas
+    for k in range(3):
+        step = 1e-6 * np.eye(3)[k]
+        sides = [level.error(R.retract(sign * step).matrix(), bias)[0] for sign in (1.0, -1.0)]
+        np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, by_tilt[:, k], atol=1e-5)
+    for k in range(6):
+        step = 1e-6 * np.eye(6)[k]
+        sides = [level.error(R.matrix(), bias + sign * step)[0] for sign in (1.0, -1.0)]
+        np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, by_bias[:, k], atol=1e-5)
