@@ -62,7 +62,7 @@ _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # of NavSatStatus, by quality of GGA: differential, RTK
 _RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # horizontal, vertical, at a dilution of 1: fixed, float
 MOST_TURNS = 20  # of a heading that is counted on from turn to turn
-_UNIT_MPS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "knots": 1852.0 / 3600.0}
+_UNIT_MPS = {"m/s": 1.0, "km/h": nmea.KM_PER_H_MPS, "knots": nmea.KNOT_MPS}
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _NO_CLIMB_MPS2 = 1e6  # variance of a vertical velocity that is not told, m^2/s^2
 # Beyond these no sensor of a vessel measures; they are finite, and a sum or a square of them need not be.

@@ -26,7 +26,7 @@ _UNREADABLE = (
     exceptions.NMEAParseError, exceptions.NMEAMessageError, exceptions.NMEATypeError, exceptions.NMEAStreamError,
     ValueError, TypeError, KeyError, IndexError, AttributeError,
 )  # fmt: skip
-_KNOT_MPS, _KM_PER_H_MPS = 1852.0 / 3600.0, 1.0 / 3.6
+KNOT_MPS, KM_PER_H_MPS = 1852.0 / 3600.0, 1.0 / 3.6
 _SLOW_MPS = 0.1  # below it a receiver may leave the course out
 # Quality of a fix as GGA has it, from the mode letters of GNS, RMC and GLL.
 _QUALITIES = {"N": 0, "A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
@@ -101,10 +101,9 @@ def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Re
     if (quality := _quality(said)) in _NOT_MEASURED:
         return rejected(f"{said.msgID}: {_NOT_MEASURED[quality]}")
     if said.msgID == "RMC":
-        speed, course = _KNOT_MPS * _number(said, "spd"), _number(said, "cog")
+        speed, course = KNOT_MPS * _number(said, "spd"), _number(said, "cog")
     else:
-        knots, km_per_h, course = (_number(said, name) for name in ("sogn", "sogk", "cogt"))
-        speed = _KNOT_MPS * knots if isfinite(knots) else _KM_PER_H_MPS * km_per_h
+        speed, course = _speed_mps(said, "sogn", "sogk"), _number(said, "cogt")
     if not isfinite(speed) or (speed > _SLOW_MPS and not isfinite(course)):
         return rejected(f"{said.msgID}: no {'course' if isfinite(speed) else 'speed'}")
     east = radians(course if isfinite(course) else 0.0)
@@ -116,8 +115,7 @@ def water_speed_mps(text: str, wanted: Collection[str]) -> float | Rejection:
     said = _read(text, wanted, SPEEDS, "speed through the water")
     if isinstance(said, Rejection):
         return said
-    knots, km_per_h = _number(said, "spdN"), _number(said, "spdK")
-    speed = _KNOT_MPS * knots if isfinite(knots) else _KM_PER_H_MPS * km_per_h
+    speed = _speed_mps(said, "spdN", "spdK")
     return speed if isfinite(speed) else rejected(f"{said.msgID}: no speed")
 
 
@@ -157,6 +155,12 @@ def _field(said: Any, name: str) -> Any:
 def _number(said: Any, name: str) -> float:
     value = _field(said, name)
     return float(value) if isinstance(value, int | float) else nan
+
+
+def _speed_mps(said: Any, knots: str, km_per_h: str) -> float:
+    """A speed that is told in knots or in km/h, m/s; NaN where it is in neither."""
+    told = _number(said, knots)
+    return KNOT_MPS * told if isfinite(told) else KM_PER_H_MPS * _number(said, km_per_h)
 
 
 def _east(said: Any, name: str) -> float:
