@@ -217,9 +217,8 @@ def test_what_reaches_a_measurement_is_integrated_anew_too() -> None:
     after = next(n for n, a in enumerate(rest) if a.true_ns > begin + 1_800_000_000)
     online = smoother(drift())
     feed(online, drift(), [*rest[:after], *hole, *rest[after:]])
-    lag = online._lag  # noqa: SLF001 - the estimate shows it by millimetres only
-    assert lag is not None
-    problem, checked = lag.problem, 0
+    assert online._tracking is not None  # noqa: SLF001 - the estimate shows it by millimetres only
+    problem, checked = online._tracking.lag.problem, 0  # noqa: SLF001
     for stream in problem.streams.values():
         for k in range(stream.measurements.first, len(stream.measurements)):
             carry, stamp_ns = stream.carry[k], stream.measurements[k].stamp_ns
@@ -476,7 +475,7 @@ def sizes(online: OnlineSmoother) -> dict[str, int]:
     seen: set[int] = set()
 
     def look(name: str, thing: object, depth: int) -> None:
-        if id(thing) in seen or depth > 6:
+        if id(thing) in seen or depth > 7:
             return
         seen.add(id(thing))
         if isinstance(thing, (list, dict, set)) or type(thing).__name__ == "deque":
@@ -510,11 +509,11 @@ def test_nothing_grows() -> None:
                 largest = early if t < 30.0 else late
                 for name, size in sizes(online).items():
                     largest[name] = max(size, largest.get(name, 0))
-    full = ("scatter._pairs", "scatter._squares", "_turned._steps", "_turned._fixes")
+    full = ("scatter._pairs", "scatter._squares", "turned._steps", "turned._fixes")
     remembered = {name for name in early if name.endswith(full)}  # fill up to their limit
     # 40 s: at the 10 Hz of states, at the 2 Hz of fixes
-    assert late["online._turned._steps"] <= 401
-    assert late["online._turned._fixes"] <= 83
+    assert late["online._persistent.turned._steps"] <= 401
+    assert late["online._persistent.turned._fixes"] <= 83
     grown = {n: (early.get(n, 0), s) for n, s in late.items() if n not in remembered and s > 1.15 * early.get(n, 0) + 5}
     assert len(early) > 30
     assert grown == {}

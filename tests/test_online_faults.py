@@ -118,7 +118,7 @@ def test_a_start_that_fails_keeps_its_accounts(monkeypatch: pytest.MonkeyPatch) 
             raise failures.pop()
         return live_problem(*arguments)
 
-    monkeypatch.setattr("graphloc.online._smoother.live_problem", fails_once)
+    monkeypatch.setattr("graphloc.online._tracking.live_problem", fails_once)
     fed = whole(base, online)
     assert complaints(base, fed) == []
     assert [e for e in fed.events if e == "the start failed (RuntimeError: planted): restarts"]
@@ -132,11 +132,11 @@ def test_what_agreed_with_a_choice_that_was_given_up_does_not_count(
     """It put off the new start of an estimate 35 m aside by a minute: the right matches agreed, but only while they were tried."""
     base, online = arrivals_of(run_of()), smoother(run_of())
     feed(online, run_of(), base[: at_s(base, 12.0)])
-    assert online._lag is not None  # noqa: SLF001
-    judge, agreement = online._lag._judge, online._lag._agreement  # noqa: SLF001
-    stream = online._lag.problem.streams["aerial"]  # noqa: SLF001
+    assert online._tracking is not None  # noqa: SLF001
+    judge, agreement = online._tracking.lag._judge, online._tracking.lag._agreement  # noqa: SLF001
+    stream = online._tracking.lag.problem.streams["aerial"]  # noqa: SLF001
     own = judge._chapter(stream)  # noqa: SLF001
-    agreement.back_to(Agreement(online._lag.problem.timeline).marked())  # noqa: SLF001
+    agreement.back_to(Agreement(online._tracking.lag.problem.timeline).marked())  # noqa: SLF001
     for entry in own:
         agreement.note(stream, entry.measurement, None)
     refused = agreement.marked()
@@ -152,8 +152,8 @@ def test_a_receiver_that_is_far_off_is_waited_for(error_m: float, denies: bool, 
     """It agrees by an error that it should not have: a jump, that ends. Where matches deny the estimate besides, it is lost."""
     online = smoother(run_of())
     feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
-    assert online._lag is not None  # noqa: SLF001
-    lag = online._lag  # noqa: SLF001
+    assert online._tracking is not None  # noqa: SLF001
+    lag = online._tracking.lag  # noqa: SLF001
     fix, match = (lag.problem.streams[name] for name in ("gnss", "aerial"))
     a_fix, a_match = (lag._judge._chapter(stream)[-1].measurement for stream in (fix, match))  # noqa: SLF001
     verdict = lag._judge._chapter(match)[-1].verdict  # noqa: SLF001
@@ -183,8 +183,8 @@ def test_a_jump_that_lasts_longer_than_what_was_before_was_none(
     """A run that begins in a jump takes its end for one: the level that is held longer is the right one. 3 sigmas are 6 m."""
     online = smoother(run_of())
     feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
-    assert online._lag is not None  # noqa: SLF001
-    lag = online._lag  # noqa: SLF001
+    assert online._tracking is not None  # noqa: SLF001
+    lag = online._tracking.lag  # noqa: SLF001
     fix = lag.problem.streams["gnss"]
     entry = lag._judge._chapter(fix)[-1]  # noqa: SLF001
     agreement, begin_ns = Agreement(lag.problem.timeline), lag.newest.stamp_ns
@@ -208,8 +208,8 @@ def test_what_denied_and_was_found_to_hang_does_not_hurry_a_start_anew() -> None
     """A receiver that is far off is waited for, whatever one that hangs has said before that was seen."""
     online = smoother(run_of())
     feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
-    assert online._lag is not None  # noqa: SLF001
-    lag = online._lag  # noqa: SLF001
+    assert online._tracking is not None  # noqa: SLF001
+    lag = online._tracking.lag  # noqa: SLF001
     fix, match = (lag.problem.streams[name] for name in ("gnss", "aerial"))
     a_fix = lag._judge._chapter(fix)[-1].measurement  # noqa: SLF001
     verdict = lag._judge._chapter(match)[-1].verdict  # noqa: SLF001
@@ -230,8 +230,8 @@ def test_what_was_let_in_agrees_when_it_is_asked_again(opened: bool, monkeypatch
     base, online = arrivals_of(run_of()), smoother(run_of())
     now, soon, later = (at_s(base, t_s) for t_s in (12.0, 12.8, 14.5))
     feed(online, run_of(), base[:now])
-    assert online._lag is not None  # noqa: SLF001
-    judge, agreement = online._lag._judge, online._lag._agreement  # noqa: SLF001
+    assert online._tracking is not None  # noqa: SLF001
+    judge, agreement = online._tracking.lag._judge, online._tracking.lag._agreement  # noqa: SLF001
     by_kernel = judge._by_kernel  # noqa: SLF001
 
     def lets_in(*arguments: Any, fresh: bool) -> Any:
@@ -240,7 +240,7 @@ def test_what_was_let_in_agrees_when_it_is_asked_again(opened: bool, monkeypatch
 
     monkeypatch.setattr(judge, "_by_kernel", lets_in)
     monkeypatch.setattr(judge, "_ask_again", lambda *_: None)
-    agreement.back_to(Agreement(online._lag.problem.timeline).marked())  # noqa: SLF001
+    agreement.back_to(Agreement(online._tracking.lag.problem.timeline).marked())  # noqa: SLF001
     feed(online, run_of(), base[now:soon])
     assert ("gnss" in agreement.agreed_ns) is not opened
     monkeypatch.undo()
@@ -254,13 +254,15 @@ def test_a_lost_estimate_starts_anew() -> None:
     base, online = arrivals_of(run), smoother(run)
     n = at_s(base, 8.0)
     fed = feed(online, run, base[:n])
-    anchor = online._recent.anchors[-1]  # noqa: SLF001
+    assert online._tracking is not None  # noqa: SLF001
+    recent = online._tracking._recent  # noqa: SLF001
+    anchor = recent.anchors[-1]
     pose = type(anchor.pose)(anchor.pose.rotation(), anchor.pose.translation() + np.array([300.0, 0.0, 0.0]))
     known = {name: replace(b, cov=b.cov * 1e-4) for name, b in anchor.slow.items()}
-    online._recent.anchors.clear()  # noqa: SLF001
-    online._recent.anchors.append(replace(anchor, pose=pose, cov=anchor.cov * 1e-4, slow=known))  # noqa: SLF001
-    online._recent.begin([m for m in online._recent if m.stamp_ns >= anchor.stamp_ns])  # noqa: SLF001
-    online._rebuild(RuntimeError("planted"))  # noqa: SLF001
+    recent.anchors.clear()
+    recent.anchors.append(replace(anchor, pose=pose, cov=anchor.cov * 1e-4, slow=known))
+    recent.begin([m for m in recent if m.stamp_ns >= anchor.stamp_ns])
+    online._rebuild("planted")  # noqa: SLF001
     feed(online, run, base[n:], fed)
     assert complaints(base, finish(online, fed)) == []
     assert max(fed.errors_m) > 100.0

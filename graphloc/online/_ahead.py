@@ -66,9 +66,9 @@ def ahead(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: in
     )
 
 
-def carry_on(odometry: Odometry, problem: LiveProblem, newest: Newest, before_ns: int, until_ns: int) -> None:
-    """Carry the odometry on, from the newest state (`before_ns`) or from where it is already, as the IMU says."""
-    links, bias = problem.links, newest.bias
+def carry_on(odometry: Odometry, problem: LiveProblem, newest: Newest, until_ns: int) -> None:
+    """Carry the odometry on, from the newest state or from where it is already, as the IMU says."""
+    links, bias, before_ns = problem.links, newest.bias, newest.stamp_ns
     if until_ns <= odometry.stamp_ns:
         return
     start = gtsam.NavState(newest.pose, newest.velocity)

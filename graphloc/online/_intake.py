@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from graphloc.hangs import WHY, HangWatch
-from graphloc.measurements import ImuSample
+from graphloc.measurements import ImuSample, ImuSeries
 
 _BACK = 50  # samples in a row before the newest: their clock was set back
 _LATE_S = 3.0  # of samples, before the start
@@ -37,6 +38,17 @@ class Taken:
     absurd: str = ""
     hangs: bool = False
     set_back_s: float = 0.0
+
+
+def series_of(samples: Sequence[ImuSample]) -> ImuSeries:
+    """Return samples of one IMU as a series."""
+    return ImuSeries(
+        sensor=samples[0].sensor if samples else "",
+        stamps_ns=np.array([m.stamp_ns for m in samples], dtype=np.int64),
+        accel_mps2=np.array([m.accel_mps2 for m in samples]).reshape(-1, 3),
+        gyro_radps=np.array([m.gyro_radps for m in samples]).reshape(-1, 3),
+        seqs=np.array([m.seq for m in samples], dtype=np.int64),
+    )
 
 
 class ImuIntake:

@@ -15,15 +15,16 @@ from typing import Any, Generic, TypeVar
 import gtsam
 import numpy as np
 
-from graphloc.build import Carry, Mounts, company_of, mount_of, state_of
+from graphloc.build import Carry, company_of, mount_of, state_of
 from graphloc.chi2 import chi2_median
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
-from graphloc.graph import Constant, InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.graph import Constant, InertialLink, Sensor, SlowProcess
 from graphloc.leaps import LeapWatch
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._habit import Habit
 from graphloc.online._parting import Parting
+from graphloc.online._setup import Setup
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
@@ -235,17 +236,10 @@ class LiveProblem:
 
 
 def live_problem(
-    config: VesselConfig,
-    datum: Datum,
-    imu: ImuSeries,
-    start_ns: int,
-    rows: Sequence[Sensor],
-    inertial: InertialRow,
-    mounts: Mounts,
-    noise_scale: float,
-    habit: Habit,
+    setup: Setup, datum: Datum, imu: ImuSeries, start_ns: int, noise_scale: float, habit: Habit
 ) -> LiveProblem:
     """Return a problem whose first state stands at `start_ns`; `imu`: the samples that are known from there on."""
+    config, rows, mounts = setup.config, setup.rows, setup.mounts
     sensor = config.sensors[imu.sensor]
     t, R = mount_of(imu.sensor, sensor, mounts)
     by_kind = {row.kind: row for row in rows}
@@ -271,7 +265,7 @@ def live_problem(
         timeline=LiveTimeline(config.timeline, start_ns),
         t_body_imu_m=t,
         R_body_imu=R,
-        links=inertial.link(imu, sensor, R, datum.gravity_mps2, noise_scale),
+        links=setup.inertial.link(imu, sensor, R, datum.gravity_mps2, noise_scale),
         streams=streams,
         habit=habit,
     )

@@ -16,13 +16,13 @@ import numpy as np
 
 from graphloc import keys, origin
 from graphloc.build import build_graph, company_of, make_problem, mount_of
-from graphloc.config import VesselConfig
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
-from graphloc.graph import Hint, InertialRow, Sensor
+from graphloc.graph import Hint
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
+from graphloc.online._setup import Setup
 from graphloc.recording import Recording
 from graphloc.solve._align import MOVED_M
 from graphloc.solve._batch import BatchResult, solve_batch
@@ -64,17 +64,9 @@ class Started:
     rows: tuple[LedgerRow, ...]
 
 
-def try_start(
-    config: VesselConfig,
-    rows: Sequence[Sensor],
-    inertial: InertialRow,
-    mounts: Mapping[str, tuple[Array, Array]],
-    imu: ImuSeries,
-    measurements: Sequence[Measurement],
-    datum: Datum | None,
-    lag_s: float,
-) -> Started | str:
-    """Return the start, or what it waits for."""
+def try_start(setup: Setup, imu: ImuSeries, measurements: Sequence[Measurement], datum: Datum | None) -> Started | str:
+    """Return the start, or what it waits for; `datum`: origin of world, None where it is to be chosen."""
+    config = setup.config
     span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 if len(imu) else 0.0
     if span_s < LEAST_S:
         return f"{LEAST_S:g} s of IMU data"
@@ -82,26 +74,26 @@ def try_start(
         source="(online)",
         imu=imu,
         measurements=tuple(sorted(measurements, key=lambda m: (m.stamp_ns, m.seq))),
-        mounts=mounts,
+        mounts=setup.mounts,
         topics={name: sensor.topic for name, sensor in config.sensors.items()},
     )
     if datum is None and config.datum is None and len(origin.fixes_of(recording)) < _FIXES:
         return f"{_FIXES} GNSS fixes to set the origin, as no `datum:` is configured"
     try:
-        datum = datum or origin.choose_datum(recording, config, rows)
+        datum = datum or origin.choose_datum(recording, config, setup.rows)
     except GraphlocError as error:
         return str(error)
-    if missing := _missing(config, rows, recording, datum):
+    if missing := _missing(setup, recording, datum):
         return missing
     try:
-        return _solved(config, rows, inertial, recording, datum, lag_s)
+        return _solved(setup, recording, datum)
     except SolveError as error:
         return f"data from which the start can be solved: {error}"
 
 
-def _missing(config: VesselConfig, rows: Sequence[Sensor], recording: Recording, datum: Datum) -> str:
+def _missing(setup: Setup, recording: Recording, datum: Datum) -> str:
     """What place or heading still wants; empty where both can be told."""
-    by_kind = {row.kind: row for row in rows}
+    config, by_kind = setup.config, {row.kind: row for row in setup.rows}
     hints: list[Hint] = []
     for m in recording.measurements:
         sensor = config.sensors[m.sensor]
@@ -120,16 +112,10 @@ def _missing(config: VesselConfig, rows: Sequence[Sensor], recording: Recording,
     return f"a heading: from a sensor, from `start.heading_deg`, or from {wanted_m:.0f} m of travel"
 
 
-def _solved(
-    config: VesselConfig,
-    rows: Sequence[Sensor],
-    inertial: InertialRow,
-    recording: Recording,
-    datum: Datum,
-    lag_s: float,
-) -> Started | str:
+def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
+    config, rows = setup.config, setup.rows
     whole = origin.with_synthetic(recording, config, datum, rows)
-    problem = make_problem(whole, config, datum, rows, inertial, company_of(config, rows))
+    problem = make_problem(whole, config, datum, rows, setup.inertial, company_of(config, rows))
     result = solve_batch(problem)
     span_s = (problem.timeline.stamps_ns[-1] - problem.timeline.stamps_ns[0]) * 1e-9
     if span_s < _CHOICE_WAIT_S:
@@ -154,7 +140,7 @@ def _solved(
         if row.synthetic is not None
         for name, sensor in config.of_kind(row.kind).items()
     }
-    k, anchor = _anchor(result, lag_s)
+    k, anchor = _anchor(result, setup.lag_s)
     before = [
         row_of(stream, m, stream.config.topic, result.verdicts[stream.number, i])
         for stream in result.problem.streams

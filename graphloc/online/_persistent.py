@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known beyond the sliding window: kept when the window is rebuilt, when the estimate restarts and, in part, in the snapshot."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+
+from graphloc.frames import Datum
+from graphloc.leaps import LeapWatch
+from graphloc.measurements import ImuSample
+from graphloc.online._anchor import Anchor
+from graphloc.online._habit import Habit
+from graphloc.online._noise import ImuNoise
+from graphloc.online._odometry import Odometry
+from graphloc.online._snapshot import Snapshot
+from graphloc.online._turned import Turned
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class PersistentState:
+    """State of the online mode outside the sliding window.
+
+    Attributes:
+        datum: origin of world; None before it is known.
+        noise: by how much the IMU noise is scaled up.
+        heights_m: configured heights (m, up in world), by the name of the sensor that measures them.
+        doubt: why the pose of this start cannot be called good; empty where it can.
+        agreed_ns: stamp at which each absolute sensor last agreed, as known when the last window ended.
+        odometry: the `odom` frame; None before the first start.
+        habit: motion model. turned: heading check.
+        leaping: detectors of position jumps, by sensor: a restart does not make a level right.
+        frozen: receivers that were last reported as frozen.
+    """
+
+    datum: Datum | None
+    noise: ImuNoise
+    heights_m: Mapping[str, float] = field(default_factory=dict)
+    doubt: str = ""
+    agreed_ns: dict[str, int] = field(default_factory=dict)
+    odometry: Odometry | None = None
+    habit: Habit = field(default_factory=Habit)
+    turned: Turned = field(default_factory=Turned)
+    leaping: dict[str, LeapWatch] = field(default_factory=dict)
+    frozen: set[str] = field(default_factory=set)
+
+    @classmethod
+    def resumed(cls, found: Snapshot, noise: ImuNoise, sensors: Collection[str]) -> PersistentState:
+        """Return what a snapshot holds.
+
+        Args:
+            noise: its scale is set to the snapshot's. sensors: names of the enabled ones.
+        """
+        noise.scale = found.noise_scale
+        return cls(
+            datum=found.datum,
+            noise=noise,
+            heights_m={name: height_m for name, height_m in found.heights_m.items() if name in sensors},
+            doubt=found.doubt,
+            agreed_ns=dict(found.agreed_ns),
+            odometry=Odometry(found.anchor.stamp_ns, found.p_odom_m, found.R_odom_body),
+        )
+
+    def snapshot(self, vessel: str, anchor: Anchor, imu: ImuSample, agreed_ns: Mapping[str, int]) -> Snapshot:
+        """Return what a run can resume from after its process was killed.
+
+        Args:
+            anchor: the newest state. imu: the sample at it or before. agreed_ns: as in the window.
+        """
+        assert self.datum is not None
+        assert self.odometry is not None
+        return Snapshot(
+            vessel=vessel,
+            anchor=anchor,
+            imu=imu,
+            datum=self.datum,
+            heights_m=self.heights_m,
+            agreed_ns={**self.agreed_ns, **agreed_ns},
+            noise_scale=self.noise.scale,
+            doubt=self.doubt,
+            p_odom_m=self.odometry.p_m,
+            R_odom_body=self.odometry.R,
+        )
+
+    def forget_clock(self, stamp_ns: int) -> None:
+        """Forget stamps of a clock that was set back; `stamp_ns`: by the clock as it is now."""
+        self.agreed_ns, self.leaping = {}, {}
+        if self.odometry is not None:
+            self.odometry.stamp_ns = stamp_ns

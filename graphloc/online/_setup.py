@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the online mode is set up with, and what follows from it: none of it changes with what is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from graphloc.config import ImuConfig, VesselConfig
+from graphloc.frames import Array
+from graphloc.graph import InertialRow, Sensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Setup:
+    """The vessel, its sensors, and the length of the window.
+
+    Attributes:
+        config: the vessel, its surveys read. rows, inertial: the table of sensors.
+        mounts: body -> sensor (t (3,), m; R (3, 3)) of sensors whose mount is not the configuration's (/tf_static).
+        lag_s: length of the sliding window.
+    """
+
+    config: VesselConfig
+    rows: tuple[Sensor, ...]
+    inertial: InertialRow
+    mounts: Mapping[str, tuple[Array, Array]]
+    lag_s: float
+
+    @cached_property
+    def imu_name(self) -> str:
+        """Name of the IMU; empty where none is enabled."""
+        return next(iter(self.config.of_kind(self.inertial.kind)), "")
+
+    @cached_property
+    def imu(self) -> ImuConfig | None:
+        """Configuration of the IMU; None where none is enabled."""
+        found = self.config.sensors.get(self.imu_name)
+        return found if isinstance(found, ImuConfig) else None
+
+    @cached_property
+    def bridge_s(self) -> float:
+        """The longest IMU gap that is bridged; after a longer one the estimate restarts."""
+        return 0.0 if self.imu is None else self.imu.max_bridge_s
+
+    @cached_property
+    def gap_s(self) -> float:
+        """The longest step between IMU samples that is no gap."""
+        return 0.0 if self.imu is None else self.imu.max_gap_s
+
+    @cached_property
+    def measuring(self) -> frozenset[str]:
+        """Names of the enabled sensors, the IMU not among them."""
+        kinds = {row.kind for row in self.rows}
+        return frozenset(name for name, s in self.config.sensors.items() if s.enabled and s.kind in kinds)
+
+    @cached_property
+    def absolute(self) -> tuple[str, ...]:
+        """Names of the enabled sensors that measure position in world."""
+        return tuple(n for row in self.rows if row.absolute for n in self.config.of_kind(row.kind))
+
+    def without_start_heading(self) -> Setup:
+        """Return the same for a later start: the configured heading is that of the first start alone."""
+        start = self.config.start.model_copy(update={"heading_deg": None})
+        return replace(self, config=self.config.model_copy(update={"start": start}))

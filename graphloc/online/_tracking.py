@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An estimate that is underway: the sliding window follows the IMU, and is rebuilt from an earlier state where it fails."""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections import deque
+from collections.abc import Iterable, Sequence
+
+import gtsam
+import numpy as np
+
+from graphloc.errors import SolveError, in_one_line
+from graphloc.estimate import Estimate
+from graphloc.frames import Array
+from graphloc.ledger import Outcome
+from graphloc.measurements import ImuSample, Measurement
+from graphloc.online._ahead import ahead, carry_on, no_further
+from graphloc.online._anchor import Anchor
+from graphloc.online._book import Book
+from graphloc.online._estimates import estimate_of
+from graphloc.online._intake import series_of
+from graphloc.online._lag import Lag
+from graphloc.online._live import live_problem
+from graphloc.online._odometry import Odometry
+from graphloc.online._persistent import PersistentState
+from graphloc.online._recent import Recent
+from graphloc.online._setup import Setup
+from graphloc.online._snapshot import Snapshot
+from graphloc.time import duration_ns
+from graphloc.trajectory import Trajectory
+
+_AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
+_PENDING = 10_000
+
+
+class Tracking:
+    """The window of one start, what waits to enter it, and what it can be rebuilt from.
+
+    Args:
+        persistent: state outside the window, updated as the window moves on. book: where measurements get their rows.
+        anchor: the state that the window begins at. samples: of the IMU, from there or before to the newest.
+        guess: pose, velocity (3,) and bias (6,) that this state is first solved at; default: the anchor's.
+
+    Attributes:
+        lag: the window; another object after a rebuild.
+
+    Raises:
+        SolveError: the window cannot be built.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        persistent: PersistentState,
+        book: Book,
+        anchor: Anchor,
+        samples: Sequence[ImuSample],
+        guess: tuple[gtsam.Pose3, Array, Array] | None = None,
+    ) -> None:
+        self._setup, self._persistent, self._book = setup, persistent, book
+        self._pending: list[Measurement] = []  # ahead of the IMU, by stamp
+        self._unread: list[ImuSample] = []  # not yet handed to the window
+        self._holes: list[tuple[int, int]] = []  # stamps (ns) between which samples came late
+        self._height_due_ns: dict[str, int] = {}  # of the next configured height, by sensor
+        self._recent = Recent()
+        self.lag = self._built(anchor, samples, guess)
+        if persistent.odometry is None:
+            pose = self.lag.newest.pose
+            place = np.asarray(pose.transformFrom(-self.lag.problem.t_body_imu_m))
+            persistent.odometry = Odometry(anchor.stamp_ns, place, pose.rotation().matrix())
+        self._odometry = persistent.odometry
+
+    def _built(
+        self,
+        anchor: Anchor,
+        samples: Sequence[ImuSample],
+        guess: tuple[gtsam.Pose3, Array, Array] | None = None,
+        before: Lag | None = None,
+    ) -> Lag:
+        """Return a window that begins at an anchor; `before`: the one that it replaces."""
+        setup, persistent = self._setup, self._persistent
+        since_ns = anchor.stamp_ns - 2 * duration_ns(setup.gap_s)
+        known = [m for m in samples if m.stamp_ns >= since_ns] or samples[-1:]
+        assert persistent.datum is not None
+        problem = live_problem(
+            setup, persistent.datum, series_of(known), anchor.stamp_ns, persistent.noise.scale, persistent.habit
+        )
+        for name, stream in problem.streams.items():
+            if before is not None:
+                stream.scatter = before.problem.streams[name].scatter
+            stream.leaping = persistent.leaping.setdefault(name, stream.leaping)
+        lag = Lag(problem, anchor, setup.lag_s, guess)
+        if before is not None:
+            lag.agreed_ns.update(before.agreed_ns)
+        self._book.begin()
+        self._height_due_ns = {}
+        return lag
+
+    # What arrives
+
+    def keep(self, m: Measurement) -> None:
+        """Keep a measurement of the window until the IMU has reached its stamp."""
+        insort(self._pending, m, key=lambda p: p.stamp_ns)
+        self._recent.keep(m)
+        if len(self._pending) > _PENDING:
+            self._book.drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
+
+    def keep_imu(self, m: ImuSample, hole: tuple[int, int] | None = None) -> None:
+        """Keep an IMU sample; `hole`: of one that came late, the stamps (ns) of the samples before and after it."""
+        if hole is not None:
+            self._holes.append(hole)
+        self._unread.append(m)
+        self._recent.keep(m)
+        self._book.used(m)
+
+    # The window moves on
+
+    def due(self, until_ns: int) -> bool:
+        """Whether the next state lies at or before a stamp."""
+        return self.lag.problem.timeline.due_ns <= until_ns
+
+    def catch_up(self, samples: Sequence[ImuSample], others: Sequence[Measurement], until_ns: int) -> None:
+        """Bring a window that has just begun to a stamp, with the measurements that the start was made of."""
+        self._pending = [m for m in others if not self._book.has(m)]
+        while self._pending and self._pending[0].stamp_ns < self.lag.first_ns:
+            self._book.drop(self._pending.pop(0), Outcome.REJECTED, "no IMU data at this stamp")
+        self._recent.begin([*samples, *self._pending])
+        self._extend(until_ns)
+
+    def resume(self, anchor: Anchor, before: ImuSample, newest: ImuSample) -> None:
+        """Go on from a snapshot: its anchor, the sample at it or before, and the first sample since."""
+        self._recent.resume(anchor, before, newest)
+        self._book.used(newest)
+
+    def advance(self, until_ns: int) -> None:
+        """Make the states that are due up to a stamp, with the measurements that belong to them: an update."""
+        self._odometry.begin()
+        self._extend(until_ns)
+
+    def _extend(self, until_ns: int) -> None:
+        self._read_imu()
+        lag, timeline = self.lag, self.lag.problem.timeline
+        while timeline.due_ns <= until_ns:
+            self._grow(until_ns)
+            reached_ns = timeline.stamps_ns[timeline.last]
+            self._take_pending(reached_ns)
+            lag.judge()
+            carry_on(self._odometry, lag.problem, lag.newest, reached_ns)
+            lag.commit()
+            lag.try_others()
+        self._book.enter(lag.gone())
+
+    def _read_imu(self) -> None:
+        """Hand the samples that have arrived to the window; where they came late, integrate anew."""
+        if self._unread:
+            stamps = np.array([m.stamp_ns for m in self._unread], dtype=np.int64)
+            readings = np.array([np.hstack([m.accel_mps2, m.gyro_radps]) for m in self._unread])
+            self.lag.problem.links.extend(stamps, readings)
+            self._unread = []
+        if self._holes:
+            holes, self._holes = self._holes, []
+            self.lag.mend(holes)
+
+    def _grow(self, until_ns: int) -> None:
+        """Stage the next states: as many as one commit takes."""
+        timeline, made, closed = self.lag.problem.timeline, 0, False
+        while timeline.due_ns <= until_ns and made < _AT_ONCE and not closed:
+            closed = self.lag.grow(timeline.due_ns)
+            made += 1
+            self._take_heights()
+
+    def _take_heights(self) -> None:
+        """Take the configured heights that are due at the newest state."""
+        timeline = self.lag.problem.timeline
+        at_ns = timeline.stamps_ns[timeline.last]
+        for name, height_m in self._persistent.heights_m.items():
+            stream = self.lag.problem.streams[name]
+            if stream.row.synthetic is None or at_ns < self._height_due_ns.get(name, at_ns):
+                continue
+            for m in stream.row.synthetic(name, stream.config, (at_ns, at_ns + 1), height_m):
+                self.lag.take(m)
+            self._height_due_ns[name] = at_ns + duration_ns(getattr(stream.config, "period_s", 1.0))
+
+    def _take_pending(self, reached_ns: int) -> None:
+        """Take the measurements whose stamps the states have reached."""
+        while self._pending and self._pending[0].stamp_ns <= reached_ns:
+            m = self._pending.pop(0)
+            if m.stamp_ns < self.lag.first_ns:
+                self._book.drop(m, Outcome.LATE, "left the lag while it waited")
+                continue
+            try:
+                self.lag.take(m)
+                self._persistent.turned.note(m, self.lag)
+            except Exception as error:  # noqa: BLE001 - the others are still good; nothing of this one is staged yet
+                self._book.drop(m, Outcome.REJECTED, f"it could not be used: {in_one_line(error)}")
+
+    def keep_anchor(self) -> bool:
+        """Remember the newest state as an anchor, if that is due, and forget what no rebuild needs; tell whether it was due."""
+        if not self._recent.keep_anchor(self.lag):
+            return False
+        self._book.forget_but({m.seq for m in self._recent})
+        return True
+
+    # What is known
+
+    def estimate(self, stamp_ns: int | None = None) -> Estimate:
+        """Return the newest state, or its propagation by the IMU to a later stamp (ns)."""
+        lag, persistent, newest = self.lag, self._persistent, self.lag.newest
+        now = no_further(newest, self._odometry)
+        if stamp_ns is not None and stamp_ns > newest.stamp_ns:
+            self._read_imu()
+            now = ahead(lag.problem, newest, self._odometry, stamp_ns)
+        doubts = (persistent.turned.said, persistent.doubt, lag.in_doubt(now.stamp_ns))
+        return estimate_of(
+            now,
+            lag,
+            self._odometry,
+            agreed_ns={**persistent.agreed_ns, **lag.agreed_ns},
+            absolute=self._setup.absolute,
+            doubt="; ".join(doubt for doubt in doubts if doubt),
+        )
+
+    def trajectory(self, now: Estimate) -> Trajectory:
+        """Return the states of the window, and `now` where it is newer; the covariance at all of them is that of `now`."""
+        stamps, p, R, v = self.lag.track()
+        if now.stamp_ns > stamps[-1]:
+            stamps, p = np.append(stamps, now.stamp_ns), np.vstack([p, now.p_world_m])
+            R, v = np.concatenate([R, now.R_world_body[None]]), np.vstack([v, now.v_world_mps])
+        cov = np.broadcast_to(now.cov, (len(stamps), 6, 6))
+        return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v, cov=cov)
+
+    def news(self) -> list[str]:
+        """Return a line on what the newest state newly shows: a wrong heading, frozen receivers, position jumps."""
+        turned = self._persistent.turned
+        wrong_heading = [turned.said] if turned.look(self.lag) else []
+        was, now = self._persistent.frozen, self.lag.parted
+        self._persistent.frozen = now
+        frozen = [f"{name}: {_FROZEN if name in now else _NO_LONGER_FROZEN}" for name in sorted(now ^ was)]
+        return [*wrong_heading, *frozen, *self.lag.leapt()]
+
+    def snapshot(self, newest: ImuSample) -> Snapshot:
+        """Return the last anchor and all that is needed to go on from it; `newest`: sample of the IMU."""
+        anchor = self._recent.anchors[-1]
+        sample = self._recent.sample_at(anchor) or newest
+        return self._persistent.snapshot(self._setup.config.vessel, anchor, sample, self.lag.agreed_ns)
+
+    # Rebuild, end
+
+    def rebuild(self, why: str, until_ns: int) -> str:
+        """Build the window anew: with all that is in it, or, if that fails too, from the last anchor without what came since.
+
+        Args:
+            why: what failed. until_ns: stamp of the newest IMU sample.
+
+        Returns:
+            What has happened, in one line.
+
+        Raises:
+            SolveError: neither could be solved; the window is the one that failed.
+        """
+        failed, recent, book = self.lag, self._recent, self._book
+        book.enter(failed.gone())
+        anchors = [a for a in recent.anchors if a.stamp_ns >= failed.first_ns]
+        for anchor, without in [(anchors[0], False), (anchors[-1], True)] if anchors else []:
+            again = [m for m in recent.others() if m.stamp_ns >= anchor.stamp_ns and not book.has(m)]
+            again.sort(key=lambda m: m.stamp_ns)
+            mark = book.marked()
+            try:
+                self._rebuild_from(anchor, [] if without else again, until_ns)
+            except Exception as error:  # noqa: BLE001 - whatever failed, an older state may do
+                why = failure_text(error)
+                book.back_to(mark)
+                continue
+            if without:
+                for m in again:
+                    book.drop(m, Outcome.REJECTED, f"left out: {why}")
+                recent.anchors = deque([anchor])
+            self._settle_rows(failed, again)
+            age_s = (self.lag.newest.stamp_ns - anchor.stamp_ns) * 1e-9
+            return f"{why}: the window was rebuilt from {age_s:.1f} s before"
+        held = {row.seq for row in failed.held()}
+        self.lag, self._pending = failed, [m for m in recent.others() if not book.has(m) and m.seq not in held]
+        raise SolveError(f"{why}, and the window could not be rebuilt from an earlier state")
+
+    def _rebuild_from(self, anchor: Anchor, measurements: Sequence[Measurement], until_ns: int) -> None:
+        self._unread, self._holes, self._pending = [], [], list(measurements)
+        self.lag = self._built(anchor, self._recent.samples(), before=self.lag)
+        self._extend(until_ns)
+        self.lag.settle()
+
+    def end(self, reason: str) -> None:
+        """Give every measurement its row; `reason`: of those that the states have not reached."""
+        self._book.enter([*self.lag.gone(), *self.lag.held()])
+        for m in self._pending:
+            self._book.drop(m, Outcome.REJECTED, reason)
+
+    def end_but(self, since_ns: int) -> list[Measurement]:
+        """Give every measurement its row, but those since a stamp (ns), which are returned to start anew with."""
+        self._book.enter(self.lag.gone())
+        again = [m for m in self._recent if m.stamp_ns >= since_ns and not self._book.has(m)]
+        self._settle_rows(self.lag, again)
+        return again
+
+    def _settle_rows(self, replaced: Lag, again: Iterable[Measurement]) -> None:
+        """Give the measurements of a window that was replaced their rows, but for what is used again."""
+        used_again = {m.seq for m in again}
+        self._book.enter([row for row in replaced.held() if row.seq not in used_again])
+        for m in self._recent.others():
+            if not self._book.has(m) and m.seq not in used_again:
+                self._book.drop(m, Outcome.LATE, "older than the oldest state of the rebuilt window")
+
+
+_FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
+_NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
+
+
+def failure_text(error: Exception) -> str:
+    """Return what failed, in one line."""
+    said = in_one_line(error)
+    return said if isinstance(error, SolveError) else f"the solver failed ({said})"
