@@ -15,6 +15,7 @@ from _rows import ROOT, Row, row
 from smoothing import HUSKY
 
 from graphloc import app
+from graphloc.ablations import ablate
 from graphloc.drills import drill
 from graphloc.eval.ablation_page import grids as ablation_grids
 from graphloc.eval.ablation_page import said as ablation_said
@@ -23,7 +24,6 @@ from graphloc.eval.drill.measure import Drilled, State, summed
 from graphloc.eval.page import Grid
 from graphloc.eval.plots import colour_of
 from graphloc.eval.simulate import SimulatedRun, harbour_scenarios, simulate
-from graphloc.whatif import ablate
 
 DOC, PICTURES = ROOT / "docs/drills.md", ROOT / "docs/pictures"
 SEED, TIMES = 1, 2

@@ -21,8 +21,8 @@ from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, 
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
 from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE, QUATERNION, yaw_of_x_axis
+from graphloc.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.measurements import GnssPosition, world_from_fixes
-from graphloc.stuck import stuck, stuck_warning
 from graphloc.time import NS_PER_S
 
 _TURNS_DEG, _SAME_DEG = 5.0, 0.2
@@ -200,7 +200,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
     status, counts = np.unique(fixes.rows[:, 3].astype(int), return_counts=True)
     known = (rows[:, 4] > 0) & np.isfinite(rows[:, 5:8]).all(axis=1) & (rows[:, 5:8] > 0.0).all(axis=1)
     sigma = np.sqrt(np.median(rows[known, 5:8], axis=0)) if known.any() else None
-    bad = stuck(stamps, rows[:, :2], p[:, :2])
+    bad = frozen_fixes(stamps, rows[:, :2], p[:, :2])
     own = p[~bad]
     scatter = _scatter(own) if len(own) > 10 else None
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
@@ -225,7 +225,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         without_height=int(np.isnan(fixes.rows[np.isfinite(fixes.rows[:, :2]).all(axis=1), 2]).sum()),
         white_m=scatter_m(stamps[~bad], own[:, :2]),
         spans_s=float(stamps[-1] - stamps[0]) / NS_PER_S,
-        hangs="".join(stuck_warning(fixes.topic, stamps, bad)),
+        frozen="".join(frozen_fixes_warning(fixes.topic, stamps, bad)),
         slow_error=not precise,
         why=why,
         tf_frame=tf_frame,

@@ -18,7 +18,7 @@ from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, without_gravity
 from graphloc.frontends._streams import Stream
 from graphloc.frontends._tf import StaticTree
-from graphloc.hangs import hanging, hanging_warning
+from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
 from graphloc.time import NS_PER_S
 
 # Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
@@ -31,8 +31,8 @@ _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, o
 def samples_of(imu: Stream) -> tuple[NDArray[np.intp], list[str]]:
     """Return which messages are samples, in order of stamps, and a line where others only repeat one that hangs."""
     keep = sane(imu)
-    bad = hanging(imu.stamps_ns[keep], imu.rows[keep, :6] if len(keep) else np.zeros((0, 6)))
-    return keep[~bad], hanging_warning(imu.topic, imu.stamps_ns[keep], bad)
+    bad = frozen_samples(imu.stamps_ns[keep], imu.rows[keep, :6] if len(keep) else np.zeros((0, 6)))
+    return keep[~bad], frozen_imu_warning(imu.topic, imu.stamps_ns[keep], bad)
 
 
 def mount_guess(
@@ -198,7 +198,7 @@ def imu_report(
     imu: Stream, motions: Sequence[Motion], courses: Courses | None, tree: StaticTree, body: str
 ) -> ImuReport | None:
     """Return units, gravity, standstill, noise and mount of an IMU."""
-    keep, hangs = samples_of(imu)
+    keep, frozen = samples_of(imu)
     rows = imu.rows[keep] if len(keep) else np.zeros((0, 13))
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(rows[:, :6]).all(axis=1))
     if finite.sum() < 20:
@@ -207,7 +207,7 @@ def imu_report(
     accel, gyro = np.where(finite[:, None], rows[:, :3], 0.0), np.where(finite[:, None], rows[:, 3:6], 0.0)
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     rate = float(np.median(np.linalg.norm(gyro, axis=1)))
-    why = hangs
+    why = frozen
     missing = missing_half(accel, gyro)
     if missing:
         why.append(f"all its {missing} are 0: {HALF}")

@@ -25,7 +25,7 @@ from graphloc.frontends._beside import Beside
 from graphloc.frontends._rejections import Rejection, rejected
 from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.decode import Decoded, ImuSample
-from graphloc.hangs import WHY, hanging, hanging_warning
+from graphloc.frozen_imu import WHY, frozen_imu_warning, frozen_samples
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
 from graphloc.time import NS_PER_S, utc_text
@@ -196,8 +196,8 @@ def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     """Drop samples that a driver which hangs only repeats: the solver bridges them as it does a gap."""
     stamps = readings.stamps()
     samples = np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)])
-    bad = hanging(stamps, samples.reshape(-1, 6))  # of none: (0,)
-    warnings += hanging_warning(readings.sensor, stamps, bad)
+    bad = frozen_samples(stamps, samples.reshape(-1, 6))  # of none: (0,)
+    warnings += frozen_imu_warning(readings.sensor, stamps, bad)
     return readings.drop(bad, rejected(WHY))
 
 

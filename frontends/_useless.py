@@ -39,8 +39,8 @@ def _why_useless(stream: Stream) -> str:
     rows = stream.rows[sane(stream)] if len(stream) else np.zeros((0, 8))
     if stream.msgtype == IMU and len(rows) and not rows[:, :6].any():
         return "they hold neither accelerations nor rates, an orientation at most"
-    if stream.msgtype == IMU and len(rows) and (hangs := samples_of(stream)[1]):
-        return hangs[0].removeprefix(f"{stream.topic}: ")
+    if stream.msgtype == IMU and len(rows) and (frozen := samples_of(stream)[1]):
+        return frozen[0].removeprefix(f"{stream.topic}: ")
     counts = {
         "cannot be decoded": stream.undecodable,
         "have no stamp": stream.no_stamp,

@@ -66,8 +66,8 @@ from graphloc.frontends.decode import (
 )
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, info_beside
+from graphloc.frozen_receiver import frozen_fixes
 from graphloc.measurements import CompassHeading, ImuSeries
-from graphloc.stuck import stuck
 from graphloc.time import NS_PER_S, utc_text
 
 __all__ = [
@@ -175,7 +175,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         body_frame=body,
         warnings=(
             *warnings,
-            *(g.hangs for g in found_gnss if g.hangs),
+            *(g.frozen for g in found_gnss if g.frozen),
             *useless(streams, used),
             *_lacking(found_imus, found_gnss, [report for _, report in told], bool(clouds or images), topics, by_topic),
         ),
@@ -307,7 +307,7 @@ def _best_track(
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None
     best = gnss[0]
     stamps, p, rows = track(by_topic[best.topic])
-    good = ~stuck(stamps, rows[:, :2], p[:, :2])
+    good = ~frozen_fixes(stamps, rows[:, :2], p[:, :2])
     return stamps[good], p[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from graphloc import app
+from graphloc.ablations import _Job, _smoothed, ablate
 from graphloc.errors import SolveError
 from graphloc.eval import ablation_page as page
 from graphloc.eval.ablation import Ablated, Effect, Off, Vote, suspects
@@ -26,7 +27,6 @@ from graphloc.frames import Array
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix, PoseMode
 from graphloc.solution import Solution
-from graphloc.whatif import _Job, _smoothed, ablate
 
 OFF_DEG = 12.0
 

@@ -81,14 +81,14 @@ def test_a_fix_or_two_are_no_steady_distance(run: SimulatedRun) -> None:
     assert len(said(run, np.tile([8.0, 0.0], (60, 1)))) == 1
 
 
-def test_a_height_above_the_geoid_beside_one_above_the_ellipsoid_is_said(run: SimulatedRun) -> None:
+def test_a_height_above_the_geoid_beside_one_above_the_ellipsoid_is_reported(run: SimulatedRun) -> None:
     (line,) = said(run, np.zeros((60, 2)), up_m=-36.0)
     assert "gnss has a constant offset of 36.0 m (down) from height" in line  # matches tell none
     assert "geoid" in line
     assert said(run, np.zeros((60, 2)), up_m=12.0) == []  # its slow error in height is 5 m, 1 sigma
 
 
-def test_poses_all_off_by_five_metres_are_said(run: SimulatedRun) -> None:
+def test_poses_all_off_by_five_metres_are_reported(run: SimulatedRun) -> None:
     """3 m east and 4 m north: the receiver is said to stand 5 m off the other way, west and south."""
     moved: list[Measurement] = []
     for m in run.recording.measurements:

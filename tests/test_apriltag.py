@@ -610,7 +610,7 @@ def test_a_sighting_says_what_it_is() -> None:
     assert ROW.describe(two) == "bow: tags 7 9 (world)"
 
 
-def test_false_is_wider_than_any_mode_and_as_rare_as_it_is_said_to_be() -> None:
+def test_false_is_wider_than_any_mode_and_as_rare_as_it_is_reported_to_be() -> None:
     m = sighting(vessel(20.0, 10.0))
     assert ROW.false is not None
     model = ROW.false(m, FIXED.model_copy(update={"false_fraction": 0.1, "false_repeats": 0.5}))

@@ -11,9 +11,9 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 VOCABULARY = {
-    "errors", "time", "chi2", "gauss", "frames", "measurements", "ledger", "trajectory", "config", "recording", "offsets", "solution", "estimate", "plain", "blocks", "hangs", "stuck", "leaps", "survey", "berths", "extras", "_config_docs",
+    "errors", "time", "chi2", "gauss", "frames", "measurements", "ledger", "trajectory", "config", "recording", "offsets", "solution", "estimate", "plain", "blocks", "frozen_imu", "frozen_receiver", "position_jumps", "survey", "berths", "extras", "_config_docs",
 }  # fmt: skip
-DOOR = {"__main__", "app", "cli", "drills", "found_tags", "gather", "replay", "stream", "job", "sweep", "whatif"}
+DOOR = {"__main__", "app", "cli", "drills", "found_tags", "gather", "replay", "stream", "job", "sweep", "ablations"}
 GRAPH = {"graph", "linear", "keys", "timeline", "build", "solve", "online", "origin", "outputs"}
 _AT_THE_DOOR = {f"graphloc.{name}" for name in ("app", "cli", "gather", "replay", "stream", "job", "sweep")}
 FORBIDDEN = {
@@ -21,7 +21,7 @@ FORBIDDEN = {
     "graph": {"graphloc.factors", "graphloc.frontends", "graphloc.eval"},
     "factors": {"graphloc.frontends", "graphloc.eval", "graphloc.solve", *_AT_THE_DOOR},
     "frontends": {"graphloc.factors", "graphloc.eval", "graphloc.solve", "gtsam", *_AT_THE_DOOR},
-    "eval": {"graphloc.drills", "graphloc.whatif", *_AT_THE_DOOR},
+    "eval": {"graphloc.drills", "graphloc.ablations", *_AT_THE_DOOR},
     "door": set(),
 }
 

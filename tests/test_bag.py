@@ -140,7 +140,7 @@ def test_split_ros1_bags(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
-def test_files_that_metadata_does_not_name_are_said(tmp_path: Path, kind: str) -> None:
+def test_files_that_metadata_does_not_name_are_reported(tmp_path: Path, kind: str) -> None:
     """Half of a run was left out without a word."""
     make = Messages(2)
     folder = write_bag(tmp_path / "run", make, still_run(make), kind)

@@ -313,7 +313,7 @@ def test_no_fix_is_no_fix(tmp_path: Path) -> None:
     assert [r.outcome for r in rows_of(recording, "gnss")] == [Outcome.REJECTED] * 4
 
 
-def test_a_sensor_that_gives_nothing_is_said(tmp_path: Path) -> None:
+def test_a_sensor_that_gives_nothing_is_reported(tmp_path: Path) -> None:
     items = [("/fix", START_NS + k * S, MAKE.fix(START_NS + k * S, status=-1)) for k in range(5)]
     recording = read(tmp_path, items, imu=None)
     assert any("gnss: none of the 5 messages on /fix" in w and "NO_FIX" in w for w in recording.warnings)
@@ -463,7 +463,7 @@ def test_the_computer_clock_is_set_during_the_run(tmp_path: Path) -> None:
     assert any("imu: 100 messages rejected" in w for w in recording.warnings)
 
 
-def test_a_sensor_in_another_epoch_is_said_and_not_fixed(tmp_path: Path) -> None:
+def test_a_sensor_in_another_epoch_is_reported_and_not_fixed(tmp_path: Path) -> None:
     """GPS time without leap seconds: 18 s ahead of UTC."""
     items = []
     for topic, log_ns, msg in still_run(MAKE):

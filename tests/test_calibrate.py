@@ -292,7 +292,7 @@ def test_it_is_written_and_shown(right: app.Run, tmp_path: Path) -> None:
     assert told["checks"][0]["sigma"] == 0.02
 
 
-def test_a_clock_years_away_is_said_to_milliseconds() -> None:
+def test_a_clock_years_away_is_reported_to_milliseconds() -> None:
     """It read '-1.75e+09 s instead of -1.75e+09'."""
     clock = Suggestion(
         sensor="compass", key="time_offset_s", unit="s", configured=-1749999862.753, suggested=-1749999862.8016, sigma=0.00923,

@@ -248,7 +248,7 @@ def test_locked_out_and_unsure_are_told_apart() -> None:
     assert flicker.state is State.LOST
 
 
-def test_an_estimator_that_gives_nothing_is_said() -> None:
+def test_an_estimator_that_gives_nothing_is_reported() -> None:
     window, truth = Window(begin_ns=0, end_ns=100 * S, whole=True), straight(100.0, lambda t: 0.0 * t)
     failure = Failure(name="f", family="f", length_s=10.0, strike=lambda *_: pytest.fail("not struck"))
     nothing = compared(None, truth, window, sure=True)

@@ -81,7 +81,7 @@ def test_fixes_that_move_or_stand_are_kept(every: int, tmp_path: Path) -> None:
     assert recording.warnings == ()
 
 
-def test_a_few_places_said_twice_are_no_habit(tmp_path: Path) -> None:
+def test_a_few_repeated_positions_are_no_pattern(tmp_path: Path) -> None:
     items = fixes(10)
     for k in range(20, 400, 40):
         items[k][2].latitude, items[k][2].longitude = items[k - 1][2].latitude, items[k - 1][2].longitude
@@ -89,7 +89,7 @@ def test_a_few_places_said_twice_are_no_habit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("step_ns", "said"), [(1, 0), (S // 10, 0), (S, 1)])
-def test_stamps_cut_to_seconds_are_said(step_ns: int, said: int, tmp_path: Path) -> None:
+def test_stamps_cut_to_seconds_are_reported(step_ns: int, said: int, tmp_path: Path) -> None:
     warnings = read(tmp_path, fixes(10, step_ns=step_ns)).warnings
     assert len(warnings) == said
     assert all("400 measurements have 40 stamps, 1 s apart" in line for line in warnings)
@@ -167,7 +167,7 @@ def test_rtk_that_claims_nothing_is_drafted_as_it_scatters(
 
 
 @pytest.mark.parametrize(("hz", "sigma_m", "said"), [(10, 1e4, 1), (2, 1e4, 1), (10, 20.0, 0)])
-def test_fixes_that_claim_to_tell_nothing_are_said(hz: int, sigma_m: float, said: int, tmp_path: Path) -> None:
+def test_fixes_that_claim_to_tell_nothing_are_reported(hz: int, sigma_m: float, said: int, tmp_path: Path) -> None:
     """A driver that writes 1e8 m^2: the track was 100 m off its fixes, and its bounds km, without a word."""
     lines = read(tmp_path, fixes(hz, noise_m=0.2, sigma_m=sigma_m, seconds=60)).warnings
     assert len(lines) == said

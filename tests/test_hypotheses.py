@@ -157,7 +157,7 @@ def test_false_matches_that_repeat_do_not_bend_the_track(noise: Any, seed: int, 
     assert compare_to_truth(app.simulated(run).solution.trajectory, run.truth).position_rmse_m < 0.2, why
 
 
-def test_matches_that_are_refused_together_are_said() -> None:
+def test_matches_that_are_refused_together_are_reported() -> None:
     """For 20 s all say 15 m beside: so many are not false by chance. Usual ones, 40 % of them, are not said."""
     run = simulate(replace(bl_scenario(1, "clean"), duration_s=70.0), 3)
     begin_ns = int(run.truth.stamps_ns[0]) + 30_000_000_000

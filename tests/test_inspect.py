@@ -497,7 +497,9 @@ def test_sensors_on_other_clocks_are_judged_by_each_other(topic: str, behind_s: 
 
 
 @pytest.mark.parametrize(("moves", "usable"), [(True, True), (False, False)])
-def test_a_heading_receiver_that_says_an_imu_does_not_hang(moves: bool, usable: bool, tmp_path: Path) -> None:
+def test_a_heading_receiver_that_publishes_an_imu_message_is_not_frozen(
+    moves: bool, usable: bool, tmp_path: Path
+) -> None:
     """Two antennas: their driver fills the orientation of an Imu alone. It was a compass, and nothing of it could be used."""
     make = Messages(2)
     items: list[Item] = []
@@ -517,7 +519,7 @@ def test_a_heading_receiver_that_says_an_imu_does_not_hang(moves: bool, usable: 
 
 
 @pytest.mark.parametrize(("status", "said"), [(-1, "say 'no fix'"), (0, "lie at 0, 0")])
-def test_topics_that_give_nothing_are_said(status: int, said: str, tmp_path: Path) -> None:
+def test_topics_that_give_nothing_are_reported(status: int, said: str, tmp_path: Path) -> None:
     make = Messages(2)
     items: list[Item] = [
         ("/fix", START_NS + k * S, make.fix(START_NS + k * S, 0.0, 0.0, status=status)) for k in range(20)
@@ -547,7 +549,7 @@ def test_a_bag_that_no_sensor_can_be_made_of_is_refused(
     assert "/fix: nothing of its 30 messages can be used: 30 have no stamp" in line
 
 
-def test_a_receiver_without_a_message_and_damaged_transforms_are_said(tmp_path: Path) -> None:
+def test_a_receiver_without_a_message_and_damaged_transforms_are_reported(tmp_path: Path) -> None:
     make = Messages(2)
     with Writer(tmp_path / "run", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         writer.add_connection("/fix", make.fix(START_NS).__msgtype__, typestore=make.store)

@@ -78,7 +78,7 @@ def test_an_imu_that_sits_askew_is_not_taken_for_straight(tmp_path: Path) -> Non
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 40.0), abs=2.0)
 
 
-def test_a_mount_in_tf_static_that_the_motion_denies_is_said(tmp_path: Path) -> None:
+def test_a_mount_in_tf_static_that_the_motion_denies_is_reported(tmp_path: Path) -> None:
     make = Messages(2)
     transforms = make.transforms([("base_link", "imu_link", (0, 0, 0), (0, 0, 0, 1))])
     items = [("/tf_static", START_NS, transforms), *drive(make, rotation_z(90.0))]
@@ -88,7 +88,7 @@ def test_a_mount_in_tf_static_that_the_motion_denies_is_said(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 90.0])
-def test_a_mount_that_the_fixes_deny_is_said_when_a_bag_is_read(turned_deg: float, tmp_path: Path) -> None:
+def test_a_mount_that_the_fixes_deny_is_reported_when_a_bag_is_read(turned_deg: float, tmp_path: Path) -> None:
     """A compass that tells the right heading leaves the course right: nothing else was said, and the track was metres off."""
     make = Messages(2)
     path = write_bag(tmp_path / "run", make, drive(make, rotation_z(90.0 + turned_deg), status=0, sigma_m=1.0))
@@ -194,7 +194,7 @@ def test_odometry_in_east_and_north_is_no_speed_along_the_craft(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(("noise_deg", "both"), [(0.0, False), (1.0, True)], ids=["the same", "another device"])
-def test_a_heading_that_is_said_twice_counts_once(noise_deg: float, both: bool, tmp_path: Path) -> None:
+def test_a_heading_that_is_reported_twice_counts_once(noise_deg: float, both: bool, tmp_path: Path) -> None:
     """MAVROS says its heading in `imu/data` and, clockwise from north and without a stamp, in `compass_hdg`."""
     rng = np.random.default_rng(1)
 
@@ -272,7 +272,7 @@ def test_rtk_is_taken_before_a_receiver_that_says_more(lasts_s: float, used: str
     assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == [used]
 
 
-def test_what_no_run_can_do_without_is_said(tmp_path: Path) -> None:
+def test_what_no_run_can_do_without_is_reported(tmp_path: Path) -> None:
     """A draft of an IMU alone was all that came of a bag whose places are in messages of another kind."""
     make = Messages(2)
     make.store.register(get_types_from_msg("float64 latitude\nfloat64 longitude", "foxglove_msgs/msg/LocationFix"))

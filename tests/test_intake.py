@@ -30,7 +30,7 @@ def running() -> ImuIntake:
     return intake
 
 
-def test_a_lone_leap_waits_for_fifty_that_do_not_follow_it() -> None:
+def test_a_single_stamp_that_jumps_waits_for_fifty_that_do_not_follow_it() -> None:
     intake = running()
     assert fed(intake, 60_000.0) == Taken()
     for k in range(49):
@@ -38,10 +38,10 @@ def test_a_lone_leap_waits_for_fifty_that_do_not_follow_it() -> None:
     ((lost, why),) = fed(intake, 1490.0).dropped
     assert lost.stamp_ns == 60_000 * MS
     assert "jumps ahead" in why
-    assert intake.leap is None
+    assert intake.jumped is None
 
 
-def test_a_gap_is_no_leap_once_another_follows() -> None:
+def test_a_gap_is_no_stamp_jump_once_another_sample_follows() -> None:
     intake = running()
     assert not fed(intake, 5000.0).accepted
     assert [m.stamp_ns // MS for m in fed(intake, 4990.0).accepted] == [4990, 5000]
@@ -85,5 +85,5 @@ def test_none_is_lost_and_none_taken_twice() -> None:
                 intake.restart([])
                 started = False
             started |= bool(rng.uniform() < 0.05)
-        out += [intake.leap.seq] if intake.leap else []
+        out += [intake.jumped.seq] if intake.jumped else []
         assert sorted(out) == list(range(300))

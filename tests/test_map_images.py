@@ -113,7 +113,7 @@ def test_deep_pixels_are_stretched(kind: str, scale: float, tmp_path: Path) -> N
     check(around(known), 255, 0)  # what is no data does not count
 
 
-def test_no_data_is_said_in_many_ways(tmp_path: Path) -> None:
+def test_no_data_is_reported_in_many_ways(tmp_path: Path) -> None:
     def holed(grey: Bytes) -> Bytes:
         grey[:, :300] = 0  # 60 of 140 m: 10 m west of the middle
         return grey
@@ -176,7 +176,7 @@ def test_images_without_a_place_say_what_to_do(tmp_path: Path) -> None:
     assert "not an image" in said(tmp_path / "absent.tif")
 
 
-def test_a_loose_tie_to_wgs_84_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_loose_tie_to_wgs_84_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """NAD 83 is tied to WGS 84 to 4 m by EPSG's best; SWEREF 99 to 1 m."""
     for crs, pixel, datum, words in ((2263, 0.5, NEW_YORK, 1), (3006, 0.2, SWEDEN, 0)):
         caplog.clear()

@@ -126,7 +126,7 @@ def test_a_part_that_cannot_be_solved_is_left_out() -> None:
     assert solved.ledger.counts()["imu"]["rejected"] == (t > 40.0).sum()
 
 
-def test_an_imu_that_ends_early_is_said() -> None:
+def test_an_imu_that_ends_early_is_reported() -> None:
     run = simulate(BASE, 1)
     imu = run.recording.imu
     assert imu is not None
@@ -222,7 +222,7 @@ def test_fixes_without_a_stamp_are_counted_by_their_reason() -> None:
         app.choose_datum(recording, VesselConfig(sensors={"gnss": GnssConfig(topic="/fix")}))
 
 
-def test_truth_on_another_clock_is_said_and_left_out() -> None:
+def test_truth_on_another_clock_is_reported_and_left_out() -> None:
     run = simulate(replace(BASE, duration_s=8.0), 1)
     truth = run.truth
     shifted = Trajectory(stamps_ns=truth.stamps_ns + 10**12, p_world_m=truth.p_world_m, R_world_body=truth.R_world_body)
@@ -286,7 +286,7 @@ def test_a_height_from_biased_fixes_is_not_known() -> None:
     assert bounds_95(known)[:, 1].max() < 1.0
 
 
-def test_a_compass_far_off_its_mount_is_said() -> None:
+def test_a_compass_far_off_its_mount_is_reported() -> None:
     """And one that is not is not: of as long a run, with fixes as good, so that it could be told."""
     scenario = replace(BASE, gnss_sigma_m=0.02, duration_s=50.0)
     off, right = (

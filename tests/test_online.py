@@ -140,7 +140,7 @@ def test_late_and_shuffled_ends_where_in_order_ends() -> None:
 
 
 @pytest.mark.parametrize("from_s", [9, 13])
-def test_when_it_starts_changes_nothing_of_where_it_ends(from_s: int) -> None:
+def test_the_final_estimate_does_not_depend_on_the_start_time(from_s: int) -> None:
     """Places and headings come all at once, so late: what is judged again in the lag is what an earlier start had.
 
     After 9 s the lag begins where the data do, after 13 s at the state a lag ago.
@@ -153,7 +153,7 @@ def test_when_it_starts_changes_nothing_of_where_it_ends(from_s: int) -> None:
     assert np.abs(lag.at(stamps_ns).p_world_m - in_order()[1].at(stamps_ns).p_world_m).max() < 0.005
 
 
-def test_order_of_arrival_changes_no_choice() -> None:
+def test_the_choice_of_modes_does_not_depend_on_the_order_of_arrival() -> None:
     """Two of three matches are false here, and some repeat: what is right is told by costs, so the graph must be solved.
 
     With steps of the IMU left 1 mm apart (iSAM2's own threshold), the late run took false ones and was 3 m off.
@@ -189,7 +189,7 @@ def test_everything_late_from_the_first_message_on() -> None:
     assert apart.max() < 0.03  # 3 s of dead reckoning later: what GNSS weighs depends on what it scattered by then
 
 
-def test_a_step_is_integrated_anew_when_its_samples_come_late() -> None:
+def test_an_imu_step_is_reintegrated_when_its_samples_come_late() -> None:
     """One hole, filled 1.5 s later: the end is that of the run without it."""
     arrivals = arrivals_of(drift())
     begin = arrivals[0].true_ns + 20_000_000_000
@@ -202,7 +202,7 @@ def test_a_step_is_integrated_anew_when_its_samples_come_late() -> None:
     assert apart_m(holed, in_order()[1]).max() > 0.02  # else this shows nothing
 
 
-def test_what_reaches_a_measurement_is_integrated_anew_too() -> None:
+def test_the_way_to_a_measurement_is_reintegrated_when_samples_come_late() -> None:
     """Each measurement of the hole is carried from its state as one that comes after all samples would be."""
     arrivals = arrivals_of(drift())
     begin = arrivals[0].true_ns + 12_000_000_000
@@ -417,7 +417,7 @@ def test_starts_from_a_tag_alone() -> None:
     assert fed.errors_m[-1] < 1.0
 
 
-def test_without_an_imu_it_says_so() -> None:
+def test_without_an_imu_it_reports_what_it_waits_for() -> None:
     run = drift()
     sensors = {n: s for n, s in run.config.sensors.items() if n != "imu"}
     bare = replace(run, config=run.config.model_copy(update={"sensors": sensors}))
@@ -494,7 +494,7 @@ def sizes(online: OnlineSmoother) -> dict[str, int]:
     return found | {"slots": online.factor_slots}
 
 
-def test_nothing_grows() -> None:
+def test_memory_does_not_grow() -> None:
     """Sensors at low rates and a short lag, so that a minute holds many lags: nothing is larger at its end than before."""
     scenario = replace(bl_scenario(2, "drift"), duration_s=50.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0)
     run = simulate(scenario, 1)
@@ -509,11 +509,11 @@ def test_nothing_grows() -> None:
                 largest = early if t < 30.0 else late
                 for name, size in sizes(online).items():
                     largest[name] = max(size, largest.get(name, 0))
-    full = ("scatter._pairs", "scatter._squares", "turned._steps", "turned._fixes")
+    full = ("scatter._pairs", "scatter._squares", "heading_check._steps", "heading_check._fixes")
     remembered = {name for name in early if name.endswith(full)}  # fill up to their limit
     # 40 s: at the 10 Hz of states, at the 2 Hz of fixes
-    assert late["online._persistent.turned._steps"] <= 401
-    assert late["online._persistent.turned._fixes"] <= 83
+    assert late["online._persistent.heading_check._steps"] <= 401
+    assert late["online._persistent.heading_check._fixes"] <= 83
     grown = {n: (early.get(n, 0), s) for n, s in late.items() if n not in remembered and s > 1.15 * early.get(n, 0) + 5}
     assert len(early) > 30
     assert grown == {}

@@ -76,7 +76,7 @@ def test_a_fault_is_survived(name: str) -> None:
     assert fed.errors_m[-1] < 1.5
 
 
-def test_wrong_units_are_said_and_waited_out() -> None:
+def test_wrong_units_are_reported_and_waited_out() -> None:
     base = arrivals_of(run_of())
     in_g = [
         replace(a, m=replace(a.m, accel_mps2=a.m.accel_mps2 / 9.81)) if isinstance(a.m, ImuSample) else a for a in base
@@ -89,7 +89,7 @@ def test_wrong_units_are_said_and_waited_out() -> None:
     assert not fed.estimates
 
 
-def test_starts_anew_after_a_long_silence() -> None:
+def test_restarts_after_a_long_imu_silence() -> None:
     """20 s of silence are bridged, more are not: 21 s."""
     run = _seldom(replace(bl_scenario(2, "clean"), duration_s=40.0), 3)
     base = arrivals_of(run)
@@ -107,7 +107,7 @@ def test_starts_anew_after_a_long_silence() -> None:
     assert step < 6.0 * (np.linalg.norm(fed.estimates[n].v_world_mps) + 1.0)
 
 
-def test_a_start_that_fails_keeps_its_accounts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_that_fails_keeps_the_ledger_complete(monkeypatch: pytest.MonkeyPatch) -> None:
     """The lag cannot be built: what came for it has its rows, and the next start is taken."""
     base, online = arrivals_of(run_of()), smoother(run_of())
     base = base[: at_s(base, 13.0)]
@@ -126,9 +126,7 @@ def test_a_start_that_fails_keeps_its_accounts(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize("kept", [True, False])
-def test_what_agreed_with_a_choice_that_was_given_up_does_not_count(
-    kept: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_agreement_with_a_rejected_choice_does_not_count(kept: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """It put off the new start of an estimate 35 m aside by a minute: the right matches agreed, but only while they were tried."""
     base, online = arrivals_of(run_of()), smoother(run_of())
     feed(online, run_of(), base[: at_s(base, 12.0)])
@@ -177,7 +175,7 @@ def test_a_receiver_that_is_far_off_is_waited_for(error_m: float, denies: bool, 
 @pytest.mark.parametrize(
     ("usual_s", "error_m", "lost_after_s"), [(20, 8.0, 60), (100, 8.0, 100), (400, 8.0, 200), (100, 5.0, 300)]
 )
-def test_a_jump_that_lasts_longer_than_what_was_before_was_none(
+def test_a_jump_that_lasts_longer_than_the_level_before_it_is_the_right_level(
     usual_s: int, error_m: float, lost_after_s: int
 ) -> None:
     """A run that begins in a jump takes its end for one: the level that is held longer is the right one. 3 sigmas are 6 m."""
@@ -204,7 +202,7 @@ def test_a_jump_that_lasts_longer_than_what_was_before_was_none(
     assert [*lost_s, 300][0] == pytest.approx(lost_after_s, abs=1)
 
 
-def test_what_denied_and_was_found_to_hang_does_not_hurry_a_start_anew() -> None:
+def test_a_sensor_found_frozen_does_not_hasten_a_restart() -> None:
     """A receiver that is far off is waited for, whatever one that hangs has said before that was seen."""
     online = smoother(run_of())
     feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
@@ -225,7 +223,9 @@ def test_what_denied_and_was_found_to_hang_does_not_hurry_a_start_anew() -> None
 
 
 @pytest.mark.parametrize("opened", [True, False])
-def test_what_was_let_in_agrees_when_it_is_asked_again(opened: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_measurement_let_in_by_a_wide_kernel_agrees_only_when_judged_again(
+    opened: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A fix 300 m off, let in once a second as the prediction was unsure, put off the new start of a lost estimate."""
     base, online = arrivals_of(run_of()), smoother(run_of())
     now, soon, later = (at_s(base, t_s) for t_s in (12.0, 12.8, 14.5))
@@ -248,7 +248,7 @@ def test_what_was_let_in_agrees_when_it_is_asked_again(opened: bool, monkeypatch
     assert "gnss" in agreement.agreed_ns
 
 
-def test_a_lost_estimate_starts_anew() -> None:
+def test_a_lost_estimate_restarts() -> None:
     """Its state put 300 m aside, with confidence: all sensors disagree, and after some seconds they are believed."""
     run = run_of(length_s=40.0)
     base, online = arrivals_of(run), smoother(run)
@@ -296,7 +296,7 @@ def test_a_receiver_alone_that_jumps_is_not_followed() -> None:
     assert fed.recovered_s(end) < 5.0
 
 
-def test_odometry_goes_on_by_a_clock_that_was_set_back() -> None:
+def test_odometry_continues_when_the_clock_is_set_back() -> None:
     base, online = arrivals_of(run_of()), smoother(run_of())
     n = at_s(base, 10.0)
     back = [replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns - 3_600_000_000_000)) for a in base[n:]]
@@ -411,7 +411,7 @@ def test_exceptions_in_the_solver_are_survived(
     assert fed.recovered_s(base[at_s(base, 16.0)].true_ns) < 6.0
 
 
-def test_a_measurement_that_cannot_be_used_goes_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_measurement_that_cannot_be_used_is_rejected_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """A row of the table that raises for one fix: that fix is rejected with the reason, nothing else happens."""
     base, online = arrivals_of(run_of()), smoother(run_of())
     n = at_s(base, 10.0)
@@ -523,7 +523,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> str:
     "damage",
     [lambda _: "", lambda _: "[1, 2]", lambda _: "{}", _truncated, _nan, _other, _elsewhere, _slow_of_other_size],
 )
-def test_a_damaged_snapshot_is_said_and_left(tmp_path: Path, saved: str, damage: Callable[[str], str]) -> None:
+def test_a_damaged_snapshot_is_reported_and_not_used(tmp_path: Path, saved: str, damage: Callable[[str], str]) -> None:
     path, base = tmp_path / "snapshot.json", arrivals_of(run_of())
     path.write_text(damage(saved), encoding="utf-8")
     online, again = smoother(run_of(), snapshot=path), base[at_s(base, 8.5) : at_s(base, 16.5)]
@@ -545,7 +545,7 @@ def test_an_old_snapshot_is_not_resumed(tmp_path: Path) -> None:
     assert fed.estimates
 
 
-def test_a_full_disk_is_said_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 

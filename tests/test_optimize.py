@@ -39,7 +39,7 @@ def test_never_returns_what_is_worse_than_the_guess() -> None:
         assert optimize(graph, guess, limit).error <= graph.error(guess)
 
 
-def test_a_state_that_nothing_holds_is_said() -> None:
+def test_a_state_that_nothing_holds_is_reported() -> None:
     graph, guess = loop(1.0)
     guess.insert(99, gtsam.Pose2())
     graph.add(gtsam.BetweenFactorPose2(99, 100, gtsam.Pose2(), gtsam.noiseModel.Unit.Create(3)))

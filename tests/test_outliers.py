@@ -16,8 +16,8 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.graph import Residual
-from graphloc.leaps import LeapWatch, leaps, leaps_said
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
+from graphloc.position_jumps import JumpDetector, jump_warnings, position_jumps
 from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.solution import Health
@@ -72,7 +72,7 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one() -> None:
 @pytest.mark.parametrize("allowed", [True, False])
 @pytest.mark.parametrize("hz", [1.0, 5.0])
 @pytest.mark.parametrize(("speed_mps", "turn_radps", "noise_m"), [(2.0, 0.1, 0.05), (15.0, 0.4, 0.2), (0.0, 0.0, 0.05)])
-def test_a_receiver_that_leaps_is_said(
+def test_position_jumps_are_found_and_turns_are_none(
     allowed: bool, hz: float, speed_mps: float, turn_radps: float, noise_m: float
 ) -> None:
     """Off by 8 m for 20 s; a craft that turns as a car does, or is silent for a while, leaps nowhere.
@@ -86,8 +86,10 @@ def test_a_receiver_that_leaps_is_said(
     stamps_ns, sigma_m = np.round(t * 1e9).astype(np.int64), np.full(len(t), noise_m)
 
     def said(heard: NDArray[np.bool_], off_m: Array | float = 0.0, *, allowed: bool) -> list[str]:
-        return leaps_said(
-            "gnss", *leaps(stamps_ns[heard], (way + off_m)[heard], sigma_m[heard], allowed=allowed), allowed=allowed
+        return jump_warnings(
+            "gnss",
+            *position_jumps(stamps_ns[heard], (way + off_m)[heard], sigma_m[heard], allowed=allowed),
+            allowed=allowed,
         )
 
     everywhere = np.full(len(t), fill_value=True)
@@ -103,7 +105,7 @@ def test_a_receiver_that_leaps_is_said(
 @pytest.mark.parametrize("allowed", [True, False])
 @pytest.mark.parametrize("every_s", [2.0, 5.0])
 @pytest.mark.parametrize(("speed_mps", "turn_radps"), [(2.0, 0.5), (8.0, 0.4), (15.0, 0.2)])
-def test_a_turn_between_fixes_that_are_seconds_apart_is_no_leap(
+def test_a_turn_between_fixes_that_are_seconds_apart_is_no_jump(
     speed_mps: float, turn_radps: float, every_s: float, *, allowed: bool
 ) -> None:
     """Every quarter of a circle was one, and health degraded for minutes."""
@@ -113,9 +115,9 @@ def test_a_turn_between_fixes_that_are_seconds_apart_is_no_leap(
     told = slice(0, None, int(100 * every_s))
     places_m = way[told] + np.random.default_rng(0).normal(0.0, 0.01, way[told].shape)
     stamps_ns, sigma_m = np.round(t[told] * 1e9).astype(np.int64), np.full(len(places_m), 0.015)
-    assert not len(leaps(stamps_ns, places_m, sigma_m, allowed=allowed)[0])
+    assert not len(position_jumps(stamps_ns, places_m, sigma_m, allowed=allowed)[0])
     leapt = places_m + np.outer(t[told] >= 350.0, [0.0, 5.0 * every_s**2])
-    assert len(leaps(stamps_ns, leapt, sigma_m, allowed=allowed)[0]) == 1
+    assert len(position_jumps(stamps_ns, leapt, sigma_m, allowed=allowed)[0]) == 1
 
 
 RTK_NS = np.arange(0, 60_000_000_000, 200_000_000)
@@ -128,40 +130,40 @@ def rtk(off_m: NDArray[Any], sigma_m: NDArray[Any] | float = 0.015) -> tuple[Arr
     return way + np.outer(off_m, [0.6, 0.8]), np.broadcast_to(sigma_m, len(RTK_NS)).astype(float)
 
 
-def test_a_receiver_that_is_believed_leaps_by_less_than_metres() -> None:
+def test_jumps_of_decimetres_are_found_in_a_receiver_of_centimetres() -> None:
     """A wrong fix of 0.6 m for 20 s, stated to 15 mm: nothing was said. A fix by itself, or two, a float that says so, and stamps
     that come late now and then leap nowhere."""
     t = RTK_S
     wrong = 0.6 * ((t >= 20.0) & (t < 40.0))
-    at_ns, off_m = leaps(RTK_NS, *rtk(wrong), allowed=False)
+    at_ns, off_m = position_jumps(RTK_NS, *rtk(wrong), allowed=False)
     assert at_ns.tolist() == [20_000_000_000, 40_000_000_000]
     assert off_m == pytest.approx([0.6, 0.6], abs=0.1)
-    assert not len(leaps(RTK_NS, *rtk(wrong), allowed=True)[0])
+    assert not len(position_jumps(RTK_NS, *rtk(wrong), allowed=True)[0])
     for burst in (100,), (100, 101), (100, 101, 102):
-        assert not len(leaps(RTK_NS, *rtk(0.6 * np.isin(np.arange(len(t)), burst)), allowed=False)[0])
-    assert not len(leaps(RTK_NS, *rtk(wrong, 0.015 + 0.5 * wrong), allowed=False)[0])
+        assert not len(position_jumps(RTK_NS, *rtk(0.6 * np.isin(np.arange(len(t)), burst)), allowed=False)[0])
+    assert not len(position_jumps(RTK_NS, *rtk(wrong, 0.015 + 0.5 * wrong), allowed=False)[0])
     late_ns = RTK_NS + 60_000_000 * (np.arange(len(t)) % 40 == 0)
     way, sigma_m = rtk(np.zeros(len(t)))
-    assert not len(leaps(late_ns, way, sigma_m, allowed=False)[0])
-    assert not len(leaps(late_ns, way + np.outer(late_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
+    assert not len(position_jumps(late_ns, way, sigma_m, allowed=False)[0])
+    assert not len(position_jumps(late_ns, way + np.outer(late_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
     waits_ns = RTK_NS + 80_000_000 * (t >= 30.0)  # one step takes longer: by its stamps, or in truth
-    assert not len(leaps(waits_ns, way, sigma_m, allowed=False)[0])
-    assert not len(leaps(waits_ns, way + np.outer(waits_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
+    assert not len(position_jumps(waits_ns, way, sigma_m, allowed=False)[0])
+    assert not len(position_jumps(waits_ns, way + np.outer(waits_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed=False)[0])
 
 
 @pytest.mark.parametrize("hz", [1.0, 5.0])
 @pytest.mark.parametrize("sigma_m", [1.2, 1.35])
-def test_a_believed_receiver_of_metres_leaps_by_what_any_other_does(hz: float, sigma_m: float) -> None:
+def test_without_slow_error_a_receiver_of_metres_has_the_same_jumps(hz: float, sigma_m: float) -> None:
     """Ten of its sigmas were asked for: 12 m were followed for 30 s, and called good, that were said with a slow error."""
     t = np.arange(0.0, 120.0, 1.0 / hz)
     places_m = np.outer(t, [5.0, 0.0]) + np.random.default_rng(4).normal(0.0, 0.3, (len(t), 2))
     places_m += np.outer((t >= 50.0) & (t < 80.0), [0.0, 12.0])
     stamps_ns, sigmas_m = np.round(t * 1e9).astype(np.int64), np.full(len(t), sigma_m)
     for allowed in (True, False):
-        at_ns, off_m = leaps(stamps_ns, places_m, sigmas_m, allowed=allowed)
+        at_ns, off_m = position_jumps(stamps_ns, places_m, sigmas_m, allowed=allowed)
         assert at_ns.tolist() == [50_000_000_000, 80_000_000_000]
         assert off_m == pytest.approx([12.0, 12.0], abs=2.0)
-        watch = LeapWatch()
+        watch = JumpDetector()
         said = [
             watch.note(*fix, allowed=allowed)[0] for fix in zip(stamps_ns.tolist(), places_m, sigmas_m, strict=True)
         ]
@@ -170,16 +172,16 @@ def test_a_believed_receiver_of_metres_leaps_by_what_any_other_does(hz: float, s
 
 @pytest.mark.parametrize("allowed", [True, False])
 @pytest.mark.parametrize("hz", [1.0, 5.0])
-def test_a_receiver_that_scatters_more_for_a_while_does_not_leap(hz: float, *, allowed: bool) -> None:
+def test_larger_scatter_for_a_while_is_no_jump(hz: float, *, allowed: bool) -> None:
     """RTK that is lost for 40 s now and then, and says so: noise of a metre, beside the usual centimetre, were leaps."""
     t = np.arange(0.0, 600.0, 1.0 / hz)
     sigma_m = np.where(t % 100.0 > 60.0, 1.2, 0.015)
     places_m = np.outer(t, [5.0, 0.0]) + np.random.default_rng(0).normal(0.0, 0.8, (len(t), 2)) * sigma_m[:, None]
-    assert not len(leaps(np.round(t * 1e9).astype(np.int64), places_m, sigma_m, allowed=allowed)[0])
+    assert not len(position_jumps(np.round(t * 1e9).astype(np.int64), places_m, sigma_m, allowed=allowed)[0])
 
 
 @pytest.mark.parametrize("hz", [2.0, 3.0, 5.0])
-def test_a_car_that_brakes_in_an_emergency_does_not_leap(hz: float) -> None:
+def test_emergency_braking_of_a_car_is_no_jump(hz: float) -> None:
     """8 m/s^2, built up at 30 m/s^3, until it stands; 30 times in ten minutes."""
     t = np.arange(0.0, 600.0, 0.001)
     accel = np.clip(30.0 * (t % 20.0 - 10.0), 0.0, 8.0) * (t % 20.0 < 12.5) - 20.0 / 10.0 * (t % 20.0 < 10.0)
@@ -187,12 +189,12 @@ def test_a_car_that_brakes_in_an_emergency_does_not_leap(hz: float) -> None:
     told = np.round(np.arange(0.0, 600.0, 1.0 / hz) * 1000.0).astype(int)
     way = np.outer(np.cumsum(speed)[told] * 0.001, [1.0, 0.0])
     way += np.random.default_rng(0).normal(0.0, 0.005, way.shape)
-    assert not len(leaps(told * 1_000_000, way, np.full(len(told), 0.005), allowed=False)[0])
+    assert not len(position_jumps(told * 1_000_000, way, np.full(len(told), 0.005), allowed=False)[0])
 
 
-def test_a_leap_is_seen_as_it_comes_and_said_once_for_long() -> None:
+def test_a_jump_is_detected_online_and_reported_once() -> None:
     t = RTK_S
-    watch, said = LeapWatch(), []
+    watch, said = JumpDetector(), []
     for at_ns, place_m, sigma_m in zip(RTK_NS.tolist(), *rtk(0.6 * ((t >= 20.0) & (t < 40.0))), strict=True):
         said += watch.note(at_ns, place_m, sigma_m, allowed=False)[0].tolist()
         assert not len(watch.note(at_ns - 300_000_000, place_m + 5.0, sigma_m, allowed=False)[0])  # late
@@ -221,7 +223,7 @@ def believed(off_m: float, last_s: float) -> tuple[Recording, Recording, VesselC
     return run.recording, wrong, config
 
 
-def test_a_run_beside_a_believed_receiver_that_leaps_is_not_called_good() -> None:
+def test_a_run_with_a_jump_that_the_bounds_do_not_cover_is_not_good() -> None:
     """Its bound was 2 cm, and its health good, where it was 0.6 m off."""
     right, wrong, config = believed(0.6, last_s=35.0)
     usual, leapt = (app.smooth_recording(of, config).solution for of in (right, wrong))
@@ -242,7 +244,7 @@ def test_a_run_beside_a_believed_receiver_that_leaps_is_not_called_good() -> Non
     # bounds of half a metre, never called good, and there 8 s after a restart would be. Known, and not mended.
     [(150.0, True), (300.0, True), (60.0, False), (100.0, False)],
 )
-def test_a_leap_is_not_forgotten_where_it_has_online_start_anew(off_m: float, restarts: bool) -> None:
+def test_a_jump_is_remembered_through_a_restart_online(off_m: float, restarts: bool) -> None:
     """Off by 150 m it is rejected for 15 s; then it was called good where it was 150 m off."""
     _, wrong, config = believed(off_m, last_s=np.inf)
     live = replay(wrong, config).solution
@@ -253,7 +255,7 @@ def test_a_leap_is_not_forgotten_where_it_has_online_start_anew(off_m: float, re
     assert Health.GOOD not in [h for h, k in zip(live.health, late, strict=True) if k]
 
 
-def test_a_receiver_alone_that_leaps_is_said_in_the_run() -> None:
+def test_a_jump_of_the_only_receiver_is_reported_in_the_run() -> None:
     run = simulate(Scenario(path="loops", duration_s=50.0, noise="drift", pose_hz=0.0, compass_hz=5.0), 1)
     begin_ns = int(run.truth.stamps_ns[0])
     config = run.config.model_copy(
@@ -277,7 +279,7 @@ def test_a_receiver_alone_that_leaps_is_said_in_the_run() -> None:
     )
 
 
-def test_a_receiver_alone_that_leaps_is_not_followed_where_the_imu_denies_it() -> None:
+def test_a_jump_of_the_only_receiver_is_not_followed_where_the_imu_contradicts_it() -> None:
     """12 m for 30 s, and back: no drift is told from motion, a leap is. It was followed, 11 m off, and left its bounds."""
     run = simulate(Scenario(path="loops", duration_s=100.0, noise="clean", pose_hz=0.0, compass_hz=5.0, imu_hz=50.0), 1)
     begin_ns = int(run.truth.stamps_ns[0])

@@ -229,7 +229,7 @@ def test_the_image_lies_where_it_shows_things(tmp_path: Path) -> None:
     assert under.east_m > 40.0 + 14.0
 
 
-def test_an_image_that_cannot_be_had_is_said_and_the_map_is_plain(tmp_path: Path) -> None:
+def test_an_image_that_cannot_be_had_is_reported_and_the_map_is_plain(tmp_path: Path) -> None:
     config = VesselConfig(output=OutputConfig(map_image="gone.tif"))
     under, said = underlay(config, tmp_path, Datum(SWEDEN), np.zeros((2, 3)))
     assert under is None

@@ -40,13 +40,13 @@ def test_the_mount_that_would_fit_is_named(degrees: float, run: SimulatedRun) ->
 
 
 @pytest.mark.parametrize(("degrees", "sigma_deg"), [(0.0, 1.0), (30.0, 1.0), (90.0, 15.0)])
-def test_nothing_is_said_of(degrees: float, sigma_deg: float, run: SimulatedRun) -> None:
+def test_nothing_is_reported_of(degrees: float, sigma_deg: float, run: SimulatedRun) -> None:
     """A craft that goes ahead, one that leads by a current, and a heading that is not claimed to be known."""
     assert posture_warnings(turned(run.truth, "z", degrees, sigma_deg), run.recording, run.config) == []
 
 
 @pytest.mark.parametrize(("axis", "degrees"), [("x", 180.0), ("y", 90.0)])
-def test_a_craft_on_its_back_or_end_is_said(axis: str, degrees: float, run: SimulatedRun) -> None:
+def test_a_craft_on_its_back_or_end_is_reported(axis: str, degrees: float, run: SimulatedRun) -> None:
     said = posture_warnings(turned(run.truth, axis, degrees), run.recording, run.config)
     named = re.search(r"tilted by (\d+) deg", said[0])
     assert named
@@ -66,7 +66,7 @@ def test_a_track_that_lies_still_says_nothing(run: SimulatedRun) -> None:
     assert posture_warnings(still, run.recording, run.config) == []
 
 
-def test_an_imu_turned_in_the_file_is_said_in_the_report(run: SimulatedRun) -> None:
+def test_an_imu_turned_in_the_file_is_reported_in_the_report(run: SimulatedRun) -> None:
     """No sensor speaks against it but the compass, whose offset is blamed; the course names the mount."""
     imu: Any = run.config.sensors["imu"]
     gnss: Any = run.config.sensors["gnss"]

@@ -144,7 +144,7 @@ def test_compare_has_it_beside_the_filters(run: SimulatedRun) -> None:
     assert offline <= online + 0.05
 
 
-def test_a_guessed_heading_is_said_with_its_times(whole: Replayed) -> None:
+def test_a_guessed_heading_is_reported_with_its_times(whole: Replayed) -> None:
     """Doubted in the first 51 of the estimates, 10 a second: for 5 s."""
     estimates = whole.estimates
     doubt = "the heading is a guess: 2 candidates explain the motion so far"

@@ -89,7 +89,7 @@ def test_what_cannot_be_used_is_one_line_with_the_file_and_the_entry(tmp_path: P
         (entry(size_m="-0.4"), "(got -0.4)"),
     ],
 )
-def test_what_was_given_is_said_in_short(tmp_path: Path, text: str, end: str) -> None:
+def test_what_was_given_is_reported_in_short(tmp_path: Path, text: str, end: str) -> None:
     """A whole block in the middle of a line hides what is wrong with it."""
     path = written(tmp_path, text)
     with pytest.raises(ConfigError) as caught:

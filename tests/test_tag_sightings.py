@@ -256,7 +256,7 @@ def test_the_ledger_adds_up(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("misread", "warned"), [(1, False), (2, False), (3, True), (4, True)])
-def test_a_limit_that_refuses_is_said_where_it_refuses_most(tmp_path: Path, misread: int, warned: bool) -> None:
+def test_a_limit_that_refuses_is_reported_where_it_refuses_most(tmp_path: Path, misread: int, warned: bool) -> None:
     """Of four lists with a tag, and two without: that a tag is misread now and then is what the limit is there for."""
     make = maker(CORNERS)
     px = corners_seen()[::-1] + 0.5
@@ -309,7 +309,7 @@ def test_a_sensor_that_is_switched_off_reads_nothing(tmp_path: Path, shown: NDAr
     assert recording.message_count == 551 == accounted(recording)
 
 
-def test_a_topic_without_messages_is_said(tmp_path: Path, shown: NDArray[np.uint8]) -> None:
+def test_a_topic_without_messages_is_reported(tmp_path: Path, shown: NDArray[np.uint8]) -> None:
     """A camera that was announced, and never sent: else the run looks as if no tag had been in view."""
     make = Messages(2)
     blank = np.full((HEIGHT, WIDTH), 90, dtype=np.uint8)

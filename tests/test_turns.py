@@ -64,7 +64,7 @@ def test_accelerations_of_the_wrong_sign_are_among_the_suspects(run: SimulatedRu
     assert "gravity: inverted" in line
 
 
-def test_iron_that_turns_with_the_vessel_is_said(run: SimulatedRun) -> None:
+def test_iron_that_turns_with_the_vessel_is_reported(run: SimulatedRun) -> None:
     """10 deg x sin(yaw): 7 deg RMS on headings all around."""
     imu, headings = of(run)
     (line,) = turn_warnings(imu, "compass", changed(headings, lambda yaw: yaw + np.radians(10.0) * np.sin(yaw)), "enu")
@@ -72,7 +72,7 @@ def test_iron_that_turns_with_the_vessel_is_said(run: SimulatedRun) -> None:
     assert turn_warnings(imu, "compass", changed(headings, lambda y: y + np.radians(2.0) * np.sin(y)), "enu") == []
 
 
-def test_headings_that_stick_are_said(run: SimulatedRun) -> None:
+def test_frozen_headings_are_reported(run: SimulatedRun) -> None:
     imu, headings = of(run)
     stuck = [m if k % 600 < 300 else replace(m, yaw_rad=headings[k - k % 300].yaw_rad) for k, m in enumerate(headings)]
     (line,) = turn_warnings(imu, "compass", stuck, "enu")
@@ -89,7 +89,7 @@ def test_a_hole_in_the_imu_is_no_turn(run: SimulatedRun) -> None:
     assert turn_warnings(cut, "compass", headings, "enu") == []
 
 
-def test_without_turns_or_gravity_nothing_is_said(run: SimulatedRun) -> None:
+def test_without_turns_or_gravity_nothing_is_reported(run: SimulatedRun) -> None:
     imu, headings = of(run)
     wrong = changed(headings, lambda yaw: -yaw)
     assert turn_warnings(replace(imu, gyro_radps=0.0 * imu.gyro_radps), "compass", wrong, "enu") == []

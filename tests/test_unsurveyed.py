@@ -220,7 +220,7 @@ def test_of_very_many_views_some_are_enough() -> None:
 
 
 @pytest.mark.parametrize("family", ["", "Standard41h12"])
-def test_a_family_that_no_survey_can_have_is_said(family: str) -> None:
+def test_a_family_that_no_survey_can_have_is_reported(family: str) -> None:
     """ROS 1's lists say no family, and AprilTag 3 has more than OpenCV: a line, not an error after the whole solve."""
     p, R = passing("arc")
     views = [replace(v, family=family) for v in views_of(p, R, np.random.default_rng(0))]

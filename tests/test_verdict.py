@@ -59,7 +59,7 @@ def moved(track: Trajectory, share: float, by_m: float) -> Trajectory:
     ("sensor", "late_s", "said"),
     [("gnss", 0.9, True), ("gnss", 0.3, False), ("compass", 0.9, False)],  # a compass tells no place
 )
-def test_stamps_that_the_bounds_know_nothing_of_are_said(
+def test_stamps_that_the_bounds_know_nothing_of_are_reported(
     data: ReportData, sensor: str, late_s: float, *, said: bool
 ) -> None:
     found = Suggestion(
@@ -110,7 +110,7 @@ def held_table() -> Table:
     return Table("Against held-out fixes", ("horizontal_rmse_m",), rows)
 
 
-def test_a_filter_that_is_nearer_is_said(data: ReportData) -> None:
+def test_a_filter_that_is_nearer_is_reported(data: ReportData) -> None:
     """A filter that is 0.1 m off beside tracks that are 0 and 0.2 m off: nearer than one of them."""
     assert data.online is not None
     track = data.solution.trajectory
@@ -153,7 +153,7 @@ def test_when_it_was_less_than_good(data: ReportData) -> None:
     assert durations_s(with_hole)[Health.DEAD_RECKONING] == pytest.approx(2.9)  # a minute without an estimate is none
 
 
-def test_what_would_end_it_is_said_of_the_cause() -> None:
+def test_what_would_end_it_is_reported_of_the_cause() -> None:
     assert cure(Health.DEGRADED, "compass, gnss missing or not agreeing").startswith("compass, gnss agreeing again")
     assert "start.heading_deg" in cure(
         Health.LOST, "95 % bound 3 m, heading 60 deg; the heading is a guess: 2 candidates explain"

@@ -83,7 +83,7 @@ def ours(steps: list[Staged]) -> Window:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_lag_says_what_gtsams_own_says(seed: int) -> None:
+def test_the_window_agrees_with_gtsams_fixed_lag_smoother(seed: int) -> None:
     steps = drive(seed)
     pose, cov = gtsams_own(steps)
     window, last = ours(steps), keys.pose(STEPS - 1)
@@ -127,7 +127,7 @@ def test_a_leaf_whose_factors_are_taken_out_can_be_put_in_again() -> None:
     assert np.linalg.norm(window.values.atPose3(keys.pose(STEPS - 1)).translation() - pose.translation()) < 0.5
 
 
-def test_it_is_told_beforehand_where_the_solver_linearises_anew() -> None:
+def test_where_the_solver_will_relinearise_is_known_before() -> None:
     """Factors are written in tangents that the next commit is the first to have."""
     window, moved = Window(LAG_S), 0
     for factors, new, t_s in drive(1):
@@ -197,7 +197,7 @@ def test_a_step_from_the_oldest_pose_costs_what_it_costs_the_solver() -> None:
     assert window.error() - before == pytest.approx(cost, abs=0.5)
 
 
-def test_two_errors_that_nothing_else_hangs_on_are_linearised_anew() -> None:
+def test_errors_connected_to_nothing_else_are_relinearised() -> None:
     """The solver then orders these two alone, and what comes last among two is no third group."""
     window = ours(drive(0))
     window.settle(5)

@@ -25,6 +25,7 @@ from graphloc.frames import Datum
 from graphloc.frontends._part import Bags
 from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
+from graphloc.frozen_receiver import without_frozen_fixes
 from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.offsets import Probe
@@ -32,7 +33,6 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.replay import Status, replay, silent
 from graphloc.solution import Solution
 from graphloc.solve import smooth
-from graphloc.stuck import without_stuck
 
 
 def configured(config_path: Path, changes: Mapping[str, object] = MappingProxyType({})) -> VesselConfig:
@@ -175,7 +175,7 @@ def solve(
         SolveError: it cannot be started or solved.
     """
     config = seen_frames(config, recording)
-    recording, said = without_stuck(recording, datum)
+    recording, said = without_frozen_fixes(recording, datum)
     solution = smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, probe=probe, progress=progress)
     return replace(solution, stats=replace(solution.stats, warnings=(*solution.stats.warnings, *said)))
 

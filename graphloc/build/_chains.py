@@ -49,16 +49,16 @@ def slow_begin(slow: SlowProcess, key: int, known: Array, *, jumps: bool = True)
 
 
 def slow_step(
-    slow: SlowProcess, key: int, following: int, dt_s: float, *, jumps: bool = True, leap_m: float = 0.0
+    slow: SlowProcess, key: int, following: int, dt_s: float, *, jumps: bool = True, jump_m: float = 0.0
 ) -> Iterator[Any]:
-    """Yield the factors of the step from one node to the next, `dt_s` later; `leap_m`: it has leapt by so much, or something else has."""
+    """Yield the factors of the step from one node to the next, `dt_s` later; `jump_m`: it has leapt by so much, or something else has."""
     constant = ~np.isfinite(slow.time_constant_s)
     # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
     step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt_s / slow.time_constant_s))
-    if leap_m > 0.0:
-        step = np.where(_far(slow), leap_m, step)
+    if jump_m > 0.0:
+        step = np.where(_far(slow), jump_m, step)
     model: Any = gtsam.noiseModel.Diagonal.Sigmas(step)
-    if slow.jumps and jumps and leap_m == 0.0:
+    if slow.jumps and jumps and jump_m == 0.0:
         model = _with_tails(model, JUMP.scale)
     yield gtsam.BetweenFactorVector(key, following, np.zeros(len(step)), model)
     yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps)

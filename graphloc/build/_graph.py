@@ -170,9 +170,9 @@ def _add_constants(
 
 
 @lru_cache(maxsize=1 << 14)
-def _step(slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool, leap_m: float) -> tuple[Any, ...]:
+def _step(slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool, jump_m: float) -> tuple[Any, ...]:
     """Factors of a step, made once: they do not depend on the estimate, so every graph shares them."""
-    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, leap_m=leap_m))
+    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, jump_m=jump_m))
 
 
 def _leaps_m(problem: Problem, stream: Stream) -> dict[int, float]:
@@ -180,7 +180,7 @@ def _leaps_m(problem: Problem, stream: Stream) -> dict[int, float]:
     found: dict[int, float] = {}
     nodes_ns = problem.timeline.slow_stamps_ns
     stamps_ns = [m.stamp_ns for m in stream.measurements]
-    for at_ns, off_m in zip(*stream.leapt, strict=True):
+    for at_ns, off_m in zip(*stream.position_jumps, strict=True):
         before_ns = stamps_ns[max(int(np.searchsorted(stamps_ns, at_ns)) - 1, 0)]
         first, last = np.searchsorted(nodes_ns, [before_ns, at_ns], side="right") - 1
         found |= dict.fromkeys(range(int(first), int(last) + 1), float(off_m))

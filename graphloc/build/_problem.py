@@ -19,15 +19,15 @@ from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, Going, InertialLink, InertialRow, Sensor, SlowProcess
-from graphloc.leaps import leaps
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement
+from graphloc.position_jumps import position_jumps
 from graphloc.recording import Recording
 from graphloc.time import utc_text
 from graphloc.timeline import Timeline, make_timeline
 
-Leaps = tuple[NDArray[np.int64], Array]
-_NO_LEAPS: Leaps = np.zeros(0, dtype=np.int64), np.zeros(0)
+PositionJumps = tuple[NDArray[np.int64], Array]
+_NO_JUMPS: PositionJumps = np.zeros(0, dtype=np.int64), np.zeros(0)
 _NO_DRIFT = 100.0  # times its time constant: nothing tells from motion what drifts, but the IMU what leaps
 
 
@@ -38,7 +38,7 @@ class Stream:
     Attributes:
         number: of the sensor, for keys. name, row, config: the sensor.
         slow: its slow state, or None. left_out: the slow state that it would have in company.
-        leapt: of one that alone tells the place, stamps (K,) and sizes (K,), m, of the leaps that its places show.
+        position_jumps: of one that alone tells the place, stamps (K,) and sizes (K,), m, of the leaps that its places show.
         constants: what its measurements may share.
         mount: pose of the sensor from the IMU's place, body axes.
         measurements: M of them by stamp. state: (M,) its state (`state_of`). carry: per measurement the
@@ -53,7 +53,7 @@ class Stream:
     config: SensorConfig
     slow: SlowProcess | None
     left_out: SlowProcess | None
-    leapt: Leaps
+    position_jumps: PositionJumps
     constants: tuple[Constant, ...]
     mount: Any
     measurements: tuple[Measurement, ...]
@@ -159,13 +159,15 @@ def make_problem(
             slow = row.slow(sensor)
             left_out = slow if slow is not None and slow.needs_company and company < 2 else None
             slow = slow if left_out is None else None
-            leapt = _NO_LEAPS
+            position_jumps = _NO_JUMPS
             if one_place and slow is None and row.absolute and row.false is None:
-                leapt = _leaps(row, by_sensor[name], datum, allowed=left_out is not None)
-            if left_out is not None and len(leapt[0]) and not starts:
+                position_jumps = _position_jumps(row, by_sensor[name], datum, allowed=left_out is not None)
+            if left_out is not None and len(position_jumps[0]) and not starts:
                 slow, left_out = replace(left_out, time_constant_s=_NO_DRIFT * left_out.time_constant_s), None
             streams.append(
-                _stream(number, name, row, sensor, slow, left_out, leapt, mount, by_sensor[name], timeline, links)
+                _stream(
+                    number, name, row, sensor, slow, left_out, position_jumps, mount, by_sensor[name], timeline, links
+                )
             )
     preintegrated = _preintegrate(timeline, links)
     warnings += [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
@@ -280,13 +282,15 @@ def bridged(problem: Problem, values: gtsam.Values) -> Problem:
     return replace(problem, preintegrated=tuple(preintegrated), inertial=tuple(inertial))
 
 
-def _leaps(row: Sensor, measurements: Sequence[Measurement], datum: Datum, *, allowed: bool) -> Leaps:
+def _position_jumps(row: Sensor, measurements: Sequence[Measurement], datum: Datum, *, allowed: bool) -> PositionJumps:
     """Stamps and sizes of the leaps of a sensor that alone tells the place."""
     hints = [(m.stamp_ns, row.hint(m, 0.0, datum)) for m in measurements]
     told = [(n, hint) for n, hint in hints if np.isfinite(hint.p_world_m[:2]).all()]
     stamps_ns = np.array([n for n, _ in told], dtype=np.int64)
     places_m = np.array([hint.p_world_m[:2] for _, hint in told])
-    return leaps(stamps_ns, places_m, np.array([hint.p_sigma_m[:2].max() for _, hint in told]), allowed=allowed)
+    return position_jumps(
+        stamps_ns, places_m, np.array([hint.p_sigma_m[:2].max() for _, hint in told]), allowed=allowed
+    )
 
 
 def apart_s_of(measurements: Sequence[Measurement]) -> Array:
@@ -302,7 +306,7 @@ def _stream(
     config: SensorConfig,
     slow: SlowProcess | None,
     left_out: SlowProcess | None,
-    leapt: Leaps,
+    position_jumps: PositionJumps,
     mount: tuple[Array, Array],
     measurements: list[Measurement],
     timeline: Timeline,
@@ -323,7 +327,7 @@ def _stream(
         config,
         slow,
         left_out,
-        leapt,
+        position_jumps,
         row.constants(config),
         T_state_sensor,
         tuple(measurements),

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from graphloc import __version__
-from graphloc.cli import _about, _estimate, _evidence, _simulate, _sweep, _whatif
+from graphloc.cli import _about, _estimate, _evidence, _experiments, _simulate, _sweep
 from graphloc.cli._shared import Stopped
 from graphloc.errors import GraphlocError
 
@@ -27,8 +27,8 @@ for _command in (
     _estimate.inspect,
     _estimate.smooth,
     _evidence.compare,
-    _whatif.ablate,
-    _whatif.drill,
+    _experiments.ablate,
+    _experiments.drill,
     _estimate.replay,
     _estimate.stream,
     _estimate.match,

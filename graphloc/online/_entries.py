@@ -147,12 +147,12 @@ class Entries:
         self._constants.use(stream, used)
         entry.held, entry.written = window.add(update.factors), at.T_solver
 
-    def carry_anew(self, torn: Collection[int]) -> None:
+    def reintegrate(self, stale: Collection[int]) -> None:
         """Integrate anew the ways from these states to measurements: samples of them came late."""
         for entry in self._all_reachable():
             carry = entry.stream.carry[entry.index]
-            if carry is not None and carry[0] in torn:
-                self._problem.carry_anew(entry.stream, entry.index)
+            if carry is not None and carry[0] in stale:
+                self._problem.reintegrate(entry.stream, entry.index)
                 if entry.held is not None:
                     self._write(entry)
 

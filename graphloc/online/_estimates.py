@@ -8,15 +8,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from graphloc.estimate import Estimate
-from graphloc.online._ahead import Ahead
 from graphloc.online._anchor import sound
 from graphloc.online._lag import Lag
 from graphloc.online._odometry import Odometry
+from graphloc.online._propagate import Propagated
 from graphloc.solve._solution import health_of, left_out, world_covariance
 
 
 def estimate_of(
-    now: Ahead, lag: Lag, odometry: Odometry, *, agreed_ns: Mapping[str, int], absolute: Sequence[str], doubt: str
+    now: Propagated, lag: Lag, odometry: Odometry, *, agreed_ns: Mapping[str, int], absolute: Sequence[str], doubt: str
 ) -> Estimate:
     """Return the estimate at a state of the lag, or ahead of it.
 

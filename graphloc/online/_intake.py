@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which IMU samples are taken, and in what order: clocks leap and are set back, samples come late or again, units are mistaken."""
+"""Which IMU samples are taken, and in what order: clocks jump and are set back, samples come late or again, units are mistaken."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphloc.hangs import WHY, HangWatch
+from graphloc.frozen_imu import WHY, FrozenImuDetector
 from graphloc.measurements import ImuSample, ImuSeries
 
 _BACK = 50  # samples in a row before the newest: their clock was set back
@@ -27,7 +27,7 @@ class Taken:
         accepted: in order, each after the newest. dropped: with the reason.
         late: the sample itself, of a stamp before the newest. hole: the stamps (ns) that it lies between; None
             before the first.
-        absurd: why it cannot be a vessel's. hangs: it is the first of those that only repeat the one before.
+        absurd: why it cannot be a vessel's. newly_frozen: it is the first of those that only repeat the one before.
         set_back_s: so far was the IMU's clock set back; all before is of another clock.
     """
 
@@ -36,7 +36,7 @@ class Taken:
     late: ImuSample | None = None
     hole: tuple[int, int] | None = None
     absurd: str = ""
-    hangs: bool = False
+    newly_frozen: bool = False
     set_back_s: float = 0.0
 
 
@@ -55,16 +55,16 @@ class ImuIntake:
     """Samples in the order in which they come.
 
     Args:
-        gap_s: a longer step is no step: the next sample tells whether the stamp leapt. floats: the accelerometer
+        gap_s: a longer step is no step: the next sample tells whether the stamp jumped. floats: the accelerometer
             feels gravity, so that little force is absurd.
     """
 
     def __init__(self, gap_s: float, floats: bool) -> None:
         self._gap_ns, self._floats = gap_s * 1e9, floats
         self.newest: ImuSample | None = None
-        self.leap: ImuSample | None = None  # waits until others follow it, so that one bad stamp does not cut the run
-        self._leap_age = self._behind = 0
-        self._hanging = HangWatch()
+        self.jumped: ImuSample | None = None  # waits until others follow it, so that one bad stamp does not cut the run
+        self._jumped_age = self._behind = 0
+        self._frozen = FrozenImuDetector()
         self._stamps: list[int] = []  # in order, as far back as a late one may lie
 
     def accept(self, m: ImuSample) -> float:
@@ -86,27 +86,27 @@ class ImuIntake:
         """Say what becomes of a sample, and of one that waited for it. `started`: there are states."""
         if absurd := self._absurd(m):
             return Taken(dropped=((m, absurd),), absurd=absurd)
-        hung = self._hanging.hung
-        if self._hanging.hangs(m):
-            return Taken(dropped=((m, WHY),), absurd=WHY, hangs=not hung)
-        newest, leap = self.newest, self.leap
+        already = self._frozen.frozen
+        if self._frozen.repeats(m):
+            return Taken(dropped=((m, WHY),), absurd=WHY, newly_frozen=not already)
+        newest, jumped = self.newest, self.jumped
         if newest is None:
             return Taken(accepted=(m,))
         if m.stamp_ns <= newest.stamp_ns:
             return self._before(m, newest, started)
-        if leap is not None and 0 < abs(m.stamp_ns - leap.stamp_ns) <= self._gap_ns:
-            self.leap = None  # the clock went on from there
-            return Taken(accepted=(leap, m) if leap.stamp_ns < m.stamp_ns else (m, leap))
-        lost = () if leap is None else ((leap, "its stamp jumps ahead and the next ones do not follow"),)
+        if jumped is not None and 0 < abs(m.stamp_ns - jumped.stamp_ns) <= self._gap_ns:
+            self.jumped = None  # the clock went on from there
+            return Taken(accepted=(jumped, m) if jumped.stamp_ns < m.stamp_ns else (m, jumped))
+        lost = () if jumped is None else ((jumped, "its stamp jumps ahead and the next ones do not follow"),)
         if m.stamp_ns - newest.stamp_ns > self._gap_ns:
-            self.leap, self._leap_age = m, 0
+            self.jumped, self._jumped_age = m, 0
             return Taken(dropped=lost)
-        if leap is None:
+        if jumped is None:
             return Taken(accepted=(m,))
-        self._leap_age += 1
-        if self._leap_age < _BACK:
+        self._jumped_age += 1
+        if self._jumped_age < _BACK:
             return Taken(accepted=(m,))
-        self.leap = None
+        self.jumped = None
         return Taken(accepted=(m,), dropped=lost)
 
     def _absurd(self, m: ImuSample) -> str:

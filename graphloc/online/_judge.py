@@ -19,15 +19,15 @@ from graphloc.config import KernelConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
-from graphloc.leaps import largest_sigma, leaps_said, told_alone
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
 from graphloc.online._alternatives import choices
 from graphloc.online._entries import Entries, Entry
+from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
-from graphloc.online._parting import PARTING_S
 from graphloc.online._states import States
 from graphloc.online._window import Window
+from graphloc.position_jumps import jump_warnings, largest_sigma, only_position_sensor
 from graphloc.solve._best_chain import best_chain
 from graphloc.solve._decide import Verdict, by_hypotheses
 from graphloc.solve._hypotheses import log_evidence_of
@@ -64,7 +64,7 @@ class Judge:
         self._leafed_s: dict[str, float] = {}  # and when
         self._refuted: set[str] = set()  # sensors of which something new was judged false
         self._tried: dict[str, frozenset[tuple[int, int | None]]] = {}
-        self._leapt: list[str] = []
+        self._jump_warnings: list[str] = []
         self._unsure: set[str] = set()  # sensors of which all choices are to be weighed
         self._chosen: dict[str, frozenset[tuple[int, int | None]]] = {}
         self._others: dict[str, tuple[Array, Array]] = {}  # mean and covariance, of each sensor
@@ -86,7 +86,7 @@ class Judge:
         if (away_m := min(r.size_m or 0.0 for r in residuals)) > _FAR_M:
             self._agreement.note(stream, m, None)
             raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
-        if self._parts(stream, m, at, residuals[0]):
+        if self._from_frozen(stream, m, at, residuals[0]):
             self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
         elif stream.row.false is None:
             verdict, opened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
@@ -100,23 +100,23 @@ class Judge:
             self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
             self._rounds[stream.name] = _ROUNDS
 
-    def _parts(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> bool:
+    def _from_frozen(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> bool:
         """Whether a place comes from a receiver that hangs; then what it said while that was not seen goes, too."""
         if stream.row.false is not None or not stream.row.absolute:
             return False
         told_m = stream.row.hint(m, 0.0, self._problem.datum).p_world_m[:2]
         if not np.isfinite(told_m).all():
             return False
-        newest, parting, parted = self._states.newest, stream.parting, stream.parting.parted
+        newest, detector, before = self._states.newest, stream.frozen_detector, stream.frozen_detector.frozen
         timeline = self._problem.timeline
         at_s = timeline.seconds(m.stamp_ns)
         sigma_m = largest_sigma(residual.cov - _walked(residual, at))
-        if told_alone(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
+        if only_position_sensor(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
             allowed = stream.left_out is not None
-            self._leapt += leaps_said(
-                stream.name, *stream.leaping.note(m.stamp_ns, told_m, sigma_m, allowed=allowed), allowed=allowed
+            self._jump_warnings += jump_warnings(
+                stream.name, *stream.jump_detector.note(m.stamp_ns, told_m, sigma_m, allowed=allowed), allowed=allowed
             )
-        parting.note(
+        detector.note(
             at_s,
             told_m,
             np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2],
@@ -124,19 +124,19 @@ class Judge:
             newest.velocity[:2],
             largest_sigma(newest.velocity_cov),
         )
-        if parting.parted and not parted:
+        if detector.frozen and not before:
             self._agreement.forget_refused()
-            since_s = min(at_s - PARTING_S, parting.stands_s)  # it drew the estimate along from when it began to stand
+            since_s = min(at_s - WINDOW_S, detector.stands_s)  # it drew the estimate along from when it began to stand
             for entry in self._entries.of(stream):
                 if timeline.seconds(entry.measurement.stamp_ns) >= since_s:
                     self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0))
-        if parting.for_long(at_s):
+        if detector.for_long(at_s):
             self._agreement.note(stream, m, None)
-        return parting.parted
+        return detector.frozen
 
-    def leapt(self) -> list[str]:
+    def jump_warnings(self) -> list[str]:
         """Return a line on each receiver that has leapt since this was last asked."""
-        said, self._leapt = self._leapt, []
+        said, self._jump_warnings = self._jump_warnings, []
         return said
 
     def judge(self) -> None:

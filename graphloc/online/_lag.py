@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.frames import Array
-from graphloc.leaps import why_in_doubt
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
@@ -26,6 +25,7 @@ from graphloc.online._judge import Judge
 from graphloc.online._live import LiveProblem
 from graphloc.online._states import Newest, States
 from graphloc.online._window import Window
+from graphloc.position_jumps import why_in_doubt
 
 _STEP_COST = (
     1.0  # of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10
@@ -69,12 +69,12 @@ class Lag:
         """Stage the next state, where the IMU says that it is; tell whether slow states got a node, which closes a commit."""
         return self._states.grow(stamp_ns)
 
-    def mend(self, holes: Sequence[tuple[int, int]]) -> None:
+    def reintegrate(self, holes: Sequence[tuple[int, int]]) -> None:
         """Stage anew what was integrated without IMU samples that came late; holes: the stamps (ns) that each lies between."""
         timeline = self.problem.timeline
-        torn = {k for a, b in holes for k in range(timeline.floor(a), timeline.floor(b) + 1)}
-        self._entries.carry_anew(torn)
-        self._states.link_anew(torn)
+        stale = {k for a, b in holes for k in range(timeline.floor(a), timeline.floor(b) + 1)}
+        self._entries.reintegrate(stale)
+        self._states.reintegrate(stale)
 
     def commit(self) -> None:
         """Estimate anew, and let go what has left."""
@@ -152,18 +152,18 @@ class Lag:
         return self._agreement.lost_s(self.newest.stamp_ns)
 
     @property
-    def parted(self) -> set[str]:
+    def frozen_receivers(self) -> set[str]:
         """Receivers that hang (see `_parting.py`)."""
-        return {name for name, stream in self.problem.streams.items() if stream.parting.parted}
+        return {name for name, stream in self.problem.streams.items() if stream.frozen_detector.frozen}
 
-    def leapt(self) -> list[str]:
-        """Return a line on each receiver that has leapt since this was last asked (see `leaps.py`)."""
-        return self._judge.leapt()
+    def jump_warnings(self) -> list[str]:
+        """Return a line on each receiver that has leapt since this was last asked (see `position_jumps.py`)."""
+        return self._judge.jump_warnings()
 
     def in_doubt(self, stamp_ns: int) -> str:
         """Why no pose can be called good as long as a receiver has leapt that alone tells the place; empty where none has."""
         streams = self.problem.streams.items()  # where one is left out, the bounds allow for it
-        doubtful = [n for n, s in streams if s.left_out is None and s.leaping.doubtful(stamp_ns)]
+        doubtful = [n for n, s in streams if s.left_out is None and s.jump_detector.doubtful(stamp_ns)]
         return "; ".join(why_in_doubt(n) for n in doubtful)
 
     def gone(self) -> list[LedgerRow]:

@@ -20,11 +20,11 @@ from graphloc.chi2 import chi2_median
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, Sensor, SlowProcess
-from graphloc.leaps import LeapWatch
 from graphloc.measurements import ImuSeries, Measurement
-from graphloc.online._habit import Habit
-from graphloc.online._parting import Parting
+from graphloc.online._frozen_receiver import FrozenReceiverDetector
+from graphloc.online._motion_model import MotionModel
 from graphloc.online._setup import Setup
+from graphloc.position_jumps import JumpDetector
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
@@ -191,8 +191,8 @@ class LiveStream:
     gyro_radps: Tape[Array] = field(default_factory=Tape)
     apart_s: Tape[float] = field(default_factory=Tape)
     scatter: Scatter = field(default_factory=Scatter)
-    parting: Parting = field(default_factory=Parting)
-    leaping: LeapWatch = field(default_factory=LeapWatch)
+    frozen_detector: FrozenReceiverDetector = field(default_factory=FrozenReceiverDetector)
+    jump_detector: JumpDetector = field(default_factory=JumpDetector)
 
 
 @dataclass(slots=True, eq=False)
@@ -206,7 +206,7 @@ class LiveProblem:
     R_body_imu: Array
     links: InertialLink
     streams: dict[str, LiveStream]
-    habit: Habit
+    motion_model: MotionModel
 
     def take(self, m: Measurement) -> tuple[LiveStream, int]:
         """Put a measurement where it belongs; return its stream and its index there."""
@@ -221,7 +221,7 @@ class LiveProblem:
         stream.gyro_radps.append(gyro_radps)
         return stream, len(stream.measurements) - 1
 
-    def carry_anew(self, stream: LiveStream, index: int) -> None:
+    def reintegrate(self, stream: LiveStream, index: int) -> None:
         """Integrate the way from the state before a measurement again: samples of it came late."""
         stream.carry[index], stream.gyro_radps[index] = self._motion(stream.measurements[index].stamp_ns)
 
@@ -236,7 +236,7 @@ class LiveProblem:
 
 
 def live_problem(
-    setup: Setup, datum: Datum, imu: ImuSeries, start_ns: int, noise_scale: float, habit: Habit
+    setup: Setup, datum: Datum, imu: ImuSeries, start_ns: int, noise_scale: float, motion_model: MotionModel
 ) -> LiveProblem:
     """Return a problem whose first state stands at `start_ns`; `imu`: the samples that are known from there on."""
     config, rows, mounts = setup.config, setup.rows, setup.mounts
@@ -267,7 +267,7 @@ def live_problem(
         R_body_imu=R,
         links=setup.inertial.link(imu, sensor, R, datum.gravity_mps2, noise_scale),
         streams=streams,
-        habit=habit,
+        motion_model=motion_model,
     )
 
 

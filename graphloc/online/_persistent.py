@@ -7,14 +7,14 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 from graphloc.frames import Datum
-from graphloc.leaps import LeapWatch
 from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
-from graphloc.online._habit import Habit
+from graphloc.online._heading_check import HeadingCheck
+from graphloc.online._motion_model import MotionModel
 from graphloc.online._noise import ImuNoise
 from graphloc.online._odometry import Odometry
 from graphloc.online._snapshot import Snapshot
-from graphloc.online._turned import Turned
+from graphloc.position_jumps import JumpDetector
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -28,8 +28,8 @@ class PersistentState:
         doubt: why the pose of this start cannot be called good; empty where it can.
         agreed_ns: stamp at which each absolute sensor last agreed, as known when the last window ended.
         odometry: the `odom` frame; None before the first start.
-        habit: motion model. turned: heading check.
-        leaping: detectors of position jumps, by sensor: a restart does not make a level right.
+        motion_model: motion model. heading_check: whether the heading fits the motion.
+        jump_detectors: detectors of position jumps, by sensor: a restart does not make a level right.
         frozen: receivers that were last reported as frozen.
     """
 
@@ -39,9 +39,9 @@ class PersistentState:
     doubt: str = ""
     agreed_ns: dict[str, int] = field(default_factory=dict)
     odometry: Odometry | None = None
-    habit: Habit = field(default_factory=Habit)
-    turned: Turned = field(default_factory=Turned)
-    leaping: dict[str, LeapWatch] = field(default_factory=dict)
+    motion_model: MotionModel = field(default_factory=MotionModel)
+    heading_check: HeadingCheck = field(default_factory=HeadingCheck)
+    jump_detectors: dict[str, JumpDetector] = field(default_factory=dict)
     frozen: set[str] = field(default_factory=set)
 
     @classmethod
@@ -84,6 +84,6 @@ class PersistentState:
 
     def forget_clock(self, stamp_ns: int) -> None:
         """Forget stamps of a clock that was set back; `stamp_ns`: by the clock as it is now."""
-        self.agreed_ns, self.leaping = {}, {}
+        self.agreed_ns, self.jump_detectors = {}, {}
         if self.odometry is not None:
             self.odometry.stamp_ns = stamp_ns

@@ -17,12 +17,12 @@ from graphloc.config import VesselConfig
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate
 from graphloc.frames import Array, Datum
+from graphloc.frozen_imu import WHY
 from graphloc.graph import InertialRow, Sensor
-from graphloc.hangs import WHY
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement
-from graphloc.online._book import Book
 from graphloc.online._intake import ImuIntake, series_of
+from graphloc.online._ledger import OnlineLedger
 from graphloc.online._noise import ImuNoise
 from graphloc.online._persistent import PersistentState
 from graphloc.online._setup import Setup
@@ -74,13 +74,13 @@ class OnlineSmoother:
         self._persistent = PersistentState(
             datum=datum or (Datum(config.datum.geodetic) if config.datum else None), noise=self._configured_noise()
         )
-        self._book = Book(config)
+        self._ledger = OnlineLedger(config)
         self._events: list[str] = []
         self._intake = ImuIntake(setup.gap_s, imu is not None and imu.gravity != "removed")
         self._snapshot = SnapshotFile(snapshot)
         self._resumable, trouble = self._snapshot.read(config.vessel, setup.imu_name, self.datum)
         self._say(trouble)
-        self._waiting = Waiting(self._book)
+        self._waiting = Waiting(self._ledger)
         self._tracking: Tracking | None = None
         self._wait(
             "the first IMU sample" if imu else f"an IMU: no enabled sensor of kind {inertial.kind} is configured"
@@ -130,8 +130,8 @@ class OnlineSmoother:
     def rows(self) -> list[LedgerRow]:
         """Return the rows of the ledger that became final since this was last asked; measurements leave with the lag."""
         if self._tracking is not None:
-            self._book.enter(self._tracking.lag.gone())
-        return self._book.taken()
+            self._ledger.enter(self._tracking.lag.gone())
+        return self._ledger.taken()
 
     def events(self) -> list[str]:
         """Return what happened since this was last asked, a line each: started, restarted, rebuilt, resumed."""
@@ -160,18 +160,18 @@ class OnlineSmoother:
         if isinstance(m, ImuSample):
             return self._feed_imu(m)
         if m.sensor not in self._setup.measuring:
-            self._book.drop(m, Outcome.IGNORED, _NOT_ASKED)
+            self._ledger.drop(m, Outcome.IGNORED, _NOT_ASKED)
             return None
         newest, tracking = self._intake.newest, self._tracking
         if newest is not None and m.stamp_ns - newest.stamp_ns > _AHEAD_S * 1e9:
             ahead_s = (m.stamp_ns - newest.stamp_ns) * 1e-9
-            self._book.drop(m, Outcome.REJECTED, f"its stamp lies {ahead_s:.0f} s ahead of the IMU's")
+            self._ledger.drop(m, Outcome.REJECTED, f"its stamp lies {ahead_s:.0f} s ahead of the IMU's")
         elif tracking is None:
             self._waiting.hold(m)
         elif m.stamp_ns < tracking.lag.first_ns:
             late_s = (tracking.lag.newest.stamp_ns - m.stamp_ns) * 1e-9
             lag_s = self._setup.lag_s
-            self._book.drop(
+            self._ledger.drop(
                 m, Outcome.LATE, f"its stamp is {late_s:.1f} s before the newest state; the lag is {lag_s:g} s"
             )
         else:
@@ -182,14 +182,14 @@ class OnlineSmoother:
         if m.sensor != self._setup.imu_name:
             sensor = self._setup.config.sensors.get(m.sensor)
             other = sensor is not None and sensor.enabled and self._setup.imu_name
-            self._book.drop(m, Outcome.IGNORED, f"{other} is the IMU" if other else _NOT_ASKED)
+            self._ledger.drop(m, Outcome.IGNORED, f"{other} is the IMU" if other else _NOT_ASKED)
             return None
         taken = self._intake.take(m, started=self._tracking is not None)
         for lost, why in taken.dropped:
-            self._book.drop(lost, Outcome.REJECTED, why)
+            self._ledger.drop(lost, Outcome.REJECTED, why)
         if taken.absurd and self._tracking is None:
             self._waiting.why = f"IMU data that a vessel can have: {taken.absurd}"
-        if taken.hangs:
+        if taken.newly_frozen:
             self._say(f"{m.sensor}: {WHY}; treated as an IMU gap until the samples change")
         if taken.late is not None:
             self._keep_imu(taken.late, taken.hole)
@@ -261,7 +261,7 @@ class OnlineSmoother:
         """Give up the estimate, and wait for a start."""
         self._tracking = None
         self._waiting.begin(why)
-        self._book.close()
+        self._ledger.close()
         self._intake.restart([])
         self._snapshot.restart()
 
@@ -286,7 +286,7 @@ class OnlineSmoother:
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             if self._tracking is None:
                 for m in others:
-                    self._book.drop(m, Outcome.REJECTED, _NOT_REACHED)
+                    self._ledger.drop(m, Outcome.REJECTED, _NOT_REACHED)
             self._restart(f"the start failed ({in_one_line(error)})")
             return None
         return self._estimate()
@@ -298,11 +298,11 @@ class OnlineSmoother:
         persistent.datum, persistent.heights_m, persistent.doubt = started.datum, started.heights_m, started.doubt
         persistent.noise.scale = max(persistent.noise.scale, started.noise_scale)
         for sample in samples:
-            self._book.used(sample)
+            self._ledger.used(sample)
         self._waiting.taken()
         solved = (started.pose, started.velocity, started.bias)
-        self._tracking = tracking = Tracking(self._setup, persistent, self._book, started.anchor, samples, solved)
-        self._book.enter(started.rows)
+        self._tracking = tracking = Tracking(self._setup, persistent, self._ledger, started.anchor, samples, solved)
+        self._ledger.enter(started.rows)
         tracking.catch_up(samples, others, until_ns)
         self._keep_anchor(tracking)
         newest_ns = tracking.lag.newest.stamp_ns
@@ -346,7 +346,7 @@ class OnlineSmoother:
             return
         persistent = PersistentState.resumed(found, self._configured_noise(), self._setup.measuring)
         try:
-            tracking = Tracking(self._setup, persistent, self._book, found.anchor, [found.imu, newest])
+            tracking = Tracking(self._setup, persistent, self._ledger, found.anchor, [found.imu, newest])
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             self._say(f"the snapshot cannot be used ({in_one_line(error)}): starts without it")
             return
@@ -363,8 +363,8 @@ class OnlineSmoother:
         if self._tracking is not None:
             why = "the run ended before there was a state at its stamp"
             self._tracking.end(why)
-        if self._intake.leap is not None:
-            self._book.drop(self._intake.leap, Outcome.REJECTED, why)
+        if self._intake.jumped is not None:
+            self._ledger.drop(self._intake.jumped, Outcome.REJECTED, why)
         self._waiting.refuse(why)
-        self._tracking, self._intake.leap = None, None
-        return self._book.taken()
+        self._tracking, self._intake.jumped = None, None
+        return self._ledger.taken()

@@ -17,8 +17,8 @@ from graphloc.frames import Array
 from graphloc.graph import Attachment, Going, Residual
 from graphloc.online._anchor import Anchor, without_prior
 from graphloc.online._constants import Constants
-from graphloc.online._habit import UNSURE_MPS, Moving
 from graphloc.online._live import LiveProblem, LiveStream
+from graphloc.online._motion_model import UNSURE_MPS, Moving
 from graphloc.online._window import Held, Window
 from graphloc.solve._foreseen import Prediction, prediction_of
 
@@ -44,7 +44,7 @@ class Newest:
     velocity_cov: Array
 
 
-def carried_on(cov: Array, newest: Newest, R: Array, dt_s: float, noise: Array) -> Array:
+def propagated_covariance(cov: Array, newest: Newest, R: Array, dt_s: float, noise: Array) -> Array:
     """Return a covariance at the newest state, dt_s later: much is added across a gap.
 
     Args:
@@ -149,18 +149,18 @@ class States:
             window.guess(keys.bias(following), bias, t)
             window.add([bias_step(links, j, dt_s)])
             self._next_slow(j, dt_s, t)
-            self._next_habit(j, dt_s)
+            self._next_motion(j, dt_s)
         window.touch(keys.bias(following), t)
         for stream in self._problem.streams.values():
             if stream.slow is not None:
                 window.touch(keys.slow(stream.number, following), t)
         return bool(following != j)
 
-    def _next_habit(self, j: int, dt_s: float) -> None:
+    def _next_motion(self, j: int, dt_s: float) -> None:
         """Learn how the vessel moves, or, where that is hardly known, stage that from slow node j on it moved as usual."""
         problem, newest, timeline = self._problem, self._newest, self._problem.timeline
         if float(np.linalg.eigvalsh(newest.velocity_cov[:2, :2])[-1]) < UNSURE_MPS**2:
-            problem.habit.learn(newest.stamp_ns, (newest.pose.rotation().matrix().T @ newest.velocity)[:2])
+            problem.motion_model.learn(newest.stamp_ns, (newest.pose.rotation().matrix().T @ newest.velocity)[:2])
             return
         begin_ns, end_ns = timeline.slow_stamps_ns[j], timeline.stamps_ns[timeline.last]
         if begin_ns < timeline.stamps_ns[timeline.first]:
@@ -168,7 +168,7 @@ class States:
         # How it turned in a hole is a guess, and so is along which axes it moved there.
         if not any(a < end_ns and b > begin_ns and b - a > _HOLE_S * 1e9 for a, b in problem.links.gaps()):
             before, now = self._moving(timeline.floor(begin_ns)), self._moving(timeline.last)
-            self._window.add(problem.habit.step(before, now, dt_s))
+            self._window.add(problem.motion_model.step(before, now, dt_s))
 
     def _moving(self, k: int) -> Moving:
         values, key = self._window.values, keys.velocity(k)
@@ -188,10 +188,10 @@ class States:
             if ends:
                 self._ends[stream.name] = window.add(ends)
 
-    def link_anew(self, torn: Collection[int]) -> None:
+    def reintegrate(self, stale: Collection[int]) -> None:
         """Stage anew the IMU's steps that begin at these states: samples of them came late."""
         timeline, links, window = self._problem.timeline, self._problem.links, self._window
-        for k in sorted(torn):
+        for k in sorted(stale):
             if k in self._links and window.remove(self._links[k]):
                 j, values = timeline.slow_of[k], window.values
                 going = Going.of(nav_state(values, k), values.atConstantBias(keys.bias(j)))
@@ -229,7 +229,7 @@ class States:
         if base != k:
             from_ns, to_ns = timeline.stamps_ns[base], timeline.stamps_ns[k]
             pim = self._problem.links.integrate(from_ns, to_ns, newest.bias)
-            P = carried_on(
+            P = propagated_covariance(
                 P, newest, at.T_world_body.rotation().matrix(), (to_ns - from_ns) * 1e-9, pim.preintMeasCov()
             )
         return prediction_of(residual, at, P, newest.velocity_cov)

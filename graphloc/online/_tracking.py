@@ -15,15 +15,15 @@ from graphloc.estimate import Estimate
 from graphloc.frames import Array
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample, Measurement
-from graphloc.online._ahead import ahead, carry_on, no_further
 from graphloc.online._anchor import Anchor
-from graphloc.online._book import Book
 from graphloc.online._estimates import estimate_of
 from graphloc.online._intake import series_of
 from graphloc.online._lag import Lag
+from graphloc.online._ledger import OnlineLedger
 from graphloc.online._live import live_problem
 from graphloc.online._odometry import Odometry
 from graphloc.online._persistent import PersistentState
+from graphloc.online._propagate import advance_odometry, propagate, unpropagated
 from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
@@ -38,7 +38,7 @@ class Tracking:
     """The window of one start, what waits to enter it, and what it can be rebuilt from.
 
     Args:
-        persistent: state outside the window, updated as the window moves on. book: where measurements get their rows.
+        persistent: state outside the window, updated as the window moves on. ledger: where measurements get their rows.
         anchor: the state that the window begins at. samples: of the IMU, from there or before to the newest.
         guess: pose, velocity (3,) and bias (6,) that this state is first solved at; default: the anchor's.
 
@@ -53,12 +53,12 @@ class Tracking:
         self,
         setup: Setup,
         persistent: PersistentState,
-        book: Book,
+        ledger: OnlineLedger,
         anchor: Anchor,
         samples: Sequence[ImuSample],
         guess: tuple[gtsam.Pose3, Array, Array] | None = None,
     ) -> None:
-        self._setup, self._persistent, self._book = setup, persistent, book
+        self._setup, self._persistent, self._ledger = setup, persistent, ledger
         self._pending: list[Measurement] = []  # ahead of the IMU, by stamp
         self._unread: list[ImuSample] = []  # not yet handed to the window
         self._holes: list[tuple[int, int]] = []  # stamps (ns) between which samples came late
@@ -84,16 +84,16 @@ class Tracking:
         known = [m for m in samples if m.stamp_ns >= since_ns] or samples[-1:]
         assert persistent.datum is not None
         problem = live_problem(
-            setup, persistent.datum, series_of(known), anchor.stamp_ns, persistent.noise.scale, persistent.habit
+            setup, persistent.datum, series_of(known), anchor.stamp_ns, persistent.noise.scale, persistent.motion_model
         )
         for name, stream in problem.streams.items():
             if before is not None:
                 stream.scatter = before.problem.streams[name].scatter
-            stream.leaping = persistent.leaping.setdefault(name, stream.leaping)
+            stream.jump_detector = persistent.jump_detectors.setdefault(name, stream.jump_detector)
         lag = Lag(problem, anchor, setup.lag_s, guess)
         if before is not None:
             lag.agreed_ns.update(before.agreed_ns)
-        self._book.begin()
+        self._ledger.begin()
         self._height_due_ns = {}
         return lag
 
@@ -104,7 +104,7 @@ class Tracking:
         insort(self._pending, m, key=lambda p: p.stamp_ns)
         self._recent.keep(m)
         if len(self._pending) > _PENDING:
-            self._book.drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
+            self._ledger.drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
 
     def keep_imu(self, m: ImuSample, hole: tuple[int, int] | None = None) -> None:
         """Keep an IMU sample; `hole`: of one that came late, the stamps (ns) of the samples before and after it."""
@@ -112,7 +112,7 @@ class Tracking:
             self._holes.append(hole)
         self._unread.append(m)
         self._recent.keep(m)
-        self._book.used(m)
+        self._ledger.used(m)
 
     # The window moves on
 
@@ -122,16 +122,16 @@ class Tracking:
 
     def catch_up(self, samples: Sequence[ImuSample], others: Sequence[Measurement], until_ns: int) -> None:
         """Bring a window that has just begun to a stamp, with the measurements that the start was made of."""
-        self._pending = [m for m in others if not self._book.has(m)]
+        self._pending = [m for m in others if not self._ledger.has(m)]
         while self._pending and self._pending[0].stamp_ns < self.lag.first_ns:
-            self._book.drop(self._pending.pop(0), Outcome.REJECTED, "no IMU data at this stamp")
+            self._ledger.drop(self._pending.pop(0), Outcome.REJECTED, "no IMU data at this stamp")
         self._recent.begin([*samples, *self._pending])
         self._extend(until_ns)
 
     def resume(self, anchor: Anchor, before: ImuSample, newest: ImuSample) -> None:
         """Go on from a snapshot: its anchor, the sample at it or before, and the first sample since."""
         self._recent.resume(anchor, before, newest)
-        self._book.used(newest)
+        self._ledger.used(newest)
 
     def advance(self, until_ns: int) -> None:
         """Make the states that are due up to a stamp, with the measurements that belong to them: an update."""
@@ -146,10 +146,10 @@ class Tracking:
             reached_ns = timeline.stamps_ns[timeline.last]
             self._take_pending(reached_ns)
             lag.judge()
-            carry_on(self._odometry, lag.problem, lag.newest, reached_ns)
+            advance_odometry(self._odometry, lag.problem, lag.newest, reached_ns)
             lag.commit()
             lag.try_others()
-        self._book.enter(lag.gone())
+        self._ledger.enter(lag.gone())
 
     def _read_imu(self) -> None:
         """Hand the samples that have arrived to the window; where they came late, integrate anew."""
@@ -160,7 +160,7 @@ class Tracking:
             self._unread = []
         if self._holes:
             holes, self._holes = self._holes, []
-            self.lag.mend(holes)
+            self.lag.reintegrate(holes)
 
     def _grow(self, until_ns: int) -> None:
         """Stage the next states: as many as one commit takes."""
@@ -187,19 +187,19 @@ class Tracking:
         while self._pending and self._pending[0].stamp_ns <= reached_ns:
             m = self._pending.pop(0)
             if m.stamp_ns < self.lag.first_ns:
-                self._book.drop(m, Outcome.LATE, "left the lag while it waited")
+                self._ledger.drop(m, Outcome.LATE, "left the lag while it waited")
                 continue
             try:
                 self.lag.take(m)
-                self._persistent.turned.note(m, self.lag)
+                self._persistent.heading_check.note(m, self.lag)
             except Exception as error:  # noqa: BLE001 - the others are still good; nothing of this one is staged yet
-                self._book.drop(m, Outcome.REJECTED, f"it could not be used: {in_one_line(error)}")
+                self._ledger.drop(m, Outcome.REJECTED, f"it could not be used: {in_one_line(error)}")
 
     def keep_anchor(self) -> bool:
         """Remember the newest state as an anchor, if that is due, and forget what no rebuild needs; tell whether it was due."""
         if not self._recent.keep_anchor(self.lag):
             return False
-        self._book.forget_but({m.seq for m in self._recent})
+        self._ledger.forget_but({m.seq for m in self._recent})
         return True
 
     # What is known
@@ -207,11 +207,11 @@ class Tracking:
     def estimate(self, stamp_ns: int | None = None) -> Estimate:
         """Return the newest state, or its propagation by the IMU to a later stamp (ns)."""
         lag, persistent, newest = self.lag, self._persistent, self.lag.newest
-        now = no_further(newest, self._odometry)
+        now = unpropagated(newest, self._odometry)
         if stamp_ns is not None and stamp_ns > newest.stamp_ns:
             self._read_imu()
-            now = ahead(lag.problem, newest, self._odometry, stamp_ns)
-        doubts = (persistent.turned.said, persistent.doubt, lag.in_doubt(now.stamp_ns))
+            now = propagate(lag.problem, newest, self._odometry, stamp_ns)
+        doubts = (persistent.heading_check.said, persistent.doubt, lag.in_doubt(now.stamp_ns))
         return estimate_of(
             now,
             lag,
@@ -232,12 +232,12 @@ class Tracking:
 
     def news(self) -> list[str]:
         """Return a line on what the newest state newly shows: a wrong heading, frozen receivers, position jumps."""
-        turned = self._persistent.turned
-        wrong_heading = [turned.said] if turned.look(self.lag) else []
-        was, now = self._persistent.frozen, self.lag.parted
+        check = self._persistent.heading_check
+        wrong_heading = [check.said] if check.look(self.lag) else []
+        was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now
         frozen = [f"{name}: {_FROZEN if name in now else _NO_LONGER_FROZEN}" for name in sorted(now ^ was)]
-        return [*wrong_heading, *frozen, *self.lag.leapt()]
+        return [*wrong_heading, *frozen, *self.lag.jump_warnings()]
 
     def snapshot(self, newest: ImuSample) -> Snapshot:
         """Return the last anchor and all that is needed to go on from it; `newest`: sample of the IMU."""
@@ -259,28 +259,28 @@ class Tracking:
         Raises:
             SolveError: neither could be solved; the window is the one that failed.
         """
-        failed, recent, book = self.lag, self._recent, self._book
-        book.enter(failed.gone())
+        failed, recent, ledger = self.lag, self._recent, self._ledger
+        ledger.enter(failed.gone())
         anchors = [a for a in recent.anchors if a.stamp_ns >= failed.first_ns]
         for anchor, without in [(anchors[0], False), (anchors[-1], True)] if anchors else []:
-            again = [m for m in recent.others() if m.stamp_ns >= anchor.stamp_ns and not book.has(m)]
+            again = [m for m in recent.others() if m.stamp_ns >= anchor.stamp_ns and not ledger.has(m)]
             again.sort(key=lambda m: m.stamp_ns)
-            mark = book.marked()
+            mark = ledger.marked()
             try:
                 self._rebuild_from(anchor, [] if without else again, until_ns)
             except Exception as error:  # noqa: BLE001 - whatever failed, an older state may do
                 why = failure_text(error)
-                book.back_to(mark)
+                ledger.back_to(mark)
                 continue
             if without:
                 for m in again:
-                    book.drop(m, Outcome.REJECTED, f"left out: {why}")
+                    ledger.drop(m, Outcome.REJECTED, f"left out: {why}")
                 recent.anchors = deque([anchor])
             self._settle_rows(failed, again)
             age_s = (self.lag.newest.stamp_ns - anchor.stamp_ns) * 1e-9
             return f"{why}: the window was rebuilt from {age_s:.1f} s before"
         held = {row.seq for row in failed.held()}
-        self.lag, self._pending = failed, [m for m in recent.others() if not book.has(m) and m.seq not in held]
+        self.lag, self._pending = failed, [m for m in recent.others() if not ledger.has(m) and m.seq not in held]
         raise SolveError(f"{why}, and the window could not be rebuilt from an earlier state")
 
     def _rebuild_from(self, anchor: Anchor, measurements: Sequence[Measurement], until_ns: int) -> None:
@@ -291,24 +291,24 @@ class Tracking:
 
     def end(self, reason: str) -> None:
         """Give every measurement its row; `reason`: of those that the states have not reached."""
-        self._book.enter([*self.lag.gone(), *self.lag.held()])
+        self._ledger.enter([*self.lag.gone(), *self.lag.held()])
         for m in self._pending:
-            self._book.drop(m, Outcome.REJECTED, reason)
+            self._ledger.drop(m, Outcome.REJECTED, reason)
 
     def end_but(self, since_ns: int) -> list[Measurement]:
         """Give every measurement its row, but those since a stamp (ns), which are returned to start anew with."""
-        self._book.enter(self.lag.gone())
-        again = [m for m in self._recent if m.stamp_ns >= since_ns and not self._book.has(m)]
+        self._ledger.enter(self.lag.gone())
+        again = [m for m in self._recent if m.stamp_ns >= since_ns and not self._ledger.has(m)]
         self._settle_rows(self.lag, again)
         return again
 
     def _settle_rows(self, replaced: Lag, again: Iterable[Measurement]) -> None:
         """Give the measurements of a window that was replaced their rows, but for what is used again."""
         used_again = {m.seq for m in again}
-        self._book.enter([row for row in replaced.held() if row.seq not in used_again])
+        self._ledger.enter([row for row in replaced.held() if row.seq not in used_again])
         for m in self._recent.others():
-            if not self._book.has(m) and m.seq not in used_again:
-                self._book.drop(m, Outcome.LATE, "older than the oldest state of the rebuilt window")
+            if not self._ledger.has(m) and m.seq not in used_again:
+                self._ledger.drop(m, Outcome.LATE, "older than the oldest state of the rebuilt window")
 
 
 _FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"

@@ -7,7 +7,7 @@ from bisect import insort
 
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample, Measurement
-from graphloc.online._book import Book
+from graphloc.online._ledger import OnlineLedger
 from graphloc.online._start import LEAST_S
 from graphloc.time import duration_ns
 
@@ -18,9 +18,9 @@ _LONGEST_S, _MOST = 120.0, 50_000  # what is older, or more, is let go
 class Waiting:
     """Measurements by stamp, and `why`: what the start waits for, in plain words."""
 
-    def __init__(self, book: Book) -> None:
+    def __init__(self, ledger: OnlineLedger) -> None:
         self.why = ""
-        self._book = book
+        self._ledger = ledger
         self._held: list[Measurement] = []
         self._tried_ns = 0
 
@@ -60,7 +60,7 @@ class Waiting:
     def refuse(self, reason: str) -> None:
         """Enter all into the ledger as not used."""
         for m in self.taken():
-            self._book.drop(m, Outcome.REJECTED, reason)
+            self._ledger.drop(m, Outcome.REJECTED, reason)
 
     def _let_go(self) -> None:
-        self._book.drop(self._held.pop(0), Outcome.REJECTED, f"came before the start: waiting for {self.why}")
+        self._ledger.drop(self._held.pop(0), Outcome.REJECTED, f"came before the start: waiting for {self.why}")

@@ -14,9 +14,9 @@ from graphloc.berths import Berth, BerthTrack, rates, seen_from
 from graphloc.build import Judged, Problem, Stream, constant_keys
 from graphloc.frames import Array, skew
 from graphloc.graph import SlowProcess
-from graphloc.leaps import LASTS_S, largest_sigma, leaps_said, why_in_doubt
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import Measurement
+from graphloc.position_jumps import LASTS_S, jump_warnings, largest_sigma, why_in_doubt
 from graphloc.recording import Recording
 from graphloc.solution import Health, SlowEstimate, Solution, SolveStats
 from graphloc.solve._batch import BatchResult, expected_cost
@@ -159,7 +159,7 @@ def _misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[s
     said = [why] * len(stamps_ns)
     for stream in problem.streams:
         if not why and stream.left_out is None and stream.slow is None:  # else the bounds allow for a slow error
-            for at_ns in stream.leapt[0]:
+            for at_ns in stream.position_jumps[0]:
                 for k in np.flatnonzero(np.abs(stamps_ns - at_ns) < LASTS_S * 1e9):
                     said[int(k)] = why_in_doubt(stream.name)
     return said
@@ -384,7 +384,7 @@ def _stats(problem: Problem, result: BatchResult) -> SolveStats:
         if stream.left_out is not None:
             warnings.append(alone(stream.name, stream.left_out))
         allowed = stream.left_out is not None
-        warnings += leaps_said(stream.name, *stream.leapt, allowed=allowed, followed=stream.slow is None)
+        warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
         warnings += disagreeing(stream.name, weights)
         if stream.row.false is not None:

@@ -20,7 +20,7 @@ from graphloc.time import NS_PER_S, utc_text
 LASTS_S = 200.0
 """For so long before and after a leap either side of it may be the wrong one: as a slow error lasts."""
 # m, as far as 4 m/s^2 that come and go within three seconds; times what is usual; fewer do not tell what that is.
-_LEAP_M, _LEAP, _FEWEST = 3.0, 10.0, 10
+_JUMP_M, _JUMP, _FEWEST = 3.0, 10.0, 10
 _AROUND = 0.75  # around a step it is usually more than that of what it is over all
 _SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # of what is stated; a car that brakes in an emergency, and then stands
 _EVEN = 1.5  # a step longer or shorter by more than this is none as those beside it
@@ -28,7 +28,7 @@ _BURST_S = 1.0  # fixes that are off for no longer are outliers
 _KEPT = 200
 
 
-def told_alone(stream: Any, absolute: Collection[Any]) -> bool:
+def only_position_sensor(stream: Any, absolute: Collection[Any]) -> bool:
     """Return whether nothing but this stream's single places tells where the craft is, and it has no slow error that may leap.
 
     Args:
@@ -37,7 +37,7 @@ def told_alone(stream: Any, absolute: Collection[Any]) -> bool:
     return len(absolute) == 1 and stream.row.absolute and stream.row.false is None and stream.slow is None
 
 
-def leaps(
+def position_jumps(
     stamps_ns: NDArray[np.int64], places_m: Array, sigma_m: Array, *, allowed: bool
 ) -> tuple[NDArray[np.int64], Array]:
     """Return stamps (K,) and sizes (K,), m, of steps between places (N, 2) that are a leap, unlike those before and after.
@@ -63,11 +63,11 @@ def leaps(
     window = np.lib.stride_tricks.sliding_window_view
     even = (window(dt, 3).max(axis=1) < _EVEN * usual_s) & (window(dt, 3).min(axis=1) * _EVEN > usual_s)
     # In a silence it may have gone anywhere; where fixes are seconds apart, any turn and any stop is metres off.
-    least_m = np.full(len(off_m), _LEAP_M * max(usual_s, 1.0) ** 2)
+    least_m = np.full(len(off_m), _JUMP_M * max(usual_s, 1.0) ** 2)
     if not allowed:  # what is said where the bounds allow for it is said where they do not, too
         believed_m = np.maximum(_BRAKES_MPS2 * usual_s**2 / 2.0, _SIGMAS * window(sigma_m, 4).max(axis=1))
         least_m = np.minimum(least_m, believed_m)
-    least_m = np.maximum(least_m, _LEAP * _usual(off_m))
+    least_m = np.maximum(least_m, _JUMP * _usual(off_m))
     far = np.flatnonzero(even & (off_m >= beside) & (off_m > least_m) & (both > off_m / 2.0))
     far = far[(far > 0) & (far < len(off_m) - 1)]  # beside an end a fix that is off may look like half a leap
     near = np.abs(np.subtract.outer(stamps_ns[far], stamps_ns[far])) <= _BURST_S * NS_PER_S
@@ -87,10 +87,10 @@ def _usual(off_m: Array) -> Array:
     return np.asarray(np.maximum(np.median(around, axis=1) * _AROUND, np.median(off_m)))
 
 
-def leaps_said(
+def jump_warnings(
     sensor: str, stamps_ns: NDArray[np.int64], off_m: Array, *, allowed: bool, followed: bool = True
 ) -> list[str]:
-    """Return a line on what `leaps` found, or none; `followed`: by the track, else they are taken for the receiver's error."""
+    """Return a line on what `position_jumps` found, or none; `followed`: by the track, else they are taken for the receiver's error."""
     if not len(stamps_ns):
         return []
     n = int(np.argmax(off_m))
@@ -114,7 +114,7 @@ def why_in_doubt(sensor: str) -> str:
     return f"position jump of {sensor}, and no other sensor measures position"
 
 
-class LeapWatch:
+class JumpDetector:
     """The same of one receiver as its fixes come: a leap is seen a second later, three fixes at least."""
 
     def __init__(self) -> None:
@@ -123,7 +123,7 @@ class LeapWatch:
         self._last_ns: int | None = None
 
     def note(self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed: bool) -> tuple[NDArray[np.int64], Array]:
-        """Take in a fix; one that is late is passed over. Return as `leaps` what it shows; of one after another the first only."""
+        """Take in a fix; one that is late is passed over. Return as `position_jumps` what it shows; of one after another the first only."""
         none = np.zeros(0, dtype=np.int64), np.zeros(0)
         if self._seen and stamp_ns <= self._seen[-1][0]:
             return none
@@ -131,7 +131,7 @@ class LeapWatch:
         if len(self._seen) < _FEWEST:
             return none
         stamps_ns, sigmas_m = np.array([at for at, _, _ in self._seen]), np.array([s for _, _, s in self._seen])
-        at_ns, off_m = leaps(stamps_ns, np.array([p for _, p, _ in self._seen]), sigmas_m, allowed=allowed)
+        at_ns, off_m = position_jumps(stamps_ns, np.array([p for _, p, _ in self._seen]), sigmas_m, allowed=allowed)
         until_ns = min(stamps_ns[-3], stamp_ns - int(_BURST_S * NS_PER_S))  # a later one may yet be a burst
         new = (at_ns > self._judged_ns) & (at_ns <= until_ns)
         self._judged_ns = max(int(until_ns), self._judged_ns)

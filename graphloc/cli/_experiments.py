@@ -37,7 +37,7 @@ def ablate(
     as_json: JsonOption = False,
 ) -> None:
     """Smooth a run without each sensor in turn: what each contributes, and whether one contradicts the rest."""
-    from graphloc import whatif
+    from graphloc import ablations
     from graphloc.eval import ablation_page as page
     from graphloc.eval.holdout import HoldOut
 
@@ -48,7 +48,7 @@ def ablate(
     wanted.check(page.MARK)
     show = progress()
     recording, vessel, scans = wanted.load(show)
-    found = whatif.ablate(
+    found = ablations.ablate(
         recording, vessel, scans=scans, hold_out=held, jobs=jobs or os.cpu_count() or 1, progress=show
     )
     said = (*page.said(found), *(grid.as_text() for grid in page.grids(found)))

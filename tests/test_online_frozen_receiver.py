@@ -12,20 +12,20 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, world_from_fixes
-from graphloc.online._parting import PARTING_S, Parting
+from graphloc.online._frozen_receiver import WINDOW_S, FrozenReceiverDetector
 from graphloc.recording import Recording
 from graphloc.replay import replay
 
 Off = Callable[[float, Array], Array]
 
 
-def parted(off_m: Off, v_mps: Array, *, hz: float = 5.0, sigma_m: float = 0.2, until_s: float = 60.0, sigma_mps: float = 0.1) -> list[float]:  # fmt: skip
+def frozen_at(off_m: Off, v_mps: Array, *, hz: float = 5.0, sigma_m: float = 0.2, until_s: float = 60.0, sigma_mps: float = 0.1) -> list[float]:  # fmt: skip
     """When a receiver parts that is off by `off_m` of the time and of a normal (2,)."""
-    rng, parting, when = np.random.default_rng(1), Parting(), []
+    rng, detector, when = np.random.default_rng(1), FrozenReceiverDetector(), []
     for k in range(round(until_s * hz)):
         there_m = v_mps * k / hz
-        parting.note(k / hz, there_m + off_m(k / hz, rng.standard_normal(2)), there_m, sigma_m, v_mps, sigma_mps)
-        when += [k / hz] if parting.parted else []
+        detector.note(k / hz, there_m + off_m(k / hz, rng.standard_normal(2)), there_m, sigma_m, v_mps, sigma_mps)
+        when += [k / hz] if detector.frozen else []
     return when
 
 
@@ -33,10 +33,10 @@ V = np.array([2.0, 1.0])
 
 
 @pytest.mark.parametrize("hz", [1.0, 5.0, 20.0])
-def test_one_that_hangs_parts_as_fast_as_the_vessel_goes_until_it_moves_along(hz: float) -> None:
+def test_a_frozen_receiver_is_detected_until_it_moves_along(hz: float) -> None:
     """It says the place of 20 s until 40 s, then the right one, where it is off by a jump."""
-    when = parted(lambda t, n: 0.2 * n - V * (t - 20.0) * (20.0 < t < 40.0), V, hz=hz)
-    assert 20.0 < when[0] < 20.0 + 1.5 * PARTING_S
+    when = frozen_at(lambda t, n: 0.2 * n - V * (t - 20.0) * (20.0 < t < 40.0), V, hz=hz)
+    assert 20.0 < when[0] < 20.0 + 1.5 * WINDOW_S
     assert 38.9 < when[-1] < 41.0
     assert len(when) > 0.9 * hz * (when[-1] - when[0])
 
@@ -51,55 +51,53 @@ def test_one_that_hangs_parts_as_fast_as_the_vessel_goes_until_it_moves_along(hz
         (lambda t, n: 0.05 * n + 0.5 * 2.2 * np.array([np.cos(0.3 * t), np.sin(0.3 * t)]), 5.0, 0.05),  # 0.5 s late, in a turn
     ],
 )  # fmt: skip
-def test_what_drifts_jumps_is_noisy_or_late_does_not_part(off_m: Off, hz: float, sigma_m: float) -> None:
-    assert parted(off_m, V, hz=hz, sigma_m=sigma_m, until_s=200.0) == []
+def test_a_receiver_that_drifts_jumps_is_noisy_or_late_is_not_frozen(off_m: Off, hz: float, sigma_m: float) -> None:
+    assert frozen_at(off_m, V, hz=hz, sigma_m=sigma_m, until_s=200.0) == []
 
 
 def test_a_velocity_that_is_hardly_known_tells_nothing() -> None:
     """After an outage it is the estimate that goes astray, and the receiver that is right."""
-    assert parted(lambda t, n: 0.2 * n - V * max(t - 20.0, 0.0), V, sigma_mps=1.0) == []
+    assert frozen_at(lambda t, n: 0.2 * n - V * max(t - 20.0, 0.0), V, sigma_mps=1.0) == []
 
 
-def test_one_that_hangs_does_so_though_the_velocity_is_known_ever_less() -> None:
+def test_a_frozen_receiver_stays_frozen_while_the_velocity_becomes_uncertain() -> None:
     """Nothing but it had told the velocity. What it has said since it stands is told, too: that drew the estimate along."""
-    rng, parting, when = np.random.default_rng(1), Parting(), []
+    rng, detector, when = np.random.default_rng(1), FrozenReceiverDetector(), []
     for k in range(200):
         t = k / 5.0
         there_m, told_m = V * t, V * min(t, 20.0) + 0.2 * rng.standard_normal(2)
-        parting.note(t, told_m, there_m, 0.2, V, 0.1 + 0.2 * max(t - 25.0, 0.0))
-        when += [t] if parting.parted else []
+        detector.note(t, told_m, there_m, 0.2, V, 0.1 + 0.2 * max(t - 25.0, 0.0))
+        when += [t] if detector.frozen else []
     assert when[-1] == 199 / 5.0
     assert len(when) > 0.9 * 5.0 * (when[-1] - when[0])
-    assert 19.0 < parting.stands_s < 20.5
+    assert 19.0 < detector.stands_s < 20.5
 
 
 def test_one_that_moves_otherwise_may_be_right() -> None:
     """The estimate went astray: it stands while the receiver goes on, or goes much faster."""
-    assert parted(lambda t, n: 0.2 * n + V * max(t - 20.0, 0.0), 0.0 * V) == []
-    assert parted(lambda t, n: 0.2 * n - 4.0 * V * max(t - 20.0, 0.0), 5.0 * V) == []
+    assert frozen_at(lambda t, n: 0.2 * n + V * max(t - 20.0, 0.0), 0.0 * V) == []
+    assert frozen_at(lambda t, n: 0.2 * n - 4.0 * V * max(t - 20.0, 0.0), 5.0 * V) == []
 
 
 @pytest.mark.parametrize(
     ("hz", "noise_m", "sigma_m"), [(1.0, 0.5, 2.0), (5.0, 1.0, 2.0), (5.0, 1.0, 0.5), (10.0, 1.0, 2.0)]
 )
-def test_one_that_goes_as_fast_another_way_may_be_right_however_noisy(
-    hz: float, noise_m: float, sigma_m: float
-) -> None:
+def test_a_noisy_receiver_that_moves_another_way_is_not_frozen(hz: float, noise_m: float, sigma_m: float) -> None:
     """The estimate turns about, as where the IMU is mounted the other way round than is configured."""
     for seed in range(4):
-        rng, parting = np.random.default_rng(seed), Parting()
+        rng, detector = np.random.default_rng(seed), FrozenReceiverDetector()
         for t in np.arange(0.0, 120.0, 1.0 / hz):
             v_mps = V if t < 20.0 else -V
             there_m = V * (min(t, 20.0) - max(t - 20.0, 0.0))
-            parting.note(t, V * t + noise_m * rng.standard_normal(2), there_m, sigma_m, v_mps, 0.1)
-            assert not parting.parted
+            detector.note(t, V * t + noise_m * rng.standard_normal(2), there_m, sigma_m, v_mps, 0.1)
+            assert not detector.frozen
 
 
 def test_at_the_start_it_may_be_the_estimate_that_is_wrong() -> None:
-    assert parted(lambda t, n: 0.2 * n - V * t * (t < 8.0), V, until_s=16.0) == []
+    assert frozen_at(lambda t, n: 0.2 * n - V * t * (t < 8.0), V, until_s=16.0) == []
 
 
-def hung(run: SimulatedRun, begin_ns: int, end_ns: int, sensors: Collection[str]) -> Recording:
+def frozen(run: SimulatedRun, begin_ns: int, end_ns: int, sensors: Collection[str]) -> Recording:
     """The recording of some sensors; between two times the receiver says one place, but for centimetres."""
     fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
     stuck = next(m for m in fixes if m.stamp_ns >= begin_ns)
@@ -115,7 +113,7 @@ def hung(run: SimulatedRun, begin_ns: int, end_ns: int, sensors: Collection[str]
     return replace(run.recording, measurements=tuple(heard(m) if isinstance(m, GnssPosition) else m for m in kept))
 
 
-def test_online_a_receiver_that_hangs_draws_nothing_along() -> None:
+def test_online_a_frozen_receiver_and_compass_do_not_pull_the_estimate() -> None:
     """Beside a compass alone. It takes 7 s to find, by when the estimate has been set back by 16 m, and braked: 86 m later."""
     scenario = Scenario(
         path="loops", duration_s=50.0, noise="clean", gnss_hz=5.0, gnss_sigma_m=0.5, accel_bias_mps2=0.3, gyro_bias_radps=0.03,
@@ -126,7 +124,7 @@ def test_online_a_receiver_that_hangs_draws_nothing_along() -> None:
     sensors["gnss"] = sensors["gnss"].model_copy(update={"slow_error": SlowErrorConfig()})
     assert run.recording.imu is not None
     begin_ns = int(run.recording.imu.stamps_ns[0]) + 25 * 10**9
-    said = hung(run, begin_ns, begin_ns + 20 * 10**9, ("gnss", "compass"))
+    said = frozen(run, begin_ns, begin_ns + 20 * 10**9, ("gnss", "compass"))
     track = replay(said, run.config.model_copy(update={"sensors": sensors})).solution.trajectory
     off_m = np.hypot(*(track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[:, :2].T)
     since_s = (track.stamps_ns - begin_ns) * 1e-9
@@ -134,12 +132,12 @@ def test_online_a_receiver_that_hangs_draws_nothing_along() -> None:
     assert off_m.max() < 35.0
 
 
-def test_online_a_receiver_that_hangs_is_not_followed() -> None:
+def test_online_frozen_sensors_are_not_followed() -> None:
     """Beside matches, 40 % of them false. Followed, it would be off by 30 m and more, and call that good."""
     run = simulate(Scenario(path="loops", duration_s=45.0, noise="drift"), 1)
     begin_ns = next(m.stamp_ns for m in run.recording.measurements if isinstance(m, GnssPosition)) + 18 * 10**9
     end_ns = begin_ns + 15 * 10**9
-    said = hung(run, begin_ns, end_ns, {m.sensor for m in run.recording.measurements})
+    said = frozen(run, begin_ns, end_ns, {m.sensor for m in run.recording.measurements})
     found = replay(said, run.config).solution
     track = found.trajectory
     off_m = (track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[:, :2]

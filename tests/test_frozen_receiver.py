@@ -12,9 +12,9 @@ from graphloc import app
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.inspect import inspect_bag, render
+from graphloc.frozen_receiver import frozen_fixes
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, PoseFix
-from graphloc.stuck import stuck
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 
 DATUM = Datum(Geodetic(57.7, 11.9, 40.0))
@@ -34,7 +34,7 @@ def said(way: Way, held_s: tuple[float, float], hz: float, noise_m: float) -> tu
 
 def judged(way: Way, held_s: tuple[float, float], hz: float, noise_m: float) -> Array:
     t, lat_lon, p = said(way, held_s, hz, noise_m)
-    return t[stuck(START_NS + np.round(t * S).astype(np.int64), lat_lon, p)]
+    return t[frozen_fixes(START_NS + np.round(t * S).astype(np.int64), lat_lon, p)]
 
 
 def at(speed_mps: float) -> Way:
@@ -52,7 +52,7 @@ def at(speed_mps: float) -> Way:
         (8.0, (30.0, 60.0), 1.0, 0.3),
     ],
 )
-def test_all_but_the_first_place_of_one_that_hangs_are_none(
+def test_all_but_the_first_fix_of_a_frozen_receiver_are_rejected(
     speed_mps: float, held_s: tuple[float, float], hz: float, noise_m: float
 ) -> None:
     found = judged(at(speed_mps), held_s, hz, noise_m)
@@ -85,7 +85,7 @@ def scattered(way: Way, held_s: tuple[float, float], hz: float, noise_m: float) 
     t, _, p = said(way, held_s, hz, noise_m)
     held = (t >= held_s[0]) & (t < held_s[1])
     p[held] += noise_m * np.random.default_rng(5).normal(size=(int(held.sum()), 2))
-    return t[stuck(START_NS + np.round(t * S).astype(np.int64), p, p)]
+    return t[frozen_fixes(START_NS + np.round(t * S).astype(np.int64), p, p)]
 
 
 @pytest.mark.parametrize("noise_m", [0.05, 0.15])
@@ -93,7 +93,7 @@ def scattered(way: Way, held_s: tuple[float, float], hz: float, noise_m: float) 
     ("speed_mps", "held_s", "hz"),
     [(5.0, (20.0, 40.0), 1.0), (2.0, (20.0, 40.0), 10.0), (2.5, (20.0, 26.0), 5.0), (15.0, (20.0, 24.0), 1.0)],
 )
-def test_a_place_that_scatters_hangs_as_well(
+def test_a_frozen_position_with_noise_is_detected(
     speed_mps: float, held_s: tuple[float, float], hz: float, noise_m: float
 ) -> None:
     found = scattered(at(speed_mps), held_s, hz, noise_m)
@@ -141,11 +141,11 @@ def test_what_comes_after_a_silence_tells_little_of_a_rest(
     """A receiver that holds its place at rest, and then says nothing until the vessel is under way."""
     t, lat_lon, p = said(way, (20.0, 30.0), hz, 0.0)
     heard = (t < silent_s[0]) | (t >= silent_s[1])
-    bad = stuck(START_NS + np.round(t[heard] * S).astype(np.int64), lat_lon[heard], p[heard])
+    bad = frozen_fixes(START_NS + np.round(t[heard] * S).astype(np.int64), lat_lon[heard], p[heard])
     assert bad.any() == found
 
 
-def test_a_receiver_that_hangs_is_as_good_as_silent() -> None:
+def test_a_frozen_receiver_is_as_good_as_a_silent_one() -> None:
     """Followed, the track is 26 to 36 m off there; nothing but IMU and compass is beside it."""
     run = simulate(Scenario(path="loops", duration_s=60.0, noise="drift"), 1)
     fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
@@ -170,7 +170,7 @@ def test_a_receiver_that_hangs_is_as_good_as_silent() -> None:
     assert f"; {len(rows)} fixes rejected" in line
 
 
-def test_inspect_says_it(tmp_path: Path) -> None:
+def test_inspect_reports_a_frozen_receiver(tmp_path: Path) -> None:
     make = Messages(2)
     t, lat_lon, _ = said(at(2.0), (20.0, 40.0), 5.0, 0.1)
     items: list[Item] = [

@@ -49,7 +49,7 @@ class _Step(NamedTuple):
     dR: Array
 
 
-class Turned:
+class HeadingCheck:
     """Watches fixes and steps of the IMU.
 
     Attributes:

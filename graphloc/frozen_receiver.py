@@ -3,7 +3,7 @@
 
 Judged from a whole run, before it is solved: beside few other sensors the graph would follow, by a tilt and a bias that were never
 there. At rest a receiver may well say one place for minutes, so it has to have been under way: the next place it says is then a leap
-away, or, where there is none (or so late that it may have gone there from rest), it stood still from one fix to the next. Online: `online/_parting.py`.
+away, or, where there is none (or so late that it may have gone there from rest), it stood still from one fix to the next. Online: `online/_frozen_receiver.py`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array, Datum
-from graphloc.hangs import stretches
+from graphloc.frozen_imu import stretches
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.recording import Recording
@@ -25,12 +25,12 @@ _HELD_S, _FEWEST = 2.5, 3  # a stretch of one place; for less a driver repeats (
 _NOISE_M = 0.5  # how far one place may scatter
 _BEFORE_S = 3.0  # whose fixes tell how fast it was under way
 _SIGMAS = 3.0
-_UNDER_WAY_MPS, _LEAP_M, _SHARE = 0.5, 2.0, 0.5  # speed before; the leap after, and its share of the way at that speed
+_UNDER_WAY_MPS, _JUMP_M, _SHARE = 0.5, 2.0, 0.5  # speed before; the leap after, and its share of the way at that speed
 # What stands at once from faster than this, and than brakes stop between two fixes, hangs. None sets off faster, either.
 _STOPS_MPS, _BRAKES_MPS2 = 1.5, 3.0
 
 
-def stuck(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Array) -> NDArray[np.bool_]:
+def frozen_fixes(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Array) -> NDArray[np.bool_]:
     """Return (N,) which fixes of one receiver, in order of time, only repeat one that hangs.
 
     Args:
@@ -43,11 +43,11 @@ def stuck(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Array) -> 
     firsts = np.concatenate([[0], np.flatnonzero((lat_lon_deg[1:] != lat_lon_deg[:-1]).any(axis=1)) + 1])
     for first, after in zip(firsts, [*firsts[1:], len(bad)], strict=True):
         if after - first >= _FEWEST and t_s[after - 1] - t_s[first] >= _HELD_S:
-            bad[first + 1 : after] = _hangs(t_s[: after + 1], places_m[: after + 1], int(first), int(after))
-    return bad | _stuck_but_for_noise(t_s, places_m, bad)
+            bad[first + 1 : after] = _is_frozen(t_s[: after + 1], places_m[: after + 1], int(first), int(after))
+    return bad | _frozen_but_for_noise(t_s, places_m, bad)
 
 
-def _stuck_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which fixes say one place but for its noise, where `known` has none to the last bit.
 
     Any receiver does so at rest, and multipath leaps from there: it must have been under way until then, and be so again
@@ -70,7 +70,7 @@ def _stuck_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_]) 
             first += 1
         elif (
             _stopped_at_once(t_s, places_m, first, _UNDER_WAY_MPS)
-            and _leaps(t_s, places_m, first, after)
+            and _jumps_on(t_s, places_m, first, after)
             and _under_way(t_s, places_m, np.arange(after, np.searchsorted(t_s, t_s[after] + _BEFORE_S))) is not None
         ):
             bad[first + 1 : after] = True
@@ -93,22 +93,22 @@ def _gone(places_m: Array, first: int, held: int) -> int:
         long *= 2
 
 
-def _hangs(t_s: Array, places_m: Array, first: int, after: int) -> bool:
+def _is_frozen(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     """Whether the stretch of one place from `first` on hangs; at `after` it says another place, or the run has ended."""
     if after < len(t_s):
         silent_s = t_s[after] - t_s[after - 1]
-        leap_m = float(np.linalg.norm(places_m[after] - places_m[first]))
-        if silent_s < _HELD_S or leap_m > _set_off_m(silent_s):
-            return _leaps(t_s, places_m, first, after)
+        jump_m = float(np.linalg.norm(places_m[after] - places_m[first]))
+        if silent_s < _HELD_S or jump_m > _set_off_m(silent_s):
+            return _jumps_on(t_s, places_m, first, after)
     return _stopped_at_once(t_s, places_m, first, _STOPS_MPS)
 
 
-def _leaps(t_s: Array, places_m: Array, first: int, after: int) -> bool:
+def _jumps_on(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     """Whether it was under way, and is a good part of the way further on at once."""
     speed = _under_way(t_s, places_m, np.append(_before(t_s, first), first))
     if speed is None:
         return False
-    least_m = max(_LEAP_M, _set_off_m(t_s[after] - t_s[after - 1]), _SHARE * speed * (t_s[after] - t_s[first]))
+    least_m = max(_JUMP_M, _set_off_m(t_s[after] - t_s[after - 1]), _SHARE * speed * (t_s[after] - t_s[first]))
     return bool(float(np.linalg.norm(places_m[after] - places_m[first])) > least_m)
 
 
@@ -151,14 +151,14 @@ def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:
     return float(np.linalg.norm(v)), float(np.sqrt((left**2).sum() / max(2 * len(t_s) - 4, 1) / square))
 
 
-def stuck_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> list[str]:
-    """Return a line on what `stuck` found."""
+def frozen_fixes_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> list[str]:
+    """Return a line on what `frozen_fixes` found."""
     if not bad.any():
         return []
     return [f"{sensor}: for {stretches(stamps_ns, bad)} {WHY}; {int(bad.sum())} fixes rejected"]
 
 
-def without_stuck(recording: Recording, datum: Datum) -> tuple[Recording, list[str]]:
+def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording, list[str]]:
     """Return a recording with the fixes of receivers that hang in the ledger instead, and a line on each such receiver."""
     of: dict[str, list[GnssPosition]] = {}
     for m in recording.measurements:
@@ -168,9 +168,9 @@ def without_stuck(recording: Recording, datum: Datum) -> tuple[Recording, list[s
     said = []
     for sensor, fixes in of.items():
         stamps_ns = np.array([m.stamp_ns for m in fixes], dtype=np.int64)
-        bad = stuck(stamps_ns, np.array([m.position[:2] for m in fixes]), world_from_fixes(fixes, datum)[:, :2])
+        bad = frozen_fixes(stamps_ns, np.array([m.position[:2] for m in fixes]), world_from_fixes(fixes, datum)[:, :2])
         gone |= {m.seq: m for m, b in zip(fixes, bad, strict=True) if b}
-        said += stuck_warning(sensor, stamps_ns, bad)
+        said += frozen_fixes_warning(sensor, stamps_ns, bad)
     rows = [
         LedgerRow(
             seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=recording.topics.get(m.sensor, ""), outcome=Outcome.REJECTED,

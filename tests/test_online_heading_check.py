@@ -48,7 +48,7 @@ def astern(config: VesselConfig) -> VesselConfig:
 
 
 @pytest.mark.parametrize(("sense", "off_deg"), [(1.0, 90.0), (-1.0, 90.0)])
-def test_a_compass_in_other_axes_is_said_under_way(sense: float, off_deg: float, run: SimulatedRun) -> None:
+def test_a_compass_in_other_axes_is_reported_under_way(sense: float, off_deg: float, run: SimulatedRun) -> None:
     """By how much it is off is told as well, as the truth has it."""
     found = replayed(read_as(run.recording, sense, off_deg), run.config)
     (event,) = (line for line in found.solution.stats.events if "the heading is off by about" in line)
@@ -62,7 +62,7 @@ def test_a_compass_in_other_axes_is_said_under_way(sense: float, off_deg: float,
     assert any("the heading is off by about" in line for line in found.solution.stats.warnings)
 
 
-def test_nothing_is_said_of_a_craft_that_goes_astern(run: SimulatedRun) -> None:
+def test_nothing_is_reported_of_a_craft_that_goes_astern(run: SimulatedRun) -> None:
     found = replayed(run.recording, astern(run.config))
     track = found.solution.trajectory
     turned = wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad - np.pi)
@@ -71,7 +71,7 @@ def test_nothing_is_said_of_a_craft_that_goes_astern(run: SimulatedRun) -> None:
 
 
 @pytest.mark.parametrize("overturned", [False, True])
-def test_nothing_is_said_of_a_gyroscope_with_a_bias(overturned: bool) -> None:
+def test_nothing_is_reported_of_a_gyroscope_with_a_bias(overturned: bool) -> None:
     """By 0.02 rad/s about the vertical, as cheap ones have: carried on raw, it turned what is felt by 28 deg."""
     scenario = replace(bl_scenario(1, "clean"), duration_s=70.0, pose_hz=0.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
     run = simulate(scenario, 4)

@@ -12,11 +12,11 @@ from graphloc.frames import Array
 from graphloc.graph import Going
 from graphloc.online._live import LiveProblem
 from graphloc.online._odometry import Odometry
-from graphloc.online._states import Newest, carried_on
+from graphloc.online._states import Newest, propagated_covariance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Ahead:
+class Propagated:
     """A state at some stamp.
 
     Attributes:
@@ -33,9 +33,9 @@ class Ahead:
     R_odom_body: Array
 
 
-def no_further(newest: Newest, odometry: Odometry) -> Ahead:
+def unpropagated(newest: Newest, odometry: Odometry) -> Propagated:
     """Return the newest state itself."""
-    return Ahead(
+    return Propagated(
         stamp_ns=newest.stamp_ns,
         pose=newest.pose,
         velocity=newest.velocity,
@@ -46,7 +46,7 @@ def no_further(newest: Newest, odometry: Odometry) -> Ahead:
     )
 
 
-def ahead(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: int) -> Ahead:
+def propagate(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: int) -> Propagated:
     """Return what becomes of the newest state until a later stamp, be it after the IMU's last sample."""
     pose = newest.pose
     start = gtsam.NavState(pose, newest.velocity)
@@ -54,8 +54,8 @@ def ahead(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: in
     there = pim.predict(start, newest.bias)
     p_odom, R_odom = odometry.after(*_body_step(problem, pose, there.pose()))
     dt_s, noise = (stamp_ns - newest.stamp_ns) * 1e-9, pim.preintMeasCov()
-    pose_cov = carried_on(newest.pose_cov, newest, there.pose().rotation().matrix(), dt_s, noise)
-    return Ahead(
+    pose_cov = propagated_covariance(newest.pose_cov, newest, there.pose().rotation().matrix(), dt_s, noise)
+    return Propagated(
         stamp_ns=stamp_ns,
         pose=there.pose(),
         velocity=np.asarray(there.velocity()),
@@ -66,7 +66,7 @@ def ahead(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: in
     )
 
 
-def carry_on(odometry: Odometry, problem: LiveProblem, newest: Newest, until_ns: int) -> None:
+def advance_odometry(odometry: Odometry, problem: LiveProblem, newest: Newest, until_ns: int) -> None:
     """Carry the odometry on, from the newest state or from where it is already, as the IMU says."""
     links, bias, before_ns = problem.links, newest.bias, newest.stamp_ns
     if until_ns <= odometry.stamp_ns:

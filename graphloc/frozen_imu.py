@@ -22,7 +22,7 @@ RATES_LEAST_S, RATES_FEWEST = 1.0, 50
 WHY = "frozen: it repeats one sample (or its three rates) bit for bit while the stamps advance; check the sensor and its driver"
 
 
-def hanging(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
+def frozen_samples(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
     """Return (N,) which samples (N, 6: specific force, rate) at increasing stamps only repeat one that hangs.
 
     The first of each stretch is a sample as any other.
@@ -47,8 +47,8 @@ def _repeats(
     return bad
 
 
-def hanging_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> list[str]:
-    """Return a line on what `hanging` found."""
+def frozen_imu_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> list[str]:
+    """Return a line on what `frozen_samples` found."""
     if not bad.any():
         return []
     where = stretches(stamps_ns, bad)
@@ -74,21 +74,21 @@ def _at_rest(samples: Array) -> NDArray[np.bool_]:
     return np.asarray((samples[..., 3:] == 0.0).all(axis=-1) & (samples[..., :3] != 0.0).any(axis=-1))
 
 
-class HangWatch:
+class FrozenImuDetector:
     """The same of samples as they come: what came before a stretch is long enough has been believed by then."""
 
     def __init__(self) -> None:
         self._all, self._rates = _Stretch(LEAST_S, FEWEST), _Stretch(RATES_LEAST_S, RATES_FEWEST)
-        self.hung = False
+        self.frozen = False
         """The newest sample only repeats one that hangs."""
 
-    def hangs(self, m: ImuSample) -> bool:
+    def repeats(self, m: ImuSample) -> bool:
         """Return whether a sample only repeats one that hangs."""
         row = np.concatenate([m.accel_mps2, m.gyro_radps])
         by_all = self._all.goes_on(m.stamp_ns, row) and not bool(_at_rest(row))
         by_rates = self._rates.goes_on(m.stamp_ns, m.gyro_radps) and bool(m.gyro_radps.any())
-        self.hung = by_all or by_rates
-        return self.hung
+        self.frozen = by_all or by_rates
+        return self.frozen
 
 
 class _Stretch:

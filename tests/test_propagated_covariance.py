@@ -5,7 +5,7 @@ import gtsam
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.online._states import Newest, carried_on
+from graphloc.online._states import Newest, propagated_covariance
 
 DT_S, STEP = 1.7, 1e-6
 
@@ -40,5 +40,5 @@ def test_a_covariance_is_carried_on_as_errors_are() -> None:
         velocity_cov=velocity_cov,
     )  # fmt: skip
     R = there(here, v).rotation().matrix()
-    np.testing.assert_allclose(carried_on(P, newest, R, DT_S, noise), expected, atol=1e-6)
-    np.testing.assert_allclose(carried_on(P[:6, :6], newest, R, DT_S, noise), expected[:6, :6], atol=1e-6)
+    np.testing.assert_allclose(propagated_covariance(P, newest, R, DT_S, noise), expected, atol=1e-6)
+    np.testing.assert_allclose(propagated_covariance(P[:6, :6], newest, R, DT_S, noise), expected[:6, :6], atol=1e-6)

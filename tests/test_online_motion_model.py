@@ -12,19 +12,19 @@ from graphloc.config import TimelineConfig
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array
 from graphloc.measurements import CompassHeading
-from graphloc.online._habit import Habit, Moving
+from graphloc.online._motion_model import MotionModel, Moving
 from graphloc.replay import replay
 from graphloc.trajectory import bounds_95
 
 SECOND = 1_000_000_000
 
 
-def taught(v_body_mps: Array) -> Habit:
+def taught(v_body_mps: Array) -> MotionModel:
     """Taught with velocities (N, 2), one a second."""
-    habit = Habit()
+    motion_model = MotionModel()
     for k, v in enumerate(v_body_mps):
-        habit.learn(k * SECOND, v)
-    return habit
+        motion_model.learn(k * SECOND, v)
+    return motion_model
 
 
 def wandering(speed_mps: float, change_mps: float, n: int) -> Array:
@@ -46,8 +46,8 @@ def test_the_process_has_what_was_learned_beside_what_any_vessel_may_do() -> Non
 
 
 def test_ten_steps_of_a_second_are_one_of_ten() -> None:
-    habit = taught(wandering(4.0, 2.0, 60))
-    (phi, w), (phi_10, w_10) = habit.process(np.ones(2), 1.0), habit.process(np.ones(2), 10.0)
+    motion_model = taught(wandering(4.0, 2.0, 60))
+    (phi, w), (phi_10, w_10) = motion_model.process(np.ones(2), 1.0), motion_model.process(np.ones(2), 10.0)
     assert phi**10 == pytest.approx(phi_10)
     assert sum(w * phi ** (2 * k) for k in range(10)) == pytest.approx(w_10)
 
@@ -55,20 +55,20 @@ def test_ten_steps_of_a_second_are_one_of_ten() -> None:
 def test_a_vessel_is_not_slower_than_it_is_now() -> None:
     """A car that has just been resumed at 15 m/s, with nothing learned, is not braked by a sigma within a minute."""
     v = np.array([15.0, 0.0])
-    phi, variance = Habit().process(v, 60.0)
+    phi, variance = MotionModel().process(v, 60.0)
     assert ((1.0 - phi) * v <= np.sqrt(variance)).all()
 
 
 def after_a_second(imu_mps: Array, sigma_mps: float) -> Array:
-    """Velocity (2,) in the body after a step, of a vessel at 2 m/s that turns by 0.3 rad, by the IMU and by habit together."""
-    habit, v_a = taught(np.tile([2.0, 0.0], (100, 1))), np.array([2.0, 0.0, 0.0])
+    """Velocity (2,) in the body after a step, of a vessel at 2 m/s that turns by 0.3 rad, by the IMU and by the motion model together."""
+    motion_model, v_a = taught(np.tile([2.0, 0.0], (100, 1))), np.array([2.0, 0.0, 0.0])
     R_a, R_b = np.eye(3), gtsam.Rot3.Yaw(0.3).matrix()
     v_b = R_b @ np.append(imu_mps, 0.0)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for key, v, sigma in ((0, v_a, 1e-3), (1, v_b, sigma_mps)):
         values.insert(key, v)
         graph.add(gtsam.PriorFactorVector(key, v, gtsam.noiseModel.Isotropic.Sigma(3, sigma)))
-    for factor in habit.step(Moving(0, v_a, R_a), Moving(1, v_b, R_b), 1.0):
+    for factor in motion_model.step(Moving(0, v_a, R_a), Moving(1, v_b, R_b), 1.0):
         graph.add(factor)
     solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     return np.asarray((R_b.T @ solved.atVector(1))[:2])
@@ -103,7 +103,7 @@ def test_without_a_place_it_drifts_as_far_as_a_vessel_can_and_no_farther() -> No
     assert imu is not None
     imu = imu.where((imu.stamps_ns < lost_ns + 60 * SECOND) | (imu.stamps_ns > lost_ns + 66 * SECOND))
     steps: list[int] = []
-    with patch.object(Habit, "step", autospec=True, side_effect=counted(steps)):
+    with patch.object(MotionModel, "step", autospec=True, side_effect=counted(steps)):
         track = replay(replace(run.recording, imu=imu, measurements=kept), config).solution.trajectory
     assert track.cov is not None
     off_m = np.hypot(*(track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[:, :2].T)
@@ -118,9 +118,9 @@ def test_without_a_place_it_drifts_as_far_as_a_vessel_can_and_no_farther() -> No
 
 
 def counted(steps: list[int]):  # type: ignore[no-untyped-def]
-    real = Habit.step
+    real = MotionModel.step
 
-    def step(self: Habit, a: Moving, b: Moving, dt_s: float) -> list[object]:
+    def step(self: MotionModel, a: Moving, b: Moving, dt_s: float) -> list[object]:
         steps.append(gtsam.Symbol(a.key).index())
         return real(self, a, b, dt_s)
 

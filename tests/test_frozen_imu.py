@@ -15,7 +15,7 @@ from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag, render
-from graphloc.hangs import HangWatch, hanging
+from graphloc.frozen_imu import FrozenImuDetector, frozen_samples
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample
 from graphloc.online import OnlineSmoother
@@ -36,33 +36,33 @@ def readings(seed: int = 3) -> Array:
     )
 
 
-def hung(samples: Array, first: int, last: int) -> Array:
+def frozen(samples: Array, first: int, last: int) -> Array:
     samples = samples.copy()
     samples[first + 1 : last + 1] = samples[first]
     return samples
 
 
 def as_it_comes(samples: Array) -> list[bool]:
-    watch = HangWatch()
+    watch = FrozenImuDetector()
     return [
-        watch.hangs(ImuSample(stamp_ns=int(s), sensor="imu", seq=k, accel_mps2=row[:3], gyro_radps=row[3:]))
+        watch.repeats(ImuSample(stamp_ns=int(s), sensor="imu", seq=k, accel_mps2=row[:3], gyro_radps=row[3:]))
         for k, (s, row) in enumerate(zip(STAMPS, samples, strict=True))
     ]
 
 
 def test_all_but_the_first_of_a_stretch_are_none_and_as_they_come_all_from_a_fifth_of_a_second_on() -> None:
-    samples = hung(hung(readings(), 200, 300), 700, len(STAMPS) - 1)
-    assert np.flatnonzero(hanging(STAMPS, samples)).tolist() == [*range(201, 301), *range(701, len(STAMPS))]
+    samples = frozen(frozen(readings(), 200, 300), 700, len(STAMPS) - 1)
+    assert np.flatnonzero(frozen_samples(STAMPS, samples)).tolist() == [*range(201, 301), *range(701, len(STAMPS))]
     assert np.flatnonzero(as_it_comes(samples)).tolist() == [*range(220, 301), *range(720, len(STAMPS))]
 
 
-def test_rates_that_hang_alone_are_told_after_a_second() -> None:
+def test_frozen_rates_alone_are_detected_after_a_second() -> None:
     samples = readings()
     samples[200:500, 3:] = samples[200, 3:]
-    assert np.flatnonzero(hanging(STAMPS, samples)).tolist() == [*range(201, 500)]
+    assert np.flatnonzero(frozen_samples(STAMPS, samples)).tolist() == [*range(201, 500)]
     assert np.flatnonzero(as_it_comes(samples)).tolist() == [*range(300, 500)]
     samples[280:500, 3:] = 0.0  # a deadband at rest
-    assert not hanging(STAMPS, samples).any()
+    assert not frozen_samples(STAMPS, samples).any()
     assert not any(as_it_comes(samples))
 
 
@@ -80,13 +80,13 @@ def test_what_only_looks_so_is_believed(case: str) -> None:
     elif case == "coarse, at rest":  # steps of three times the noise
         samples = np.round(samples / 0.03) * 0.03
         assert (samples[1:] == samples[:-1]).all(axis=1).any()
-    assert not hanging(STAMPS, samples).any()
+    assert not frozen_samples(STAMPS, samples).any()
     assert not any(as_it_comes(samples))
 
 
-def test_a_sensor_that_is_dead_hangs() -> None:
+def test_an_imu_that_repeats_from_the_start_is_frozen() -> None:
     samples = np.zeros((len(STAMPS), 6))
-    assert hanging(STAMPS, samples).sum() == len(samples) - 1
+    assert frozen_samples(STAMPS, samples).sum() == len(samples) - 1
     assert sum(as_it_comes(samples)) == len(samples) - 20
 
 
@@ -97,8 +97,8 @@ def bag(path: Path, samples: Array) -> Path:
     return write_bag(path, MAKE, items, "mcap")
 
 
-def test_a_bag_says_where_it_hung(tmp_path: Path) -> None:
-    path = bag(tmp_path / "run", hung(readings(), 200, 500))
+def test_a_bag_reports_where_its_imu_was_frozen(tmp_path: Path) -> None:
+    path = bag(tmp_path / "run", frozen(readings(), 200, 500))
     recording = read_recording(path, vessel(gnss=None))
     assert recording.message_count == accounted(recording)
     rows = rows_of(recording, "imu")
@@ -109,8 +109,8 @@ def test_a_bag_says_where_it_hung(tmp_path: Path) -> None:
     assert "for 3.0 s from 2023-11-14T22:13:22" in render(inspect_bag(path))
 
 
-def test_a_bag_in_which_it_hangs_throughout_is_refused_with_the_cause(tmp_path: Path) -> None:
-    path = bag(tmp_path / "run", hung(readings(), 0, len(STAMPS) - 1))
+def test_a_bag_whose_imu_is_frozen_throughout_is_refused_with_the_cause(tmp_path: Path) -> None:
+    path = bag(tmp_path / "run", frozen(readings(), 0, len(STAMPS) - 1))
     datum = DatumConfig(latitude_deg=57.7, longitude_deg=11.9, height_m=40.0)
     config = vessel(gnss=None).model_copy(update={"datum": datum})
     recording = read_recording(path, config)

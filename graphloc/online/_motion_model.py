@@ -39,7 +39,7 @@ class Moving(NamedTuple):
     R: Array
 
 
-class Habit:
+class MotionModel:
     """Usual speeds and changes of speed along the body's horizontal axes, forward first."""
 
     def __init__(self) -> None:

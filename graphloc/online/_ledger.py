@@ -10,7 +10,7 @@ from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import Measurement
 
 
-class Book:
+class OnlineLedger:
     """Rows that have become final, and which measurements have theirs, so that none is taken again when a lag is built anew."""
 
     def __init__(self, config: VesselConfig) -> None:
@@ -57,7 +57,7 @@ class Book:
             self._rows.append(self._row(m, Outcome.USED, ""))
 
     def marked(self) -> tuple[int, set[int] | None]:
-        """Return where the book stands, for `back_to`."""
+        """Return where the ledger stands, for `back_to`."""
         return len(self._rows), None if self._settled is None else set(self._settled)
 
     def back_to(self, mark: tuple[int, set[int] | None]) -> None:
