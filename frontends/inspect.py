@@ -31,6 +31,7 @@ from graphloc.frontends._assess_velocity import motions_of, odometry_report, vel
 from graphloc.frontends._assess_world import origin_of
 from graphloc.frontends._clock import refuse_woven
 from graphloc.frontends._draft import draft_config
+from graphloc.frontends._inspect_text import render
 from graphloc.frontends._lag import lag, lag_of_way
 from graphloc.frontends._reports import (
     CompassReport,
@@ -68,7 +69,7 @@ from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, info_beside
 from graphloc.frozen_receiver import frozen_fixes
 from graphloc.measurements import CompassHeading, ImuSeries
-from graphloc.time import NS_PER_S, utc_text
+from graphloc.time import NS_PER_S
 
 __all__ = [
     "CompassReport",
@@ -309,99 +310,3 @@ def _best_track(
     stamps, p, rows = track(by_topic[best.topic])
     good = ~frozen_fixes(stamps, rows[:, :2], p[:, :2])
     return stamps[good], p[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first
-
-
-def render(inspection: Inspection) -> str:
-    """Return the inspection as text for a terminal."""
-    lines = [inspection.source, ""]
-    lines += _topic_table(inspection.topics)
-    for imu in inspection.imus:
-        lines += ["", *_imu_lines(imu)]
-    for gnss in inspection.gnss:
-        lines += ["", *_gnss_lines(gnss)]
-    for compass in inspection.compasses:
-        verdict = f"fits as a compass ({compass.convention})" if compass.usable else "not usable as a compass"
-        lines += ["", f"{compass.topic}: {verdict}", f"  {compass.why}"]
-    for twist in inspection.velocities:
-        lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
-    for item in inspection.odometry:
-        lines += ["", f"{item.topic}: suggested as {item.role}", f"  {item.why}; {item.world}"]
-    counts = {t.topic: t.count for t in inspection.topics}
-    for what, kind, mounted, need in (
-        ("scans", "aerial", inspection.lidars, "a map"),
-        ("images", "apriltag", inspection.cameras, "a survey of tags"),
-    ):
-        if mounted:
-            lines += ["", *(f"{m.topic}: {counts[m.topic]} {what}" for m in mounted)]
-            lines.append(f"  read by a sensor of kind {kind}, which the draft has switched off until there is {need}")
-    if inspection.tf_frames:
-        lines += ["", f"frames in /tf_static: {', '.join(inspection.tf_frames)}"]
-    lines += [f"warning: {w}" for w in inspection.warnings]
-    return "\n".join(lines)
-
-
-def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
-    head = ("topic", "type", "count", "Hz", "span s", "gaps", "longest s", "repeated", "backward", "latency s")
-    rows = [head]
-    for t in topics:
-        latency = "-" if t.latency_s is None else f"{t.latency_s[1]:.3f} ({t.latency_s[0]:.3f}..{t.latency_s[2]:.3f})"
-        rows.append(
-            (
-                t.topic,
-                t.msgtype.replace("/msg/", "/"),
-                str(t.count),
-                _number(t.rate_hz, ".1f"),
-                _number(t.span_s, ".1f"),
-                _number(t.gaps, "d"),
-                _number(t.max_gap_s, ".2f"),
-                _number(t.repeated, "d"),
-                _number(t.backward, "d"),
-                latency,
-            )
-        )
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
-    lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-    starts = [t.start_ns for t in topics if t.start_ns is not None]
-    if starts:
-        lines.append(f"starts {utc_text(min(starts))}")
-    for t in topics:
-        if t.undecodable or t.no_stamp:
-            lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded, {t.no_stamp or 0} have no stamp")
-    return lines
-
-
-def _number(value: float | None, spec: str) -> str:
-    return "-" if value is None else format(value, spec)
-
-
-def _imu_lines(imu: ImuReport) -> list[str]:
-    x, y, z = imu.gravity_axis
-    lines = [
-        f"{imu.topic}: acceleration {imu.gravity_size:.2f} (median), along {x:+.2f} {y:+.2f} {z:+.2f}",
-        *(f"  {why}" for why in imu.why),
-        f"  mount: rpy {', '.join(f'{a:.1f}' for a in imu.mount.rpy_deg)} deg; {imu.mount.evidence}",
-    ]
-    if imu.gyro_bias_radps is None:
-        lines.append("  no standstill found, so the gyro bias was not measured")
-    else:
-        bias = ", ".join(f"{b:+.5f}" for b in imu.gyro_bias_radps)
-        lines.append(f"  standstill {imu.still_s:.1f} s: gyro bias {bias} rad/s")
-    noise = f"{imu.accel_noise_ug:.0f} ug/sqrt(Hz) and {imu.gyro_noise_mdps:.1f} mdeg/s/sqrt(Hz)"
-    return [*lines, f"  noise of the worst axis, vibration included: {noise}"]
-
-
-def _gnss_lines(gnss: GnssReport) -> list[str]:
-    statuses = ", ".join(f"{n} {s}" for s, n in gnss.statuses.items())
-    lat, lon, height = gnss.first
-    east_m, north_m = gnss.extent_m
-    lines = [
-        f"{gnss.topic}: {statuses}; first fix {lat:.7f}, {lon:.7f}, {height:.1f} m",
-        f"  track {gnss.travelled_m:.0f} m in a box of {east_m:.0f} x {north_m:.0f} m, height {gnss.height_range_m:.1f} m",
-    ]
-    if gnss.without_height:
-        lines.append(f"  {gnss.without_height} messages have no height (NaN) and are used as horizontal fixes")
-    if gnss.reported_sigma_m is not None:
-        lines.append(f"  reported sigma east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
-    if gnss.scatter_m is not None:
-        lines.append(f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m)} m")
-    return lines

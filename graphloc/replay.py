@@ -30,7 +30,7 @@ from graphloc.measurements import ImuSample, Measurement, TagSighting
 from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
 from graphloc.solution import Solution, SolveStats
-from graphloc.solve._solution import disagreeing, refused_together
+from graphloc.solve._warnings import disagreement_warning, joint_rejection_warning
 from graphloc.trajectory import Trajectory
 
 Status = Callable[[float, float, Estimate | None, str], None]
@@ -349,10 +349,10 @@ def _solution(
     for name, rows in judged.items():
         rows.sort(key=lambda row: row.stamp_ns)
         weights = np.array([row.weight for row in rows])
-        warnings += disagreeing(name, weights)
+        warnings += disagreement_warning(name, weights)
         if (usual := getattr(config.sensors.get(name), "false_fraction", None)) is not None:
             false = np.array([false_of.get(row.seq, usual) for row in rows])
-            warnings += refused_together(name, np.array([row.stamp_ns for row in rows]), weights, false)
+            warnings += joint_rejection_warning(name, np.array([row.stamp_ns for row in rows]), weights, false)
     return Solution(
         datum=smoother.datum,
         trajectory=Trajectory(

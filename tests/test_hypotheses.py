@@ -19,7 +19,7 @@ from graphloc.solve._best_chain import best_chain
 from graphloc.solve._decide import Verdict, by_hypotheses
 from graphloc.solve._foreseen import Prediction
 from graphloc.solve._hypotheses import FalseSequence
-from graphloc.solve._solution import refused_together
+from graphloc.solve._warnings import joint_rejection_warning
 
 SIGMA_M = 0.2
 
@@ -183,14 +183,14 @@ def test_few_or_brief_ones_are_no_news() -> None:
     stamps_ns, weights = np.arange(40) * 1_000_000_000, np.ones(40)
     weights[10:17] = 0.0
     rare, usual = np.full(40, 0.02), np.full(40, 0.4)
-    assert refused_together("tags", stamps_ns, weights, rare)
-    assert not refused_together("aerial", stamps_ns, weights, usual)  # 0.4 ** 7 * 40 is 0.07
-    assert not refused_together("tags", stamps_ns // 10, weights, rare)  # within 0.6 s
-    assert not refused_together("tags", stamps_ns, np.zeros(40), rare)  # all: said otherwise
+    assert joint_rejection_warning("tags", stamps_ns, weights, rare)
+    assert not joint_rejection_warning("aerial", stamps_ns, weights, usual)  # 0.4 ** 7 * 40 is 0.07
+    assert not joint_rejection_warning("tags", stamps_ns // 10, weights, rare)  # within 0.6 s
+    assert not joint_rejection_warning("tags", stamps_ns, np.zeros(40), rare)  # all: said otherwise
     doubtful = np.where(weights > 0.5, 0.02, 0.9)
-    assert not refused_together("aerial", stamps_ns, weights, doubtful)  # so they said themselves
+    assert not joint_rejection_warning("aerial", stamps_ns, weights, doubtful)  # so they said themselves
     brief = np.concatenate([stamps_ns, stamps_ns[-1] + 1 + np.arange(30) * 1_000_000])
-    (line,) = refused_together("tags", brief, np.append(weights, np.zeros(30)), np.full(70, 0.02))
+    (line,) = joint_rejection_warning("tags", brief, np.append(weights, np.zeros(30)), np.full(70, 0.02))
     assert "all 7 measurements in the 6 s" in line  # 30 more within 30 ms are no longer row
 
 

@@ -35,7 +35,7 @@ from graphloc.frontends.decode import (
 from graphloc.measurements import GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Recording
 from graphloc.solve._align import _position_and_velocity, _Track
-from graphloc.solve._solution import world_covariance
+from graphloc.solve._covariances import world_covariance
 from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import Messages, still_run, write_bag

@@ -19,8 +19,8 @@ from graphloc.factors import KINDS
 from graphloc.frontends import nmea
 from graphloc.frontends._assess_velocity import motions_of, velocity_report
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends._source import _OTHER_TYPES
 from graphloc.frontends._streams import Stream
+from graphloc.frontends._types import OTHER_TYPES
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import TWIST
 from graphloc.frontends.inspect import draft_config, inspect_bag
@@ -245,7 +245,7 @@ def test_lines_in_plain_strings_count_from_when_they_were_recorded(tmp_path: Pat
 def test_messages_of_other_packages_say_the_same(tmp_path: Path) -> None:
     """A GPSFix with WAAS, a velocity as a bare vector, a pose without a covariance."""
     make, items = Messages(2), []
-    make.store.register(get_types_from_msg(_OTHER_TYPES["gps_msgs/msg/GPSFix"], "gps_msgs/msg/GPSFix"))
+    make.store.register(get_types_from_msg(OTHER_TYPES["gps_msgs/msg/GPSFix"], "gps_msgs/msg/GPSFix"))
     for k in range(40):
         stamp = 1_700_000_000 * S + k * S // 5
         none = {n: 0.0 for n in ("track", "speed", "climb", "pitch", "roll", "dip", "time", "gdop", "pdop", "hdop", "vdop", "tdop", "err", "err_horz", "err_vert", "err_track", "err_speed", "err_climb", "err_time", "err_pitch", "err_roll", "err_dip")}  # fmt: skip

@@ -8,8 +8,7 @@ import numpy as np
 from graphloc.graph import Attachment
 from graphloc.measurements import Measurement
 from graphloc.online._live import LiveStream, LiveTimeline
-from graphloc.solve._decide import Verdict
-from graphloc.solve._solution import AGREES
+from graphloc.solve._decide import AGREES, Verdict
 
 _CREDIBLE = 6.0  # sigmas of a slow error: beyond, a sensor that agrees does so by an error that it does not have
 _USUAL = 3.0  # sigmas of one that jumps: beyond, what it jumped from may be the wrong level

@@ -17,7 +17,7 @@ from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window, keys_of
 from graphloc.solve._decide import NEGLIGIBLE, Verdict
-from graphloc.solve._solution import row_of
+from graphloc.solve._ledger import row_of
 
 _CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at

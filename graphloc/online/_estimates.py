@@ -12,7 +12,8 @@ from graphloc.online._anchor import sound
 from graphloc.online._lag import Lag
 from graphloc.online._odometry import Odometry
 from graphloc.online._propagate import Propagated
-from graphloc.solve._solution import health_of, left_out, world_covariance
+from graphloc.solve._covariances import unmodelled_covariance, world_covariance
+from graphloc.solve._health import health_of
 
 
 def estimate_of(
@@ -29,7 +30,7 @@ def estimate_of(
     R = now.pose.rotation().matrix()
     gyro = problem.links.gyro_at(np.array([at_ns]))[0] - problem.R_body_imu @ newest.bias.gyroscope()
     cov = world_covariance(sound(now.pose_cov), R, lever)
-    cov[:3, :3] += left_out(list(problem.streams.values()))
+    cov[:3, :3] += unmodelled_covariance(list(problem.streams.values()))
     others_m, others_cov = lag.others
     cov[:3, :3] += others_cov
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}

@@ -25,7 +25,7 @@ from graphloc.frames import Array
 from graphloc.measurements import Measurement
 from graphloc.online._lag import Lag
 from graphloc.online._states import Newest
-from graphloc.solve._solution import world_covariance
+from graphloc.solve._covariances import world_covariance
 from graphloc.trajectory import bounds_95
 
 _WINDOW_S, _EVERY_S = 40.0, 5.0

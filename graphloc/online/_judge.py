@@ -23,15 +23,13 @@ from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
 from graphloc.online._alternatives import choices
 from graphloc.online._entries import Entries, Entry
-from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
+from graphloc.online._receiver_checks import ReceiverChecks
 from graphloc.online._states import States
 from graphloc.online._window import Window
-from graphloc.position_jumps import jump_warnings, largest_sigma, only_position_sensor
 from graphloc.solve._best_chain import best_chain
-from graphloc.solve._decide import Verdict, by_hypotheses
+from graphloc.solve._decide import AGREES, Verdict, by_hypotheses
 from graphloc.solve._hypotheses import log_evidence_of
-from graphloc.solve._solution import AGREES
 
 _AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
 _LEAF_S, _SURE = 1.0, 0.9  # how often an older chapter is judged again; a weight that needs no second look
@@ -50,6 +48,9 @@ class Judge:
 
     Args:
         agreement: told of what absolute sensors say.
+
+    Attributes:
+        receivers: checks of single receivers, before a measurement is judged.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Judge:
     ) -> None:
         self._problem, self._window = problem, window
         self._states, self._entries, self._agreement = states, entries, agreement
+        self.receivers = ReceiverChecks(problem, states, entries, agreement)
         self._again: list[tuple[float, int, Entry]] = []  # a heap: when, and in turn
         self._turn = count()
         self._rounds: dict[str, int] = {}
@@ -64,7 +66,6 @@ class Judge:
         self._leafed_s: dict[str, float] = {}  # and when
         self._refuted: set[str] = set()  # sensors of which something new was judged false
         self._tried: dict[str, frozenset[tuple[int, int | None]]] = {}
-        self._jump_warnings: list[str] = []
         self._unsure: set[str] = set()  # sensors of which all choices are to be weighed
         self._chosen: dict[str, frozenset[tuple[int, int | None]]] = {}
         self._others: dict[str, tuple[Array, Array]] = {}  # mean and covariance, of each sensor
@@ -86,7 +87,7 @@ class Judge:
         if (away_m := min(r.size_m or 0.0 for r in residuals)) > _FAR_M:
             self._agreement.note(stream, m, None)
             raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
-        if self._from_frozen(stream, m, at, residuals[0]):
+        if self.receivers.frozen(stream, m, at, residuals[0]):
             self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
         elif stream.row.false is None:
             verdict, opened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
@@ -99,45 +100,6 @@ class Judge:
         else:
             self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
             self._rounds[stream.name] = _ROUNDS
-
-    def _from_frozen(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> bool:
-        """Whether a place comes from a receiver that hangs; then what it said while that was not seen goes, too."""
-        if stream.row.false is not None or not stream.row.absolute:
-            return False
-        told_m = stream.row.hint(m, 0.0, self._problem.datum).p_world_m[:2]
-        if not np.isfinite(told_m).all():
-            return False
-        newest, detector, before = self._states.newest, stream.frozen_detector, stream.frozen_detector.frozen
-        timeline = self._problem.timeline
-        at_s = timeline.seconds(m.stamp_ns)
-        sigma_m = largest_sigma(residual.cov - _walked(residual, at))
-        if only_position_sensor(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
-            allowed = stream.left_out is not None
-            self._jump_warnings += jump_warnings(
-                stream.name, *stream.jump_detector.note(m.stamp_ns, told_m, sigma_m, allowed=allowed), allowed=allowed
-            )
-        detector.note(
-            at_s,
-            told_m,
-            np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2],
-            sigma_m,
-            newest.velocity[:2],
-            largest_sigma(newest.velocity_cov),
-        )
-        if detector.frozen and not before:
-            self._agreement.forget_refused()
-            since_s = min(at_s - WINDOW_S, detector.stands_s)  # it drew the estimate along from when it began to stand
-            for entry in self._entries.of(stream):
-                if timeline.seconds(entry.measurement.stamp_ns) >= since_s:
-                    self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0))
-        if detector.for_long(at_s):
-            self._agreement.note(stream, m, None)
-        return detector.frozen
-
-    def jump_warnings(self) -> list[str]:
-        """Return a line on each receiver that has leapt since this was last asked."""
-        said, self._jump_warnings = self._jump_warnings, []
-        return said
 
     def judge(self) -> None:
         """Stage what is to be decided, anew or again."""
@@ -344,11 +306,3 @@ def _along(modes: Sequence[int | None], found: list[tuple[Residual, ...]], attac
         )
         for mode, r, at in zip(modes, found, attached, strict=True)
     ]
-
-
-def _walked(residual: Residual, at: Attachment) -> Array | float:
-    """What of the covariance of a residual is no noise of its own, but what its slow error walks between nodes."""
-    if at.slow_walk is None or residual.slow_jacobian is None:
-        return 0.0
-    J = residual.slow_jacobian()
-    return np.asarray(J @ np.diag(at.slow_walk) @ J.T)

@@ -158,7 +158,7 @@ class Lag:
 
     def jump_warnings(self) -> list[str]:
         """Return a line on each receiver that has leapt since this was last asked (see `position_jumps.py`)."""
-        return self._judge.jump_warnings()
+        return self._judge.receivers.jump_warnings()
 
     def in_doubt(self, stamp_ns: int) -> str:
         """Why no pose can be called good as long as a receiver has leapt that alone tells the place; empty where none has."""

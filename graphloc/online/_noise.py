@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphloc.online._lag import Lag
-from graphloc.solve._batch import CONTRADICTION
-from graphloc.solve._solution import NO_NOISE
+from graphloc.solve._batch import CONTRADICTION, LARGEST_NOISE_SCALE
 
 _EVERY_S, _MISFITS = 5.0, 2  # how often the fit is looked at, and how often in turn it must be bad
 
@@ -38,8 +37,8 @@ class ImuNoise:
         self._looked_ns = at_ns
         misfit = lag.misfit()
         self._misfits = self._misfits + 1 if misfit > CONTRADICTION else 0
-        if self._misfits < _MISFITS or self.scale >= NO_NOISE:
+        if self._misfits < _MISFITS or self.scale >= LARGEST_NOISE_SCALE:
             return ""
         self._misfits = 0
-        self.scale = min(self.scale * float(np.clip(np.sqrt(misfit), 1.5, 3.0)), NO_NOISE)
+        self.scale = min(self.scale * float(np.clip(np.sqrt(misfit), 1.5, 3.0)), LARGEST_NOISE_SCALE)
         return f"the IMU contradicts the other sensors: its noise is scaled up to {self.scale:.1f} times"

@@ -31,7 +31,7 @@ from graphloc.online._start import Started, try_start
 from graphloc.online._tracking import Tracking, failure_text
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
-from graphloc.solve._solution import alone
+from graphloc.solve._warnings import slow_error_warning
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 
@@ -311,7 +311,7 @@ class OnlineSmoother:
         self._say(started.doubt)
         for stream in tracking.lag.problem.streams.values():
             if stream.left_out is not None:
-                self._say(alone(stream.name, stream.left_out))
+                self._say(slow_error_warning(stream.name, stream.left_out))
 
     def _restart(self, why: str) -> None:
         """Give up the estimate, and start from what arrives from now on."""

@@ -14,7 +14,7 @@ from graphloc.errors import in_one_line
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
-from graphloc.solve._solution import NO_NOISE
+from graphloc.solve._batch import LARGEST_NOISE_SCALE
 
 _VERSION = 2
 _EVERY_S = 2.0
@@ -91,7 +91,7 @@ class Snapshot:
             datum=datum,
             heights_m=heights_m,
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
-            noise_scale=float(np.clip(scale, 1.0, NO_NOISE)),
+            noise_scale=float(np.clip(scale, 1.0, LARGEST_NOISE_SCALE)),
             doubt=str(raw["doubt"]),
             p_odom_m=p,
             R_odom_body=R,

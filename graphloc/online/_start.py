@@ -26,8 +26,9 @@ from graphloc.online._setup import Setup
 from graphloc.recording import Recording
 from graphloc.solve._align import MOVED_M
 from graphloc.solve._batch import BatchResult, solve_batch
-from graphloc.solve._decide import decisions
-from graphloc.solve._solution import AGREES, row_of, world_covariance
+from graphloc.solve._covariances import world_covariance
+from graphloc.solve._decide import AGREES, decisions
+from graphloc.solve._ledger import row_of
 from graphloc.solve._stretch import StretchStep, past_at
 from graphloc.time import duration_ns
 

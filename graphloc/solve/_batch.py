@@ -36,6 +36,7 @@ _MAX_NOISE_ROUNDS = 5
 # Before other choices are tried, the passes need not stand: what creeps on is a choice that confirms itself.
 _FIRST_PASSES, _LAST_PASSES = 6, 15
 CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
+LARGEST_NOISE_SCALE = 10.0  # no IMU is so many times noisier than configured
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

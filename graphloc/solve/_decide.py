@@ -36,6 +36,7 @@ _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
 # How far apart pairs of residuals are; multiples of the latter, whole turns taken off, spread them evenly.
 _LAGS_S, _GOLDEN = (2.0, 4.0), 0.618
 _WIDEST = 1e9  # sigmas: a sensor that lies by more (0.1 mm stated, 100 km off) is no less an outlier for it
+AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
 
 # Of a state and a key: the covariance of the key's value as it is predicted for that state; None: not predicted.

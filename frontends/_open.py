@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Opening bags with rosbags: files, folders, and what is readable of damaged ones."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import NamedTuple
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2.storage_mcap import McapReader
+
+from graphloc.errors import InputError
+from graphloc.frontends._recover import Recovered, as_ros2, recover
+from graphloc.frontends._unpack import limit_unpacking
+
+log = logging.getLogger(__name__)
+limit_unpacking()
+HINTS = {
+    ".bag": "try `rosbag reindex`",
+    ".mcap": "try `mcap recover`",
+    ".db3": "try `sqlite3 FILE .recover` and `ros2 bag reindex`",
+    "": "try `ros2 bag reindex`",
+}
+
+
+class Opened(NamedTuple):
+    """A file or folder, and its reader."""
+
+    path: Path
+    reader: Reader1 | Reader2
+
+    def messages(
+        self, wanted: list[Connection], start_ns: int | None, end_ns: int | None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Return messages that were recorded from `start_ns` to before `end_ns`: connection, time (ns), bytes.
+
+        MCAP without an index is taken in the order of the file, which need not be that of time.
+        """
+        if isinstance(self.reader, Reader2) and isinstance(self.reader.storage, McapReader):
+            storage = self.reader.storage
+            read = storage.messages if storage.chunks else storage.messages_scan
+            return read(wanted, start_ns, end_ns)
+        return self.reader.messages(wanted, start_ns, end_ns)
+
+
+class BagOpener:
+    """Opens one path after another.
+
+    Args:
+        stack: closes the readers. warnings: gets a line for each file that was damaged and could be read in part.
+
+    Attributes:
+        opened: in order. broken: why others could not be opened.
+    """
+
+    def __init__(self, stack: ExitStack, warnings: list[str]) -> None:
+        self._stack, self.warnings = stack, warnings
+        self.opened: list[Opened] = []
+        self.broken: list[str] = []
+
+    def open(self, path: Path) -> None:
+        """Open a file, or a folder, or what is readable of it."""
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
+        if path.is_dir():
+            self._open_folder(path)
+        elif path.suffix in (".bag", ".mcap", ".db3"):
+            self._try(path, Reader1 if path.suffix == ".bag" else Reader2)
+        else:
+            raise InputError(f"{path}: not a bag: expected .bag, .mcap, .db3, or the folder of a ROS 2 bag")
+
+    def _open_folder(self, path: Path) -> None:
+        if (path / "metadata.yaml").exists():
+            if self._try(path, Reader2):
+                if left := _not_named(path):
+                    self.warnings.append(
+                        f"{path}: its metadata.yaml does not name {', '.join(left)}, so what is in there is not read "
+                        f"({HINTS['']}, or give the files one by one)"
+                    )
+                return
+            reason = self.broken.pop()
+        else:
+            reason = f"{path}: has no metadata.yaml"
+        files = sorted(p for p in path.iterdir() if p.suffix in (".bag", ".mcap", ".db3"))
+        before = len(self.opened)
+        for file in files:
+            self.open(file)
+        if len(self.opened) > before:
+            if files[0].suffix != ".bag":
+                self.warnings.append(f"{reason}; its files were read one by one ({HINTS['']})")
+        else:
+            self.broken.append(f"{reason}; and no readable .bag, .mcap or .db3 file lies in it ({_instead(path)})")
+
+    def _try(self, path: Path, kind: type[Reader1 | Reader2]) -> bool:
+        """Open with rosbags; a file that is cut short is opened again as far as it is whole."""
+        try:
+            view = as_ros2(path) if path.is_file() else None
+            reader = _open_reader(kind, view or path)
+        except Exception as error:  # noqa: BLE001 - rosbags lets struct, assertion, sqlite and codec errors through
+            reason = f"{path}: cannot be read ({text_of(error)}); {HINTS.get(path.suffix, HINTS[''])}"
+            repaired = recover(path) if path.is_file() else None
+            if repaired is None or not self._try_recovered(path, kind, repaired):
+                # Only now: the summary alone may be damaged.
+                others = isinstance(error, KeyError) and path.suffix == ".mcap"
+                self.broken.append(_of_others(path, str(error)) if others else reason)
+                return False
+            self.warnings.append(
+                f"{path}: damaged or cut short ({text_of(error)}): read up to byte {repaired.whole_bytes} "
+                f"of {repaired.file_bytes}; {HINTS[path.suffix]} to repair it"
+            )
+            return True
+        self._append(path, reader)
+        return True
+
+    def _append(self, path: Path, reader: Reader1 | Reader2) -> None:
+        self._stack.callback(reader.close)
+        self.opened.append(Opened(path, reader))
+
+    def _try_recovered(self, path: Path, kind: type[Reader1 | Reader2], repaired: Recovered) -> bool:
+        try:
+            reader = _open_reader(kind, repaired)
+        except Exception as error:  # noqa: BLE001 - as above
+            log.debug("%s: recovery failed: %s", path, error)
+            return False
+        self._append(path, reader)
+        return True
+
+
+def _not_named(folder: Path) -> list[str]:
+    """Files of a folder that its metadata.yaml does not name: of a recorder that died, say, or copied there."""
+    named = (folder / "metadata.yaml").read_text(encoding="utf-8", errors="replace")
+    return sorted(p.name for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.name not in named)
+
+
+def _instead(folder: Path) -> str:
+    """Say what may have been meant by a folder that is no bag: one of graphloc's own, or one level up."""
+    if (folder / "run.json").exists():
+        return "it is the folder of a finished run: give the bag, which its run.json names"
+    inside = sorted(p.name for p in folder.iterdir() if (p / "metadata.yaml").exists())
+    return f"a bag lies in it: {folder / inside[0]}" if inside else HINTS[""]
+
+
+def _open_reader(kind: type[Reader1 | Reader2], path: Path | Recovered) -> Reader1 | Reader2:
+    """Open with rosbags, and look at what it says of its topics: sqlite3 gives back whatever bytes were damaged to."""
+    reader = kind(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what a YAML reader thinks of metadata.yaml
+        reader.open()
+    for c in reader.connections:
+        if not (isinstance(c.topic, str) and isinstance(c.msgtype, str) and isinstance(c.msgcount, int)):
+            reader.close()
+            raise TypeError("its list of topics is damaged")
+    return reader
+
+
+def _of_others(path: Path, encoding: str) -> str:
+    """What is said of an MCAP file with a schema in an encoding that rosbags does not know."""
+    if "ros1" in encoding:
+        return f"{path}: holds messages of ROS 1, which are read from a .bag only: give the one that it was made of"
+    return f"{path}: holds messages that are not ROS 2's ({encoding}): write its ROS topics to a file of their own (`mcap filter`)"
+
+
+def text_of(error: BaseException) -> str:
+    """Return an error of any library in one short line."""
+    return " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__

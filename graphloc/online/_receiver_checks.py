@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of each position receiver before its fixes are judged: is it frozen, does its position jump?"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphloc.frames import Array
+from graphloc.graph import Attachment, Residual
+from graphloc.measurements import Measurement
+from graphloc.online._agreement import Agreement
+from graphloc.online._entries import Entries
+from graphloc.online._frozen_receiver import WINDOW_S
+from graphloc.online._live import LiveProblem, LiveStream
+from graphloc.online._states import States
+from graphloc.position_jumps import jump_warnings, largest_sigma, only_position_sensor
+
+
+class ReceiverChecks:
+    """Feeds the detectors of each stream whose single positions are never false altogether (GNSS).
+
+    Args:
+        agreement: told where a receiver turns out to be frozen.
+    """
+
+    def __init__(self, problem: LiveProblem, states: States, entries: Entries, agreement: Agreement) -> None:
+        self._problem, self._states, self._entries, self._agreement = problem, states, entries, agreement
+        self._jump_warnings: list[str] = []
+
+    def frozen(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> bool:
+        """Return whether a measurement comes from a frozen receiver.
+
+        When that is first found, the fixes since the receiver froze are taken out of the window as well.
+        """
+        if stream.row.false is not None or not stream.row.absolute:
+            return False
+        told_m = stream.row.hint(m, 0.0, self._problem.datum).p_world_m[:2]
+        if not np.isfinite(told_m).all():
+            return False
+        sigma_m = largest_sigma(residual.cov - _walked(residual, at))
+        self._check_jump(stream, m.stamp_ns, told_m, sigma_m)
+        detector, newest, at_s = stream.frozen_detector, self._states.newest, self._problem.timeline.seconds(m.stamp_ns)
+        before = detector.frozen
+        estimated_m = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2]
+        sigma_mps = largest_sigma(newest.velocity_cov)
+        detector.note(at_s, told_m, estimated_m, sigma_m, newest.velocity[:2], sigma_mps)
+        if detector.frozen and not before:
+            self._agreement.forget_refused()
+            self._reject_since(stream, min(at_s - WINDOW_S, detector.stands_s))
+        if detector.for_long(at_s):
+            self._agreement.note(stream, m, None)
+        return detector.frozen
+
+    def _check_jump(self, stream: LiveStream, stamp_ns: int, told_m: Array, sigma_m: float) -> None:
+        if only_position_sensor(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
+            allowed = stream.left_out is not None
+            found = stream.jump_detector.note(stamp_ns, told_m, sigma_m, allowed=allowed)
+            self._jump_warnings += jump_warnings(stream.name, *found, allowed=allowed)
+
+    def _reject_since(self, stream: LiveStream, since_s: float) -> None:
+        """Take the fixes since a time (s of the timeline) out of the graph: they pulled the estimate along."""
+        for entry in self._entries.of(stream):
+            if self._problem.timeline.seconds(entry.measurement.stamp_ns) >= since_s:
+                self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0))
+
+    def jump_warnings(self) -> list[str]:
+        """Return a line on each receiver whose position has jumped since this was last asked."""
+        warnings, self._jump_warnings = self._jump_warnings, []
+        return warnings
+
+
+def _walked(residual: Residual, at: Attachment) -> Array | float:
+    """Return the part of a residual's covariance (k, k) that its slow error adds between two of its nodes: no noise of the fix."""
+    if at.slow_walk is None or residual.slow_jacobian is None:
+        return 0.0
+    J = residual.slow_jacobian()
+    return np.asarray(J @ np.diag(at.slow_walk) @ J.T)

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Covariances in the axes of world, and what a position is off by beyond them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from graphloc.frames import Array, skew
+
+
+def world_covariance(cov_body: Any, R: Array, lever_m: Array) -> Array:
+    """Turn a body-tangent covariance (rotation first) into x, y, z, rotation, all about the world's axes.
+
+    For the point `lever_m` (body axes) from the state. Only the blocks are rotated: the full adjoint
+    would mix yaw times distance from the datum into position.
+    """
+    turn = to_world(R, lever_m)
+    return np.asarray(turn @ np.asarray(cov_body) @ turn.T)
+
+
+def to_world(R: Array, lever_m: Array) -> Array:
+    """Return d (place of a point, rotation; world's axes) / d body tangent (6, 6)."""
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = -R @ skew(lever_m)
+    turn[:3, 3:], turn[3:, :3] = R, R
+    return turn
+
+
+def unmodelled_covariance(streams: Sequence[Any]) -> Array:
+    """Return the covariance (3, 3) of slow errors that nothing can tell from motion: the position is off by as much."""
+    total = np.zeros((3, 3))
+    for stream in streams:
+        if stream.left_out is not None:
+            total += np.diag(stream.left_out.sigma**2)
+    if any(s.row.synthetic is not None and getattr(s.config, "height_m", None) is not None for s in streams):
+        total[2, 2] = 0.0  # the height is known otherwise; taken from the fixes, it is as far off as they are
+    return total

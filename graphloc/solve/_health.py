@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Health: how far each pose can be trusted, and why not fully."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.build import Problem, Stream
+from graphloc.frames import Array
+from graphloc.position_jumps import LASTS_S, why_in_doubt
+from graphloc.solution import Health, SolveStats
+from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
+from graphloc.solve._decide import AGREES, Verdict
+from graphloc.trajectory import Trajectory, bounds_95
+
+# Health: DNV asks for 2.5 m at 95 % in port (Digerud); beyond 25 m a pose helps nobody there.
+_GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_DEG = 2.5, 25.0, 45.0
+_DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
+CONTRADICTING_COST = 3.0  # over the expected cost: noise that is configured too small alone does not cost so much
+
+
+def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
+    """Why each state cannot be called good; empty where nothing speaks against it."""
+    stamps_ns, why = problem.timeline.stamps_ns, ""
+    if not result.converged:
+        why = "the solver did not converge"
+    elif result.noise_scale > LARGEST_NOISE_SCALE or stats.cost > CONTRADICTING_COST * max(stats.expected_cost, 1.0):
+        why = "the measurements contradict each other"
+    said = [why] * len(stamps_ns)
+    for stream in problem.streams:
+        if not why and stream.left_out is None and stream.slow is None:  # else the bounds allow for a slow error
+            for at_ns in stream.position_jumps[0]:
+                for k in np.flatnonzero(np.abs(stamps_ns - at_ns) < LASTS_S * 1e9):
+                    said[int(k)] = why_in_doubt(stream.name)
+    return said
+
+
+def since_agreed(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int], Verdict]) -> Array:
+    agreed = np.array(
+        [m.stamp_ns for i, m in enumerate(stream.measurements) if verdicts[(stream.number, i)].weight >= AGREES],
+        dtype=np.int64,
+    )
+    stamps = problem.timeline.stamps_ns
+    if not len(agreed):
+        return np.full(len(stamps), np.inf)
+    left = np.searchsorted(agreed, stamps, side="right") - 1
+    return np.where(left >= 0, (stamps - agreed[np.maximum(left, 0)]) * 1e-9, np.inf)
+
+
+def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
+    """Seconds since a sensor agreed, or until it first does: a smoother knows what comes."""
+    known = np.flatnonzero(np.isfinite(since))
+    if not len(known):
+        return since
+    first = stamps_ns[known[0]] - int(since[known[0]] * 1e9)
+    return np.where(np.isfinite(since), since, (first - stamps_ns) * 1e-9)
+
+
+def health_over_time(
+    trajectory: Trajectory, since: dict[str, Array], misfits: Sequence[str]
+) -> tuple[tuple[Health, ...], tuple[str, ...]]:
+    assert trajectory.cov is not None
+    away = {name: _or_until(s, trajectory.stamps_ns) for name, s in since.items()}
+    found = [
+        health_of(cov, {name: float(s[k]) for name, s in away.items()}, misfits[k])
+        for k, cov in enumerate(trajectory.cov)
+    ]
+    return tuple(health for health, _ in found), tuple(why for _, why in found)
+
+
+def health_of(cov: Array, away_s: Mapping[str, float], misfit: str = "") -> tuple[Health, str]:
+    """Return how far a pose can be trusted, and why not fully.
+
+    Args:
+        cov: (6, 6) as in `Trajectory`. away_s: s to where each absolute sensor agrees.
+        misfit: what else speaks against it.
+    """
+    bound_m, _, heading_deg = (float(v) for v in bounds_95(cov[None])[0])
+    silent = [name for name, s in away_s.items() if s > _SILENT_S]
+    if bound_m > _LOST_BOUND_M or heading_deg > _LOST_HEADING_DEG:
+        return Health.LOST, f"95 % bound {bound_m:.0f} m, heading {heading_deg:.0f} deg"
+    if min(away_s.values(), default=np.inf) > _DEAD_RECKONING_S:
+        return Health.DEAD_RECKONING, "no absolute position agrees"
+    if bound_m > _GOOD_BOUND_M:
+        return Health.DEGRADED, f"95 % bound {bound_m:.1f} m"
+    if silent:
+        return Health.DEGRADED, f"{', '.join(silent)} missing or not agreeing"
+    return (Health.DEGRADED, misfit) if misfit else (Health.GOOD, "")

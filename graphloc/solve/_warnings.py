@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Warnings: what in the solution contradicts the configuration, or each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc import keys
+from graphloc.build import Problem, Stream, constant_keys
+from graphloc.frames import Array
+from graphloc.graph import SlowProcess
+from graphloc.position_jumps import jump_warnings, largest_sigma
+from graphloc.solution import SolveStats
+from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult, expected_cost
+from graphloc.solve._decide import AGREES
+from graphloc.solve._health import CONTRADICTING_COST
+from graphloc.solve._passes import outliers_cost
+from graphloc.time import utc_text
+
+_FAR_OFF = 3.0
+_TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
+_BY_CHANCE = 1e-3
+_LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
+
+
+def slow_error_warning(sensor: str, slow: SlowProcess) -> str:
+    """Say what a slow error that nothing can tell from motion does to the bounds."""
+    return (
+        f"{sensor}: no second sensor can separate its slow error (multipath) from motion; the bounds include "
+        f"{slow.sigma[0]:.1f} m (1 sigma) for it; set slow_error.enabled: false if it has none (RTK in the open)"
+    )
+
+
+def disagreement_warning(sensor: str, weights: Array) -> list[str]:
+    """Say where most measurements (N,) of a sensor disagree with the rest: a line, or none."""
+    share = float((weights < AGREES).mean()) if len(weights) else 0.0
+    if share <= 0.5 or len(weights) <= 10:
+        return []
+    return [f"{sensor}: {100 * share:.0f} % of its measurements disagree with the rest"]
+
+
+def joint_rejection_warning(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, false: Array) -> list[str]:
+    """Say where more measurements (N,) in a row are refused than false ones come together by chance: a line, or none.
+
+    Args:
+        false: (N,) probability of each that it is false.
+    """
+    edges = np.flatnonzero(np.diff((weights < AGREES).astype(int), prepend=0, append=0)).reshape(-1, 2)
+    chance = np.concatenate([[0.0], np.cumsum(np.log(np.maximum(false, 1e-6)))])
+    rows = [
+        ((stamps_ns[end - 1] - stamps_ns[begin]) * 1e-9, begin, end)
+        for begin, end in edges
+        if end - begin < len(weights) and np.log(len(weights)) + chance[end] - chance[begin] < np.log(_BY_CHANCE)
+    ]
+    lasts_s, begin, end = max(rows, default=(0.0, 0, 0))
+    if lasts_s < _TOGETHER_S:
+        return []
+    since = utc_text(int(stamps_ns[begin]))
+    return [
+        f"{sensor}: all {end - begin} measurements in the {lasts_s:.0f} s from {since} on are rejected: they or the track are wrong"
+    ]
+
+
+def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
+    """How many of its sigmas a constant slow state (a mount's offset) lies from zero, 0 where there is none; which, and where."""
+    slow = stream.slow
+    if slow is None:
+        return 0.0, ""
+    value = np.atleast_1d(result.values.atVector(keys.slow(stream.number, 0)))
+    far = np.where(np.isfinite(slow.time_constant_s), 0.0, np.abs(value) / slow.sigma)
+    k = int(np.argmax(far))
+    where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
+    return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where})"
+
+
+def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
+    expected = expected_cost(problem, result.verdicts)
+    warnings = list(problem.warnings)
+    if not result.converged:
+        warnings.append("the solver did not converge: the last pass still moved the track by centimetres or more")
+    if result.noise_scale > 1.0:
+        said = (
+            f"IMU noise scaled up {result.noise_scale:.1f} times: as configured, the IMU contradicts the other sensors"
+        )
+        if result.noise_scale > LARGEST_NOISE_SCALE:
+            cure = "no IMU is that noisy: look for a wrong mount, unit, axis convention, time offset or sensor"
+        else:
+            cure = (
+                "set accel_noise_ug_per_sqrt_hz and gyro_noise_mdps_per_sqrt_hz accordingly, or look for a wrong mount"
+            )
+            if any(stream.constants for stream in problem.streams):
+                cure += ", or for tags on a floating dock that the survey has as fixed"
+        warnings.append(f"{said}; {cure}")
+    cost = 2.0 * float(result.graph.error(result.values)) - outliers_cost(result.verdicts)
+    if expected > 0 and cost > CONTRADICTING_COST * expected:
+        warnings.append(
+            f"the cost is {cost / expected:.1f} times its expectation: noise is configured too small, or a "
+            "mount, a unit or a time offset is wrong"
+        )
+    if (beside_m := largest_sigma(result.levels_cov)) > _LEVELS_M:
+        warnings.append(
+            "the fixes jump, and no other sensor shows which level is right: the one held longest is taken, "
+            f"and the bounds include {beside_m:.1f} m (1 sigma) for the others"
+        )
+    for stream in problem.streams:
+        far, said = _far_from_prior(stream, result)
+        if far > _FAR_OFF:
+            warnings.append(
+                f"{stream.name}: {said} from zero: check its mount and the IMU's, or raise the configured sigma"
+            )
+        for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
+            if result.values.exists(key):
+                off = float(np.abs(np.atleast_1d(result.values.atVector(key)) / constant.sigma).max())
+                if off > _FAR_OFF:
+                    warnings.append(
+                        f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
+                        "its sigmas"
+                    )
+        if stream.left_out is not None:
+            warnings.append(slow_error_warning(stream.name, stream.left_out))
+        allowed = stream.left_out is not None
+        warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
+        weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
+        warnings += disagreement_warning(stream.name, weights)
+        if stream.row.false is not None:
+            stamps_ns = np.array([m.stamp_ns for m in stream.measurements])
+            false = np.array([stream.row.false(m, stream.config).probability for m in stream.measurements])
+            warnings += joint_rejection_warning(stream.name, stamps_ns, weights, false)
+    return SolveStats(
+        passes=result.passes,
+        iterations=result.iterations,
+        states=len(problem.timeline),
+        factors=int(result.graph.size()),
+        cost=cost,
+        expected_cost=expected,
+        converged=result.converged,
+        warnings=tuple(warnings),
+    )
