@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An IMU that hangs: its driver says the last sample again and again, under stamps that move on.
+"""A frozen IMU: its driver repeats the last sample again and again while the stamps advance.
 
-Believed, it stands still or turns steadily, whatever the vessel does. No noise is the same to the last bit in six axes for
-long, nor in three for longer; a simulated IMU without noise is, but at rest its rates are exactly zero, and it is believed.
+Such samples claim standstill or a steady turn, whatever the vessel does. Real noise never repeats bit for bit in all six
+axes for long, nor in the three rates for longer. A simulated IMU without noise does repeat at rest, but then its rates are
+exactly zero: such samples are accepted.
 """
 
 from __future__ import annotations
@@ -15,17 +16,20 @@ from graphloc.measurements import ImuSample
 from graphloc.time import NS_PER_S, utc_text
 
 LEAST_S, FEWEST = 0.2, 10
-"""So long, and so many times in a row, is a sample repeated until it is no sample. Drivers that publish faster than they
-measure, and quantised readings at rest, repeat for less."""
+"""Duration (s) and number of repetitions from which a repeated sample counts as frozen. Drivers that publish faster than
+they measure, and quantised readings at rest, repeat for less."""
 RATES_LEAST_S, RATES_FEWEST = 1.0, 50
-"""The same of the three rates alone: fewer axes are the same more easily."""
+"""The same for the three rates alone: fewer axes repeat by chance more easily."""
 WHY = "frozen: it repeats one sample (or its three rates) bit for bit while the stamps advance; check the sensor and its driver"
 
 
 def frozen_samples(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
-    """Return (N,) which samples (N, 6: specific force, rate) at increasing stamps only repeat one that hangs.
+    """Return (N,) which samples are repetitions of a frozen IMU.
 
-    The first of each stretch is a sample as any other.
+    The first sample of each stretch is not one of them: it was measured.
+
+    Args:
+        stamps_ns: (N,), increasing. samples: (N, 6), specific force (m/s^2) and angular rate (rad/s), axes of the IMU.
     """
     rates = samples[:, 3:]
     return _repeats(stamps_ns, samples, ~_at_rest(samples), LEAST_S, FEWEST) | _repeats(
@@ -36,7 +40,7 @@ def frozen_samples(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.b
 def _repeats(
     stamps_ns: NDArray[np.int64], rows: Array, judged: NDArray[np.bool_], least_s: float, fewest: int
 ) -> NDArray[np.bool_]:
-    """Return (N,) which rows (N, k) that are `judged` repeat the first of a stretch that is long enough."""
+    """Return (N,) which rows (N, k), of those to be `judged`, repeat the first of a stretch that is long enough."""
     if len(stamps_ns) == 0:
         return np.zeros(0, dtype=bool)
     first = np.concatenate([[0], np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1])
@@ -58,7 +62,7 @@ def frozen_imu_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[n
 
 
 def stretches(stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> str:
-    """Return where (N,) bad ones repeat the one before: for how long, and from when."""
+    """Describe the stretches of `bad` (N,) in words: for how long each lasts, and from when."""
     first = np.flatnonzero(np.diff(bad.astype(int), prepend=0) == 1)
     last = np.flatnonzero(np.diff(bad.astype(int), append=0) == -1)
     lasts_s = (stamps_ns[last] - stamps_ns[first - 1]) / NS_PER_S
@@ -70,20 +74,20 @@ def stretches(stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> str:
 
 
 def _at_rest(samples: Array) -> NDArray[np.bool_]:
-    """Return (...) whether samples (..., 6) are what an IMU without noise says at rest: a force, and no rate at all."""
+    """Return (...) whether samples (..., 6) are those of a noise-free IMU at rest: a specific force, and all rates exactly zero."""
     return np.asarray((samples[..., 3:] == 0.0).all(axis=-1) & (samples[..., :3] != 0.0).any(axis=-1))
 
 
 class FrozenImuDetector:
-    """The same of samples as they come: what came before a stretch is long enough has been believed by then."""
+    """The same online: repetitions are accepted until the stretch is long enough to be detected."""
 
     def __init__(self) -> None:
         self._all, self._rates = _Stretch(LEAST_S, FEWEST), _Stretch(RATES_LEAST_S, RATES_FEWEST)
         self.frozen = False
-        """The newest sample only repeats one that hangs."""
+        """Whether the newest sample is a repetition of a frozen IMU."""
 
     def repeats(self, m: ImuSample) -> bool:
-        """Return whether a sample only repeats one that hangs."""
+        """Take in a sample; return whether it is a repetition of a frozen IMU."""
         row = np.concatenate([m.accel_mps2, m.gyro_radps])
         by_all = self._all.goes_on(m.stamp_ns, row) and not bool(_at_rest(row))
         by_rates = self._rates.goes_on(m.stamp_ns, m.gyro_radps) and bool(m.gyro_radps.any())
@@ -92,7 +96,7 @@ class FrozenImuDetector:
 
 
 class _Stretch:
-    """Rows that are the same."""
+    """A stretch of equal rows."""
 
     def __init__(self, least_s: float, fewest: int) -> None:
         self._least_ns, self._fewest = least_s * NS_PER_S, fewest
@@ -100,7 +104,7 @@ class _Stretch:
         self._row = np.zeros(0)
 
     def goes_on(self, stamp_ns: int, row: Array) -> bool:
-        """Return whether a row repeats the first of its stretch, long enough after it."""
+        """Take in a row; return whether it repeats the first of its stretch, and the stretch is long enough."""
         if stamp_ns < self._first_ns or not np.array_equal(row, self._row):
             self._first_ns, self._row, self._repeats = stamp_ns, row, 0
             return False

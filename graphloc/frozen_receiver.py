@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver that hangs, or its driver: it says one place, to the last bit or but for its noise, while the vessel goes on.
+"""A frozen receiver (or driver): it repeats one position, exactly or but for its noise, while the vessel moves on.
 
-Judged from a whole run, before it is solved: beside few other sensors the graph would follow, by a tilt and a bias that were never
-there. At rest a receiver may well say one place for minutes, so it has to have been under way: the next place it says is then a leap
-away, or, where there is none (or so late that it may have gone there from rest), it stood still from one fix to the next. Online: `online/_frozen_receiver.py`.
+Detected over a whole run before it is solved: with few other sensors the graph would follow the frozen position by a false
+tilt and bias. At rest a receiver may rightly repeat one position for minutes, so the vessel must have been under way. Then
+either the next different position is a jump away, or, where there is no next one (or one so late that the vessel may have
+gone there from rest), the vessel stopped from one fix to the next, faster than it can brake. Online:
+`online/_frozen_receiver.py`.
 """
 
 from __future__ import annotations
@@ -21,20 +23,23 @@ from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
 
 WHY = "frozen receiver or driver: it repeats one position while the vessel moves"
-_HELD_S, _FEWEST = 2.5, 3  # a stretch of one place; for less a driver repeats (`frontends/_fixes.py`)
-_NOISE_M = 0.5  # how far one place may scatter
-_BEFORE_S = 3.0  # whose fixes tell how fast it was under way
+_HELD_S, _FEWEST = (
+    2.5,
+    3,
+)  # a stretch of one position; a driver that repeats fixes does so for less (`frontends/_fixes.py`)
+_NOISE_M = 0.5  # how far the fixes of one position may scatter
+_BEFORE_S = 3.0  # before the stretch: the fixes in it give the speed
 _SIGMAS = 3.0
-_UNDER_WAY_MPS, _JUMP_M, _SHARE = 0.5, 2.0, 0.5  # speed before; the leap after, and its share of the way at that speed
-# What stands at once from faster than this, and than brakes stop between two fixes, hangs. None sets off faster, either.
+_UNDER_WAY_MPS, _JUMP_M, _SHARE = 0.5, 2.0, 0.5  # speed before; the jump after, and its share of the way at that speed
+# A vessel cannot stop between two fixes from more than this speed and deceleration; nor does one set off faster.
 _STOPS_MPS, _BRAKES_MPS2 = 1.5, 3.0
 
 
 def frozen_fixes(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Array) -> NDArray[np.bool_]:
-    """Return (N,) which fixes of one receiver, in order of time, only repeat one that hangs.
+    """Return (N,) which fixes of one receiver, in order of time, are repetitions of a frozen one.
 
     Args:
-        stamps_ns: (N,). lat_lon_deg: (N, 2), as they came. places_m: (N, 2), the same in metres, axes level.
+        stamps_ns: (N,). lat_lon_deg: (N, 2), as received. places_m: (N, 2), the same in a local level frame.
     """
     bad = np.zeros(len(stamps_ns), dtype=bool)
     if not len(bad):
@@ -48,10 +53,10 @@ def frozen_fixes(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Arr
 
 
 def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which fixes say one place but for its noise, where `known` has none to the last bit.
+    """Return (N,) which fixes repeat one position but for its noise; stretches with exact repetitions (`known`) are left out.
 
-    Any receiver does so at rest, and multipath leaps from there: it must have been under way until then, and be so again
-    where it leaps to.
+    Any receiver does so at rest, and multipath may jump from there: the vessel must have been under way until then, and again
+    where the position jumps to.
     """
     bad = np.zeros(len(t_s), dtype=bool)
     held = np.searchsorted(t_s, t_s + _HELD_S)  # the first that is so much later
@@ -66,7 +71,7 @@ def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_])
         after = _gone(places_m, first, int(held[first]))
         if after == len(t_s) or known[first:after].any():
             first = after
-        elif after <= held[first]:  # it was on its way
+        elif after <= held[first]:  # it was under way
             first += 1
         elif (
             _stopped_at_once(t_s, places_m, first, _UNDER_WAY_MPS)
@@ -82,7 +87,7 @@ def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_])
 
 
 def _gone(places_m: Array, first: int, held: int) -> int:
-    """The first that is farther from the middle of those in [first, held) than noise is; or how many there are."""
+    """Return the first fix farther than noise from the mean of [first, held); the number of fixes where there is none."""
     middle, long = places_m[first:held].mean(axis=0), held - first
     while True:
         away = np.linalg.norm(places_m[first : first + long] - middle, axis=1) > _NOISE_M
@@ -94,7 +99,7 @@ def _gone(places_m: Array, first: int, held: int) -> int:
 
 
 def _is_frozen(t_s: Array, places_m: Array, first: int, after: int) -> bool:
-    """Whether the stretch of one place from `first` on hangs; at `after` it says another place, or the run has ended."""
+    """Whether the stretch of one position from `first` on is frozen; at `after` the position changes, or the run has ended."""
     if after < len(t_s):
         silent_s = t_s[after] - t_s[after - 1]
         jump_m = float(np.linalg.norm(places_m[after] - places_m[first]))
@@ -104,7 +109,7 @@ def _is_frozen(t_s: Array, places_m: Array, first: int, after: int) -> bool:
 
 
 def _jumps_on(t_s: Array, places_m: Array, first: int, after: int) -> bool:
-    """Whether it was under way, and is a good part of the way further on at once."""
+    """Whether the vessel was under way, and the position then jumps on by a good part of the distance made meanwhile."""
     speed = _under_way(t_s, places_m, np.append(_before(t_s, first), first))
     if speed is None:
         return False
@@ -113,12 +118,12 @@ def _jumps_on(t_s: Array, places_m: Array, first: int, after: int) -> bool:
 
 
 def _set_off_m(silent_s: float) -> float:
-    """How far it may have gone from rest, while it said nothing."""
+    """How far (m) the vessel may have gone from rest during a silence of the receiver."""
     return _BRAKES_MPS2 * silent_s**2 / 2.0
 
 
 def _under_way(t_s: Array, places_m: Array, of: NDArray[np.int64]) -> float | None:
-    """Speed of a vessel that is surely under way in these; None of one that may not be."""
+    """Speed (m/s) over these fixes; None where the vessel may have been at rest."""
     if len(of) < _FEWEST:
         return None
     speed, sigma = _speed(t_s[of], places_m[of])
@@ -126,7 +131,7 @@ def _under_way(t_s: Array, places_m: Array, of: NDArray[np.int64]) -> float | No
 
 
 def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) -> bool:
-    """Whether it was under way until the fix before, faster than this and than brakes stop between two fixes."""
+    """Whether the vessel was under way until the fix before, at a speed above `least_mps` from which it cannot brake between two fixes."""
     before = _before(t_s, first)
     if len(before) < 2:
         return False
@@ -138,12 +143,12 @@ def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) 
 
 
 def _before(t_s: Array, first: int) -> NDArray[np.int64]:
-    """The fixes before this one that tell how fast it was."""
+    """The fixes before this one that give the speed."""
     return np.arange(*np.searchsorted(t_s, [t_s[first] - _BEFORE_S, t_s[first]]))
 
 
 def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:
-    """Speed along places (N, 2), and its sigma by how far they lie off a line."""
+    """Speed (m/s) of a straight line through places (N, 2), and its sigma from the residuals."""
     dt = t_s - t_s.mean()
     square = max(float(dt @ dt), 1e-9)
     v = dt @ (places_m - places_m.mean(axis=0)) / square
@@ -159,7 +164,7 @@ def frozen_fixes_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray
 
 
 def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording, list[str]]:
-    """Return a recording with the fixes of receivers that hang in the ledger instead, and a line on each such receiver."""
+    """Return a recording without the fixes of frozen receivers (they get ledger rows), and a warning on each such receiver."""
     of: dict[str, list[GnssPosition]] = {}
     for m in recording.measurements:
         if isinstance(m, GnssPosition):

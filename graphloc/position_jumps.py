@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver that leaps, by multipath or in another mode, where no other sensor tells the place: the track goes along.
+"""Position jumps of a receiver (multipath, wrong RTK fix) where no other sensor measures position: the track follows them.
 
-Its sigma knows nothing of that: a wrong RTK fix is stated to a centimetre as a right one is. Seen in the places themselves, before
-and after each step: no craft changes its acceleration by so much at once.
+The stated sigma does not show them: a wrong RTK fix is stated to a centimetre as a right one is. They are found in the
+positions themselves, by comparing each step with those before and after it: no vessel changes its acceleration by so much
+at once.
 """
 
 from __future__ import annotations
@@ -18,18 +19,18 @@ from graphloc.frames import Array
 from graphloc.time import NS_PER_S, utc_text
 
 LASTS_S = 200.0
-"""For so long before and after a leap either side of it may be the wrong one: as a slow error lasts."""
-# m, as far as 4 m/s^2 that come and go within three seconds; times what is usual; fewer do not tell what that is.
+"""For so long (s) before and after a jump either side may be the wrong one: about as long as a slow error lasts."""
+# Metres: 4 m/s^2 that come and go within three seconds; times the usual step difference; number of fixes that give the latter.
 _JUMP_M, _JUMP, _FEWEST = 3.0, 10.0, 10
-_AROUND = 0.75  # around a step it is usually more than that of what it is over all
-_SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # of what is stated; a car that brakes in an emergency, and then stands
-_EVEN = 1.5  # a step longer or shorter by more than this is none as those beside it
+_AROUND = 0.75  # share of the local median, which is usually above that of the whole run
+_SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # stated sigmas; emergency braking of a car to a stop
+_EVEN = 1.5  # steps in time that differ by more than this factor are not compared
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
 _KEPT = 200
 
 
 def only_position_sensor(stream: Any, absolute: Collection[Any]) -> bool:
-    """Return whether nothing but this stream's single places tells where the craft is, and it has no slow error that may leap.
+    """Return whether this stream is the only one that measures position, and has no slow error that could take up a jump.
 
     Args:
         absolute: the absolute streams of the run.
@@ -40,36 +41,37 @@ def only_position_sensor(stream: Any, absolute: Collection[Any]) -> bool:
 def position_jumps(
     stamps_ns: NDArray[np.int64], places_m: Array, sigma_m: Array, *, allowed: bool
 ) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps (K,) and sizes (K,), m, of steps between places (N, 2) that are a leap, unlike those before and after.
+    """Return stamps (K,) and sizes (K,), m, of the position jumps: steps unlike those before and after.
 
-    A fix that is off by itself, or a burst of them, is none: it has not drawn the track along.
+    A single outlier, or a burst of them, is no jump: the track does not follow it.
 
     Args:
-        sigma_m: (N,) as stated. allowed: the bounds allow for a slow error; then metres count.
+        stamps_ns: (N,), increasing. places_m: (N, 2), in a local level frame. sigma_m: (N,) as stated.
+        allowed: whether the bounds already include a slow error: then only jumps of metres matter.
     """
     if len(stamps_ns) < _FEWEST:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
     steps, dt = np.diff(places_m, axis=0), np.diff(stamps_ns) / NS_PER_S
     usual_s = float(np.median(dt))
-    # Where stamps tell when a place was measured its step goes by time, where they are those of arrival it does not.
+    # Stamps of measurement: steps are proportional to time; stamps of arrival: they are not.
     by_time = _parts(steps * (usual_s / np.maximum(dt, 1e-9))[:, None])
     parts = _parts(steps)
     off_m = np.minimum(np.linalg.norm(parts, axis=1), np.linalg.norm(by_time, axis=1))
     padded = np.pad(off_m, 1)
-    beside = np.maximum(padded[:-2], padded[2:])  # they feel half of it
-    # Two steps together, beside those before and after: a fix that is off by itself goes there and back.
+    beside = np.maximum(padded[:-2], padded[2:])  # the steps beside a jump show half of it
+    # Two steps together against those before and after: a single outlier goes there and back.
     both = np.linalg.norm(steps[1:-2] + steps[2:-1] - steps[:-3] - steps[3:], axis=1)
     both = np.minimum(np.append(both, np.inf), np.append(np.inf, both))
     window = np.lib.stride_tricks.sliding_window_view
     even = (window(dt, 3).max(axis=1) < _EVEN * usual_s) & (window(dt, 3).min(axis=1) * _EVEN > usual_s)
-    # In a silence it may have gone anywhere; where fixes are seconds apart, any turn and any stop is metres off.
+    # In a gap the vessel may have gone anywhere; where fixes are seconds apart, any turn or stop differs by metres.
     least_m = np.full(len(off_m), _JUMP_M * max(usual_s, 1.0) ** 2)
-    if not allowed:  # what is said where the bounds allow for it is said where they do not, too
+    if not allowed:  # smaller jumps matter too where the bounds do not include a slow error
         believed_m = np.maximum(_BRAKES_MPS2 * usual_s**2 / 2.0, _SIGMAS * window(sigma_m, 4).max(axis=1))
         least_m = np.minimum(least_m, believed_m)
     least_m = np.maximum(least_m, _JUMP * _usual(off_m))
     far = np.flatnonzero(even & (off_m >= beside) & (off_m > least_m) & (both > off_m / 2.0))
-    far = far[(far > 0) & (far < len(off_m) - 1)]  # beside an end a fix that is off may look like half a leap
+    far = far[(far > 0) & (far < len(off_m) - 1)]  # at either end an outlier looks like half a jump
     near = np.abs(np.subtract.outer(stamps_ns[far], stamps_ns[far])) <= _BURST_S * NS_PER_S
     back = np.linalg.norm(parts[far][:, None] + parts[far][None], axis=2) < off_m[far] / 2.0
     far = far[~(near & back).any(axis=1)]
@@ -77,12 +79,12 @@ def position_jumps(
 
 
 def _parts(steps_m: Array) -> Array:
-    """How each step (N, 2) but the first and last parts from the mean of those beside it (N - 2, 2)."""
+    """Return (N - 2, 2) the difference between each inner step (N, 2) and the mean of its neighbours."""
     return np.asarray(steps_m[1:-1] - (steps_m[:-2] + steps_m[2:]) / 2.0)
 
 
 def _usual(off_m: Array) -> Array:
-    """What is usual (N,): over all, or most of what is around each where that is more: for a while a receiver may scatter more."""
+    """Return (N,) the usual step difference: the median of all, or of the neighbourhood where that is larger (scatter may grow for a while)."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(off_m, _FEWEST, mode="reflect"), 2 * _FEWEST + 1)
     return np.asarray(np.maximum(np.median(around, axis=1) * _AROUND, np.median(off_m)))
 
@@ -90,7 +92,11 @@ def _usual(off_m: Array) -> Array:
 def jump_warnings(
     sensor: str, stamps_ns: NDArray[np.int64], off_m: Array, *, allowed: bool, followed: bool = True
 ) -> list[str]:
-    """Return a line on what `position_jumps` found, or none; `followed`: by the track, else they are taken for the receiver's error."""
+    """Return a warning on what `position_jumps` found, or none.
+
+    Args:
+        followed: whether the track follows the jumps; else they are attributed to the receiver's slow error.
+    """
     if not len(stamps_ns):
         return []
     n = int(np.argmax(off_m))
@@ -105,17 +111,17 @@ def jump_warnings(
 
 
 def largest_sigma(cov: Array) -> float:
-    """Return the largest sigma of the first two axes."""
+    """Return the largest standard deviation in the plane of the first two axes of cov (>= 2, >= 2)."""
     return float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
 
 
 def why_in_doubt(sensor: str) -> str:
-    """Say why a pose near a leap is not good."""
+    """Say why the health of a pose near a jump is not good."""
     return f"position jump of {sensor}, and no other sensor measures position"
 
 
 class JumpDetector:
-    """The same of one receiver as its fixes come: a leap is seen a second later, three fixes at least."""
+    """The same for one receiver online: a jump is detected a second later, after three fixes at least."""
 
     def __init__(self) -> None:
         self._seen: deque[tuple[int, Array, float]] = deque(maxlen=_KEPT)
@@ -123,7 +129,7 @@ class JumpDetector:
         self._last_ns: int | None = None
 
     def note(self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed: bool) -> tuple[NDArray[np.int64], Array]:
-        """Take in a fix; one that is late is passed over. Return as `position_jumps` what it shows; of one after another the first only."""
+        """Take in a fix; one that is late is ignored. Return new jumps as `position_jumps` does; while in doubt, no further ones."""
         none = np.zeros(0, dtype=np.int64), np.zeros(0)
         if self._seen and stamp_ns <= self._seen[-1][0]:
             return none
@@ -142,5 +148,5 @@ class JumpDetector:
         return none if again else (at_ns[new], off_m[new])
 
     def doubtful(self, stamp_ns: int) -> bool:
-        """Return whether it has leapt lately."""
+        """Return whether there was a jump within the last `LASTS_S`."""
         return self._last_ns is not None and 0 <= stamp_ns - self._last_ns < LASTS_S * NS_PER_S

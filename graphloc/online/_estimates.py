@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What users get of a state."""
+"""From a state of the window to the `Estimate` that users get."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from graphloc.solve._health import health_of
 def estimate_of(
     now: Propagated, lag: Lag, odometry: Odometry, *, agreed_ns: Mapping[str, int], absolute: Sequence[str], doubt: str
 ) -> Estimate:
-    """Return the estimate at a state of the lag, or ahead of it.
+    """Return the estimate at a state of the window, or propagated beyond it.
 
     Args:
-        agreed_ns: when each absolute sensor last agreed. absolute: names of all of them.
-        doubt: why the pose cannot be called good, or empty.
+        agreed_ns: stamp at which each absolute sensor last agreed. absolute: names of all absolute sensors.
+        doubt: why the health cannot be good, or empty.
     """
     newest, problem = lag.newest, lag.problem
     at_ns, lever = now.stamp_ns, -problem.t_body_imu_m

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ledger of a run that goes on."""
+"""Ledger rows online: each measurement gets exactly one, also where a window is rebuilt."""
 
 from __future__ import annotations
 
@@ -11,57 +11,57 @@ from graphloc.measurements import Measurement
 
 
 class OnlineLedger:
-    """Rows that have become final, and which measurements have theirs, so that none is taken again when a lag is built anew."""
+    """Rows that have become final, and the measurements that have theirs: these are not used again in a rebuilt window."""
 
     def __init__(self, config: VesselConfig) -> None:
         self._config = config
         self._rows: list[LedgerRow] = []
-        self._settled: set[int] | None = None  # None: no lag is underway, nothing can be taken again
+        self._settled: set[int] | None = None  # None: there is no window, so nothing can be used again
 
     def taken(self) -> list[LedgerRow]:
-        """Return the rows since this was last asked."""
+        """Return the rows since this was last called."""
         rows, self._rows = self._rows, []
         return rows
 
     def begin(self) -> None:
-        """A lag is underway from now on, or still is."""
+        """There is a window from now on (or still)."""
         self._settled = self._settled or set()
 
     def close(self) -> None:
-        """No lag is underway any more."""
+        """There is no window any more."""
         self._settled = None
 
     def has(self, m: Measurement) -> bool:
-        """Whether a measurement of the lag has its row already."""
+        """Whether a measurement already has its row."""
         return m.seq in (self._settled or ())
 
     def forget_but(self, seqs: Collection[int]) -> None:
-        """Forget about all but these: they are too old to be taken again."""
+        """Forget all measurements but these: the others are too old to be used again."""
         if self._settled is not None:
             self._settled.intersection_update(seqs)
 
     def enter(self, rows: Sequence[LedgerRow]) -> None:
-        """Enter rows of measurements that have left the lag."""
+        """Enter rows of measurements that have left the window."""
         self._rows += rows
         if self._settled is not None:
             self._settled.update(row.seq for row in rows)
 
     def drop(self, m: Measurement, outcome: Outcome, reason: str) -> None:
-        """Enter why a measurement is not in the estimate; those that something else was made of (seq < 0) have no row."""
+        """Enter why a measurement is not in the estimate; synthetic ones (seq < 0) have no row."""
         if m.seq >= 0:
             self.enter([self._row(m, outcome, reason)])
 
     def used(self, m: Measurement) -> None:
-        """Enter an IMU sample: it can be taken again, and is in the estimate in any case."""
+        """Enter an IMU sample as used; it may be used again in a rebuilt window."""
         if m.seq >= 0:
             self._rows.append(self._row(m, Outcome.USED, ""))
 
     def marked(self) -> tuple[int, set[int] | None]:
-        """Return where the ledger stands, for `back_to`."""
+        """Return the state of the ledger, for `back_to`."""
         return len(self._rows), None if self._settled is None else set(self._settled)
 
     def back_to(self, mark: tuple[int, set[int] | None]) -> None:
-        """Strike what was entered since: what it came of has failed."""
+        """Remove what was entered since `marked`: the rebuild that it came from has failed."""
         length, self._settled = mark
         del self._rows[length:]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much noisier the IMU is taken for than it is configured."""
+"""Scale of the IMU noise: raised where the IMU contradicts the other sensors."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ import numpy as np
 from graphloc.online._lag import Lag
 from graphloc.solve._batch import CONTRADICTION, LARGEST_NOISE_SCALE
 
-_EVERY_S, _MISFITS = 5.0, 2  # how often the fit is looked at, and how often in turn it must be bad
+_EVERY_S, _MISFITS = 5.0, 2  # how often the fit is checked, and how many checks in a row must fail
 
 
 class ImuNoise:
-    """Asked of a lag that is to be solved about every 0.1 s; `scale` only grows.
+    """Factor on the configured noise densities; it only grows.
 
     Args:
         adapt: whether it may grow (`adapt_noise`).
+
+    Attributes:
+        scale: at least 1.
     """
 
     def __init__(self, *, adapt: bool) -> None:
@@ -24,15 +27,15 @@ class ImuNoise:
         self._looked_ns, self._misfits = 0, 0
 
     def begin(self, at_ns: int) -> None:
-        """A lag has begun, and what has just begun has not settled."""
+        """A window has begun at a stamp: it is not checked until it has settled."""
         self._looked_ns, self._misfits = at_ns, 0
 
     def contradicted(self, lag: Lag) -> str:
-        """Take the IMU for noisier where the lag contradicts it time and again, as the batch does; what to say of it."""
+        """Raise the scale where the window contradicts the IMU repeatedly, as the batch solver does; return a line on that, or empty."""
         at_ns = lag.newest.stamp_ns
         if at_ns - self._looked_ns < _EVERY_S * 1e9 or not self._adapt:
             return ""
-        if not lag.fresh:  # steps cost what estimates have moved since they were linearised, up to a second ago
+        if not lag.fresh:  # until relinearised, the cost of a step includes how far its states have moved since
             return ""
         self._looked_ns = at_ns
         misfit = lag.misfit()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the IMU makes of the newest state: where the vessel is by now, and the next step of the odometry."""
+"""Propagation by the IMU: the newest state to a later stamp, and the odometry from state to state."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ class Propagated:
     """A state at some stamp.
 
     Attributes:
-        pose, velocity: of the IMU's place, gtsam.Pose3 and (3,). pose_cov: (6, 6), in the body tangent.
-        velocity_cov: (3, 3). p_odom_m, R_odom_body: (3,) and (3, 3), of the body's origin.
+        pose, velocity: at the IMU with the body's axes, in world: gtsam.Pose3 and (3,), m/s.
+        pose_cov: (6, 6), rotation first, in the body tangent. velocity_cov: (3, 3), in world.
+        p_odom_m, R_odom_body: (3,) and (3, 3), pose of the body's origin in odom.
     """
 
     stamp_ns: int
@@ -47,7 +48,7 @@ def unpropagated(newest: Newest, odometry: Odometry) -> Propagated:
 
 
 def propagate(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns: int) -> Propagated:
-    """Return what becomes of the newest state until a later stamp, be it after the IMU's last sample."""
+    """Return the newest state propagated to a later stamp, which may lie after the last IMU sample."""
     pose = newest.pose
     start = gtsam.NavState(pose, newest.velocity)
     pim = problem.links.integrate(newest.stamp_ns, stamp_ns, newest.bias, Going.of(start, newest.bias))
@@ -67,7 +68,7 @@ def propagate(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns
 
 
 def advance_odometry(odometry: Odometry, problem: LiveProblem, newest: Newest, until_ns: int) -> None:
-    """Carry the odometry on, from the newest state or from where it is already, as the IMU says."""
+    """Propagate the odometry by the IMU to a stamp: from the newest state, or from where it has already got to."""
     links, bias, before_ns = problem.links, newest.bias, newest.stamp_ns
     if until_ns <= odometry.stamp_ns:
         return
@@ -84,7 +85,7 @@ def advance_odometry(odometry: Odometry, problem: LiveProblem, newest: Newest, u
 
 
 def _body_step(problem: LiveProblem, a: gtsam.Pose3, b: gtsam.Pose3) -> tuple[Array, Array]:
-    """The step of the body's origin, from that of the IMU's place."""
+    """Return the step of the body's origin (3,) and its rotation (3, 3), in the body's axes before it; a, b: poses at the IMU."""
     lever = -problem.t_body_imu_m
     R = a.rotation().matrix()
     dp = R.T @ (b.transformFrom(lever) - a.transformFrom(lever))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a lag can be built anew from."""
+"""What the window can be rebuilt from."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _EVERY_S = 1.0
 
 
 class Recent:
-    """Anchors of the lag, one a second, and all that came since the oldest of them.
+    """Anchors of the window, one per second, and all that arrived since the oldest of them.
 
-    An anchor holds what was known when its state was the newest, so what was measured since can be taken again.
+    An anchor is the estimate from when its state was the newest: what was measured since can be used again without counting twice.
     """
 
     def __init__(self) -> None:
@@ -25,25 +25,25 @@ class Recent:
         self._before: ImuSample | None = None  # the last sample before the oldest anchor
 
     def clear(self) -> None:
-        """Forget all."""
+        """Forget everything."""
         self.anchors.clear()
         self._came, self._before = [], None
 
     def begin(self, came: Iterable[Measurement]) -> None:
-        """A lag has begun with these."""
+        """A window has begun with these measurements."""
         self._came = list(came)
 
     def resume(self, anchor: Anchor, before: ImuSample, came: ImuSample) -> None:
-        """A lag goes on from an anchor, the sample at it or before, and the first since."""
+        """A window has begun at an anchor of a snapshot, with the IMU sample at it or before, and the first since."""
         self.anchors = deque([anchor])
         self._before, self._came = before, [came]
 
     def keep(self, m: Measurement) -> None:
-        """Keep what came: where its stamp is does not matter."""
+        """Keep a measurement, whatever its stamp."""
         self._came.append(m)
 
     def keep_anchor(self, lag: Lag) -> bool:
-        """Remember the newest state, if that is due, and forget what came before the oldest; tell whether it was due."""
+        """Keep the newest state as an anchor if one is due, and forget what is older than the oldest anchor; return whether it was due."""
         at_ns, anchors = lag.newest.stamp_ns, self.anchors
         if anchors and at_ns - anchors[-1].stamp_ns < _EVERY_S * 1e9:
             return False
@@ -60,18 +60,18 @@ class Recent:
         return True
 
     def __iter__(self) -> Iterator[Measurement]:
-        """All that came, in the order of arrival."""
+        """All measurements, in order of arrival."""
         return iter(self._came)
 
     def others(self) -> list[Measurement]:
-        """Return what came that is no sample of the IMU, in the order of arrival."""
+        """Return all but the IMU samples, in order of arrival."""
         return [m for m in self._came if not isinstance(m, ImuSample)]
 
     def samples(self) -> list[ImuSample]:
-        """Return the IMU's samples, one before the oldest anchor among them, by stamp."""
+        """Return the IMU samples by stamp, with the last one before the oldest anchor."""
         found = [m for m in self._came if isinstance(m, ImuSample)]
         return sorted([*([self._before] if self._before else []), *found], key=lambda m: m.stamp_ns)
 
     def sample_at(self, anchor: Anchor) -> ImuSample | None:
-        """Return the last sample at an anchor or before."""
+        """Return the last IMU sample at or before an anchor."""
         return next((m for m in reversed(self.samples()) if m.stamp_ns <= anchor.stamp_ns), None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What came while there is no estimate."""
+"""Measurements held while there is no estimate."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ from graphloc.online._start import LEAST_S
 from graphloc.time import duration_ns
 
 _TRY_EVERY_S, _TRY_AGAIN = 0.5, 0.15  # of a start
-_LONGEST_S, _MOST = 120.0, 50_000  # what is older, or more, is let go
+_LONGEST_S, _MOST = 120.0, 50_000  # what is older, or beyond this number, is dropped
 
 
 class Waiting:
-    """Measurements by stamp, and `why`: what the start waits for, in plain words."""
+    """Measurements in order of stamp.
+
+    Attributes:
+        why: what the start waits for, in plain words.
+    """
 
     def __init__(self, ledger: OnlineLedger) -> None:
         self.why = ""
@@ -25,17 +29,17 @@ class Waiting:
         self._tried_ns = 0
 
     def begin(self, why: str) -> None:
-        """Wait anew, with nothing."""
+        """Begin to wait, holding nothing."""
         self.why, self._held, self._tried_ns = why, [], 0
 
     def hold(self, m: Measurement) -> None:
-        """Keep a measurement."""
+        """Hold a measurement."""
         insort(self._held, m, key=lambda held: held.stamp_ns)
         if len(self._held) > _MOST:
             self._let_go()
 
     def due(self, newest_ns: int) -> bool:
-        """Whether a start is to be tried: the more there is to solve, the rarer."""
+        """Whether a start should be tried now; the more data there is to solve, the less often."""
         while newest_ns - self._held[0].stamp_ns > _LONGEST_S * 1e9:
             self._let_go()
         waited_ns = newest_ns - self._held[0].stamp_ns - duration_ns(LEAST_S)
@@ -45,20 +49,20 @@ class Waiting:
         return True
 
     def samples(self) -> list[ImuSample]:
-        """Return those of the IMU."""
+        """Return the IMU samples."""
         return [m for m in self._held if isinstance(m, ImuSample)]
 
     def others(self) -> list[Measurement]:
-        """Return all but the IMU's."""
+        """Return all but the IMU samples."""
         return [m for m in self._held if not isinstance(m, ImuSample)]
 
     def taken(self) -> list[Measurement]:
-        """Return all, and keep nothing."""
+        """Return all, and hold nothing any more."""
         held, self._held = self._held, []
         return held
 
     def refuse(self, reason: str) -> None:
-        """Enter all into the ledger as not used."""
+        """Enter all into the ledger as rejected."""
         for m in self.taken():
             self._ledger.drop(m, Outcome.REJECTED, reason)
 
