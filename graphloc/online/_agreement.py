@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether what measures place agrees with the estimate: when each sensor last did, and for how long none has."""
+"""Agreement of the absolute sensors with the estimate: when each last agreed, and for how long none has."""
 
 from __future__ import annotations
 
@@ -10,30 +10,35 @@ from graphloc.measurements import Measurement
 from graphloc.online._live import LiveStream, LiveTimeline
 from graphloc.solve._decide import AGREES, Verdict
 
-_CREDIBLE = 6.0  # sigmas of a slow error: beyond, a sensor that agrees does so by an error that it does not have
-_USUAL = 3.0  # sigmas of one that jumps: beyond, what it jumped from may be the wrong level
-_FEW = 8  # measurements of absolute sensors in a row that disagree: not yet a sign
-_LOST_S, _DENIES = 15.0, 3  # of disagreement, until the estimate is; what of a sensor in a row disagrees
-_JUMPED_S = (60.0, 200.0)  # a jump lasts no longer than that; while another level has been held for long
+_CREDIBLE = 6.0  # sigmas of a slow error: a sensor that agrees only by a larger one does not really agree
+_USUAL = 3.0  # sigmas of a jumping slow error: beyond them the level that it jumped from may be the wrong one
+_FEW = 8  # absolute measurements in a row must disagree; fewer are no sign
+_LOST_S, _DENIES = (
+    15.0,
+    3,
+)  # of disagreement, until the estimate is lost; measurements of one sensor in a row that must disagree
+_JUMPED_S = (60.0, 200.0)  # the longest a jump lasts: after a short, and after a long time at the level before it
 
 
 class Agreement:
-    """Of absolute sensors with the estimate.
+    """Notes how each absolute measurement was judged.
 
     Attributes:
-        agreed_ns: of each, the stamp of the last measurement that agreed.
+        agreed_ns: stamp of the last measurement that agreed, by sensor.
     """
 
     def __init__(self, timeline: LiveTimeline) -> None:
         self._timeline = timeline
         self.agreed_ns: dict[str, int] = {}
-        self._refused: list[int] = []  # stamps of absolute measurements since the last that agreed: the first few
-        self._denied: dict[str, int] = {}  # by sensor: how many in a row disagreed, by whatever error it may have
-        self._usual_ns: tuple[int, int] | None = None  # from when to when one was where it usually is
-        self._jumped_ns: int | None = None  # since when all that agree do so by a jump
+        self._refused: list[
+            int
+        ] = []  # stamps of the first few absolute measurements that disagreed since the last that agreed
+        self._denied: dict[str, int] = {}  # by sensor: how many in a row disagreed, whatever slow error is allowed
+        self._usual_ns: tuple[int, int] | None = None  # first and last stamp at the usual level
+        self._jumped_ns: int | None = None  # since when sensors agree only by a jump
 
     def note(self, stream: LiveStream, m: Measurement, verdict: Verdict | None) -> None:
-        """Remember how a measurement was judged; None: it was refused unjudged."""
+        """Note how a measurement was judged; verdict None: it was rejected without being judged."""
         if not stream.row.absolute:
             return
         agrees = verdict is not None and verdict.weight >= AGREES
@@ -56,24 +61,24 @@ class Agreement:
             self._jumped_ns = stamp_ns
 
     def forget_refused(self) -> None:
-        """Of what disagreed, a receiver is known to be wrong: nothing says any more that it is elsewhere."""
+        """Forget disagreement: a receiver turned out to be frozen, so it is no evidence against the estimate."""
         self._refused = []
         self._denied.clear()
         self._jumped_ns = None
 
     def marked(self) -> _Mark:
-        """Return what is remembered, for `back_to`."""
+        """Return the state, for `back_to`."""
         return dict(self.agreed_ns), list(self._refused), dict(self._denied), self._usual_ns, self._jumped_ns
 
     def back_to(self, mark: _Mark) -> None:
-        """Forget what was noted since: it agreed with what has been given up."""
+        """Forget what was noted since `marked`: it agreed with choices that were given up."""
         self.agreed_ns, self._refused, self._denied, self._usual_ns, self._jumped_ns = mark
 
     def lost_s(self, now_ns: int) -> float:
-        """For how long absolute sensors have said that the estimate is elsewhere, and none that it is here; 0: not for so long that it is lost.
+        """Return for how long (s) the absolute sensors have disagreed with the estimate; 0 where that is too short to call it lost.
 
-        Where all agree, but by an error that has jumped, the estimate is right as long as a jump lasts; and the longer, the
-        longer they stood at the level before it.
+        Where they agree, but only by a slow error that has jumped, the estimate is taken to be right for as long as jumps last:
+        the longer the level before was held, the longer.
         """
         seconds = self._timeline.seconds
         if len(self._refused) >= _FEW and any(in_a_row >= _DENIES for in_a_row in self._denied.values()):
@@ -91,14 +96,14 @@ _Mark = tuple[dict[str, int], list[int], dict[str, int], tuple[int, int] | None,
 
 
 def _credible(stream: LiveStream, at: Attachment) -> bool:
-    """Whether a sensor agrees by an error that it may have."""
+    """Whether a sensor agrees by a slow error of plausible size."""
     if stream.slow is None or at.slow_value is None:
         return True
     return bool((np.abs(at.slow_value) <= _CREDIBLE * stream.slow.sigma).all())
 
 
 def _jumped(stream: LiveStream, at: Attachment) -> float:
-    """By how many sigmas a sensor agrees that may stand far off; 0 for any other."""
+    """Return how many sigmas the jumping slow error of a sensor is; 0 where it has none."""
     if stream.slow is None or at.slow_value is None:
         return 0.0
     far = [axis in stream.slow.far for axis in stream.slow.axes]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known at one state, to go on from: after the start, after a failure, after a kill.
+"""The estimate at one state, to continue from: after the start, after a failure of the solver, after a kill.
 
-Kept are the joint Gaussian of pose, velocity and bias, and each slow state given these: what is known of a drifting receiver
-is known together with the place, not apart from it.
+Kept are the joint Gaussian of pose, velocity and bias, and that of each slow state conditional on these: the slow error of a
+receiver is correlated with the position.
 """
 
 from __future__ import annotations
@@ -25,10 +25,13 @@ _PARTS = (slice(0, 6), slice(6, 9), slice(9, _CORE))
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Beside:
-    """A vector known beside a state: value (k,) at the state's own, gain (k, 15) by its pose (tangent), velocity and bias, cov (k, k) given it.
+    """A vector conditional on a state: its mean is value + gain * (state - anchor), its covariance cov.
 
-    Given the pose alone, all that the velocity tells later moves the vector with the place: after a second of data a tide was so
-    known to 0.47 m of 0.5, and 0.12 m off, by nothing but the first second's heave.
+    Conditional on the pose alone, all that later data say of the velocity would move the vector together with the position: after
+    a second of data a tide (0.5 m, 1 sigma) was so known to 0.47 m, and 0.12 m off, by nothing but the heave of that second.
+
+    Attributes:
+        value: (k,). gain: (k, 15) by pose (tangent), velocity and bias. cov: (k, k).
     """
 
     value: Array
@@ -37,7 +40,7 @@ class Beside:
 
     @classmethod
     def apart(cls, value: Array, cov: Array) -> Beside:
-        """Return what is known whatever the state is."""
+        """Return a vector that is independent of the state."""
         return cls(value=value, gain=np.zeros((len(value), _CORE)), cov=cov)
 
 
@@ -46,9 +49,11 @@ class Anchor:
     """A state and its Gaussian.
 
     Attributes:
-        stamp_ns: of the state. pose: gtsam.Pose3 of the IMU's place, body axes. velocity: (3,). bias: (6,) accelerometer first.
-        step: (15,) from there to the mean: of pose (tangent), velocity, bias. Written about the mean, where that lies tens of degrees
-            from where the rest was solved, a start would not stay where it was. cov: (15, 15), so, too. level: what a start says beside, which no snapshot has.
+        stamp_ns: of the state. pose: gtsam.Pose3 at the IMU with the body's axes, in world. velocity: (3,), in world.
+        bias: (6,), accelerometer first.
+        step: (15,) from there to the mean: pose (body tangent, rotation first), velocity, bias. It is kept apart from the point of
+            linearisation: written about the mean, which may lie tens of degrees off, a start would not stay at its solution.
+        cov: (15, 15), in the same order. level: levelling factor of a start; a snapshot has none.
         slow: by sensor. constants: by sensor and number.
     """
 
@@ -64,7 +69,7 @@ class Anchor:
 
     @classmethod
     def of_start(cls, stamp_ns: int, prior: StartPrior) -> Anchor:
-        """Return the prior of a start; nothing is known of slow states."""
+        """Return the prior of a start; slow states have none."""
         cov = np.zeros((_CORE, _CORE))
         cov[:6, :6], cov[6:9, 6:9], cov[9:, 9:] = prior.pose_cov, prior.velocity_cov, prior.bias_cov
         bias = np.concatenate([prior.bias.accelerometer(), prior.bias.gyroscope()])
@@ -81,12 +86,12 @@ class Anchor:
         slow: Mapping[str, int],
         constants: Mapping[tuple[str, int], int],
     ) -> Anchor:
-        """Return what a joint Gaussian says.
+        """Return the anchor of a joint Gaussian.
 
         Args:
-            point: pose, velocity, bias (6,) that it is about.
-            mean: (n,) steps from there (pose in the tangent), and then the slow states and constants themselves, in turn.
-            cov: (n, n). slow, constants: how many rows each has.
+            point: pose, velocity, bias (6,) that it is written about.
+            mean: (n,) step from there (15,), and then the values of the slow states and constants, in turn.
+            cov: (n, n), likewise. slow, constants: how many rows each has.
         """
         ends = np.cumsum([_CORE, *slow.values(), *constants.values()])
         own = [np.arange(a, b) for a, b in pairwise(ends)]
@@ -96,7 +101,7 @@ class Anchor:
             name: _beside(mean[[*core, *rows]], cov[np.ix_([*core, *rows], [*core, *rows])])
             for name, rows in zip(slow, own, strict=False)
         }
-        # Not given the state: a constant's prior, when it is seen again, does not have that.
+        # Not conditional on the state: when a constant is seen again, its prior cannot depend on an old state.
         alone = {
             number: Beside.apart(mean[rows], cov[np.ix_(rows, rows)])
             for number, rows in zip(constants, own[len(slow) :], strict=True)
@@ -114,10 +119,10 @@ class Anchor:
 
     @classmethod
     def of_past(cls, problem: Problem, values: gtsam.Values, past: Past, k: int) -> Anchor:
-        """Return what all that was before says of state `k` of a solved run.
+        """Return the anchor at state `k` of a solved run, from all data before it.
 
         Raises:
-            numpy.linalg.LinAlgError: it says too little.
+            numpy.linalg.LinAlgError: they do not determine the state.
         """
         j = int(problem.timeline.slow_of[k])
         slow = {s.name: keys.slow(s.number, j) for s in problem.streams if s.slow is not None}
@@ -142,7 +147,7 @@ class Anchor:
         )
 
     def factors(self, pose: int, velocity: int, bias: int) -> list[Any]:
-        """Return the prior of the state, by its keys; linear in world, as in `beside`."""
+        """Return the prior factors of the state, by its keys; linear in world, as in `beside`."""
         turn = np.eye(_CORE)
         turn[:3, :3] = turn[3:6, 3:6] = self.pose.rotation().matrix()
         whiten, mean = np.linalg.inv(np.linalg.cholesky(sound(turn @ self.cov @ turn.T))), turn @ self.step
@@ -158,10 +163,11 @@ class Anchor:
         return found if self.level is None else [*found, _upright(self.level, pose, bias)]
 
     def beside(self, known: Beside, state: Sequence[int], key: int) -> Any:
-        """Return the prior of a vector, given the state, by the keys of its pose, velocity and bias.
+        """Return the factor of a vector conditional on the state (keys of its pose, velocity and bias).
 
-        Linear in world: a place that is hardly known is known to centimetres together with a slow error. In tangents of a
-        heading that turns on by 20 deg, that would be another sum, and both sums together would tell the place.
+        Linear in the axes of world: position and slow error may each be hardly known, but their sum to centimetres. In the body
+        tangent of a heading that is later corrected by 20 deg the factor would state another sum, and both sums together would
+        determine the position.
         """
         whiten, turn = np.linalg.inv(np.linalg.cholesky(sound(known.cov))), np.eye(_CORE)
         turn[:3, :3] = turn[3:6, 3:6] = self.pose.rotation().matrix()
@@ -179,7 +185,7 @@ class Anchor:
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(known.value)), [*state, key], error)
 
     def _off(self, state: Sequence[int], values: gtsam.Values) -> tuple[Array, tuple[Array, ...]]:
-        """By how far a state is off this one (15,), its pose in world, and the Jacobians of its parts."""
+        """Return the difference of a state from this one (15,), in the axes of world, and the Jacobians of its three parts."""
         pose, velocity, bias = state
         R, p = values.atPose3(pose).rotation(), values.atPose3(pose).translation()
         turned = gtsam.Rot3.Logmap(R.compose(self.pose.rotation().inverse()))
@@ -237,7 +243,7 @@ def _upright(level: Level, pose: int, bias: int) -> Any:
 
 
 def _beside(mean: Array, joint: Array) -> Beside:
-    """Return what a joint Gaussian of a state's step and a vector (15 + k,) says of the vector given the state."""
+    """Return the vector conditional on the state, from the joint Gaussian (15 + k,) of the state's step and the vector."""
     gain = np.linalg.solve(sound(joint[:_CORE, :_CORE]), joint[:_CORE, _CORE:]).T
     cov = joint[_CORE:, _CORE:] - gain @ joint[:_CORE, _CORE:]
     value = mean[_CORE:] - gain @ mean[:_CORE]
@@ -245,16 +251,16 @@ def _beside(mean: Array, joint: Array) -> Beside:
 
 
 def without_prior(mean: Array, cov: Array, rows: Array, variance: Array) -> tuple[Array, Array]:
-    """Return mean (n,) and covariance (n, n) as they would be without a prior on some rows (k,), of mean 0 and variance (k,).
+    """Return mean (n,) and covariance (n, n) after removing a prior on some rows (k,), of mean 0 and variance (k,).
 
-    That is what closes a slow chain: kept in what it goes on from, it would count again at each of its ends.
+    Such a prior closes a slow chain at its end. Kept in an anchor, it would count again when the continued chain is closed.
     """
     gain = np.linalg.solve(np.diag(variance) - cov[np.ix_(rows, rows)], cov[rows]).T
     return mean + gain @ mean[rows], cov + gain @ cov[rows]
 
 
 def sound(cov: Array) -> Array:
-    """Return the covariance, symmetric, and positive where rounding took that away."""
+    """Return the covariance made symmetric and positive definite, where rounding has spoiled that."""
     whole = 0.5 * (cov + cov.T)
     scale = np.sqrt(np.maximum(np.diagonal(whole), 1e-18))
     values, vectors = np.linalg.eigh(whole / np.outer(scale, scale))

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the heading that of the motion? What the IMU feels, turned as the estimate says, must move the antenna as its fixes do.
+"""Does the heading fit the motion? The accelerations, rotated by the estimate, must move the antenna as its fixes do.
 
 Over 40 s, with places as complex numbers, east + i north:
 
     z(t) = a + b t + c t^2 + d t^3 + f x2(t) + g x3(t) + rho s(t)
 
-s: the specific force in axes that the gyroscope carries on, integrated twice, and the lever; x2, x3: exp(i yaw), integrated twice
-and three times. a, b: place and velocity; c, d: gravity, by a tilt that is off or moves; f, g: biases of the accelerometer and
-the gyroscope, about 0 and not the estimate's: with a wrong heading these are wrong, too. A heading that is
-right leaves rho = 1, one that is off by e leaves exp(-i e). A gyroscope that drifts by 0.02 rad/s about the vertical turns s by 0.8 rad in 40 s: where
-the heading is right with the drift that is estimated, nothing is said. So a compass that is turned, or in other axes, is told from a craft
-that goes astern, sideways or with a current: what it feels fits how it moves. A course tells neither.
+s: the specific force in axes propagated by the gyroscope, integrated twice, plus the lever arm; x2, x3: exp(i yaw), integrated
+twice and three times. a, b: position and velocity; c, d: gravity, by a tilt that is wrong or changes; f, g: biases of the
+accelerometer and the gyroscope, about 0 and not about the estimated ones, which are wrong too where the heading is. With the
+right heading rho = 1; a heading that is off by e gives rho = exp(-i e). A gyroscope bias of 0.02 rad/s about the vertical turns
+s by 0.8 rad in 40 s: where the heading fits with the estimated bias taken off, nothing is reported. So a compass with a wrong
+mount or convention is told from a vessel that moves astern, sideways or with a current: there the accelerations fit the motion.
+The course over ground cannot tell these apart.
 """
 
 from __future__ import annotations
@@ -29,18 +30,18 @@ from graphloc.solve._covariances import world_covariance
 from graphloc.trajectory import bounds_95
 
 _WINDOW_S, _EVERY_S = 40.0, 5.0
-_LONGEST_STEP_S = 1.0  # of the IMU; a longer one is a hole: what it felt there is a guess
-_TURNED_RAD, _KNOWN_DEG = np.radians(20.0), 20.0  # off by more than this, where the 95 % bound is less
-_SIGMAS = 3.0  # and by more than so many of its own
-_SIZE, _SURE = (0.7, 1.4), 0.2  # |rho| is 1 unless fixes jump; its sigma
-_APART_S = 1.0  # what fixes err by stays the same for so long, at least
-_FEWEST = 15  # fixes; and how often in turn it must be wrong, or right, to be said
-_IN_A_ROW = 2
+_LONGEST_STEP_S = 1.0  # of the IMU; in a longer gap the accelerations are unknown
+_TURNED_RAD, _KNOWN_DEG = np.radians(20.0), 20.0  # reported from this error on, where the 95 % bound is smaller
+_SIGMAS = 3.0  # and from so many sigmas of the check itself on
+_SIZE, _SURE = (0.7, 1.4), 0.2  # |rho| is near 1 unless fixes jump; largest sigma of rho
+_APART_S = 1.0  # correlation time of the errors of fixes, at least
+_FEWEST = 15  # fixes
+_IN_A_ROW = 2  # checks that must agree before the heading is called wrong, or right again
 _BIASES = np.array([0.1, 9.8 * 0.005])  # 1 sigma: m/s^2, and of the rate that tilts gravity, m/s^3
 
 
 class _Step(NamedTuple):
-    """What the IMU felt between two stamps, by its own axes at the first: velocity, place (without gravity), rotation."""
+    """The IMU between two stamps, without gravity, in the body's axes at the first: change of velocity (3,), of position (3,), rotation (3, 3)."""
 
     from_ns: int
     until_ns: int
@@ -50,10 +51,10 @@ class _Step(NamedTuple):
 
 
 class HeadingCheck:
-    """Watches fixes and steps of the IMU.
+    """Compares the fixes of one receiver with the steps of the IMU.
 
     Attributes:
-        said: what is wrong with the heading, in plain words; empty where nothing is known to be.
+        said: what is wrong with the heading, in plain words; empty where nothing is.
     """
 
     def __init__(self) -> None:
@@ -64,7 +65,7 @@ class HeadingCheck:
         self._looked_ns, self._wrong, self._right = 0, 0, 0
 
     def note(self, m: Measurement, lag: Lag) -> None:
-        """Take in a place of the first sensor whose places are never false altogether: of a GNSS receiver."""
+        """Take in a position of the first GNSS receiver (any absolute sensor without hypotheses)."""
         stream = lag.problem.streams.get(m.sensor)
         if (
             stream is None
@@ -79,7 +80,7 @@ class HeadingCheck:
             self._fixes.append((m.stamp_ns, complex(p[0], p[1])))
 
     def look(self, lag: Lag) -> bool:
-        """Carry the IMU on to the newest state; tell whether it is newly said that the heading is wrong."""
+        """Integrate the IMU to the newest state and check the heading; return whether it is newly found to be wrong."""
         newest = lag.newest
         self._carry_on(lag, newest)
         if not self._steps or newest.stamp_ns - self._looked_ns < _EVERY_S * 1e9:
@@ -115,7 +116,7 @@ class HeadingCheck:
         return self.said != "" and not was
 
     def _carry_on(self, lag: Lag, newest: Newest) -> None:
-        """Take in the IMU's step since the last; begin anew after a hole, or a clock that was set back."""
+        """Add the IMU's step since the last one; begin again after a gap, or when the clock was set back."""
         until_ns = newest.stamp_ns
         from_ns = self._steps[-1].until_ns if self._steps else lag.first_ns
         if until_ns == from_ns:
@@ -137,7 +138,11 @@ class HeadingCheck:
             self._fixes.popleft()
 
     def _off_rad(self, lag: Lag, newest: Newest, drift_radps: Array) -> float | None:
-        """How far the heading is off by the motion, 0 where that may be its noise; None where it does not tell."""
+        """Return the error of the heading (rad) by the motion; 0 where it may be noise, None where the motion does not show it.
+
+        Args:
+            drift_radps: (3,) gyroscope bias to take off, body axes.
+        """
         at_s, felt = self._felt(lag, newest, drift_radps)
         fixes = [(stamp, z) for stamp, z in self._fixes if self._steps[0].until_ns <= stamp <= newest.stamp_ns]
         if at_s[-1] - at_s[0] < 0.9 * _WINDOW_S or len(fixes) < _FEWEST:
@@ -160,7 +165,7 @@ class HeadingCheck:
         return off_rad if abs(off_rad) > _SIGMAS * sigma else 0.0
 
     def _felt(self, lag: Lag, newest: Newest, drift_radps: Array) -> tuple[Array, Array]:
-        """Times (N,), s to the newest state; s, and what e^(i psi) makes in two and in three integrals (3, N), in world."""
+        """Return times (N,), s, relative to the newest state, and s, x2 and x3 (3, N), complex, in world."""
         stream = lag.problem.streams[self._sensor]
         lever = np.asarray(stream.mount.translation()) - lag.problem.t_body_imu_m
         R, v, p, places, ahead = np.eye(3), np.zeros(3), np.zeros(3), [], []

@@ -12,23 +12,23 @@ import numpy as np
 from graphloc.frozen_imu import WHY, FrozenImuDetector
 from graphloc.measurements import ImuSample, ImuSeries
 
-_BACK = 50  # samples in a row before the newest: their clock was set back
-_LATE_S = 3.0  # of samples, before the start
-_HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing
-_FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # what an IMU aboard can say; in g, or deg/s of a turn, it says other
-_PERIODS = 1000  # that the IMU's own is told from
+_BACK = 50  # samples in a row with stamps before the newest: the clock was set back
+_LATE_S = 3.0  # how late samples may come before the start
+_HOLE = 0.7  # of the IMU's period to either side without a sample: one is missing there
+_FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # plausible for a vessel; readings in g or deg/s fall outside
+_PERIODS = 1000  # newest steps, from which the IMU's period is taken
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Taken:
-    """What becomes of the samples that one brought to an end.
+    """What becomes of a sample, and of one that was held back until it came.
 
     Attributes:
         accepted: in order, each after the newest. dropped: with the reason.
-        late: the sample itself, of a stamp before the newest. hole: the stamps (ns) that it lies between; None
-            before the first.
-        absurd: why it cannot be a vessel's. newly_frozen: it is the first of those that only repeat the one before.
-        set_back_s: so far was the IMU's clock set back; all before is of another clock.
+        late: the sample itself, where its stamp lies before the newest. hole: stamps (ns) of the samples before and after
+            it; None before the first.
+        absurd: why it cannot be a reading of a vessel. newly_frozen: it is the first repetition of a frozen IMU.
+        set_back_s: by how much the IMU's clock was set back; all earlier stamps are of another clock.
     """
 
     accepted: tuple[ImuSample, ...] = ()
@@ -52,17 +52,19 @@ def series_of(samples: Sequence[ImuSample]) -> ImuSeries:
 
 
 class ImuIntake:
-    """Samples in the order in which they come.
+    """Sorts the samples of the IMU as they arrive.
 
     Args:
-        gap_s: a longer step is no step: the next sample tells whether the stamp jumped. floats: the accelerometer
-            feels gravity, so that little force is absurd.
+        gap_s: after a longer step a sample is held back: the next one shows whether its stamp was wrong.
+        floats: the accelerometer measures gravity, so that a small force is absurd.
     """
 
     def __init__(self, gap_s: float, floats: bool) -> None:
         self._gap_ns, self._floats = gap_s * 1e9, floats
         self.newest: ImuSample | None = None
-        self.jumped: ImuSample | None = None  # waits until others follow it, so that one bad stamp does not cut the run
+        self.jumped: ImuSample | None = (
+            None  # held back until others follow it, so that one bad stamp does not cut the run
+        )
         self._jumped_age = self._behind = 0
         self._frozen = FrozenImuDetector()
         self._stamps: list[int] = []  # in order, as far back as a late one may lie
@@ -75,7 +77,7 @@ class ImuIntake:
         return 0.0 if before is None else (m.stamp_ns - before.stamp_ns) * 1e-9
 
     def restart(self, stamps_ns: list[int]) -> None:
-        """Remember these stamps alone."""
+        """Forget all stamps but these."""
         self._stamps = stamps_ns
 
     def forget(self, before_ns: int) -> None:
@@ -83,7 +85,7 @@ class ImuIntake:
         del self._stamps[: bisect_left(self._stamps, before_ns)]
 
     def take(self, m: ImuSample, *, started: bool) -> Taken:
-        """Say what becomes of a sample, and of one that waited for it. `started`: there are states."""
+        """Decide on a sample, and on one that was held back. `started`: there is an estimate."""
         if absurd := self._absurd(m):
             return Taken(dropped=((m, absurd),), absurd=absurd)
         already = self._frozen.frozen
@@ -110,14 +112,14 @@ class ImuIntake:
         return Taken(accepted=(m,), dropped=lost)
 
     def _absurd(self, m: ImuSample) -> str:
-        """Why a sample cannot be a vessel's; empty where it can."""
+        """Return why a sample cannot be a reading of a vessel; empty where it can."""
         force, rate = float(np.linalg.norm(m.accel_mps2)), float(np.linalg.norm(m.gyro_radps))
         if (self._floats and force < _FORCE_MPS2[0]) or force > _FORCE_MPS2[1]:
             return f"a specific force of {force:.3g} m/s^2, impossible for a vessel: wrong unit?"
         return f"a rate of {rate:.3g} rad/s, impossible for a vessel: wrong unit?" if rate > _RATE_RADPS else ""
 
     def _before(self, m: ImuSample, newest: ImuSample, started: bool) -> Taken:
-        """A sample before the newest: it is late where one is missing; else its clock is not to be trusted."""
+        """Decide on a sample with a stamp before the newest: late where one is missing, else its clock was set back."""
         stamps = self._stamps
         n = bisect_left(stamps, m.stamp_ns)
         period_ns = float(np.quantile(np.diff(stamps[-_PERIODS:]), 0.1)) if len(stamps) > 2 else np.inf
@@ -127,7 +129,9 @@ class ImuIntake:
             hole = (stamps[n - 1], stamps[n]) if n > 0 else None
             stamps.insert(n, m.stamp_ns)
             return Taken(late=m, hole=hole)
-        self._behind += newest.stamp_ns - m.stamp_ns > self._gap_ns  # less is caught up with, and bridged
+        self._behind += (
+            newest.stamp_ns - m.stamp_ns > self._gap_ns
+        )  # a smaller step back is caught up with, and bridged
         if self._behind < _BACK:
             return Taken(dropped=((m, "its stamp does not increase"),))
         self.newest = None

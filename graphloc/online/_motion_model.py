@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a vessel usually moves: what bounds a track that nothing but the IMU tells.
+"""A motion model of the vessel: bounds the drift of the estimate while nothing but the IMU measures motion.
 
-Along each horizontal axis of the body, velocity is taken for an Ornstein-Uhlenbeck process about 0:
+Along each horizontal axis of the body the velocity is modelled as an Ornstein-Uhlenbeck process about 0:
 
     b' v_b = phi a' v_a + w,   phi = exp(-dt / tau),   w ~ N(0, s^2 (1 - phi^2)),   2 s^2 (1 - exp(-10 s / tau)) = d^2
 
-v_a, v_b: velocities in world, dt apart; a, b: the axis in world then, as the IMU turned it; s: usual speed along the axis, d:
-usual change over 10 s. Both are learned while the velocity is known, beside what any vessel may do. The IMU knows a
-second's change far better than this does. But its errors add up, those of the tilt most of all, and a vessel's do not: the
-mean acceleration of a minute is small, and there is a speed that it does not exceed. The filters of the theses say so by
-taking the mean acceleration off.
+v_a, v_b: velocities in world, dt apart; a, b: the axis in world at both times, rotated by the IMU; s: usual speed along the
+axis; d: usual change over 10 s. Both are learned while the velocity is known, and added to what any vessel may do. Over a
+second the IMU is far more accurate than this model. But its errors accumulate, above all those of the tilt, while a vessel's
+mean acceleration over a minute is small and its speed is limited. The filters of the theses use the same knowledge when they
+subtract the mean acceleration.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from graphloc.frames import Array
 from graphloc.graph import Decision, Residual
 from graphloc.linear import Term, linear_update
 
-UNSURE_MPS = 0.2  # of sigma: a velocity less known than this is bounded, one better known is learned from
-_SPEED_MPS, _CHANGE_MPS, _OVER_S = 1.0, 0.5, 10.0  # what any vessel may do beside what it did
+UNSURE_MPS = 0.2  # sigma of the velocity: above it the model is applied, below it the model is learned
+_SPEED_MPS, _CHANGE_MPS, _OVER_S = 1.0, 0.5, 10.0  # what any vessel may do, beside what was learned
 _GUESS = (2.0, 1.0)  # m/s: usual speed and change before any is learned; counts as 10 s of data
 _REMEMBERED_S = 300.0
-_QUICKEST = 0.95  # of 1: a velocity that has forgotten itself within 10 s
-_KERNEL = KernelConfig(kind="cauchy", scale=2.0)  # a vessel that casts off or stops is not as usual: the IMU knows
+_QUICKEST = 0.95  # share of the velocity that may be forgotten within 10 s
+_KERNEL = KernelConfig(kind="cauchy", scale=2.0)  # casting off or stopping is unusual: there the IMU prevails
 
 
 class Moving(NamedTuple):
@@ -44,11 +44,11 @@ class MotionModel:
 
     def __init__(self) -> None:
         self._speed, self._change = np.full(2, _GUESS[0] ** 2), np.full(2, _GUESS[1] ** 2)  # mean squares
-        self._speed_s = self._change_s = _OVER_S  # of how long
+        self._speed_s = self._change_s = _OVER_S  # of data so far
         self._recent: list[tuple[int, Array]] = []
 
     def learn(self, stamp_ns: int, v_body_mps: Array) -> None:
-        """Take in a velocity (2,) that is known; about one a second."""
+        """Take in a well-known velocity (2,), forward and left, about once per second."""
         self._recent = [r for r in self._recent if 0 < stamp_ns - r[0] < 1.5e9 * _OVER_S]
         if self._recent:
             dt_s = (stamp_ns - self._recent[-1][0]) * 1e-9
@@ -60,14 +60,14 @@ class MotionModel:
         self._recent.append((stamp_ns, v_body_mps))
 
     def process(self, v_body_mps: Array, dt_s: float) -> tuple[Array, Array]:
-        """Return phi (2,) and the variances of w (2,) over dt_s, of a vessel that now does v_body_mps (2,)."""
+        """Return phi (2,) and the variances of w (2,), m^2/s^2, over dt_s, for a present velocity v_body_mps (2,)."""
         speed = _SPEED_MPS**2 + np.maximum(self._speed, v_body_mps**2)
         forgotten = np.minimum((_CHANGE_MPS**2 + self._change) / (2.0 * speed), _QUICKEST)
         phi = (1.0 - forgotten) ** (dt_s / _OVER_S)
         return phi, speed * (1.0 - phi**2)
 
     def step(self, a: Moving, b: Moving, dt_s: float) -> list[Any]:
-        """Return the factors of a step from a to b, dt_s later: one for each axis, as a vessel that stops does not begin to slide."""
+        """Return the factors of a step from a to b, dt_s later: one per axis, so that stopping along one loosens nothing along the other."""
         phi, variance = self.process((a.R.T @ a.v_mps)[:2], dt_s)
         factors: list[Any] = []
         for axis in range(2):
@@ -75,7 +75,7 @@ class MotionModel:
             residual = Residual(
                 raw=J_a @ a.v_mps + J_b @ b.v_mps,
                 cov=variance[axis].reshape(1, 1),
-                jacobian=lambda: np.zeros((1, 6)),  # how the axes turned is the IMU's to say
+                jacobian=lambda: np.zeros((1, 6)),  # how the axes turned is left to the IMU
                 prior=1.0,
                 size_m=None,
                 size_deg=None,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file to go on from after a kill: written whole or not at all."""
+"""The snapshot file, to resume from after the process was killed: written whole or not at all."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _EVERY_S = 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Snapshot:
-    """What the online mode is built anew from.
+    """What the online mode resumes from.
 
     Attributes:
         vessel: its name. anchor: the newest state. imu: the sample at it or before.
-        datum: origin of world. heights_m: of each sensor that the configuration makes itself, what it says.
-        agreed_ns: when each absolute sensor last agreed. noise_scale: of the IMU.
-        doubt: why the pose cannot be called good.
+        datum: origin of world. heights_m: configured heights (m, up in world), by sensor.
+        agreed_ns: stamp at which each absolute sensor last agreed. noise_scale: factor on the IMU noise.
+        doubt: why the health cannot be good, or empty.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
     """
 
@@ -44,7 +44,7 @@ class Snapshot:
     R_odom_body: Array
 
     def write(self, path: Path) -> None:
-        """Replace the file at once: a kill leaves the old one or the new one.
+        """Replace the file atomically: a kill leaves the old one or the new one.
 
         Raises:
             OSError: it cannot be written.
@@ -63,7 +63,9 @@ class Snapshot:
         }
         part = path.with_name(path.name + ".part")
         with part.open("w", encoding="utf-8") as stream:
-            json.dump(raw, stream)  # no fsync: a kill loses nothing, and a card may take a second for it
+            json.dump(
+                raw, stream
+            )  # no fsync: a killed process loses nothing, and a memory card may take a second for it
         part.replace(path)
 
     @classmethod
@@ -99,7 +101,7 @@ class Snapshot:
 
 
 class SnapshotFile:
-    """Where a run leaves its snapshots, and finds one; `path` None: nowhere."""
+    """The file that snapshots are written to and read from; `path` None: no file."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
@@ -107,7 +109,7 @@ class SnapshotFile:
         self._unwritable = False
 
     def due(self, at_ns: int) -> bool:
-        """Whether it is time for one."""
+        """Whether it is time to write one."""
         return self._path is not None and at_ns - self._written_ns >= _EVERY_S * 1e9
 
     def restart(self) -> None:
@@ -115,7 +117,7 @@ class SnapshotFile:
         self._written_ns = 0
 
     def write(self, snapshot: Snapshot) -> str:
-        """Replace what is there; return what is to be said, once, where that fails."""
+        """Replace what is there; where that fails, return why, the first time in a row only."""
         assert self._path is not None
         self._written_ns = snapshot.anchor.stamp_ns
         try:
@@ -127,7 +129,7 @@ class SnapshotFile:
         return ""
 
     def read(self, vessel: str, imu: str, datum: Datum | None) -> tuple[Snapshot | None, str]:
-        """Return the snapshot that is there, and why it is of no use where it is not: of another vessel or origin, damaged."""
+        """Return the snapshot that is there, or None and why it cannot be used (another vessel or origin, damaged)."""
         path = self._path
         if path is None or not path.exists():
             return None, ""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The start: wait until place and heading can be told, and solve what has come as the batch would.
+"""The start: wait until position and heading are observable, then solve the data so far with the batch solver.
 
-The lag then begins where the data do, with what was known before them, at the solution: what the start chose
-among matches stays open for as long as they are in the lag. Where the start had to wait for longer than a lag - for a
-heading from the way alone - it begins a lag ago, with what the solution says of that state by what was before.
+The window then begins at the first data, with the prior of the start, linearised at the solution: the choice of modes
+among matches stays open for as long as these are in the window. Where the start had to wait for longer than the window (for
+a heading from travel alone), the window begins its own length ago, with the prior that all earlier data give for that state.
 """
 
 from __future__ import annotations
@@ -32,25 +32,32 @@ from graphloc.solve._ledger import row_of
 from graphloc.solve._stretch import StretchStep, past_at
 from graphloc.time import duration_ns
 
-LEAST_S = 5.0  # of inertial data: gyro bias, roll and pitch of a vessel in waves
-_HEADING_RAD = np.radians(15.0)  # 1 sigma: from farther off a lag does not come back soon
-_HEADING_WAIT_S = 30.0  # for a heading from the way alone; then the place is worth more than nothing
-_DOUBTFUL = 0.1  # probability of being false: a tag is believed at once, and so is a single pose that is given
-_AGREEING, _SHARE, _CHOICE_WAIT_S = 3, 0.4, 15.0  # two false matches of five may agree with each other
-_FIXES = 3  # to take a datum from
+LEAST_S = 5.0  # of IMU data: gives gyro bias, roll and pitch of a vessel in waves
+_HEADING_RAD = np.radians(15.0)  # 1 sigma: from a larger error the window does not recover soon
+_HEADING_WAIT_S = (
+    30.0  # wait for a heading from travel alone; then a position with a doubtful heading is better than none
+)
+_DOUBTFUL = 0.1  # probability of being false, above which several must agree; tags and poses lie below
+_AGREEING, _SHARE, _CHOICE_WAIT_S = (
+    3,
+    0.4,
+    15.0,
+)  # number and share that must agree: two false matches of five may agree with each other
+_FIXES = 3  # needed to set a datum
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Started:
-    """What the start hands over.
+    """A solved start.
 
     Attributes:
         datum: origin of world.
-        anchor: the first state, by what was known before what is measured from there on: all that is judged again in the lag.
-        pose, velocity, bias: of that state, as it was solved: (gtsam.Pose3), (3,), (6,).
-        heights_m: of each sensor that the configuration makes itself, what it says.
-        doubt: why the pose cannot be called good. noise_scale: of the IMU.
-        notes: what the alignment went by. rows: of what was measured before the first state.
+        anchor: the first state of the window, with its prior: without what is measured from there on, which is judged again.
+        pose, velocity, bias: of that state, as solved: at the IMU with the body's axes, in world: gtsam.Pose3, (3,), m/s,
+            (6,), accelerometer first.
+        heights_m: configured heights (m, up in world), by sensor.
+        doubt: why the health cannot be good, or empty. noise_scale: factor on the IMU noise.
+        notes: what the alignment was based on. rows: ledger rows of what was measured before the first state.
     """
 
     datum: Datum
@@ -93,7 +100,7 @@ def try_start(setup: Setup, imu: ImuSeries, measurements: Sequence[Measurement],
 
 
 def _missing(setup: Setup, recording: Recording, datum: Datum) -> str:
-    """What place or heading still wants; empty where both can be told."""
+    """Return what position or heading still needs; empty where both are observable."""
     config, by_kind = setup.config, {row.kind: row for row in setup.rows}
     hints: list[Hint] = []
     for m in recording.measurements:
@@ -163,20 +170,21 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
 
 
 def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:
-    """Return the state that the lag begins at, and what is known of it by what was before.
+    """Return the state that the window begins at, and its prior from earlier data.
 
-    Begun farther back, a heading that half a minute of way has told would be told again by ten seconds of it at a time.
+    In a window that began at the first data, a heading that needed half a minute of travel would have to be found again from ten
+    seconds at a time.
     """
     problem, values = result.problem, result.values
     timeline, last = problem.timeline, len(problem.timeline) - 1
     back = timeline.floor(int(timeline.stamps_ns[last]) - duration_ns(lag_s))
-    # Not at the last node: what closes the slow chains there would be in what was before, and count twice.
+    # Not at the last node: the prior that closes the slow chains there would be part of the anchor, and count twice.
     k = int(np.searchsorted(timeline.slow_of, min(timeline.slow_of[back], timeline.slow_of[last] - 1)))
     if k == 0:
         return 0, Anchor.of_start(int(timeline.stamps_ns[0]), result.prior)
     made: dict[tuple[int, int], range] = {}
     graph, guess = build_graph(problem, values, decisions(result.verdicts), 0, last, result.prior, made=made)
-    # What came before the state may be tied to it; the lag takes only what comes from its stamp on.
+    # Earlier measurements may be attached to this state; the window takes only those from its stamp on.
     stamps_ns = {s.number: [m.stamp_ns for m in s.measurements] for s in problem.streams}
     after = {at: found for at, found in made.items() if stamps_ns[at[0]][at[1]] >= timeline.stamps_ns[k]}
     past = past_at(problem, StretchStep(guess, graph, after, 0, 0.0, 0.0), k)
