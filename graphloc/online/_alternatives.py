@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of the last measurements of a sensor are right, all ways to choose them weighed against each other.
+"""Which of the newest measurements of a sensor are right: all choices, with their probabilities.
 
-One choice is in the graph, and what it says of itself confirms it: two false matches that agree move the estimate to
-themselves. But about the estimate the graph is linear, so what it says without any of them follows from the joint covariance
-(they are taken out), and what it would say with others, and how probable these are. The most probable
-choice is worth a try; what the others leave is a covariance of the place.
+One choice is in the graph, and it confirms itself: two false matches that agree pull the estimate to themselves. But near the
+estimate the graph is linear. So the joint covariance gives the estimate without any of these measurements (they are removed),
+the estimate with any other choice, and the probability of that choice. The most probable one is then tried in the graph; the
+spread of the others adds to the covariance of the position.
 """
 
 from __future__ import annotations
@@ -22,19 +22,20 @@ from graphloc.graph import Residual
 from graphloc.solve._foreseen import taken_of
 from graphloc.solve._hypotheses import log_repeat, log_right_and_false
 
-_MOST, _LEAST = 16, 12.0  # choices that are followed; nats below the most probable one
-# What else tells of a measurement is known by at least such a share of what itself does. Its factor was linearised a moment ago,
-# at another place: to a hundredth or so, taken out again it may leave less than nothing, and then nothing is as loose as one likes.
+_MOST, _LEAST = 16, 12.0  # choices that are kept; log probability (nats) below the best at which one is dropped
+# Least eigenvalue of what remains when a measurement is removed, as a share of its own information. Its factor was linearised
+# a moment ago at another pose, so the difference may come out negative by a hundredth or so.
 _LOOSEST = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """One way to choose.
+    """One choice of modes.
 
     Attributes:
-        log: of its probability. modes: of N measurements, which is right; None: none is.
-        step: (d,) from the estimate to what is expected then: rows of the place first, then of each residual. cov: (d, d) of that.
+        log: log of its probability. modes: of N measurements, the mode that is right; None: the measurement is false.
+        step: (d,) from the present estimate to that of this choice: position first (m, world), then each residual.
+        cov: (d, d), its covariance.
     """
 
     log: float
@@ -50,11 +51,12 @@ def choices(
     cov: Array,
     held: Sequence[tuple[int, float] | None],
 ) -> list[Choice]:
-    """Return ways to choose among N measurements of a stream, the most probable first.
+    """Return the choices among N measurements of a stream, the most probable first.
 
     Args:
-        residuals: N tuples of modes. cov: of the place and all residuals at the estimate, of the graph as it is.
-        held: N modes and weights with which they are in it, or None.
+        indices: of the measurements. residuals: N tuples, one residual per mode.
+        cov: (d, d), joint covariance of the position and all residuals, from the graph as it is.
+        held: N modes and weights with which they are in the graph, or None.
     """
     _, models = taken_of(stream, indices)
     ends = np.cumsum([0, *(len(found[0].raw) for found in residuals)])
@@ -86,14 +88,14 @@ def choices(
 def _without(
     residuals: Sequence[tuple[Residual, ...]], cov: Array, held: Sequence[tuple[int, float] | None], at: list[slice]
 ) -> tuple[Array, Array]:
-    """Step and covariance, as in `Choice`, with none of the measurements in the graph."""
+    """Return step and covariance, as in `Choice`, after removing all of the measurements from the graph."""
     there = [(n, *h) for n, h in enumerate(held) if h is not None]
     if not there:
         return np.zeros(len(cov)), cov
     rows = np.concatenate([np.arange(len(cov))[at[n]] for n, _, _ in there])
     raw = np.concatenate([residuals[n][mode].raw for n, mode, _ in there])
     root = block_diag(*(np.linalg.cholesky(residuals[n][mode].cov / weight) for n, mode, weight in there))
-    # What is left of their covariance by what else there is.
+    # Inverse of the innovation covariance of the removal.
     inverse = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(np.eye(len(rows)) - inverse @ cov[np.ix_(rows, rows)] @ inverse.T)
     left = inverse.T @ vectors / np.maximum(values, _LOOSEST) @ vectors.T @ inverse

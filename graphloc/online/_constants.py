@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Constants that measurements of a sensor share: in the graph while they are seen, remembered when they are not."""
+"""Constants that measurements of a sensor share (survey errors of tags): in the graph while observed, remembered afterwards."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Window
 
 Number = tuple[str, int]
-"""A sensor, and which of its constants."""
+"""Name of a sensor, and number of one of its constants."""
 
 
 class Constants:
     """The constants of all sensors.
 
     Args:
-        known: what is known of them from before.
+        known: estimates from before the window.
     """
 
     def __init__(self, problem: LiveProblem, window: Window, known: Mapping[Number, Beside]) -> None:
@@ -35,7 +35,7 @@ class Constants:
                 yield (stream.name, n), key
 
     def use(self, stream: LiveStream, used: set[int]) -> None:
-        """Stage those of a stream that are among the keys that new factors hold on to, and keep them from leaving."""
+        """Stage those constants of a stream that are among the `used` keys of new factors, and keep them in the window."""
         window, timeline = self._window, self._problem.timeline
         now_s = timeline.page_s(timeline.stamps_ns[timeline.last])
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
@@ -54,23 +54,23 @@ class Constants:
             window.touch(key, now_s)
 
     def marked(self) -> dict[int, Beside]:
-        """Return what is remembered, for `back_to`."""
+        """Return the remembered estimates, for `back_to`."""
         return dict(self._known)
 
     def back_to(self, mark: Mapping[int, Beside]) -> None:
-        """Remember what was remembered then: what was taken from there since has left the graph again."""
+        """Restore the remembered estimates: what was taken into the graph since `marked` has left it again."""
         self._known = dict(mark)
 
     def remember(self, now_s: float) -> None:
-        """Remember those that the next commit lets go."""
+        """Remember the constants that the next commit marginalises."""
         for key in self._window.leaving([key for _, key in self._keys()], now_s):
             value = np.atleast_1d(self._window.values.atVector(key))
             self._known[key] = Beside.apart(value, self._window.covariance([key]))
 
     def seen(self) -> dict[Number, int]:
-        """Return the keys of those that are in the graph."""
+        """Return the keys of the constants in the graph."""
         return {number: key for number, key in self._keys() if self._window.is_committed(key)}
 
     def remembered(self) -> dict[Number, Beside]:
-        """Return what is known of those that are not."""
+        """Return the estimates of the constants that are not in the graph."""
         return {number: self._known[key] for number, key in self._keys() if key in self._known}

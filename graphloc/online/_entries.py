@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The measurements of the last seconds: how each was judged, and its factors in the window."""
+"""The measurements of the window: how each was judged, and its factors in the graph."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from graphloc.online._window import Held, Window, keys_of
 from graphloc.solve._decide import NEGLIGIBLE, Verdict
 from graphloc.solve._ledger import row_of
 
-_CHANGED = 0.1  # of a weight, from which a decision is made anew in the graph
-_MOVED_M, _TURNED_RAD = 0.1, 0.01  # of the state a factor was linearised at
-_SAME = 1e-9  # m, rad: the solver has linearised a pose anew, or not
+_CHANGED = 0.1  # change of a weight from which its factors are replaced
+_MOVED_M, _TURNED_RAD = 0.1, 0.01  # from the pose that a factor was linearised at
+_SAME = 1e-9  # m, rad: below it the solver has not relinearised the pose
 
 
 @dataclass(slots=True, eq=False)
 class Entry:
-    """A measurement in the window."""
+    """A measurement in the window, its verdict, and its factors (`held`)."""
 
     stream: LiveStream
     index: int
     verdict: Verdict
     held: Held | None = None
-    written: Any = None  # the pose whose tangent its factors are written in
-    opened: bool = False  # its kernel bends later than configured
-    judged: bool = False  # as a hypothesis, once at least
+    written: Any = None  # the pose in whose tangent its factors are written
+    opened: bool = False  # its kernel was widened, because the prediction was uncertain
+    judged: bool = False  # among hypotheses, at least once
 
     @property
     def measurement(self) -> Measurement:
@@ -46,21 +46,21 @@ class Entry:
 
     @property
     def within(self) -> tuple[int, float] | None:
-        """The mode and the weight with which it is in the graph; None: it is not."""
+        """Mode and weight with which it is in the graph; None: it is not."""
         decision = self.verdict.decision
         return None if self.held is None or decision is None else (self.verdict.mode, decision.weight)
 
     def reaches(self, first: int) -> bool:
-        """Whether the states that it is carried from are still there."""
+        """Whether its state, and the one that it is propagated from, are still in the window."""
         carry = self.stream.carry[self.index]
         return self.state >= first and (carry is None or carry[0] >= first)
 
     def weighs_other(self, verdict: Verdict) -> bool:
-        """Whether the weight is so much another that it is decided anew."""
+        """Whether the weight differs so much that the factors must be replaced."""
         return abs(verdict.weight - self.verdict.weight) > _CHANGED
 
     def differs(self, verdict: Verdict) -> bool:
-        """Whether what is in the graph is not what was decided, or is linearised elsewhere."""
+        """Whether the factors in the graph must be replaced: decided otherwise, or linearised elsewhere."""
         old = self.verdict
         if (self.held is None) != (verdict.decision is None):
             return True
@@ -74,7 +74,7 @@ class Entry:
 
 
 class Entries:
-    """Those in the window. What was decided of each is in the graph, or staged: who judges it says so by `change`."""
+    """All entries of the window. The decision on each is in the graph, or staged; `change` replaces it."""
 
     def __init__(self, problem: LiveProblem, window: Window, constants: Constants) -> None:
         self._problem, self._window, self._constants = problem, window, constants
@@ -82,12 +82,12 @@ class Entries:
         self._gone: list[LedgerRow] = []
 
     def reachable(self, entry: Entry) -> bool:
-        """Whether it can still be judged: neither it has left, nor the states that it is carried from."""
+        """Whether an entry can still be judged: it and its states are in the window."""
         here = (entry.stream.number, entry.index) in self._entries
         return here and entry.reaches(self._problem.timeline.first)
 
     def of(self, stream: LiveStream) -> list[Entry]:
-        """Return those of a stream that can still be judged, by stamp."""
+        """Return the entries of a stream that can still be judged, by stamp."""
         own = [e for e in self._all_reachable() if e.stream is stream]
         return sorted(own, key=lambda e: (e.measurement.stamp_ns, e.index))
 
@@ -96,19 +96,19 @@ class Entries:
         return (e for e in self._entries.values() if e.reaches(first))
 
     def residuals_at(self, stream: LiveStream, index: int) -> tuple[Attachment, tuple[Residual, ...]]:
-        """Return where a measurement meets the states as they are now estimated, and its residuals there, one for each mode."""
+        """Return the attachment of a measurement at the present estimate, and its residuals there, one per mode."""
         at = attach(self._problem, stream, index, self._window.values)
         return at, stream.row.residuals(stream.measurements[index], stream.config, at)
 
     # In the graph
 
     def add(self, entry: Entry) -> None:
-        """Take a new one in, as it was judged."""
+        """Add a new entry, as judged."""
         self._put(entry)
         self._entries[(entry.stream.number, entry.index)] = entry
 
     def change(self, entry: Entry, verdict: Verdict) -> None:
-        """Take an entry out of the graph, and in again as it is judged now; it stays where its part has left."""
+        """Replace the factors of an entry by those of a new verdict; no change where some have been marginalised."""
         if entry.held is not None:
             if not self._window.remove(entry.held):
                 return
@@ -117,7 +117,7 @@ class Entries:
         self._put(entry)
 
     def marked(self, own: Collection[Entry]) -> Callable[[], None]:
-        """Return a way back to the window as it is, nothing being staged, and to what is in it of some entries."""
+        """Return a function that restores the window as it is now (nothing being staged), and these entries."""
         window, constants = self._window.marked(), self._constants.marked()
         entries = [(e, e.verdict, e.held, e.written, e.judged) for e in own]
         places = [(held, tuple(held.slots)) for _, _, held, _, _ in entries if held is not None]
@@ -148,7 +148,7 @@ class Entries:
         entry.held, entry.written = window.add(update.factors), at.T_solver
 
     def reintegrate(self, stale: Collection[int]) -> None:
-        """Integrate anew the ways from these states to measurements: samples of them came late."""
+        """Integrate again from these states to the measurements after them: samples in between came late."""
         for entry in self._all_reachable():
             carry = entry.stream.carry[entry.index]
             if carry is not None and carry[0] in stale:
@@ -157,15 +157,15 @@ class Entries:
                     self._write(entry)
 
     def follow_solver(self) -> None:
-        """Write anew what is written in a tangent that the solver has left, or before its next slow node came."""
+        """Replace factors written in a tangent that the solver no longer uses, or before their next slow node existed."""
         self._write_anew(self._left_behind)
 
     def follow_estimate(self) -> None:
-        """Write anew what is linear about a place that the estimate has left: judged there, right ones look false."""
+        """Replace factors linearised at a pose that the estimate has moved away from: judged there, right ones look false."""
         self._write_anew(self._elsewhere)
 
     def _write_anew(self, stale: Callable[[Entry], bool]) -> None:
-        """Stage anew, at the estimate, the stale ones of the factors that see to centimetres: of sensors with hypotheses."""
+        """Relinearise the stale factors of sensors with hypotheses, which are accurate to centimetres."""
         for entry in self._all_reachable():
             if entry.stream.row.false is not None and entry.held is not None and stale(entry):
                 self._write(entry)
@@ -185,14 +185,14 @@ class Entries:
         return _moved(at.T_world_body, self._window.values.atPose3(at.pose_key))
 
     def expected_cost(self) -> float:
-        """Return the weighted squares that are to be expected of what is in the graph: as many as axes, by weight."""
+        """Return the expected sum of weighted squares of what is in the graph: one per axis, times its weight."""
         held = [e.verdict for e in self._entries.values() if e.held is not None]
         return sum((v.residual.expected_nis or len(v.residual.raw)) * v.weight for v in held)
 
     # In the ledger
 
     def let_go(self) -> None:
-        """Forget the measurements whose states are forgotten."""
+        """Forget the measurements whose states have left the window; their ledger rows are final."""
         problem, first = self._problem, self._problem.timeline.first
         for key, entry in list(self._entries.items()):
             if entry.state < first:
@@ -204,12 +204,12 @@ class Entries:
                 tape.forget(kept)
 
     def gone(self) -> list[LedgerRow]:
-        """Return rows of measurements that have left since this was last asked."""
+        """Return ledger rows of measurements that have left since this was last called."""
         rows, self._gone = self._gone, []
         return [row for row in rows if row.seq >= 0]
 
     def held(self) -> list[LedgerRow]:
-        """Return rows, as they stand, of what is in the window."""
+        """Return ledger rows of the measurements in the window, as judged now."""
         return [_row(e) for e in self._entries.values() if e.measurement.seq >= 0]
 
 
@@ -219,6 +219,6 @@ def _row(entry: Entry) -> LedgerRow:
 
 
 def _moved(a: Any, b: Any) -> bool:
-    """Whether a factor that is linear about the one pose is another about the other."""
+    """Whether two poses differ so much that a factor linearised at one is wrong at the other."""
     step = a.localCoordinates(b)
     return float(np.linalg.norm(step[3:])) > _MOVED_M or float(np.linalg.norm(step[:3])) > _TURNED_RAD

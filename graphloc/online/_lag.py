@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last seconds of a run: states that grow, measurements that are taken, judged, judged again, and let go.
+"""The sliding window: states are added, measurements taken, judged, judged again, and marginalised.
 
-Here is when: a commit, what comes before and after it, and whether it is solved on. States, measurements and judging
-have their own files; the judge changes entries by what states predict, and neither knows of it.
+This file is about the order of events: a commit, what comes before and after it, and whether to iterate. States
+(`_states`), measurements (`_entries`) and judging (`_judge`) have their own files; the judge changes entries by the predictions
+of the states, and neither of these knows the judge.
 """
 
 from __future__ import annotations
@@ -30,14 +31,21 @@ from graphloc.position_jumps import why_in_doubt
 _STEP_COST = (
     1.0  # of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10
 )
-_STEP_M = 0.3  # a commit that moves the newest state by so much is solved on
-_MOST_STEPS, _STANDS = 10, 0.1  # at most so often, until a step changes its cost by no more than such a share
+_STEP_M = 0.3  # a commit that moves the newest state by more is followed by further iterations
+_MOST_STEPS, _STANDS = 10, 0.1  # largest number of iterations; relative change of the cost at which they end
 
 
 class Lag:
     """States and measurements of the last seconds, from an anchor on.
 
-    Raises (every method): SolveError: from then on it is of no use.
+    Args:
+        lag_s: length of the window. guess: pose, velocity (3,) and bias (6,) to solve the first state at; default: the anchor's.
+
+    Raises:
+        SolveError: by every method; the window cannot be used afterwards.
+
+    Attributes:
+        problem: what the factors are built from.
     """
 
     def __init__(
@@ -52,7 +60,7 @@ class Lag:
         self._judge = Judge(problem, self._window, self._states, self._entries, self._agreement)
         self._page_s = 0.0
         self.fresh = False
-        """The last commit linearised anew what had moved."""
+        """Whether the last commit relinearised the states that had moved."""
 
     # States
 
@@ -66,22 +74,26 @@ class Lag:
         return self.problem.timeline.stamps_ns[self.problem.timeline.first]
 
     def grow(self, stamp_ns: int) -> bool:
-        """Stage the next state, where the IMU says that it is; tell whether slow states got a node, which closes a commit."""
+        """Stage the next state, predicted by the IMU; return whether slow states got a new node: then a commit is due."""
         return self._states.grow(stamp_ns)
 
     def reintegrate(self, holes: Sequence[tuple[int, int]]) -> None:
-        """Stage anew what was integrated without IMU samples that came late; holes: the stamps (ns) that each lies between."""
+        """Stage again what was integrated without IMU samples that came late.
+
+        Args:
+            holes: of each such sample, the stamps (ns) of the samples before and after it.
+        """
         timeline = self.problem.timeline
         stale = {k for a, b in holes for k in range(timeline.floor(a), timeline.floor(b) + 1)}
         self._entries.reintegrate(stale)
         self._states.reintegrate(stale)
 
     def commit(self) -> None:
-        """Estimate anew, and let go what has left."""
+        """Solve with what is staged, and forget what has been marginalised."""
         timeline, window = self.problem.timeline, self._window
         pose, now_s = keys.pose(timeline.last), timeline.page_s(timeline.stamps_ns[timeline.last])
         self.fresh = now_s > self._page_s
-        if self.fresh:  # together with the page that leaves, which re-eliminates everything as well
+        if self.fresh:  # when a page is marginalised, everything is eliminated again anyway
             self._page_s = now_s
             window.relinearise()
             self._entries.follow_solver()
@@ -95,7 +107,7 @@ class Lag:
         self._states.read()
 
     def _settle_down(self) -> None:
-        """Solve again and again, until the cost stands: one step from metres off leaves older states further off than the newest."""
+        """Iterate until the cost no longer changes: after one step of metres, older states are further off than the newest."""
         cost = self._window.error()
         for _ in range(_MOST_STEPS):
             self._entries.follow_estimate()
@@ -105,16 +117,16 @@ class Lag:
                 break
 
     def settle(self) -> None:
-        """Relinearise, where many states came at once."""
+        """Relinearise after many states came at once."""
         self._window.settle()
         self._states.read()
 
     def anchor(self) -> Anchor:
-        """Return what is known at the newest state, to go on from."""
+        """Return the anchor at the newest state, to rebuild or resume from."""
         return self._states.anchor()
 
     def track(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
-        """Return stamps (N,), places (N, 3), attitudes (N, 3, 3) and velocities (N, 3) of the body's origin."""
+        """Return stamps (N,), ns, and in world positions (N, 3), attitudes (N, 3, 3) and velocities (N, 3) of the body's origin."""
         return self._states.track()
 
     @property
@@ -124,60 +136,61 @@ class Lag:
     # Measurements
 
     def take(self, m: Measurement) -> None:
-        """Stage a measurement whose stamp lies within the states."""
+        """Stage a measurement whose stamp lies within the window."""
         self._judge.take(m)
 
     def judge(self) -> None:
-        """Stage what is to be decided, anew or again."""
+        """Stage new decisions, and those that changed."""
         self._judge.judge()
 
     def try_others(self) -> None:
-        """Where what was judged false agrees among itself, try that instead, and keep what is more probable."""
+        """Where measurements judged false agree with each other, try to believe them instead, and keep what is more probable."""
         if self._judge.try_others():
             self._states.read()
 
     @property
     def others(self) -> tuple[Array, Array]:
-        """What other choices of what is right add to the newest place in world: mean (3,), m, and covariance (3, 3), m^2."""
+        """What other choices of modes add to the newest position in world: mean (3,), m, and covariance (3, 3), m^2."""
         return self._judge.others
 
     @property
     def agreed_ns(self) -> dict[str, int]:
-        """Of each absolute sensor, the stamp of the last measurement that agreed."""
+        """Stamp of the last measurement that agreed, by absolute sensor."""
         return self._agreement.agreed_ns
 
     @property
     def lost_s(self) -> float:
-        """For how long it has been lost, by what absolute sensors say; 0: it is not (see `_agreement.py`)."""
+        """For how long (s) the estimate has been lost, by the absolute sensors; 0: it is not (see `_agreement.py`)."""
         return self._agreement.lost_s(self.newest.stamp_ns)
 
     @property
     def frozen_receivers(self) -> set[str]:
-        """Receivers that hang (see `_parting.py`)."""
+        """Names of the receivers that are frozen (see `_frozen_receiver.py`)."""
         return {name for name, stream in self.problem.streams.items() if stream.frozen_detector.frozen}
 
     def jump_warnings(self) -> list[str]:
-        """Return a line on each receiver that has leapt since this was last asked (see `position_jumps.py`)."""
+        """Return a warning on each position jump since this was last called (see `position_jumps.py`)."""
         return self._judge.receivers.jump_warnings()
 
     def in_doubt(self, stamp_ns: int) -> str:
-        """Why no pose can be called good as long as a receiver has leapt that alone tells the place; empty where none has."""
-        streams = self.problem.streams.items()  # where one is left out, the bounds allow for it
+        """Return why the health cannot be good at a stamp: the only position sensor has jumped; empty where it has not."""
+        streams = self.problem.streams.items()  # where a slow error is left out, the bounds include it
         doubtful = [n for n, s in streams if s.left_out is None and s.jump_detector.doubtful(stamp_ns)]
         return "; ".join(why_in_doubt(n) for n in doubtful)
 
     def gone(self) -> list[LedgerRow]:
-        """Return rows of measurements that have left since this was last asked."""
+        """Return ledger rows of measurements that have left since this was last called."""
         return self._entries.gone()
 
     def held(self) -> list[LedgerRow]:
-        """Return rows, as they stand, of what is in the window."""
+        """Return ledger rows of the measurements in the window, as judged now."""
         return self._entries.held()
 
     def misfit(self) -> float:
         """Return the cost of the window over its expectation (see `solve._passes.expected_cost`); 1 where the IMU agrees.
 
-        A jump of GNSS, or a step that is not relinearised yet, costs as much in a window: but not in most of its steps.
+        A GNSS jump, or a step that is not relinearised yet, may cost as much as IMU noise that is configured too small, but not in
+        most of the IMU's steps.
         """
         if 2.0 * self._states.step_cost() < _STEP_COST:
             return 1.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A problem that grows at one end and is forgotten at the other (see `graphloc.build.Problem`)."""
+"""The online problem: it grows at its end and is forgotten from its beginning (offline: `graphloc.build.Problem`)."""
 
 from __future__ import annotations
 
@@ -28,14 +28,17 @@ from graphloc.position_jumps import JumpDetector
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
-_LAST = 15  # measurements that tell a sensor's rate
-_REMEMBERED = 300  # residuals, and pairs of them, that say how wide a sensor scatters
-_LAGS_S, _GOLDEN = (2.0, 4.0), 0.618  # how far apart pairs are; its multiples, whole turns taken off, spread evenly
-_PAGE_S = 1.0  # states leave together by so much
+_LAST = 15  # newest measurements, from which a sensor's rate is taken
+_REMEMBERED = 300  # residuals, and pairs of them, from which the scatter of a sensor is taken
+_LAGS_S, _GOLDEN = (
+    (2.0, 4.0),
+    0.618,
+)  # time between the residuals of a pair; golden ratio: its multiples modulo 1 are spread evenly
+_PAGE_S = 1.0  # states are marginalised in pages of this length
 
 
 class Tape(Generic[T]):
-    """A list that is forgotten from its beginning on; indices stay what they were."""
+    """A list whose oldest items are forgotten; the indices of the others stay the same."""
 
     def __init__(self) -> None:
         self._items: list[T] = []
@@ -67,7 +70,7 @@ class Tape(Generic[T]):
 
 
 class LiveTimeline:
-    """States in turn, on a grid from `start_ns` on."""
+    """States on a regular grid from `start_ns` on, and the slow nodes among them."""
 
     def __init__(self, config: TimelineConfig, start_ns: int) -> None:
         self._start_ns = start_ns
@@ -83,7 +86,7 @@ class LiveTimeline:
 
     @property
     def first(self) -> int:
-        """The oldest state that is not forgotten."""
+        """Number of the oldest state that is not forgotten."""
         return self.stamps_ns.first
 
     @property
@@ -96,13 +99,13 @@ class LiveTimeline:
         return self.stamps_ns[self.last] + self._period_ns
 
     def seconds(self, stamp_ns: int) -> float:
-        """Return s from the first state that there was."""
+        """Return the time (s) since the first state of all."""
         return (stamp_ns - self._start_ns) * 1e-9
 
     def page_s(self, stamp_ns: int) -> float:
-        """Return when keys of a stamp are told to be from, s: those of a page leave together.
+        """Return the time (s) that the window keeps for the keys of a stamp: the same for a whole page.
 
-        What leaves is re-eliminated together with all that is newer: once a second, and not at every state.
+        Marginalising keys eliminates all newer ones again; so it is done once per second, and not at every state.
         """
         return float(np.ceil(self.seconds(stamp_ns) / _PAGE_S)) * _PAGE_S
 
@@ -120,29 +123,30 @@ class LiveTimeline:
         self.slow_stamps_ns.forget(self.slow_of[before])
 
     def nearest(self, stamp_ns: int) -> int:
-        """Return the state nearest to a stamp."""
+        """Return the number of the state nearest to a stamp."""
         kept = self.stamps_ns.kept
         right = min(max(bisect_left(kept, stamp_ns), 1), len(kept) - 1)
         left = right - 1 if len(kept) > 1 else right
         return self.first + (left if stamp_ns - kept[left] <= kept[right] - stamp_ns else right)
 
     def floor(self, stamp_ns: int) -> int:
-        """Return the last state at or before a stamp (the first one for stamps before it)."""
+        """Return the number of the last state at or before a stamp (of the first one for stamps before it)."""
         return self.first + max(bisect_right(self.stamps_ns.kept, stamp_ns) - 1, 0)
 
 
 class Scatter:
-    """How many times wider than configured a sensor's residuals scatter: about 0, or about each other if that is less.
+    """By what factor a sensor's residuals scatter more than configured: about 0, or about each other if that is less.
 
-    What they have in common is no noise. Taken for it, a compass that was 15 deg off beside a crane was believed after 15 s, for
-    half of what was remembered said that it is always so far off. About each other alone, a third of outliers makes the half
-    of all pairs wide. Pairs are 2 to 4 s apart, evenly: of one lag, a swell of that period would not show.
+    An error that residuals share is no noise. With the scatter about 0 alone, a compass that was 15 deg off beside a crane was
+    believed after 15 s, because half of the remembered residuals were that large. With the scatter about each other alone, one
+    third of outliers would make half of all pairs wide. The two residuals of a pair are 2 to 4 s apart, evenly distributed:
+    with one fixed distance, swell of that period would not show.
 
     Args:
-        jumps: what residuals have in common is a state that may jump, and has not yet: only about 0.
+        jumps: the shared error is modelled as a state that may jump, and has not yet: then only about 0.
 
     Attributes:
-        times: at least 1.
+        times: the factor, at least 1.
     """
 
     def __init__(self, *, jumps: bool = False) -> None:
@@ -154,7 +158,7 @@ class Scatter:
         self._pairs: deque[float] = deque(maxlen=_REMEMBERED)
 
     def note(self, stamp_ns: int, residual: Array) -> None:
-        """Take in a residual (k,), normalised by its covariance."""
+        """Take in a residual (k,), normalised to unit covariance."""
         self._squares.append(float(residual @ residual))
         self._noted += 1
         before, lag_ns = None, float(np.interp(self._noted * _GOLDEN % 1.0, (0.0, 1.0), _LAGS_S)) * 1e9
@@ -175,7 +179,7 @@ class Scatter:
 
 @dataclass(slots=True, eq=False)
 class LiveStream:
-    """The measurements of one sensor (see `graphloc.build.Stream`), by arrival."""
+    """The measurements of one sensor in order of arrival (offline: `graphloc.build.Stream`), and its detectors."""
 
     number: int
     name: str
@@ -197,7 +201,7 @@ class LiveStream:
 
 @dataclass(slots=True, eq=False)
 class LiveProblem:
-    """A vessel under way: what `attach` needs, and the IMU."""
+    """What `attach` needs, and the IMU. `t_body_imu_m` (3,), `R_body_imu` (3, 3): mount of the IMU in body."""
 
     config: VesselConfig
     datum: Datum
@@ -209,7 +213,7 @@ class LiveProblem:
     motion_model: MotionModel
 
     def take(self, m: Measurement) -> tuple[LiveStream, int]:
-        """Put a measurement where it belongs; return its stream and its index there."""
+        """Attach a measurement to its state; return its stream and its index there."""
         stream = self.streams[m.sensor]
         carry, gyro_radps = self._motion(m.stamp_ns)
         timeline = self.timeline
@@ -222,11 +226,11 @@ class LiveProblem:
         return stream, len(stream.measurements) - 1
 
     def reintegrate(self, stream: LiveStream, index: int) -> None:
-        """Integrate the way from the state before a measurement again: samples of it came late."""
+        """Integrate again from the state before a measurement to its stamp: samples in between came late."""
         stream.carry[index], stream.gyro_radps[index] = self._motion(stream.measurements[index].stamp_ns)
 
     def _motion(self, stamp_ns: int) -> tuple[Carry | None, Array]:
-        """How a stamp is reached from the state before it, and the rate there."""
+        """Return the motion from the state before a stamp to it (None at a state), and the raw angular rate there (3,), rad/s."""
         floor = self.timeline.floor(stamp_ns)
         at_ns = self.timeline.stamps_ns[floor]
         carry = None
@@ -238,7 +242,7 @@ class LiveProblem:
 def live_problem(
     setup: Setup, datum: Datum, imu: ImuSeries, start_ns: int, noise_scale: float, motion_model: MotionModel
 ) -> LiveProblem:
-    """Return a problem whose first state stands at `start_ns`; `imu`: the samples that are known from there on."""
+    """Return a problem whose first state is at `start_ns`; `imu`: the samples known from there on."""
     config, rows, mounts = setup.config, setup.rows, setup.mounts
     sensor = config.sensors[imu.sensor]
     t, R = mount_of(imu.sensor, sensor, mounts)
@@ -272,6 +276,6 @@ def live_problem(
 
 
 def _apart_s(last: Sequence[Measurement]) -> float:
-    """How far apart the last measurements of a sensor are, as a rule, s, in whatever order they came; inf: of one alone."""
+    """Return the median time (s) between the last measurements of a sensor, whatever their order of arrival; inf for a single one."""
     stamps_ns = sorted(m.stamp_ns for m in last)
     return float(median(b - a for a, b in pairwise(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else math.inf

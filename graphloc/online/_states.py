@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of the last seconds: each follows from the one before by the IMU, biases and slow errors by their steps."""
+"""The states of the window: each predicted from the one before by the IMU; biases and slow errors by their random walks."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from graphloc.online._motion_model import UNSURE_MPS, Moving
 from graphloc.online._window import Held, Window
 from graphloc.solve._foreseen import Prediction, prediction_of
 
-_HOLE_S = 1.0  # in the IMU's data
-_AWAY_M = 2e3  # no vessel goes so far from one state to the next, in the longest hole that is bridged
+_HOLE_S = 1.0  # an IMU gap that the motion model is not applied across
+_AWAY_M = 2e3  # no vessel moves so far between two states, even across the longest IMU gap that is bridged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Newest:
-    """The newest state that is solved; while others are staged, not the last of the timeline.
+    """The newest solved state; while others are staged, it is not the last of the timeline.
 
     Attributes:
-        number: in the timeline. pose, velocity: of the IMU's place, gtsam.Pose3 and (3,). bias: of the IMU.
-        pose_cov: (6, 6), in the body tangent. velocity_cov: (3, 3).
+        number: in the timeline. pose, velocity: at the IMU with the body's axes, in world: gtsam.Pose3 and (3,), m/s.
+        bias: of the IMU. pose_cov: (6, 6), rotation first, in the body tangent. velocity_cov: (3, 3), in world.
     """
 
     number: int
@@ -45,11 +45,11 @@ class Newest:
 
 
 def propagated_covariance(cov: Array, newest: Newest, R: Array, dt_s: float, noise: Array) -> Array:
-    """Return a covariance at the newest state, dt_s later: much is added across a gap.
+    """Return a covariance at the newest state propagated by dt_s: across an IMU gap it grows much.
 
     Args:
-        cov: (n, n), of its pose (body tangent) first, then of what stays.
-        R: (3, 3), body in world then. noise: (9, 9), what the IMU adds on the way, as preintegrated.
+        cov: (n, n), of the pose (body tangent, rotation first), then of states that do not change.
+        R: (3, 3), body in world after dt_s. noise: (9, 9), of the IMU over dt_s, as preintegrated.
     """
     turn = np.eye(len(cov))
     turn[:3, :3] = turn[3:6, 3:6] = R.T @ newest.pose.rotation().matrix()
@@ -63,10 +63,11 @@ class States:
     """States from an anchor on, in a window.
 
     Args:
-        constants: told of in an anchor. guess: pose, velocity (3,) and bias (6,) that the first state is first solved at;
-            its prior is the anchor's.
+        constants: shared by measurements; part of every anchor. guess: pose, velocity (3,) and bias (6,) that the first state
+            is first solved at; its prior is the anchor.
 
-    Raises (every method): SolveError: from then on it is of no use.
+    Raises:
+        SolveError: by every method; the window cannot be used afterwards.
     """
 
     def __init__(
@@ -78,8 +79,8 @@ class States:
         guess: tuple[gtsam.Pose3, Array, Array],
     ) -> None:
         self._problem, self._window, self._constants = problem, window, constants
-        self._ends: dict[str, Held] = {}  # what closes the slow chain of each sensor
-        self._links: dict[int, Held] = {}  # by the state that each begins at
+        self._ends: dict[str, Held] = {}  # the prior that closes the slow chain of each sensor
+        self._links: dict[int, Held] = {}  # IMU factors, by the state that each begins at
         state = (keys.pose(0), keys.velocity(0), keys.bias(0))
         pose, velocity, bias = guess
         window.guess(state[0], pose, 0.0)
@@ -103,7 +104,7 @@ class States:
         return self._newest
 
     def read(self) -> None:
-        """Read the newest state off the window, once it has been solved.
+        """Read the newest state from the window after it has been solved.
 
         Raises:
             SolveError: the solver diverged.
@@ -131,7 +132,7 @@ class States:
         return newest
 
     def grow(self, stamp_ns: int) -> bool:
-        """Stage the next state, where the IMU says that it is; tell whether slow states got a node, which closes a commit."""
+        """Stage the next state, predicted by the IMU; return whether slow states got a new node: then a commit is due."""
         timeline, window, links = self._problem.timeline, self._window, self._problem.links
         k, values = timeline.last, window.values
         j, before_ns = timeline.slow_of[k], timeline.stamps_ns[k]
@@ -157,7 +158,7 @@ class States:
         return bool(following != j)
 
     def _next_motion(self, j: int, dt_s: float) -> None:
-        """Learn how the vessel moves, or, where that is hardly known, stage that from slow node j on it moved as usual."""
+        """Learn the motion model, or, where the velocity is uncertain, stage its factors from slow node j to now."""
         problem, newest, timeline = self._problem, self._newest, self._problem.timeline
         if float(np.linalg.eigvalsh(newest.velocity_cov[:2, :2])[-1]) < UNSURE_MPS**2:
             problem.motion_model.learn(newest.stamp_ns, (newest.pose.rotation().matrix().T @ newest.velocity)[:2])
@@ -165,7 +166,7 @@ class States:
         begin_ns, end_ns = timeline.slow_stamps_ns[j], timeline.stamps_ns[timeline.last]
         if begin_ns < timeline.stamps_ns[timeline.first]:
             return
-        # How it turned in a hole is a guess, and so is along which axes it moved there.
+        # The rotation across an IMU gap is unknown, and so are the axes that the model is about.
         if not any(a < end_ns and b > begin_ns and b - a > _HOLE_S * 1e9 for a, b in problem.links.gaps()):
             before, now = self._moving(timeline.floor(begin_ns)), self._moving(timeline.last)
             self._window.add(problem.motion_model.step(before, now, dt_s))
@@ -189,7 +190,7 @@ class States:
                 self._ends[stream.name] = window.add(ends)
 
     def reintegrate(self, stale: Collection[int]) -> None:
-        """Stage anew the IMU's steps that begin at these states: samples of them came late."""
+        """Integrate again the IMU steps that begin at these states, and stage their factors: samples in them came late."""
         timeline, links, window = self._problem.timeline, self._problem.links, self._window
         for k in sorted(stale):
             if k in self._links and window.remove(self._links[k]):
@@ -201,7 +202,7 @@ class States:
                 self._links[k] = window.add([links.factor(k, j, pim)])
 
     def let_go(self) -> bool:
-        """Forget the states that have left the window; tell whether any have."""
+        """Forget the states that have left the window; return whether any have."""
         timeline = self._problem.timeline
         first = timeline.first
         gone = first
@@ -216,7 +217,7 @@ class States:
         return True
 
     def prediction(self, stream: LiveStream, at: Attachment, k: int, residual: Residual) -> Prediction:
-        """Return what is predicted of a residual at state k, from pose and slow state together."""
+        """Return the prediction of a residual at state k, from the joint covariance of pose and slow state."""
         timeline, window, newest = self._problem.timeline, self._window, self._newest
         base = min(k, newest.number)
         wanted, size = [keys.pose(base)], 6
@@ -235,7 +236,7 @@ class States:
         return prediction_of(residual, at, P, newest.velocity_cov)
 
     def joint(self, attached: Sequence[Attachment], residuals: Sequence[Residual]) -> Array:
-        """Return the covariance of the newest place in world (3 rows), and of what residuals owe to the estimate."""
+        """Return the joint covariance of the newest position in world (3 rows first) and of the residuals, as far as the estimate causes it."""
         newest, window = keys.pose(self._problem.timeline.last), self._window
         poses = list(dict.fromkeys([newest, *(at.pose_key for at in attached)]))
         slow = list(dict.fromkeys(at.slow_key for at in attached if at.slow_key is not None))
@@ -253,12 +254,12 @@ class States:
         return np.asarray(J @ window.covariance([*poses, *slow]) @ J.T)
 
     def step_cost(self) -> float:
-        """Return the median cost of the IMU's steps; 0 where none is in the graph."""
+        """Return the median cost of the IMU factors; 0 where none is in the graph."""
         steps = self._window.errors_of(held for held in self._links.values() if held.slots)
         return float(np.median(steps)) if steps else 0.0
 
     def anchor(self) -> Anchor:
-        """Return what is known at the newest state, but for what closes the slow chains: they go on from here."""
+        """Return the anchor at the newest state, without the priors that close the slow chains: these continue from here."""
         timeline, window, streams = self._problem.timeline, self._window, self._problem.streams
         k = timeline.last
         j = timeline.slow_of[k]
@@ -288,7 +289,7 @@ class States:
         return replace(anchor, constants={**self._constants.remembered(), **anchor.constants})
 
     def track(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
-        """Return stamps (N,), places (N, 3), attitudes (N, 3, 3) and velocities (N, 3) of the body's origin."""
+        """Return stamps (N,), ns, and in world positions (N, 3), attitudes (N, 3, 3) and velocities (N, 3) of the body's origin."""
         timeline, values, lever = self._problem.timeline, self._window.values, -self._problem.t_body_imu_m
         states = range(timeline.first, len(timeline))
         poses = [values.atPose3(keys.pose(k)) for k in states]

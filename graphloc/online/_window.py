@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of the last seconds: iSAM2, whose oldest keys are marginalised.
+"""The graph of the window: iSAM2, whose oldest keys are marginalised.
 
-What is added and taken out is staged, and goes in whole or not at all. `ISAM2` is not safe after
-an exception: from then on it is thrown away, and the caller builds another.
+Additions and removals are staged, and applied whole or not at all. `ISAM2` is not usable after an exception: the caller then
+throws it away and builds another.
 
-GTSAM's own fixed lag leaves the order of elimination to fill-in. Here the newest keys come last: what is asked and
-added at every update is then at the root of the tree.
+GTSAM's own fixed-lag smoother orders elimination by fill-in alone. Here the newest keys come last: what is queried and added
+at every update is then at the root of the Bayes tree.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _NEVER = 1_000_000_000  # updates
 
 
 def keys_of(factor: Any) -> list[int]:
-    """Return the keys that a factor holds on to."""
+    """Return the keys of a factor."""
     return [int(key) for key in factor.keys()]  # noqa: SIM118 - no mapping
 
 
 @dataclass(slots=True, eq=False)
 class Held:
-    """Factors that went in together: their places in the smoother, and the keys that they hold on to."""
+    """Factors that were added together: their slots in iSAM2, and their keys."""
 
     keys: frozenset[int]
     count: int
@@ -43,7 +43,7 @@ class Held:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mark:
-    """A window with nothing staged, to go back to: a copy of all that a commit changes."""
+    """A copy of all that a commit changes, to restore a window with nothing staged."""
 
     solver: gtsam.ISAM2
     values: gtsam.Values
@@ -53,7 +53,7 @@ class Mark:
 
 
 class Window:
-    """A fixed lag. `values` is the estimate of every key in it, and the guess of what is staged."""
+    """A fixed-lag smoother. `values` holds the estimate of every key in it, and the guess of staged keys."""
 
     def __init__(self, lag_s: float) -> None:
         params = gtsam.ISAM2Params()
@@ -65,16 +65,16 @@ class Window:
         self.lag_s = lag_s
         self._solver = gtsam.ISAM2(params)
         self.values = gtsam.Values()
-        self._alive: dict[int, float] = {}  # keys in the solver, and when each was last touched
+        self._alive: dict[int, float] = {}  # keys in the solver, and the time (s) when each was last touched
         self._newest: set[int] = set()  # keys of the last commit
-        self._linearised = gtsam.Values()  # the point of each key that the solver's tangents are those of
+        self._linearised = gtsam.Values()  # linearisation point of each key in the solver
         self._clear()
 
     def _clear(self) -> None:
         self._graph, self._guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._stamps: dict[int, float] = {}
         self._remove: list[int] = []
-        self._bare: set[int] = set()  # leaves whose factors are removed: the solver forgets them
+        self._bare: set[int] = set()  # keys whose factors are all removed: the solver forgets them
         self._added: list[Held] = []
         self._to_relinearise = False
 
@@ -86,18 +86,18 @@ class Window:
         self._stamps[key] = t_s
 
     def touch(self, key: int, t_s: float) -> None:
-        """Keep a key from leaving before `t_s` + lag."""
+        """Keep a key in the window until `t_s` + lag."""
         self._stamps[key] = max(t_s, self._stamps.get(key, self._alive.get(key, t_s)))
 
     def stamp_of(self, key: int) -> float:
-        """When a key was last touched."""
+        """Return the time (s) when a key was last touched."""
         return self._stamps.get(key, self._alive.get(key, -np.inf))
 
     def add(self, factors: Iterable[Any]) -> Held:
         """Stage factors.
 
         Raises:
-            SolveError: one of them holds on to a key that is not there (any more).
+            SolveError: a key of one of them is not in the window (any more).
         """
         found = list(factors)
         keys = frozenset(key for factor in found for key in keys_of(factor))
@@ -111,7 +111,7 @@ class Window:
         return held
 
     def remove(self, held: Held) -> bool:
-        """Stage the removal of factors; False where a part of them has left with the lag."""
+        """Stage the removal of factors; return False where some of them have been marginalised."""
         if not held.slots or any(key not in self._alive for key in held.keys):
             return False
         self._remove += held.slots
@@ -120,13 +120,14 @@ class Window:
         return True
 
     def linearised_at(self, key: int) -> Any:
-        """Return the value that the solver's tangent of a key is that of."""
+        """Return the linearisation point of a pose key."""
         return self._linearised.atPose3(key)
 
     def relinearise(self) -> bool:
-        """Have the next commit linearise anew where the estimate has moved away; `linearised_at` says at once where.
+        """Relinearise in the next commit the keys that have moved; `linearised_at` gives their new points at once.
 
-        Tell whether it has anywhere.
+        Returns:
+            Whether any key has moved.
         """
         step = self._solver.getDelta()
         poses = [key for key in self._alive if is_pose(key)]
@@ -139,10 +140,10 @@ class Window:
         return self._to_relinearise
 
     def commit(self) -> None:
-        """Take in what is staged, and estimate anew.
+        """Apply what is staged, marginalise what is older than the lag, and solve.
 
         Raises:
-            SolveError: the linear algebra failed; this window is of no use from now on.
+            SolveError: the linear algebra failed; this window cannot be used any more.
         """
         alive = {key: touched_s for key, touched_s in (self._alive | self._stamps).items() if key not in self._bare}
         oldest_s = max(alive.values(), default=0.0) - self.lag_s
@@ -153,7 +154,7 @@ class Window:
         params.force_relinearize = self._to_relinearise
         if gone or self._to_relinearise:
             params.constrainedKeys = _groups(alive, gone, self._newest)
-        if gone:  # it must have nothing below it in the tree
+        if gone:  # marginalised keys must be leaves of the tree
             params.extraReelimKeys = _listed(self._alive.keys() & alive)
         with self._solving():
             slots = list(self._solver.update(self._graph, self._guess, params).getNewFactorsIndices())
@@ -170,7 +171,7 @@ class Window:
         self._clear()
 
     def settle(self, steps: int = 1) -> None:
-        """Take in what is staged, if anything is, and relinearise `steps` times."""
+        """Apply what is staged, if anything is, and relinearise up to `steps` times."""
         if self._added or self._remove:
             self.commit()
         for _ in range(steps):
@@ -187,7 +188,7 @@ class Window:
             raise not_solved("the solver failed", error) from error
 
     def marked(self) -> Mark:
-        """Return a window as it is, nothing being staged, for `back_to`."""
+        """Return a copy of the window (nothing being staged), for `back_to`."""
         assert not self._added
         assert not self._remove
         return Mark(
@@ -199,10 +200,10 @@ class Window:
         )
 
     def back_to(self, mark: Mark, held: Iterable[tuple[Held, Sequence[int]]]) -> None:
-        """Go back to a mark, also after an exception; once for each mark.
+        """Restore a mark, also after an exception; each mark can be used once.
 
         Args:
-            held: factors that may have been removed since, and their places then.
+            held: factors that may have been removed since, and their slots then.
         """
         self._solver, self.values, self._linearised = mark.solver, mark.values, mark.linearised
         self._alive, self._newest = mark.alive, mark.newest
@@ -211,11 +212,11 @@ class Window:
             factors.slots = list(slots)
 
     def leaving(self, keys: Iterable[int], now_s: float) -> list[int]:
-        """Return those of the keys that the next commit at `now_s` lets go."""
+        """Return those of the keys that the next commit at `now_s` marginalises."""
         return [key for key in keys if self.values.exists(key) and self.stamp_of(key) < now_s - self.lag_s]
 
     def covariance(self, keys: Sequence[int]) -> Array:
-        """Return the joint covariance of keys that were committed, in their order, poses first; of a pose in the tangent of its estimate.
+        """Return the joint covariance of committed keys, in their order, poses first; of a pose in the body tangent at its estimate.
 
         Raises:
             SolveError: it could not be computed.
@@ -227,7 +228,7 @@ class Window:
                 cov = np.asarray(self._solver.jointMarginalCovariance(list(keys)).fullMatrix())
         except (RuntimeError, IndexError, ValueError) as error:
             raise not_solved("the covariance could not be computed", error) from error
-        # Poses first, by the signature: the solver's own tangents are those of its linearisation.
+        # The solver's tangents are at its linearisation points; turn those of the poses to the estimate.
         for n, key in enumerate(itertools.takewhile(is_pose, keys)):
             turn = self.values.atPose3(key).rotation().matrix().T @ self.linearised_at(key).rotation().matrix()
             for rows in (slice(6 * n, 6 * n + 3), slice(6 * n + 3, 6 * n + 6)):
@@ -236,15 +237,15 @@ class Window:
         return cov
 
     def error(self, without: Iterable[Held] = ()) -> float:
-        """Return the cost of the graph at the estimate (half of the weighted squares), less that of some factors."""
+        """Return the cost of the graph at the estimate (half the weighted squares), without that of some factors."""
         graph = self._solver.getFactorsUnsafe()
         return float(graph.error(self.values)) - self._bent(graph) - sum(self.errors_of(without))
 
     def _bent(self, graph: gtsam.NonlinearFactorGraph) -> float:
-        """What steps from the oldest poses seem to cost beyond what they cost in the solver, which never linearises these anew.
+        """Return how much the factors at the oldest poses cost beyond their cost in the solver, which cannot relinearise these poses.
 
-        Half a metre from where they were linearised the IMU's own step from there costs tens: whatever moves the end of the lag
-        would be refused.
+        Half a metre from the linearisation point the IMU factor there costs tens: every change that moves the oldest end of
+        the window would be rejected for that alone.
         """
         solver = self._solver
         held, slots = solver.getFixedVariables(), solver.getVariableIndex()
@@ -260,7 +261,7 @@ class Window:
         return float(sum(f.error(self.values) - f.linearize(point).error(step) for f in bent))
 
     def errors_of(self, parts: Iterable[Held]) -> list[float]:
-        """Return the share of the cost that committed factors have, together as they went in."""
+        """Return the cost of committed factors, of each `Held` together."""
         factors = self._solver.getFactorsUnsafe()
         return [float(sum(factors.at(slot).error(self.values) for slot in held.slots)) for held in parts]
 
@@ -269,7 +270,7 @@ class Window:
 
     @property
     def factor_slots(self) -> int:
-        """Places that the smoother keeps for factors: must not grow with time."""
+        """Number of slots that iSAM2 keeps for factors: must not grow with time."""
         return int(self._solver.getFactorsUnsafe().size())
 
 
@@ -281,14 +282,15 @@ def _listed(keys: Iterable[int]) -> Any:
 
 
 def _groups(alive: Iterable[int], gone: Collection[int], newest: Collection[int]) -> Any:
-    """The order of elimination: what leaves, what stays, what is asked and added next.
+    """Return the groups of the elimination order: keys that are marginalised, those that stay, and the newest.
 
-    CCOLAMD fails at a group whose number is not below that of the keys that it orders: where nothing leaves these are two, or one.
+    CCOLAMD fails where the number of a group is not below the number of keys: so where nothing is marginalised there are only
+    two groups, or one.
     """
     stays = 1 if gone else 0
     groups = gtsam.KeyGroupMap()
     for key in gone:
         groups.insert2(key, 0)
-    for key in alive:  # what has a group keeps it
+    for key in alive:  # insert2 keeps the group of a key that has one
         groups.insert2(key, stays + 1 if key in newest else stays)
     return groups
