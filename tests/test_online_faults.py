@@ -133,7 +133,7 @@ def test_agreement_with_a_rejected_choice_does_not_count(kept: bool, monkeypatch
     assert online._tracking is not None  # noqa: SLF001
     judge, agreement = online._tracking.lag._judge, online._tracking.lag._agreement  # noqa: SLF001
     stream = online._tracking.lag.problem.streams["aerial"]  # noqa: SLF001
-    own = judge._chapter(stream)  # noqa: SLF001
+    own = judge._group(stream)  # noqa: SLF001
     agreement.back_to(Agreement(online._tracking.lag.problem.timeline).marked())  # noqa: SLF001
     for entry in own:
         agreement.note(stream, entry.measurement, None)
@@ -153,8 +153,8 @@ def test_a_receiver_that_is_far_off_is_waited_for(error_m: float, denies: bool, 
     assert online._tracking is not None  # noqa: SLF001
     lag = online._tracking.lag  # noqa: SLF001
     fix, match = (lag.problem.streams[name] for name in ("gnss", "aerial"))
-    a_fix, a_match = (lag._judge._chapter(stream)[-1].measurement for stream in (fix, match))  # noqa: SLF001
-    verdict = lag._judge._chapter(match)[-1].verdict  # noqa: SLF001
+    a_fix, a_match = (lag._judge._group(stream)[-1].measurement for stream in (fix, match))  # noqa: SLF001
+    verdict = lag._judge._group(match)[-1].verdict  # noqa: SLF001
     agrees = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([error_m, 0.0, 0.0])))
     agreement, begin_ns = lag._agreement, lag.newest.stamp_ns  # noqa: SLF001
     agreement.back_to(Agreement(lag.problem.timeline).marked())
@@ -184,7 +184,7 @@ def test_a_jump_that_lasts_longer_than_the_level_before_it_is_the_right_level(
     assert online._tracking is not None  # noqa: SLF001
     lag = online._tracking.lag  # noqa: SLF001
     fix = lag.problem.streams["gnss"]
-    entry = lag._judge._chapter(fix)[-1]  # noqa: SLF001
+    entry = lag._judge._group(fix)[-1]  # noqa: SLF001
     agreement, begin_ns = Agreement(lag.problem.timeline), lag.newest.stamp_ns
 
     def agrees(t_s: int, off_m: float) -> None:
@@ -209,8 +209,8 @@ def test_a_sensor_found_frozen_does_not_hasten_a_restart() -> None:
     assert online._tracking is not None  # noqa: SLF001
     lag = online._tracking.lag  # noqa: SLF001
     fix, match = (lag.problem.streams[name] for name in ("gnss", "aerial"))
-    a_fix = lag._judge._chapter(fix)[-1].measurement  # noqa: SLF001
-    verdict = lag._judge._chapter(match)[-1].verdict  # noqa: SLF001
+    a_fix = lag._judge._group(fix)[-1].measurement  # noqa: SLF001
+    verdict = lag._judge._group(match)[-1].verdict  # noqa: SLF001
     far_off = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([20.0, 0.0, 0.0])))
     agreement, begin_ns = lag._agreement, lag.newest.stamp_ns  # noqa: SLF001
     agreement.back_to(Agreement(lag.problem.timeline).marked())
@@ -222,9 +222,9 @@ def test_a_sensor_found_frozen_does_not_hasten_a_restart() -> None:
     assert not agreement.lost_s(begin_ns + 50 * 1_000_000_000)
 
 
-@pytest.mark.parametrize("opened", [True, False])
+@pytest.mark.parametrize("widened", [True, False])
 def test_a_measurement_let_in_by_a_wide_kernel_agrees_only_when_judged_again(
-    opened: bool, monkeypatch: pytest.MonkeyPatch
+    widened: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A fix 300 m off, let in once a second as the prediction was unsure, put off the new start of a lost estimate."""
     base, online = arrivals_of(run_of()), smoother(run_of())
@@ -236,13 +236,13 @@ def test_a_measurement_let_in_by_a_wide_kernel_agrees_only_when_judged_again(
 
     def lets_in(*arguments: Any, fresh: bool) -> Any:
         verdict, _ = by_kernel(*arguments, fresh=fresh)
-        return replace(verdict, weight=1.0), opened and fresh
+        return replace(verdict, weight=1.0), widened and fresh
 
     monkeypatch.setattr(judge, "_by_kernel", lets_in)
-    monkeypatch.setattr(judge, "_ask_again", lambda *_: None)
+    monkeypatch.setattr(judge, "_rejudge", lambda *_: None)
     agreement.back_to(Agreement(online._tracking.lag.problem.timeline).marked())  # noqa: SLF001
     feed(online, run_of(), base[now:soon])
-    assert ("gnss" in agreement.agreed_ns) is not opened
+    assert ("gnss" in agreement.agreed_ns) is not widened
     monkeypatch.undo()
     feed(online, run_of(), base[soon:later])
     assert "gnss" in agreement.agreed_ns

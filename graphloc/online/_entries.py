@@ -33,7 +33,7 @@ class Entry:
     verdict: Verdict
     held: Held | None = None
     written: Any = None  # the pose in whose tangent its factors are written
-    opened: bool = False  # its kernel was widened, because the prediction was uncertain
+    widened: bool = False  # its kernel was widened, because the prediction was uncertain
     judged: bool = False  # among hypotheses, at least once
 
     @property

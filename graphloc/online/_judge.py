@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to believe of the measurements in the window: asked when each comes, and again.
+"""Which measurements in the window are believed, and with what weight: decided when each arrives, and again later.
 
-A sensor with a kernel is judged when it comes, and once or twice again. What of it disagrees is asked whether the
-prediction is sure enough to say so: where it is not, after an outage, the kernel bends later. A sensor with
-hypotheses is judged as the batch does it, as a sequence, against the prediction while it is new.
+A measurement of a sensor with a robust kernel is judged on arrival, and once or twice again. Where it disagrees, but the
+prediction is too uncertain to say so (after an outage), its kernel is widened. Measurements of a sensor with hypotheses are
+judged as a sequence, as the batch solver does, and new ones against the prediction.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from graphloc.solve._best_chain import best_chain
 from graphloc.solve._decide import AGREES, Verdict, by_hypotheses
 from graphloc.solve._hypotheses import log_evidence_of
 
-_AGAIN_S = (1.0, 4.0)  # ages at which a kernel is asked again
-_LEAF_S, _SURE = 1.0, 0.9  # how often an older chapter is judged again; a weight that needs no second look
+_REJUDGE_AGES_S = (1.0, 4.0)  # ages at which a measurement with a kernel is judged again
+_OLDER_EVERY_S, _SURE = 1.0, 0.9  # how often an older group is judged again; a weight that needs no second round
 _CERTAIN = 0.99  # a weight that leaves no doubt
-_LOOSE = 25.0  # times its variance: a choice that says so little of the place does not move it
-_SHOWS = 0.01  # of a covariance: what other choices must add to be worth adding
-_CHAPTER = 10  # hypotheses that are judged as one sequence
+_LOOSE = 25.0  # times the variance of the position: a choice that leaves it so uncertain does not move it
+_SHOWS = 0.01  # share of the covariance that other choices must add to be counted
+_GROUP = 10  # hypotheses that are judged as one sequence
 _ROUNDS = 2  # of judging what is new
-_CHAIN = 2  # measurements that agree with each other, and not with the estimate
-_FAR_M = 20e3  # from the estimate: no place of this run; beyond, the linear algebra fails before a kernel helps
-_STEPS = 3  # of the solver, where other choices are tried
+_CHAIN = 2  # measurements that agree with each other and not with the estimate, for a trial
+_FAR_M = 20e3  # from the estimate: not of this run; the linear algebra would fail before a kernel helps
+_STEPS = 3  # iterations of the solver in a trial
 
 
 class Judge:
-    """Decides about the entries, by the prediction of the states.
+    """Decides on the entries by the predictions of the states.
 
     Args:
-        agreement: told of what absolute sensors say.
+        agreement: notes how absolute sensors were judged.
 
     Attributes:
         receivers: checks of single receivers, before a measurement is judged.
@@ -59,28 +59,28 @@ class Judge:
         self._problem, self._window = problem, window
         self._states, self._entries, self._agreement = states, entries, agreement
         self.receivers = ReceiverChecks(problem, states, entries, agreement)
-        self._again: list[tuple[float, int, Entry]] = []  # a heap: when, and in turn
+        self._scheduled: list[tuple[float, int, Entry]] = []  # a heap: due time (s), order, entry
         self._turn = count()
         self._rounds: dict[str, int] = {}
-        self._leaves: dict[str, int] = {}  # how many chapters back was judged again
-        self._leafed_s: dict[str, float] = {}  # and when
-        self._refuted: set[str] = set()  # sensors of which something new was judged false
+        self._groups_back: dict[str, int] = {}  # which older group was judged again last, counted from the newest
+        self._rejudged_s: dict[str, float] = {}  # and when, s
+        self._refuted: set[str] = set()  # sensors with a new measurement that was judged false
         self._tried: dict[str, frozenset[tuple[int, int | None]]] = {}
-        self._unsure: set[str] = set()  # sensors of which all choices are to be weighed
+        self._unsure: set[str] = set()  # sensors whose choices are to be weighed
         self._chosen: dict[str, frozenset[tuple[int, int | None]]] = {}
         self._others: dict[str, tuple[Array, Array]] = {}  # mean and covariance, of each sensor
 
     @property
     def others(self) -> tuple[Array, Array]:
-        """What other choices of what is right, by their probability, add to the newest place in world: mean (3,) and covariance (3, 3)."""
+        """What other choices of modes, by their probability, add to the newest position in world: mean (3,), m, and covariance (3, 3)."""
         means, covs = zip(*self._others.values(), strict=True) if self._others else ((), ())
         return np.asarray(sum(means, start=np.zeros(3))), np.asarray(sum(covs, start=np.zeros((3, 3))))
 
     def take(self, m: Measurement) -> None:
-        """Stage a measurement whose stamp lies within the states; one with hypotheses waits for `judge`.
+        """Stage a measurement whose stamp lies within the window; one with hypotheses is decided on in `judge`.
 
         Raises:
-            SolveError: it cannot be of this run; nothing of it is staged.
+            SolveError: it lies impossibly far away; nothing of it is staged.
         """
         stream, i = self._problem.take(m)
         at, residuals = self._entries.residuals_at(stream, i)
@@ -90,84 +90,88 @@ class Judge:
         if self.receivers.frozen(stream, m, at, residuals[0]):
             self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
         elif stream.row.false is None:
-            verdict, opened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
-            # Where its kernel was opened it was let in; whether it agrees is seen when it is asked again.
-            if not opened or verdict.weight < AGREES:
+            verdict, widened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
+            # Where its kernel was widened it was let in; whether it agrees is seen when it is asked again.
+            if not widened or verdict.weight < AGREES:
                 self._agreement.note(stream, m, verdict)
-            entry = Entry(stream, i, verdict, opened=opened)
+            entry = Entry(stream, i, verdict, widened=widened)
             self._entries.add(entry)
-            self._ask_at(self._problem.timeline.seconds(m.stamp_ns) + _AGAIN_S[0], entry)
+            self._schedule(self._problem.timeline.seconds(m.stamp_ns) + _REJUDGE_AGES_S[0], entry)
         else:
             self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
             self._rounds[stream.name] = _ROUNDS
 
     def judge(self) -> None:
-        """Stage what is to be decided, anew or again."""
+        """Stage the decisions that are due, on new and on older measurements."""
         timeline = self._problem.timeline
         now_s = timeline.seconds(timeline.stamps_ns[timeline.last])
         for name, stream in self._problem.streams.items():
             rounds = self._rounds.pop(name, 0)
             if rounds:
-                unsettled = self._by_hypotheses(stream, self._chapter(stream))
+                unsettled = self._by_hypotheses(stream, self._group(stream))
                 if rounds > 1 and unsettled:
                     self._rounds[name] = rounds - 1
-            elif stream.row.false is not None and now_s >= self._leafed_s.get(name, 0.0) + _LEAF_S:
-                self._leaf_back(stream, now_s)
+            elif stream.row.false is not None and now_s >= self._rejudged_s.get(name, 0.0) + _OLDER_EVERY_S:
+                self._rejudge_older(stream, now_s)
                 if name in self._others:
                     self._unsure.add(name)
         due = []
-        while self._again and self._again[0][0] <= now_s:
-            due.append(heapq.heappop(self._again)[2])
+        while self._scheduled and self._scheduled[0][0] <= now_s:
+            due.append(heapq.heappop(self._scheduled)[2])
         for entry in due:
-            self._ask_again(entry, now_s)
+            self._rejudge(entry, now_s)
 
     # By a kernel
 
     def _by_kernel(
         self, stream: LiveStream, i: int, at: Attachment, residual: Residual, *, fresh: bool
     ) -> tuple[Verdict, bool]:
-        """The sensor's kernel: as wide as its residuals scatter, and as the prediction is unsure. True: for that reason."""
+        """Judge by the sensor's kernel, widened by the scatter of its residuals and, for a new one, by an uncertain prediction.
+
+        Returns:
+            The verdict, and whether the prediction widened the kernel.
+        """
         own, dof = stream.config.kernel, len(residual.raw)
         scale = own.scale * stream.scatter.times * float(np.sqrt(dof))
         plain = nis = residual.nis()
-        opened, inflation = False, None
+        widened, inflation = False, None
         if fresh and own.kind != "none" and nis > scale**2:
             inflation = self._states.prediction(stream, at, stream.state[i], residual).cov
             nis = residual.nis(inflation)
-            opened = plain > 1.5 * nis
-            scale *= float(np.sqrt(plain / max(nis, 1e-9))) if opened else 1.0
+            widened = plain > 1.5 * nis
+            scale *= float(np.sqrt(plain / max(nis, 1e-9))) if widened else 1.0
         if fresh:
             stream.scatter.note(stream.measurements[i].stamp_ns, residual.normalised(inflation))
         kernel = KernelConfig(kind=own.kind, scale=scale)
-        return Verdict(Decision(kernel=kernel), kernel.weight(plain), 1.0, residual, 0, at), opened
+        return Verdict(Decision(kernel=kernel), kernel.weight(plain), 1.0, residual, 0, at), widened
 
-    def _ask_at(self, due_s: float, entry: Entry) -> None:
-        heapq.heappush(self._again, (due_s, next(self._turn), entry))
+    def _schedule(self, due_s: float, entry: Entry) -> None:
+        heapq.heappush(self._scheduled, (due_s, next(self._turn), entry))
 
-    def _ask_again(self, entry: Entry, now_s: float) -> None:
+    def _rejudge(self, entry: Entry, now_s: float) -> None:
         if not self._entries.reachable(entry) or entry.verdict.decision is None:
             return
         at, residuals = self._entries.residuals_at(entry.stream, entry.index)
-        verdict, opened = self._by_kernel(entry.stream, entry.index, at, residuals[0], fresh=False)
+        verdict, widened = self._by_kernel(entry.stream, entry.index, at, residuals[0], fresh=False)
         if verdict.weight >= AGREES:
             self._agreement.note(entry.stream, entry.measurement, verdict)
-        if entry.opened or entry.weighs_other(verdict):
-            entry.opened = opened
+        if entry.widened or entry.weighs_other(verdict):
+            entry.widened = widened
             self._entries.change(entry, verdict)
         else:
             entry.verdict = replace(verdict, decision=entry.verdict.decision)
         age_s = now_s - self._problem.timeline.seconds(entry.measurement.stamp_ns)
-        if age_s < _AGAIN_S[1]:
-            self._ask_at(now_s + _AGAIN_S[1] - age_s, entry)
+        if age_s < _REJUDGE_AGES_S[1]:
+            self._schedule(now_s + _REJUDGE_AGES_S[1] - age_s, entry)
 
     # By hypotheses
 
     def _by_hypotheses(self, stream: LiveStream, own: list[Entry]) -> bool:
-        """Judge measurements of a stream as one sequence; what is new, by the prediction. Tell whether it may change yet."""
+        """Judge measurements of a stream as one sequence, new ones by the prediction; return whether another round may change them."""
         unsettled = False
         if not own:
             return False
-        attached, residuals = self._met(own)
+        attached, residuals = self._attach(own)
         predictions = [
             self._states.prediction(stream, at, e.state, found[0])
             if e.held is None and e.verdict.decision is None and not e.judged else None
@@ -191,71 +195,75 @@ class Judge:
                 entry.verdict = replace(verdict, decision=entry.verdict.decision, at=entry.verdict.at)
         return unsettled
 
-    def _chapter(self, stream: LiveStream, back: int = 0) -> list[Entry]:
-        """A chapter of a stream that can still be judged, by stamp: the newest, or so many before it."""
+    def _group(self, stream: LiveStream, back: int = 0) -> list[Entry]:
+        """Return a group of `_GROUP` measurements of a stream that can still be judged, by stamp: the newest, or the `back`-th before it."""
         own = self._entries.of(stream)
-        end = len(own) - back * _CHAPTER
-        return own[max(end - _CHAPTER, 0) : max(end, 0)]
+        end = len(own) - back * _GROUP
+        return own[max(end - _GROUP, 0) : max(end, 0)]
 
-    def _leaf_back(self, stream: LiveStream, now_s: float) -> None:
-        """Judge an older chapter again, each in its turn: what came since may say otherwise."""
-        self._leafed_s[stream.name] = now_s
-        back = self._leaves.get(stream.name, 0) + 1
-        own = self._chapter(stream, back)
-        self._leaves[stream.name] = back if own else 0
+    def _rejudge_older(self, stream: LiveStream, now_s: float) -> None:
+        """Judge an older group again, one after another: later data may decide otherwise."""
+        self._rejudged_s[stream.name] = now_s
+        back = self._groups_back.get(stream.name, 0) + 1
+        own = self._group(stream, back)
+        self._groups_back[stream.name] = back if own else 0
         self._by_hypotheses(stream, own)
 
-    def _met(self, own: list[Entry]) -> tuple[list[Attachment], list[tuple[Residual, ...]]]:
-        """Where each meets the graph as it is now estimated, and the residuals of its modes there."""
+    def _attach(self, own: list[Entry]) -> tuple[list[Attachment], list[tuple[Residual, ...]]]:
+        """Return the attachments of entries at the present estimate, and the residuals of their modes there."""
         met = [self._entries.residuals_at(e.stream, e.index) for e in own]
         return [at for at, _ in met], [found for _, found in met]
 
-    # Other choices: what was chosen confirms itself, for the estimate follows it (see `graphloc.solve._choices`)
+    # Other choices: a choice confirms itself, because the estimate follows it (see `graphloc.solve._choices`)
 
     def try_others(self) -> bool:
-        """Where what was judged false agrees among itself, try that instead, and keep what is more probable. Tell whether any was tried."""
+        """Where measurements judged false agree with each other, try to believe them instead, and keep what is more probable.
+
+        Returns:
+            Whether anything was tried.
+        """
         names, self._refuted = self._refuted, set()
         moved = False
         for name in sorted(names):
             stream = self._problem.streams[name]
-            own = self._chapter(stream)
+            own = self._group(stream)
             if len(own) < _CHAIN:
                 continue
-            attached, found = self._met(own)
+            attached, found = self._attach(own)
             chain = best_chain(stream, [e.index for e in own], found)
             believed = [e.verdict.mode if e.held is not None and e.verdict.weight >= AGREES else None for e in own]
             others = [mode for mode, held in zip(chain, believed, strict=True) if mode != held]
             tried = frozenset((e.index, mode) for e, mode in zip(own, chain, strict=True))
-            # One that comes alone may agree with some of what is believed, and refute the rest.
+            # A single new one may agree with some of those believed, and contradict the others.
             if len(others) < _CHAIN or all(mode is None for mode in others) or tried == self._tried.get(name):
                 continue
             self._tried[name] = tried
             moved = True
-            self._try(stream, own, _along(chain, found, attached))
+            self._try(stream, own, _believing(chain, found, attached))
         unsure, self._unsure = self._unsure, set()
         for name in sorted(unsure):
             moved |= self._weigh_choices(self._problem.streams[name])
         return moved
 
     def _weigh_choices(self, stream: LiveStream) -> bool:
-        """Try the most probable choice of the newest measurements, and remember what the others leave. Tell whether any was tried.
+        """Try the most probable choice of the newest measurements, and keep the spread of the others; return whether any was tried.
 
-        Only one that believes something more: that all are false is also what a receiver says that hangs.
+        Only choices that believe something more are tried: that all are false is also the explanation for a frozen sensor.
         """
         for tried in range(_ROUNDS):
             self._others.pop(stream.name, None)
-            own = self._chapter(stream)
+            own = self._group(stream)
             if not own or stream.constants:
                 return tried > 0
-            attached, found = self._met(own)
+            attached, found = self._attach(own)
             held = [e.within for e in own]
             cov = self._states.joint(attached, [modes[0] for modes in found])
             weighed = choices(stream, [e.index for e in own], found, cov, held)
             best = weighed[0].modes
             now = tuple(h[0] if h is not None and h[1] >= AGREES else None for h in held)
             share, steps = np.exp([c.log for c in weighed]), np.array([c.step[:3] for c in weighed])
-            # What is not the most probable, and was refused when it was tried, does not move the place; nor does a choice
-            # by which nothing tells it: its share of a step of 100 m is no place that anybody means.
+            # The mean is moved only where the present choice is the most probable one (else that was tried and rejected), and
+            # not by choices that leave the position undetermined: their share of a step of 100 m is no position that any means.
             tells = np.array([np.trace(c.cov[:3, :3]) for c in weighed]) < _LOOSE * np.trace(cov[:3, :3])
             mean = (share * tells) @ steps if best == now else np.zeros(3)
             around = (share[:, None] * (steps - mean)).T @ (steps - mean)
@@ -266,22 +274,22 @@ class Judge:
             if not gains or chosen == self._chosen.get(stream.name):
                 return tried > 0
             self._chosen[stream.name] = chosen
-            self._others.pop(stream.name, None)  # was about the estimate before the trial
-            self._try(stream, own, _along(best, found, attached))
+            self._others.pop(stream.name, None)  # it belonged to the estimate before the trial
+            self._try(stream, own, _believing(best, found, attached))
         return True
 
     def _try(self, stream: LiveStream, own: list[Entry], others: list[Verdict]) -> None:
-        """Take other verdicts, settle around them, and go back if that is less probable, or if the solver runs away.
+        """Apply other verdicts and iterate; restore the window where that is less probable, or the solver diverges.
 
-        Back by a mark: from far off its steps do not lead back.
+        Restored from a copy: from far off the steps of the solver would not lead back.
         """
         self._window.settle()
         cost, agreement, back = self._cost(stream, own), self._agreement.marked(), self._entries.marked(own)
         try:
             for entry, verdict in zip(own, others, strict=True):
                 self._entries.change(entry, verdict)
-            self._window.settle(_STEPS)  # a metre off, one step says nothing of the cost
-            self._by_hypotheses(stream, self._chapter(stream))
+            self._window.settle(_STEPS)  # a metre off, the cost after one step means nothing
+            self._by_hypotheses(stream, self._group(stream))
             self._window.settle(_STEPS)
             better = self._cost(stream, own) < cost
         except (SolveError, RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):
@@ -293,13 +301,15 @@ class Judge:
         back()
 
     def _cost(self, stream: LiveStream, own: list[Entry]) -> float:
-        """Minus the log of the probability of the window, all hypotheses of a stream summed over."""
-        evidence = log_evidence_of(stream, [e.index for e in own], self._met(own)[1])
+        """Return minus the log probability of the window, marginalised over all hypotheses of a stream."""
+        evidence = log_evidence_of(stream, [e.index for e in own], self._attach(own)[1])
         return self._window.error([e.held for e in own if e.held is not None]) - evidence
 
 
-def _along(modes: Sequence[int | None], found: list[tuple[Residual, ...]], attached: list[Attachment]) -> list[Verdict]:
-    """Return the verdicts that believe these modes, and nothing else."""
+def _believing(
+    modes: Sequence[int | None], found: list[tuple[Residual, ...]], attached: list[Attachment]
+) -> list[Verdict]:
+    """Return the verdicts that believe exactly these modes."""
     return [
         Verdict(
             None if mode is None else Decision(mode=mode), float(mode is not None), 1.0, r[mode or 0], mode or 0, at
