@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a measurement meets the states at the current estimate, of a recorded run or of a live one."""
+"""Attachment of a measurement to the states at the current estimate, offline and online."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from graphloc.graph import Attachment, Constant, Sensor, SlowProcess
 from graphloc.measurements import Measurement
 
 Carry = tuple[int, Any]
-"""A state, and the motion preintegrated from there."""
+"""Number of a state, and the motion preintegrated from there to a measurement."""
 
 
 class Stamps(Protocol):
     """Stamps of states, by number."""
 
     def __getitem__(self, k: int, /) -> Any:
-        """Of one."""
+        """Return the stamp (ns) of a state."""
         ...
 
 
@@ -47,12 +47,12 @@ class Sited(Protocol):
 
     @property
     def timeline(self) -> OnTimeline:
-        """Where the states stand."""
+        """Stamps of the states."""
         ...
 
     @property
     def R_body_imu(self) -> Array:
-        """The IMU's axes."""
+        """Rotation (3, 3) from the IMU's axes to the body's."""
         ...
 
     @property
@@ -76,7 +76,7 @@ class Attaching(Protocol):
 
     @property
     def mount(self) -> Any:
-        """Pose of the sensor from the IMU's place."""
+        """Pose of the sensor from the IMU, body axes."""
         ...
 
     @property
@@ -101,17 +101,17 @@ class Attaching(Protocol):
 
     @property
     def carry(self) -> Any:
-        """Motion to each from the state before it."""
+        """Motion from the state before each measurement to it."""
         ...
 
     @property
     def gyro_radps(self) -> Any:
-        """Raw rate at each."""
+        """Raw angular rate at each measurement, rad/s, body axes."""
         ...
 
     @property
     def apart_s(self) -> Any:
-        """How long after the one before each is, s; inf for the first."""
+        """Time since the measurement before, s; inf for the first."""
         ...
 
 
@@ -140,10 +140,10 @@ def nav_state(values: gtsam.Values, k: int) -> Any:
 
 
 def state_of(m: Measurement, floor: int, nearest: int, stamps_ns: Stamps, holes: Sequence[tuple[int, int]]) -> int:
-    """Return the state that a measurement belongs to: the nearest, or where a hole of the IMU lies in between the one before (`floor`).
+    """Return the state that a measurement attaches to: the nearest, or the one before (`floor`) where an IMU gap lies in between.
 
-    It is carried from there. How the nearest lies to that is a guess across a hole: what tells of the one, written as news of
-    the other, is news again each time it is written.
+    The measurement is propagated from the state before it. Across a gap the motion to the nearest state is uncertain; written as a
+    factor of that state, the measurement would count as new information each time it is linearised.
     """
     start_ns, stop_ns = int(stamps_ns[floor]), int(stamps_ns[nearest])
     in_hole = nearest != floor and m.stamp_ns > start_ns and any(a < stop_ns and b > start_ns for a, b in holes)
@@ -151,7 +151,7 @@ def state_of(m: Measurement, floor: int, nearest: int, stamps_ns: Stamps, holes:
 
 
 def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> Attachment:
-    """Return how measurement `i` of a stream meets the graph at the current estimate."""
+    """Return the attachment of measurement `i` of a stream at the current estimate."""
     k = int(stream.state[i])
     j = int(problem.timeline.slow_of[k])
     T = values.atPose3(keys.pose(k))
@@ -203,7 +203,7 @@ def _next_slow(
 
 
 def constants_of(stream: Attaching, values: gtsam.Values) -> tuple[tuple[int, Array], ...]:
-    """Keys and estimates; what no factor had yet is zero."""
+    """Return keys and estimates of a sensor's constants; zero for those that no factor has yet."""
     if not stream.constants:
         return ()
     return tuple(

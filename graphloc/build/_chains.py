@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps of what varies slowly: IMU biases, and the slow errors of sensors.
+"""Factors of slowly varying states: IMU biases, and the slow errors of sensors.
 
-A slow state is a chain of first-order Gauss-Markov steps, from native factors. Its path measure,
-exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both ends, is a random walk with a
-standing prior at each node: exact as the node period goes to 0, and the steps stay free for a robust loss (a
-`JacobianFactor` with the decay in it takes none). So do the priors: what may stand far off (`SlowProcess.far`) has
-tails, w = 1 / (1 + x^2 / (F s)^2) on all of its part of the measure, so that of two levels one is the usual one.
+A slow error is a first-order Gauss-Markov process (sigma s, time constant T), built from native factors. Its path measure,
+exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both ends, is a random walk with a prior
+about 0 at each node. That is exact as the node period goes to 0, and leaves the steps free for a robust loss (a
+`JacobianFactor` that contains the decay takes none); the priors, too: components that may stay far off (`SlowProcess.far`)
+have tails, w = 1 / (1 + x^2 / (F s)^2), on all of their part of the measure, so that of two levels one is the usual one.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import InertialLink, SlowProcess
 
-# A step of a slow state is believed to be a jump beyond this many sigmas.
+# Loss of a step: beyond this many sigmas it counts as a jump.
 JUMP = KernelConfig(kind="cauchy", scale=2.0)
-_FAR = 2.0  # sigmas from which on an error that may stand far off is believed to
-CONSTANT_TAILS = 9.0  # of a constant's prior: squared sigmas that double its variance
-_NOTHING = 1e6  # sigmas: a prior that says nothing
-_CHAIN_END = 2.0  # times its variance: the prior at either end of a slow chain
+_FAR = 2.0  # F above: sigmas beyond which such a component counts as far off
+CONSTANT_TAILS = 9.0  # squared sigmas at which the variance of a constant's prior doubles
+_NOTHING = 1e6  # sigmas: no information
+_CHAIN_END = 2.0  # variances of the process: the prior at either end of a chain
 
 
 def bias_step(links: InertialLink, j: int, dt_s: float) -> Any:
-    """Return the factor of the bias walk from slow node `j` to the next."""
+    """Return the random walk factor of the bias from slow node `j` to the next."""
     model = gtsam.noiseModel.Diagonal.Sigmas(links.bias_steps(dt_s))
     return gtsam.BetweenFactorConstantBias(keys.bias(j), keys.bias(j + 1), gtsam.imuBias.ConstantBias(), model)
 
 
 def slow_begin(slow: SlowProcess, key: int, known: Array, *, jumps: bool = True) -> Iterator[Any]:
-    """Yield the priors of a chain's first node; `known`: its estimate, for the tails of what is constant."""
+    """Yield the priors of the first node of a chain; `known` (k,): its estimate, which sets the tails of constant components."""
     constant = ~np.isfinite(slow.time_constant_s)
     if constant.any():
         # Why tails: see `_add_constants` in `_graph.py`.
@@ -51,7 +51,11 @@ def slow_begin(slow: SlowProcess, key: int, known: Array, *, jumps: bool = True)
 def slow_step(
     slow: SlowProcess, key: int, following: int, dt_s: float, *, jumps: bool = True, jump_m: float = 0.0
 ) -> Iterator[Any]:
-    """Yield the factors of the step from one node to the next, `dt_s` later; `jump_m`: it has leapt by so much, or something else has."""
+    """Yield the factors of the step to the next node, `dt_s` later.
+
+    Args:
+        jumps: whether steps have a robust loss. jump_m: size of a position jump seen in this step: it, or the vessel, has moved so far.
+    """
     constant = ~np.isfinite(slow.time_constant_s)
     # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
     step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt_s / slow.time_constant_s))
@@ -65,16 +69,16 @@ def slow_step(
 
 
 def slow_end(slow: SlowProcess, key: int, *, jumps: bool = True) -> Iterator[Any]:
-    """Yield what closes a chain at its last node."""
+    """Yield the prior that closes a chain at its last node."""
     yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps)
 
 
 def walk_between_nodes(slow: SlowProcess, period_s: float, apart_s: float) -> Array:
-    """Variance (k,) that each measurement's share is of what a slow state walks between its nodes, where it is held.
+    """Return the variance (k,) to add to each measurement, because its slow error walks on between two nodes.
 
-    n of them, h apart, at one node: their mean is off by what the state has walked since the first in the mean, of variance q h (n - 1)
-    (2n - 1) / 6n, whatever their noise. So each has n times that. Without, fixes good to centimetres know the speed to
-    centimetres a second, by a slow error that walks decimetres.
+    n measurements, h apart, share one node. Whatever their noise, their mean is off by the mean walk since the first, of
+    variance q h (n - 1)(2n - 1) / 6n; so each gets n times that. Without it, fixes good to centimetres would determine the
+    speed to centimetres per second, although their slow error walks by decimetres.
 
     Args:
         period_s: of the nodes. apart_s: h.
@@ -85,12 +89,12 @@ def walk_between_nodes(slow: SlowProcess, period_s: float, apart_s: float) -> Ar
 
 @lru_cache(maxsize=64)
 def _walk_rate(slow: SlowProcess) -> Array:
-    """Variance (k,) that a process gains in a second."""
+    """Return the variance (k,) that a process gains per second: q."""
     return np.where(np.isfinite(slow.time_constant_s), 2.0 * slow.sigma**2 / slow.time_constant_s, 0.0)
 
 
 def closing_variance(slow: SlowProcess, value: Array) -> Array:
-    """Variance (k,) of what closes a chain, as it weighs where its last node is `value`; inf for constants."""
+    """Return the variance (k,) of the prior that closes a chain, re-weighted at `value` (k,), its last node; inf for constants."""
     far = _far(slow)
     square = float(((value[far] / slow.sigma[far]) ** 2).sum())
     tails = np.where(far, 1.0 + square / _FAR**2, 1.0)
@@ -98,7 +102,7 @@ def closing_variance(slow: SlowProcess, value: Array) -> Array:
 
 
 def standing_cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
-    """What a whole chain costs, in nats, by where it stands; of what may stand far off alone.
+    """Return the cost (nats) of the priors of a whole chain, of the components that may stay far off.
 
     Args:
         path: (N, k) nodes. dt_s: (N - 1,) between them.
@@ -111,9 +115,9 @@ def standing_cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
 
 
 def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool) -> Iterator[Any]:
-    """Yield the priors that hold a node where the process stands, `times` (k,) its variance; constants are not held.
+    """Yield the priors about 0 of a node, with `times` (k,) the variance of the process; constants have none.
 
-    What may stand far off has a prior of its own: heights above another zero must not set places free.
+    Components that may stay far off have a prior of their own: a height above another zero must not loosen the horizontal ones.
     """
     held, far = np.isfinite(slow.time_constant_s), _far(slow) & jumps
     for part in (held & ~far, held & far):
@@ -127,7 +131,7 @@ def _far(slow: SlowProcess) -> NDArray[np.bool_]:
 
 
 def _prior(key: int, sigmas: Array, tails: float | None = None) -> Any:
-    """Return a prior at zero; `tails`: sigmas from which on it has those of Cauchy's."""
+    """Return a prior at zero; `tails`: sigmas beyond which it has Cauchy tails."""
     model: Any = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     return gtsam.PriorFactorVector(key, np.zeros(len(sigmas)), model if tails is None else _with_tails(model, tails))
 

@@ -21,13 +21,13 @@ from graphloc.graph import Attachment, Decision, SlowProcess
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Level:
-    """Which way is up, by the mean specific force of a while, in axes that the gyroscope carries along.
+    """Levelling: the vertical, from the mean specific force over some time in axes propagated by the gyroscope.
 
-    It is that of *these* biases. Taken for roll and pitch as such, a levelling that is 20 mrad off bent the accelerometer's
-    bias by 30 mm/s^2, for a minute: the run itself tells tilt less bias to 2 mrad, each for itself only once it has turned.
+    It depends on the biases. Used as a prior on roll and pitch alone, a levelling that was 20 mrad off bent the accelerometer bias
+    by 30 mm/s^2 for a minute: the run determines tilt minus bias to 2 mrad, but each of them only after the vessel has turned.
 
     Attributes:
-        up: (3,) in axes of the body at the first state, at `bias`. by_bias: (3, 6) its change with the bias.
+        up: (3,), unit, in the body's axes at the first state, at `bias`. by_bias: (3, 6) its derivative by the bias.
         bias: (6,), accelerometer first. sigma_rad: of roll and pitch, at the true bias.
     """
 
@@ -37,9 +37,13 @@ class Level:
     sigma_rad: float
 
     def error(self, R: Array, bias: Array) -> tuple[Array, Array, Array]:
-        """Return by how far up (2,), in sigmas, is off the vertical at an attitude (3, 3) and a bias (6,), and its Jacobians.
+        """Return the horizontal part (2,) of `up` in world, in sigmas, and its Jacobians.
 
-        These are (2, 3) by the body's tangent, and (2, 6) by the bias.
+        Args:
+            R: (3, 3), body in world. bias: (6,).
+
+        Returns:
+            Error (2,), Jacobian (2, 3) by the body tangent of the attitude, Jacobian (2, 6) by the bias.
         """
         up = self.up + self.by_bias @ (bias - self.bias)
         horizontal = R[:2] / self.sigma_rad
@@ -51,8 +55,8 @@ class StartPrior:
     """Gaussian prior on the first state of a stretch (covariances; block-diagonal, but for `level`).
 
     Attributes:
-        level: what the specific force says of roll and pitch, whose own share of `pose_cov` is wide then; None: nothing.
-        slow: value and covariance, by the sensor's number; those that are not there have the prior of their kind.
+        level: levelling of roll and pitch (then their part of `pose_cov` is wide); None: no such factor.
+        slow: value (k,) and covariance (k, k), by sensor number; others have the prior of their process.
     """
 
     pose: Any
@@ -67,19 +71,19 @@ class StartPrior:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Past:
-    """All that was before the first state of a stretch: what it says of that state, its slow states and constants, jointly.
+    """All data before a stretch as a joint prior on its first state, its slow states and constants.
 
-    A place and a receiver's slow error may each be hardly known, and their sum well.
+    It is joint because position and slow error of a receiver may each be hardly known, but their sum well.
 
     Attributes:
-        factors: linear ones. known: the keys that they hold.
+        factors: linear ones. known: the keys that they have.
     """
 
     factors: gtsam.NonlinearFactorGraph
     known: Collection[int]
 
 
-# What was decided about (stream number, measurement index), and where it attaches; without it, or None: left out.
+# By (stream number, measurement index): the decision and the attachment; missing or None: left out of the graph.
 Decisions = Mapping[tuple[int, int], tuple[Decision, Attachment] | None]
 
 
@@ -96,10 +100,10 @@ def build_graph(
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """Return the graph of states first..last and the values of its keys.
 
-    `made` is filled with where the factors of each measurement stand in the graph; those between states come first.
-
-    `jumps` lets slow states jump where their process may. Not while the estimate is far off: a GNSS error
-    that may jump explains a dead-reckoned track that is 300 m off better than the track's own correction.
+    Args:
+        jumps: whether slow states may jump where their process allows it. Not while the estimate may be far off: a GNSS error that
+            may jump explains a dead-reckoned track that is 300 m off at less cost than correcting the track.
+        made: filled with the range of factors of each measurement in the graph; those between states come first.
     """
     graph, guess = gtsam.NonlinearFactorGraph(), values.extract(state_keys(problem, first, last))
     for k in range(first, last):
@@ -153,10 +157,10 @@ def _add_constants(
     values: gtsam.Values,
     prior: StartPrior | Past,
 ) -> None:
-    """Those that a factor has, each with its prior: what is not seen in a stretch needs no state there.
+    """Add the constants that a factor of this stretch has, each with its prior.
 
-    The prior has the tails of Student's t, re-weighted at every pass: under a Gaussian one, a tag that was surveyed 0.5 m
-    off drags two good ones along (0.5 m off at the berth, 0.05 m with tails).
+    The prior has the tails of Student's t, re-weighted at every pass: with a Gaussian one, a tag that was surveyed 0.5 m wrong pulls
+    two good ones along (error at the berth 0.5 m; 0.05 m with tails).
     """
     used = set(graph.keyVector()) if stream.constants else set()
     for (key, known), constant in zip(constants_of(stream, values), stream.constants, strict=True):
@@ -175,8 +179,8 @@ def _step(slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool,
     return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, jump_m=jump_m))
 
 
-def _leaps_m(problem: Problem, stream: Stream) -> dict[int, float]:
-    """By slow node: how far the places leap, m, before the next one; from the last place before to the first one after."""
+def _jumps_m(problem: Problem, stream: Stream) -> dict[int, float]:
+    """Return by slow node the size (m) of the position jump before the next node, from the last fix before it to the first after."""
     found: dict[int, float] = {}
     nodes_ns = problem.timeline.slow_stamps_ns
     stamps_ns = [m.stamp_ns for m in stream.measurements]
@@ -229,7 +233,7 @@ def _add_slow_chain(
         else:
             for factor in slow_begin(slow, key[0], np.atleast_1d(values.atVector(key[0])), jumps=jumps):
                 graph.add(factor)
-    leaps_m = _leaps_m(problem, stream)
+    leaps_m = _jumps_m(problem, stream)
     for n, j in enumerate(nodes[:-1]):
         for factor in _step(slow, key[n], key[n + 1], _node_dt_s(problem, j), jumps, leaps_m.get(j, 0.0)):
             graph.add(factor)

@@ -28,7 +28,7 @@ from graphloc.timeline import Timeline, make_timeline
 
 PositionJumps = tuple[NDArray[np.int64], Array]
 _NO_JUMPS: PositionJumps = np.zeros(0, dtype=np.int64), np.zeros(0)
-_NO_DRIFT = 100.0  # times its time constant: nothing tells from motion what drifts, but the IMU what leaps
+_NO_DRIFT = 100.0  # times its time constant: a drift cannot be separated from motion, but the IMU shows a jump
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,14 +37,14 @@ class Stream:
 
     Attributes:
         number: of the sensor, for keys. name, row, config: the sensor.
-        slow: its slow state, or None. left_out: the slow state that it would have in company.
-        position_jumps: of one that alone tells the place, stamps (K,) and sizes (K,), m, of the leaps that its places show.
-        constants: what its measurements may share.
-        mount: pose of the sensor from the IMU's place, body axes.
-        measurements: M of them by stamp. state: (M,) its state (`state_of`). carry: per measurement the
-            preintegrated motion from the state before it, or None where it stands on a state.
+        slow: its slow state, or None. left_out: the slow state that it would have beside a second position sensor.
+        position_jumps: stamps (K,) and sizes (K,), m, of its position jumps, where it alone measures position.
+        constants: that its measurements may share.
+        mount: pose of the sensor from the IMU, body axes.
+        measurements: M of them by stamp. state: (M,) the state of each (`state_of`). carry: for each, the preintegrated motion
+            from the state before it; None where its stamp is that of a state.
         gyro_radps: (M, 3) raw rate at each measurement, body axes.
-        apart_s: (M,) how long after the one before each is; inf for the first.
+        apart_s: (M,) time since the measurement before; inf for the first.
     """
 
     number: int
@@ -72,8 +72,13 @@ class Stream:
 class Problem:
     """A run, ready to be solved.
 
-    `preintegrated` and `inertial` have the motion from each state to the next, and the factor of it: neither depends on
-    the estimate, so every graph shares them. `silent` says of each sensor that has no measurement here why, as a clause.
+    Attributes:
+        t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body.
+        relink: makes the inertial links for a noise scale. links: those of `noise_scale`.
+        preintegrated, inertial: motion from each state to the next, and its factor; neither depends on the estimate, so all graphs
+            share them.
+        rejected: ledger rows of measurements that the graph cannot take.
+        silent: clauses on why sensors have no measurement here.
     """
 
     config: VesselConfig
@@ -97,12 +102,12 @@ Mounts = Mapping[str, tuple[Array, Array]]  # by sensor, from /tf_static: t (3,)
 
 
 def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Array]:
-    """Return (t (3,), R (3, 3)) of a sensor in body: from /tf_static where it was asked for."""
+    """Return the mount of a sensor in body (t (3,), m; R (3, 3)): from /tf_static where configured so."""
     return mounts.get(name) or (config.mount.t_body_sensor_m, config.mount.R_body_sensor)
 
 
 def company_of(config: VesselConfig, rows: Sequence[Sensor], seen: Container[str] | None = None) -> int:
-    """Return how many of the sensors (of those in `seen`, if given) can tell each other's slow errors from motion."""
+    """Return how many sensors (of those in `seen`, if given) can separate each other's slow errors from motion."""
     able = (name for row in rows if row.company for name in config.of_kind(row.kind))
     return sum(seen is None or name in seen for name in able)
 
@@ -117,7 +122,8 @@ def make_problem(
 ) -> Problem:
     """Lay out the timeline, preintegrate, and attach every measurement.
 
-    `company`: how many sensors can tell each other's slow errors from motion; by default those that the recording has.
+    Args:
+        company: how many sensors can separate each other's slow errors from motion; default: counted in the recording.
 
     Raises:
         SolveError: the recording has no usable IMU data.
@@ -262,13 +268,13 @@ def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
 
 
 def with_links(problem: Problem, preintegrated: tuple[Any, ...]) -> Problem:
-    """Return the problem with the motion from each state to the next, and the factors of that."""
+    """Return the problem with other preintegrated motions from each state to the next, and their factors."""
     inertial = _inertial(problem.timeline, problem.links, preintegrated)
     return replace(problem, preintegrated=preintegrated, inertial=inertial)
 
 
 def bridged(problem: Problem, values: gtsam.Values) -> Problem:
-    """Return the problem with the links across the IMU's holes made anew: what goes on there is what was before, by `values`."""
+    """Return the problem with new links across IMU gaps: the vessel continues there as it moved before, by `values`."""
     timeline, zero = problem.timeline, gtsam.imuBias.ConstantBias()
     preintegrated, inertial = list(problem.preintegrated), list(problem.inertial)
     for start_ns, stop_ns in problem.links.gaps():
@@ -283,7 +289,7 @@ def bridged(problem: Problem, values: gtsam.Values) -> Problem:
 
 
 def _position_jumps(row: Sensor, measurements: Sequence[Measurement], datum: Datum, *, allowed: bool) -> PositionJumps:
-    """Stamps and sizes of the leaps of a sensor that alone tells the place."""
+    """Return stamps and sizes of the position jumps of the only sensor that measures position."""
     hints = [(m.stamp_ns, row.hint(m, 0.0, datum)) for m in measurements]
     told = [(n, hint) for n, hint in hints if np.isfinite(hint.p_world_m[:2]).all()]
     stamps_ns = np.array([n for n, _ in told], dtype=np.int64)
@@ -294,7 +300,7 @@ def _position_jumps(row: Sensor, measurements: Sequence[Measurement], datum: Dat
 
 
 def apart_s_of(measurements: Sequence[Measurement]) -> Array:
-    """Return how long after the one before each of M measurements is (M,), s; inf for the first."""
+    """Return the time since the measurement before, of M measurements (M,), s; inf for the first."""
     stamps_ns = [m.stamp_ns for m in measurements]
     return np.concatenate([[np.inf], np.diff(stamps_ns) * 1e-9])[: len(stamps_ns)]
 

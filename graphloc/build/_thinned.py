@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run with few states and measurements: enough to find about where it went, and what of the rest to believe.
+"""A thinned run: few states and measurements, enough for a rough track that the other measurements can be judged by.
 
-Sensors without hypotheses keep one measurement for each slow node; those with them keep all. States that none of these
-needs are held by the IMU alone, and one link from state to state says the same as ten.
+Sensors without hypotheses keep one measurement per slow node; those with hypotheses keep all. Between the states that these
+need, one preintegrated IMU link carries the same information as ten.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from graphloc.build._problem import Problem, Stream, apart_s_of, with_links
 from graphloc.time import duration_ns
 from graphloc.timeline import Timeline
 
-_LONGEST_NS = duration_ns(1.0)  # of a link: so far a bias that is off is corrected well enough to first order
+_LONGEST_NS = duration_ns(1.0)  # of a link: up to here the first-order bias correction is accurate enough
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thinned:
-    """A thinned run, and what of the whole one is in it.
+    """A thinned run, and which states and measurements of the whole one it has.
 
     Attributes:
         problem: the run; its slow nodes are those of the whole one.
@@ -48,7 +48,7 @@ class Thinned:
         return kept
 
     def filled(self, whole: Problem, values: gtsam.Values) -> gtsam.Values:
-        """Return the values of the whole run from those of this one: what lies between two states is dead-reckoned."""
+        """Return the values of the whole run from those of this one; states in between are dead-reckoned."""
         nodes = range(len(whole.timeline.slow_stamps_ns))
         filled = values.extract(_shared_keys(whole, nodes, values))
         for k, (first, following) in enumerate(pairwise([*self.states.tolist(), len(whole.timeline)])):
@@ -63,7 +63,7 @@ class Thinned:
 
 
 def thinned(problem: Problem) -> Thinned:
-    """Return a run without what is not needed to find about where it went."""
+    """Return a run reduced to what a rough track needs."""
     chosen = {stream.number: _chosen(problem, stream) for stream in problem.streams}
     states = _states(problem, chosen)
     timeline = problem.timeline
@@ -81,14 +81,14 @@ def thinned(problem: Problem) -> Thinned:
 
 
 def _chosen(problem: Problem, stream: Stream) -> NDArray[np.int64]:
-    """Indices of the measurements that stay."""
+    """Return the indices of the measurements that are kept."""
     if stream.row.false is not None:
         return np.arange(len(stream.measurements))
     return np.flatnonzero(np.diff(problem.timeline.slow_of[stream.state], prepend=-1) > 0)
 
 
 def _states(problem: Problem, chosen: Mapping[int, NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Numbers of the states that stay: at both ends, where measurements are or are carried from, at the nodes, and in holes."""
+    """Return the states that are kept: both ends, states of measurements or before them, slow nodes, one per second, and IMU gaps."""
     timeline, last = problem.timeline, len(problem.timeline) - 1
     second = (timeline.stamps_ns - timeline.stamps_ns[0]) // _LONGEST_NS
     kept = [np.array([0, last]), *(np.flatnonzero(np.diff(n, prepend=-1) > 0) for n in (timeline.slow_of, second))]
@@ -102,7 +102,7 @@ def _states(problem: Problem, chosen: Mapping[int, NDArray[np.int64]]) -> NDArra
 
 
 def _thin(stream: Stream, indices: NDArray[np.int64], states: NDArray[np.int64]) -> Stream:
-    """A stream with the measurements that stay, on the states that stay."""
+    """Return a stream with the kept measurements, on the kept states."""
     few = indices.tolist()
     measurements, carried = tuple(stream.measurements[i] for i in few), [stream.carry[i] for i in few]
     return replace(
@@ -116,7 +116,7 @@ def _thin(stream: Stream, indices: NDArray[np.int64], states: NDArray[np.int64])
 
 
 def _shared_keys(problem: Problem, nodes: range, values: gtsam.Values) -> list[int]:
-    """Keys that are the same in the whole run and the thinned one: of slow nodes and constants."""
+    """Return the keys that the whole and the thinned run share: slow nodes and constants."""
     names = [keys.bias(j) for j in nodes]
     names += [keys.slow(s.number, j) for s in problem.streams if s.slow is not None for j in nodes]
     return names + [key for s in problem.streams for key in constant_keys(s) if values.exists(key)]

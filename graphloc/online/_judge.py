@@ -91,7 +91,7 @@ class Judge:
             self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
         elif stream.row.false is None:
             verdict, widened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
-            # Where its kernel was widened it was let in; whether it agrees is seen when it is asked again.
+            # Behind a widened kernel it is used, but whether it agrees shows only when it is judged again.
             if not widened or verdict.weight < AGREES:
                 self._agreement.note(stream, m, verdict)
             entry = Entry(stream, i, verdict, widened=widened)
