@@ -138,14 +138,14 @@ def _smooth(yaw: Array, at_s: Array) -> NDArray[np.bool_]:
     """Return (N,) which headings lie on a turn that they tell without the gyroscope: steady within `_NEAR_S` to either side."""
     steps = wrap_angle(np.diff(yaw))
     way = np.concatenate([[0.0], np.cumsum(steps)])
-    leaps = np.concatenate([[0], np.cumsum(np.abs(steps) > np.radians(_LEAP_DEG))])
+    too_far = np.concatenate([[0], np.cumsum(np.abs(steps) > np.radians(_LEAP_DEG))])
     sums = [np.concatenate([[0.0], np.cumsum(of)]) for of in (at_s, way, at_s**2, at_s * way, way**2)]
     first, last = np.searchsorted(at_s, at_s - _NEAR_S), np.searchsorted(at_s, at_s + _NEAR_S, side="right")
     n = np.maximum(last - first, 1)
     t, y, tt, ty, yy = [(total[last] - total[first]) / n for total in sums]
     line = (ty - t * y) ** 2 / np.maximum(tt - t**2, 1e-9)
     rest = np.sqrt(np.maximum(yy - y**2 - line, 0.0))
-    return np.asarray((n > _FEW) & (leaps[last - 1] == leaps[first]) & (rest < np.radians(_SMOOTH_DEG)))
+    return np.asarray((n > _FEW) & (too_far[last - 1] == too_far[first]) & (rest < np.radians(_SMOOTH_DEG)))
 
 
 def _said(headings: Sequence[CompassHeading]) -> Yaws:

@@ -17,8 +17,8 @@ from graphloc.measurements import Measurement, PoseFix
 from graphloc.replay import replay
 from graphloc.solve._best_chain import best_chain
 from graphloc.solve._decide import Verdict, by_hypotheses
-from graphloc.solve._foreseen import Prediction
 from graphloc.solve._hypotheses import FalseSequence
+from graphloc.solve._prediction import Prediction
 from graphloc.solve._warnings import joint_rejection_warning
 
 SIGMA_M = 0.2

@@ -20,7 +20,7 @@ from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._motion_model import UNSURE_MPS, Moving
 from graphloc.online._window import Held, Window
-from graphloc.solve._foreseen import Prediction, prediction_of
+from graphloc.solve._prediction import Prediction, prediction_of
 
 _HOLE_S = 1.0  # an IMU gap that the motion model is not applied across
 _AWAY_M = 2e3  # no vessel moves so far between two states, even across the longest IMU gap that is bridged

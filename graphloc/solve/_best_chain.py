@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which measurements of a sensor are right, wherever that is.
+"""The most probable chain of right measurements of a sensor, however far from the estimate.
 
-An estimate in the wrong place still has the right shape, so the residuals of the right measurements lie along one
-slowly moving offset from it. Where the estimate is a prediction, loose enough to believe two measurements that
-contradict each other, it tells which.
+An estimate in the wrong place still has the right shape, so the residuals of the right measurements share one slowly changing
+offset. Where the estimate is a prediction so loose that two measurements that contradict each other both fit, the chain decides
+between them.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 
 from graphloc.build import Judged
 from graphloc.graph import Residual
-from graphloc.solve._foreseen import Prediction, carried, kept_of, moved, taken_of, walk_of
 from graphloc.solve._hypotheses import log_repeat
+from graphloc.solve._prediction import Prediction, carried, kept_of, moved, taken_of, walk_of
 
 _LOOK_BACK = 64  # candidates for the right one before
 
@@ -28,11 +28,11 @@ def best_chain(
 ) -> list[int | None]:
     """Return which mode of each of N measurements of a stream is right on the most probable chain; None: none is.
 
-    The longest path: nodes are modes taken for right, and an edge gains what its end gains over being false, as
-    its begin tells where it should be. False ones between that repeat each other gain too.
+    It is a longest path: nodes are modes taken for right; the gain of an edge is the log likelihood ratio (right over false) of
+    its end, predicted from its beginning. False measurements in between that repeat each other add to the gain.
 
     Args:
-        predictions: N, which bound where a chain begins; None: it may lie anywhere.
+        predictions: N, which limit where a chain may begin; None: anywhere.
     """
     taken, models = taken_of(stream, indices)
     dof, count = len(residuals[0][0].raw), len(residuals)

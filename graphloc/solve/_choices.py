@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Other choices of modes and weights than those that the estimate confirms.
 
-Choices confirm themselves: the estimate follows them. Three others are made here: along the most probable
-chain of measurements that agree with each other, by what the run says of each stretch without its own, and without
-what is believed at the ends.
+A choice confirms itself, because the estimate follows it. Three others are tried here: the most probable chain of measurements
+that agree with each other; each stretch judged by a solution without its own measurements; and without those believed at the
+ends.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _AROUND_PASSES = 6
 def other_choices(
     problem: Problem, few: Thinned, settled: Settled, prior: StartPrior
 ) -> Iterator[tuple[Verdicts, int]]:
-    """Each of the three, with the iterations it took, made of what `settled` is by then."""
+    """Yield each of the three, with the iterations it took, from `settled` as it is by then."""
     yield along_best_chains(problem, settled.values, settled.verdicts), 0
     yield _judged_by_the_rest(few, settled, prior)
     yield _without_its_ends(problem, settled), 0
@@ -51,8 +51,8 @@ def other_choices(
 def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tuple[Verdicts, int]:
     """Weigh each stretch's hypotheses by the solution of the thinned run without them and their neighbours.
 
-    Hypotheses that took part in the estimate speak for themselves, and a wrong choice confirms itself. Every
-    third stretch is judged at once, so three solutions do for the whole run.
+    A hypothesis that took part in the estimate supports itself, so a wrong choice would be confirmed. Every third stretch is judged
+    at once, so three solutions are enough for the whole run.
     """
     problem, values = few.problem, few.of(settled.values)
     start_ns = int(problem.timeline.stamps_ns[0])
@@ -68,7 +68,7 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
         around = {
             key for key, t in at_s.items() if (t / _STRETCH_S - third + _STRETCH_MARGIN) % 3 < 1 + 2 * _STRETCH_MARGIN
         }
-        if not own or len(around) == len(at_s):  # nothing to judge, or nothing to judge it by
+        if not own or len(around) == len(at_s):  # nothing to judge, or no measurements to judge it by
             continue
         rest = _without(problem, values, everything, prior, around)
         fresh = weigh(
@@ -89,7 +89,7 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
 
 
 def _decided(few: Thinned, verdicts: Verdicts, values: gtsam.Values) -> Decisions:
-    """What is decided of the measurements of a thinned run by verdicts about the whole one."""
+    """Return the decisions on the measurements of a thinned run, from verdicts on the whole one."""
     decided: dict[tuple[int, int], tuple[Decision, Attachment] | None] = {}
     for stream in few.problem.streams:
         for i, whole in enumerate(few.chosen[stream.number].tolist()):
@@ -100,9 +100,9 @@ def _decided(few: Thinned, verdicts: Verdicts, values: gtsam.Values) -> Decision
 
 
 def _without_its_ends(problem: Problem, settled: Settled) -> Verdicts:
-    """Refuse what is believed at either end of a sensor's measurements, where others near by are refused.
+    """Reject what is believed at either end of a sensor's measurements, where others near by are rejected.
 
-    There only one side speaks against a few false ones that agree.
+    At an end, evidence against a few false measurements that agree comes from one side only.
     """
     others = dict(settled.verdicts)
     for stream in problem.streams:
@@ -129,14 +129,14 @@ class _Rest(NamedTuple):
 def _without(
     problem: Problem, estimate: gtsam.Values, decided: Decisions, prior: StartPrior, left_out: set[tuple[int, int]]
 ) -> _Rest:
-    """One step of the whole run without what is left out."""
+    """Take one step of the whole run without some measurements."""
     kept = {key: found for key, found in decided.items() if key not in left_out}
     tree = bayes_tree(*build_graph(problem, estimate, kept, 0, len(problem.timeline) - 1, prior))
     return _Rest(gtsam.Values(tree.calculateBestEstimate()), tree)
 
 
 def _decisive(verdict: Verdict, at: Attachment) -> Verdict:
-    """All or nothing: half a belief in each of several that repeat each other is enough to bend the estimate to them."""
+    """Round weights to 0 or 1: half a weight for each of several that repeat each other would pull the estimate to them."""
     sure = verdict.weight > _SURE
     return replace(verdict, decision=Decision(mode=verdict.mode) if sure else None, weight=float(sure), at=at)
 
@@ -166,7 +166,7 @@ def take_more_probable(problem: Problem, settled: Settled, others: Verdicts, pri
 
 
 def _groups(problem: Problem, some: Verdicts, others: Verdicts) -> list[list[tuple[int, int]]]:
-    """Measurements that are believed in the one and not in the other, split where they are far apart in time."""
+    """Return the measurements that are believed in one and not in the other, split where they are far apart in time."""
     stamps = problem.timeline.stamps_ns
     differ = sorted(
         (key for key, v in some.items() if abs(others[key].weight - v.weight) > 0.5),
@@ -192,7 +192,7 @@ def _index_around(problem: Problem, k: int, seconds: float) -> int:
 
 
 class _Around(NamedTuple):
-    """A stretch solved on its own: values, verdicts, and -log of its probability, all hypotheses summed over."""
+    """A stretch solved on its own: values, verdicts, and -log of its probability, marginalised over all hypotheses."""
 
     values: gtsam.Values
     verdicts: Verdicts
@@ -208,7 +208,7 @@ def _solve_around(
     prior: StartPrior,
     unlike: Verdicts | None = None,
 ) -> _Around | None:
-    """Solve a stretch until its choices stand; None where they become those of `unlike`."""
+    """Solve a stretch until its choices no longer change; None where they become those of `unlike`."""
     local = copy_states(problem, values, max(first - 1, 0), min(last + 1, len(problem.timeline) - 1))
     for _ in range(_AROUND_PASSES):
         step = solve_until_written_there(problem, local, first, last, prior, decisions(verdicts), tol=1e-3)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to believe of each measurement, given an estimate: modes, weights, kernels.
+"""Decisions on each measurement, given an estimate: mode, weight, kernel.
 
-Sensors without hypotheses keep their kernel. Sensors with modes are weighed as a mixture: each mode has
-a density, and so has 'false'. The weight is the posterior probability that the chosen mode is right.
-Where the prediction stands without the measurement, its covariance is added to the measurement's, so
-that a state that has drifted through an outage does not lock the truth out.
+Sensors without hypotheses keep their kernel. Sensors with hypotheses are weighed as a mixture: each mode has a density, and so
+has 'false'. The weight is the posterior probability that the chosen mode is right. Where the estimate is a prediction (without
+the measurement), its covariance is added to the measurement's, so that a state that has drifted through an outage does not
+reject the right measurements.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
 from graphloc.solve._best_chain import best_chain
-from graphloc.solve._foreseen import Prediction, foresee, prediction_of
 from graphloc.solve._hypotheses import log_evidence_of, sequence_of
+from graphloc.solve._prediction import Prediction, predict_residuals, prediction_of
 
 # By stage, for every sensor that has a kernel at all: Huber is convex, so a start that is tens of metres
 # off still pulls in; Cauchy forgets outliers better and still lets the truth back in.
@@ -35,7 +35,7 @@ _STAGE_KERNEL = {"far": KernelConfig(kind="huber", scale=1.5), "open": KernelCon
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
 # How far apart pairs of residuals are; multiples of the latter, whole turns taken off, spread them evenly.
 _LAGS_S, _GOLDEN = (2.0, 4.0), 0.618
-_WIDEST = 1e9  # sigmas: a sensor that lies by more (0.1 mm stated, 100 km off) is no less an outlier for it
+_WIDEST = 1e9  # sigmas: larger residuals (0.1 mm stated, 100 km off) count the same
 AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
 
@@ -51,7 +51,7 @@ class Verdict:
         decision: None leaves the measurement out. mode: the chosen one, also then.
         weight: posterior probability that the mode is right (or the kernel's weight).
         mode_probability: of the chosen mode among the modes.
-        residual: of the chosen mode. at: where the measurement meets the graph.
+        residual: of the chosen mode. at: its attachment.
         settled: pass over the whole run from which on this mode was the chosen one.
     """
 
@@ -71,7 +71,7 @@ Verdicts = dict[tuple[int, int], Verdict]
 def _predicted(
     found: tuple[Residual, ...], at: Attachment, k: int, covariance: PredictedCovariance
 ) -> Prediction | None:
-    """What the prediction of a state knows of a residual; None: it is no prediction."""
+    """Return the prediction of a residual; None where the estimate already contains the measurement."""
     P = covariance(k, at.pose_key)
     if P is None or (V := covariance(k, keys.velocity(k))) is None:
         return None
@@ -90,7 +90,7 @@ def weigh(
     hypotheses: bool = True,
     only: Container[tuple[int, int]] | None = None,
 ) -> Verdicts:
-    """Decide about the measurements of states first..last.
+    """Decide on the measurements of states first..last.
 
     Args:
         problem: the run. values: current estimate.
@@ -99,7 +99,7 @@ def weigh(
         covariance: (state, key) -> covariance of the key's prediction (a pose's in the body tangent), or None.
         hypotheses: weigh sensors that can be false by their hypotheses; else by the stage's kernel, on the
             nearest mode.
-        only: decide about these alone, all of sensors that can be false.
+        only: decide on these alone, all of sensors with hypotheses.
     """
     verdicts: Verdicts = {}
     for stream in problem.streams:
@@ -143,10 +143,10 @@ def _by_kernel(
     best = [float(nis[a + m]) for a, m in zip(starts, mode, strict=False)]
     own, limit = stream.config.kernel, _STAGE_KERNEL.get(stage, stream.config.kernel)
     gentle = _CONVEXITY.index(own.kind) <= _CONVEXITY.index(limit.kind)
-    # The norm of k whitened residuals is about sqrt(k) where all is well: bend that much later.
+    # The norm of k whitened residuals is about sqrt(k): the threshold is larger by that.
     dof = len(residuals[0][0].raw)
     spread = _spread(best, dof)
-    if spread > 1.0 and not stream.row.absolute:  # of places, what they have in common may be the estimate's own error
+    if spread > 1.0 and not stream.row.absolute:  # of positions, a shared error may be that of the estimate
         pairs = _pairs(stream, indices, [found[m] for m, found in zip(mode, residuals, strict=True)])
         spread = min(spread, _spread(pairs, dof)) if len(pairs) >= dof + 4 else spread
     scale = min(own.scale * spread * float(np.sqrt(dof)), _WIDEST)
@@ -167,19 +167,20 @@ def _nis(residuals: list[Residual]) -> Array:
 
 
 def _spread(nis: list[float], dof: int) -> float:
-    """How many times wider than configured the residuals of a sensor are, as a whole; at least 1.
+    """Return by what factor the residuals of a sensor scatter more than configured, at least 1: its kernel is widened by it.
 
-    A loss that bends at 1.5 sigmas around an estimate that is 100 sigmas off sees outliers only, and
-    re-weighting then creeps; one that bends too early for noise that is configured too small rejects a
-    good sensor (measured on KITTI: 97 % of the fixes lost, 23 m off). So the bend follows the median.
+    Around an estimate that is 100 sigmas off, a loss with a threshold of 1.5 sigmas sees only outliers, and re-weighting converges
+    slowly; and where the noise is configured too small, it rejects a good sensor (measured on KITTI: 97 % of the fixes lost,
+    23 m off). So the threshold follows the median of the residuals.
     """
     return max(1.0, float(np.sqrt(np.median(nis) / chi2_median(dof)))) if nis else 1.0
 
 
 def _pairs(stream: Stream, indices: list[int], residuals: list[Residual]) -> list[float]:
-    """Half the squares of what normalised residuals 2 to 4 s apart differ by: what they have in common is no scatter.
+    """Return half the squared differences of normalised residuals 2 to 4 s apart: an error that they share is no scatter.
 
-    Taken for it, a compass that was 90 deg off for more than half of a window bent its kernel at 90 deg, and turned the run.
+    If it were counted, a compass that is 90 deg off for more than half of a window would widen its kernel to 90 deg and turn the run
+    (measured).
     """
     stamps_ns = np.array([stream.measurements[i].stamp_ns for i in indices])
     lags_s = np.interp(np.arange(len(indices)) * _GOLDEN % 1.0, (0.0, 1.0), _LAGS_S)
@@ -196,10 +197,10 @@ def by_hypotheses(
     residuals: list[tuple[Residual, ...]],
     predictions: list[Prediction | None],
 ) -> list[Verdict]:
-    """Judge measurements of a sensor that can be false, as a sequence (see `sequence_of`).
+    """Judge measurements of a sensor with hypotheses as a sequence (see `sequence_of`).
 
-    Two that contradict each other, both in the graph, bend a loose prediction to where neither is right. So of what is
-    judged by a prediction, only the most probable chain of those is believed that agree.
+    Two measurements that contradict each other, both in the graph, pull a loose prediction to where neither is right. So of those
+    judged by a prediction, only the most probable chain of measurements that agree is believed.
     """
     new = {n: prediction for n, prediction in enumerate(predictions) if prediction is not None}
     chain: list[int | None] = [None] * len(residuals)
@@ -207,10 +208,10 @@ def by_hypotheses(
         chosen = best_chain(stream, [indices[n] for n in new], [residuals[n] for n in new], list(new.values()))
         for n, mode in zip(new, chosen, strict=True):
             chain[n] = mode
-    foreseen = foresee(stream, indices, residuals, predictions, chain)
-    posterior = sequence_of(stream, indices, residuals, predictions, foreseen).posterior()
+    conditioned = predict_residuals(stream, indices, residuals, predictions, chain)
+    posterior = sequence_of(stream, indices, residuals, predictions, conditioned).posterior()
     verdicts = []
-    for n, (modes, cov, _) in enumerate(foreseen):
+    for n, (modes, cov, _) in enumerate(conditioned):
         logs = np.array([r.log_density(cov) for r in modes])
         on = chain[n]
         mode, weight = int(np.argmax(logs)) if on is None else on, float(posterior[n])
@@ -222,7 +223,7 @@ def by_hypotheses(
 
 
 def log_evidence(problem: Problem, values: gtsam.Values, first: int, last: int) -> float:
-    """Log probability of all hypotheses of states first..last together, around an estimate."""
+    """Return the log probability of states first..last around an estimate, marginalised over all hypotheses."""
     total = 0.0
     for stream in problem.streams:
         if stream.row.false is not None:
@@ -233,7 +234,7 @@ def log_evidence(problem: Problem, values: gtsam.Values, first: int, last: int) 
 
 
 def along_best_chains(problem: Problem, values: gtsam.Values, verdicts: Verdicts) -> Verdicts:
-    """Return the verdicts that believe each sensor's most probable chain, wherever it lies."""
+    """Return the verdicts that believe each sensor's most probable chain, however far from the estimate."""
     changed = dict(verdicts)
     for stream in problem.streams:
         if stream.row.false is None:
@@ -248,7 +249,7 @@ def along_best_chains(problem: Problem, values: gtsam.Values, verdicts: Verdicts
 
 
 def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> Decisions:
-    """Return what the graph builder needs of verdicts; what is in `without` is left out."""
+    """Return the decisions of verdicts for the graph builder, without those of `without`."""
     return {key: None if v.decision is None or key in without else (v.decision, v.at) for key, v in verdicts.items()}
 
 

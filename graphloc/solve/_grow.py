@@ -30,9 +30,9 @@ from graphloc.solve._stretch import (
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
 _SETTLED_M = 0.5
 _MAX_FAR_ROUNDS, _FAR_SETTLED_M = 8, 2.0
-# Starts that cost this much more (log-likelihood) are dropped; while others live, the window grows.
+# Starts that cost this much more (log-likelihood) are dropped; while several remain, the window grows.
 _COST_APART, _LONGEST_START_S = 8.0, 60.0
-_PLACE_S, _LATE_PLACE_S = 5.0, 90.0  # of places in the first window; and by when they come at the latest
+_PLACE_S, _LATE_PLACE_S = 5.0, 90.0  # of positions in the first window; latest time of the first one
 # Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
 _START_STAGES = (("far", 8, 0.5, False), ("open", 2, 0.5, False), ("final", 2, 0.5, True))
 
@@ -75,10 +75,10 @@ def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
 
 
 def _placed_s(problem: Problem) -> float:
-    """How far the first window must reach for a place to be in it, s; 0 where none comes soon.
+    """Return how long (s) the first window must be to contain a position measurement; 0 where none comes soon.
 
-    Without one the next window would be dead reckoned, with biases that are hardly known: after 15 s, what tags say of a place
-    that is 300 m off cannot be weighed by it.
+    Without one the next window would be dead reckoning with poorly known biases: after 15 s it may be 300 m off, and tags cannot be
+    judged by such a prediction.
     """
     stamps = problem.timeline.stamps_ns
     first_ns = [s.measurements[0].stamp_ns for s in problem.streams if s.row.absolute and s.measurements]
@@ -124,7 +124,7 @@ def _start_prior(problem: Problem, start: Start, yaw: float) -> StartPrior:
 
 
 def _different(ranked: list[_Candidate]) -> list[_Candidate]:
-    """Drop what is clearly dearer than the cheapest, and what has come to the same heading as a cheaper one."""
+    """Drop candidates that cost clearly more than the cheapest, or have converged to the heading of a cheaper one."""
     kept: list[_Candidate] = []
     for candidate in ranked:
         yaw = candidate.values.atPose3(keys.pose(0)).rotation().yaw()
@@ -171,7 +171,7 @@ def grow(
 
     Args:
         chunk_s, overlap_s: how far a step goes, and how far back its window reaches.
-        watch: is told the last state of each window and what was decided in it: what one knew then.
+        watch: called with the last state of each window and the decisions in it, as known at that time.
     """
     stamps, slow_of, end = problem.timeline.stamps_ns, problem.timeline.slow_of, len(problem.timeline) - 1
     prior: StartPrior | Past = start
@@ -198,9 +198,9 @@ def _solve_grown(
 ) -> tuple[int, StretchStep, Verdicts]:
     """Solve a window whose states after `known` are new, in place; return iterations, the last step and its verdicts.
 
-    New hypotheses wait until the rest has said where the vessel is, and how well it knows: with false matches
-    in it, a window solved under Huber alone is off by many of its own sigmas (0.01 rad/s of gyro bias, 300 m
-    after 20 s of dead reckoning).
+    New hypotheses are judged only after the other measurements have given an estimate with its covariance: with false matches in it, a
+    window solved with Huber losses alone is off by many of its own sigmas (0.01 rad/s of gyro bias, 300 m after 20 s of dead
+    reckoning).
     """
     fresh = {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
     iterations = 0

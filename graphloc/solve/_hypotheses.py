@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Right or false: the measurements of one sensor that can be false, as a sequence.
+"""Right or false: the measurements of one sensor with hypotheses, as a hidden Markov chain.
 
-A false measurement's error is drawn anew, or repeats that of the false one before it. So right and false
-form a chain of two states, and forward-backward gives each posterior of that chain: without the repeats, six
-scans that take the same wrong boat for the right one outweigh IMU and GNSS together. Of what is judged by a
-prediction, each state is two: what a right one tells the next (`foresee`) holds once one has been right.
+The error of a false measurement is drawn independently, or repeats that of the false one before it. So right and false form a
+chain with two states, and forward-backward gives the posteriors. Without the repeats, six scans that take the same wrong boat
+for the right one would outweigh IMU and GNSS together. For measurements judged by a prediction each state is split in two,
+before and after the first right one: only then is the prediction conditioned on it (`predict_residuals`).
 
-That is local: around an estimate. `best_chain` is global.
+This is local, around an estimate; `best_chain` is global.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from graphloc import gauss
 from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
-from graphloc.solve._foreseen import Foreseen, Prediction, moved, taken_of
+from graphloc.solve._prediction import PredictedResidual, Prediction, moved, taken_of
 
 
 @dataclass(frozen=True, slots=True)
 class FalseSequence:
-    """Log of prior x density of N measurements in turn, before [0] and after [1] a new one among them was right.
+    """Log of prior x density of N measurements in order; [0]: before, [1]: after a new one among them was right.
 
     Attributes:
         right: (2, N) of any mode being right. fresh, repeated: (2, N) of all being false, after a right one and
@@ -39,7 +39,7 @@ class FalseSequence:
     new: NDArray[np.bool_]
 
     def posterior(self) -> Array:
-        """Probability (N,) that a mode is right."""
+        """Return the probability (N,) that a mode is right."""
         ahead = self._ahead()
         back = np.zeros_like(ahead)
         for n in range(len(back) - 2, -1, -1):
@@ -53,7 +53,7 @@ class FalseSequence:
         return np.asarray(np.exp(both[:, 0] - np.logaddexp(both[:, 0], both[:, 1])))
 
     def log_evidence(self) -> float:
-        """Log probability of the whole sequence."""
+        """Return the log probability of the whole sequence."""
         return float(np.logaddexp.reduce(self._ahead()[-1], axis=None)) if len(self.new) else 0.0
 
     def _ahead(self) -> Array:
@@ -73,18 +73,18 @@ def sequence_of(
     indices: Sequence[int],
     residuals: Sequence[tuple[Residual, ...]],
     predictions: Sequence[Prediction | None],
-    foreseen: Sequence[Foreseen],
+    conditioned: Sequence[PredictedResidual],
 ) -> FalseSequence:
     """Return the sequence of a stream's measurements.
 
     Args:
         stream: the sensor; its row has a false model. indices: N of its measurements.
         residuals: N tuples, one residual for each mode.
-        predictions: N, or None where it took part in the estimate. foreseen: the residuals, given a chain.
+        predictions: N, or None where it took part in the estimate. conditioned: the residuals, predicted given a chain.
     """
     taken, models = taken_of(stream, indices)
     densities = np.zeros((2, 2, len(models)))  # right or false, before or after
-    for n, (found, prediction, seen, model) in enumerate(zip(residuals, predictions, foreseen, models, strict=True)):
+    for n, (found, prediction, seen, model) in enumerate(zip(residuals, predictions, conditioned, models, strict=True)):
         P = None if prediction is None else prediction.cov
         densities[:, 0, n] = densities[:, 1, n] = log_right_and_false(found, P, model)
         if seen.modes is not found:
@@ -103,13 +103,13 @@ def sequence_of(
 
 
 def log_evidence_of(stream: Judged, indices: Sequence[int], residuals: Sequence[tuple[Residual, ...]]) -> float:
-    """Log probability of measurements of a stream that took part in the estimate, all hypotheses summed over."""
-    seen = [Foreseen(found, None) for found in residuals]
+    """Return the log probability of measurements that took part in the estimate, marginalised over all hypotheses."""
+    seen = [PredictedResidual(found, None) for found in residuals]
     return sequence_of(stream, indices, residuals, [None] * len(seen), seen).log_evidence()
 
 
 def log_right_and_false(modes: tuple[Residual, ...], P: Array | None, model: FalseModel) -> tuple[float, float]:
-    """Log of prior x density of any mode being right, and of all being false. The prediction's covariance widens both."""
+    """Return the log of prior x density: that any mode is right, and that all are false; both widened by the prediction's covariance."""
     right = np.logaddexp.reduce([r.log_density(P) for r in modes])
     around = model.cov if P is None else model.cov + P
     share = np.log([r.prior for r in modes]) - np.log(sum(r.prior for r in modes))
@@ -118,9 +118,10 @@ def log_right_and_false(modes: tuple[Residual, ...], P: Array | None, model: Fal
 
 
 def log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...], walked: Array | float = 0.0) -> float:
-    """Log density of seeing the error of one measurement again in the next, over pairs of modes.
+    """Return the log density that the error of one measurement repeats in the next, over pairs of modes.
 
-    `walked`: covariance (k, k) of what the estimate's own error has moved in between.
+    Args:
+        walked: (k, k) covariance of how much the error of the estimate has changed in between.
     """
     if len(before[0].raw) != len(now[0].raw):
         return -np.inf

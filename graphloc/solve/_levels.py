@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""At which of its levels the error of a receiver usually stands, where nothing but such errors tells the place.
+"""Which level of a jumping receiver is the usual one (zero error), where no other sensor measures position.
 
-A run grows from its first level, and no single step of the solver leads from one to another. So the levels that jumps lead
-to are compared: by where the errors would stand, and for how long far off, for a jump ends within a minute.
+A run grows from its first level, and no single step of the solver leads to another one. So the levels that the jumps lead to
+are compared as candidates: by the size of the errors that would result, and for how long they last, as a jump ends within a
+minute.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ from graphloc.solve._decide import Verdicts, weigh
 from graphloc.solve._passes import Settled, settle
 from graphloc.time import NS_PER_S
 
-_JUMP = 1.0  # sigmas from one node to the next: ten times what an error drifts
-_FAR = 2.0  # sigmas: nearer, it is where it usually is
-_LASTS_S = 30.0  # a jump, in the mean
+_JUMP = 1.0  # sigmas from one node to the next: ten times the drift
+_FAR = 2.0  # sigmas: nearer, the error is at its usual level
+_LASTS_S = 30.0  # mean duration of a jump
 
 
 def at_usual_level(
     problem: Problem, settled: Settled, prior: StartPrior, progress: Progress, most: int
 ) -> tuple[Settled, Array]:
-    """Return the solution with the most probable of the levels as the usual one, settled in `most` passes, and what the others leave.
+    """Return the solution with the most probable level as the usual one, settled in at most `most` passes.
 
-    The latter is a covariance (3, 3) of the place, m^2, in world.
+    Also returns the covariance (3, 3) of the position that the other levels add, m^2, in world.
     """
     alone = np.zeros((3, 3))
     streams = [s for s in problem.streams if s.slow is not None and s.slow.far]
@@ -52,7 +53,7 @@ def at_usual_level(
     verdicts = weigh(problem, values, first=0, last=len(problem.timeline) - 1, stage="final")
     other = settle(problem, values, verdicts, prior, progress, most)
     if _error(other) - _error(settled) > cost[0] - cost[usual]:
-        return settled, alone  # something else holds the place
+        return settled, alone  # another sensor determines the position
     return other, others
 
 
@@ -61,19 +62,19 @@ def _error(settled: Settled) -> float:
 
 
 def _told_otherwise(problem: Problem, verdicts: Verdicts) -> bool:
-    """Whether a sensor without such an error tells the place, too."""
+    """Whether a sensor without such an error measures position, too."""
     others = {s.number for s in problem.streams if s.row.absolute and (s.slow is None or not s.slow.far)}
     return any(number in others and v.weight > 0.5 for (number, _), v in verdicts.items())
 
 
 def _path(problem: Problem, values: gtsam.Values, stream: Stream) -> Array:
-    """How an error goes (N, 3) from node to node, m."""
+    """Return the slow error (N, 3) at the nodes, m."""
     nodes = range(len(problem.timeline.slow_stamps_ns))
     return np.array([np.atleast_1d(values.atVector(keys.slow(stream.number, j))) for j in nodes])
 
 
 def _levels(slow: SlowProcess | None, path: Array) -> list[Array]:
-    """Where an error (N, 3) stands from one jump to the next, (3,) each, m: but where it usually is, and each level once."""
+    """Return the levels (3,), m, of an error (N, 3) between its jumps: each once, without the usual one."""
     assert slow is not None
     held = path * [axis in slow.far for axis in slow.axes]
     jumps = 1 + np.flatnonzero(np.linalg.norm(np.diff(held / slow.sigma, axis=0), axis=1) > _JUMP)
@@ -86,7 +87,7 @@ def _levels(slow: SlowProcess | None, path: Array) -> list[Array]:
 
 
 def _cost(slow: SlowProcess | None, path: Array, dt_s: Array) -> float:
-    """Of an error that goes so (N, 3), nats: where it stands, and the time that it is far off."""
+    """Return the cost (nats) of an error (N, 3): of its size, and of the time that it is far off."""
     assert slow is not None
     far = [axis in slow.far for axis in slow.axes]
     away = np.linalg.norm(path[:, far] / slow.sigma[far], axis=1) > _FAR
@@ -94,7 +95,7 @@ def _cost(slow: SlowProcess | None, path: Array, dt_s: Array) -> float:
 
 
 def _moved(problem: Problem, values: gtsam.Values, streams: list[Stream], by_m: Array) -> gtsam.Values:
-    """The same run so far (3,) away in world, and as far from what these streams say of it."""
+    """Return the run shifted by (3,), m, in world, and the slow errors of these streams shifted to match."""
     moved = gtsam.Values(values)
     for k in range(len(problem.timeline)):
         pose = values.atPose3(keys.pose(k))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Passes over the whole run, with given decisions or until they stand."""
+"""Passes over the whole run: with given decisions, or until modes and weights no longer change."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from graphloc.solve._stretch import moved
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
 _MAX_OPEN_PASSES, _OPEN_SETTLED_M = 4, 0.5
-_UPHILL = 1.1  # times the cost before: from there a single step has not landed
+_UPHILL = 1.1  # times the cost before: above it a single step has failed
 _OUTLIER = 0.1  # weight under its own kernel below which a measurement is an outlier
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One optimisation of the whole run: what came out of which graph, and how far any pose moved."""
+    """One optimisation of the whole run: values, the graph they come from, and how far any pose moved."""
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
@@ -41,7 +41,7 @@ def optimise_run(
 
 
 def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Step:
-    """One step of the whole run; more where it comes out uphill, by more than a step on curved ground ever does at the end."""
+    """Take one step over the whole run, and iterate only where the cost rises by more than a nonlinear step near the minimum does."""
     last = len(problem.timeline) - 1
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
     values, iterations = full_step(graph, guess), 1
@@ -53,7 +53,7 @@ def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, pri
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settled:
-    """A solution of the whole run, and the graph whose last step led there."""
+    """A solution of the whole run, and the graph of its last step."""
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
@@ -71,12 +71,12 @@ def settle(
     progress: Progress,
     most: int,
 ) -> Settled:
-    """Passes until modes and weights stand, `most` of them."""
+    """Run passes until modes and weights no longer change, at most `most`."""
     last, iterations = len(problem.timeline) - 1, 0
     done: Step | None = None
     for n in range(most):
         done = None  # frees its graph before the next one is made: gigabytes on a run of hours
-        # The first pass takes out the seams of the windows; from then on one step at a time is enough.
+        # The first pass removes the seams between windows; after it one step per pass is enough.
         done = (optimise_run if n == 0 else refine_run)(problem, estimate, verdicts, prior)
         estimate, iterations = done.values, iterations + done.iterations
         used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage="final")
@@ -96,7 +96,7 @@ def settle(
 
 
 def _date(verdicts: Verdicts, before: Verdicts, n: int) -> None:
-    """Note in `verdicts`, in place, since when each mode stands: since pass `n` where it was another one before."""
+    """Note in `verdicts`, in place, since which pass each mode is unchanged: `n` where it has just changed."""
     for key, verdict in verdicts.items():
         old = before[key]
         settled = old.settled if old.mode == verdict.mode else n
@@ -105,14 +105,14 @@ def _date(verdicts: Verdicts, before: Verdicts, n: int) -> None:
 
 
 def changed(before: Verdicts, after: Verdicts) -> float:
-    """The largest change of any weight."""
+    """Return the largest change of any weight."""
     return max((abs(v.weight - before[key].weight) for key, v in after.items()), default=0.0)
 
 
 def open_passes(
     problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress
 ) -> tuple[gtsam.Values, int, int]:
-    """Solve the whole run with gentle losses. Carries and anchors depend on the estimate: build anew until it stands."""
+    """Solve the whole run with gentle losses; rebuild the graph until the estimate no longer moves, as attachments depend on it."""
     last = len(problem.timeline) - 1
     passes = iterations = 0
     for stage in ("far", "open"):
@@ -128,9 +128,10 @@ def open_passes(
 
 
 def outliers_cost(verdicts: Verdicts) -> float:
-    """What measurements that the sensor's own kernel has judged outliers are to 2 x the cost.
+    """Return the share of outliers (by the sensor's own kernel) in 2 x the cost.
 
-    The kernel bends where the sensor's median says, so they are few and far off. No noise of another sensor explains them.
+    The kernel width follows the median of the sensor's residuals, so outliers are few and far off: no noise of another sensor
+    explains them.
     """
     return sum(
         v.decision.kernel.cost(v.residual.nis())
@@ -140,7 +141,7 @@ def outliers_cost(verdicts: Verdicts) -> float:
 
 
 def expected_cost(problem: Problem, verdicts: Verdicts) -> float:
-    """Degrees of freedom of the weighted problem: what 2 x its cost is expected to be."""
+    """Return the degrees of freedom of the weighted problem: the expectation of 2 x its cost."""
     n, m = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
     expected = sum((v.residual.expected_nis or len(v.residual.raw)) * v.weight for v in verdicts.values())
     expected += 9.0 * (n - 1) + 6.0 * (m - 1) + 15.0 - 9.0 * n - 6.0 * m

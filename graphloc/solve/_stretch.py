@@ -23,7 +23,7 @@ from graphloc.build import (
 from graphloc.frames import Array
 from graphloc.solve._optimize import optimize
 
-_MOVED_M, _MOST_TIMES = 0.3, 4  # a solution so far from where it was written is written anew, at most so often
+_MOVED_M, _MOST_TIMES = 0.3, 4  # distance at which factors are linearised again, and how often at most
 
 
 class StretchStep(NamedTuple):
@@ -51,7 +51,7 @@ def solve_stretch(
     jumps: bool = True,
     tol: float = 3e-3,
 ) -> StretchStep:
-    """Optimise states first..last in place, roughly: what it leaves, the passes over the whole run take up."""
+    """Optimise states first..last in place, roughly: the passes over the whole run do the rest."""
     made: dict[tuple[int, int], range] = {}
     graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps, made=made)
     solved = optimize(graph, guess, 15, tol)
@@ -70,9 +70,9 @@ def solve_until_written_there(
     *,
     tol: float = 3e-3,
 ) -> StretchStep:
-    """`solve_stretch`, again and again while it moves away from where its factors were written.
+    """Repeat `solve_stretch` while the solution moves away from where its factors were linearised.
 
-    What is decided of sensors with hypotheses is linear about the estimate. Written a metre away, a right sighting is left
+    Factors of sensors with hypotheses are linear about the estimate. Linearised a metre away, a right sighting leaves the solution
     tenths of a metre off, and judged there it looks false.
     """
     begin, iterations = values.extract(state_keys(problem, first, last)), 0
@@ -86,7 +86,7 @@ def solve_until_written_there(
 
 
 def _written_anew(problem: Problem, values: gtsam.Values, first: int, last: int, decided: Decisions) -> Decisions:
-    """What is decided of a stretch, where it meets the graph now, of sensors with hypotheses."""
+    """Return the decisions of a stretch with the attachments of sensors with hypotheses at the present estimate."""
     written = dict(decided)
     for stream in problem.streams:
         if stream.row.false is not None:
@@ -98,7 +98,7 @@ def _written_anew(problem: Problem, values: gtsam.Values, first: int, last: int,
 
 def moved(old: gtsam.Values, new: gtsam.Values) -> float:
     """How far any pose moved, m (1 rad counts as 10 m)."""
-    # Of a graph that measurements contradict grossly the first steps go anywhere: no number is far enough then.
+    # Where measurements contradict each other grossly, the first steps may be huge: an overflow to infinity is meant here.
     with np.errstate(over="ignore"):
         apart = gtsam.utilities.extractPose3(new) - gtsam.utilities.extractPose3(old)  # (poses, 9 of R and 3)
         # Two rotations by an angle a apart differ by 2 sqrt(2) sin(a / 2), squares of all nine summed.
@@ -115,7 +115,7 @@ def update_states(problem: Problem, values: gtsam.Values, new: gtsam.Values, fir
 
 
 def copy_states(problem: Problem, values: gtsam.Values, first: int, last: int) -> gtsam.Values:
-    """The states first..last and their slow states."""
+    """Return the values of states first..last and of their slow states."""
     constants = [key for key in _constants(problem) if values.exists(key)]
     return values.extract(state_keys(problem, first, last) + constants)
 
@@ -150,7 +150,7 @@ def dead_reckon(problem: Problem, values: gtsam.Values, known: int, until: int) 
 
 
 def weak_prior(problem: Problem, values: gtsam.Values, k: int) -> StartPrior:
-    """A prior on state `k` that only keeps a stretch determined; what the stretch measures outweighs it."""
+    """Return a wide prior on state `k`, which only keeps a stretch determined."""
     j = int(problem.timeline.slow_of[k])
     slow = slow_at(problem, values, j)
     return StartPrior(
@@ -165,9 +165,9 @@ def weak_prior(problem: Problem, values: gtsam.Values, k: int) -> StartPrior:
 
 
 def past_at(problem: Problem, step: StretchStep, k: int) -> Past:
-    """What a solved stretch says of state `k`, the first one of its slow node, by what it has from before.
+    """Return the joint prior that a solved stretch gives for state `k`, the first one of its slow node, from data before it.
 
-    Measurements of the states from there on are left out: the next stretch has them, and they would count twice.
+    Measurements from that state on are left out: the next stretch has them, and they would count twice.
     """
     names = np.array(list(step.values.keys()), dtype=np.uint64)
     letter, index = keys.parts(names)

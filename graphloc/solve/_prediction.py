@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a prediction says of the measurements of one sensor, together: its error is one error, which they share.
+"""Predictions of the residuals of one sensor, jointly: the measurements share the error of the predicted estimate.
 
-The error is a smooth process of unit variance in each of m independent directions. A root (k, m) for each measurement
-says what these do to its residual, so what a right one before tells of the next is the mean and the
-covariance of one Gaussian given another. Each by itself, two measurements that contradict each other both fit a
-prediction that is loose, and two that agree to centimetres under one that is 20 m off look like a repeated error.
+This error is modelled as a smooth process of unit variance in each of m independent directions. A root (k, m) per measurement
+maps it to the residual, so that a right measurement conditions the prediction of the next (Gaussian conditioning). Without
+this, two measurements that contradict each other would both fit a loose prediction, and two that agree to centimetres, with a
+prediction that is 20 m off, would look like a repeated false error.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from graphloc.frames import Array
 from graphloc.graph import Attachment, FalseModel, Residual
 from graphloc.measurements import Measurement
 
-_LASTS_S = 60.0  # at most: in which the error of a prediction becomes another one
+_LASTS_S = 60.0  # largest correlation time of the error of a prediction
 # How fast the offset of an estimate in the wrong place may move besides: a random walk of this share of a false
 # error's size in a second (0.1 m of 5 m).
 _OFFSET_WALK = 0.02
 
 
-class Foreseen(NamedTuple):
-    """A residual, its prediction's error known as far as right ones before it tell.
+class PredictedResidual(NamedTuple):
+    """A residual, its prediction conditioned on the right measurements before it.
 
     Attributes:
-        modes: the residual of each mode, less the error that is expected.
-        cov: (k, k) of the error that is left; None: the measurement took part in the estimate.
-        possible: False where it contradicts the chain of those that are taken for right.
+        modes: residual of each mode, less the expected error.
+        cov: (k, k) of the remaining error; None: the measurement took part in the estimate.
+        possible: False where it contradicts the chain of measurements taken for right.
     """
 
     modes: tuple[Residual, ...]
@@ -41,10 +41,10 @@ class Foreseen(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """What a prediction knows of a residual.
+    """The prediction of a residual.
 
     Attributes:
-        root: (k, m) of its covariance. lasts_s: in which the error becomes another one: sigma of place over that of velocity.
+        root: (k, m), root of its covariance. lasts_s: correlation time of the error: sigma of position over that of velocity.
     """
 
     root: Array
@@ -57,24 +57,24 @@ class Prediction(NamedTuple):
 
 
 def prediction_of(residual: Residual, at: Attachment, P: Array, velocity_cov: Array) -> Prediction:
-    """Return what a prediction knows of a residual.
+    """Return the prediction of a residual.
 
     Args:
-        P: (m, m) of the state's pose in the body tangent (6), and of the sensor's slow state, where it has one: also for
-            a residual that has no part in that (a tag on the quay beside those of a dock), whose root is as wide.
-        velocity_cov: (3, 3) in (m/s)^2. A start knows its place better than its velocity: a moment later it errs otherwise.
+        P: (m, m) of the state's pose in the body tangent (6) and of the sensor's slow state, where it has one; also for a residual
+            that does not depend on the latter (a tag on the quay beside those of a dock), so that all roots have the same width.
+        velocity_cov: (3, 3), (m/s)^2. Where velocity is less certain than position (at a start), the error changes quickly.
     """
     J = residual.jacobian()
     if (others := len(P) - J.shape[1]) > 0:
         slow = np.zeros((len(J), others)) if residual.slow_jacobian is None else residual.slow_jacobian()
         J = np.hstack([J, slow])
     turn = np.eye(len(P))
-    # In world axes: an error stays where it is as the vessel turns.
+    # In the axes of world: an error keeps its direction while the vessel turns.
     turn[:3, :3] = turn[3:6, 3:6] = at.T_world_body.rotation().matrix()
-    # The symmetric root is one that changes little where P does, so that those of two states go together.
+    # The symmetric root is continuous in P, so that the roots of two states belong together.
     values, vectors = np.linalg.eigh(turn @ P @ turn.T)
     root = J @ turn.T @ (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    if residual.velocity_jacobian is not None:  # what pose and velocity err together is left out: it is little
+    if residual.velocity_jacobian is not None:  # the correlation of pose and velocity is small and left out
         values, vectors = np.linalg.eigh(velocity_cov)
         by_velocity = residual.velocity_jacobian() @ (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
         root = np.hstack([root, by_velocity])
@@ -82,14 +82,14 @@ def prediction_of(residual: Residual, at: Attachment, P: Array, velocity_cov: Ar
     return Prediction(root, min(float(np.sqrt(max(squared, 0.0))), _LASTS_S))
 
 
-def foresee(
+def predict_residuals(
     stream: Judged,
     indices: Sequence[int],
     residuals: Sequence[tuple[Residual, ...]],
     predictions: Sequence[Prediction | None],
     chain: Sequence[int | None],
-) -> list[Foreseen]:
-    """Return the residuals of N measurements as the prediction has them, given those before that are right.
+) -> list[PredictedResidual]:
+    """Return the residuals of N measurements, each predicted conditional on the right ones before it.
 
     Args:
         predictions: N, or None where the measurement took part in the estimate.
@@ -100,12 +100,12 @@ def foresee(
     seen, last = [], None
     for n, (found, prediction) in enumerate(zip(residuals, predictions, strict=True)):
         if prediction is None:
-            seen.append(Foreseen(found, None))
+            seen.append(PredictedResidual(found, None))
             continue
         mode_now = chain[n]
         possible = mode_now is not None or not chained
         if last is None:
-            seen.append(Foreseen(found, prediction.cov, possible))
+            seen.append(PredictedResidual(found, prediction.cov, possible))
         else:
             j, before, mode = last
             m = stream.measurements[indices[n]]
@@ -114,19 +114,21 @@ def foresee(
             right = residuals[j][mode]
             mean, cov = carried(right.raw[None], right.cov[None], before.root[None], prediction.root, kept)
             modes = tuple(replace(r, raw=r.raw - mean[0]) for r in found)
-            seen.append(Foreseen(modes, cov[0] + walk_of(stream.row.false(m, stream.config)) * age_s, possible))
+            seen.append(
+                PredictedResidual(modes, cov[0] + walk_of(stream.row.false(m, stream.config)) * age_s, possible)
+            )
         if mode_now is not None:
             last = n, prediction, mode_now
     return seen
 
 
 def kept_of(before_s: Array, now_s: float, ages_s: Array) -> Array:
-    """Return the share (J,) of the error that is still the same, between two that last so long: it changes as a velocity does."""
+    """Return the correlation (J,) between the errors of two predictions with these correlation times: smooth, as of an integrated velocity."""
     return np.asarray(np.exp(-0.5 * (ages_s / np.maximum(np.minimum(before_s, now_s), 1e-6)) ** 2))
 
 
 def carried(raw: Array, cov: Array, roots: Array, root: Array, kept: Array) -> tuple[Array, Array]:
-    """Return mean (J, k) and covariance (J, k, k) of the error in a residual, from one of J before it that is right.
+    """Return mean (J, k) and covariance (J, k, k) of the error in a residual, conditional on each of J right ones before it.
 
     Args:
         raw: (J, k) residuals. cov: (J, k, k) of the measurements. roots: (J, k, m). kept: (J,), see `kept_of`.
@@ -138,7 +140,7 @@ def carried(raw: Array, cov: Array, roots: Array, root: Array, kept: Array) -> t
 
 
 def moved(before: Prediction | None, now: Prediction | None, age_s: float) -> Array | float:
-    """Return the covariance (k, k) of what the error has changed from one residual to the next."""
+    """Return the covariance (k, k) of the change of the error from one residual to the next."""
     if before is None or now is None:
         alone = before or now
         return 0.0 if alone is None else alone.cov
@@ -150,12 +152,12 @@ def moved(before: Prediction | None, now: Prediction | None, age_s: float) -> Ar
 
 
 def walk_of(model: FalseModel) -> Array:
-    """Return the covariance (k, k) that an offset gains in a second besides."""
+    """Return the covariance (k, k) that an offset gains per second in addition."""
     return np.asarray(_OFFSET_WALK**2 * model.cov)
 
 
 def taken_of(stream: Judged, indices: Sequence[int]) -> tuple[list[Measurement], list[FalseModel]]:
-    """Return measurements of a sensor that can be false, and what is known of each one's errors."""
+    """Return measurements of a sensor with hypotheses, and the error model of each."""
     assert stream.row.false is not None
     taken = [stream.measurements[i] for i in indices]
     return taken, [stream.row.false(m, stream.config) for m in taken]
