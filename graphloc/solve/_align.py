@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start alignment: what the first seconds say about attitude, heading, position, velocity and bias.
+"""Start alignment: attitude, heading, position, velocity and gyro bias from the first seconds.
 
-It looks at a window, never at one measurement: gyro bias from standstill or from what the headings of
-the window leave over, roll and pitch from the mean specific force in a frame carried along by the
-gyroscope, heading from poses, compass or course. Where headings disagree, or none is known, several
-candidates go out and the solver tries each.
+It uses a window, never a single measurement: gyro bias from standstill, or from the difference between headings and integrated
+rates; roll and pitch from the mean specific force in a frame propagated by the gyroscope; heading from poses, compass or
+course. Where headings disagree, or none is known, there are several candidates, and the solver tries each.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from graphloc.time import duration_ns, utc_text
 
 _STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
 _STILL_SPEED_MPS = 0.15
-_USUAL_SPEED_MPS = 10.0  # where nothing is known of it
+_USUAL_SPEED_MPS = 10.0  # 1 sigma, where the speed is unknown
 _BLOCK_S, _SWELL_S = 0.5, 10.0
-_CARRIED_RAD = np.radians(20.0)  # 1 sigma of the gyro's bias: a heading that comes later is no heading of the start
-_OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, before any force is felt
-MOVED_M = 15.0  # travel from which a heading can be told without a heading sensor
+_CARRIED_RAD = np.radians(20.0)  # error by gyro bias, 1 sigma: from later on, a heading is no longer one of the start
+_OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, without accelerometer data
+MOVED_M = 15.0  # travel from which the heading is observable without a heading sensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,12 +38,12 @@ class Start:
     """A start: level attitude without heading, and candidates for the heading.
 
     Attributes:
-        R_level_body: (3, 3) attitude with yaw 0. tilt_sigma_rad: of roll and pitch, where `level` says nothing of them.
+        R_level_body: (3, 3) attitude with yaw 0. tilt_sigma_rad: of roll and pitch, where there is no `level`.
         yaws_rad: candidates. yaw_sigma_rad: of each (wide where it is a guess).
         p_world_m, p_sigma_m, v_world_mps, v_sigma_mps: (3,) each.
         gyro_bias_radps, gyro_bias_sigma_radps: (3,) in IMU axes.
-        window_s: span over which the candidates have to be told apart.
-        notes: what the alignment went by.
+        window_s: span over which the candidates must be distinguished.
+        notes: what the alignment is based on.
     """
 
     R_level_body: Array
@@ -64,7 +63,7 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class _Track:
-    """Positions (antenna taken to body as far as attitude is not needed): t (M,) s, p (M, 3), sigma (M, 3)."""
+    """Positions in world, moved from antenna to body as far as that needs no attitude: t (M,), s; p (M, 3), m; sigma (M, 3), m."""
 
     t: Array
     p: Array
@@ -75,7 +74,7 @@ def align(problem: Problem) -> Start:
     """Return the start of a run.
 
     Raises:
-        SolveError: nothing in the run says where it is.
+        SolveError: no sensor measures position.
     """
     origin = int(problem.imu.stamps_ns[0])
     window = problem.config.start.window_s
@@ -115,7 +114,7 @@ def align(problem: Problem) -> Start:
 
 
 def _hints(problem: Problem, origin: int) -> dict[str, list[tuple[float, Hint]]]:
-    """Per sensor what its measurements say by themselves, with their times, s."""
+    """Return by sensor the hints (position, heading, velocity) of its measurements, with their times, s."""
     found = {}
     for stream in problem.streams:
         R_sensor = stream.mount.rotation().matrix()
@@ -137,7 +136,7 @@ def _track(hints: dict[str, list[tuple[float, Hint]]]) -> _Track:
 
 
 def _yaws(hints: dict[str, list[tuple[float, Hint]]]) -> dict[str, Array]:
-    """Per sensor (M, 3): t in s, yaw of the body in rad, sigma in rad."""
+    """Return by sensor (M, 3): time (s), yaw of the body (rad), sigma (rad)."""
     rows = {
         name: [(t, h.yaw_rad, h.yaw_sigma_rad) for t, h in found if np.isfinite(h.yaw_rad)]
         for name, found in hints.items()
@@ -156,7 +155,7 @@ def _samples(problem: Problem, start_s: float, stop_s: float) -> tuple[Array, Ar
 
 
 def _standstill(problem: Problem, track: _Track, yaws: dict[str, Array]) -> tuple[float, float] | None:
-    """The longest stretch of the whole run (at least 3 s) in which nothing turns, moves or shakes."""
+    """Return the longest stretch of the run (at least 3 s) without rotation, acceleration or vibration."""
     span = float((problem.imu.stamps_ns[-1] - problem.imu.stamps_ns[0]) * 1e-9)
     t, f, w = _samples(problem, 0.0, span)
     block = np.floor(t).astype(np.int64)
@@ -176,7 +175,7 @@ def _standstill(problem: Problem, track: _Track, yaws: dict[str, Array]) -> tupl
 
 
 def _rests(track: _Track, yaws: dict[str, Array], first: float, last: float) -> bool:
-    """Whether positions and headings agree that a quiet stretch is no steady glide or turn."""
+    """Whether positions and headings confirm that a quiet stretch is standstill, and no steady motion or turn."""
     inside = (track.t >= first) & (track.t <= last)
     if inside.sum() < 4 or np.ptp(track.t[inside]) < 0.5 * (last - first):
         return False
@@ -194,7 +193,7 @@ def _rests(track: _Track, yaws: dict[str, Array], first: float, last: float) -> 
 
 
 def _slope(t: Array, y: Array) -> float:
-    """Theil-Sen slope: the median over pairs a good way apart."""
+    """Return the Theil-Sen slope: the median over pairs that are far enough apart."""
     n = len(t)
     i = np.arange(n)
     j = (i + max(n // 2, 1)) % n
@@ -221,11 +220,11 @@ def _gyro_bias(
         near = rows[rows[:, 0] <= window]
         if len(near) >= 8 and np.ptp(near[:, 0]) > 0.5 * window:
             rate = _slope(near[:, 0], np.unwrap(near[:, 1]))
-            # A slope from two halves of the window, outliers and slow errors of the sensor allowed for.
+            # A slope from two halves of the window, with allowance for outliers and slow errors of the sensor.
             sigma[2] = min(sigma[2], 0.002 + 0.1 / np.ptp(near[:, 0]))
             bias[2] = mean[2] - rate
             break
-    # Roll and pitch come back to where they were (to 0.1 rad): what is left of their mean rate is bias.
+    # Roll and pitch return to where they were (to 0.1 rad): the rest of their mean rate is bias.
     turn = abs(rate) if rate is not None else abs(mean[2])
     around = np.hypot(0.1 / span, 0.1 * turn)
     bias[:2] = np.where(around < prior[:2], mean[:2], 0.0)
@@ -236,10 +235,10 @@ def _gyro_bias(
 
 
 def _swell(t: Array, w: Array) -> Array:
-    """How far the mean rate (3,) of a quiet stretch may be from zero because the vessel rides on slow waves, rad/s.
+    """Return how far (3,), rad/s, the mean rate of a quiet stretch may be from zero because of slow waves.
 
-    Three quiet seconds are half a swell, whose rates do not average out: what means of half a second scatter by is what
-    their mean may be off, less only where the stretch is longer than waves are.
+    Three quiet seconds are half a period of swell, whose rates do not average out: the mean may be off by as much as means over half
+    a second scatter, and by less only where the stretch is longer than wave periods.
     """
     block = np.floor((t - t[0]) / _BLOCK_S).astype(np.int64)
     starts = np.flatnonzero(np.diff(block, prepend=-1))  # a gap may leave blocks empty
@@ -248,7 +247,7 @@ def _swell(t: Array, w: Array) -> Array:
 
 
 def _turns(problem: Problem, span_s: float, bias: Array) -> Callable[[float], Array]:
-    """Return a function t -> R_body0_body(t), integrated from the gyroscope over the run's beginning."""
+    """Return a function t (s) -> R_body0_body(t) (3, 3), integrated from the gyroscope over the beginning of the run."""
     span = float((problem.imu.stamps_ns[-1] - problem.imu.stamps_ns[0]) * 1e-9)
     t, _, w = _samples(problem, 0.0, min(span_s, span))
     R = np.empty((len(t), 3, 3))
@@ -266,7 +265,7 @@ def _level(
     turn: Callable[[float], Array],
     bias: Array,
 ) -> tuple[Array, float, Level | None, str]:
-    """Roll and pitch at the start, as R (3, 3) with yaw 0; their sigma; what they go by; a note.
+    """Return roll and pitch at the start as R (3, 3) with yaw 0, their sigma, the levelling factor, and a note.
 
     Args:
         turn: t -> R_body0_body(t), by the gyroscope less its bias (3,), in body axes.
@@ -283,7 +282,7 @@ def _level(
     by_gyro = np.einsum("nij,njk->ik", [skew(v) for v in forces[1:]], turned) / len(t)
     by_bias = np.hstack([-R.mean(axis=0), by_gyro]) @ np.kron(np.eye(2), problem.R_body_imu) / force
     pitch, roll = np.arctan2(-up[0], np.hypot(up[1], up[2])), np.arctan2(up[1], up[2])
-    # What a change of speed over the window does to the mean force: 2 m/s over its length.
+    # Effect of a change of speed on the mean force: 2 m/s over the length of the window.
     sigma = 0.01 if still else float(np.clip(2.0 / STANDARD_GRAVITY_MPS2 / max(span, 1.0), 0.02, 0.1))
     level = Level(
         up=up,
@@ -298,7 +297,7 @@ def _level(
 def _headings(
     problem: Problem, track: _Track, yaws: dict[str, Array], turn: Callable[[float], Array]
 ) -> tuple[tuple[float, ...], float, float, str]:
-    """Candidates for the yaw at the start, their sigma, the window that tells them apart, a note."""
+    """Return candidates for the yaw at the start, their sigma, the span that distinguishes them, and a note."""
     config = problem.config.start
     candidates: list[float] = []
     sources = []
@@ -334,7 +333,7 @@ def _headings(
 
 
 def _moved_at(track: _Track) -> float | None:
-    """When the vessel has moved so far that its way tells a heading, s; None: it does not."""
+    """Return when (s) the vessel has travelled far enough for a heading from its course; None: never."""
     moved = np.hypot(*(track.p[:, :2] - np.median(track.p[:5, :2], axis=0)).T)
     noise = 5.0 * float(np.nanmedian(track.sigma[:, :2]))
     far = np.flatnonzero(moved > max(MOVED_M, noise))
@@ -359,7 +358,7 @@ def _position_and_velocity(
     p0 = np.array([np.nanmedian(c) if np.isfinite(c).any() else 0.0 for c in track.p[near].T])
     every = [h for found in hints.values() for _, h in found]
     heights = [h.p_world_m[2] for h in every if np.isnan(h.p_world_m[0]) and np.isfinite(h.p_world_m[2])]
-    if heights:  # of sensors that tell nothing else: the waterline is surer than GNSS
+    if heights:  # sensors of height alone: the waterline is more certain than GNSS
         p0[2] = heights[0]
     v0, unsure = np.zeros(3), 0.0
     speeds = [h.v_world_mps for h in every if np.isfinite(h.v_world_mps).all()]
@@ -369,7 +368,7 @@ def _position_and_velocity(
         soon = track.t <= first + 5.0
         soon[: min(4, len(soon))] = True
         slope = np.array([_slope(track.t[soon], track.p[soon, i]) for i in range(2)])
-        # Two sightings within a quarter of a second, each a metre off, tell a speed to 6 m/s at best.
+        # Two sightings within a quarter of a second, each a metre off, give the speed to 6 m/s at best.
         noise = float(np.median(np.nan_to_num(track.sigma[soon, :2], nan=5.0))) / max(
             float(np.std(track.t[soon]) * np.sqrt(soon.sum())), 1e-3
         )
@@ -377,7 +376,7 @@ def _position_and_velocity(
         v0[:2], unsure = share * slope, float(np.sqrt(share)) * noise
     v_sigma = np.full(3, 0.2 if still else float(np.hypot(3.0, unsure)))
     v_sigma[2] = 0.2 if still else 1.0
-    # Carried back to the first state, straight: what the vessel did before the first position is unknown.
+    # Extrapolated back to the first state in a straight line: the motion before the first position is unknown.
     back_s = max(float(np.median(track.t[near])), 0.0)
     p0[:2] -= v0[:2] * back_s
     sigma = np.full(3, 10.0) + 3.0 * np.nan_to_num(track.sigma[near], nan=5.0).max(axis=0)

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The offline solver: align, grow, then decide about the whole run.
+"""The offline solver: align, grow, then decide over the whole run.
 
 1. Align over a window; try each candidate heading on it and keep the cheapest (`_align`, `_grow`).
-2. Grow, some seconds at a time, each window solved with a prior from what was before. Hypotheses that
-   are new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
+2. Grow by some seconds at a time, each window solved with a prior from earlier data. Hypotheses that are
+   new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
    thinned run (`graphloc.build.thinned`).
-3. Passes over the whole run: modes and weights re-chosen until they stand (`_passes`).
-4. Look for other choices that are more probable (`_choices`), and pass again where there are any.
-5. Where receivers jump and nothing else tells the place, take the level that is the usual one (`_levels`).
+3. Passes over the whole run: modes and weights re-chosen until they no longer change (`_passes`).
+4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any.
+5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
 6. A Bayes tree of the last graph gives the covariances of every state.
 
-An inertial sensor that contradicts the rest gets more noise, and 3 and 4 are done again, from gentle losses on.
+Where the IMU contradicts the other sensors, its noise is scaled up, and 3 and 4 are repeated, beginning with gentle losses.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import Settled, expected_cost, open_passes, outliers_cost, settle
 
 _MAX_NOISE_ROUNDS = 5
-# Before other choices are tried, the passes need not stand: what creeps on is a choice that confirms itself.
+# Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
 _FIRST_PASSES, _LAST_PASSES = 6, 15
-CONTRADICTION = 2.5  # times its expectation: a cost from which the IMU noise is not believed
+CONTRADICTION = 2.5  # cost over its expectation, from which the configured IMU noise is not believed
 LARGEST_NOISE_SCALE = 10.0  # no IMU is so many times noisier than configured
 
 
@@ -53,14 +53,12 @@ class BatchResult:
     converged: bool
     noise_scale: float
     prior: StartPrior
-    headings: int  # that explained the start as well as the one that was taken, and this one
-    levels_cov: (
-        Array  # (3, 3) of the place, m^2: levels of receivers that may be the usual ones as well (see `_levels`)
-    )
+    headings: int  # number of candidates that explain the start about equally well
+    levels_cov: Array  # (3, 3) of the position, m^2, by other levels that may be the usual ones (see `_levels`)
     notes: tuple[str, ...]
 
     def lightened(self) -> BatchResult:
-        """The same without tree and graph, which are gigabytes of a run of hours."""
+        """Return the same without tree and graph, which take gigabytes on a run of hours."""
         return replace(self, tree=gtsam.ISAM2(), graph=gtsam.NonlinearFactorGraph())
 
 
@@ -113,11 +111,9 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
 def _final_passes(
     problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
 ) -> Settled:
-    """Re-choose modes and weights over the whole run until they stand, and look for better choices.
+    """Re-choose modes and weights over the whole run until they no longer change, and try other choices (see `_choices`).
 
-    Choices confirm themselves: the estimate follows them. So three others are tried: the most probable chain of
-    measurements that agree with each other, what the run says of each stretch without its own, and none of those at its
-    ends. Where one of these is more probable, it is taken.
+    A choice confirms itself, because the estimate follows it; another one that is more probable replaces it.
     """
     last = len(problem.timeline) - 1
     settled = settle(

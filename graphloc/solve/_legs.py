@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run of hours is solved in legs that overlap, so that memory does not grow with it.
+"""A run of hours is solved in overlapping legs, so that memory does not grow with its length.
 
-What is known at the end of the overlap hardly depends on what came before it: biases and slow errors are known again
-after some tens of seconds. Only a heading that no sensor tells is handed on.
+The estimate at the end of an overlap hardly depends on data before it: biases and slow errors are known again after some tens of
+seconds. Only a heading that no sensor measures is handed on to the next leg.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from graphloc.solve._memory import give_back_memory
 from graphloc.time import NS_PER_S
 from graphloc.trajectory import bounds_95
 
-_OVERLAP_S, _SHARE = 60.0, 0.2  # on each side of a seam, at most such a share of a leg
-_LOOK = 0.1  # of a leg, to each side: where a seam is looked for
-_ENOUGH = 0.9  # of the most places that are told beside any of these
+_OVERLAP_S, _SHARE = 60.0, 0.2  # overlap on each side of a seam, s, and at most this share of a leg
+_LOOK = 0.1  # share of a leg to each side within which a seam is placed
+_ENOUGH = 0.9  # share of the largest number of positions near a candidate
 
 Solve = Callable[[Recording, float | None], Solution]
 """Solves a recording; with the compass heading (deg) at its start, where that is known."""
@@ -32,7 +32,7 @@ Solve = Callable[[Recording, float | None], Solution]
 
 @dataclass(frozen=True, slots=True)
 class Apart:
-    """How far legs are apart where they meet, at most; `within`: of what their bounds (95 %) allow."""
+    """The largest difference between legs at a seam; `within`: as a share of their bounds (95 %)."""
 
     m: float = 0.0
     deg: float = 0.0
@@ -43,7 +43,7 @@ def seams(recording: Recording, leg_s: float, absolute: Collection[str]) -> list
     """Return the stamps at which a run is cut into legs of at most about `leg_s`; none where it is no longer.
 
     Args:
-        absolute: sensors that tell a place: a leg cannot start amid an outage, so seams keep away from these.
+        absolute: sensors that measure position: a leg cannot start within an outage of them, so seams avoid these.
     """
     imu = recording.imu
     if imu is None or len(imu) < 2:
@@ -62,14 +62,14 @@ def seams(recording: Recording, leg_s: float, absolute: Collection[str]) -> list
 
 
 def overlap_ns(leg_s: float) -> int:
-    """Return how far a leg goes on beyond a seam."""
+    """Return how far (ns) a leg extends beyond a seam."""
     return round(min(_OVERLAP_S, _SHARE * leg_s) * NS_PER_S)
 
 
 def solve_legs(
     recording: Recording, seams_ns: Collection[int], leg_s: float, solve: Solve
 ) -> tuple[list[Solution], Apart]:
-    """Solve the legs of a run in turn; return what each says of its own time, and how far they are apart at most.
+    """Solve the legs of a run in turn; return the solution of each for its own time, and the largest difference at a seam.
 
     Raises:
         SolveError: one of them could not be solved.
@@ -113,7 +113,7 @@ def _farther(apart: Apart, before: Solution, after: Solution, at_ns: int) -> Apa
 
 
 def _own(leg: Solution, begin_ns: int, end_ns: int, before: Solution | None) -> Solution:
-    """What a leg says of its own time."""
+    """Return the solution of a leg, cut to its own time."""
 
     def mine(stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         return np.asarray((stamps_ns >= begin_ns) & (stamps_ns < end_ns))

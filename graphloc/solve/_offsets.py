@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the cost of a solved run would change, were a lever, a mount or a stamp other than configured.
+"""How the cost of a solved run would change if a lever arm, a mount or a stamp were not as configured.
 
-The solution has bent to what it was told, so residuals alone say too little: here everything follows. The graph is
-linearised at the solution, J dx = b in whitened rows, with one column B for each offset theta. A sensor that sits
-elsewhere, or is read at another time, sees what it would see were the body elsewhere, e(T Exp(xi theta)), so
+The solution has adapted to the configuration, so its residuals alone show too little; here all states follow the offset. The
+graph is linearised at the solution, J dx = b in whitened rows, with one column B for each offset theta. A sensor that is
+mounted elsewhere, or measures at another time, measures what it would if the body were elsewhere, e(T Exp(xi theta)), so
 
     B = J_pose xi + J_velocity eta
 
 with (rotation, translation; body axes) xi = (0, e) for a lever along e, (z, -z x l) for a yaw of the mount at l,
-(w, R'v) for a stamp; and eta = R (w x e), 0, a: what the velocity of the lever's end gains. What is left of B when all
-states have followed, B~ = B - J argmin |J X - B|, is what tells of theta: H = B~'B~, g = B~'b.
+(w, R'v) for a stamp; and eta = R (w x e), 0, a: the change of velocity at the end of the lever. The part of B that no change
+of the states explains, B~ = B - J argmin |J X - B|, carries the information on theta: H = B~'B~, g = B~'b.
 
-Losses are re-weighed with the offsets free: or what a wrong lever does in a turn would go for a jump of the GNSS error.
+Robust weights are chosen again with the offsets free: otherwise the effect of a wrong lever in a turn would count as a jump of
+the GNSS error.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ from graphloc.offsets import Misfit, Offset, Offsets, Probe
 from graphloc.solve._batch import BatchResult
 
 BLOCK_S = 2.0
-# Rounds of choosing weights; they need not be chosen anew where they change little at once, or (in sigmas) theta does.
+# Rounds of choosing weights; they end early where the weights, or theta (in sigmas), change little.
 _ROUNDS, _SAME_WEIGHT, _SAME = 6, 0.2, 0.1
 # How far an offset may be off while weights are chosen, 1 sigma: m, rad, s.
 _FREE: dict[Offset, float] = {"x": 3.0, "y": 3.0, "yaw": 0.5, "time": 1.0}
 _LEAST_WEIGHT = 1e-6
-_HELD_RAD = 1e-6  # of a mount that is no state
-_DRAWS = 16  # random vectors that a trace is estimated with
+_HELD_RAD = 1e-6  # sigma of a mount that is held
+_DRAWS = 16  # random vectors for the estimate of a trace
 _NOISE_ROUNDS, _LEAST_FREEDOM, _UNLIKELY = 5, 3.0, 1e-4
 
 
@@ -58,7 +59,7 @@ class _Rows:
     Attributes:
         J: (rows, columns), sparse. b: (rows,). states: poses, whose columns come last; before them their velocities.
         starts: first row of each factor, and of the end. stamps_ns: (rows,) when each row is.
-        made: factors of each measurement. kernels: factors that share a loss, and the loss.
+        made: range of factors of each measurement. kernels: factors that share a loss, and the loss.
     """
 
     J: Any
@@ -71,10 +72,10 @@ class _Rows:
 
 
 def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
-    """Return what a solved run says of the offsets of its sensors; None where it has none to look at.
+    """Return the information of a solved run on the offsets of its sensors; None where there is none to examine.
 
     Raises:
-        RuntimeError, numpy.linalg.LinAlgError: something is not determined.
+        RuntimeError, numpy.linalg.LinAlgError: a state or offset is not determined.
     """
     problem, values = _with_offsets_free(result)
     rows = _linearised(problem, values, result)
@@ -170,7 +171,7 @@ def _linearised(problem: Problem, values: gtsam.Values, result: BatchResult) -> 
 
 
 def _without_mount(problem: Problem, stream: Stream, slow: SlowProcess, values: gtsam.Values) -> SlowProcess | None:
-    """A compass's slow state with its mount held where it is configured, in `values` too; None where that is all of it."""
+    """Return a compass's slow state without its mount, which is held as configured (in `values` too); None where nothing else is in it."""
     if len(slow.axes) == 1:
         return None
     for j in range(len(problem.timeline.slow_stamps_ns)):
@@ -180,7 +181,7 @@ def _without_mount(problem: Problem, stream: Stream, slow: SlowProcess, values: 
 
 
 def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: gtsam.Values) -> Attachment:
-    """An attachment of the solution, to the slow states that the stream has here."""
+    """Return an attachment of the solution, with the slow states that the stream has here."""
     if stream.slow is None:
         return replace(at, slow_key=None, slow_value=None, slow_next=None)
     key = keys.slow(stream.number, int(problem.timeline.slow_of[stream.state[i]]))
@@ -188,14 +189,14 @@ def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: 
 
 
 def _jumps(problem: Problem, held: list[Any]) -> list[int]:
-    """Factors that are steps of slow states which may jump."""
+    """Return the factors that are steps of slow states which may jump."""
     nodes = range(len(problem.timeline.slow_stamps_ns))
     slow = {keys.slow(s.number, j) for s in problem.streams if s.slow is not None and s.slow.jumps for j in nodes}
     return [f for f, own in enumerate(held) if len(own) == 2 and own[0] in slow and own[1] in slow]
 
 
 def _stamps_ns(problem: Problem, held: list[Any]) -> NDArray[np.int64]:
-    """When each factor is: at the first of its states. A leaf's own prior stands before the factor that ties it."""
+    """Return the stamp (ns) of each factor: that of its first state. The prior of a leaf comes before the factor that connects it."""
     nodes = problem.timeline.slow_stamps_ns.tolist()
     at = {key(k): n for key in (keys.pose, keys.velocity) for k, n in enumerate(problem.timeline.stamps_ns.tolist())}
     at |= {keys.bias(j): n for j, n in enumerate(nodes)}
@@ -253,7 +254,7 @@ def _columns(
 
 
 def _root_weights(rows: _Rows, misfit: Array) -> Array:
-    """Root of each row's weight, by the losses."""
+    """Return the root of the weight of each row, by the losses."""
     total, root = np.concatenate([[0.0], np.cumsum(misfit**2)]), np.ones(len(misfit))
     for factors, kernel in rows.kernels:
         a, b = rows.starts[factors.start], rows.starts[factors.stop]
@@ -276,10 +277,10 @@ def _normal_solver(J: Any) -> Callable[[Array], Array]:
 
 
 def _imu_misfit(rows: _Rows, root: Array, b: Array, solved: _Solved) -> tuple[Misfit, Misfit]:
-    """Misfit of gyroscope and accelerometer, and how much less noise would explain it.
+    """Return the misfit of gyroscope and accelerometer, and by what factor smaller noise would explain it.
 
-    The links come first, nine rows each: attitude (the gyroscope's), place, velocity. With less noise the other sensors
-    have more to say there, so that how much less is found in some rounds (variance components, Helmert).
+    The IMU factors come first, nine rows each: attitude (gyroscope), position, velocity. With smaller noise the share of the other
+    sensors changes, so the factor is found in some rounds (variance components, Helmert).
 
     Args:
         root: (rows,) of the weights. b: (rows,) of `rows`, the offsets taken out. solved: the run with these.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GTSAM's optimiser and covariances, with the settings that survive bias chains."""
+"""GTSAM's optimiser and covariances, with settings that are stable with chains of slow biases."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import gtsam
 from graphloc.errors import not_solved
 
 _ABSOLUTE_TOL = 1e-3
-_AS_PROMISED = 0.1  # of the tolerance
-_HOPELESS = 1e6  # times the initial cost: from there no full step comes back
+_AS_PROMISED = 0.1  # of the tolerance: agreement with the linear model
+_HOPELESS = 1e6  # times the initial cost: full steps do not recover from there
 
 
 class Optimized(NamedTuple):
@@ -28,18 +28,18 @@ def optimize(
     max_iterations: int,
     relative_tol: float = 1e-4,
 ) -> Optimized:
-    """Minimise with Gauss-Newton, and with Levenberg-Marquardt where that does not come down.
+    """Minimise with Gauss-Newton, and with Levenberg-Marquardt where that does not reduce the cost.
 
-    Full steps: from a start some degrees and metres off, the first one overshoots (cost x 60) and the second
-    lands; a method that takes no uphill step creeps along the valley instead (measured: 3 against 48
-    iterations, docs/decisions). QR: Cholesky stops early and unconverged on slow biases.
+    Full steps: from a start some degrees and metres off, the first one overshoots (cost x 60) and the second converges; a method
+    that accepts no increase of the cost takes many short steps instead (measured: 3 against 48 iterations, docs/decisions). QR:
+    with Cholesky the solver stops early, not converged, on slow biases.
 
     Args:
-        relative_tol: of the error; done where a step brings less than this, or where it brought what its linear model
-            said to a tenth of it: there is no curvature then that another step could make good.
+        relative_tol: of the error; it ends where a step reduces it by less, or where the reduction equals that of the linear
+            model to a tenth of this: then there is no nonlinearity left that another step could correct.
 
     Raises:
-        SolveError: the linear algebra failed (a state that nothing holds, or a value that is not finite).
+        SolveError: the linear algebra failed (an undetermined state, or a value that is not finite).
     """
     order = graph.orderingCOLAMD()
     initial = last = float(graph.error(guess))
@@ -61,7 +61,7 @@ def optimize(
             last = error
             del linear, delta  # before the next ones are made
     except RuntimeError:
-        pass  # a full step led to where nothing is determined: the damped method stays near
+        pass  # a full step led to where states are undetermined: the damped method stays near the start
     if lowest < initial or (used == 1 and abs(lowest - initial) <= relative_tol * initial + _ABSOLUTE_TOL):
         return Optimized(best, used, lowest)
     return _levenberg_marquardt(graph, guess, max_iterations, relative_tol, used)

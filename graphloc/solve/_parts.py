@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run whose IMU fell silent for long is several runs: cut there, each solved for itself (in legs, if it is long), joined again.
+"""A run with a long IMU gap is solved in parts: cut there, each solved by itself (in legs, if it is long), then joined.
 
-Over a hole of minutes nothing links the two sides: as one graph, both sides were bent by the link that
-has to stand for it (120 s: 4.6 m and 30 deg off beside the hole, where 0.1 m is usual).
+Across a gap of minutes nothing connects the two sides. Solved as one graph, both sides were distorted by the factor that
+bridges the gap (120 s: errors of 4.6 m and 30 deg beside it, where 0.1 m is usual).
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from graphloc.trajectory import Trajectory
 def solve_parts(
     recording: Recording, bridge_s: float, leg_s: float, absolute: Collection[str], solve: Solve
 ) -> Solution:
-    """Cut the recording at holes of the IMU longer than `bridge_s`, and what is long into legs; solve these and join them.
+    """Cut the recording at IMU gaps longer than `bridge_s`, and long parts into legs; solve these and join them.
 
     Args:
-        leg_s: about how long legs are at most. absolute: the sensors that tell a place.
+        leg_s: about how long legs are at most. absolute: names of the sensors that measure position.
 
     Raises:
-        SolveError: no part could be solved; it is the first part's.
+        SolveError: no part could be solved; the error of the first one.
     """
     parts = _cut(recording, bridge_s)
     cuts = [seams(part, leg_s, absolute) for part in parts]
@@ -66,9 +66,9 @@ def solve_parts(
 def _in_legs(
     part: Recording, where: Collection[int], leg_s: float, solve: Solve
 ) -> tuple[list[Solution], list[str], bool]:
-    """Solve a part, one that is long in legs, between the stamps `where`; as a whole where a leg cannot be solved by itself.
+    """Solve a part, in legs where it is long, between the stamps `where`; as a whole where a leg cannot be solved by itself.
 
-    Return what is said of it, and whether something is wrong.
+    Also returns the lines to report, and whether they are warnings.
     """
     if not where:
         return [solve(part, None)], [], False
@@ -82,7 +82,7 @@ def _in_legs(
 
 
 def _cut(recording: Recording, bridge_s: float) -> list[Recording]:
-    """Parts in turn; each has the measurements from its own first sample up to the next part's."""
+    """Return the parts in order; each has the measurements from its own first IMU sample up to that of the next part."""
     imu = recording.imu
     if imu is None or len(imu) < 2:
         return [recording]
