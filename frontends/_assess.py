@@ -308,7 +308,7 @@ def says_the_same(first: Stream, second: Stream, *, mirrored: bool) -> bool:
 
 
 def _middle_deg(angle: Array) -> tuple[float, float]:
-    """Return the middle and the scatter (as of a normal) of angles (N,), deg, whatever a few say: fixes may jump, or hang."""
+    """Return a robust mean and standard deviation of angles (N,), deg: fixes may jump or be frozen."""
     mean = float(np.angle(np.exp(1j * angle).mean()))
     middle = mean + float(np.median(wrap_angle(angle - mean)))
     scatter = 1.4826 * float(np.median(np.abs(wrap_angle(angle - middle))))

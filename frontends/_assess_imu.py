@@ -29,7 +29,7 @@ _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, o
 
 
 def samples_of(imu: Stream) -> tuple[NDArray[np.intp], list[str]]:
-    """Return which messages are samples, in order of stamps, and a line where others only repeat one that hangs."""
+    """Return which messages are samples, in order of stamps, and a warning on frozen ones, which are not among them."""
     keep = sane(imu)
     bad = frozen_samples(imu.stamps_ns[keep], imu.rows[keep, :6] if len(keep) else np.zeros((0, 6)))
     return keep[~bad], frozen_imu_warning(imu.topic, imu.stamps_ns[keep], bad)

@@ -193,7 +193,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
 
 
 def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop samples that a driver which hangs only repeats: the solver bridges them as it does a gap."""
+    """Drop the repetitions of a frozen IMU: the solver bridges them as it does a gap."""
     stamps = readings.stamps()
     samples = np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)])
     bad = frozen_samples(stamps, samples.reshape(-1, 6))  # of none: (0,)

@@ -95,7 +95,7 @@ class GnssReport:
         white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
         spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
             1 sigma; None where that does not tell.
-        frozen: where it says one place while the craft goes on, in words; '' where it does not.
+        frozen: warning where it repeats one position while the vessel moves; '' where it does not.
         without_height: messages with a place and no height. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
 

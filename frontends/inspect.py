@@ -303,7 +303,7 @@ def _known(stream: Stream, tree: StaticTree, body: str) -> str | None:
 def _best_track(
     by_topic: dict[str, Stream], gnss: Sequence[GnssReport]
 ) -> tuple[NDArray[np.int64], Array, float, Vec | None]:
-    """Return stamps, places about the first fix, scatter (m) and first fix of the receiver with most fixes, where it does not hang."""
+    """Return stamps, places about the first fix (m), scatter (m) and first fix of the best receiver, without frozen fixes."""
     if not gnss:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None
     best = gnss[0]

@@ -261,7 +261,7 @@ def _strangers(arrivals: Arrivals, at_ns: int, rng: np.random.Generator) -> tupl
 FAULTS: dict[str, Fault] = {
     "repeated": _repeated,
     "backward stamps": _some(Measurement, 0.3, lambda rng: _stamped(-int(rng.uniform(0.02, 5.0) * 1e9))),
-    "leaping stamps": _some(Measurement, 0.05, lambda rng: _stamped(int(rng.uniform(1.0, 1e6) * 1e9))),
+    "jumping stamps": _some(Measurement, 0.05, lambda rng: _stamped(int(rng.uniform(1.0, 1e6) * 1e9))),
     "zero stamps": _some(Measurement, 0.1, lambda rng: lambda m: replace(m, stamp_ns=0)),
     "one clock off": _for(GnssPosition, 2.0, 6.0, lambda rng: _stamped(int(rng.uniform(-9.0, 9.0) * 1e9))),
     "IMU clock off": _for(ImuSample, 2.0, 6.0, lambda rng: _stamped(int(rng.uniform(-9.0, 9.0) * 1e9))),

@@ -496,7 +496,7 @@ def test_a_sensor_in_another_epoch_is_reported_and_not_fixed(tmp_path: Path) -> 
 )
 def test_wrong_units_and_gravity(tmp_path: Path, accel: Any, gyro: Any, block: dict[str, str], words: str) -> None:
     items: list[Item] = []
-    for k in range(100):  # its last bits move, as those of a sensor that does not hang
+    for k in range(100):  # its last bits vary, as those of a sensor that is not frozen
         t = START_NS + k * S // 50
         items.append(("/imu", t, MAKE.imu(t, accel=accel, gyro=(gyro[0], gyro[1], gyro[2] + 1e-6 * (k % 2)))))
     recording = read(tmp_path, items, gnss=None, imu={"topic": "/imu", **block})

@@ -126,7 +126,7 @@ def run() -> SimulatedRun:
 
 
 def struck(run: SimulatedRun, begin_s: float, end_s: float) -> Arrivals:
-    """Its IMU hangs between two times."""
+    """Its IMU is frozen between two times."""
     arrivals: Arrivals = []
     held: ImuSample | None = None
     for a in arrivals_of(run):

@@ -81,7 +81,7 @@ def test_one_at_rest_or_that_repeats_for_a_moment_is_believed(
 
 
 def scattered(way: Way, held_s: tuple[float, float], hz: float, noise_m: float) -> Array:
-    """The times that are judged to hang of a receiver whose one place scatters."""
+    """The times at which a receiver is judged frozen whose one position scatters."""
     t, _, p = said(way, held_s, hz, noise_m)
     held = (t >= held_s[0]) & (t < held_s[1])
     p[held] += noise_m * np.random.default_rng(5).normal(size=(int(held.sum()), 2))

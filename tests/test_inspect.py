@@ -456,7 +456,7 @@ def test_a_clock_ahead_gets_an_offset(tmp_path: Path) -> None:
     assert config.sensors["gnss"].time_offset_s == pytest.approx(-37.0, abs=0.1)
 
 
-@pytest.mark.parametrize("fault", ["jumps", "hangs"])
+@pytest.mark.parametrize("fault", ["jumps", "frozen"])
 def test_fixes_that_err_for_a_while_leave_no_compass_out(fault: str, tmp_path: Path) -> None:
     """15 m off now and then, or a quarter of the run at one place: most courses still tell what the compass is."""
     make, held = Messages(2), None
@@ -466,7 +466,7 @@ def test_fixes_that_err_for_a_while_leave_no_compass_out(fault: str, tmp_path: P
         if topic == "/fix":
             if fault == "jumps" and t % 12.0 > 8.0:
                 message.latitude += 15.0 / 111e3
-            elif fault == "hangs" and 50.0 < t < 80.0:
+            elif fault == "frozen" and 50.0 < t < 80.0:
                 held = held or message
                 message.latitude, message.longitude = held.latitude, held.longitude
     found, config, _ = look(tmp_path, items, make)

@@ -1,4 +1,4 @@
-"""Which IMU samples are taken: leaps, clocks that are set back, late ones; and that none is lost or taken twice."""
+"""Which IMU samples are taken: stamps that jump, clocks that are set back, late samples; none is lost or taken twice."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ def fed(intake: ImuIntake, at_ms: float, *, started: bool = True, seq: int = 0) 
 
 
 def running() -> ImuIntake:
-    """100 samples, 10 ms apart, until 990 ms; more than 200 ms are a leap."""
+    """100 samples, 10 ms apart, until 990 ms; more than 200 ms are a jump."""
     intake = ImuIntake(0.2, floats=True)
     for k in range(100):
         assert len(fed(intake, 10.0 * k).accepted) == 1

@@ -58,7 +58,7 @@ def at_s(arrivals: Arrivals, t_s: float) -> int:
     return next(n for n, a in enumerate(arrivals) if a.true_ns >= arrivals[0].true_ns + t_s * 1e9)
 
 
-QUICK = ["backward stamps", "leaping stamps", "zero stamps", "repeated", "clock back", "latitude and longitude swapped",
+QUICK = ["backward stamps", "jumping stamps", "zero stamps", "repeated", "clock back", "latitude and longitude swapped",
          "GNSS jump", "absurd GNSS covariance", "wrong headings", "strangers", "flood", "accelerometer in g"]  # fmt: skip
 
 
@@ -203,7 +203,7 @@ def test_a_jump_that_lasts_longer_than_the_level_before_it_is_the_right_level(
 
 
 def test_a_sensor_found_frozen_does_not_hasten_a_restart() -> None:
-    """A receiver that is far off is waited for, whatever one that hangs has said before that was seen."""
+    """A receiver that is far off is waited for, whatever a frozen one measured before it was detected."""
     online = smoother(run_of())
     feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
     assert online._tracking is not None  # noqa: SLF001

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver that hangs under way is told from one that drifts, jumps, is noisy or late."""
+"""A receiver that is frozen under way is told from one that drifts, jumps, is noisy or late."""
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -20,7 +20,7 @@ Off = Callable[[float, Array], Array]
 
 
 def frozen_at(off_m: Off, v_mps: Array, *, hz: float = 5.0, sigma_m: float = 0.2, until_s: float = 60.0, sigma_mps: float = 0.1) -> list[float]:  # fmt: skip
-    """When a receiver parts that is off by `off_m` of the time and of a normal (2,)."""
+    """Times (s) at which a receiver is judged frozen; its error is `off_m` of the time and of a standard normal (2,)."""
     rng, detector, when = np.random.default_rng(1), FrozenReceiverDetector(), []
     for k in range(round(until_s * hz)):
         there_m = v_mps * k / hz
@@ -100,13 +100,13 @@ def test_at_the_start_it_may_be_the_estimate_that_is_wrong() -> None:
 def frozen(run: SimulatedRun, begin_ns: int, end_ns: int, sensors: Collection[str]) -> Recording:
     """The recording of some sensors; between two times the receiver says one place, but for centimetres."""
     fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
-    stuck = next(m for m in fixes if m.stamp_ns >= begin_ns)
-    datum, rng = Datum(stuck.position), np.random.default_rng(5)
+    held = next(m for m in fixes if m.stamp_ns >= begin_ns)
+    datum, rng = Datum(held.position), np.random.default_rng(5)
 
     def heard(m: GnssPosition) -> GnssPosition:
         if not begin_ns <= m.stamp_ns < end_ns:
             return m
-        place = world_from_fixes([stuck], datum) + 0.03 * rng.standard_normal((1, 3))
+        place = world_from_fixes([held], datum) + 0.03 * rng.standard_normal((1, 3))
         return replace(m, position=Geodetic(*datum.geodetic_from_enu(place)[0]))
 
     kept = [m for m in run.recording.measurements if m.sensor in sensors]

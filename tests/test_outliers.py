@@ -75,9 +75,9 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one() -> None:
 def test_position_jumps_are_found_and_turns_are_none(
     allowed: bool, hz: float, speed_mps: float, turn_radps: float, noise_m: float
 ) -> None:
-    """Off by 8 m for 20 s; a craft that turns as a car does, or is silent for a while, leaps nowhere.
+    """Off by 8 m for 20 s; the turns of a car, or a silence, are no jumps.
 
-    Where noise is low, the steps beside a leap stand out as well, and are no leaps of their own.
+    Where noise is low, the steps beside a jump stand out as well, but are no jumps themselves.
     """
     t = np.arange(0.0, 80.0, 1.0 / hz)
     course = turn_radps * np.clip(t - 20.0, 0.0, 10.0)
@@ -116,8 +116,8 @@ def test_a_turn_between_fixes_that_are_seconds_apart_is_no_jump(
     places_m = way[told] + np.random.default_rng(0).normal(0.0, 0.01, way[told].shape)
     stamps_ns, sigma_m = np.round(t[told] * 1e9).astype(np.int64), np.full(len(places_m), 0.015)
     assert not len(position_jumps(stamps_ns, places_m, sigma_m, allowed=allowed)[0])
-    leapt = places_m + np.outer(t[told] >= 350.0, [0.0, 5.0 * every_s**2])
-    assert len(position_jumps(stamps_ns, leapt, sigma_m, allowed=allowed)[0]) == 1
+    jumped = places_m + np.outer(t[told] >= 350.0, [0.0, 5.0 * every_s**2])
+    assert len(position_jumps(stamps_ns, jumped, sigma_m, allowed=allowed)[0]) == 1
 
 
 RTK_NS = np.arange(0, 60_000_000_000, 200_000_000)
@@ -132,7 +132,7 @@ def rtk(off_m: NDArray[Any], sigma_m: NDArray[Any] | float = 0.015) -> tuple[Arr
 
 def test_jumps_of_decimetres_are_found_in_a_receiver_of_centimetres() -> None:
     """A wrong fix of 0.6 m for 20 s, stated to 15 mm: nothing was said. A fix by itself, or two, a float that says so, and stamps
-    that come late now and then leap nowhere."""
+    that come late now and then are no jumps."""
     t = RTK_S
     wrong = 0.6 * ((t >= 20.0) & (t < 40.0))
     at_ns, off_m = position_jumps(RTK_NS, *rtk(wrong), allowed=False)
@@ -173,7 +173,7 @@ def test_without_slow_error_a_receiver_of_metres_has_the_same_jumps(hz: float, s
 @pytest.mark.parametrize("allowed", [True, False])
 @pytest.mark.parametrize("hz", [1.0, 5.0])
 def test_larger_scatter_for_a_while_is_no_jump(hz: float, *, allowed: bool) -> None:
-    """RTK that is lost for 40 s now and then, and says so: noise of a metre, beside the usual centimetre, were leaps."""
+    """RTK that is lost for 40 s now and then, and says so: noise of a metre looked like jumps beside the usual centimetre."""
     t = np.arange(0.0, 600.0, 1.0 / hz)
     sigma_m = np.where(t % 100.0 > 60.0, 1.2, 0.015)
     places_m = np.outer(t, [5.0, 0.0]) + np.random.default_rng(0).normal(0.0, 0.8, (len(t), 2)) * sigma_m[:, None]
@@ -226,12 +226,12 @@ def believed(off_m: float, last_s: float) -> tuple[Recording, Recording, VesselC
 def test_a_run_with_a_jump_that_the_bounds_do_not_cover_is_not_good() -> None:
     """Its bound was 2 cm, and its health good, where it was 0.6 m off."""
     right, wrong, config = believed(0.6, last_s=35.0)
-    usual, leapt = (app.smooth_recording(of, config).solution for of in (right, wrong))
+    usual, jumped = (app.smooth_recording(of, config).solution for of in (right, wrong))
     assert not any("position jump" in line for line in usual.stats.warnings)
     assert "position jump of gnss, and no other sensor measures position" not in usual.health_reason
-    assert any(line.startswith("gnss: position jump of 0.") for line in leapt.stats.warnings)
+    assert any(line.startswith("gnss: position jump of 0.") for line in jumped.stats.warnings)
     assert Health.GOOD in usual.health
-    assert Health.GOOD not in leapt.health
+    assert Health.GOOD not in jumped.health
     usual_live, live = (replay(of, config) for of in (right, wrong))
     assert not any("position jump" in line for line in usual_live.solution.stats.warnings)
     assert any("gnss: position jump of 0." in line for line in live.solution.stats.warnings)
@@ -280,7 +280,7 @@ def test_a_jump_of_the_only_receiver_is_reported_in_the_run() -> None:
 
 
 def test_a_jump_of_the_only_receiver_is_not_followed_where_the_imu_contradicts_it() -> None:
-    """12 m for 30 s, and back: no drift is told from motion, a leap is. It was followed, 11 m off, and left its bounds."""
+    """12 m for 30 s, and back: a drift cannot be separated from motion, a jump can. It was followed, 11 m off, outside the bounds."""
     run = simulate(Scenario(path="loops", duration_s=100.0, noise="clean", pose_hz=0.0, compass_hz=5.0, imu_hz=50.0), 1)
     begin_ns = int(run.truth.stamps_ns[0])
     sensors = {k: v for k, v in run.config.sensors.items() if k in ("imu", "gnss", "compass")}

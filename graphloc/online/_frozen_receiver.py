@@ -68,9 +68,9 @@ class FrozenReceiverDetector:
         if len(t) < _FEWEST or t[-1] - t[0] < WINDOW_S:
             return
         told, off = (np.array([row[k] for row in self._seen]) for k in (1, 2))
-        parts, steady = _slope(t, off)
-        left = off - off.mean(axis=0) - np.outer(t - t.mean(), parts)
-        rms, speed = float(np.sqrt((left**2).sum(axis=1).mean())), float(np.linalg.norm(parts))
+        growth, steady = _slope(t, off)
+        left = off - off.mean(axis=0) - np.outer(t - t.mean(), growth)
+        rms, speed = float(np.sqrt((left**2).sum(axis=1).mean())), float(np.linalg.norm(growth))
         late = t > t[-1] - (0.5 if self.frozen else 1.0) * WINDOW_S  # shorter when frozen, so that motion is seen soon
         moves, noise = _slope(t[late], told[late])
         stands = float(np.linalg.norm(moves)) < _STANDS_MPS + _SIGMAS * sigma_m * noise
