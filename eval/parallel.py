@@ -17,7 +17,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
-def beside(
+def run_jobs(
     work: Callable[[Job], Result], jobs: Sequence[Job], workers: int, stage: str, progress: Progress
 ) -> Iterator[tuple[int, Result]]:
     """Yield the number of each job and its result, as they get done; `work` is a function of a module.

@@ -21,7 +21,7 @@ from graphloc.config import (
     VesselConfig,
 )
 from graphloc.frontends import _clock, _fixes, _sanity
-from graphloc.frontends._beside import Beside
+from graphloc.frontends._references import Reference
 from graphloc.frontends._rejections import Rejection, rejected
 from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.decode import Decoded, ImuSample
@@ -109,7 +109,7 @@ def reject_jumps(sensors: Sequence[Readings], warnings: list[str]) -> list[Ledge
     return rows
 
 
-def reject_set_back(sensors: Sequence[Readings], beside: Sequence[Beside], warnings: list[str]) -> list[LedgerRow]:
+def reject_set_back(sensors: Sequence[Readings], beside: Sequence[Reference], warnings: list[str]) -> list[LedgerRow]:
     """Keep the longest part of a run in which the IMU's clock was set back, by recording times; say where that was.
 
     Two parts that bear the same times would be laid over each other.

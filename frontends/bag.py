@@ -19,7 +19,6 @@ from graphloc.config import CompassConfig, ImuConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import courses_of_fixes, motion_of_fixes
-from graphloc.frontends._beside import Beside, check_speed, true_trajectory
 from graphloc.frontends._mount_yaw import yaw_in_craft
 from graphloc.frontends._part import Bags
 from graphloc.frontends._readings import (
@@ -35,6 +34,7 @@ from graphloc.frontends._readings import (
     reject_set_back,
     thin_headings,
 )
+from graphloc.frontends._references import Reference, check_speed, true_trajectory
 from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
@@ -144,11 +144,11 @@ def _span(bag: Bag, config: VesselConfig) -> Span | None:
     return span
 
 
-def _asked_for(config: VesselConfig, bag: Bag) -> tuple[list[Readings], Beside | None, Beside | None]:
+def _asked_for(config: VesselConfig, bag: Bag) -> tuple[list[Readings], Reference | None, Reference | None]:
     """What is read of a bag: for each sensor, for the truth, and for the speed to check with."""
     sensors = _subscriptions(config, bag.topics, bag.name)
-    truth = _beside(config.truth_topic, "truth_topic", "truth, never fused", bag.topics, bag.name)
-    check = _beside(config.check_speed_topic, "check_speed_topic", "check, never fused", bag.topics, bag.name)
+    truth = _reference(config.truth_topic, "truth_topic", "truth, never fused", bag.topics, bag.name)
+    check = _reference(config.check_speed_topic, "check_speed_topic", "check, never fused", bag.topics, bag.name)
     return sensors, truth, check
 
 
@@ -160,17 +160,17 @@ class _Reader:
         bag: Bag,
         topics: Mapping[str, TopicSummary],
         sensors: Sequence[Readings],
-        beside: Sequence[Beside],
+        beside: Sequence[Reference],
         tree: StaticTree | None,
     ) -> None:
         self._bag, self._topics, self._tree = bag, topics, tree
         self._sensors: dict[str, list[Readings]] = {}
         for readings in sensors:
             self._sensors.setdefault(readings.config.topic, []).append(readings)
-        self._beside: dict[str, list[Beside]] = {}
+        self._references: dict[str, list[Reference]] = {}
         for item in beside:
-            self._beside.setdefault(item.topic, []).append(item)
-        self._wanted = set(self._sensors) | set(self._beside)
+            self._references.setdefault(item.topic, []).append(item)
+        self._wanted = set(self._sensors) | set(self._references)
         if tree is not None and TF_STATIC in topics:
             self._wanted.add(TF_STATIC)
         self._rows: list[LedgerRow] = []
@@ -205,7 +205,7 @@ class _Reader:
                 self._rows.append(readings.row(seq, 0, broken))
             else:
                 self._decode(readings, raw, msg, seq)
-        for item in self._beside.get(raw.topic, ()):
+        for item in self._references.get(raw.topic, ()):
             item.count, item.broken = item.count + 1, item.broken + (msg is None)
             stamp_ns = None if msg is None else header_stamp_ns(msg)
             if stamp_ns is not None:
@@ -254,7 +254,7 @@ class _Reader:
                 reason = f"no sensor reads this topic ({_or(summary.msgtypes)})"
                 add(topic, summary.messages, Outcome.IGNORED, reason)
                 continue
-            for item in self._beside.get(topic, ()):
+            for item in self._references.get(topic, ()):
                 add(topic, item.count - item.broken, Outcome.READ, item.reason)
                 add(topic, item.broken, Outcome.MALFORMED, "cannot be decoded")
             if topic == TF_STATIC and self._tree is not None:
@@ -293,11 +293,13 @@ def _or(names: Sequence[str]) -> str:
     return " or ".join(n.replace("/msg/", "/") for n in names)
 
 
-def _beside(topic: str | None, key: str, reason: str, topics: Mapping[str, TopicSummary], bag: str) -> Beside | None:
+def _reference(
+    topic: str | None, key: str, reason: str, topics: Mapping[str, TopicSummary], bag: str
+) -> Reference | None:
     if topic is None:
         return None
     _check_topic(topic, key, (ODOMETRY, POSE, PLAIN_POSE) if key == "truth_topic" else (ODOMETRY,), topics, bag)
-    return Beside(topic, reason)
+    return Reference(topic, reason)
 
 
 def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str, tuple[Array, Array]]:

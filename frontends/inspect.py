@@ -50,7 +50,7 @@ from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import SCATTERED, scattered
-from graphloc.frontends._useless import useless
+from graphloc.frontends._unused import unused_topics
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import (
     GPS_FIXES,
@@ -66,7 +66,7 @@ from graphloc.frontends.decode import (
     VECTOR,
 )
 from graphloc.frontends.tags.listed import LISTS
-from graphloc.frontends.tags.sightings import IMAGES, INFO, info_beside
+from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic
 from graphloc.frozen_receiver import frozen_fixes
 from graphloc.measurements import CompassHeading, ImuSeries
 from graphloc.time import NS_PER_S
@@ -177,7 +177,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         warnings=(
             *warnings,
             *(g.frozen for g in found_gnss if g.frozen),
-            *useless(streams, used),
+            *unused_topics(streams, used),
             *_lacking(found_imus, found_gnss, [report for _, report in told], bool(clouds or images), topics, by_topic),
         ),
     )
@@ -263,7 +263,7 @@ def _mounted(
 ) -> tuple[MountedTopic, ...]:
     found = []
     for topic, frame in sorted(frames.items()):
-        beside = info_beside(topic)
+        beside = camera_info_topic(topic)
         tf_frame = frame if tree.resolve(body, frame) else None
         info = beside if beside in infos else ""
         found.append(MountedTopic(topic=topic, frame_id=frame, tf_frame=tf_frame, info_topic=info))

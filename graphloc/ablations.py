@@ -15,7 +15,7 @@ from graphloc.eval.ablation import Ablated, Effect, Off, Vote, effect, off, susp
 from graphloc.eval.consistency import contradiction, fit
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import NoCommonTimeError
-from graphloc.eval.parallel import beside
+from graphloc.eval.parallel import run_jobs
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum
 from graphloc.recording import Progress, Recording, quiet
@@ -98,7 +98,7 @@ def _solve(
     jobs = [
         _Job(recording=run.recording, config=run.config, datum=run.solution.datum, without=names) for names in without
     ]
-    done = dict(beside(_smoothed, jobs, workers, stage, progress))
+    done = dict(run_jobs(_smoothed, jobs, workers, stage, progress))
     return {names: done[k] for k, names in enumerate(without)} | {("",): run.solution}
 
 

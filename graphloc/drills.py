@@ -16,7 +16,7 @@ from graphloc.eval import ekf
 from graphloc.eval.drill import Case, Failure, Measured, Struck, Times, Window, cut, judge, schedule, script
 from graphloc.eval.drill.measure import Drilled, compared
 from graphloc.eval.drill.plan import judged_until, windows
-from graphloc.eval.parallel import beside
+from graphloc.eval.parallel import run_jobs
 from graphloc.frames import Datum, heading_deg_from_yaw
 from graphloc.measurements import CompassHeading
 from graphloc.recording import Progress, Recording, quiet
@@ -74,7 +74,7 @@ def drill(
         part = pieces[window] if case is None else cut(pieces[window], judged_until(case, parts[window]))
         return _Job(part=part, config=configs[window], datum=datum, window=window, case=case)
 
-    undisturbed = dict(beside(_tracks, [job(k, None) for k in range(len(parts))], jobs, "undisturbed", progress))
+    undisturbed = dict(run_jobs(_tracks, [job(k, None) for k in range(len(parts))], jobs, "undisturbed", progress))
     normal = [undisturbed[k] for k in range(len(parts))]
     ready_ns = [_first_ns(tracks, part) for tracks, part in zip(normal, parts, strict=True)]
     cases, too_long = schedule(failures, parts, ready_ns, times, seed)
@@ -89,7 +89,7 @@ def drill(
     usual = [against(tracks, k) for k, tracks in enumerate(normal)]
     measured: dict[int, list[Measured]] = {}
     shown: dict[int, dict[str, Times]] = {}
-    for number, tracks in beside(_tracks, [job(c.window, c) for c in cases], jobs, "drills", progress):
+    for number, tracks in run_jobs(_tracks, [job(c.window, c) for c in cases], jobs, "drills", progress):
         case = cases[number]
         tracks = {**normal[case.window], **tracks}
         struck = against(tracks, case.window)

@@ -17,7 +17,7 @@ from graphloc.eval.match_picture import Gallery
 from graphloc.frames import Datum
 from graphloc.frontends._part import Bags
 from graphloc.frontends.aerial import match_bag
-from graphloc.frontends.tags.sightings import info_beside, sightings_of_bag
+from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_bag
 from graphloc.frontends.tags.sizes import size_factors
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import Measurement, TagSighting
@@ -110,7 +110,7 @@ def with_sightings(recording: Recording, config: VesselConfig, bags: Bags, progr
     for name, sensor in config.of_kind("apriltag").items():
         cameras = {camera.topic for camera in sensor.cameras.values()}
         total, without = sum(r.count for r in recording.rows if r.topic in cameras), 0
-        infos = {camera.info_topic or info_beside(camera.topic) for camera in sensor.cameras.values()}
+        infos = {camera.info_topic or camera_info_topic(camera.topic) for camera in sensor.cameras.values()}
         taken: list[TagSighting] = []
         reasons, doubts, shown = Counter[str](), Counter[str](), Counter[str]()
         found = sightings_of_bag(bags, name, sensor, config.body_frame, warn=gathered.said.append)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import AprilTagConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frontends.tags import sightings
-from graphloc.frontends.tags.sightings import info_beside, sightings_of_bag
+from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_bag
 from graphloc.gather import with_surveys
 from graphloc.ledger import Outcome
 from graphloc.measurements import TagSighting
@@ -352,4 +352,4 @@ def test_images_are_not_kept(tmp_path: Path, shown: NDArray[np.uint8], monkeypat
     ],
 )
 def test_where_a_camera_info_lies_by_custom(topic: str, beside: str) -> None:
-    assert info_beside(topic) == beside
+    assert camera_info_topic(topic) == beside

@@ -137,7 +137,7 @@ def _eyes(bag: Bag, config: AprilTagConfig, body_frame: str, warn: Callable[[str
     return found
 
 
-def info_beside(topic: str) -> str:
+def camera_info_topic(topic: str) -> str:
     """Return where the CameraInfo of a topic of images lies by custom."""
     return f"{topic.removesuffix('/compressed').rsplit('/', 1)[0]}/camera_info"
 
@@ -147,7 +147,7 @@ def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callabl
     topic = config.info_topic
     if not topic and listed:
         return None
-    topic = topic or info_beside(config.topic)
+    topic = topic or camera_info_topic(config.topic)
     where = f"{bag.name}: cameras.{name}: CameraInfo on '{topic}'"
     have = bag.topics.get(topic)
     if have is None or INFO not in have.msgtypes:
@@ -295,4 +295,4 @@ def _in_survey(tags: Sequence[TagConfig], number: int, family: str) -> TagConfig
     return fitting[0] if len(fitting) == 1 else None
 
 
-__all__ = ["IMAGES", "INFO", "Seen", "info_beside", "sightings_of_bag"]
+__all__ = ["IMAGES", "INFO", "Seen", "camera_info_topic", "sightings_of_bag"]

@@ -24,7 +24,7 @@ _PARTS = (slice(0, 6), slice(6, 9), slice(9, _CORE))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Beside:
+class ConditionalGaussian:
     """A vector conditional on a state: its mean is value + gain * (state - anchor), its covariance cov.
 
     Conditional on the pose alone, all that later data say of the velocity would move the vector together with the position: after
@@ -39,7 +39,7 @@ class Beside:
     cov: Array
 
     @classmethod
-    def apart(cls, value: Array, cov: Array) -> Beside:
+    def independent(cls, value: Array, cov: Array) -> ConditionalGaussian:
         """Return a vector that is independent of the state."""
         return cls(value=value, gain=np.zeros((len(value), _CORE)), cov=cov)
 
@@ -63,8 +63,8 @@ class Anchor:
     bias: Array
     cov: Array
     step: Array = field(default_factory=lambda: np.zeros(_CORE))
-    slow: Mapping[str, Beside] = field(default_factory=dict)
-    constants: Mapping[tuple[str, int], Beside] = field(default_factory=dict)
+    slow: Mapping[str, ConditionalGaussian] = field(default_factory=dict)
+    constants: Mapping[tuple[str, int], ConditionalGaussian] = field(default_factory=dict)
     level: Level | None = None
 
     @classmethod
@@ -98,12 +98,12 @@ class Anchor:
         pose, velocity, bias = point
         core = range(_CORE)
         beside = {
-            name: _beside(mean[[*core, *rows]], cov[np.ix_([*core, *rows], [*core, *rows])])
+            name: _conditional(mean[[*core, *rows]], cov[np.ix_([*core, *rows], [*core, *rows])])
             for name, rows in zip(slow, own, strict=False)
         }
         # Not conditional on the state: when a constant is seen again, its prior cannot depend on an old state.
         alone = {
-            number: Beside.apart(mean[rows], cov[np.ix_(rows, rows)])
+            number: ConditionalGaussian.independent(mean[rows], cov[np.ix_(rows, rows)])
             for number, rows in zip(constants, own[len(slow) :], strict=True)
         }
         return cls(
@@ -147,7 +147,7 @@ class Anchor:
         )
 
     def factors(self, pose: int, velocity: int, bias: int) -> list[Any]:
-        """Return the prior factors of the state, by its keys; linear in world, as in `beside`."""
+        """Return the prior factors of the state, by its keys; linear in world, as in `conditional_factor`."""
         turn = np.eye(_CORE)
         turn[:3, :3] = turn[3:6, 3:6] = self.pose.rotation().matrix()
         whiten, mean = np.linalg.inv(np.linalg.cholesky(sound(turn @ self.cov @ turn.T))), turn @ self.step
@@ -162,7 +162,7 @@ class Anchor:
         found = [gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(_CORE), [pose, velocity, bias], error)]
         return found if self.level is None else [*found, _upright(self.level, pose, bias)]
 
-    def beside(self, known: Beside, state: Sequence[int], key: int) -> Any:
+    def conditional_factor(self, known: ConditionalGaussian, state: Sequence[int], key: int) -> Any:
         """Return the factor of a vector conditional on the state (keys of its pose, velocity and bias).
 
         Linear in the axes of world: position and slow error may each be hardly known, but their sum to centimetres. In the body
@@ -242,12 +242,12 @@ def _upright(level: Level, pose: int, bias: int) -> Any:
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(2), [pose, bias], error)
 
 
-def _beside(mean: Array, joint: Array) -> Beside:
+def _conditional(mean: Array, joint: Array) -> ConditionalGaussian:
     """Return the vector conditional on the state, from the joint Gaussian (15 + k,) of the state's step and the vector."""
     gain = np.linalg.solve(sound(joint[:_CORE, :_CORE]), joint[:_CORE, _CORE:]).T
     cov = joint[_CORE:, _CORE:] - gain @ joint[:_CORE, _CORE:]
     value = mean[_CORE:] - gain @ mean[:_CORE]
-    return Beside(value=value, gain=np.asarray(gain, dtype=np.float64), cov=cov)
+    return ConditionalGaussian(value=value, gain=np.asarray(gain, dtype=np.float64), cov=cov)
 
 
 def without_prior(mean: Array, cov: Array, rows: Array, variance: Array) -> tuple[Array, Array]:
@@ -268,13 +268,13 @@ def sound(cov: Array) -> Array:
     return np.asarray(kept * np.outer(scale, scale))
 
 
-def _plain(b: Beside) -> dict[str, Any]:
+def _plain(b: ConditionalGaussian) -> dict[str, Any]:
     return {"value": b.value.tolist(), "gain": b.gain.tolist(), "cov": b.cov.tolist()}
 
 
-def _read(raw: Mapping[str, Any]) -> Beside:
+def _read(raw: Mapping[str, Any]) -> ConditionalGaussian:
     size = len(raw["value"])
-    return Beside(
+    return ConditionalGaussian(
         value=_array(raw["value"], (size,)),
         gain=_array(raw["gain"], (size, _CORE)),
         cov=_array(raw["cov"], (size, size)),

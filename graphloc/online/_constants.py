@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from graphloc.build import CONSTANT_TAILS, constant_keys
-from graphloc.online._anchor import Beside
+from graphloc.online._anchor import ConditionalGaussian
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Window
 
@@ -25,9 +25,11 @@ class Constants:
         known: estimates from before the window.
     """
 
-    def __init__(self, problem: LiveProblem, window: Window, known: Mapping[Number, Beside]) -> None:
+    def __init__(self, problem: LiveProblem, window: Window, known: Mapping[Number, ConditionalGaussian]) -> None:
         self._problem, self._window = problem, window
-        self._known: dict[int, Beside] = {key: known[number] for number, key in self._keys() if number in known}
+        self._known: dict[int, ConditionalGaussian] = {
+            key: known[number] for number, key in self._keys() if number in known
+        }
 
     def _keys(self) -> Iterator[tuple[Number, int]]:
         for stream in self._problem.streams.values():
@@ -53,11 +55,11 @@ class Constants:
                 window.add([gtsam.PriorFactorVector(key, value, model)])
             window.touch(key, now_s)
 
-    def marked(self) -> dict[int, Beside]:
+    def marked(self) -> dict[int, ConditionalGaussian]:
         """Return the remembered estimates, for `back_to`."""
         return dict(self._known)
 
-    def back_to(self, mark: Mapping[int, Beside]) -> None:
+    def back_to(self, mark: Mapping[int, ConditionalGaussian]) -> None:
         """Restore the remembered estimates: what was taken into the graph since `marked` has left it again."""
         self._known = dict(mark)
 
@@ -65,12 +67,12 @@ class Constants:
         """Remember the constants that the next commit marginalises."""
         for key in self._window.leaving([key for _, key in self._keys()], now_s):
             value = np.atleast_1d(self._window.values.atVector(key))
-            self._known[key] = Beside.apart(value, self._window.covariance([key]))
+            self._known[key] = ConditionalGaussian.independent(value, self._window.covariance([key]))
 
     def seen(self) -> dict[Number, int]:
         """Return the keys of the constants in the graph."""
         return {number: key for number, key in self._keys() if self._window.is_committed(key)}
 
-    def remembered(self) -> dict[Number, Beside]:
+    def remembered(self) -> dict[Number, ConditionalGaussian]:
         """Return the estimates of the constants that are not in the graph."""
         return {number: self._known[key] for number, key in self._keys() if key in self._known}

@@ -94,7 +94,7 @@ class States:
                     raise SolveError(f"{stream.name}: its slow error is of another size")
                 window.guess(key, np.zeros(len(stream.slow.sigma)) if known is None else known.value, 0.0)
                 window.add(slow_begin(stream.slow, key, np.zeros(len(stream.slow.sigma)))
-                           if known is None else [anchor.beside(known, state, key)])  # fmt: skip
+                           if known is None else [anchor.conditional_factor(known, state, key)])  # fmt: skip
                 self._ends[stream.name] = window.add(slow_end(stream.slow, key))
         window.commit()
         self._newest = self._read()

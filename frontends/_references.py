@@ -20,7 +20,7 @@ from graphloc.trajectory import Trajectory
 
 
 @dataclass(slots=True)
-class Beside:
+class Reference:
     """A topic that is read beside the sensors: truth or check speed."""
 
     topic: str
@@ -39,7 +39,7 @@ class Beside:
             column[:] = list(compress(column, kept))
 
 
-def true_trajectory(item: Beside, warnings: list[str]) -> Trajectory | None:
+def true_trajectory(item: Reference, warnings: list[str]) -> Trajectory | None:
     """Return the true trajectory, with velocity."""
     poses = [(s, *pose_of(m), m) for s, m in zip(item.stamps_ns, item.messages, strict=True)]
     good = [(s, p, R, m) for s, p, R, m in poses if R is not None and (np.abs(p) <= MOST_DISTANCE_M).all()]
@@ -74,7 +74,7 @@ def _true_velocity(stamps_ns: NDArray[np.int64], p_m: Array, R: Array, messages:
     return np.asarray(twist if apart < 0.1 + 0.1 * speed else derivative)
 
 
-def check_speed(item: Beside) -> SpeedSeries | None:
+def check_speed(item: Reference) -> SpeedSeries | None:
     """Return the forward speed of an odometry topic, in stamp order."""
     stamps = np.array(item.stamps_ns, dtype=np.int64)
     speed = np.array([float(m.twist.twist.linear.x) for m in item.messages])

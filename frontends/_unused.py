@@ -15,7 +15,7 @@ from graphloc.frontends.decode import GPS_FIXES, IMU, NAV_SAT_FIX
 _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 
 
-def useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
+def unused_topics(streams: Sequence[Stream], used: Container[str]) -> list[str]:
     """Say which IMU and GNSS topics gave nothing, and why: silence would read as if they were not there."""
     lines = (
         []
@@ -26,7 +26,7 @@ def useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
         if stream.topic in used or stream.msgtype not in (IMU, *_FIXES):
             continue
         total = len(stream) + stream.undecodable + stream.no_stamp
-        why = _why_useless(stream)
+        why = _why_unused(stream)
         lines.append(
             f"{stream.topic}: nothing of its {total} messages can be used: {why}"
             if total
@@ -35,7 +35,7 @@ def useless(streams: Sequence[Stream], used: Container[str]) -> list[str]:
     return lines
 
 
-def _why_useless(stream: Stream) -> str:
+def _why_unused(stream: Stream) -> str:
     rows = stream.rows[sane(stream)] if len(stream) else np.zeros((0, 8))
     if stream.msgtype == IMU and len(rows) and not rows[:, :6].any():
         return "they hold neither accelerations nor rates, an orientation at most"
