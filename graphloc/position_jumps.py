@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +30,13 @@ _KEPT = 200
 
 
 def only_position_sensor(stream: Any, absolute: Collection[Any]) -> bool:
-    """Return whether this stream is the only one that measures position, and has no slow error that could take up a jump.
+    """Return whether this stream is the only one that measures position, and no slow error that drifts is estimated with it.
 
     Args:
         absolute: the absolute streams of the run.
     """
-    return len(absolute) == 1 and stream.row.absolute and stream.row.false is None and stream.slow is None
+    alone = len(absolute) == 1 and stream.row.absolute and stream.row.false is None
+    return bool(alone and (stream.slow is None or stream.left_out is not None))
 
 
 def position_jumps(
@@ -120,10 +121,23 @@ def why_in_doubt(sensor: str) -> str:
     return f"position jump of {sensor}, and no other sensor measures position"
 
 
+class PositionJump(NamedTuple):
+    """A jump between two fixes: their stamps (ns), and its size (m)."""
+
+    before_ns: int
+    after_ns: int
+    size_m: float
+
+
 class JumpDetector:
-    """The same for one receiver online: a jump is detected a second later, after three fixes at least."""
+    """The same for one receiver online: a jump is detected a second later, after three fixes at least.
+
+    Attributes:
+        jumps: those detected since the estimate started.
+    """
 
     def __init__(self) -> None:
+        self.jumps: tuple[PositionJump, ...] = ()
         self._seen: deque[tuple[int, Array, float]] = deque(maxlen=_KEPT)
         self._judged_ns = 0
         self._last_ns: int | None = None
@@ -143,6 +157,8 @@ class JumpDetector:
         self._judged_ns = max(int(until_ns), self._judged_ns)
         if not new.any():
             return none
+        before_ns = stamps_ns[np.searchsorted(stamps_ns, at_ns[new]) - 1]
+        self.jumps += tuple(map(PositionJump, before_ns.tolist(), at_ns[new].tolist(), off_m[new].tolist()))
         again = self.doubtful(stamp_ns)
         self._last_ns = int(at_ns[new][-1])
         return none if again else (at_ns[new], off_m[new])

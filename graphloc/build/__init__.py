@@ -16,11 +16,13 @@ from graphloc.build._chains import (
     JUMP,
     bias_step,
     closing_variance,
+    far_axes,
     slow_begin,
     slow_end,
     slow_step,
     standing_cost,
     walk_between_nodes,
+    without_drift,
 )
 from graphloc.build._graph import Decisions, Level, Past, StartPrior, build_graph, state_keys
 from graphloc.build._problem import (
@@ -55,6 +57,7 @@ __all__ = [
     "closing_variance",
     "company_of",
     "constant_keys",
+    "far_axes",
     "make_problem",
     "mount_of",
     "nav_state",
@@ -67,4 +70,5 @@ __all__ = [
     "thinned",
     "walk_between_nodes",
     "with_noise_scale",
+    "without_drift",
 ]

@@ -11,6 +11,7 @@ have tails, w = 1 / (1 + x^2 / (F s)^2), on all of their part of the measure, so
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -28,6 +29,7 @@ JUMP = KernelConfig(kind="cauchy", scale=2.0)
 _FAR = 2.0  # F above: sigmas beyond which such a component counts as far off
 CONSTANT_TAILS = 9.0  # squared sigmas at which the variance of a constant's prior doubles
 _NOTHING = 1e6  # sigmas: no information
+_NO_DRIFT = 100.0  # times the time constant
 _CHAIN_END = 2.0  # variances of the process: the prior at either end of a chain
 
 
@@ -60,12 +62,17 @@ def slow_step(
     # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
     step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt_s / slow.time_constant_s))
     if jump_m > 0.0:
-        step = np.where(_far(slow), jump_m, step)
+        step = np.where(far_axes(slow), jump_m, step)
     model: Any = gtsam.noiseModel.Diagonal.Sigmas(step)
     if slow.jumps and jumps and jump_m == 0.0:
         model = _with_tails(model, JUMP.scale)
     yield gtsam.BetweenFactorVector(key, following, np.zeros(len(step)), model)
     yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps)
+
+
+def without_drift(slow: SlowProcess) -> SlowProcess:
+    """Return a slow process that hardly moves but where it jumps: nothing tells a drift from motion, but the IMU tells a jump."""
+    return replace(slow, time_constant_s=_NO_DRIFT * slow.time_constant_s)
 
 
 def slow_end(slow: SlowProcess, key: int, *, jumps: bool = True) -> Iterator[Any]:
@@ -95,7 +102,7 @@ def _walk_rate(slow: SlowProcess) -> Array:
 
 def closing_variance(slow: SlowProcess, value: Array) -> Array:
     """Return the variance (k,) of the prior that closes a chain, re-weighted at `value` (k,), its last node; inf for constants."""
-    far = _far(slow)
+    far = far_axes(slow)
     square = float(((value[far] / slow.sigma[far]) ** 2).sum())
     tails = np.where(far, 1.0 + square / _FAR**2, 1.0)
     return np.where(np.isfinite(slow.time_constant_s), _CHAIN_END * slow.sigma**2 * tails, np.inf)
@@ -107,7 +114,7 @@ def standing_cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
     Args:
         path: (N, k) nodes. dt_s: (N - 1,) between them.
     """
-    far = _far(slow)
+    far = far_axes(slow)
     square = ((path[:, far] / slow.sigma[far]) ** 2).sum(axis=1)
     held = np.concatenate([[1.0 / _CHAIN_END], dt_s / (2.0 * float(slow.time_constant_s[far].max()))])
     held[-1] += 1.0 / _CHAIN_END
@@ -119,14 +126,15 @@ def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool) -> Iter
 
     Components that may stay far off have a prior of their own: a height above another zero must not loosen the horizontal ones.
     """
-    held, far = np.isfinite(slow.time_constant_s), _far(slow) & jumps
+    held, far = np.isfinite(slow.time_constant_s), far_axes(slow) & jumps
     for part in (held & ~far, held & far):
         if part.any():
             tails = _FAR / float(np.sqrt(times[part].max())) if far[part].all() else None
             yield _prior(key, slow.sigma * np.where(part, np.sqrt(times), _NOTHING), tails)
 
 
-def _far(slow: SlowProcess) -> NDArray[np.bool_]:
+def far_axes(slow: SlowProcess) -> NDArray[np.bool_]:
+    """Return which axes (k,) may stand far off, and jump."""
     return np.array([axis in slow.far for axis in slow.axes])
 
 

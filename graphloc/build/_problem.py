@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build._attach import nav_state, state_of
+from graphloc.build._chains import without_drift
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array, Datum
@@ -28,7 +29,6 @@ from graphloc.timeline import Timeline, make_timeline
 
 PositionJumps = tuple[NDArray[np.int64], Array]
 _NO_JUMPS: PositionJumps = np.zeros(0, dtype=np.int64), np.zeros(0)
-_NO_DRIFT = 100.0  # times its time constant: a drift cannot be separated from motion, but the IMU shows a jump
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +169,7 @@ def make_problem(
             if one_place and slow is None and row.absolute and row.false is None:
                 position_jumps = _position_jumps(row, by_sensor[name], datum, allowed=left_out is not None)
             if left_out is not None and len(position_jumps[0]) and not starts:
-                slow, left_out = replace(left_out, time_constant_s=_NO_DRIFT * left_out.time_constant_s), None
+                slow, left_out = without_drift(left_out), None
             streams.append(
                 _stream(
                     number, name, row, sensor, slow, left_out, position_jumps, mount, by_sensor[name], timeline, links

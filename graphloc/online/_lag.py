@@ -172,6 +172,12 @@ class Lag:
         """Return a warning on each position jump since this was last called (see `position_jumps.py`)."""
         return self._judge.receivers.jump_warnings()
 
+    @property
+    def unmodelled_jumps(self) -> list[str]:
+        """Names of the receivers that have jumped since the window was built, where the window can estimate that as their error."""
+        streams = self.problem.streams.items()
+        return [n for n, s in streams if s.left_out is not None and s.jump_detector.jumps != s.jumps]
+
     def in_doubt(self, stamp_ns: int) -> str:
         """Return why the health cannot be good at a stamp: the only position sensor has jumped; empty where it has not."""
         streams = self.problem.streams.items()  # where a slow error is left out, the bounds include it

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, MutableMapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 import gtsam
 import numpy as np
 
-from graphloc.build import Carry, company_of, mount_of, state_of
+from graphloc.build import Carry, company_of, mount_of, state_of, without_drift
 from graphloc.chi2 import chi2_median
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
@@ -24,7 +24,7 @@ from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._frozen_receiver import FrozenReceiverDetector
 from graphloc.online._motion_model import MotionModel
 from graphloc.online._setup import Setup
-from graphloc.position_jumps import JumpDetector
+from graphloc.position_jumps import JumpDetector, PositionJump
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
@@ -179,7 +179,13 @@ class Scatter:
 
 @dataclass(slots=True, eq=False)
 class LiveStream:
-    """The measurements of one sensor in order of arrival (offline: `graphloc.build.Stream`), and its detectors."""
+    """The measurements of one sensor in order of arrival (offline: `graphloc.build.Stream`), and its detectors.
+
+    Attributes:
+        slow: the slow error that is estimated. left_out: the one that is added to the bounds instead, because no second sensor
+            separates it from motion; both, once the receiver has jumped: then the window estimates its jumps.
+        jumps: those that the window estimates.
+    """
 
     number: int
     name: str
@@ -197,6 +203,11 @@ class LiveStream:
     scatter: Scatter = field(default_factory=Scatter)
     frozen_detector: FrozenReceiverDetector = field(default_factory=FrozenReceiverDetector)
     jump_detector: JumpDetector = field(default_factory=JumpDetector)
+    jumps: tuple[PositionJump, ...] = ()
+
+    def jump_m(self, begin_ns: int, end_ns: int) -> float:
+        """Return the size of the largest jump that its slow error may have made between two stamps, m; 0: none."""
+        return max((j.size_m for j in self.jumps if j.before_ns < end_ns and j.after_ns >= begin_ns), default=0.0)
 
 
 @dataclass(slots=True, eq=False)
@@ -240,9 +251,21 @@ class LiveProblem:
 
 
 def live_problem(
-    setup: Setup, datum: Datum, imu: ImuSeries, start_ns: int, noise_scale: float, motion_model: MotionModel
+    setup: Setup,
+    datum: Datum,
+    imu: ImuSeries,
+    start_ns: int,
+    noise_scale: float,
+    motion_model: MotionModel,
+    jump_detectors: MutableMapping[str, JumpDetector],
+    slow_known: Collection[str],
 ) -> LiveProblem:
-    """Return a problem whose first state is at `start_ns`; `imu`: the samples known from there on."""
+    """Return a problem whose first state is at `start_ns`.
+
+    Args:
+        imu: the samples known from there on. jump_detectors: by sensor; missing ones are added.
+        slow_known: names of the sensors whose slow error is known at the start.
+    """
     config, rows, mounts = setup.config, setup.rows, setup.mounts
     sensor = config.sensors[imu.sensor]
     t, R = mount_of(imu.sensor, sensor, mounts)
@@ -258,11 +281,15 @@ def live_problem(
         left_out = slow if slow is not None and slow.needs_company and company < 2 else None
         t_sensor, R_sensor = mount_of(name, block, mounts)
         mount = gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t)
+        detector = jump_detectors.setdefault(name, JumpDetector())
         kept = slow if left_out is None else None
+        if left_out is not None and (detector.jumps or name in slow_known):
+            kept = without_drift(left_out)
         scatter = Scatter(jumps=kept is not None and kept.jumps)
         streams[name] = LiveStream(
-            number, name, row, block, kept, left_out, row.constants(block), mount, scatter=scatter
-        )
+            number, name, row, block, kept, left_out, row.constants(block), mount, scatter=scatter,
+            jump_detector=detector, jumps=detector.jumps,
+        )  # fmt: skip
     return LiveProblem(
         config=config,
         datum=datum,

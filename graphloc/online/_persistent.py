@@ -82,6 +82,11 @@ class PersistentState:
             R_odom_body=self.odometry.R,
         )
 
+    def forget_jumps(self) -> None:
+        """Forget position jumps: an estimate that restarts takes a receiver's level as it is. That it jumped stays in doubt."""
+        for detector in self.jump_detectors.values():
+            detector.jumps = ()
+
     def forget_clock(self, stamp_ns: int) -> None:
         """Forget stamps of a clock that was set back; `stamp_ns`: by the clock as it is now."""
         self.agreed_ns, self.jump_detectors = {}, {}

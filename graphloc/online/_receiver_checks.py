@@ -57,7 +57,7 @@ class ReceiverChecks:
         if only_position_sensor(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
             allowed = stream.left_out is not None
             found = stream.jump_detector.note(stamp_ns, told_m, sigma_m, allowed=allowed)
-            self._jump_warnings += jump_warnings(stream.name, *found, allowed=allowed)
+            self._jump_warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
 
     def _reject_since(self, stream: LiveStream, since_s: float) -> None:
         """Take the fixes since a time (s of the timeline) out of the graph: they pulled the estimate along."""

@@ -228,6 +228,9 @@ class OnlineSmoother:
             self._events += tracking.news()
             if tracking.lag.lost_s:
                 return self._start_over(tracking, until_ns)
+            if jumped := tracking.lag.unmodelled_jumps:
+                self._rebuild(f"position jump of {', '.join(jumped)}")
+                return self._estimate()
             if contradiction := self._persistent.noise.contradicted(tracking.lag):
                 self._rebuild(contradiction)
                 return self._estimate()
@@ -260,6 +263,7 @@ class OnlineSmoother:
     def _wait(self, why: str) -> None:
         """Give up the estimate, and wait for a start."""
         self._tracking = None
+        self._persistent.forget_jumps()
         self._waiting.begin(why)
         self._ledger.close()
         self._intake.restart([])

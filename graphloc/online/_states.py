@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import bias_step, closing_variance, nav_state, slow_begin, slow_end, slow_step
+from graphloc.build import bias_step, closing_variance, far_axes, nav_state, slow_begin, slow_end, slow_step
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Going, Residual
@@ -182,7 +182,9 @@ class States:
                 continue
             key, following = (keys.slow(stream.number, n) for n in (j, j + 1))
             window.guess(following, np.atleast_1d(window.values.atVector(key)), t)
-            window.add(slow_step(stream.slow, key, following, dt_s))
+            stamps_ns = self._problem.timeline.slow_stamps_ns
+            jump_m = stream.jump_m(stamps_ns[j], stamps_ns[j + 1])
+            window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m))
             if stream.name in self._ends:
                 window.remove(self._ends[stream.name])
             ends = list(slow_end(stream.slow, following))
@@ -233,6 +235,8 @@ class States:
             P = propagated_covariance(
                 P, newest, at.T_world_body.rotation().matrix(), (to_ns - from_ns) * 1e-9, pim.preintMeasCov()
             )
+            if stream.slow is not None and size > 6 and (jump_m := stream.jump_m(from_ns, to_ns)):
+                P[6:, 6:] += np.diag(np.where(far_axes(stream.slow), jump_m**2, 0.0))
         return prediction_of(residual, at, P, newest.velocity_cov)
 
     def joint(self, attached: Sequence[Attachment], residuals: Sequence[Residual]) -> Array:

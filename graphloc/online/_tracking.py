@@ -84,12 +84,12 @@ class Tracking:
         known = [m for m in samples if m.stamp_ns >= since_ns] or samples[-1:]
         assert persistent.datum is not None
         problem = live_problem(
-            setup, persistent.datum, series_of(known), anchor.stamp_ns, persistent.noise.scale, persistent.motion_model
-        )
-        for name, stream in problem.streams.items():
-            if before is not None:
+            setup, persistent.datum, series_of(known), anchor.stamp_ns, persistent.noise.scale, persistent.motion_model,
+            persistent.jump_detectors, anchor.slow,
+        )  # fmt: skip
+        if before is not None:
+            for name, stream in problem.streams.items():
                 stream.scatter = before.problem.streams[name].scatter
-            stream.jump_detector = persistent.jump_detectors.setdefault(name, stream.jump_detector)
         lag = Lag(problem, anchor, setup.lag_s, guess)
         if before is not None:
             lag.agreed_ns.update(before.agreed_ns)
