@@ -23,6 +23,11 @@ LABELS = {
 """What a number is, in words; docs/outputs.md says it at length."""
 
 
+def percent(share: float | None) -> str:
+    """Return a share as a whole percentage; a dash where there is none."""
+    return "-" if share is None else f"{100.0 * share:.0f} %"
+
+
 def number(value: float | None, digits: int = 3) -> str:
     """Return a number for a table; a dash where there is none."""
     return "-" if value is None else str(value) if isinstance(value, int) else f"{value:.{digits}f}"

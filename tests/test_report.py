@@ -54,9 +54,9 @@ def test_verdict_names_the_numbers(data: ReportData) -> None:
     solution = replace(data.solution, trajectory=replace(data.solution.trajectory, cov=made))
     said = verdict(replace(data, solution=solution, tables=covered(0.95)))
     text = " ".join(reason.text for reason in said.reasons)
-    assert "95 % bound of 1.00 m" in text
+    assert "95 % bound is 1.00 m" in text
     assert said.tracks[0].accuracy == "Horizontal RMSE 0.12 m; beside it: BL EKF 1.50 m (12 x)."  # 1.5 / 0.1234 = 12.2
-    assert "held the truth for 95% of the time" in text
+    assert "held the truth for 95 % of the time" in text
     assert said.trust is Trust.YES
 
 

@@ -11,6 +11,7 @@ from itertools import groupby
 import numpy as np
 
 from graphloc.eval.pieces import note, table
+from graphloc.eval.words import percent
 from graphloc.frames import Array
 from graphloc.solution import Health, Solution
 from graphloc.time import seconds_since
@@ -67,9 +68,9 @@ def stretches(solution: Solution, begin_ns: int) -> list[Stretch]:
 
 
 def said_of(solution: Solution) -> str:
-    """Return the states with their shares and durations, as 'good for 80% (64 s), degraded for 20% (16 s)'."""
+    """Return the states with their shares and durations, as 'good for 80 % (64 s), degraded for 20 % (16 s)'."""
     lasting = durations_s(solution)
-    told = [f"{_words(h)} for {share:.0%} ({_seconds(lasting[h])})" for h, share in shares(solution).items()]
+    told = [f"{_words(h)} for {percent(share)} ({_seconds(lasting[h])})" for h, share in shares(solution).items()]
     return ", ".join(told)
 
 
@@ -104,7 +105,7 @@ def section(solutions: Sequence[Solution], begin_ns: int) -> str:
             left = (
                 f" The {_LONGEST} longest of {len(every)} times; solution.csv has all." if len(every) > _LONGEST else ""
             )
-            head = ("", "s of the track", "for", "why", "what ends it")
+            head = ("", "time, s", "for", "why", "what ends it")
             parts.append(
                 f"<h3>{solution.name}: {said_of(solution)}</h3>{table(head, rows, text=(3, 4))}{note(left.strip())}"
             )
