@@ -88,6 +88,8 @@ _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MOST_TRIED = 200  # messages of a topic that cannot be decoded
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
 _MOST_NAMED = 6
+# How the draft names an odometry or pose topic, by its role.
+_DRAFTED = {"truth": "truth_topic", "check_speed": "check_speed_topic", "pose": "a sensor of kind pose, switched off"}
 _COVERS = 0.8  # of the run, from which a receiver is there throughout
 
 
@@ -325,7 +327,8 @@ def render(inspection: Inspection) -> str:
     for twist in inspection.velocities:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
-        lines += ["", f"{item.topic}: suggested as {item.role}", f"  {item.why}; {item.world}"]
+        off = ", switched off" if item.role == "truth" and item.origin is None else ""
+        lines += ["", f"{item.topic}: drafted as {_DRAFTED[item.role]}{off}", f"  {item.why}; {item.world}"]
     counts = {t.topic: t.count for t in inspection.topics}
     for what, kind, mounted, need in (
         ("scans", "aerial", inspection.lidars, "a map"),
