@@ -161,8 +161,12 @@ def test_when_it_was_less_than_good(data: ReportData) -> None:
     assert lasting[Health.DEAD_RECKONING] == pytest.approx(3.0)
     assert lasting[Health.GOOD] == pytest.approx(5.0)
     page = section([solution], 0)
-    assert "<td>2 to 5</td><td>3.0 s</td>" in page
+    assert "<td>1</td><td>3.0 s</td><td>2 to 5</td>" in page
     assert "good for 50 % (5.0 s), degraded for 20 % (1.9 s), dead reckoning for 30 % (3.0 s)" in page
+    for k in range(60, 70):
+        health[k], why[k] = Health.DEAD_RECKONING, "no position for 9 s"
+    page = section([replace(solution, health=tuple(health), health_reason=tuple(why))], 0)
+    assert "<td>2</td><td>4.0 s</td><td>2 to 5</td>" in page  # the same reason but for its number: one row
     assert section([data.solution], 0) == ""  # all good
     hole = np.concatenate([stamps[:50], stamps[50:] + 60_000_000_000])
     with_hole = replace(solution, trajectory=replace(track, stamps_ns=hole))
