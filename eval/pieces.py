@@ -33,7 +33,7 @@ img{max-width:100%}ul.warnings{padding-left:1.2rem}li.warning{color:#8a3b00;over
 @media(max-width:600px){.wide{display:none}body{padding:.5rem .6rem 2rem}th,td{padding:.25rem .4rem}table{font-size:.82rem}.verdict{font-size:1rem}}
 @page{size:A4;margin:12mm}
 @media print{body{font-size:10.5pt;max-width:none;padding:0}.figure,table,img{break-inside:avoid}nav,details{display:none}
-.scroll{overflow:visible}th,td{white-space:normal}td.text,td:first-child{overflow-wrap:anywhere}.figure{overflow:visible}.reason td:first-child{min-width:10rem}.reason td:last-child{min-width:17rem}*{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
+.scroll{overflow:visible}th,td{white-space:normal}td.text,td:first-child{overflow-wrap:anywhere}td:first-child{min-width:6.5rem}.figure{overflow:visible}.reason td:first-child{min-width:10rem}.reason td:last-child{min-width:17rem}*{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
 """
 
 

@@ -17,6 +17,7 @@ from graphloc.eval.metrics import Table
 from graphloc.eval.plots import Underlay
 from graphloc.eval.report import ReportData, Trust, figures, theses_section, verdict, write_report
 from graphloc.eval.simulate import Scenario, simulate
+from graphloc.eval.words import significant
 from graphloc.measurements import GnssPosition
 from graphloc.survey import Survey
 from graphloc.trajectory import Trajectory
@@ -42,6 +43,14 @@ def data() -> ReportData:
 def covered(share: float) -> tuple[Table, ...]:
     columns = ("position_rmse_m", "coverage_95")
     return (Table("Against truth", columns, (("graphloc", (0.1234, share)), ("BL EKF", (1.5, None)))),)
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "said"),
+    [(9231.0, 3, "9230"), (-0.04427, 3, "-0.0443"), (390.4, 2, "390"), (0.0, 3, "0"), (1.1e-5, 2, "0.000011")],
+)
+def test_significant_digits_without_powers_of_ten(value: float, digits: int, said: str) -> None:
+    assert significant(value, digits) == said
 
 
 def test_verdict_names_the_numbers(data: ReportData) -> None:

@@ -12,7 +12,7 @@ from graphloc.eval.plots import HEALTH, OUTAGE
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._judged import Trust, main_table, times
 from graphloc.eval.report._verdict import Verdict
-from graphloc.eval.words import number, percent
+from graphloc.eval.words import number, percent, significant
 from graphloc.solution import Solution
 
 _REASONS = 60
@@ -137,7 +137,8 @@ def calibration(data: ReportData) -> str:
         return ""
     wrong = "".join(f'<li class="warning">{escape(str(s))}</li>' for s in found.suggestions)
     rows = "".join(
-        f"<tr><td>{escape(c.key)}</td><td>{c.configured:.3g}</td><td>{c.change:+.3g}</td><td>{c.sigma:.2g} {escape(c.unit)}"
+        f"<tr><td>{escape(c.key)}</td><td>{significant(c.configured)}</td><td>{'-' if c.change < 0 else '+'}{significant(abs(c.change))}</td>"
+        f"<td>{significant(c.sigma, 2)} {escape(c.unit)}"
         f"</td><td>{escape(c.said)}</td></tr>"
         for c in found.checks
     )
