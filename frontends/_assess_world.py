@@ -62,7 +62,7 @@ def origin_of(
         return None, f"its frame is not east-north-up: turned by {turned:+.1f} deg, {apart:.1f} m apart from the fixes"
     place = Datum(Geodetic(*first_fix)).geodetic_from_enu(offset[None, :])[0]
     lever = "" if antenna_m is not None else " and the antenna's unknown lever arm"
-    return vec(place), f"fits the fixes to {apart:.1f} m; their slow error{lever} is in it, and in every latitude"
+    return vec(place), f"fits the fixes to {apart:.1f} m; an origin found this way is off by their slow error{lever}"
 
 
 def _quaternions(rows: Array) -> Array:

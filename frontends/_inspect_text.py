@@ -8,6 +8,9 @@ from collections.abc import Sequence
 from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, TopicReport
 from graphloc.time import utc_text
 
+# How the draft names an odometry or pose topic, by its role.
+_DRAFTED = {"truth": "truth_topic", "check_speed": "check_speed_topic", "pose": "a sensor of kind pose, switched off"}
+
 
 def render(inspection: Inspection) -> str:
     """Return the inspection as text for a terminal."""
@@ -23,7 +26,8 @@ def render(inspection: Inspection) -> str:
     for twist in inspection.velocities:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
-        lines += ["", f"{item.topic}: suggested as {item.role}", f"  {item.why}; {item.world}"]
+        off = ", switched off" if item.role == "truth" and item.origin is None else ""
+        lines += ["", f"{item.topic}: drafted as {_DRAFTED[item.role]}{off}", f"  {item.why}; {item.world}"]
     counts = {t.topic: t.count for t in inspection.topics}
     for what, kind, mounted, need in (
         ("scans", "aerial", inspection.lidars, "a map"),

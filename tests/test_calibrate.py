@@ -169,7 +169,7 @@ def test_all_that_is_wrong_is_found_at_once(simulated: SimulatedRun) -> None:
         assert abs(found[key].z) > 4.0
     said = found["sensors.compass.mount.rpy_deg[2]"]
     assert said.suggested == pytest.approx(0.0, abs=1.0)
-    assert "cannot tell it from sensors.aerial.mount.rpy_deg[2]" in said.action
+    assert "cannot tell it from sensors.matcher.mount.rpy_deg[2]" in said.action
 
 
 def test_fixes_that_are_late_are_found(simulated: SimulatedRun) -> None:

@@ -400,10 +400,11 @@ def test_another_body_is_no_truth(tmp_path: Path) -> None:
     for k, (_, log_ns, fix) in enumerate([item for item in items if item[0] == "/fix"]):
         stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
         items.append(("/truth/dock", log_ns, make.odometry(stamp, (140.0 + 0.3 * np.sin(0.1 * k), 86.0, 0.0))))
-    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     assert config.truth_topic is None
     assert config.datum is None
     assert "not a pose of this vessel" in text
+    assert "/truth/dock: drafted as truth_topic, switched off" in render(found)
 
 
 def test_the_antenna_is_taken_off_the_datum(tmp_path: Path) -> None:

@@ -87,7 +87,23 @@ def test_the_online_track_is_judged_by_its_own_numbers(
     assert offline.trust is Trust.YES
     assert online.trust is said.trust is expected
     assert online.accuracy == "Horizontal RMSE 0.24 m, worst 0.90 m."  # not beside the offline one, which knows more
-    assert any(f"held the truth for {covered:.0%}" in r.text and f"NEES {nees:.1f}" in r.text for r in online.reasons)
+    assert any(
+        f"held the truth for {100 * covered:.0f} %" in r.text and f"NEES {nees:.1f}" in r.text for r in online.reasons
+    )
+
+
+@pytest.mark.parametrize(("covered", "expected"), [(0.9, Trust.YES), (0.6, Trust.WITH_CARE)])
+def test_headings_are_judged_with_their_size(data: ReportData, covered: float, expected: Trust) -> None:
+    """Sigma 1 rad: a bound of 1.96 rad, 112.3 deg; beside it the error that it should have held."""
+    columns = ("position_rmse_m", "heading_rmse_deg", "heading_max_deg", "heading_coverage_95")
+    rows = tuple((name, (0.1, 1.25, 2.5, covered)) for name in ("graphloc", "graphloc online"))
+    (offline, _) = verdict(replace(data, tables=(Table("Against truth", columns, rows),))).tracks
+    (found,) = (r for r in offline.reasons if "heading bounds" in r.text)
+    assert found.trust is expected
+    assert found.text.startswith(
+        f"Its heading bounds (112.30 deg, median) held the truth for {100 * covered:.0f} % of the time; "
+        "off by 1.25 deg (RMS), 2.50 at most"
+    )
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.02, Trust.YES), (0.2, Trust.WITH_CARE), (0.7, Trust.NO)])
@@ -145,8 +161,12 @@ def test_when_it_was_less_than_good(data: ReportData) -> None:
     assert lasting[Health.DEAD_RECKONING] == pytest.approx(3.0)
     assert lasting[Health.GOOD] == pytest.approx(5.0)
     page = section([solution], 0)
-    assert "<td>2 to 5</td><td>3.0 s</td>" in page
-    assert "good for 50% (5.0 s), degraded for 20% (1.9 s), dead reckoning for 30% (3.0 s)" in page
+    assert "<td>1</td><td>3.0 s</td><td>2 to 5</td>" in page
+    assert "good for 50 % (5.0 s), degraded for 20 % (1.9 s), dead reckoning for 30 % (3.0 s)" in page
+    for k in range(60, 70):
+        health[k], why[k] = Health.DEAD_RECKONING, "no position for 9 s"
+    page = section([replace(solution, health=tuple(health), health_reason=tuple(why))], 0)
+    assert "<td>2</td><td>4.0 s</td><td>2 to 5</td>" in page  # the same reason but for its number: one row
     assert section([data.solution], 0) == ""  # all good
     hole = np.concatenate([stamps[:50], stamps[50:] + 60_000_000_000])
     with_hole = replace(solution, trajectory=replace(track, stamps_ns=hole))

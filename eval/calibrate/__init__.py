@@ -11,6 +11,7 @@ from graphloc.config import VesselConfig
 from graphloc.eval.calibrate._evidence import Estimate, Evidence, Name
 from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
 from graphloc.eval.calibrate._imu import imu_noise
+from graphloc.eval.words import significant
 from graphloc.frames import rpy_from_rotation
 from graphloc.offsets import Offset, Probe
 from graphloc.recording import Recording
@@ -38,10 +39,10 @@ _UNIT: dict[Offset, tuple[str, float]] = {
 # A sigma from which the run says nothing of use, and what would help.
 _USEFUL: dict[Offset, float] = {"x": 0.15, "y": 0.15, "yaw": float(np.radians(1.0)), "time": 0.05}
 _WOULD_TELL: dict[Offset, str] = {
-    "x": "turns by 90 degrees and more, within a minute or so, would",
-    "y": "turns by 90 degrees and more, within a minute or so, would",
-    "yaw": "a longer run with fixes or matches, at changing speed, would",
-    "time": "turns, and speeding up and down, would",
+    "x": "turns by 90 degrees and more, within a minute or so",
+    "y": "turns by 90 degrees and more, within a minute or so",
+    "yaw": "a longer run with fixes or matches, at changing speed",
+    "time": "turns, and speeding up and down",
 }
 _MEANS: dict[Offset, str] = {
     "x": "its measurements fit the run better from there, whatever the heading",
@@ -118,9 +119,9 @@ def _check(name: Name, found: Estimate, recording: Recording, config: VesselConf
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
     if found.sigma > _USEFUL[name[1]]:
-        said = f"this run cannot tell (1 sigma {factor * found.sigma:.2g} {unit}); {_WOULD_TELL[name[1]]}"
+        said = f"this run does not show it (1 sigma {significant(factor * found.sigma, 2)} {unit}); it would take {_WOULD_TELL[name[1]]}"
     else:
-        said = f"fits, within {SIGMAS_95 * factor * found.sigma:.2g} {unit} (95 %)"
+        said = f"fits, within {significant(SIGMAS_95 * factor * found.sigma, 2)} {unit} (95 %)"
     return Check(
         key=key, unit=unit, configured=configured, change=factor * found.value, sigma=factor * found.sigma, said=said
     )

@@ -13,6 +13,7 @@ from graphloc.chi2 import chi2_95
 from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
+from graphloc.eval.words import percent
 from graphloc.frames import Array
 from graphloc.solution import Health, Solution
 from graphloc.trajectory import Trajectory, bounds_95
@@ -92,7 +93,7 @@ def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
     doubtful = called.get(Health.GOOD, 0.0) < _MOSTLY or called.get(Health.LOST, 0.0) > _LOST
     yield Reason(
         trust=Trust.WITH_CARE if doubtful else Trust.YES,
-        text=f"It states a 95 % bound of {bound:.2f} m or better for 95 % of the run, and calls itself {said_of(solution)}.",
+        text=f"Its 95 % bound is {bound:.2f} m or less for 95 % of the run. Health: {said_of(solution)}.",
     )
     covered, headed, nees = (
         of(data, solution.name, column) for column in ("coverage_95", "heading_coverage_95", "nees")
@@ -103,10 +104,20 @@ def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
         why = ". The bounds are far too small: a mount, the datum or a noise is wrong" if trust is Trust.NO else ""
         why = why or ("; they are too small" if trust is Trust.WITH_CARE else "")
         beside = "" if nees is None else f" (NEES {nees:.1f}; 2 where they are honest)"
-        yield Reason(trust=trust, text=f"Its 95 % bounds held the truth for {covered:.0%} of the time{beside}{why}.")
+        yield Reason(
+            trust=trust, text=f"Its 95 % bounds held the truth for {percent(covered)} of the time{beside}{why}."
+        )
     if headed is not None:
-        trust = Trust.WITH_CARE if headed < _COVERED else Trust.YES
-        yield Reason(trust=trust, text=f"Its heading bounds held the truth for {headed:.0%} of the time.")
+        bound_deg = float(np.median(bounds_95(solution.trajectory.cov)[:, 2]))
+        off_deg, most_deg = (of(data, solution.name, f"heading_{which}_deg") for which in ("rmse", "max"))
+        off = "" if off_deg is None or most_deg is None else f"; off by {off_deg:.2f} deg (RMS), {most_deg:.2f} at most"
+        trust, why = (
+            (Trust.WITH_CARE, "; too small, or in a run of a minute or two chance")
+            if headed < _COVERED
+            else (Trust.YES, "")
+        )
+        text = f"Its heading bounds ({bound_deg:.2f} deg, median) held the truth for {percent(headed)} of the time{off}{why}."
+        yield Reason(trust=trust, text=text)
 
 
 def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
@@ -180,7 +191,7 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
     yield Reason(
         trust=trust,
         text=f"It is {_rms(off):.2f} m from the offline track (RMS), {off.max():.2f} m at most; its own 95 % bounds hold the "
-        f"offline position for {placed:.0%} of the time, the offline heading for {headed:.0%}{said}.",
+        f"offline position for {percent(placed)} of the time, the offline heading for {percent(headed)}{said}.",
     )
 
 
@@ -196,10 +207,12 @@ def _compared(data: ReportData, solution: Solution) -> Iterator[Reason]:
     if matched is None or matched >= _MATCHED:
         return
     if solution.stats.online and matched >= _STARTED:
-        text = f"It covers {matched:.0%} of what it is compared with: it begins once position and heading are known."
+        text = (
+            f"It covers {percent(matched)} of what it is compared with: it begins once position and heading are known."
+        )
         yield Reason(trust=Trust.YES, text=text)
         return
-    text = f"It covers only {matched:.0%} of what it is compared with; the filters may cover more."
+    text = f"It covers only {percent(matched)} of what it is compared with; the filters may cover more."
     yield Reason(trust=Trust.WITH_CARE, text=text)
 
 
@@ -214,7 +227,8 @@ def _solved(data: ReportData, solution: Solution) -> Iterator[Reason]:
         ratio = stats.cost / max(stats.expected_cost, 1.0)
         trust = Trust.WITH_CARE if ratio > _FAR_OFF else Trust.YES
         text = (
-            f"The solver converged; cost over its expectation {ratio:.2f} (near 1 where the noise is configured right)."
+            f"The solver converged; cost over its expectation {ratio:.2f} (near 1 where the noise is configured right, "
+            "below where it is configured too large)."
         )
         yield Reason(trust=trust, text=text)
     about_all = len(data.recording.warnings) if solution is data.solution else 0
