@@ -20,7 +20,7 @@ from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
-from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE, QUATERNION, yaw_of_x_axis
+from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE, QUATERNION, UNSTAMPED, yaw_of_x_axis
 from graphloc.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.time import NS_PER_S
@@ -88,6 +88,7 @@ def topic_report(stream: Stream, count: int) -> TopicReport:
         repeated=int((steps == 0).sum()),
         backward=int((steps < 0).sum()),
         no_stamp=stream.no_stamp,
+        recorded=stream.recorded,
         latency_s=vec(latency),
     )
 
@@ -101,12 +102,17 @@ def sane(stream: Stream) -> NDArray[np.intp]:
 def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:
     """Return streams with messages, each on the clock of the first IMU where its own is another one, by the recording times.
 
+    Where that tells no date, on the first clock that does.
+
     One cannot be judged by another that lies seconds or years away. A pose may well come late: it takes time to match.
     """
     latency = {s.topic: _clock.usual_latency_s(s.stamps_ns, s.logs_ns) for s in streams}
-    reference = next((latency[s.topic] for s in streams if s.msgtype == IMU), None)
-    if reference is None:
+    clocks = {s.topic: _clock.Clock(int(s.stamps_ns.min()), latency[s.topic]) for s in streams}
+    imu = next((clocks[s.topic] for s in streams if s.msgtype == IMU), None)
+    if imu is None:
         return list(streams)
+    own = [clocks[s.topic] for s in streams if not s.recorded and s.msgtype not in UNSTAMPED]
+    reference = _clock.reference_of(imu, own).latency_s
     found = []
     for stream in streams:
         behind = latency[stream.topic] - reference

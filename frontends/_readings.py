@@ -160,7 +160,8 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
         if abs(behind) > _clock.EPOCH_LIMIT_S:
             lines.append(
                 f"{sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "
-                f"{reference}, by the recording times; if that is right, add {behind:.3f} to its time_offset_s"
+                f"{reference}, by the recording times; if that is right, add {behind:.3f} to its time_offset_s (how much longer its "
+                "messages take than those of the other is in it)"
             )
     return lines
 

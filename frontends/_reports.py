@@ -7,12 +7,18 @@ import re
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from graphloc.frontends.nmea import SPEEDS
 from graphloc.plain import plain
 
 Vec = tuple[float, float, float]
 # Of MAVROS, microstrain_inertial, robot_localization, xsens_mti: what an EKF makes of receiver and IMU.
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
+
+
+def through_water(topic: str) -> bool:
+    """Return whether a velocity is through the water, by the sentence of NMEA in the name of its stream."""
+    return topic.endswith(SPEEDS)
 
 
 def filtered(topic: str) -> bool:
@@ -27,6 +33,7 @@ class TopicReport:
     Attributes:
         gaps: intervals longer than 5 usual ones (and 0.1 s); max_gap_s: the longest interval.
         repeated, backward: stamps equal to, or before, the one before; no_stamp: zero stamps.
+        recorded: whether the headers hold no stamps, so that the recording times stand for them here.
         latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points.
     """
 
@@ -43,6 +50,7 @@ class TopicReport:
     repeated: int | None = None
     backward: int | None = None
     no_stamp: int | None = None
+    recorded: bool = False
     latency_s: Vec | None = None
 
 
@@ -158,7 +166,7 @@ class VelocityReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryReport:
-    """An odometry or pose topic: role is 'truth', 'check_speed' or 'pose'.
+    """An odometry or pose topic: role is 'truth', 'check_speed', 'pose', or 'other' of what is no pose of the vessel.
 
     `origin`: latitude, longitude (deg) and height (m) of its frame's origin, where the frame is
     east-north-up by the fixes; `world`: the evidence.

@@ -40,6 +40,7 @@ from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, To
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import Yaws, refuse_unit, turn_warnings
 from graphloc.frontends.decode import (
+    NO_STAMP,
     ODOMETRY,
     PLAIN_POSE,
     POSE,
@@ -217,9 +218,9 @@ class _Reader:
 
     def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:
         """Hand a message to its decoder; what gives no reading gives a row."""
-        stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns)
+        stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=readings.config.stamps == "recorded")
         if stamp_ns is None:
-            text = f"{raw.file}: header stamp is zero or negative, recorded at {utc_text(raw.log_ns)}"
+            text = f"{raw.file}: header stamp is zero or negative, recorded at {utc_text(raw.log_ns)}: {NO_STAMP}"
             self._rows.append(readings.row(seq, 0, malformed(text)))
             return
         stamp_ns += duration_ns(readings.config.time_offset_s)
@@ -361,13 +362,17 @@ def _mount_warnings(
 
 
 def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) -> list[str]:
-    """Say which sensors' messages have no stamp."""
-    return [
-        f"{r.sensor}: {_or(topics[r.config.topic].msgtypes)} has no stamp: recording times are used; set time_offset_s (negative) "
-        "if they are late"
-        for r in sensors
-        if set(topics[r.config.topic].msgtypes) & set(UNSTAMPED)
-    ]
+    """Say which sensors' messages have the recording times for stamps."""
+    lines = []
+    for r in sensors:
+        types = topics[r.config.topic].msgtypes
+        why = f"{_or(types)} has no stamp" if set(types) & set(UNSTAMPED) else "stamps: recorded"
+        if set(types) & set(UNSTAMPED) or r.config.stamps == "recorded":
+            lines.append(
+                f"{r.sensor}: {why}: recording times are used, which are late by as long as a message takes (a receiver's often "
+                "0.1 s and more); no bound includes that: set time_offset_s (negative)"
+            )
+    return lines
 
 
 def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary]) -> list[str]:

@@ -28,7 +28,7 @@ from graphloc.frontends._assess import (
 )
 from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
-from graphloc.frontends._assess_world import origin_of
+from graphloc.frontends._assess_world import world_of
 from graphloc.frontends._clock import refuse_woven
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._lag import lag, lag_of_way
@@ -127,10 +127,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     mount = tree.resolve(body, frame) if frame else None
     antenna = None if mount is None else mount[0]
     courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
-    told = [
-        (s, odometry_report(s, stamps, p_m, *origin_of(s, stamps, p_m, first, antenna), scatter_m=scatter_m))
-        for s in poses
-    ]
+    told = [(s, odometry_report(s, stamps, p_m, world_of(s, stamps, p_m, first, antenna), scatter_m)) for s in poses]
     twists = [
         (s, velocity_report(s, stamps, p_m, _known(s, tree, body), scatter_m))
         for s in filled
@@ -325,7 +322,8 @@ def render(inspection: Inspection) -> str:
     for twist in inspection.velocities:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
-        lines += ["", f"{item.topic}: suggested as {item.role}", f"  {item.why}; {item.world}"]
+        said = "left out" if item.role == "other" else f"suggested as {item.role}"
+        lines += ["", f"{item.topic}: {said}", f"  {item.why}; {item.world}"]
     counts = {t.topic: t.count for t in inspection.topics}
     for what, kind, mounted, need in (
         ("scans", "aerial", inspection.lidars, "a map"),
@@ -365,6 +363,8 @@ def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
     if starts:
         lines.append(f"starts {utc_text(min(starts))}")
     for t in topics:
+        if t.recorded:
+            lines.append(f"{t.topic}: its headers hold no stamps (all zero, or all the same): recording times are used")
         if t.undecodable or t.no_stamp:
             lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded, {t.no_stamp or 0} have no stamp")
     return lines

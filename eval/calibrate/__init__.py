@@ -21,6 +21,7 @@ __all__ = ["PROBE", "Calibration", "Check", "Suggestion", "calibrate"]
 PROBE: Probe = {
     "gnss": ("x", "y", "time"),
     "gnss_velocity": ("time",),
+    "body_velocity": ("time",),
     "compass": ("yaw", "time"),
     "pose": ("yaw", "time"),
     "aerial": ("time",),
