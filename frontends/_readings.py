@@ -28,10 +28,8 @@ from graphloc.frontends.decode import Decoded, ImuSample
 from graphloc.frozen_imu import WHY, frozen_imu_warning, frozen_samples
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
+from graphloc.thinning import HEADINGS_APART_NS, THINNED, Thinning
 from graphloc.time import NS_PER_S, utc_text
-
-_HEADINGS_APART_NS = 45_000_000  # 20 a second stay, though their stamps jitter
-THINNED = "less than 0.05 s after the heading before: what a compass errs lasts longer, so that it tells nothing new"
 
 
 @dataclass(slots=True)
@@ -233,14 +231,10 @@ def thin_headings(readings: Readings) -> list[LedgerRow]:
 
     They must be in order of their stamps to be dropped evenly; those that are not stay.
     """
-    if not isinstance(readings.config, CompassConfig) or len(readings.values) < 2:
+    if not isinstance(readings.config, CompassConfig):
         return []
-    stamps = readings.stamps()
-    bad = np.zeros(len(stamps), dtype=bool)
-    last_ns = int(stamps[0])
-    for i, stamp_ns in enumerate(stamps[1:].tolist(), start=1):
-        bad[i] = 0 < stamp_ns - last_ns < _HEADINGS_APART_NS
-        last_ns = last_ns if bad[i] else stamp_ns
+    thinning = Thinning(HEADINGS_APART_NS)
+    bad = np.array([thinning.drops(stamp_ns) for stamp_ns in readings.stamps_ns], dtype=bool)
     return readings.drop(bad, rejected(THINNED))
 
 
