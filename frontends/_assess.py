@@ -17,7 +17,7 @@ from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import scatter_m
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
+from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec, two_antennas
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
 from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE, QUATERNION, UNSTAMPED, yaw_of_x_axis
@@ -342,7 +342,14 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
         return None
     yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in quaternions]
     good = np.array([not isinstance(y, Rejection) for y in yaw])
-    plain: dict[str, Any] = {"topic": stream.topic, "msgtype": stream.msgtype, "unit": unit_of(stream)}
+    # Drivers of receivers with two antennas fill an Imu with the orientation alone.
+    gnss = not rows[:, :6].any() if stream.msgtype == IMU else two_antennas(stream.topic)
+    plain: dict[str, Any] = {
+        "topic": stream.topic,
+        "msgtype": stream.msgtype,
+        "unit": unit_of(stream),
+        "two_antennas": gnss,
+    }
     if good.sum() < 10:
         why = "its messages give no yaw"
         return CompassReport(

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from graphloc.config import GnssConfig, ImuConfig, SlowErrorConfig
+from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SlowErrorConfig
 from graphloc.frontends._clock import EPOCH_LIMIT_S, Clock, reference_of
 from graphloc.frontends._fixes import NOTHING_M, SCATTERS
 from graphloc.frontends._reports import (
@@ -24,6 +24,7 @@ from graphloc.frontends._reports import (
     filtered,
     through_water,
 )
+from graphloc.frontends._turns import WANDERS_DEG
 from graphloc.frontends.decode import IMU, UNSTAMPED, VECTOR
 
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
@@ -360,11 +361,28 @@ def _compass_block(name: str, compass: CompassReport, *, again: bool) -> list[st
             "  enabled: false  # guess: another heading of the same topic is used, a true one before a magnetic one"
         )
     lines += _mount_lines(compass)
-    lines.append("  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass")
-    lines.append("  wander_sigma_deg: 0.5  # guess: passing errors near iron; 0.2 for a GNSS compass")
-    if compass.msgtype == IMU:
+    lines += _error_lines(compass)
+    if compass.msgtype == IMU and not compass.two_antennas:
         lines.append("  use_reported_sigma: false  # guess: drivers' orientation covariances are seldom measured")
     return lines
+
+
+def _error_lines(compass: CompassReport) -> list[str]:
+    """What turns a compass for a while or by the heading: iron, of which two antennas know nothing."""
+    wander = compass.wander_deg or 0.0
+    gnss = compass.two_antennas and wander < WANDERS_DEG
+    usual = 0.2 if gnss else CompassConfig().wander_sigma_deg
+    if gnss:
+        lines = [
+            "  deviation_sigma_deg: 0.0  # guess: a heading of GNSS by its topic or message; 1.5 for a magnetic compass"
+        ]
+        why = "a heading of GNSS; 0.5 for a magnetic compass"
+    else:
+        lines = ["  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass"]
+        why = "passing errors near iron; 0.2 for a GNSS compass"
+    if wander > max(WANDERS_DEG, 2.0 * usual):
+        usual, why = wander, "as it wanders beside the gyro; iron near it, or its own filter"
+    return [*lines, f"  wander_sigma_deg: {usual:.1f}  # guess: {why}"]
 
 
 def _mount_lines(compass: CompassReport) -> list[str]:

@@ -12,8 +12,15 @@ from graphloc.plain import plain
 
 Vec = tuple[float, float, float]
 # Of MAVROS, microstrain_inertial, robot_localization, xsens_mti: what an EKF makes of receiver and IMU.
+# HDT and THS of a GNSS receiver; topics of ublox_gps, septentrio_gnss_driver, mavros and their like.
+_TWO_ANTENNAS = re.compile(r" G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
+
+
+def two_antennas(topic: str) -> bool:
+    """Return whether a heading is one of GNSS, by the name of its topic or its sentence."""
+    return bool(_TWO_ANTENNAS.search(topic)) and not filtered(topic)
 
 
 def through_water(topic: str) -> bool:
@@ -137,6 +144,8 @@ class CompassReport:
         leeway_deg: how far that wanders, from half minute to half minute: leeway, or the compass; None where it is not told.
         samples: courses compared; why: the judgement in words. unit: of bare numbers, else None.
         like: an orientation that says the same, of the same device, else ''.
+        wander_deg: how far its error wanders beside the gyroscope, 1 sigma for a minute; None where that does not tell.
+        two_antennas: whether a GNSS receiver says it, by its sentence, its topic, or as an Imu with an orientation alone.
     """
 
     topic: str
@@ -150,6 +159,8 @@ class CompassReport:
     unit: str | None = None
     like: str = ""
     leeway_deg: float | None = None
+    wander_deg: float | None = None
+    two_antennas: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

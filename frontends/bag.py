@@ -38,7 +38,7 @@ from graphloc.frontends._readings import (
 from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turns import Yaws, refuse_unit, turn_warnings
+from graphloc.frontends._turns import Yaws, refuse_unit, turn_warnings, wander_warning
 from graphloc.frontends.decode import (
     NO_STAMP,
     ODOMETRY,
@@ -339,6 +339,7 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
         if isinstance(readings.config, CompassConfig):
             headings = [v for v in readings.values if isinstance(v, CompassHeading)]
             lines += turn_warnings(imu, readings.sensor, headings, readings.config.convention)
+            lines += wander_warning(imu, readings.sensor, headings, readings.config)
     return lines
 
 

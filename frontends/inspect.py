@@ -48,7 +48,7 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turns import SCATTERED, scattered
+from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends._useless import useless
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import (
@@ -229,7 +229,7 @@ def _timed(report: CompassReport, stream: Stream, told: Stream, turning: Turning
 
 
 def _asked_together(report: CompassReport, stream: Stream, imus: Sequence[tuple[ImuReport, Stream]]) -> CompassReport:
-    """The report, with how many readings have nothing to do with those beside them, by the best IMU."""
+    """The report, with what the gyroscope of the best IMU says: how far it wanders, how many readings are none of a heading."""
     if not imus or not report.usable:
         return report
     imu, samples = imus[0]
@@ -250,6 +250,7 @@ def _asked_together(report: CompassReport, stream: Stream, imus: Sequence[tuple[
         CompassHeading(stamp_ns=int(s), sensor=stream.topic, seq=0, yaw_rad=float(y), sigma_rad=1.0)
         for s, y in zip(stamps, wrap_angle(yaw), strict=True)
     ]
+    report = replace(report, wander_deg=wander_deg(series, said))
     bad = int(scattered(series, said).sum())
     return replace(report, why=f"{report.why}; {bad} of {len(said)}: {SCATTERED}") if bad else report
 

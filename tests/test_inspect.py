@@ -512,6 +512,31 @@ def test_sensors_on_other_clocks_are_judged_by_each_other(topic: str, behind_s: 
     assert gnss - imu == pytest.approx(offset_s, abs=0.1)
 
 
+@pytest.mark.parametrize("topic", ["/mag", "/gps/heading"])
+@pytest.mark.parametrize("swing_deg", [0.0, 6.0])
+def test_a_compass_is_drafted_as_far_as_it_wanders(topic: str, swing_deg: float, tmp_path: Path) -> None:
+    """One that swings to and fro in 80 s was drafted as good to half a degree; what wanders so far is no receiver's, whatever its name."""
+    make = Messages(2)
+    items: list[Item] = []
+    for name, at, m in drive(make, seconds=150):
+        if name == "/compass":
+            error = np.radians(swing_deg) * np.sin(2.0 * np.pi * (at - START_NS) / (80 * S))
+            half = np.arctan2(m.quaternion.z, m.quaternion.w) + error / 2.0
+            items.append((topic, at, make.compass(at, (0, 0, np.sin(half), np.cos(half)))))
+        else:
+            items.append((name, at, m))
+    _, config, text = look(tmp_path, items, make)
+    compass = config.sensors["compass"]
+    assert isinstance(compass, CompassConfig)
+    gnss = topic == "/gps/heading" and not swing_deg
+    assert compass.deviation_sigma_deg == (0.0 if gnss else 1.5)
+    assert ("as it wanders beside the gyro" in text) is (swing_deg > 0.0)
+    if swing_deg:
+        assert 2.0 < compass.wander_sigma_deg < 8.0
+    else:
+        assert compass.wander_sigma_deg == (0.2 if gnss else 0.5)
+
+
 @pytest.mark.parametrize(("moves", "usable"), [(True, True), (False, False)])
 def test_a_heading_receiver_that_publishes_an_imu_message_is_not_frozen(
     moves: bool, usable: bool, tmp_path: Path
@@ -528,6 +553,11 @@ def test_a_heading_receiver_that_publishes_an_imu_message_is_not_frozen(
             items.append((topic, at, m))
     found, config, _ = look(tmp_path, items, make)
     assert ("compass" in config.sensors) is usable
+    if usable:
+        compass = config.sensors["compass"]
+        assert isinstance(compass, CompassConfig)
+        # Iron does nothing to two antennas, and a receiver knows how good it is.
+        assert (compass.deviation_sigma_deg, compass.wander_sigma_deg, compass.use_reported_sigma) == (0.0, 0.2, True)
     said = [w for w in found.warnings if w.startswith("/heading")]
     assert not any("frozen" in w for w in said)
     assert len(said) == (0 if usable else 1)
