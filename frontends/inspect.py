@@ -403,6 +403,11 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         lines.append(f"  {gnss.without_height} messages have no height (NaN) and are used as horizontal fixes")
     if gnss.reported_sigma_m is not None:
         lines.append(f"  reported sigma east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
+    if gnss.tf_frame is None:
+        lines.append(
+            "  no /tf_static tells where its antenna sits: drafted at 0, 0, 0; measure it: by as much the track is off, which no "
+            "bound includes"
+        )
     if gnss.scatter_m is not None:
         lines.append(f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m)} m")
     return lines
