@@ -113,6 +113,11 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         _refuse_unit(imu, sensors)
         warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, sensors, mounts, config)
     warnings += _silent(sensors, rows, topics) + _unstamped(sensors, topics)
+    warnings += [
+        f"{b.topic}: {b.unstamped} of its headers hold no stamp: recording times are used"
+        for b in (truth, check)
+        if b and b.unstamped
+    ]
     return Recording(
         source=bag.name if span is None else f"{bag.name}, {span.start_s:g} s to {span.end_s:g} s",
         imu=imu,
@@ -208,9 +213,10 @@ class _Reader:
                 self._decode(readings, raw, msg, seq)
         for item in self._beside.get(raw.topic, ()):
             item.count, item.broken = item.count + 1, item.broken + (msg is None)
-            stamp_ns = None if msg is None else header_stamp_ns(msg)
-            if stamp_ns is not None:
-                item.stamps_ns.append(stamp_ns)
+            if msg is not None:
+                stamp_ns = header_stamp_ns(msg)
+                item.unstamped += stamp_ns is None
+                item.stamps_ns.append(raw.log_ns if stamp_ns is None else stamp_ns)
                 item.logs_ns.append(raw.log_ns)
                 item.messages.append(msg)
         if raw.topic == TF_STATIC and self._tree is not None:
@@ -363,12 +369,13 @@ def _mount_warnings(
 
 
 def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) -> list[str]:
-    """Say which sensors' messages have the recording times for stamps."""
+    """Say which sensors' messages have the recording times for stamps, as they are."""
     lines = []
     for r in sensors:
         types = topics[r.config.topic].msgtypes
         why = f"{_or(types)} has no stamp" if set(types) & set(UNSTAMPED) else "stamps: recorded"
-        if set(types) & set(UNSTAMPED) or r.config.stamps == "recorded":
+        recorded = set(types) & set(UNSTAMPED) or r.config.stamps == "recorded"
+        if recorded and r.config.time_offset_s == 0.0:
             lines.append(
                 f"{r.sensor}: {why}: recording times are used, which are late by as long as a message takes (a receiver's often "
                 "0.1 s and more); no bound includes that: set time_offset_s (negative)"

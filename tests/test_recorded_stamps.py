@@ -10,8 +10,8 @@ from graphloc.config import VesselConfig
 from graphloc.frontends.bag import read_recording
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
-from tests.bagfactory import START_NS, Item, Messages, S
-from tests.test_bag_bad_input import accounted
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.test_bag_bad_input import accounted, vessel
 from tests.test_inspect import drive, look
 
 MAKE = Messages(2)
@@ -58,6 +58,20 @@ def test_headers_without_stamps_are_read_by_the_recording_times(tmp_path: Path, 
         assert stamps[:2] == [START_NS + way_ns, START_NS + way_ns + S // 5]
     assert recording.imu.stamps_ns[0] == START_NS
     assert any(w.startswith("gnss: stamps: recorded: recording times are used") for w in recording.warnings)
+    said = read(tmp_path, config).warnings  # as drafted, with the receiver's offset
+    assert not any(w.startswith("gnss: stamps: recorded") for w in said)
+
+
+def test_a_truth_without_stamps_is_compared_by_the_recording_times(tmp_path: Path) -> None:
+    items = restamped({})
+    for k in range(200):
+        at_ns = START_NS + k * S // 10
+        items.append(("/truth", at_ns, MAKE.odometry(0, (0.1 * k, 0.0, 0.0))))
+    path = write_bag(tmp_path / "run", MAKE, sorted(items, key=lambda item: item[1]), "mcap")
+    recording = read_recording(path, vessel().model_copy(update={"truth_topic": "/truth"}))
+    assert recording.truth is not None
+    assert recording.truth.stamps_ns.tolist() == [START_NS + k * S // 10 for k in range(200)]
+    assert "/truth: 200 of its headers hold no stamp: recording times are used" in recording.warnings
 
 
 def test_without_the_key_a_message_without_a_stamp_names_it(tmp_path: Path) -> None:
