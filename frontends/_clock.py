@@ -22,7 +22,10 @@ EPOCH_LIMIT_S = 1.0
 """Clocks of two sensors that differ by more are said to disagree."""
 NO_DATE_NS = 946_684_800 * NS_PER_S
 """2000-01-01: a stamp before it is no date."""
+GAIN_LIMIT_S = 0.1
+"""A clock that gains more on another during a run is said to drift."""
 
+_FEWEST = 10  # messages that tell how soon they are recorded
 _SET_BACK_S = 0.5
 _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
 _HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing, as online
@@ -32,6 +35,18 @@ _IN_ORDER = 0.8  # of those that follow, at the least: others come late
 def usual_latency_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
     """Return the median of recording time minus header stamp, s."""
     return float(np.median(logs_ns - stamps_ns)) / NS_PER_S
+
+
+def gain_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
+    """Return by how much a clock gains on the recording times from the first tenth of its messages to the last, s.
+
+    Of each tenth the messages that were recorded soonest are asked: others waited somewhere.
+    """
+    tenth = len(stamps_ns) // 10
+    if tenth < _FEWEST:
+        return 0.0
+    ahead_s = (stamps_ns - logs_ns) / NS_PER_S
+    return float(np.percentile(ahead_s[-tenth:], 95) - np.percentile(ahead_s[:tenth], 95))
 
 
 class Clock(NamedTuple):

@@ -161,6 +161,15 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
                 f"{reference}, by the recording times; if that is right, add {behind:.3f} to its time_offset_s (how much longer its "
                 "messages take than those of the other is in it)"
             )
+    reach = next(r for r in sensors if r.sensor == reference)
+    for r in sensors:
+        gain_s = _clock.gain_s(r.stamps(), r.logs()) - _clock.gain_s(reach.stamps(), reach.logs())
+        if abs(gain_s) > _clock.GAIN_LIMIT_S:
+            lines.append(
+                f"{r.sensor}: its clock {'gains' if gain_s > 0 else 'loses'} {abs(gain_s):.2f} s on that of {reference} during the "
+                "run, by the recording times: no time_offset_s holds throughout, and no bound includes it; synchronise the clocks, "
+                "or smooth short parts (--start, --duration)"
+            )
     return lines
 
 

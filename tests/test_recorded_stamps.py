@@ -104,3 +104,25 @@ def test_clocks_that_all_count_from_their_start_keep_the_time_of_the_imu(tmp_pat
     _, config, _ = look(tmp_path, restamped(dict.fromkeys(WAY_NS, lambda ns: ns - STARTED_NS)), MAKE)
     assert all(abs(config.sensors[n].time_offset_s) < 0.2 for n in ("imu", "gnss", "compass"))
     assert read(tmp_path, config).imu.stamps_ns[0] == START_NS - STARTED_NS
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.01, "gains 0.54 s"), (-0.01, "loses 0.54 s"), (0.001, "")])
+def test_a_clock_that_drifts_is_said(share: float, said: str, tmp_path: Path) -> None:
+    """By a hundredth over 60 s; nine tenths of that lie between the first tenth and the last."""
+    _, config, _ = look(tmp_path, restamped({"/fix": lambda ns: ns + round(share * (ns - START_NS))}), MAKE)
+    lines = [w for w in read(tmp_path, config).warnings if "during the run, by the recording times" in w]
+    assert len(lines) == bool(said)
+    assert all(line.startswith(f"gnss: its clock {said}") for line in lines)
+
+
+@pytest.mark.parametrize("together", [5, 1])
+def test_stamps_that_come_in_bursts_are_said(together: int, tmp_path: Path) -> None:
+    """Fixes at 5 Hz that are recorded a second's at once, and stamped so."""
+    items, fixes = [], 0
+    for topic, at_ns, msg in restamped({"/fix": lambda _ns: 0}):
+        wait_ns = (together - 1 - fixes % together) * (S // 5 - 1_000_000) if topic == "/fix" else 0
+        fixes += topic == "/fix"
+        items.append((topic, at_ns + wait_ns, msg))
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), MAKE)
+    lines = [w for w in read(tmp_path, config).warnings if "stamped in bursts, 1.0 s apart" in w]
+    assert len(lines) == (together > 1)
