@@ -387,7 +387,7 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
     usable = scatter < 15.0
     why = f"yaw minus GNSS course: {offset:+.0f} deg, scatter {scatter:.0f} deg over {len(measured)} courses"
     if not usable:
-        why += ": a relative or a disturbed heading"
+        why += ": a relative or a disturbed heading, or a vessel that often goes sideways"
     elif by_gyro:
         why += "; convention from the gyro"
     elif turned < 20.0:
