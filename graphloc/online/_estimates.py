@@ -16,13 +16,21 @@ from graphloc.solve._solution import health_of, left_out, world_covariance
 
 
 def estimate_of(
-    now: Propagated, lag: Lag, odometry: Odometry, *, agreed_ns: Mapping[str, int], absolute: Sequence[str], doubt: str
+    now: Propagated,
+    lag: Lag,
+    odometry: Odometry,
+    *,
+    agreed_ns: Mapping[str, int],
+    absolute: Sequence[str],
+    doubt: str,
+    heading_off_rad: float,
 ) -> Estimate:
     """Return the estimate at a state of the lag, or ahead of it.
 
     Args:
         agreed_ns: when each absolute sensor last agreed. absolute: names of all of them.
         doubt: why the pose cannot be called good, or empty.
+        heading_off_rad: by how much the motion says that the heading is off; the covariance then includes it.
     """
     newest, problem = lag.newest, lag.problem
     at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
@@ -32,6 +40,7 @@ def estimate_of(
     cov[:3, :3] += left_out(list(problem.streams.values()))
     others_m, others_cov = lag.others
     cov[:3, :3] += others_cov
+    cov[5, 5] += heading_off_rad**2
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
     health, reason = health_of(cov, since, doubt)
     if doubt and reason != doubt:
