@@ -137,7 +137,8 @@ def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | No
         there, count = np.unique(cell, return_counts=True)
         apart = np.unwrap(yaw - turned)
         columns = [np.ones(len(yaw)), at_s - at_s.mean(), turned, np.gradient(turned, at_s), apart]
-        along = turned + np.median(apart)  # the heading without its own error, or that would explain itself
+        # The heading by the gyroscope, its bias taken off: by the compass itself, its error would explain itself.
+        along = turned + np.polyval(np.polyfit(at_s - at_s.mean(), apart, 1), at_s - at_s.mean())
         columns += [f(k * along) for k in (1.0, 2.0) for f in (np.sin, np.cos)]
         means = [np.bincount(cell, column)[there] / count for column in columns]
         blocks.append((there, np.column_stack(means)))
