@@ -106,16 +106,17 @@ def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:
 
     One cannot be judged by another that lies seconds or years away. A pose may well come late: it takes time to match.
     """
-    latency = {s.topic: _clock.usual_latency_s(s.stamps_ns, s.logs_ns) for s in streams}
-    clocks = {s.topic: _clock.Clock(int(s.stamps_ns.min()), latency[s.topic]) for s in streams}
+    clocks = {
+        s.topic: _clock.Clock(int(s.stamps_ns.min()), _clock.usual_latency_s(s.stamps_ns, s.logs_ns)) for s in streams
+    }
     imu = next((clocks[s.topic] for s in streams if s.msgtype == IMU), None)
     if imu is None:
         return list(streams)
     own = [clocks[s.topic] for s in streams if not s.recorded and s.msgtype not in UNSTAMPED]
-    reference = _clock.reference_of(imu, own).latency_s
+    reference = _clock.reference_of(imu, own)
     found = []
     for stream in streams:
-        behind = latency[stream.topic] - reference
+        behind = _clock.behind_s(clocks[stream.topic], imu, reference)
         limit = _clock.JUMP_LIMIT_S if stream.msgtype in (POSE, PLAIN_POSE) else _clock.EPOCH_LIMIT_S
         found.append(stream.later(round(behind * NS_PER_S)) if abs(behind) > limit else stream)
     return found

@@ -64,6 +64,15 @@ def reference_of(imu: Clock, others: Iterable[Clock]) -> Clock:
     return next((c for c in (imu, *others) if c.first_ns >= NO_DATE_NS), imu)
 
 
+def behind_s(own: Clock, imu: Clock, reference: Clock) -> float:
+    """Return by how much a clock is behind the reference, s; of one that looks the IMU's, by how much the IMU's is.
+
+    Messages of one computer take longer or shorter, and its stamps must not be pulled apart by that.
+    """
+    same = abs(own.latency_s - imu.latency_s) <= EPOCH_LIMIT_S
+    return (imu if same else own).latency_s - reference.latency_s
+
+
 def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps, limit_s: float = JUMP_LIMIT_S) -> NDArray[np.bool_]:
     """Return (N,) whether a stamp lies further than `limit_s` from its topic's usual latency."""
     if len(stamps_ns) == 0:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SlowErrorConfig
-from graphloc.frontends._clock import EPOCH_LIMIT_S, Clock, reference_of
+from graphloc.frontends._clock import EPOCH_LIMIT_S, Clock, behind_s, reference_of
 from graphloc.frontends._fixes import NOTHING_M, SCATTERS
 from graphloc.frontends._reports import (
     BODY_AXES,
@@ -168,7 +168,7 @@ def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
     told = inspection.gnss if kind == "gnss" else inspection.velocities if kind == "gnss_velocity" else ()
     late = next((r.late_s for r in told if r.topic.partition(" ")[0] == topic and r.late_s), None)
     offset_s, why = 0.0, []
-    behind = clocks[topic].latency_s - reference.latency_s
+    behind = behind_s(clocks[topic], imu, reference)
     if abs(behind) > EPOCH_LIMIT_S:
         offset_s += behind
         clock = "the IMU's" if reference is imu else "one that tells the date"
