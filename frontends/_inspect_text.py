@@ -27,7 +27,8 @@ def render(inspection: Inspection) -> str:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
         off = ", switched off" if item.role == "truth" and item.origin is None else ""
-        lines += ["", f"{item.topic}: drafted as {_DRAFTED[item.role]}{off}", f"  {item.why}; {item.world}"]
+        drafted = "left out" if item.role == "other" else f"drafted as {_DRAFTED[item.role]}{off}"
+        lines += ["", f"{item.topic}: {drafted}", f"  {item.why}; {item.world}"]
     counts = {t.topic: t.count for t in inspection.topics}
     for what, kind, mounted, need in (
         ("scans", "aerial", inspection.lidars, "a map"),
@@ -67,6 +68,8 @@ def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
     if starts:
         lines.append(f"starts {utc_text(min(starts))}")
     for t in topics:
+        if t.recorded:
+            lines.append(f"{t.topic}: its headers hold no stamps (all zero, or all the same): recording times are used")
         if t.undecodable or t.no_stamp:
             lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded, {t.no_stamp or 0} have no stamp")
     return lines
@@ -104,6 +107,11 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         lines.append(f"  {gnss.without_height} messages have no height (NaN) and are used as horizontal fixes")
     if gnss.reported_sigma_m is not None:
         lines.append(f"  reported sigma east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
+    if gnss.tf_frame is None:
+        lines.append(
+            "  no /tf_static tells where its antenna sits: drafted at 0, 0, 0; measure it: by as much the track is off, which no "
+            "bound includes"
+        )
     if gnss.scatter_m is not None:
         lines.append(f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m)} m")
     return lines

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.eval.calibrate import Calibration, Suggestion
+from graphloc.eval.calibrate import Calibration, Check, Suggestion
 from graphloc.eval.ekf import FilterResult
 from graphloc.eval.metrics import Table
 from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verdict
@@ -72,6 +72,45 @@ def test_stamps_that_the_bounds_know_nothing_of_are_reported(
     (offline, _) = verdict(replace(data, solution=solution, calibration=Calibration(suggestions=(found,)))).tracks
     assert offline.trust is (Trust.WITH_CARE if said else Trust.YES)
     assert any(f"up to {4.0 * late_s:.2f} m behind or ahead" in r.text for r in offline.reasons) == said
+
+
+def antenna_at(data: ReportData, x_m: float, *, change_m: float = 0.0, sigma_m: float = 0.0) -> tuple[Trust, list[str]]:
+    """What is said of a run without truth (bounds: 2.45 m) whose antenna is configured at x; a change that is suggested, or its sigma."""
+    mount = data.config.sensors["gnss"].mount.model_copy(update={"xyz_m": (x_m, 0.0, 2.0)})
+    sensors = {**data.config.sensors, "gnss": data.config.sensors["gnss"].model_copy(update={"mount": mount})}
+    keys = [f"sensors.gnss.mount.xyz_m[{axis}]" for axis in (0, 1)]
+    found = [
+        Suggestion(
+            sensor="gnss", key=key, unit="m", configured=x_m, suggested=x_m + change_m, sigma=0.1, z=30.0, evidence="", action=""
+        )
+        for key in keys
+        if change_m
+    ]  # fmt: skip
+    checks = [Check(key=key, unit="m", configured=x_m, change=0.0, sigma=sigma_m, said="") for key in keys if sigma_m]
+    calibration = Calibration(suggestions=tuple(found), checks=tuple(checks))
+    (track, _) = verdict(
+        replace(
+            data, config=data.config.model_copy(update={"sensors": sensors}), recording=replace(data.recording, truth=None),
+            calibration=calibration,
+        )
+    ).tracks  # fmt: skip
+    return track.trust, [r.text for r in track.reasons if "antenna" in r.text]
+
+
+def test_an_antenna_that_is_elsewhere_or_was_left_at_the_guess_is_said(data: ReportData) -> None:
+    assert antenna_at(data, 1.5) == (Trust.YES, [])  # measured
+    trust, (text,) = antenna_at(data, 1.5, change_m=3.0)
+    assert trust is Trust.WITH_CARE
+    assert "looks 4.24 m away from where mount.xyz_m has it" in text
+    assert antenna_at(data, 1.5, change_m=0.3)[0] is Trust.YES  # within the bounds
+    trust, (text,) = antenna_at(data, 0.0, sigma_m=0.4)  # 1.96 x 0.4 x sqrt(2)
+    assert trust is Trust.YES
+    assert "taken to be at the vessel's origin" in text
+    assert "this run knows it to 1.1 m (95 %)" in text
+    assert antenna_at(data, 0.0, sigma_m=1.0)[0] is Trust.WITH_CARE
+    trust, (text,) = antenna_at(data, 0.0)
+    assert trust is Trust.WITH_CARE
+    assert "nothing here checks that" in text
 
 
 @pytest.mark.parametrize(

@@ -21,13 +21,13 @@ __all__ = ["PROBE", "Calibration", "Check", "Suggestion", "calibrate"]
 
 PROBE: Probe = {
     "gnss": ("x", "y", "time"),
-    "gnss_velocity": ("time",),
+    "gnss_velocity": ("x", "y", "time"),
+    "body_velocity": ("time",),
     "compass": ("yaw", "time"),
     "pose": ("yaw", "time"),
     "aerial": ("time",),
 }
-"""What is looked at, by kind of sensor, those first that are wrong most often; heights, and the lever of a velocity, show
-too little."""
+"""What is looked at, by kind of sensor, those first that are wrong most often; heights show too little."""
 
 _AXIS: dict[Offset, int] = {"x": 0, "y": 1}
 _UNIT: dict[Offset, tuple[str, float]] = {
@@ -90,12 +90,22 @@ def _configured(name: Name, recording: Recording, config: VesselConfig) -> tuple
     return f"sensors.{sensor}.mount.xyz_m[{_AXIS[what]}]", float(t[_AXIS[what]])
 
 
+def _of_one_antenna(sensor: str, recording: Recording, config: VesselConfig) -> list[str]:
+    """Names of sensors of other kinds at the same place: what is found of its lever is found of them together."""
+    own = config.sensors[sensor]
+    place = mount_of(sensor, own, recording.mounts)[0]
+    others = [n for kind in PROBE if kind != own.kind and "x" in PROBE[kind] for n in config.of_kind(kind)]
+    return [n for n in others if np.array_equal(mount_of(n, config.sensors[n], recording.mounts)[0], place)]
+
+
 def _suggestion(
     name: Name, found: Estimate, others: dict[Name, Estimate], recording: Recording, config: VesselConfig
 ) -> Suggestion:
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
     action = "measure it, then set it"
+    if name[1] in _AXIS and (shares := _of_one_antenna(name[0], recording, config)):
+        action += f", also of {', '.join(shares)}, taken for the same antenna"
     if name[1] != "time" and name[0] in recording.mounts:
         action = (
             "measure it; its mount comes from /tf_static: correct it there, or set xyz_m and rpy_deg without tf_frame"

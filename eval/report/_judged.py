@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from graphloc.chi2 import chi2_95
+from graphloc.chi2 import SIGMAS_95, chi2_95
 from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
@@ -79,7 +80,7 @@ def worst(of: Iterator[Trust]) -> Trust:
 def judged(data: ReportData, solution: Solution) -> Judged:
     """Judge a track of a run."""
     reasons = (
-        *_bounds(data, solution), *_late(data, solution), *_beside(data, solution), *_from_offline(data, solution),
+        *_bounds(data, solution), *_late(data, solution), *_levers(data, solution), *_beside(data, solution), *_from_offline(data, solution),
         *_compared(data, solution), *_solved(data, solution),
     )  # fmt: skip
     return Judged(name=solution.name, accuracy=_accuracy(data, solution.name), reasons=reasons)
@@ -133,6 +134,36 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
                 trust=Trust.WITH_CARE,
                 text=f"{found.sensor} and the IMU are {off_s:.2g} s apart (Calibration, below): at this run's {speed_mps:.1f} m/s the "
                 f"track is up to {off_s * speed_mps:.2f} m behind or ahead, which its bounds of {bound_m:.2f} m (median) do not include.",
+            )
+
+
+def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """Antennas that sit elsewhere than configured, or were left where `inspect` drafts them.
+
+    The track is off by as much, which neither a bound nor a held-out fix of theirs knows.
+    """
+    track = solution.trajectory
+    if data.recording.truth is not None or track.cov is None:
+        return
+    bound_m = float(np.median(bounds_95(track.cov)[:, 0]))
+    suggestions, checks = (data.calibration.suggestions, data.calibration.checks) if data.calibration else ((), ())
+    for name in data.config.of_kind("gnss"):
+        keys = [f"sensors.{name}.mount.xyz_m[{axis}]" for axis in (0, 1)]
+        off_m = math.hypot(*(s.suggested - s.configured for s in suggestions if s.key in keys))
+        if off_m > 0.0:
+            yield Reason(
+                trust=Trust.WITH_CARE if off_m > bound_m else Trust.YES,
+                text=f"The antenna of {name} looks {off_m:.2f} m away from where mount.xyz_m has it (Calibration, below): the track is off "
+                f"by as much, which its bounds of {bound_m:.2f} m (median) do not include.",
+            )
+        elif name not in data.recording.mounts and not any(data.config.sensors[name].mount.xyz_m[:2]):
+            known = [SIGMAS_95 * c.sigma for c in checks if c.key in keys]
+            known_m = math.hypot(*known) if len(known) == len(keys) else None
+            said = "nothing here checks that" if known_m is None else f"this run knows it to {known_m:.2g} m (95 %)"
+            yield Reason(
+                trust=Trust.YES if known_m is not None and known_m < bound_m else Trust.WITH_CARE,
+                text=f"The antenna of {name} is taken to be at the vessel's origin (mount.xyz_m is 0, as `inspect` drafts it); where it is "
+                f"not, the track is off by as much, which no bound includes; {said}.",
             )
 
 
