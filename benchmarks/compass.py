@@ -41,7 +41,7 @@ Found = tuple[float, float, float, float]
 
 def _figures(solution: Solution, run: SimulatedRun) -> Found:
     """Position RMSE m, heading RMSE deg, share of headings in their 95 % bounds, share of matches that were not used."""
-    ours, counts = compare_to_truth(solution.trajectory, run.truth), solution.ledger.counts()["aerial"]
+    ours, counts = compare_to_truth(solution.trajectory, run.truth), solution.ledger.counts()["matcher"]
     held = ours.heading_coverage_95
     assert held is not None
     return ours.position_rmse_m, ours.heading_rmse_deg, held, 1.0 - counts.get("used", 0) / sum(counts.values())

@@ -13,6 +13,7 @@ from graphloc.eval.ablation import CONTRADICTS, Ablated, Effect, Vote, suspects
 from graphloc.eval.page import Cell, Grid, write_csv, write_markdown, write_page
 from graphloc.eval.pieces import drawing
 from graphloc.eval.plots import COLOURS, TRUTH, Figure, Line, Mark, Panel, Points, peaks
+from graphloc.eval.words import percent
 from graphloc.time import seconds_since
 
 MARK = "ablation.json"  # a folder with this file is ours to replace
@@ -50,7 +51,7 @@ def _bought(e: Effect, ablated: Ablated) -> str:
     assert e.rmse_m is not None
     assert e.worst_m is not None
     bounds = f"95 % bound {e.bound_m:.2f} m instead of {full.bound_m:.2f} m"
-    gone = f"; {e.missing:.0%} of the track is missing" if e.missing is not None and e.missing > 0.01 else ""
+    gone = f"; {percent(e.missing)} of the track is missing" if e.missing is not None and e.missing > 0.01 else ""
     if ablated.basis == "full" or full.rmse_m is None:
         return f"Without {e.without}: up to {e.worst_m:.2f} m from the run with all, at {e.worst_at_s:.0f} s; {bounds}{gone}."
     how = ""

@@ -145,10 +145,10 @@ def _why(ledger: Ledger, off_m: Mapping[int, float], o: DigerudConfig) -> str:
     right = sum(off_m[row.seq] < o.gate_m for row in dropped)
     wrong = sum(off_m[row.seq] >= o.gate_m for row in tried if row.outcome is Outcome.USED)
     return (
-        f"it started on a pose {off_m[tried[0].seq]:.1f} m off, and its gate takes only what is within {o.gate_m:g} m of where it "
-        f"already is: {len(dropped)} of {len(tried)} sightings of its one tag were dropped, {right} of them right to {o.gate_m:g} m, "
-        f"for up to {lasted_s:.0f} s on end; of the {len(tried) - len(dropped)} that it took {wrong} were farther off than that, as "
-        "the flipped pose of a tag is"
+        f"it started on a pose {off_m[tried[0].seq]:.1f} m off, and its gate accepts only poses within {o.gate_m:g} m of its own "
+        f"estimate. Of {len(tried)} sightings of its one tag it rejected {len(dropped)} (for up to {lasted_s:.0f} s without a break), "
+        f"{right} of them right to {o.gate_m:g} m; it accepted {len(tried) - len(dropped)}, {wrong} of them farther off than that, as "
+        "a flipped pose is"
     )
 
 

@@ -155,12 +155,22 @@ def _ellipse(
 
 
 def _heat(match: Match, rows: int) -> Pixels:
-    """The score, the best heading of each place."""
+    """The score, the best heading of each place; below, what the picture shows."""
     assert match.score is not None
+    assert match.grid is not None
     best = match.score.max(axis=0)
     grey = np.clip(255.0 * (1.0 + (best - best.max()) / 40.0), 0.0, 255.0).astype(np.uint8)
     coloured = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)
     side = rows // 2
     heat = np.zeros((rows, side, 3), dtype=np.uint8)
     heat[:side] = cv2.resize(coloured, (side, side), interpolation=cv2.INTER_NEAREST)
+    wide_m = float(np.ptp(match.grid.east_m))
+    for k, (line, colour) in enumerate(
+        (
+            (f"score at the best heading, {wide_m:.0f} m wide", (255, 255, 255)),
+            ("scan: faces", _FACES),
+            ("scan: first returns", _SHORES),
+        )
+    ):
+        cv2.putText(heat, line, (12, side + 32 + 28 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
     return heat

@@ -11,6 +11,7 @@ import numpy as np
 
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig
+from graphloc.eval.words import percent
 from graphloc.frames import rpy_from_rotation, wrap_angle
 from graphloc.recording import Recording
 from graphloc.trajectory import Trajectory, bounds_95
@@ -54,7 +55,7 @@ def _sideways(track: Trajectory, recording: Recording, config: VesselConfig) -> 
     if share < _MOST:
         return ""
     said = (
-        f"the course is more than {_SIDEWAYS_DEG:.0f} deg off the solved heading for {share:.0%} of the {way_m.sum():.0f} m "
+        f"the course is more than {_SIDEWAYS_DEG:.0f} deg off the solved heading for {percent(share)} of the {way_m.sum():.0f} m "
         f"made above {_MOVES_MPS:.0f} m/s: unless the vessel goes sideways or astern"
     )
     mean = complex((way_m * np.exp(1j * off)).sum() / way_m.sum())

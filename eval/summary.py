@@ -69,12 +69,15 @@ def read_runs(folders: Sequence[Path]) -> tuple[FinishedRun, ...]:
     """Read what run folders say.
 
     Raises:
-        InputError: a folder is given twice, or its run.json is not that of a run.
+        InputError: a folder is given twice, is none of a run, or its run.json cannot be read.
     """
     whole = [folder.resolve() for folder in folders]
     twice = next((folder for k, folder in enumerate(whole) if folder in whole[:k]), None)
     if twice is not None:
         raise InputError(f"{twice}: given twice, so it would count twice")
+    other = next((folder for folder in folders if not is_run(folder)), None)
+    if other is not None:
+        raise InputError(f"{other}: is not the folder of a finished run: it has no {MARK}")
     short = [folder.name for folder in whole]
     names = [name if short.count(name) == 1 else str(folder) for name, folder in zip(short, folders, strict=True)]
     return tuple(_read(folder, name) for folder, name in zip(folders, names, strict=True))

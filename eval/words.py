@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 LABELS = {
     "position_rmse_m": "horizontal error, RMSE, m",
     "position_p95_m": "horizontal error, 95 %, m",
@@ -21,6 +23,16 @@ LABELS = {
     "std_mps": "forward speed minus the measured one (not fused), standard deviation, m/s",
 }
 """What a number is, in words; docs/outputs.md says it at length."""
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits, and never as a power of ten: 9231 is 9230."""
+    return np.format_float_positional(float(f"{value:.{digits}g}"), trim="-")
+
+
+def percent(share: float | None) -> str:
+    """Return a share as a whole percentage; a dash where there is none."""
+    return "-" if share is None else f"{100.0 * share:.0f} %"
 
 
 def number(value: float | None, digits: int = 3) -> str:

@@ -27,6 +27,7 @@ from graphloc.frames import Array, Datum, skew, wrap_angle
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import CompassHeading
+from graphloc.thinning import HEADINGS_APART_NS
 
 _FLOOR_RAD = np.radians(0.05)  # no compass is better, whatever it says
 _DEVIATION = ("B", "C", "D", "E")
@@ -138,4 +139,5 @@ ROW = Sensor(
     ideal=ideal,
     hint=hint,
     slow=slow,
+    apart_ns=HEADINGS_APART_NS,
 )

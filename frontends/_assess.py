@@ -17,10 +17,10 @@ from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import scatter_m
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec
+from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec, two_antennas
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
-from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE, QUATERNION, yaw_of_x_axis
+from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE, QUATERNION, UNSTAMPED, yaw_of_x_axis
 from graphloc.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.time import NS_PER_S
@@ -88,6 +88,7 @@ def topic_report(stream: Stream, count: int) -> TopicReport:
         repeated=int((steps == 0).sum()),
         backward=int((steps < 0).sum()),
         no_stamp=stream.no_stamp,
+        recorded=stream.recorded,
         latency_s=vec(latency),
     )
 
@@ -101,15 +102,21 @@ def sane(stream: Stream) -> NDArray[np.intp]:
 def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:
     """Return streams with messages, each on the clock of the first IMU where its own is another one, by the recording times.
 
+    Where that tells no date, on the first clock that does.
+
     One cannot be judged by another that lies seconds or years away. A pose may well come late: it takes time to match.
     """
-    latency = {s.topic: _clock.usual_latency_s(s.stamps_ns, s.logs_ns) for s in streams}
-    reference = next((latency[s.topic] for s in streams if s.msgtype == IMU), None)
-    if reference is None:
+    clocks = {
+        s.topic: _clock.Clock(int(s.stamps_ns.min()), _clock.usual_latency_s(s.stamps_ns, s.logs_ns)) for s in streams
+    }
+    imu = next((clocks[s.topic] for s in streams if s.msgtype == IMU), None)
+    if imu is None:
         return list(streams)
+    own = [clocks[s.topic] for s in streams if not s.recorded and s.msgtype not in UNSTAMPED]
+    reference = _clock.reference_of(imu, own)
     found = []
     for stream in streams:
-        behind = latency[stream.topic] - reference
+        behind = _clock.behind_s(clocks[stream.topic], imu, reference)
         limit = _clock.JUMP_LIMIT_S if stream.msgtype in (POSE, PLAIN_POSE) else _clock.EPOCH_LIMIT_S
         found.append(stream.later(round(behind * NS_PER_S)) if abs(behind) > limit else stream)
     return found
@@ -336,7 +343,14 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
         return None
     yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in quaternions]
     good = np.array([not isinstance(y, Rejection) for y in yaw])
-    plain: dict[str, Any] = {"topic": stream.topic, "msgtype": stream.msgtype, "unit": unit_of(stream)}
+    # Drivers of receivers with two antennas fill an Imu with the orientation alone.
+    gnss = not rows[:, :6].any() if stream.msgtype == IMU else two_antennas(stream.topic)
+    plain: dict[str, Any] = {
+        "topic": stream.topic,
+        "msgtype": stream.msgtype,
+        "unit": unit_of(stream),
+        "two_antennas": gnss,
+    }
     if good.sum() < 10:
         why = "its messages give no yaw"
         return CompassReport(
@@ -374,7 +388,7 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
     usable = scatter < 15.0
     why = f"yaw minus GNSS course: {offset:+.0f} deg, scatter {scatter:.0f} deg over {len(measured)} courses"
     if not usable:
-        why += ": a relative or a disturbed heading"
+        why += ": a relative or a disturbed heading, or a vessel that often goes sideways"
     elif by_gyro:
         why += "; convention from the gyro"
     elif turned < 20.0:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import Motion, motion_of_places, sane, summed, track
-from graphloc.frontends._reports import BODY_AXES, EAST_AXES, NORTH_AXES, OdometryReport, Vec, VelocityReport
+from graphloc.frontends._assess_world import World
+from graphloc.frontends._reports import BODY_AXES, EAST_AXES, NORTH_AXES, OdometryReport, VelocityReport, through_water
 from graphloc.frontends._streams import Stream
 from graphloc.frontends.decode import ODOMETRY, VECTOR
 from graphloc.time import NS_PER_S
@@ -63,16 +64,18 @@ def velocity_report(
 ) -> VelocityReport:
     """Return the axes of a twist or vector; `tf_frame`: its frame, where /tf_static knows it; else as `axes_of`."""
     axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
+    if through_water(stream.topic):
+        axes, why = BODY_AXES, f"a speed through the water; {why}"
     return VelocityReport(topic=stream.topic, msgtype=stream.msgtype, axes=axes, why=why, tf_frame=tf_frame)
 
 
 def odometry_report(
-    stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, origin: Vec | None, world: str, scatter_m: float = 0.0
+    stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, world: World, scatter_m: float = 0.0
 ) -> OdometryReport:
     """Guess what an odometry or pose topic is, by its name and whether it reports the speed of the craft.
 
     Args:
-        origin, world: of its frame, as `origin_of` tells them; else as `axes_of`.
+        world: its frame, by `world_of`; else as `axes_of`.
     """
     rows = stream.rows[sane(stream)]
     speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
@@ -86,6 +89,8 @@ def odometry_report(
         role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: looks like wheel odometry"
         if axes not in (None, BODY_AXES):
             role, why = "pose", f"its speeds are none along the craft: {fit}"
+    if not world.pose and role != "check_speed":
+        role, why = "other", "no pose about a datum that the vessel could have"
     return OdometryReport(
         topic=stream.topic,
         msgtype=stream.msgtype,
@@ -93,8 +98,8 @@ def odometry_report(
         role=role,
         max_speed_mps=speed,
         why=why,
-        origin=origin,
-        world=world,
+        origin=world.origin,
+        world=world.why,
     )
 
 
@@ -109,7 +114,11 @@ def motions_of(
     """
     found = [m for s in wheels if (m := _told(s, BODY_AXES)) and float(np.ptp(m.speed_mps)) > 0.2]
     for stream, report in twists:
-        if report.axes == "unknown" or (stream.msgtype == VECTOR and report.axes not in (EAST_AXES, NORTH_AXES)):
+        if (
+            report.axes == "unknown"
+            or through_water(stream.topic)
+            or (stream.msgtype == VECTOR and report.axes not in (EAST_AXES, NORTH_AXES))
+        ):
             continue
         motion = _told(stream, report.axes or EAST_AXES)
         if motion is not None and float(np.percentile(np.abs(motion.speed_mps), 90)) > 0.5:

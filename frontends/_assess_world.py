@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -20,12 +22,21 @@ _STANDS = 0.1  # of the fixes' extent: what moves less is not the craft
 _APART_M, _APART = 5.0, 0.02  # largest distance that still fits: metres, share of the extent
 
 
-def origin_of(
-    poses: Stream, stamps_ns: NDArray[np.int64], p_m: Array, first_fix: Vec | None, antenna_m: Array | None
-) -> tuple[Vec | None, str]:
-    """Return latitude, longitude, height of the origin of the poses' frame, and the evidence in words.
+class World(NamedTuple):
+    """The frame of some poses: its origin, None where it is not east-north-up or nothing tells; the evidence in words.
 
-    None where the frame is not east-north-up, or nothing tells.
+    `pose`: whether they may be poses of the vessel about a datum: no map grid, nor what stays where it is while she moves.
+    """
+
+    origin: Vec | None
+    why: str
+    pose: bool = True
+
+
+def world_of(
+    poses: Stream, stamps_ns: NDArray[np.int64], p_m: Array, first_fix: Vec | None, antenna_m: Array | None
+) -> World:
+    """Return where the origin of the poses' frame is: latitude, longitude, deg, and height, m.
 
     Args:
         poses: odometry or poses. stamps_ns: (N,) of the fixes. p_m: (N, 3) m about `first_fix`, ENU.
@@ -33,8 +44,14 @@ def origin_of(
     """
     keep = sane(poses)
     keep = keep[np.isfinite(poses.rows[keep, :3]).all(axis=1)] if len(keep) else keep
+    middle = np.median(poses.rows[keep, :3], axis=0) if len(keep) else np.zeros(3)
+    if float(np.linalg.norm(middle)) > _FAR_M:
+        kind = "earth-centred axes" if abs(middle[2]) > _FAR_M else "a map grid (UTM)"
+        away_km = np.linalg.norm(middle) / 1e3
+        why = f"it is {away_km:.0f} km from its origin: looks like {kind}, which is not read: take the receiver's NavSatFix"
+        return World(None, why, pose=False)
     if first_fix is None or len(keep) < 10 or len(stamps_ns) < 10:
-        return None, "no GNSS track to check its frame against"
+        return World(None, "no GNSS track to check its frame against")
     at, q = poses.stamps_ns[keep], poses.rows[keep, :3]
     if antenna_m is not None:  # the antenna by the poses' own attitude
         q = q + Rotation.from_quat(_quaternions(poses.rows[keep, 3:7])).apply(antenna_m)
@@ -43,26 +60,30 @@ def origin_of(
     p, q = p_m[inside], np.column_stack([np.interp(there, t, q[:, k]) for k in range(3)])
     extent = float(np.hypot(*np.ptp(p[:, :2], axis=0))) if len(p) else 0.0
     if len(p) < 10 or extent < _EXTENT_M:
-        return None, f"the GNSS track is too short ({extent:.0f} m) to check its frame against"
+        return World(None, f"the GNSS track is too short ({extent:.0f} m) to check its frame against")
     moved = float(np.hypot(*np.ptp(q[:, :2], axis=0)))
     if moved < _STANDS * extent:
-        return None, f"it moves by {moved:.1f} m while the fixes move by {extent:.0f} m: not a pose of this vessel"
+        return World(
+            None,
+            f"it moves by {moved:.1f} m while the fixes move by {extent:.0f} m: not a pose of this vessel",
+            pose=False,
+        )
     # As complex numbers about their means, p = exp(i turned) q where the frames differ by a turn.
     a, b = (v[:, 0] - v[:, 0].mean() + 1j * (v[:, 1] - v[:, 1].mean()) for v in (q, p))
     turned = float(np.degrees(np.angle(np.vdot(a, b))))
     offset = np.median(p - q, axis=0)
     apart = float(np.median(np.hypot(*(p - q - offset)[:, :2].T)))
-    away = float(np.linalg.norm(offset))
-    if away > _FAR_M:
-        kind = "earth-centred axes" if abs(offset[2]) > _FAR_M else "a map grid (UTM)"
-        return None, f"its origin is {away / 1e3:.0f} km from the fixes: looks like {kind}, which is not east-north-up"
     # What the fixes' scatter, and an antenna whose place is not known, can turn a track of this extent by.
     tolerance = np.degrees((_SLACK_M if antenna_m is None else 1.0) / extent) + 0.2
     if abs(turned) > tolerance or apart > max(_APART_M, _APART * extent):
-        return None, f"its frame is not east-north-up: turned by {turned:+.1f} deg, {apart:.1f} m apart from the fixes"
+        return World(
+            None, f"its frame is not east-north-up: turned by {turned:+.1f} deg, {apart:.1f} m apart from the fixes"
+        )
     place = Datum(Geodetic(*first_fix)).geodetic_from_enu(offset[None, :])[0]
     lever = "" if antenna_m is not None else " and the antenna's unknown lever arm"
-    return vec(place), f"fits the fixes to {apart:.1f} m; their slow error{lever} is in it, and in every latitude"
+    return World(
+        vec(place), f"fits the fixes to {apart:.1f} m; their slow error{lever} is in it, and in every latitude"
+    )
 
 
 def _quaternions(rows: Array) -> Array:

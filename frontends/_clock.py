@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,12 @@ HOLE_LIMIT_S = 600.0
 """Where no sensor says anything for so long, nothing can bridge it: the run falls apart there."""
 EPOCH_LIMIT_S = 1.0
 """Clocks of two sensors that differ by more are said to disagree."""
+NO_DATE_NS = 946_684_800 * NS_PER_S
+"""2000-01-01: a stamp before it is no date."""
+GAIN_LIMIT_S = 0.1
+"""A clock that gains more on another during a run is said to drift."""
 
+_FEWEST = 10  # messages that tell how soon they are recorded
 _SET_BACK_S = 0.5
 _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
 _HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing, as online
@@ -29,6 +35,42 @@ _IN_ORDER = 0.8  # of those that follow, at the least: others come late
 def usual_latency_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
     """Return the median of recording time minus header stamp, s."""
     return float(np.median(logs_ns - stamps_ns)) / NS_PER_S
+
+
+def gain_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
+    """Return by how much a clock gains on the recording times from the first tenth of its messages to the last, s.
+
+    Of each tenth the messages that were recorded soonest are asked: others waited somewhere.
+    """
+    tenth = len(stamps_ns) // 10
+    if tenth < _FEWEST:
+        return 0.0
+    ahead_s = (stamps_ns - logs_ns) / NS_PER_S
+    return float(np.percentile(ahead_s[-tenth:], 95) - np.percentile(ahead_s[:tenth], 95))
+
+
+class Clock(NamedTuple):
+    """Of a topic: its first stamp, ns, and the usual latency by it, s."""
+
+    first_ns: int
+    latency_s: float
+
+
+def reference_of(imu: Clock, others: Iterable[Clock]) -> Clock:
+    """Return the clock that the others are set by: the IMU's, or the first that tells a date where that counts from its start.
+
+    By the latter the track would lie in 1970.
+    """
+    return next((c for c in (imu, *others) if c.first_ns >= NO_DATE_NS), imu)
+
+
+def behind_s(own: Clock, imu: Clock, reference: Clock) -> float:
+    """Return by how much a clock is behind the reference, s; of one that looks the IMU's, by how much the IMU's is.
+
+    Messages of one computer take longer or shorter, and its stamps must not be pulled apart by that.
+    """
+    same = abs(own.latency_s - imu.latency_s) <= EPOCH_LIMIT_S
+    return (imu if same else own).latency_s - reference.latency_s
 
 
 def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps, limit_s: float = JUMP_LIMIT_S) -> NDArray[np.bool_]:

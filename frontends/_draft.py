@@ -7,8 +7,8 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from graphloc.config import GnssConfig, ImuConfig, SlowErrorConfig
-from graphloc.frontends._clock import EPOCH_LIMIT_S
+from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SlowErrorConfig
+from graphloc.frontends._clock import EPOCH_LIMIT_S, Clock, behind_s, reference_of
 from graphloc.frontends._fixes import NOTHING_M, SCATTERS
 from graphloc.frontends._reports import (
     BODY_AXES,
@@ -22,8 +22,10 @@ from graphloc.frontends._reports import (
     OdometryReport,
     VelocityReport,
     filtered,
+    through_water,
 )
-from graphloc.frontends.decode import IMU, VECTOR
+from graphloc.frontends._turns import WANDERS_DEG
+from graphloc.frontends.decode import IMU, UNSTAMPED, VECTOR
 
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 _TURNED_DEG = 10.0  # off the course, from which a compass is taken for turned in the craft
@@ -40,6 +42,7 @@ _RTK_SCATTER_M = 0.1
 _FILTERED = (
     "by its name a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 )
+_SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clocks are set
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
 
@@ -83,6 +86,8 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
             f"  # its frame '{item.frame_id}': {item.world}",
             "  enabled: false  # guess: true if its frame is east-north-up at the datum and no fix went into it",
         ]
+    for item in (o for o in inspection.odometry if o.role == "other"):
+        yield [f"# {item.topic}: left out, {item.world}"]
     if inspection.lidars:
         yield _aerial_block(inspection.lidars)
     if inspection.cameras:
@@ -144,23 +149,33 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
 
 
 def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
-    """Add a time offset where a receiver's clock is off by the recording times, or its stamps are late by the motion.
+    """Say where recording times stand for stamps; where a clock is off by them, or stamps are late by the motion, add an offset.
 
     Poses may take their time.
     """
-    latency = {t.topic.partition(" ")[0]: t.latency_s[1] for t in inspection.topics if t.latency_s is not None}
-    reference = next((latency[i.topic] for i in inspection.imus if i.topic in latency), None)
+    topics = {t.topic.partition(" ")[0]: t for t in inspection.topics}
+    clocks = {n: Clock(t.start_ns, t.latency_s[1]) for n, t in topics.items() if t.start_ns is not None and t.latency_s}
+    imu = next((clocks[i.topic] for i in inspection.imus if i.topic in clocks), None)
     kind = next((line.split()[1] for line in block if line.startswith("  kind:")), "")
     topic = next((line.split()[1] for line in block if line.startswith("  topic:")), "")
-    if reference is None or kind not in ("gnss", "gnss_velocity", "compass") or topic not in latency:
+    if topic in topics and topics[topic].recorded:
+        said = "guess: its headers hold no stamps; they are late by as long as a message takes, which no bound includes"
+        block = [*block, f"  stamps: recorded  # {said}"]
+    if imu is None or kind not in _SET or topic not in clocks:
         return block
+    own = (c for n, c in clocks.items() if not topics[n].recorded and topics[n].msgtype not in UNSTAMPED)
+    reference = reference_of(imu, own)
     told = inspection.gnss if kind == "gnss" else inspection.velocities if kind == "gnss_velocity" else ()
     late = next((r.late_s for r in told if r.topic.partition(" ")[0] == topic and r.late_s), None)
     offset_s, why = 0.0, []
-    behind = latency[topic] - reference
+    behind = behind_s(clocks[topic], imu, reference)
     if abs(behind) > EPOCH_LIMIT_S:
         offset_s += behind
-        why.append(f"its clock is {'behind' if behind > 0 else 'ahead of'} the IMU's, by the recording times")
+        clock = "the IMU's" if reference is imu else "one that tells the date"
+        why.append(
+            f"its clock is {'behind' if behind > 0 else 'ahead of'} {clock}, by the recording times; how much longer one "
+            "message takes than the other is in it, which no bound includes"
+        )
     if late is not None:
         offset_s += late[0]
         why.append(f"what the IMU feels fits its motion {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
@@ -299,9 +314,11 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
 def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
     frame = f"tf_frame: {json.dumps(twist.tf_frame)}" if twist.tf_frame else "xyz_m: [0.0, 0.0, 0.0]"
     known = "from /tf_static" if twist.tf_frame else "guess: where it sits is not in the bag; measure it"
+    water = through_water(twist.topic)
+    fuse = "true to fuse it" if water else "true to fuse it, through: water for a speed log"
     return [
-        f"{name}:", "  kind: body_velocity", *_topic_lines(twist.topic),
-        f"  enabled: false  # guess: true to fuse it, through: water for a speed log; its axes look {twist.axes}; {twist.why}",
+        f"{name}:", "  kind: body_velocity", *_topic_lines(twist.topic), *(["  through: water"] if water else []),
+        f"  enabled: false  # guess: {fuse}; its axes look {twist.axes}; {twist.why}",
         f"  mount: {{{frame}}}  # {known}",
     ]  # fmt: skip
 
@@ -344,11 +361,28 @@ def _compass_block(name: str, compass: CompassReport, *, again: bool) -> list[st
             "  enabled: false  # guess: another heading of the same topic is used, a true one before a magnetic one"
         )
     lines += _mount_lines(compass)
-    lines.append("  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass")
-    lines.append("  wander_sigma_deg: 0.5  # guess: passing errors near iron; 0.2 for a GNSS compass")
-    if compass.msgtype == IMU:
+    lines += _error_lines(compass)
+    if compass.msgtype == IMU and not compass.two_antennas:
         lines.append("  use_reported_sigma: false  # guess: drivers' orientation covariances are seldom measured")
     return lines
+
+
+def _error_lines(compass: CompassReport) -> list[str]:
+    """What turns a compass for a while or by the heading: iron, of which two antennas know nothing."""
+    wander = compass.wander_deg or 0.0
+    gnss = compass.two_antennas and wander < WANDERS_DEG
+    usual = 0.2 if gnss else CompassConfig().wander_sigma_deg
+    if gnss:
+        lines = [
+            "  deviation_sigma_deg: 0.0  # guess: a heading of GNSS by its topic or message; 1.5 for a magnetic compass"
+        ]
+        why = "a heading of GNSS; 0.5 for a magnetic compass"
+    else:
+        lines = ["  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass"]
+        why = "passing errors near iron; 0.2 for a GNSS compass"
+    if wander > max(WANDERS_DEG, 2.0 * usual):
+        usual, why = wander, "as it wanders beside the gyro; iron near it, or its own filter"
+    return [*lines, f"  wander_sigma_deg: {usual:.1f}  # guess: {why}"]
 
 
 def _mount_lines(compass: CompassReport) -> list[str]:

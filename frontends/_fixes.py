@@ -16,6 +16,7 @@ from graphloc.time import NS_PER_S
 _HELD_S = 2.5
 """A place that is repeated for less, and then changes, was held by a driver; for longer, the receiver itself stands still."""
 _OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp again, from which a line is due
+_AT_ONCE, _BURST_S = 0.1, 0.3  # of the mean step: within a burst; bursts that are closer than that are left alone
 _FAST_S, _SLOW_S, _EVEN, _FEWEST = 0.25, 1.5, 0.2, 100  # steps: motion hides in none, in few, how even, how many tell
 _UNSTEADY_MPS2 = 4.0  # of slow ones, twice what a craft's acceleration changes by from step to step, most of the time
 NOTHING_M = 100.0
@@ -49,8 +50,15 @@ def held_warning(sensor: str, bad: NDArray[np.bool_]) -> list[str]:
 
 
 def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
-    """Return a line where stamps (N,) of different measurements are often the same: a driver cuts them."""
+    """Return a line where stamps (N,) of different measurements are often the same, as a driver cuts them, or come in bursts."""
     moments = np.unique(stamps_ns)
+    steps_s = np.diff(moments) / NS_PER_S
+    if len(moments) > 3 and float((steps_s < _AT_ONCE * steps_s.mean()).mean()) > _CUT:
+        apart_s = float(np.median(steps_s[steps_s >= _AT_ONCE * steps_s.mean()]))
+        if apart_s < _BURST_S:
+            return []
+        said = f"{sensor}: its measurements are stamped in bursts, {apart_s:.1f} s apart: when they came, not when they were of"
+        return [f"{said}; times are off by up to that, positions by that times the speed, which no bound includes"]
     if len(moments) < 3 or 1.0 - len(moments) / len(stamps_ns) < _CUT:
         return []
     step_s = float(np.median(np.diff(moments))) / NS_PER_S

@@ -8,6 +8,9 @@ from collections.abc import Sequence
 from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, TopicReport
 from graphloc.time import utc_text
 
+# How the draft names an odometry or pose topic, by its role.
+_DRAFTED = {"truth": "truth_topic", "check_speed": "check_speed_topic", "pose": "a sensor of kind pose, switched off"}
+
 
 def render(inspection: Inspection) -> str:
     """Return the inspection as text for a terminal."""
@@ -23,7 +26,9 @@ def render(inspection: Inspection) -> str:
     for twist in inspection.velocities:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
-        lines += ["", f"{item.topic}: suggested as {item.role}", f"  {item.why}; {item.world}"]
+        off = ", switched off" if item.role == "truth" and item.origin is None else ""
+        drafted = "left out" if item.role == "other" else f"drafted as {_DRAFTED[item.role]}{off}"
+        lines += ["", f"{item.topic}: {drafted}", f"  {item.why}; {item.world}"]
     counts = {t.topic: t.count for t in inspection.topics}
     for what, kind, mounted, need in (
         ("scans", "aerial", inspection.lidars, "a map"),
@@ -63,6 +68,8 @@ def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
     if starts:
         lines.append(f"starts {utc_text(min(starts))}")
     for t in topics:
+        if t.recorded:
+            lines.append(f"{t.topic}: its headers hold no stamps (all zero, or all the same): recording times are used")
         if t.undecodable or t.no_stamp:
             lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded, {t.no_stamp or 0} have no stamp")
     return lines
@@ -100,6 +107,11 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         lines.append(f"  {gnss.without_height} messages have no height (NaN) and are used as horizontal fixes")
     if gnss.reported_sigma_m is not None:
         lines.append(f"  reported sigma east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
+    if gnss.tf_frame is None:
+        lines.append(
+            "  no /tf_static tells where its antenna sits: drafted at 0, 0, 0; measure it: by as much the track is off, which no "
+            "bound includes"
+        )
     if gnss.scatter_m is not None:
         lines.append(f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m)} m")
     return lines

@@ -28,10 +28,8 @@ from graphloc.frontends.decode import Decoded, ImuSample
 from graphloc.frozen_imu import WHY, frozen_imu_warning, frozen_samples
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
+from graphloc.thinning import HEADINGS_APART_NS, THINNED, Thinning
 from graphloc.time import NS_PER_S, utc_text
-
-_HEADINGS_APART_NS = 45_000_000  # 20 a second stay, though their stamps jitter
-THINNED = "less than 0.05 s after the heading before: what a compass errs lasts longer, so that it tells nothing new"
 
 
 @dataclass(slots=True)
@@ -160,7 +158,17 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
         if abs(behind) > _clock.EPOCH_LIMIT_S:
             lines.append(
                 f"{sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "
-                f"{reference}, by the recording times; if that is right, add {behind:.3f} to its time_offset_s"
+                f"{reference}, by the recording times; if that is right, add {behind:.3f} to its time_offset_s (how much longer its "
+                "messages take than those of the other is in it)"
+            )
+    reach = next(r for r in sensors if r.sensor == reference)
+    for r in sensors:
+        gain_s = _clock.gain_s(r.stamps(), r.logs()) - _clock.gain_s(reach.stamps(), reach.logs())
+        if abs(gain_s) > _clock.GAIN_LIMIT_S:
+            lines.append(
+                f"{r.sensor}: its clock {'gains' if gain_s > 0 else 'loses'} {abs(gain_s):.2f} s on that of {reference} during the "
+                "run, by the recording times: no time_offset_s holds throughout, and no bound includes it; synchronise the clocks, "
+                "or smooth short parts (--start, --duration)"
             )
     return lines
 
@@ -232,14 +240,10 @@ def thin_headings(readings: Readings) -> list[LedgerRow]:
 
     They must be in order of their stamps to be dropped evenly; those that are not stay.
     """
-    if not isinstance(readings.config, CompassConfig) or len(readings.values) < 2:
+    if not isinstance(readings.config, CompassConfig):
         return []
-    stamps = readings.stamps()
-    bad = np.zeros(len(stamps), dtype=bool)
-    last_ns = int(stamps[0])
-    for i, stamp_ns in enumerate(stamps[1:].tolist(), start=1):
-        bad[i] = 0 < stamp_ns - last_ns < _HEADINGS_APART_NS
-        last_ns = last_ns if bad[i] else stamp_ns
+    thinning = Thinning(HEADINGS_APART_NS)
+    bad = np.array([thinning.drops(stamp_ns) for stamp_ns in readings.stamps_ns], dtype=bool)
     return readings.drop(bad, rejected(THINNED))
 
 

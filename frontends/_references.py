@@ -21,12 +21,13 @@ from graphloc.trajectory import Trajectory
 
 @dataclass(slots=True)
 class Reference:
-    """A topic that is read beside the sensors: truth or check speed."""
+    """A topic that is read beside the sensors: truth or check speed; `unstamped`: messages that stand at their recording times."""
 
     topic: str
     reason: str
     count: int = 0
     broken: int = 0
+    unstamped: int = 0
     stamps_ns: list[int] = field(default_factory=list)
     logs_ns: list[int] = field(default_factory=list)
     messages: list[Any] = field(default_factory=list)

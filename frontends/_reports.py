@@ -7,12 +7,25 @@ import re
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from graphloc.frontends.nmea import SPEEDS
 from graphloc.plain import plain
 
 Vec = tuple[float, float, float]
 # Of MAVROS, microstrain_inertial, robot_localization, xsens_mti: what an EKF makes of receiver and IMU.
+# HDT and THS of a GNSS receiver; topics of ublox_gps, septentrio_gnss_driver, mavros and their like.
+_TWO_ANTENNAS = re.compile(r" G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
+
+
+def two_antennas(topic: str) -> bool:
+    """Return whether a heading is one of GNSS, by the name of its topic or its sentence."""
+    return bool(_TWO_ANTENNAS.search(topic)) and not filtered(topic)
+
+
+def through_water(topic: str) -> bool:
+    """Return whether a velocity is through the water, by the sentence of NMEA in the name of its stream."""
+    return topic.endswith(SPEEDS)
 
 
 def filtered(topic: str) -> bool:
@@ -27,6 +40,7 @@ class TopicReport:
     Attributes:
         gaps: intervals longer than 5 usual ones (and 0.1 s); max_gap_s: the longest interval.
         repeated, backward: stamps equal to, or before, the one before; no_stamp: zero stamps.
+        recorded: whether the headers hold no stamps, so that the recording times stand for them here.
         latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points.
     """
 
@@ -43,6 +57,7 @@ class TopicReport:
     repeated: int | None = None
     backward: int | None = None
     no_stamp: int | None = None
+    recorded: bool = False
     latency_s: Vec | None = None
 
 
@@ -129,6 +144,8 @@ class CompassReport:
         leeway_deg: how far that wanders, from half minute to half minute: leeway, or the compass; None where it is not told.
         samples: courses compared; why: the judgement in words. unit: of bare numbers, else None.
         like: an orientation that says the same, of the same device, else ''.
+        wander_deg: how far its error wanders beside the gyroscope, 1 sigma for a minute; None where that does not tell.
+        two_antennas: whether a GNSS receiver says it, by its sentence, its topic, or as an Imu with an orientation alone.
     """
 
     topic: str
@@ -142,6 +159,8 @@ class CompassReport:
     unit: str | None = None
     like: str = ""
     leeway_deg: float | None = None
+    wander_deg: float | None = None
+    two_antennas: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,7 +177,7 @@ class VelocityReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryReport:
-    """An odometry or pose topic: role is 'truth', 'check_speed' or 'pose'.
+    """An odometry or pose topic: role is 'truth', 'check_speed', 'pose', or 'other' of what is no pose of the vessel.
 
     `origin`: latitude, longitude (deg) and height (m) of its frame's origin, where the frame is
     east-north-up by the fixes; `world`: the evidence.

@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -100,10 +101,16 @@ def _nmea_velocity(text: str, wanted: str) -> tuple[float, ...]:
     return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (*said, 0.0)
 
 
+def _nmea_speed(text: str, wanted: str) -> tuple[float, ...]:
+    said = nmea.water_speed_mps(text, [wanted])
+    return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (said, 0.0, 0.0)
+
+
 # Of a sentence: the message type that says the same, and its row.
 SENTENCES: dict[str, tuple[str, Callable[[str, str], tuple[float, ...]]]] = {
     **dict.fromkeys(nmea.HEADINGS, (QUATERNION, _nmea_heading)),
     "VTG": (TWIST, _nmea_velocity),
+    **dict.fromkeys(nmea.SPEEDS, (TWIST, _nmea_speed)),
     **dict.fromkeys(nmea.PLACES, (NAV_SAT_FIX, _nmea_fix)),
 }
 
@@ -113,13 +120,17 @@ _MOST = 1e12
 
 @dataclass(slots=True)
 class Stream:
-    """One topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`)."""
+    """One topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`).
+
+    recorded: whether the stamps are the recording times, as the headers of a type that has stamps hold none.
+    """
 
     topic: str
     msgtype: str
     frame_id: str = ""
     undecodable: int = 0
     no_stamp: int = 0
+    recorded: bool = False
     _stamps: list[int] = field(default_factory=list)
     _logs: list[int] = field(default_factory=list)
     tuples: list[tuple[float, ...]] = field(default_factory=list)
@@ -131,6 +142,18 @@ class Stream:
         self._stamps.append(stamp_ns)
         self._logs.append(log_ns)
         self.tuples.append(row)
+
+    def settle(self) -> None:
+        """Leave out what has no stamp; where no message has one of its own, put the recording times in their place."""
+        stamps = self.stamps_ns
+        if len(stamps) > 1 and bool((stamps == stamps[0]).all()):
+            self.recorded, self._stamps = True, list(self._logs)
+            return
+        there = (stamps != 0).tolist()
+        self.no_stamp = there.count(False)
+        columns: tuple[list[Any], ...] = (self._stamps, self._logs, self.tuples, self.files)
+        for column in columns:
+            column[:] = list(compress(column, there))
 
     def later(self, by_ns: int) -> Stream:
         """Return the stream with `by_ns` added to its stamps."""
@@ -185,12 +208,11 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
                 stream.undecodable += 1
                 continue
             stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns)
-            if stamp_ns is None:
-                stream.no_stamp += 1
-                continue
             if raw.msgtype not in UNSTAMPED:
                 stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
-            stream.add(stamp_ns, raw.log_ns, row, raw.file)
+            stream.add(stamp_ns or 0, raw.log_ns, row, raw.file)
+    for stream in streams.values():
+        stream.settle()
     return list(streams.values()), tree
 
 

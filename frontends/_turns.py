@@ -7,8 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
-from graphloc.config import ImuConfig
+from graphloc.config import CompassConfig, ImuConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading, ImuSeries
@@ -25,6 +26,10 @@ _LEAP_DEG, _SMOOTH_DEG = 120.0, 15.0  # beyond the one, which way it turned is a
 SCATTERED = (
     "differs from most headings around it, with and without the gyro: a course over ground at rest is no heading"
 )
+WANDERS_DEG = 1.0
+"""Of a compass beside the gyroscope: above it there is more than such a comparison errs by."""
+_CELL_S, _WANDER_BLOCK_S, _LONG_BLOCK_S, _LAGS_S, _MINUTE_S = 2.0, 300.0, 60.0, (4.0, 24.0), 60.0
+"""Headings are averaged over the first; of blocks as long as the second, changes over the third are compared."""
 Yaws = tuple[NDArray[np.int64], Array]  # stamps (N,), ns, and yaw (N,), rad
 _PART_DEG, _PART = 3.0, 3.0  # least RMS that is said; times the sigma that is claimed
 _LONG_S = 12.0  # over which courses are no noise (as in `_assess_imu.py`)
@@ -114,6 +119,62 @@ def _times_turned(imu: ImuSeries, yaws: Yaws) -> float:
     return float(np.sqrt((b**2).sum() / (a**2).sum()))
 
 
+def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | None:
+    """Return how far a compass's error wanders beside the gyroscope, 1 sigma, deg, as one that lasts for a minute; None of a short run.
+
+    What is left of heading minus integrated rate, when each block's straight line (offset, bias), what goes with the heading
+    (deviation), with the turn (scale) and with the rate (delay) are taken off, grows from some seconds to half a minute by
+    q t where it diffuses, on top of white noise. A first-order Gauss-Markov process does so with q = 2 sigma^2 / tau.
+
+    Args:
+        headings: of one compass, as the configuration reads them.
+    """
+    blocks = []
+    for _, turned, yaw, at_s in _blocks(imu, _said(headings), _WANDER_BLOCK_S):
+        cell = ((at_s - at_s[0]) // _CELL_S).astype(int)
+        if cell[-1] * _CELL_S < _LONG_BLOCK_S:
+            continue
+        there, count = np.unique(cell, return_counts=True)
+        apart = np.unwrap(yaw - turned)
+        columns = [np.ones(len(yaw)), at_s - at_s.mean(), turned, np.gradient(turned, at_s), apart]
+        # The heading by the gyroscope, its bias taken off: by the compass itself, its error would explain itself.
+        along = turned + np.polyval(np.polyfit(at_s - at_s.mean(), apart, 1), at_s - at_s.mean())
+        columns += [f(k * along) for k in (1.0, 2.0) for f in (np.sin, np.cos)]
+        means = [np.bincount(cell, column)[there] / count for column in columns]
+        blocks.append((there, np.column_stack(means)))
+    if not blocks:
+        return None
+    parts = [len(cells) for cells, _ in blocks]
+    common = np.vstack([columns[:, [2, 3, 5, 6, 7, 8]] for _, columns in blocks])
+    lines = block_diag(*(columns[:, :2] for _, columns in blocks))
+    apart, design = np.concatenate([columns[:, 4] for _, columns in blocks]), np.hstack([lines, common])
+    left = np.split(apart - design @ np.linalg.lstsq(design, apart, rcond=1e-6)[0], np.cumsum(parts)[:-1])
+    soon, late = (_squared_steps(blocks, left, round(lag_s / _CELL_S)) for lag_s in _LAGS_S)
+    diffusion = max(late - soon, 0.0) / (_LAGS_S[1] - _LAGS_S[0])
+    return float(np.degrees(np.sqrt(0.5 * diffusion * _MINUTE_S)))
+
+
+def wander_warning(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading], config: CompassConfig) -> list[str]:
+    """Return a line where a compass wanders by far more than is configured: the heading's bounds would be too small."""
+    found = wander_deg(imu, headings)
+    if found is None or config.mount_offset_sigma_deg == 0.0 or found < max(WANDERS_DEG, 2.0 * config.wander_sigma_deg):
+        return []
+    said = f"{sensor}: its error wanders by {found:.1f} deg beside the integrated gyro of {imu.sensor} (1 sigma, in a minute)"
+    return [
+        f"{said}, and wander_sigma_deg is {config.wander_sigma_deg:g}: set it so, or the heading's bounds are too small"
+    ]
+
+
+def _squared_steps(blocks: Sequence[tuple[NDArray[np.intp], Array]], left: Sequence[Array], steps: int) -> float:
+    """Mean square of the changes over so many cells."""
+    changes = [np.zeros(0)]
+    for (cells, _), rest in zip(blocks, left, strict=True):
+        along = np.full(int(cells[-1]) + 1, np.nan)
+        along[cells] = rest
+        changes.append(along[steps:] - along[:-steps])
+    return float(np.nanmean(np.concatenate(changes) ** 2))
+
+
 def scattered(imu: ImuSeries, headings: Sequence[CompassHeading]) -> NDArray[np.bool_]:
     """Return (N,) which headings agree with less than half of those beside them, whether the craft turned or not.
 
@@ -152,7 +213,9 @@ def _said(headings: Sequence[CompassHeading]) -> Yaws:
     return np.array([m.stamp_ns for m in headings], dtype=np.int64), np.array([m.yaw_rad for m in headings])
 
 
-def _blocks(imu: ImuSeries, yaws: Yaws) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
+def _blocks(
+    imu: ImuSeries, yaws: Yaws, block_s: float = _BLOCK_S
+) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
     """Yield places in `yaws`, turned angle by the gyroscope, yaw, and time (s), at the yaws of each block without a hole in the IMU."""
     up = np.median(imu.accel_mps2, axis=0) if len(imu.stamps_ns) else np.zeros(3)
     size = float(np.linalg.norm(up))
@@ -166,9 +229,9 @@ def _blocks(imu: ImuSeries, yaws: Yaws) -> Iterator[tuple[NDArray[np.intp], Arra
     order = np.argsort(stamps, kind="stable")
     at = (stamps[order] - imu.stamps_ns[0]) / NS_PER_S
     yaw = yaw[order]
-    # A block ends where the next hole begins, and after two minutes.
+    # A block ends where the next hole begins, and after `block_s`.
     part = np.searchsorted(t[holes], at)
-    block = part * (1 + int(t[-1] / _BLOCK_S)) + np.clip(at // _BLOCK_S, 0, t[-1] // _BLOCK_S).astype(int)
+    block = part * (1 + int(t[-1] / block_s)) + np.clip(at // block_s, 0, t[-1] // block_s).astype(int)
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
     inside = (at >= t[0]) & (at <= t[-1]) & (t[after] - t[after - 1] <= _HOLE_S)
     for k in np.unique(block[inside]):

@@ -38,8 +38,9 @@ from graphloc.frontends._references import Reference, check_speed, true_trajecto
 from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turns import Yaws, refuse_unit, turn_warnings
+from graphloc.frontends._turns import Yaws, refuse_unit, turn_warnings, wander_warning
 from graphloc.frontends.decode import (
+    NO_STAMP,
     ODOMETRY,
     PLAIN_POSE,
     POSE,
@@ -112,6 +113,11 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         _refuse_unit(imu, sensors)
         warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, sensors, mounts, config)
     warnings += _silent(sensors, rows, topics) + _unstamped(sensors, topics)
+    warnings += [
+        f"{b.topic}: {b.unstamped} of its headers hold no stamp: recording times are used"
+        for b in (truth, check)
+        if b and b.unstamped
+    ]
     return Recording(
         source=bag.name if span is None else f"{bag.name}, {span.start_s:g} s to {span.end_s:g} s",
         imu=imu,
@@ -207,9 +213,10 @@ class _Reader:
                 self._decode(readings, raw, msg, seq)
         for item in self._references.get(raw.topic, ()):
             item.count, item.broken = item.count + 1, item.broken + (msg is None)
-            stamp_ns = None if msg is None else header_stamp_ns(msg)
-            if stamp_ns is not None:
-                item.stamps_ns.append(stamp_ns)
+            if msg is not None:
+                stamp_ns = header_stamp_ns(msg)
+                item.unstamped += stamp_ns is None
+                item.stamps_ns.append(raw.log_ns if stamp_ns is None else stamp_ns)
                 item.logs_ns.append(raw.log_ns)
                 item.messages.append(msg)
         if raw.topic == TF_STATIC and self._tree is not None:
@@ -217,9 +224,9 @@ class _Reader:
 
     def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:
         """Hand a message to its decoder; what gives no reading gives a row."""
-        stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns)
+        stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=readings.config.stamps == "recorded")
         if stamp_ns is None:
-            text = f"{raw.file}: header stamp is zero or negative, recorded at {utc_text(raw.log_ns)}"
+            text = f"{raw.file}: header stamp is zero or negative, recorded at {utc_text(raw.log_ns)}: {NO_STAMP}"
             self._rows.append(readings.row(seq, 0, malformed(text)))
             return
         stamp_ns += duration_ns(readings.config.time_offset_s)
@@ -340,6 +347,7 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
         if isinstance(readings.config, CompassConfig):
             headings = [v for v in readings.values if isinstance(v, CompassHeading)]
             lines += turn_warnings(imu, readings.sensor, headings, readings.config.convention)
+            lines += wander_warning(imu, readings.sensor, headings, readings.config)
     return lines
 
 
@@ -363,13 +371,18 @@ def _mount_warnings(
 
 
 def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) -> list[str]:
-    """Say which sensors' messages have no stamp."""
-    return [
-        f"{r.sensor}: {_or(topics[r.config.topic].msgtypes)} has no stamp: recording times are used; set time_offset_s (negative) "
-        "if they are late"
-        for r in sensors
-        if set(topics[r.config.topic].msgtypes) & set(UNSTAMPED)
-    ]
+    """Say which sensors' messages have the recording times for stamps, as they are."""
+    lines = []
+    for r in sensors:
+        types = topics[r.config.topic].msgtypes
+        why = f"{_or(types)} has no stamp" if set(types) & set(UNSTAMPED) else "stamps: recorded"
+        recorded = set(types) & set(UNSTAMPED) or r.config.stamps == "recorded"
+        if recorded and r.config.time_offset_s == 0.0:
+            lines.append(
+                f"{r.sensor}: {why}: recording times are used, which are late by as long as a message takes (a receiver's often "
+                "0.1 s and more); no bound includes that: set time_offset_s (negative)"
+            )
+    return lines
 
 
 def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary]) -> list[str]:

@@ -56,6 +56,7 @@ _STRING = "std_msgs/msg/String"
 NMEA = ("nmea_msgs/msg/Sentence", _STRING)
 UNSTAMPED = (*NUMBERS, _STRING)
 TF = "tf2_msgs/msg/TFMessage"
+NO_STAMP = "`stamps: recorded` of that sensor takes the recording time instead"
 
 _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
@@ -92,9 +93,12 @@ def header_stamp_ns(msg: Any) -> int | None:
     return stamp_ns if stamp_ns > 0 else None
 
 
-def stamp_ns_of(msg: Any, msgtype: str, log_ns: int) -> int | None:
-    """Return the stamp of a message, ns: its header's, or of a type that has none when it was recorded; None where there is none."""
-    return log_ns if msgtype in UNSTAMPED else header_stamp_ns(msg)
+def stamp_ns_of(msg: Any, msgtype: str, log_ns: int, *, recorded: bool = False) -> int | None:
+    """Return the stamp of a message, ns: its header's; when it was recorded, if that is asked for or its type has none.
+
+    None where the header has none.
+    """
+    return log_ns if recorded or msgtype in UNSTAMPED else header_stamp_ns(msg)
 
 
 def covariance_translation_first(values: ArrayLike) -> Array:

@@ -28,7 +28,7 @@ from graphloc.frontends._assess import (
 )
 from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
-from graphloc.frontends._assess_world import origin_of
+from graphloc.frontends._assess_world import world_of
 from graphloc.frontends._clock import refuse_woven
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
@@ -49,7 +49,7 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turns import SCATTERED, scattered
+from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends._unused import unused_topics
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import (
@@ -128,10 +128,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     mount = tree.resolve(body, frame) if frame else None
     antenna = None if mount is None else mount[0]
     courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
-    told = [
-        (s, odometry_report(s, stamps, p_m, *origin_of(s, stamps, p_m, first, antenna), scatter_m=scatter_m))
-        for s in poses
-    ]
+    told = [(s, odometry_report(s, stamps, p_m, world_of(s, stamps, p_m, first, antenna), scatter_m)) for s in poses]
     twists = [
         (s, velocity_report(s, stamps, p_m, _known(s, tree, body), scatter_m))
         for s in filled
@@ -233,7 +230,7 @@ def _timed(report: CompassReport, stream: Stream, told: Stream, turning: Turning
 
 
 def _asked_together(report: CompassReport, stream: Stream, imus: Sequence[tuple[ImuReport, Stream]]) -> CompassReport:
-    """The report, with how many readings have nothing to do with those beside them, by the best IMU."""
+    """The report, with what the gyroscope of the best IMU says: how far it wanders, how many readings are none of a heading."""
     if not imus or not report.usable:
         return report
     imu, samples = imus[0]
@@ -254,6 +251,7 @@ def _asked_together(report: CompassReport, stream: Stream, imus: Sequence[tuple[
         CompassHeading(stamp_ns=int(s), sensor=stream.topic, seq=0, yaw_rad=float(y), sigma_rad=1.0)
         for s, y in zip(stamps, wrap_angle(yaw), strict=True)
     ]
+    report = replace(report, wander_deg=wander_deg(series, said))
     bad = int(scattered(series, said).sum())
     return replace(report, why=f"{report.why}; {bad} of {len(said)}: {SCATTERED}") if bad else report
 

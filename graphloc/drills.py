@@ -117,7 +117,7 @@ def _refuse_unknown(recording: Recording, only: Sequence[str]) -> None:
     for part in only:
         if not any(_asked_for(name, [part]) for name in names):
             families = ", ".join(dict.fromkeys([*(f.family for f in found), *(name for name, _ in left)]))
-            raise ConfigError(f"--set {part}: no such drill; there are: {families}")
+            raise ConfigError(f"--only {part}: no such drill; there are: {families}")
 
 
 def _asked_for(name: str, only: Sequence[str]) -> bool:
@@ -128,7 +128,7 @@ def _wanted(failures: Sequence[Failure], only: Sequence[str]) -> tuple[Failure, 
     found = tuple(f for f in failures if _asked_for(f.name, only))
     if not found:
         names = ", ".join(dict.fromkeys(f.family for f in failures))
-        raise ConfigError(f"--set {', '.join(only)}: the recording does not permit it; it permits: {names}")
+        raise ConfigError(f"--only {', '.join(only)}: the recording does not permit it; it permits: {names}")
     return found
 
 

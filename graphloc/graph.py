@@ -230,6 +230,7 @@ class Sensor:
         absolute: whether it says something about position (for health).
         company: whether it can tell another sensor's slow error from motion.
         in_world: whether it is given in world coordinates, so that the datum must be known.
+        apart_ns: measurements of a sensor that follow the one before within less tell nothing new, and are left out.
     """
 
     kind: str
@@ -249,6 +250,7 @@ class Sensor:
     absolute: bool = False
     company: bool = False
     in_world: bool = False
+    apart_ns: int = 0
 
 
 class InertialRow(Protocol):

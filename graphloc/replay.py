@@ -181,7 +181,7 @@ def replay(
     config: VesselConfig,
     *,
     scans: Scans | None = None,
-    rate: float | None = None,
+    speed: float | None = None,
     lag_s: float = 10.0,
     datum: Datum | None = None,
     smoother: OnlineSmoother | None = None,
@@ -193,7 +193,7 @@ def replay(
 
     Args:
         scans: where the scans of aerial sensors are matched from; None: matches that are in the recording are taken.
-        rate: of the run's own time; None: as fast as it can. datum: origin of world; None: as `OnlineSmoother` finds it.
+        speed: times real time; None: as fast as it can. datum: origin of world; None: as `OnlineSmoother` finds it.
         smoother: another than a fresh one, for tests. late_ns: as `arrivals` takes it.
         stoppable: Ctrl-C ends it early, and what there is until then is returned.
 
@@ -229,7 +229,7 @@ def replay(
         said.extend((m.stamp_ns, event) for event in smoother.events())
 
     with ExitStack() as stack:
-        pool = None if rate is None else stack.enter_context(ThreadPoolExecutor(1))
+        pool = None if speed is None else stack.enter_context(ThreadPoolExecutor(1))
         matchings = [
             _Matching(name, config, scans, stack.enter_context(Bag(scans.bags)), gathering, pool)
             for name in (config.of_kind("aerial") if scans is not None else ())
@@ -238,8 +238,8 @@ def replay(
         tried = -1
         try:
             for m in arrivals(recording, late_ns):
-                if rate is not None and isinstance(m, ImuSample):
-                    ahead_s = (m.stamp_ns - first_ns) / 1e9 / rate - (time.monotonic() - begun)
+                if speed is not None and isinstance(m, ImuSample):
+                    ahead_s = (m.stamp_ns - first_ns) / 1e9 / speed - (time.monotonic() - begun)
                     if ahead_s > 0.0:
                         time.sleep(ahead_s)
                 feed(m)

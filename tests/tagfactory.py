@@ -137,5 +137,5 @@ def sighted(
     )
     every = sorted([*run.recording.measurements, *(s for s, _ in numbered)], key=lambda m: (m.stamp_ns, m.seq))
     recording = replace(run.recording, measurements=tuple(every), message_count=first + len(numbered))
-    sensors = {name: sensor for name, sensor in run.config.sensors.items() if name != "aerial"} | {"tags": config}
+    sensors = {name: sensor for name, sensor in run.config.sensors.items() if name != "matcher"} | {"tags": config}
     return replace(run, recording=recording, config=run.config.model_copy(update={"sensors": sensors})), numbered

@@ -63,7 +63,7 @@ def test_a_bad_compass_shows_without_truth(bad: tuple[SimulatedRun, Ablated]) ->
     text = "\n".join(page.said(found))
     assert "CONTRADICTION: compass" in text
     assert "does not measure accuracy" in text
-    # aerial knows the heading, too, and is as far from the compass as that from it: what is left tells
+    # the matcher knows the heading, too, and is as far from the compass as that from it: what is left tells
     assert "compass is the likelier culprit" in text
     assert (of(found, "gnss").contradiction or 0.0) < 1.5
 
@@ -74,8 +74,8 @@ def test_each_sensor_is_left_out_but_the_imu(bad: tuple[SimulatedRun, Ablated]) 
     assert "every state depends on it" in of(found, "imu").why_not
     assert of(found, "gnss").measurements == sum(isinstance(m, GnssPosition) for m in run.recording.measurements)
     assert of(found, "height").measurements == 0  # the recording has none: the configuration makes it
-    assert of(found, "compass").fits.keys() == {"gnss", "aerial", "height"}
-    assert of(found, "aerial").bound_m > found.full.bound_m  # type: ignore[operator]
+    assert of(found, "compass").fits.keys() == {"gnss", "matcher", "height"}
+    assert of(found, "matcher").bound_m > found.full.bound_m  # type: ignore[operator]
     assert "cannot be left out" in page.grids(found)[0].as_text()
 
 
@@ -83,13 +83,13 @@ def test_against_truth_the_numbers_are_those_of_a_run_without_it() -> None:
     run = made(compass_hz=0.0, duration_s=12.0)
     found = ablate(run.recording, run.config)
     assert found.basis == "truth"
-    gone = run.config.sensors["aerial"].model_copy(update={"enabled": False})
-    config = run.config.model_copy(update={"sensors": {**run.config.sensors, "aerial": gone}})
+    gone = run.config.sensors["matcher"].model_copy(update={"enabled": False})
+    config = run.config.model_copy(update={"sensors": {**run.config.sensors, "matcher": gone}})
     track = app.smooth_recording(run.recording, config).solution.trajectory
     inside = track.covers(run.truth.stamps_ns)
     stamps = run.truth.stamps_ns[inside]
     away = np.hypot(*(track.at(stamps).p_world_m - run.truth.at(stamps).p_world_m).T[:2])
-    effect = of(found, "aerial")
+    effect = of(found, "matcher")
     assert effect.worst_m == pytest.approx(away.max(), rel=0.02)
     assert effect.rmse_m == pytest.approx(np.sqrt(np.mean(away**2)), rel=0.02)
     at_ns = round((effect.worst_at_s or 0.0) * 1e9) + track.stamps_ns[0]
@@ -211,7 +211,7 @@ def test_what_the_solution_knows_counts_along_the_worlds_axes(
 ) -> None:
     """Matches 3 m east of a track, which is known to 3 m east and to 1 cm north, while it turns."""
     run, _ = bad
-    sensor = "aerial"
+    sensor = "matcher"
     own = [m for m in run.recording.measurements if isinstance(m, PoseFix) and m.sensor == sensor]
     there = whole.trajectory.at(np.array([m.stamp_ns for m in own]))
     yaw = there.yaw_rad
@@ -244,11 +244,11 @@ def test_the_false_ones_that_a_sensor_owns_to_do_not_count(bad: tuple[SimulatedR
             for m, v, k in zip(own, values, kept, strict=True)
             if k
         ]
-        aerial = run.config.sensors["aerial"].model_copy(update={"false_fraction": share})
-        config = run.config.model_copy(update={"sensors": {"aerial": aerial}})
+        matcher = run.config.sensors["matcher"].model_copy(update={"false_fraction": share})
+        config = run.config.model_copy(update={"sensors": {"matcher": matcher}})
         recording = replace(run.recording, measurements=tuple(made))
         sure = stated(whole, (1e-8,) * 6)
-        found = contradiction(sure, recording, config, "aerial", SENSORS)
+        found = contradiction(sure, recording, config, "matcher", SENSORS)
         assert found is not None
         return found.sigmas
 

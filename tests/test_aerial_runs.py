@@ -329,7 +329,7 @@ def test_turns_of_lidars_at_different_rates(monkeypatch: pytest.MonkeyPatch) -> 
         def decode(self, raw: RawMessage) -> RawMessage:
             return raw
 
-    monkeypatch.setattr(scans, "header_stamp_ns", lambda raw: raw.log_ns)
+    monkeypatch.setattr(scans, "stamp_ns_of", lambda raw, _type, log_ns, **_: log_ns)
     monkeypatch.setattr(
         scans, "decode_cloud",
         lambda raw, stamp, name: Cloud(name, stamp, np.ones((1, 3)), np.array([stamp], dtype=np.int64)),

@@ -103,7 +103,7 @@ def test_poses_all_off_by_five_metres_are_reported(run: SimulatedRun) -> None:
     recording = replace(run.recording, measurements=tuple(moved))
     for solved in (app.smooth_recording(recording, run.config), app.replay_recording(recording, run.config)):
         lines = [w for w in solved.recording.warnings if "constant offset" in w]
-        found = re.search(r"gnss has a constant offset of (\d\.\d) m \(towards (\d+) deg\) from aerial", lines[0])
+        found = re.search(r"gnss has a constant offset of (\d\.\d) m \(towards (\d+) deg\) from matcher", lines[0])
         assert found
         assert float(found[1]) == pytest.approx(5.0, abs=0.3)
         assert float(found[2]) == pytest.approx(180.0 + np.degrees(np.arctan2(3.0, 4.0)), abs=4.0)

@@ -10,7 +10,7 @@ import pytest
 from scipy.sparse import csr_array
 
 from graphloc import app
-from graphloc.config import ImuConfig, VesselConfig
+from graphloc.config import BodyVelocityConfig, ImuConfig, VelocityConfig, VesselConfig
 from graphloc.eval.calibrate import PROBE, Calibration, Check, Suggestion
 from graphloc.eval.calibrate._evidence import Evidence
 from graphloc.eval.calibrate._imu import density, imu_noise
@@ -18,10 +18,14 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frontends._assess import Turning
 from graphloc.frontends._lag import lag
-from graphloc.measurements import ImuSeries
+from graphloc.frontends.bag import read_recording
+from graphloc.measurements import GnssVelocity, ImuSeries
 from graphloc.offsets import Misfit, Offset, Offsets, joined
 from graphloc.solve import smooth
 from graphloc.solve._offsets import _imu_misfit, _normal_solver, _Rows
+from tests.bagfactory import Messages
+from tests.test_inspect import drive, look
+from tests.test_odd_vessels import antenna_velocity
 
 LEVER_M, LATE_S, TURNED_DEG = (0.6, -0.5), 0.15, 5.0
 FINE = Misfit(squares=10.0, freedom=10.0)
@@ -169,7 +173,7 @@ def test_all_that_is_wrong_is_found_at_once(simulated: SimulatedRun) -> None:
         assert abs(found[key].z) > 4.0
     said = found["sensors.compass.mount.rpy_deg[2]"]
     assert said.suggested == pytest.approx(0.0, abs=1.0)
-    assert "cannot tell it from sensors.aerial.mount.rpy_deg[2]" in said.action
+    assert "cannot tell it from sensors.matcher.mount.rpy_deg[2]" in said.action
 
 
 def test_fixes_that_are_late_are_found(simulated: SimulatedRun) -> None:
@@ -182,6 +186,47 @@ def test_fixes_that_are_late_are_found(simulated: SimulatedRun) -> None:
     assert only.key == "sensors.gnss.time_offset_s"
     assert abs(only.suggested + LATE_S) < 4.0 * only.sigma
     assert only.sigma < 0.03
+
+
+def test_an_antenna_that_tells_its_velocity_too_is_found(simulated: SimulatedRun) -> None:
+    """Both are configured 0.6 and -0.5 m off, as of one antenna: each bears the other out, and the IMU alone contradicts."""
+    rng, truth, gnss = np.random.default_rng(3), simulated.truth, simulated.config.sensors["gnss"]
+    v = antenna_velocity(truth)
+    every = range(10, len(truth) - 10, max(1, round(0.2e9 / (truth.stamps_ns[1] - truth.stamps_ns[0]))))
+    told = [
+        GnssVelocity(
+            stamp_ns=int(truth.stamps_ns[k]), sensor="velocity", seq=10**6 + k, v_world_mps=v[k] + rng.normal(0.0, 0.05, 3),
+            cov_m2ps2=0.05**2 * np.eye(3),
+        )
+        for k in every
+    ]  # fmt: skip
+    off = gnss.mount.model_copy(update={"xyz_m": tuple(gnss.mount.xyz_m + np.array([*LEVER_M, 0.0]))})
+    config = changed(simulated.config, "gnss", mount=off)
+    config = config.model_copy(update={"sensors": {**config.sensors, "velocity": VelocityConfig(mount=off)}})
+    measurements = sorted((*simulated.recording.measurements, *told), key=lambda m: m.stamp_ns)
+    recording = replace(simulated.recording, measurements=tuple(measurements))
+    found = {s.key: s for s in calibration_of(recording, config).suggestions}
+    for axis, right_m in enumerate(gnss.mount.xyz_m[:2]):
+        said = found[f"sensors.gnss.mount.xyz_m[{axis}]"]
+        assert abs(said.suggested - right_m) < 4.0 * said.sigma, said.key
+        assert said.sigma < 0.1
+        assert "also of velocity, taken for the same antenna" in said.action
+
+
+def test_wheels_that_are_late_are_found(tmp_path: Path) -> None:
+    """A speed that goes up and down by 0.6 m/s^2, stamped 0.15 s late by the wheels alone."""
+    make, items = Messages(2), []
+    for topic, at, msg in drive(Messages(2)):
+        if topic == "/wheel/odom":
+            msg.header = make.header(at + round(LATE_S * 1e9))
+        items.append((topic, at, msg))
+    _, config, _ = look(tmp_path, items, make)
+    wheels = BodyVelocityConfig(topic="/wheel/odom")
+    config = config.model_copy(update={"sensors": {**config.sensors, "wheels": wheels}})
+    found = {s.key: s for s in calibration_of(read_recording(tmp_path / "run", config), config).suggestions}
+    late = found["sensors.wheels.time_offset_s"]
+    assert abs(late.suggested + LATE_S) < 4.0 * late.sigma
+    assert late.sigma < 0.03
 
 
 @pytest.mark.parametrize(("times", "needed"), [(1.0, 1.0), (5.0, 0.2)])

@@ -308,7 +308,7 @@ def test_another_rig_sees_with_its_own_eyes(
         counts = {c.topic: c.msgcount for c in reader.connections}
     assert counts["/mast/points"] == 11
     assert counts["/bow/image_raw/compressed"] == counts["/bow/camera_info"] == 5
-    assert "/aerial/pose" not in counts
+    assert "/matcher/pose" not in counts
     vessel = YAML(typ="safe").load((tmp_path / "out/vessel.yaml").read_text())
     assert vessel["sensors"]["imu"]["mount"]["rpy_deg"] == [180.0, 0.0, 0.0]
     matcher = vessel["sensors"]["aerial"]

@@ -61,7 +61,7 @@ def test_a_draft_from_inspect_gives_a_track(
     """
     where, _ = write_bag(simulate(replace(bl_scenario(1, "clean"), duration_s=60.0), 1), tmp_path / "bag", ros=1)
     draft = tmp_path / "vessel.yaml"
-    assert called(monkeypatch, "inspect", where, "--write", draft) == 0
+    assert called(monkeypatch, "inspect", where, "--out", draft) == 0
     assert "guess" in draft.read_text()
     assert called(monkeypatch, "smooth", where, "-c", draft, "-o", tmp_path / "run", "--json") == 0
     printed = capsys.readouterr().out
@@ -127,7 +127,7 @@ def test_bad_arguments_are_one_line(
         (["smoth"], "Did you mean 'smooth'"),
         (["smooth"], "see graphloc smooth --help"),
         ([*good, "--foo"], "--foo"),
-        (["replay", *good[1:], "--rate", "fast"], "--rate"),
+        (["replay", *good[1:], "--speed", "fast"], "--speed"),
         (["sweep", "bl1-drift", "--mode", "x"], "--mode"),
     ):
         assert called(monkeypatch, *arguments) == 2, arguments

@@ -318,10 +318,12 @@ def test_flipped_start_locks_the_truth_out_for_ever() -> None:
     begun = re.match(r"it started on a pose (\d+\.\d) m off", result.why)
     assert begun is not None
     assert float(begun[1]) == pytest.approx(12.0, abs=0.3)
-    dropped = re.search(r"299 of 300 sightings of its one tag were dropped, (\d+) of them right to 2 m", result.why)
+    dropped = re.search(
+        r"Of 300 sightings of its one tag it rejected 299 \(for up to 20 s .*\), (\d+) of them right to 2 m", result.why
+    )
     assert dropped is not None
     assert int(dropped[1]) > 250  # 0.02 px: nearly all are
-    assert "for up to 20 s on end; of the 1 that it took 1 were farther off" in result.why
+    assert "it accepted 1, 1 of them farther off" in result.why
 
 
 def test_right_start_keeps_it() -> None:

@@ -417,7 +417,7 @@ def test_the_command_prints_its_table_and_replaces_nothing_unasked(
 
     monkeypatch.setattr("graphloc.app.load", lambda *_: (run.recording, run.config))
     out = tmp_path / "out"
-    arguments = ["drill", "my.bag", "-c", "vessel.yaml", "-o", str(out), "--set", "gap", "--times", "3"]
+    arguments = ["drill", "my.bag", "-c", "vessel.yaml", "-o", str(out), "--only", "gap", "--times", "3"]
     with monkeypatch.context() as patch:
         patch.setattr("graphloc.drills.drill", drill_instead)
         assert called(patch, *arguments) == 0
@@ -427,7 +427,7 @@ def test_the_command_prints_its_table_and_replaces_nothing_unasked(
     assert printed.rstrip().endswith("drill.html")
     for changed, said in (
         (arguments, "--overwrite"),
-        ([*arguments[:5], str(out / "x"), "--set", "meteor"], "no such drill"),
+        ([*arguments[:5], str(out / "x"), "--only", "meteor"], "no such drill"),
     ):
         assert called(monkeypatch, *changed) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()

@@ -53,7 +53,7 @@ def test_online_loop(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
     said = run(monkeypatch, capsys, "online_loop.py")
     assert "waiting for" in said
     assert len(re.findall(r"m north, \+- 0\.\d\d m, good", said)) >= 2
-    assert "aerial: rejected, judged false" in said
+    assert "matcher: rejected, judged false" in said
 
 
 def test_compare_in_memory(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -134,7 +134,7 @@ def jumped(
     ordered = sorted(kept, key=lambda m: (m.stamp_ns, m.sensor))
     measurements = tuple(replace(m, seq=len(imu) + i) for i, m in enumerate(ordered))
     velocity = VelocityConfig(topic="/velocity", mount=run.config.sensors["gnss"].mount)
-    sensors = {n: s for n, s in run.config.sensors.items() if n != "aerial"} | {"velocity": velocity}
+    sensors = {n: s for n, s in run.config.sensors.items() if n != "matcher"} | {"velocity": velocity}
     recording = replace(run.recording, measurements=measurements, message_count=len(imu) + len(measurements))
     return run, recording, run.config.model_copy(update={"sensors": sensors})
 

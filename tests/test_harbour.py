@@ -155,7 +155,7 @@ def test_a_recording_tells_how_it_was_made(run: SimulatedRun, tmp_path: Path) ->
     assert TypeAdapter(Scenario).validate_python(told["scenario"]) == chosen
     assert chosen.outage_s == (3.0, 5.0)
     sensors = YAML(typ="safe").load(config.read_text())["sensors"]
-    assert set(sensors) == {"imu", "gnss", "aerial", "height"}  # what is off is not asked for
+    assert set(sensors) == {"imu", "gnss", "matcher", "height"}  # what is off is not asked for
 
 
 def test_a_shorter_run_ends_on_the_way() -> None:

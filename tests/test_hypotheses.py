@@ -175,7 +175,7 @@ def test_matches_that_are_refused_together_are_reported() -> None:
     }
     assert not any("are rejected" in line for line in said["usual"])
     for mode in ("batch", "online"):
-        (line,) = (line for line in said[mode] if line.startswith("aerial: all ") and "are rejected" in line)
+        (line,) = (line for line in said[mode] if line.startswith("matcher: all ") and "are rejected" in line)
         assert 18 <= int(line.split(" all ")[1].split()[0]) <= 24, line
 
 
@@ -184,11 +184,11 @@ def test_few_or_brief_ones_are_no_news() -> None:
     weights[10:17] = 0.0
     rare, usual = np.full(40, 0.02), np.full(40, 0.4)
     assert joint_rejection_warning("tags", stamps_ns, weights, rare)
-    assert not joint_rejection_warning("aerial", stamps_ns, weights, usual)  # 0.4 ** 7 * 40 is 0.07
+    assert not joint_rejection_warning("matcher", stamps_ns, weights, usual)  # 0.4 ** 7 * 40 is 0.07
     assert not joint_rejection_warning("tags", stamps_ns // 10, weights, rare)  # within 0.6 s
     assert not joint_rejection_warning("tags", stamps_ns, np.zeros(40), rare)  # all: said otherwise
     doubtful = np.where(weights > 0.5, 0.02, 0.9)
-    assert not joint_rejection_warning("aerial", stamps_ns, weights, doubtful)  # so they said themselves
+    assert not joint_rejection_warning("matcher", stamps_ns, weights, doubtful)  # so they said themselves
     brief = np.concatenate([stamps_ns, stamps_ns[-1] + 1 + np.arange(30) * 1_000_000])
     (line,) = joint_rejection_warning("tags", brief, np.append(weights, np.zeros(30)), np.full(70, 0.02))
     assert "all 7 measurements in the 6 s" in line  # 30 more within 30 ms are no longer row

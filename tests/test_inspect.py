@@ -394,16 +394,31 @@ def test_a_map_grid_is_no_world(tmp_path: Path) -> None:
     assert "looks like a map grid (UTM)" in text
 
 
+def test_places_on_a_map_grid_alone_are_said_to_tell_no_place(tmp_path: Path) -> None:
+    """A receiver's driver that publishes UTM and no fix: drafted as a pose, it went on to ask for a datum, which would not help."""
+    make = Messages(2)
+    items = [item for item in drive(make) if item[0] in ("/imu", "/compass")]
+    for k in range(300):
+        stamp = START_NS + k * S // 5
+        items.append(("/gps/odom", stamp, make.odometry(stamp, (674_000.0 + 0.5 * k, 6_399_000.0, 40.0))))
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert not config.of_kind("pose")
+    assert "# /gps/odom: left out, it is 6434 km from its origin: looks like a map grid (UTM)" in text
+    assert any("nothing in it tells the place" in w for w in found.warnings)
+
+
 def test_another_body_is_no_truth(tmp_path: Path) -> None:
     """Odometry of something that all but stays where it is, while the craft drives."""
     make, items = Messages(2), drive(Messages(2))
     for k, (_, log_ns, fix) in enumerate([item for item in items if item[0] == "/fix"]):
         stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
         items.append(("/truth/dock", log_ns, make.odometry(stamp, (140.0 + 0.3 * np.sin(0.1 * k), 86.0, 0.0))))
-    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     assert config.truth_topic is None
     assert config.datum is None
-    assert "not a pose of this vessel" in text
+    assert "# /truth/dock: left out, it moves by" in text
+    assert "/truth/dock: left out" in render(found)
+    assert "truth_topic" not in render(found)
 
 
 def test_the_antenna_is_taken_off_the_datum(tmp_path: Path) -> None:
@@ -493,7 +508,33 @@ def test_sensors_on_other_clocks_are_judged_by_each_other(topic: str, behind_s: 
     assert (compass.usable, compass.convention) == (True, "ned")
     assert compass.samples > 100
     offset_s = behind_s if topic == "/fix" else -behind_s
-    assert config.sensors["gnss"].time_offset_s == pytest.approx(offset_s, abs=0.1)
+    gnss, imu = (config.sensors[name].time_offset_s for name in ("gnss", "imu"))
+    assert gnss - imu == pytest.approx(offset_s, abs=0.1)
+
+
+@pytest.mark.parametrize("topic", ["/mag", "/gps/heading"])
+@pytest.mark.parametrize("swing_deg", [0.0, 6.0])
+def test_a_compass_is_drafted_as_far_as_it_wanders(topic: str, swing_deg: float, tmp_path: Path) -> None:
+    """One that swings to and fro in 80 s was drafted as good to half a degree; what wanders so far is no receiver's, whatever its name."""
+    make = Messages(2)
+    items: list[Item] = []
+    for name, at, m in drive(make, seconds=150):
+        if name == "/compass":
+            error = np.radians(swing_deg) * np.sin(2.0 * np.pi * (at - START_NS) / (80 * S))
+            half = np.arctan2(m.quaternion.z, m.quaternion.w) + error / 2.0
+            items.append((topic, at, make.compass(at, (0, 0, np.sin(half), np.cos(half)))))
+        else:
+            items.append((name, at, m))
+    _, config, text = look(tmp_path, items, make)
+    compass = config.sensors["compass"]
+    assert isinstance(compass, CompassConfig)
+    gnss = topic == "/gps/heading" and not swing_deg
+    assert compass.deviation_sigma_deg == (0.0 if gnss else 1.5)
+    assert ("as it wanders beside the gyro" in text) is (swing_deg > 0.0)
+    if swing_deg:
+        assert 2.0 < compass.wander_sigma_deg < 8.0
+    else:
+        assert compass.wander_sigma_deg == (0.2 if gnss else 0.5)
 
 
 @pytest.mark.parametrize(("moves", "usable"), [(True, True), (False, False)])
@@ -512,6 +553,11 @@ def test_a_heading_receiver_that_publishes_an_imu_message_is_not_frozen(
             items.append((topic, at, m))
     found, config, _ = look(tmp_path, items, make)
     assert ("compass" in config.sensors) is usable
+    if usable:
+        compass = config.sensors["compass"]
+        assert isinstance(compass, CompassConfig)
+        # Iron does nothing to two antennas, and a receiver knows how good it is.
+        assert (compass.deviation_sigma_deg, compass.wander_sigma_deg, compass.use_reported_sigma) == (0.0, 0.2, True)
     said = [w for w in found.warnings if w.startswith("/heading")]
     assert not any("frozen" in w for w in said)
     assert len(said) == (0 if usable else 1)
@@ -533,20 +579,20 @@ def test_topics_that_give_nothing_are_reported(status: int, said: str, tmp_path:
 def test_a_bag_that_no_sensor_can_be_made_of_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It ended well, with a vessel.yaml that has no sensors; what stamps of zero and NaN were counted as was left to guess."""
+    """It ended well, with a vessel.yaml that has no sensors; what NaN was counted as was left to guess."""
     make = Messages(2)
     nan = (float("nan"),) * 3
     items: list[Item] = []
     for k in range(30):
         at = START_NS + k * S
-        items += [("/imu", at, make.imu(at, nan)), ("/fix", at, make.fix(0, 57.7, 11.9)), ("/note", at, make.text("a"))]
+        items += [("/imu", at, make.imu(at, nan)), ("/fix", at, make.fix(0, status=-1)), ("/note", at, make.text("a"))]
     where, draft = write_bag(tmp_path / "run", make, items, "mcap"), tmp_path / "vessel.yaml"
     assert called(monkeypatch, "inspect", where, "-o", draft) == 2
     assert not draft.exists()
     (line,) = capsys.readouterr().err.splitlines()
     assert "no usable sensor in it" in line
     assert "/imu: nothing of its 30 messages can be used: 30 hold an acceleration or a rate that is NaN" in line
-    assert "/fix: nothing of its 30 messages can be used: 30 have no stamp" in line
+    assert "/fix: nothing of its 30 messages can be used: 30 say 'no fix'" in line
 
 
 def test_a_receiver_without_a_message_and_damaged_transforms_are_reported(tmp_path: Path) -> None:

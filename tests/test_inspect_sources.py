@@ -188,7 +188,7 @@ def test_odometry_in_east_and_north_is_no_speed_along_the_craft(tmp_path: Path) 
         return [("/local", make.odometry(stamp, v=v.tolist()))]
 
     found, config, _ = seen(tmp_path, told)
-    assert found.odometry[0].role == "pose"
+    assert found.odometry[0].role == "other"  # no pose either: it says 0, 0 throughout
     assert config.check_speed_topic is None
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
 

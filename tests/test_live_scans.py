@@ -15,6 +15,7 @@ from graphloc.config import AerialConfig, LidarConfig
 from graphloc.eval.simulate import find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.frames import Datum, Geodetic
+from graphloc.frontends import decode
 from graphloc.frontends._source import Bag, RawMessage, TopicSummary
 from graphloc.frontends.aerial import live, match_bag, scans
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, level
@@ -319,13 +320,20 @@ class Heap:
         return float(raw.data)
 
 
-def turns_of(monkeypatch: pytest.MonkeyPatch, *messages: tuple[str, float, float]) -> list[Turn]:
+def turns_of(
+    monkeypatch: pytest.MonkeyPatch,
+    *messages: tuple[str, float, float],
+    stamps: Literal["header", "recorded"] = "header",
+) -> list[Turn]:
     def decode_cloud(_: float, stamp_ns: int, name: str) -> Cloud:
         return Cloud(name, stamp_ns, np.ones((1, 3)), np.array([stamp_ns], dtype=np.int64))
 
-    monkeypatch.setattr(scans, "header_stamp_ns", lambda t: None if np.isnan(t) else BEGIN + round(t * 1e9))
+    def header_stamp_ns(t: float) -> int | None:
+        return None if np.isnan(t) else BEGIN + round(t * 1e9)
+
+    monkeypatch.setattr(decode, "header_stamp_ns", header_stamp_ns)
     monkeypatch.setattr(scans, "decode_cloud", decode_cloud)
-    config = AerialConfig(lidars={n: LidarConfig(topic=f"/{n}") for n in ("one", "two")})
+    config = AerialConfig(lidars={n: LidarConfig(topic=f"/{n}") for n in ("one", "two")}, stamps=stamps)
     return list(ScanFeed(Heap(*messages), config, "base_link"))  # type: ignore[arg-type]
 
 
@@ -343,6 +351,11 @@ def test_turns_arrive_with_the_message_that_ends_them(monkeypatch: pytest.Monkey
     assert [(t.stamp_ns - BEGIN) / 1e9 for t in found] == [1.02, 3.0, 4.0, 5.2]
 
 
+def test_scans_without_stamps_are_of_when_they_were_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    (turn,) = turns_of(monkeypatch, ("one", np.nan, 1.1), ("two", np.nan, 1.14), stamps="recorded")
+    assert [c.stamp_ns - BEGIN for c in turn.clouds] == [1_100_000_000, 1_140_000_000]
+
+
 def test_a_damaged_scan_is_answered_at_once(monkeypatch: pytest.MonkeyPatch, seen: Seen) -> None:
     """It needs no track, and the scans beside it still make a turn; turns stay in order of arrival."""
     found = turns_of(
@@ -354,6 +367,6 @@ def test_a_damaged_scan_is_answered_at_once(monkeypatch: pytest.MonkeyPatch, see
     answer = matcher.offer(found[0], track_of(-5.0, 0.5))
     assert isinstance(answer, Matched)
     assert (answer.stamp_ns, answer.match, answer.why_not) == (
-        BEGIN + 12 * S // 10, None, "/two: its header has no stamp"
+        BEGIN + 12 * S // 10, None, "/two: its header has no stamp: `stamps: recorded` of that sensor takes the recording time instead"
     )  # fmt: skip
     assert not seen.numbers

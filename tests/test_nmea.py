@@ -12,7 +12,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from graphloc.app import smooth_recording
-from graphloc.config import CompassConfig, GnssConfig, load_config
+from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, load_config
 from graphloc.errors import ConfigError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
@@ -175,6 +175,7 @@ def bag(run: SimulatedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
             say(m.stamp_ns, "GPGSV,1,1,01,01,40,083,46")
             east, north, _ = run.recording.truth.at(np.array([m.stamp_ns])).v_world_mps[0]  # type: ignore[index]
             knots, course = np.hypot(east, north) * 3600.0 / 1852.0, np.degrees(np.arctan2(east, north)) % 360.0
+            say(m.stamp_ns, f"VWVHW,,T,,M,{knots + 0.4:.2f},N,,K")
             say(m.stamp_ns, f"GPVTG,{course:.2f},T,,M,{knots:.3f},N,{knots * 1.852:.3f},K,A")
         elif isinstance(m, CompassHeading):
             say(m.stamp_ns, f"HEHDT,{(90.0 - np.degrees(m.yaw_rad)) % 360.0:.3f},T")
@@ -191,7 +192,11 @@ def test_a_bag_of_sentences_is_read_as_drafted(run: SimulatedRun, bag: Path, tmp
     assert kinds["gnss"] == ("gnss", ("GPGGA",), True)
     assert kinds["compass"] == ("compass", ("HEHDT",), True)
     assert kinds["compass_2"] == ("compass", ("HCHDM",), False)  # two of one mast are not two witnesses
-    assert kinds["gnss_velocity"] == ("gnss_velocity", ("GPVTG",), True)
+    assert kinds["gnss_velocity_2"] == ("gnss_velocity", ("GPVTG",), True)
+    assert kinds["body_velocity"] == ("body_velocity", ("VWVHW",), False)
+    log = config.sensors["body_velocity"]
+    assert isinstance(log, BodyVelocityConfig)
+    assert log.through == "water"
     recording = read_recording(bag, config)
     assert recording.message_count == len(recording.measurements) + len(recording.imu or ()) + sum(
         r.count for r in recording.rows

@@ -137,15 +137,15 @@ def test_an_imu_that_ends_early_is_reported() -> None:
 
 def test_a_sensor_that_is_switched_off_keeps_its_rows() -> None:
     run = simulate(replace(BASE, duration_s=8.0, pose_hz=1.0), 1)
-    matches = sum(m.sensor == "aerial" for m in run.recording.measurements)
+    matches = sum(m.sensor == "matcher" for m in run.recording.measurements)
     assert matches >= 7
-    off = run.config.sensors["aerial"].model_copy(update={"enabled": False})
-    for config in (with_sensors(run, aerial=off), with_sensors(run, aerial=None)):
+    off = run.config.sensors["matcher"].model_copy(update={"enabled": False})
+    for config in (with_sensors(run, matcher=off), with_sensors(run, matcher=None)):
         solved = app.smooth_recording(run.recording, config, compare=True)
         assert len(solved.solution.ledger) == run.recording.message_count
-        assert solved.solution.ledger.counts()["aerial"] == {"ignored": matches}
+        assert solved.solution.ledger.counts()["matcher"] == {"ignored": matches}
         filters = [f for f in solved.filters if f.name != "graphloc online"]  # which accounts for every message, too
-        assert all(row.sensor != "aerial" for f in filters for row in f.ledger)
+        assert all(row.sensor != "matcher" for f in filters for row in f.ledger)
 
 
 def test_held_out_fixes_of_two_receivers_keep_their_antennas() -> None:
@@ -173,7 +173,7 @@ def test_held_out_fixes_of_two_receivers_keep_their_antennas() -> None:
 
 def test_places_in_world_need_a_datum() -> None:
     run = simulate(replace(BASE, duration_s=10.0, pose_hz=1.0), 1)
-    with pytest.raises(InputError, match=r"sensors\.aerial, truth_topic.*set datum"):
+    with pytest.raises(InputError, match=r"sensors\.matcher, truth_topic.*set datum"):
         app.smooth_recording(run.recording, run.config.model_copy(update={"datum": None}))
 
 
@@ -384,12 +384,13 @@ def test_parts_that_lack_a_sensor_and_do_not_converge() -> None:
     kept = tuple(
         m
         for m in run.recording.measurements
-        if not 15 * 10**9 < m.stamp_ns - t0 < 35 * 10**9 and not (m.sensor == "aerial" and m.stamp_ns > t0 + 25 * 10**9)
+        if not 15 * 10**9 < m.stamp_ns - t0 < 35 * 10**9
+        and not (m.sensor == "matcher" and m.stamp_ns > t0 + 25 * 10**9)
     )
     paused = replace(only(run.recording, kept), imu=imu.where((t < 15.0) | (t > 35.0)))
     solved = app.smooth_recording(paused, run.config).solution
     seconds = (solved.trajectory.stamps_ns - t0) * 1e-9
-    assert np.isinf(solved.since_agreed_s["aerial"][seconds > 30.0]).all()
+    assert np.isinf(solved.since_agreed_s["matcher"][seconds > 30.0]).all()
     assert solved.stats.converged
     one, other = (replace(solved.stats, converged=c) for c in (True, False))
     assert not _join_stats([one, other], ()).converged

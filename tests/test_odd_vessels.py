@@ -15,9 +15,9 @@ from graphloc import app
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, rpy_from_rotation
-from graphloc.frontends._readings import THINNED
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.measurements import GnssPosition
+from graphloc.thinning import THINNED
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import Item, Messages, write_bag
 

@@ -21,6 +21,7 @@ from graphloc.frames import Array, wrap_angle
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix, PoseMode
 from graphloc.online import OnlineSmoother
+from graphloc.thinning import THINNED
 from graphloc.trajectory import Trajectory, bounds_95
 from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, delayed, feed, finish
 from tests.tagfactory import sighted
@@ -517,6 +518,27 @@ def test_memory_does_not_grow() -> None:
     grown = {n: (early.get(n, 0), s) for n, s in late.items() if n not in remembered and s > 1.15 * early.get(n, 0) + 5}
     assert len(early) > 30
     assert grown == {}
+
+
+def test_headings_faster_than_a_compass_errs_anew_are_thinned() -> None:
+    """Each heading said again 10, 20 and 30 ms later: as if it were said once, with a row for each."""
+    more: Arrivals = []
+    for a in arrivals_of(drift()):
+        later = (10, 20, 30) if isinstance(a.m, CompassHeading) else ()
+        more += [
+            a,
+            *(
+                replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns + ms * 1_000_000, seq=10**6 * ms + a.m.seq))
+                for ms in later
+            ),
+        ]
+    fed, _ = whole(drift(), more)
+    assert complaints(more, fed) == []
+    once, _ = in_order()
+    thinned = [row for row in fed.rows if row.reason == THINNED]
+    assert len(thinned) == 3 * sum(isinstance(a.m, CompassHeading) for a in arrivals_of(drift()))
+    assert {row.outcome for row in thinned} == {Outcome.REJECTED}
+    np.testing.assert_allclose(fed.errors_m, once.errors_m, atol=1e-9)
 
 
 # Prediction

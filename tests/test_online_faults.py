@@ -132,7 +132,7 @@ def test_agreement_with_a_rejected_choice_does_not_count(kept: bool, monkeypatch
     feed(online, run_of(), base[: at_s(base, 12.0)])
     assert online._tracking is not None  # noqa: SLF001
     judge, agreement = online._tracking.lag._judge, online._tracking.lag._agreement  # noqa: SLF001
-    stream = online._tracking.lag.problem.streams["aerial"]  # noqa: SLF001
+    stream = online._tracking.lag.problem.streams["matcher"]  # noqa: SLF001
     own = judge._group(stream)  # noqa: SLF001
     agreement.back_to(Agreement(online._tracking.lag.problem.timeline).marked())  # noqa: SLF001
     for entry in own:
@@ -142,7 +142,7 @@ def test_agreement_with_a_rejected_choice_does_not_count(kept: bool, monkeypatch
     monkeypatch.setattr(judge, "_cost", lambda *_: next(costs))
     judge._try(stream, own, [e.verdict for e in own])  # noqa: SLF001
     assert (agreement.marked() == refused) is not kept
-    assert ("aerial" in agreement.agreed_ns) is kept
+    assert ("matcher" in agreement.agreed_ns) is kept
 
 
 @pytest.mark.parametrize(("error_m", "denies", "lost_after_s"), [(3.0, False, 90), (20.0, False, 60), (20.0, True, 15)])
@@ -152,7 +152,7 @@ def test_a_receiver_that_is_far_off_is_waited_for(error_m: float, denies: bool, 
     feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
     assert online._tracking is not None  # noqa: SLF001
     lag = online._tracking.lag  # noqa: SLF001
-    fix, match = (lag.problem.streams[name] for name in ("gnss", "aerial"))
+    fix, match = (lag.problem.streams[name] for name in ("gnss", "matcher"))
     a_fix, a_match = (lag._judge._group(stream)[-1].measurement for stream in (fix, match))  # noqa: SLF001
     verdict = lag._judge._group(match)[-1].verdict  # noqa: SLF001
     agrees = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([error_m, 0.0, 0.0])))
@@ -208,14 +208,14 @@ def test_a_sensor_found_frozen_does_not_hasten_a_restart() -> None:
     feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
     assert online._tracking is not None  # noqa: SLF001
     lag = online._tracking.lag  # noqa: SLF001
-    fix, match = (lag.problem.streams[name] for name in ("gnss", "aerial"))
+    fix, match = (lag.problem.streams[name] for name in ("gnss", "matcher"))
     a_fix = lag._judge._group(fix)[-1].measurement  # noqa: SLF001
     verdict = lag._judge._group(match)[-1].verdict  # noqa: SLF001
     far_off = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([20.0, 0.0, 0.0])))
     agreement, begin_ns = lag._agreement, lag.newest.stamp_ns  # noqa: SLF001
     agreement.back_to(Agreement(lag.problem.timeline).marked())
     for _ in range(5):
-        agreement.note(match, replace(a_fix, stamp_ns=begin_ns, sensor="aerial"), None)
+        agreement.note(match, replace(a_fix, stamp_ns=begin_ns, sensor="matcher"), None)
     agreement.forget_refused()
     for t_s in range(50):
         agreement.note(fix, replace(a_fix, stamp_ns=begin_ns + t_s * 1_000_000_000), far_off)

@@ -59,6 +59,9 @@ def test_a_compass_in_other_axes_is_reported_under_way(sense: float, off_deg: fl
     off = wrap_angle(yaw - run.truth.at(np.array([said[0].stamp_ns])).yaw_rad[0])
     told = float(event.split("off by about ")[1].split(" deg")[0])
     assert wrap_angle(np.radians(told) - off) == pytest.approx(0.0, abs=np.radians(20.0))
+    assert all(
+        e.heading_bound_95_rad > abs(off) for e in said
+    )  # it was known to be wrong, with a bound of some degrees
     assert any("the heading is off by about" in line for line in found.solution.stats.warnings)
 
 

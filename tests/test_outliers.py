@@ -66,7 +66,7 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one() -> None:
     track = solved.trajectory
     off_deg = np.degrees(np.abs(wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad)))
     assert off_deg.max() < 3.0
-    assert solved.ledger.counts()["aerial"]["used"] > 30
+    assert solved.ledger.counts()["matcher"]["used"] > 30
 
 
 @pytest.mark.parametrize("allowed", [True, False])

@@ -17,6 +17,7 @@ from graphloc.eval.metrics import Table
 from graphloc.eval.plots import Underlay
 from graphloc.eval.report import ReportData, Trust, figures, theses_section, verdict, write_report
 from graphloc.eval.simulate import Scenario, simulate
+from graphloc.eval.words import significant
 from graphloc.measurements import GnssPosition
 from graphloc.survey import Survey
 from graphloc.trajectory import Trajectory
@@ -44,6 +45,14 @@ def covered(share: float) -> tuple[Table, ...]:
     return (Table("Against truth", columns, (("graphloc", (0.1234, share)), ("BL EKF", (1.5, None)))),)
 
 
+@pytest.mark.parametrize(
+    ("value", "digits", "said"),
+    [(9231.0, 3, "9230"), (-0.04427, 3, "-0.0443"), (390.4, 2, "390"), (0.0, 3, "0"), (1.1e-5, 2, "0.000011")],
+)
+def test_significant_digits_without_powers_of_ten(value: float, digits: int, said: str) -> None:
+    assert significant(value, digits) == said
+
+
 def test_verdict_names_the_numbers(data: ReportData) -> None:
     """Bounds of 0.5 m for a tenth of the states, of 9 m for one in 25, else of 1 m: '1.00 m for 95 %' it is."""
     cov = data.solution.trajectory.cov
@@ -54,9 +63,9 @@ def test_verdict_names_the_numbers(data: ReportData) -> None:
     solution = replace(data.solution, trajectory=replace(data.solution.trajectory, cov=made))
     said = verdict(replace(data, solution=solution, tables=covered(0.95)))
     text = " ".join(reason.text for reason in said.reasons)
-    assert "95 % bound of 1.00 m" in text
+    assert "95 % bound is 1.00 m" in text
     assert said.tracks[0].accuracy == "Horizontal RMSE 0.12 m; beside it: BL EKF 1.50 m (12 x)."  # 1.5 / 0.1234 = 12.2
-    assert "held the truth for 95% of the time" in text
+    assert "held the truth for 95 % of the time" in text
     assert said.trust is Trust.YES
 
 

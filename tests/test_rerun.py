@@ -72,9 +72,9 @@ def test_tracks_weights_and_health_are_those_of_the_run(run: app.Run, tmp_path: 
         (rgba,) = np.ravel(said[f"/world/{name.replace(' ', BLANK)}/track"]["colors"])
         assert f"#{int(rgba) >> 8:06X}" == colour_of(name)  # as in the report
 
-    rows = [row for row in run.solution.ledger if row.sensor == "aerial"]
+    rows = [row for row in run.solution.ledger if row.sensor == "matcher"]
     stamps = {m.seq: m.stamp_ns for m in run.recording.measurements}
-    weights = said["/weights/aerial"]
+    weights = said["/weights/matcher"]
     assert dict(zip(weights["stamp"], np.ravel(weights["scalars"]), strict=True)) == {
         stamps[row.seq]: row.weight for row in rows
     }
@@ -87,9 +87,9 @@ def test_tracks_weights_and_health_are_those_of_the_run(run: app.Run, tmp_path: 
 
 def test_measurements_lie_where_they_say_red_where_they_are_not_believed(run: app.Run, tmp_path: Path) -> None:
     said = write(run, tmp_path / "run.rrd")
-    false = {row.seq: row.weight for row in run.solution.ledger if row.sensor == "aerial"}
-    matches = [m for m in run.recording.measurements if m.sensor == "aerial"]
-    points = said["/world/measured/aerial"]
+    false = {row.seq: row.weight for row in run.solution.ledger if row.sensor == "matcher"}
+    matches = [m for m in run.recording.measurements if m.sensor == "matcher"]
+    points = said["/world/measured/matcher"]
     assert points["stamp"] == [m.stamp_ns for m in matches]
     for m, (place,), (colour,) in zip(matches, points["positions"], points["colors"], strict=True):
         assert m.modes[0].value[:2] == pytest.approx(place[:2], abs=1e-4)  # type: ignore[attr-defined]
@@ -104,7 +104,7 @@ def test_measurements_lie_where_they_say_red_where_they_are_not_believed(run: ap
 
 def test_sensors_of_like_names_are_told_apart(run: app.Run, tmp_path: Path) -> None:
     """Matches as `my fix`, fixes as `my_fix`: each has its own stamps and weights, and nobody else's."""
-    names = {"aerial": "my fix", "gnss": "my_fix", "compass": "my/fix"}
+    names = {"matcher": "my fix", "gnss": "my_fix", "compass": "my/fix"}
     measurements = tuple(replace(m, sensor=names.get(m.sensor, m.sensor)) for m in run.recording.measurements)
     ledger = Ledger()
     for row in run.solution.ledger:

@@ -102,17 +102,17 @@ def test_runs_of_one_name_are_told_apart(tmp_path: Path) -> None:
     assert [run.name for run in read_runs(folders)] == [str(f) for f in folders]
 
 
-def test_compare_of_run_folders(
+def test_the_command_prints_and_writes(
     three: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "sum"
-    assert called(monkeypatch, "compare", *three, "-o", out, "--json") == 0
+    assert called(monkeypatch, "summary", *three, "-o", out, "--json") == 0
     printed = capsys.readouterr().out
     told = json.loads(printed[: printed.rindex("}") + 1])
     assert told["Against truth: position_rmse_m"]["worst"] == {"graphloc": 0.5, "BL EKF": 1.4}
-    assert called(monkeypatch, "compare", *three, "-o", out) == 2
+    assert called(monkeypatch, "summary", *three, "-o", out) == 2
     assert "--overwrite" in capsys.readouterr().err
-    assert called(monkeypatch, "compare", *three, "-o", out, "--overwrite") == 0
+    assert called(monkeypatch, "summary", *three, "-o", out, "--overwrite") == 0
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_a_broken_run_is_one_line(
     broken: str, said: str,
 ) -> None:  # fmt: skip
     (three[1] / "run.json").write_text(broken)
-    assert called(monkeypatch, "compare", *three, "-o", tmp_path / "sum") == 2
+    assert called(monkeypatch, "summary", *three, "-o", tmp_path / "sum") == 2
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
@@ -142,12 +142,11 @@ def test_what_does_not_go_together_is_one_line(
 ) -> None:
     (tmp_path / "bag").mkdir()
     for arguments, said in (
-        ((three[0], tmp_path / "bag"), "is not the folder of a finished run"),
-        ((three[0], three[0]), "given twice"),
-        ((three[0], three[1], "-c", "vessel.yaml"), "are for bags"),
-        ((tmp_path / "bag",), "give --config"),
+        (("summary", three[0], tmp_path / "bag"), "is not the folder of a finished run"),
+        (("summary", three[0], three[0]), "given twice"),
+        (("compare", three[0], "-c", "vessel.yaml"), "`graphloc summary` puts finished runs into one table"),
     ):
-        assert called(monkeypatch, "compare", *arguments, "-o", tmp_path / "sum") == 2
+        assert called(monkeypatch, *arguments, "-o", tmp_path / "sum") == 2
         error = capsys.readouterr().err
         assert said in error
         assert error.count("\n") == 1

@@ -113,6 +113,11 @@ def test_stamps_and_their_offset(tmp_path: Path, shown: NDArray[np.uint8]) -> No
     assert only(look(path)).stamp_ns == stamp_ns
     (seen,), _ = look(path, tags(time_offset_s=-0.25))
     assert seen.stamp_ns == seen.sightings[0].stamp_ns == stamp_ns - 250_000_000
+    recorded = only(look(path, tags(stamps="recorded"))).stamp_ns
+    assert recorded != stamp_ns
+    (tmp_path / "never").mkdir()
+    never = bag_of(tmp_path / "never", make, (INFO, info(make)), (IMAGE, image(make, shown, 0)))
+    assert only(look(never, tags(stamps="recorded"))).stamp_ns == recorded
 
 
 def test_a_mount_by_tf(tmp_path: Path, shown: NDArray[np.uint8]) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from graphloc.config import ImuConfig
+from graphloc.config import CompassConfig, ImuConfig
 from graphloc.errors import InputError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array
 from graphloc.frontends._assess import courses_of_fixes
-from graphloc.frontends._turns import Yaws, refuse_unit, scattered, turn_warnings
+from graphloc.frontends._turns import Yaws, refuse_unit, scattered, turn_warnings, wander_deg, wander_warning
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries
@@ -70,6 +70,45 @@ def test_iron_that_turns_with_the_vessel_is_reported(run: SimulatedRun) -> None:
     (line,) = turn_warnings(imu, "compass", changed(headings, lambda yaw: yaw + np.radians(10.0) * np.sin(yaw)), "enu")
     assert "magnetic deviation" in line
     assert turn_warnings(imu, "compass", changed(headings, lambda y: y + np.radians(2.0) * np.sin(y)), "enu") == []
+
+
+def wandering(headings: list[CompassHeading], sigma_deg: float, time_constant_s: float) -> list[CompassHeading]:
+    """A first-order Gauss-Markov process on top."""
+    rng, error, found, before_ns = np.random.default_rng(7), 0.0, [], headings[0].stamp_ns - 1000 * S
+    for m in headings:
+        keep = np.exp(-(m.stamp_ns - before_ns) / S / time_constant_s)
+        error = keep * error + np.sqrt(1.0 - keep**2) * np.radians(sigma_deg) * rng.normal()
+        before_ns = m.stamp_ns
+        found.append(replace(m, yaw_rad=m.yaw_rad + error))
+    return found
+
+
+def test_a_compass_that_wanders_is_told_by_the_gyroscope(run: SimulatedRun) -> None:
+    """3 deg that last for 100 s diffuse as 3 sqrt(60 / 100) = 2.3 deg that last for 60 s; a line is taken off, and some of it with that."""
+    imu, headings = of(run)
+    found = wander_deg(imu, wandering(headings, 3.0, 100.0))
+    assert found is not None
+    assert 1.2 < found < 3.0
+    (line,) = wander_warning(imu, "compass", wandering(headings, 3.0, 100.0), CompassConfig())
+    assert f"wanders by {found:.1f} deg" in line
+    assert wander_warning(imu, "compass", wandering(headings, 3.0, 100.0), CompassConfig(wander_sigma_deg=2.0)) == []
+    assert (
+        wander_warning(imu, "compass", wandering(headings, 3.0, 100.0), CompassConfig(mount_offset_sigma_deg=0.0)) == []
+    )
+
+
+def test_what_is_no_wander_is_not_taken_for_it(run: SimulatedRun) -> None:
+    """Noise, the gyro's bias and scale, iron that turns with the vessel, late stamps."""
+    imu, headings = of(run)
+    late = [replace(m, stamp_ns=m.stamp_ns + S // 2) for m in headings]
+    scaled = replace(imu, gyro_radps=1.02 * imu.gyro_radps)
+    iron = changed(headings, lambda yaw: yaw + np.radians(3.0) * np.sin(yaw))
+    for samples, said in ((imu, headings), (scaled, headings), (imu, late), (imu, iron)):
+        found = wander_deg(samples, said)
+        assert found is not None
+        assert found < 0.6
+        assert wander_warning(samples, "compass", said, CompassConfig()) == []
+    assert wander_deg(imu, headings[:60]) is None  # too short a time
 
 
 def test_frozen_headings_are_reported(run: SimulatedRun) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.eval.calibrate import Calibration, Suggestion
+from graphloc.eval.calibrate import Calibration, Check, Suggestion
 from graphloc.eval.ekf import FilterResult
 from graphloc.eval.metrics import Table
 from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verdict
@@ -74,6 +74,45 @@ def test_stamps_that_the_bounds_know_nothing_of_are_reported(
     assert any(f"up to {4.0 * late_s:.2f} m behind or ahead" in r.text for r in offline.reasons) == said
 
 
+def antenna_at(data: ReportData, x_m: float, *, change_m: float = 0.0, sigma_m: float = 0.0) -> tuple[Trust, list[str]]:
+    """What is said of a run without truth (bounds: 2.45 m) whose antenna is configured at x; a change that is suggested, or its sigma."""
+    mount = data.config.sensors["gnss"].mount.model_copy(update={"xyz_m": (x_m, 0.0, 2.0)})
+    sensors = {**data.config.sensors, "gnss": data.config.sensors["gnss"].model_copy(update={"mount": mount})}
+    keys = [f"sensors.gnss.mount.xyz_m[{axis}]" for axis in (0, 1)]
+    found = [
+        Suggestion(
+            sensor="gnss", key=key, unit="m", configured=x_m, suggested=x_m + change_m, sigma=0.1, z=30.0, evidence="", action=""
+        )
+        for key in keys
+        if change_m
+    ]  # fmt: skip
+    checks = [Check(key=key, unit="m", configured=x_m, change=0.0, sigma=sigma_m, said="") for key in keys if sigma_m]
+    calibration = Calibration(suggestions=tuple(found), checks=tuple(checks))
+    (track, _) = verdict(
+        replace(
+            data, config=data.config.model_copy(update={"sensors": sensors}), recording=replace(data.recording, truth=None),
+            calibration=calibration,
+        )
+    ).tracks  # fmt: skip
+    return track.trust, [r.text for r in track.reasons if "antenna" in r.text]
+
+
+def test_an_antenna_that_is_elsewhere_or_was_left_at_the_guess_is_said(data: ReportData) -> None:
+    assert antenna_at(data, 1.5) == (Trust.YES, [])  # measured
+    trust, (text,) = antenna_at(data, 1.5, change_m=3.0)
+    assert trust is Trust.WITH_CARE
+    assert "looks 4.24 m away from where mount.xyz_m has it" in text
+    assert antenna_at(data, 1.5, change_m=0.3)[0] is Trust.YES  # within the bounds
+    trust, (text,) = antenna_at(data, 0.0, sigma_m=0.4)  # 1.96 x 0.4 x sqrt(2)
+    assert trust is Trust.YES
+    assert "taken to be at the vessel's origin" in text
+    assert "this run knows it to 1.1 m (95 %)" in text
+    assert antenna_at(data, 0.0, sigma_m=1.0)[0] is Trust.WITH_CARE
+    trust, (text,) = antenna_at(data, 0.0)
+    assert trust is Trust.WITH_CARE
+    assert "nothing here checks that" in text
+
+
 @pytest.mark.parametrize(
     ("covered", "nees", "expected"),
     [(0.95, 2.0, Trust.YES), (0.75, 2.0, Trust.WITH_CARE), (0.9, 5.5, Trust.WITH_CARE), (0.3, 20.0, Trust.NO)],
@@ -87,7 +126,23 @@ def test_the_online_track_is_judged_by_its_own_numbers(
     assert offline.trust is Trust.YES
     assert online.trust is said.trust is expected
     assert online.accuracy == "Horizontal RMSE 0.24 m, worst 0.90 m."  # not beside the offline one, which knows more
-    assert any(f"held the truth for {covered:.0%}" in r.text and f"NEES {nees:.1f}" in r.text for r in online.reasons)
+    assert any(
+        f"held the truth for {100 * covered:.0f} %" in r.text and f"NEES {nees:.1f}" in r.text for r in online.reasons
+    )
+
+
+@pytest.mark.parametrize(("covered", "expected"), [(0.9, Trust.YES), (0.6, Trust.WITH_CARE)])
+def test_headings_are_judged_with_their_size(data: ReportData, covered: float, expected: Trust) -> None:
+    """Sigma 1 rad: a bound of 1.96 rad, 112.3 deg; beside it the error that it should have held."""
+    columns = ("position_rmse_m", "heading_rmse_deg", "heading_max_deg", "heading_coverage_95")
+    rows = tuple((name, (0.1, 1.25, 2.5, covered)) for name in ("graphloc", "graphloc online"))
+    (offline, _) = verdict(replace(data, tables=(Table("Against truth", columns, rows),))).tracks
+    (found,) = (r for r in offline.reasons if "heading bounds" in r.text)
+    assert found.trust is expected
+    assert found.text.startswith(
+        f"Its heading bounds (112.30 deg, median) held the truth for {100 * covered:.0f} % of the time; "
+        "off by 1.25 deg (RMS), 2.50 at most"
+    )
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.02, Trust.YES), (0.2, Trust.WITH_CARE), (0.7, Trust.NO)])
@@ -145,8 +200,12 @@ def test_when_it_was_less_than_good(data: ReportData) -> None:
     assert lasting[Health.DEAD_RECKONING] == pytest.approx(3.0)
     assert lasting[Health.GOOD] == pytest.approx(5.0)
     page = section([solution], 0)
-    assert "<td>2 to 5</td><td>3.0 s</td>" in page
-    assert "good for 50% (5.0 s), degraded for 20% (1.9 s), dead reckoning for 30% (3.0 s)" in page
+    assert "<td>1</td><td>3.0 s</td><td>2 to 5</td>" in page
+    assert "good for 50 % (5.0 s), degraded for 20 % (1.9 s), dead reckoning for 30 % (3.0 s)" in page
+    for k in range(60, 70):
+        health[k], why[k] = Health.DEAD_RECKONING, "no position for 9 s"
+    page = section([replace(solution, health=tuple(health), health_reason=tuple(why))], 0)
+    assert "<td>2</td><td>4.0 s</td><td>2 to 5</td>" in page  # the same reason but for its number: one row
     assert section([data.solution], 0) == ""  # all good
     hole = np.concatenate([stamps[:50], stamps[50:] + 60_000_000_000])
     with_hole = replace(solution, trajectory=replace(track, stamps_ns=hole))

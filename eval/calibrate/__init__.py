@@ -11,6 +11,7 @@ from graphloc.config import VesselConfig
 from graphloc.eval.calibrate._evidence import Estimate, Evidence, Name
 from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
 from graphloc.eval.calibrate._imu import imu_noise
+from graphloc.eval.words import significant
 from graphloc.frames import rpy_from_rotation
 from graphloc.offsets import Offset, Probe
 from graphloc.recording import Recording
@@ -20,13 +21,13 @@ __all__ = ["PROBE", "Calibration", "Check", "Suggestion", "calibrate"]
 
 PROBE: Probe = {
     "gnss": ("x", "y", "time"),
-    "gnss_velocity": ("time",),
+    "gnss_velocity": ("x", "y", "time"),
+    "body_velocity": ("time",),
     "compass": ("yaw", "time"),
     "pose": ("yaw", "time"),
     "aerial": ("time",),
 }
-"""What is looked at, by kind of sensor, those first that are wrong most often; heights, and the lever of a velocity, show
-too little."""
+"""What is looked at, by kind of sensor, those first that are wrong most often; heights show too little."""
 
 _AXIS: dict[Offset, int] = {"x": 0, "y": 1}
 _UNIT: dict[Offset, tuple[str, float]] = {
@@ -38,10 +39,10 @@ _UNIT: dict[Offset, tuple[str, float]] = {
 # A sigma from which the run says nothing of use, and what would help.
 _USEFUL: dict[Offset, float] = {"x": 0.15, "y": 0.15, "yaw": float(np.radians(1.0)), "time": 0.05}
 _WOULD_TELL: dict[Offset, str] = {
-    "x": "turns by 90 degrees and more, within a minute or so, would",
-    "y": "turns by 90 degrees and more, within a minute or so, would",
-    "yaw": "a longer run with fixes or matches, at changing speed, would",
-    "time": "turns, and speeding up and down, would",
+    "x": "turns by 90 degrees and more, within a minute or so",
+    "y": "turns by 90 degrees and more, within a minute or so",
+    "yaw": "a longer run with fixes or matches, at changing speed",
+    "time": "turns, and speeding up and down",
 }
 _MEANS: dict[Offset, str] = {
     "x": "its measurements fit the run better from there, whatever the heading",
@@ -89,12 +90,22 @@ def _configured(name: Name, recording: Recording, config: VesselConfig) -> tuple
     return f"sensors.{sensor}.mount.xyz_m[{_AXIS[what]}]", float(t[_AXIS[what]])
 
 
+def _of_one_antenna(sensor: str, recording: Recording, config: VesselConfig) -> list[str]:
+    """Names of sensors of other kinds at the same place: what is found of its lever is found of them together."""
+    own = config.sensors[sensor]
+    place = mount_of(sensor, own, recording.mounts)[0]
+    others = [n for kind in PROBE if kind != own.kind and "x" in PROBE[kind] for n in config.of_kind(kind)]
+    return [n for n in others if np.array_equal(mount_of(n, config.sensors[n], recording.mounts)[0], place)]
+
+
 def _suggestion(
     name: Name, found: Estimate, others: dict[Name, Estimate], recording: Recording, config: VesselConfig
 ) -> Suggestion:
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
     action = "measure it, then set it"
+    if name[1] in _AXIS and (shares := _of_one_antenna(name[0], recording, config)):
+        action += f", also of {', '.join(shares)}, taken for the same antenna"
     if name[1] != "time" and name[0] in recording.mounts:
         action = (
             "measure it; its mount comes from /tf_static: correct it there, or set xyz_m and rpy_deg without tf_frame"
@@ -118,9 +129,9 @@ def _check(name: Name, found: Estimate, recording: Recording, config: VesselConf
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
     if found.sigma > _USEFUL[name[1]]:
-        said = f"this run cannot tell (1 sigma {factor * found.sigma:.2g} {unit}); {_WOULD_TELL[name[1]]}"
+        said = f"this run does not show it (1 sigma {significant(factor * found.sigma, 2)} {unit}); it would take {_WOULD_TELL[name[1]]}"
     else:
-        said = f"fits, within {SIGMAS_95 * factor * found.sigma:.2g} {unit} (95 %)"
+        said = f"fits, within {significant(SIGMAS_95 * factor * found.sigma, 2)} {unit} (95 %)"
     return Check(
         key=key, unit=unit, configured=configured, change=factor * found.value, sigma=factor * found.sigma, said=said
     )

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
 from graphloc.eval.calibrate._findings import Check, Suggestion
+from graphloc.eval.words import significant
 from graphloc.frames import Array
 from graphloc.measurements import ImuSeries
 from graphloc.offsets import Misfit, Offsets
@@ -89,11 +90,11 @@ def _judge(
         value, off = (needed, unsure) if needed - scatter > 2.0 * unsure else (scatter, sigma)
         return Suggestion(
             sensor=sensor, key=path, unit=unit, configured=configured, suggested=value, sigma=off, z=(value - configured) / off,
-            evidence=f"its samples scatter by {scatter:.3g}, and the run leaves a misfit of {misfit.squares:.0f} where so "
+            evidence=f"its samples scatter by {significant(scatter)}, and the run leaves a misfit of {misfit.squares:.0f} where so "
             f"much noise would leave {misfit.freedom:.0f}",
             action="set it, no smaller",
         )  # fmt: skip
-    said = f"its samples scatter by {scatter:.3g} +- {sigma:.2g} {unit}, engine and hull included"
+    said = f"its samples scatter by {significant(scatter)} +- {significant(sigma, 2)} {unit}, engine and hull included"
     if scatter < _TOO_LARGE * configured:
         said += "; whether the larger noise is needed, a longer run with better fixes would tell"
     return Check(key=path, unit=unit, configured=configured, change=scatter - configured, sigma=sigma, said=said)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from graphloc.chi2 import SIGMAS_95
 from graphloc.eval.plots._map import hover
 from graphloc.eval.plots._marks import COLOURS, Band, Figure, Line, Mark, Panel, Points, shown_of, thinned
+from graphloc.eval.words import percent
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.solution import SlowEstimate, Solution
@@ -78,7 +79,9 @@ def residuals_over_time(solution: Solution) -> Figure | None:
             text=[hover(r) for r in shown], size=4.0, listed=False,
         )  # fmt: skip
         far = float(sigmas.max()) > _SEEN_SIGMAS
-        said = f"{sensor}: {np.mean(weight < 0.5):.0%} down-weighted or rejected" + (", some beyond" if far else "")
+        said = f"{sensor}: {percent(float(np.mean(weight < 0.5)))} down-weighted or rejected" + (
+            ", some beyond" if far else ""
+        )
         limit = (0.0, _SEEN_SIGMAS) if far else None
         panels.append(Panel(title=said, y="sigmas", marks=(points,), from_zero=True, range_y=limit))
     return _stacked("residuals", panels) if panels else None

@@ -11,11 +11,12 @@ from itertools import groupby
 import numpy as np
 
 from graphloc.eval.pieces import note, table
+from graphloc.eval.words import percent
 from graphloc.frames import Array
 from graphloc.solution import Health, Solution
 from graphloc.time import seconds_since
 
-_LONGEST = 12  # stretches that a table has
+_MOST = 12  # reasons that a table has
 _STEP_S = 1.0  # between two poses: beyond, there was no estimate (as `Trajectory.covers` has it)
 
 
@@ -54,7 +55,7 @@ def stretches(solution: Solution, begin_ns: int) -> list[Stretch]:
     ends = t + _lasting_s(solution)
 
     def kind(k: int) -> tuple[Health, str]:
-        return solution.health[k], re.sub(r"\d[\d.]*", "#", solution.health_reason[k])
+        return solution.health[k], _kind(solution.health_reason[k])
 
     found = []
     for (health, _), group in groupby(range(len(t)), key=kind):
@@ -67,9 +68,9 @@ def stretches(solution: Solution, begin_ns: int) -> list[Stretch]:
 
 
 def said_of(solution: Solution) -> str:
-    """Return the states with their shares and durations, as 'good for 80% (64 s), degraded for 20% (16 s)'."""
+    """Return the states with their shares and durations, as 'good for 80 % (64 s), degraded for 20 % (16 s)'."""
     lasting = durations_s(solution)
-    told = [f"{_words(h)} for {share:.0%} ({_seconds(lasting[h])})" for h, share in shares(solution).items()]
+    told = [f"{_words(h)} for {percent(share)} ({_seconds(lasting[h])})" for h, share in shares(solution).items()]
     return ", ".join(told)
 
 
@@ -90,25 +91,31 @@ def cure(health: Health, reason: str) -> str:
 
 
 def section(solutions: Sequence[Solution], begin_ns: int) -> str:
-    """Return when each estimate was less than good, the longest times first, as HTML; empty where all are good."""
+    """Return why each estimate was less than good, a row per reason, the lasting ones first, as HTML; empty where all are good."""
     parts = []
     for solution in solutions:
-        every = stretches(solution, begin_ns)
-        longest = sorted(every, key=lambda s: s.begin_s - s.end_s)[:_LONGEST]
-        rows = [
-            [f"{_words(s.health)}", f"{s.begin_s:.0f} to {s.end_s:.0f}", _seconds(s.end_s - s.begin_s), s.reason,
-             cure(s.health, s.reason)]
-            for s in longest
-        ]  # fmt: skip
+        alike: dict[tuple[Health, str], list[Stretch]] = {}
+        for stretch in stretches(solution, begin_ns):
+            alike.setdefault((stretch.health, _kind(stretch.reason)), []).append(stretch)
+        whole = sorted(alike.values(), key=lambda same: -sum(s.end_s - s.begin_s for s in same))
+        rows = []
+        for same in whole[:_MOST]:
+            longest = max(same, key=lambda s: s.end_s - s.begin_s)
+            total_s = sum(s.end_s - s.begin_s for s in same)
+            rows.append(
+                [_words(longest.health), str(len(same)), _seconds(total_s), f"{longest.begin_s:.0f} to {longest.end_s:.0f}",
+                 longest.reason, cure(longest.health, longest.reason)]
+            )  # fmt: skip
         if rows:
-            left = (
-                f" The {_LONGEST} longest of {len(every)} times; solution.csv has all." if len(every) > _LONGEST else ""
-            )
-            head = ("", "s of the track", "for", "why", "what ends it")
-            parts.append(
-                f"<h3>{solution.name}: {said_of(solution)}</h3>{table(head, rows, text=(3, 4))}{note(left.strip())}"
-            )
+            left = f"{len(whole) - _MOST} more reasons are in solution.csv." if len(whole) > _MOST else ""
+            head = ("", "times", "in all", "longest, s", "why", "what ends it")
+            parts.append(f"<h3>{solution.name}: {said_of(solution)}</h3>{table(head, rows, text=(4, 5))}{note(left)}")
     return "".join(parts)
+
+
+def _kind(reason: str) -> str:
+    """A reason without its numbers."""
+    return re.sub(r"\d[\d.]*", "#", reason)
 
 
 def _words(health: Health) -> str:

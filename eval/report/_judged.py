@@ -4,15 +4,17 @@
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from graphloc.chi2 import chi2_95
+from graphloc.chi2 import SIGMAS_95, chi2_95
 from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
+from graphloc.eval.words import percent
 from graphloc.frames import Array
 from graphloc.solution import Health, Solution
 from graphloc.trajectory import Trajectory, bounds_95
@@ -78,7 +80,7 @@ def worst(of: Iterator[Trust]) -> Trust:
 def judged(data: ReportData, solution: Solution) -> Judged:
     """Judge a track of a run."""
     reasons = (
-        *_bounds(data, solution), *_late(data, solution), *_beside(data, solution), *_from_offline(data, solution),
+        *_bounds(data, solution), *_late(data, solution), *_levers(data, solution), *_beside(data, solution), *_from_offline(data, solution),
         *_compared(data, solution), *_solved(data, solution),
     )  # fmt: skip
     return Judged(name=solution.name, accuracy=_accuracy(data, solution.name), reasons=reasons)
@@ -92,7 +94,7 @@ def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
     doubtful = called.get(Health.GOOD, 0.0) < _MOSTLY or called.get(Health.LOST, 0.0) > _LOST
     yield Reason(
         trust=Trust.WITH_CARE if doubtful else Trust.YES,
-        text=f"It states a 95 % bound of {bound:.2f} m or better for 95 % of the run, and calls itself {said_of(solution)}.",
+        text=f"Its 95 % bound is {bound:.2f} m or less for 95 % of the run. Health: {said_of(solution)}.",
     )
     covered, headed, nees = (
         of(data, solution.name, column) for column in ("coverage_95", "heading_coverage_95", "nees")
@@ -103,10 +105,20 @@ def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
         why = ". The bounds are far too small: a mount, the datum or a noise is wrong" if trust is Trust.NO else ""
         why = why or ("; they are too small" if trust is Trust.WITH_CARE else "")
         beside = "" if nees is None else f" (NEES {nees:.1f}; 2 where they are honest)"
-        yield Reason(trust=trust, text=f"Its 95 % bounds held the truth for {covered:.0%} of the time{beside}{why}.")
+        yield Reason(
+            trust=trust, text=f"Its 95 % bounds held the truth for {percent(covered)} of the time{beside}{why}."
+        )
     if headed is not None:
-        trust = Trust.WITH_CARE if headed < _COVERED else Trust.YES
-        yield Reason(trust=trust, text=f"Its heading bounds held the truth for {headed:.0%} of the time.")
+        bound_deg = float(np.median(bounds_95(solution.trajectory.cov)[:, 2]))
+        off_deg, most_deg = (of(data, solution.name, f"heading_{which}_deg") for which in ("rmse", "max"))
+        off = "" if off_deg is None or most_deg is None else f"; off by {off_deg:.2f} deg (RMS), {most_deg:.2f} at most"
+        trust, why = (
+            (Trust.WITH_CARE, "; too small, or in a run of a minute or two chance")
+            if headed < _COVERED
+            else (Trust.YES, "")
+        )
+        text = f"Its heading bounds ({bound_deg:.2f} deg, median) held the truth for {percent(headed)} of the time{off}{why}."
+        yield Reason(trust=trust, text=text)
 
 
 def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
@@ -122,6 +134,36 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
                 trust=Trust.WITH_CARE,
                 text=f"{found.sensor} and the IMU are {off_s:.2g} s apart (Calibration, below): at this run's {speed_mps:.1f} m/s the "
                 f"track is up to {off_s * speed_mps:.2f} m behind or ahead, which its bounds of {bound_m:.2f} m (median) do not include.",
+            )
+
+
+def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """Antennas that sit elsewhere than configured, or were left where `inspect` drafts them.
+
+    The track is off by as much, which neither a bound nor a held-out fix of theirs knows.
+    """
+    track = solution.trajectory
+    if data.recording.truth is not None or track.cov is None:
+        return
+    bound_m = float(np.median(bounds_95(track.cov)[:, 0]))
+    suggestions, checks = (data.calibration.suggestions, data.calibration.checks) if data.calibration else ((), ())
+    for name in data.config.of_kind("gnss"):
+        keys = [f"sensors.{name}.mount.xyz_m[{axis}]" for axis in (0, 1)]
+        off_m = math.hypot(*(s.suggested - s.configured for s in suggestions if s.key in keys))
+        if off_m > 0.0:
+            yield Reason(
+                trust=Trust.WITH_CARE if off_m > bound_m else Trust.YES,
+                text=f"The antenna of {name} looks {off_m:.2f} m away from where mount.xyz_m has it (Calibration, below): the track is off "
+                f"by as much, which its bounds of {bound_m:.2f} m (median) do not include.",
+            )
+        elif name not in data.recording.mounts and not any(data.config.sensors[name].mount.xyz_m[:2]):
+            known = [SIGMAS_95 * c.sigma for c in checks if c.key in keys]
+            known_m = math.hypot(*known) if len(known) == len(keys) else None
+            said = "nothing here checks that" if known_m is None else f"this run knows it to {known_m:.2g} m (95 %)"
+            yield Reason(
+                trust=Trust.YES if known_m is not None and known_m < bound_m else Trust.WITH_CARE,
+                text=f"The antenna of {name} is taken to be at the vessel's origin (mount.xyz_m is 0, as `inspect` drafts it); where it is "
+                f"not, the track is off by as much, which no bound includes; {said}.",
             )
 
 
@@ -180,7 +222,7 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
     yield Reason(
         trust=trust,
         text=f"It is {_rms(off):.2f} m from the offline track (RMS), {off.max():.2f} m at most; its own 95 % bounds hold the "
-        f"offline position for {placed:.0%} of the time, the offline heading for {headed:.0%}{said}.",
+        f"offline position for {percent(placed)} of the time, the offline heading for {percent(headed)}{said}.",
     )
 
 
@@ -196,10 +238,12 @@ def _compared(data: ReportData, solution: Solution) -> Iterator[Reason]:
     if matched is None or matched >= _MATCHED:
         return
     if solution.stats.online and matched >= _STARTED:
-        text = f"It covers {matched:.0%} of what it is compared with: it begins once position and heading are known."
+        text = (
+            f"It covers {percent(matched)} of what it is compared with: it begins once position and heading are known."
+        )
         yield Reason(trust=Trust.YES, text=text)
         return
-    text = f"It covers only {matched:.0%} of what it is compared with; the filters may cover more."
+    text = f"It covers only {percent(matched)} of what it is compared with; the filters may cover more."
     yield Reason(trust=Trust.WITH_CARE, text=text)
 
 
@@ -214,7 +258,8 @@ def _solved(data: ReportData, solution: Solution) -> Iterator[Reason]:
         ratio = stats.cost / max(stats.expected_cost, 1.0)
         trust = Trust.WITH_CARE if ratio > _FAR_OFF else Trust.YES
         text = (
-            f"The solver converged; cost over its expectation {ratio:.2f} (near 1 where the noise is configured right)."
+            f"The solver converged; cost over its expectation {ratio:.2f} (near 1 where the noise is configured right, "
+            "below where it is configured too large)."
         )
         yield Reason(trust=trust, text=text)
     about_all = len(data.recording.warnings) if solution is data.solution else 0

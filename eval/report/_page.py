@@ -21,15 +21,18 @@ from graphloc.eval.report._data import ReportData, figures
 from graphloc.eval.report._theses import theses_section
 from graphloc.eval.report._verdict import verdict
 
-# A finger scrolls the page, not the figure; a narrow screen needs room for the legend; on paper figures take the sheet's width.
+# A finger scrolls the page, not the figure. A narrow screen needs room for the legend, and none above and below a wide map.
+# On paper figures take the sheet's width, and leave room for their heading.
 _SCRIPT = """
 addEventListener("load",()=>{const all=()=>[...document.querySelectorAll(".js-plotly-plot")];
+const tall=(p,h)=>{p.style.height=h+"px";p.parentElement.style.height="auto";return h};
 if(matchMedia("(pointer:coarse)").matches)all().forEach(p=>Plotly.relayout(p,{dragmode:false}));
-if(innerWidth<600)all().filter(p=>p.querySelector(".legend")).forEach(p=>{const map=p.id==="map",t=map?150:110;
-const h=map?460:p.layout.height+t-64;p.style.height=h+"px";p.parentElement.style.height="auto";
-Plotly.relayout(p,{"legend.font.size":10,"margin.t":t,height:h})});
-const width=w=>all().forEach(p=>Plotly.relayout(p,{width:w,autosize:w===null}));
-addEventListener("beforeprint",()=>width(690));addEventListener("afterprint",()=>width(null))});
+if(innerWidth<600)all().filter(p=>p.querySelector(".legend")).forEach(p=>{const map=p.id==="map",t=map?150:110,l=p._fullLayout;
+const h=map?Math.min(460,t+l._size.b+Math.max(160,l.yaxis._length)):p.layout.height+t-64;
+Plotly.relayout(p,{"legend.font.size":10,"margin.t":t,height:tall(p,h)})});
+const paper=(w,most)=>all().forEach(p=>{const h=p.dataset.high=+(p.dataset.high||p._fullLayout.height);
+Plotly.relayout(p,{width:w,autosize:w===null,height:tall(p,Math.min(h,most))})});
+addEventListener("beforeprint",()=>paper(690,880));addEventListener("afterprint",()=>paper(null,1e9))});
 """
 _MAP = (
     "East and north of the datum, m. Points: where measurements put the vessel (a fix: its antenna), coloured by final weight; "
@@ -47,7 +50,10 @@ _BERTHS = (
 _RESIDUALS = (
     "Residual of each measurement in its own standard deviations, before the loss, coloured by its final weight."
 )
-_SLOW = "Estimated slow errors (GNSS error, compass offset, image offset, docks) with 95 % bands, and IMU biases."
+_SLOW = (
+    "Estimated slow errors (GNSS error, compass offset, image offset, docks) with 95 % bands, and IMU biases. "
+    "Compass: yaw is the offset of its mount, B to E the magnetic deviation, wander what lasts about a minute."
+)
 
 
 def write_report(path: Path, data: ReportData) -> None:

@@ -12,14 +12,14 @@ from graphloc.eval.plots import HEALTH, OUTAGE
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._judged import Trust, main_table, times
 from graphloc.eval.report._verdict import Verdict
-from graphloc.eval.words import number
+from graphloc.eval.words import number, percent, significant
 from graphloc.solution import Solution
 
 _REASONS = 60
 _WHOLE = "{name} knows the whole run; the others, at each time, only what came before."
 _KNOWS = {
-    "graphloc": "The whole run (graphloc, offline)",
-    "graphloc online": "At the time (graphloc online)",
+    "graphloc": "Offline, from the whole run (graphloc)",
+    "graphloc online": "Online, as known at each time (graphloc online)",
 }
 _CLASS = {Trust.YES: "", Trust.WITH_CARE: "care", Trust.NO: "no"}
 # What the first table says of each estimate, where a run has it: column, heading, digits.
@@ -64,13 +64,13 @@ def _key_numbers(data: ReportData) -> str:
     columns = [(c, said, digits) for c, said, digits in _KEY if c in whole.columns]
     columns = [c for c in columns if any(v[c[0]] is not None for v in values.values())]
     shares = [(c, said) for c, said in _SHARES if c in whole.columns]
-    head = ["", columns[0][1], "to ours", *(c[1] for c in columns[1:]), *(said for _, said in shares)]
+    head = ["", columns[0][1], "times ours", *(c[1] for c in columns[1:]), *(said for _, said in shares)]
     rows = []
     for name, row in values.items():
         first = row[key]
         ratio = "" if name == data.solution.name or not mine or first is None else times(first, mine)
         first_of, *rest = (number(row[c], digits) for c, _, digits in columns)
-        rows.append([name, first_of, ratio, *rest, *(_percent(row[c]) for c, _ in shares)])
+        rows.append([name, first_of, ratio, *rest, *(percent(row[c]) for c, _ in shares)])
     wide = [k for k, said in enumerate(head) if said in _WIDE]
     whys = "".join(note(f"{f.name}: {f.why}.") for f in data.filters if f.why and f.name in values)
     said = "" if data.solution.stats.online or len(values) < 2 else _WHOLE.format(name=data.solution.name)
@@ -79,10 +79,6 @@ def _key_numbers(data: ReportData) -> str:
         + note(said)
         + whys
     )
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0%}"
 
 
 def warnings_list(data: ReportData) -> str:
@@ -141,14 +137,16 @@ def calibration(data: ReportData) -> str:
         return ""
     wrong = "".join(f'<li class="warning">{escape(str(s))}</li>' for s in found.suggestions)
     rows = "".join(
-        f"<tr><td>{escape(c.key)}</td><td>{c.configured:.3g}</td><td>{c.change:+.3g}</td><td>{c.sigma:.2g} {escape(c.unit)}"
+        f"<tr><td>{escape(c.key)}</td><td>{significant(c.configured)}</td><td>{'-' if c.change < 0 else '+'}{significant(abs(c.change))}</td>"
+        f"<td>{significant(c.sigma, 2)} {escape(c.unit)}"
         f"</td><td>{escape(c.said)}</td></tr>"
         for c in found.checks
     )
-    head = "<tr><th></th><th>configured</th><th>change</th><th>1 sigma</th><th></th></tr>"
+    head = "<tr><th>setting</th><th>configured</th><th>change</th><th>1 sigma</th><th>meaning</th></tr>"
     return (
         note("What the run tells about lever arms, mounts, time stamps and IMU noise. Nothing of it was applied.")
-        + f'<ul>{wrong}</ul><div class="scroll"><table class="reason">{head}{rows}</table></div>'
+        + (f"<ul>{wrong}</ul>" if wrong else "")
+        + f'<div class="scroll"><table class="reason">{head}{rows}</table></div>'
     )
 
 
@@ -161,5 +159,5 @@ def solver(solution: Solution) -> str:
     return (
         f"<p>{s.states} states, {s.factors} factors, {s.passes} passes, {s.iterations} iterations; "
         f"{'converged' if s.converged else 'NOT converged'}. Cost {s.cost:.0f}, expected {s.expected_cost:.0f} "
-        f"(ratio {s.cost / max(s.expected_cost, 1.0):.2f}; near 1 where the noise is configured right).</p>{events}"
+        f"(ratio {s.cost / max(s.expected_cost, 1.0):.2f}; near 1 where the noise is configured right, below where it is configured too large).</p>{events}"
     )

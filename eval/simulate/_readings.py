@@ -141,7 +141,7 @@ def made_up_matches(s: Scenario, motion: Motion, rng: np.random.Generator) -> li
             for k in order
         )
         if not silent:
-            out.append(PoseFix(stamp_ns=int(n), sensor="aerial", seq=0, axes=("x", "y", "yaw"), modes=modes))
+            out.append(PoseFix(stamp_ns=int(n), sensor="matcher", seq=0, axes=("x", "y", "yaw"), modes=modes))
     return out
 
 

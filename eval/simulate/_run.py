@@ -123,7 +123,7 @@ def _config(s: Scenario, rig: RigConfig, motion: Motion, datum: Datum) -> Vessel
     if s.log_hz > 0.0:
         sensors["log"] = BodyVelocityConfig(topic="/log/velocity", through=s.log_through, sigma_mps=s.log_sigma_mps)
     if s.pose_hz > 0.0:
-        sensors["aerial"] = PoseConfig(topic="/aerial/pose", axes=("x", "y", "yaw"))
+        sensors["matcher"] = PoseConfig(topic="/matcher/pose", axes=("x", "y", "yaw"))
     elif s.harbour and s.lidar_hz > 0.0 and rig.lidars:
         sensors["aerial"] = _matcher(rig)
     if s.harbour and s.camera_hz > 0.0 and rig.cameras and load_harbour(s.harbour).config.tags:

@@ -38,7 +38,7 @@ _LATENCY_NS = {
     "/imu/data": 2_000_000,
     "/gnss/fix": 60_000_000,
     "/gnss/heading": 60_000_000,
-    "/aerial/pose": 400_000_000,
+    "/matcher/pose": 400_000_000,
 }
 _DRIVER_NS = 30_000_000  # after the turn of a LiDAR
 _IMAGE_LATENCY_NS = 80_000_000
@@ -228,7 +228,7 @@ def _small(run: SimulatedRun, make: Messages) -> list[_Item]:
         elif isinstance(m, BodyVelocity):
             add(m.stamp_ns, "/log/velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", make.speed(m))
         elif isinstance(m, PoseFix):
-            add(m.stamp_ns, "/aerial/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", make.pose(m))
+            add(m.stamp_ns, "/matcher/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", make.pose(m))
     t = np.arange(round(run.scenario.duration_s * _TRUTH_HZ)) / _TRUTH_HZ
     stamps = (_start_ns(run) + np.rint(t * 1e9).astype(np.int64)).tolist()
     for stamp, p, R, v in zip(stamps, *run.motion.pose(t), strict=True):

@@ -17,7 +17,7 @@ from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, decode_cloud
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn, outside
-from graphloc.frontends.decode import header_stamp_ns
+from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
 from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 
@@ -119,9 +119,9 @@ def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
         name, now_ns = names[raw.topic], raw.log_ns
         try:
             msg = bag.decode(raw)
-            stamp_ns = header_stamp_ns(msg)
+            stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=config.stamps == "recorded")
             if stamp_ns is None:
-                raise ValueError("its header has no stamp")
+                raise ValueError(f"its header has no stamp: {NO_STAMP}")
             cloud = decode_cloud(msg, stamp_ns, name)
         except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
             said = str(error) if isinstance(error, ValueError) else f"cannot be decoded ({type(error).__name__})"

@@ -19,7 +19,7 @@ from graphloc.frames import Array
 from graphloc.frontends._mounts import mounts_of
 from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag, RawMessage
-from graphloc.frontends.decode import header_stamp_ns
+from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
 from graphloc.frontends.tags.bundles import Seeing, SeenTag, sightings_of
 from graphloc.frontends.tags.camera import Camera, camera_of
 from graphloc.frontends.tags.detect import Detector
@@ -200,9 +200,9 @@ def _look(raw: RawMessage, msg: Any, eye: _Eye, sensor: str, config: AprilTagCon
     try:
         if isinstance(msg, Exception):
             raise msg
-        stamp_ns = header_stamp_ns(msg)
+        stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=config.stamps == "recorded")
         if stamp_ns is None:
-            raise ValueError("its header has no stamp")
+            raise ValueError(f"its header has no stamp: {NO_STAMP}")
         stamp_ns += duration_ns(config.time_offset_s)
         shown = _listed(msg, raw.msgtype, eye, config) if eye.listed else _detected(msg, raw.msgtype, eye, detector)
     except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything

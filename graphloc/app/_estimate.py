@@ -145,12 +145,12 @@ def replay_recording(
     config: VesselConfig,
     *,
     scans: Scans | None = None,
-    rate: float | None = None,
+    speed: float | None = None,
     lag_s: float = 10.0,
     status: Status = silent,
 ) -> Run:
     """Run a recording through the online mode (see `graphloc.replay`)."""
-    replayed = replay(recording, config, scans=scans, rate=rate, lag_s=lag_s, stoppable=True, status=status)
+    replayed = replay(recording, config, scans=scans, speed=speed, lag_s=lag_s, stoppable=True, status=status)
     recording, solution = replayed.recording, replayed.solution
     postures, apart = _track_warnings(solution, recording, config)
     said = [*suspect_tags(recording, config, solution), *postures, *apart]

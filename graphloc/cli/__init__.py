@@ -27,6 +27,7 @@ for _command in (
     _estimate.inspect,
     _estimate.smooth,
     _evidence.compare,
+    _evidence.summary,
     _experiments.ablate,
     _experiments.drill,
     _estimate.replay,

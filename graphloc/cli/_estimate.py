@@ -32,9 +32,7 @@ from graphloc.cli._shared import (
 
 def inspect(
     bag: BagArgument,
-    config: Annotated[Path, typer.Option("--write", "-o", help="Where to write the first vessel.yaml.")] = Path(
-        "vessel.yaml"
-    ),
+    config: Annotated[Path, typer.Option("--out", "-o", help="The vessel.yaml to write.")] = Path("vessel.yaml"),
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -48,7 +46,7 @@ def inspect(
         why = "; ".join(found.warnings) or "none of its topics has a supported sensor type (docs/quick-start.md)"
         raise InputError(f"{found.source}: no usable sensor in it, so {config} is not written: {why}")
     if config.exists() and not overwrite:
-        raise OutputError(f"{config}: exists already; give --write another name, or --overwrite")
+        raise OutputError(f"{config}: exists already; give another --out, or --overwrite")
     try:
         config.write_text(inspection.draft_config(found), encoding="utf-8")
     except OSError as error:
@@ -81,9 +79,9 @@ def replay(
     out: OutOption,
     start: StartOption = 0.0,
     duration: DurationOption = None,
-    rate: Annotated[
+    speed: Annotated[
         float | None,
-        typer.Option(min=0.01, help="Speed as a multiple of real time, e.g. 1; default: as fast as possible."),
+        typer.Option(min=0.01, help="Times real time: 1 plays as recorded; default: as fast as possible."),
     ] = None,
     lag: LagOption = 10.0,
     figures: FiguresOption = False,
@@ -100,7 +98,7 @@ def replay(
     wanted.check()
     recording, vessel, scans = wanted.load(progress())
     gc.freeze()  # as in `graphloc.stream`: what is loaded stays
-    run = application.replay_recording(recording, vessel, scans=scans, rate=rate, lag_s=lag, status=status_line())
+    run = application.replay_recording(recording, vessel, scans=scans, speed=speed, lag_s=lag, status=status_line())
     if sys.stderr.isatty():
         sys.stderr.write("\r\033[K")
     wanted.write(run)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good it is, and what it can bear: compare."""
+"""How good runs are: compare, summary."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Annotated
 import typer
 
 from graphloc.cli._shared import (
+    BagArgument,
+    ConfigOption,
     DurationOption,
     FiguresOption,
     HoldOutOption,
@@ -22,18 +24,13 @@ from graphloc.cli._shared import (
     smooth_bags,
 )
 
-_BagsOrRuns = Annotated[
-    list[Path], typer.Argument(help="A bag (all files of a split one), or the folders of finished runs.")
-]
-_ConfigIfBag = Annotated[
-    Path | None, typer.Option("--config", "-c", help="The vessel.yaml of a bag; run folders need none.")
-]
+RunsArgument = Annotated[list[Path], typer.Argument(help="The run folders of `smooth`, `compare` or `replay`.")]
 
 
 def compare(
-    bag: _BagsOrRuns,
+    bag: BagArgument,
+    config: ConfigOption,
     out: OutOption,
-    config: _ConfigIfBag = None,
     start: StartOption = 0.0,
     duration: DurationOption = None,
     hold_out: HoldOutOption = None,
@@ -42,40 +39,33 @@ def compare(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Smooth a run, run the online mode and the EKFs on the same measurements, and report all of them.
-
-    Given folders of finished runs instead of a bag: put their numbers into one summary.
-    """
+    """Smooth a run, run the online mode and the EKFs on the same measurements, and report all of them."""
     from graphloc.errors import ConfigError
     from graphloc.eval.summary import is_run
 
-    runs = [folder for folder in bag if is_run(folder)]
-    if not runs:
-        if config is None:
-            raise ConfigError(f"{bag[0]}: a bag needs its vessel.yaml: give --config")
-        wanted = Wanted(
-            bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun, start=start, duration=duration
-        )  # fmt: skip
-        smooth_bags(wanted, hold_out, compare=True)
-        return
-    other = next((path for path in bag if path not in runs), None)
-    if other is not None:
+    finished = next((folder for folder in bag if is_run(folder)), None)
+    if finished is not None:
         raise ConfigError(
-            f"{other}: is not the folder of a finished run, and {runs[0]} is: give either bags or run folders"
+            f"{finished}: is a finished run, not a bag; `graphloc summary` puts finished runs into one table"
         )
-    if figures or start or any(given is not None for given in (config, hold_out, rerun, duration)):
-        raise ConfigError(
-            f"{runs[0]}: is a finished run: --config, --start, --duration, --hold-out, --figures and --rerun are for bags"
-        )
-    _summarise(runs, out, overwrite=overwrite, as_json=as_json)
+    wanted = Wanted(
+        bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun, start=start, duration=duration
+    )  # fmt: skip
+    smooth_bags(wanted, hold_out, compare=True)
 
 
-def _summarise(folders: list[Path], out: Path, *, overwrite: bool, as_json: bool) -> None:
-    from graphloc.eval import summary
+def summary(
+    runs: RunsArgument,
+    out: OutOption,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Put the numbers of finished runs into one table: a row per run, the mean and the worst."""
+    from graphloc.eval import summary as summaries
 
-    runs = summary.read_runs(folders)
-    page = summary.write_summary(out, runs, overwrite=overwrite)
-    found = summary.blocks(runs)
+    read = summaries.read_runs(runs)
+    page = summaries.write_summary(out, read, overwrite=overwrite)
+    found = summaries.blocks(read)
     if as_json:
         told = {
             f"{b.title}: {b.metric}": {
@@ -86,5 +76,5 @@ def _summarise(folders: list[Path], out: Path, *, overwrite: bool, as_json: bool
         }
         typer.echo(json.dumps(told, indent=2))
     else:
-        typer.echo(summary.as_markdown(runs, found))
+        typer.echo(summaries.as_markdown(read, found))
     typer.echo(str(page))

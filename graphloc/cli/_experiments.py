@@ -64,7 +64,7 @@ def drill(
     times: Annotated[int, typer.Option(min=1, help="How often each failure is injected, at different times.")] = 2,
     only: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Only failures whose name contains this, e.g. outage; repeat for more."),
+        typer.Option("--only", help="Only failures whose name contains this, e.g. outage; repeat for more."),
     ] = None,
     seed: SeedOption = 0,
     jobs: JobsOption = None,

@@ -33,7 +33,7 @@ DurationOption = Annotated[
     float | None, typer.Option("--duration", help="Use only this many seconds of the bag; default: to its end.")
 ]
 ConfigOption = Annotated[Path, typer.Option("--config", "-c", help="The vessel.yaml.")]
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")]
 HoldOutOption = Annotated[
     str | None, typer.Option("--hold-out", help="Withhold GNSS fixes and predict them: every:N or gaps:COUNTxSECONDS.")
 ]

@@ -17,13 +17,21 @@ from graphloc.solve._health import health_of
 
 
 def estimate_of(
-    now: Propagated, lag: Lag, odometry: Odometry, *, agreed_ns: Mapping[str, int], absolute: Sequence[str], doubt: str
+    now: Propagated,
+    lag: Lag,
+    odometry: Odometry,
+    *,
+    agreed_ns: Mapping[str, int],
+    absolute: Sequence[str],
+    doubt: str,
+    heading_off_rad: float,
 ) -> Estimate:
     """Return the estimate at a state of the window, or propagated beyond it.
 
     Args:
         agreed_ns: stamp at which each absolute sensor last agreed. absolute: names of all absolute sensors.
         doubt: why the health cannot be good, or empty.
+        heading_off_rad: by how much the motion shows the heading to be off; the covariance then includes it.
     """
     newest, problem = lag.newest, lag.problem
     at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
@@ -33,6 +41,7 @@ def estimate_of(
     cov[:3, :3] += unmodelled_covariance(list(problem.streams.values()))
     others_m, others_cov = lag.others
     cov[:3, :3] += others_cov
+    cov[5, 5] += heading_off_rad**2
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
     health, reason = health_of(cov, since, doubt)
     if doubt and reason != doubt:

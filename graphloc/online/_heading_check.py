@@ -54,11 +54,12 @@ class HeadingCheck:
     """Compares the fixes of one receiver with the steps of the IMU.
 
     Attributes:
-        said: what is wrong with the heading, in plain words; empty where nothing is.
+        said: what is wrong with the heading, in plain words; empty where nothing is known to be.
+        off_rad: by how much it is off, as far as that is known; 0 while nothing is said.
     """
 
     def __init__(self) -> None:
-        self.said = ""
+        self.said, self.off_rad = "", 0.0
         self._steps: deque[_Step] = deque()
         self._fixes: deque[tuple[int, complex]] = deque()
         self._sensor = ""
@@ -107,12 +108,13 @@ class HeadingCheck:
             self._wrong, self._right = 0, self._right + 1
         was = self.said
         if self._wrong >= _IN_A_ROW:
+            self.off_rad = off_rad
             self.said = was or (
                 f"the heading is off by about {np.degrees(off_rad):.0f} deg, by the IMU's accelerations and the fixes of {self._sensor}: "
                 "check the compass (convention, mount) and the IMU's axes"
             )
         elif self._right >= _IN_A_ROW:
-            self.said = ""
+            self.said, self.off_rad = "", 0.0
         return self.said != "" and not was
 
     def _carry_on(self, lag: Lag, newest: Newest) -> None:

@@ -56,6 +56,12 @@ class Setup:
         return frozenset(name for name, s in self.config.sensors.items() if s.enabled and s.kind in kinds)
 
     @cached_property
+    def apart_ns(self) -> dict[str, int]:
+        """Of each of these, how close to the one before a measurement tells nothing new."""
+        kinds = {row.kind: row.apart_ns for row in self.rows}
+        return {name: kinds[self.config.sensors[name].kind] for name in self.measuring}
+
+    @cached_property
     def absolute(self) -> tuple[str, ...]:
         """Names of the enabled sensors that measure position in world."""
         return tuple(n for row in self.rows if row.absolute for n in self.config.of_kind(row.kind))

@@ -32,6 +32,7 @@ from graphloc.online._tracking import Tracking, failure_text
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
 from graphloc.solve._warnings import slow_error_warning
+from graphloc.thinning import THINNED, Thinning
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 
@@ -76,6 +77,7 @@ class OnlineSmoother:
         )
         self._ledger = OnlineLedger(config)
         self._events: list[str] = []
+        self._thinnings = {n: Thinning(apart_ns) for n, apart_ns in setup.apart_ns.items()}
         self._intake = ImuIntake(setup.gap_s, imu is not None and imu.gravity != "removed")
         self._snapshot = SnapshotFile(snapshot)
         self._resumable, trouble = self._snapshot.read(config.vessel, setup.imu_name, self.datum)
@@ -161,6 +163,9 @@ class OnlineSmoother:
             return self._feed_imu(m)
         if m.sensor not in self._setup.measuring:
             self._ledger.drop(m, Outcome.IGNORED, _NOT_ASKED)
+            return None
+        if self._thinnings[m.sensor].drops(m.stamp_ns):
+            self._ledger.drop(m, Outcome.REJECTED, THINNED)
             return None
         newest, tracking = self._intake.newest, self._tracking
         if newest is not None and m.stamp_ns - newest.stamp_ns > _AHEAD_S * 1e9:

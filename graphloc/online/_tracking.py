@@ -219,6 +219,7 @@ class Tracking:
             agreed_ns={**persistent.agreed_ns, **lag.agreed_ns},
             absolute=self._setup.absolute,
             doubt="; ".join(doubt for doubt in doubts if doubt),
+            heading_off_rad=persistent.heading_check.off_rad,
         )
 
     def trajectory(self, now: Estimate) -> Trajectory:

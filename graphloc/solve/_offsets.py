@@ -79,16 +79,16 @@ def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
     """
     problem, values = _with_offsets_free(result)
     rows = _linearised(problem, values, result)
-    names: list[tuple[str, Offset]] = []
-    columns: list[Array] = []
+    columns: dict[tuple[str, Offset], Array] = {}
     for stream in problem.streams:
         wanted = tuple(probe.get(stream.config.kind, ()))
-        if wanted:
-            names += [(stream.name, what) for what in wanted]
-            columns.append(_columns(problem, stream, rows, values, result, wanted))
-    if not names:
+        own = _columns(problem, stream, rows, values, result, wanted) if wanted else np.zeros((0, 0))
+        for c, what in enumerate(wanted):
+            name = _antenna_of(problem, stream, probe) if what in ("x", "y") else stream.name
+            columns[name, what] = own[:, c] + columns.get((name, what), 0.0)
+    if not columns:
         return None
-    B = np.hstack(columns)
+    names, B = list(columns), np.column_stack(list(columns.values()))
     weak = np.array([1.0 / _FREE[what] for _, what in names])
     fresh = _root_weights(rows, -rows.b)
     theta = np.zeros(len(names))
@@ -116,6 +116,19 @@ def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
         accelerometer=accelerometer,
         noise_scale=problem.noise_scale,
     )
+
+
+def _antenna_of(problem: Problem, stream: Stream, probe: Probe) -> str:
+    """Return the sensor whose lever a stream shares: the first of the first kind in `probe` at its place, of which it is another output.
+
+    Fixes and velocities of one antenna, both configured where it is not, bear each other out: one at a time, neither could
+    leave. Two of a kind are two antennas.
+    """
+    kinds = list(probe)
+    before = [kind for kind in kinds[: kinds.index(stream.config.kind)] if "x" in probe[kind]]
+    place = np.asarray(stream.mount.translation())
+    there = [s for s in problem.streams if np.array_equal(np.asarray(s.mount.translation()), place)]
+    return next((s.name for kind in before for s in there if s.config.kind == kind), stream.name)
 
 
 def _in_blocks(rows: _Rows, left: Array, r: Array) -> tuple[Array, Array]:

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Headers without stamps, and clocks that count from their start: recording times take their place, or set them."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from graphloc.config import VesselConfig
+from graphloc.frontends.bag import read_recording
+from graphloc.ledger import Outcome
+from graphloc.measurements import CompassHeading, GnssPosition
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.test_bag_bad_input import accounted, vessel
+from tests.test_inspect import drive, look
+
+MAKE = Messages(2)
+WAY_NS = {"/fix": 120_000_000, "/compass": 30_000_000, "/imu": 5_000_000}
+STARTED_NS = START_NS - 900 * S  # of a clock that counts from then
+
+
+def restamped(topics: dict[str, Any]) -> list[Item]:
+    """The drive, each message recorded after its way; `topics`: what becomes of their stamps, ns."""
+    items = []
+    for topic, at_ns, msg in drive(MAKE):
+        if topic in WAY_NS:
+            stamp_ns = topics.get(topic, lambda ns: ns)(at_ns)
+            msg.header = MAKE.header(stamp_ns, msg.header.frame_id)
+            items.append((topic, at_ns + WAY_NS[topic], msg))
+    return sorted(items, key=lambda item: item[1])
+
+
+def read(tmp_path: Path, config: VesselConfig) -> Any:
+    recording = read_recording(tmp_path / "run", config)
+    assert recording.message_count == accounted(recording)
+    return recording
+
+
+@pytest.mark.parametrize("said_ns", [0, START_NS], ids=["zero", "one stamp"])
+def test_headers_without_stamps_are_read_by_the_recording_times(tmp_path: Path, said_ns: int) -> None:
+    never = {"/fix": lambda _ns: said_ns, "/compass": lambda _ns: said_ns}
+    found, config, text = look(tmp_path, restamped(never), MAKE)
+    assert {t.topic: t.recorded for t in found.topics} == {"/imu": False, "/fix": True, "/compass": True}
+    assert {n: config.sensors[n].stamps for n in ("imu", "gnss", "compass")} == {
+        "imu": "header",
+        "gnss": "recorded",
+        "compass": "recorded",
+    }
+    assert "stamps: recorded  # guess: its headers hold no stamps; they are late by as long as a message takes" in text
+    late_s, _ = found.gnss[0].late_s or (0.0, 0.0)
+    assert late_s == pytest.approx(-0.12, abs=0.02)  # the accelerometer tells how long a fix is on its way
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(late_s, abs=1e-3)
+    gnss = config.sensors["gnss"].model_copy(update={"time_offset_s": 0.0})
+    recording = read(tmp_path, config.model_copy(update={"sensors": {**config.sensors, "gnss": gnss}}))
+    for kind, way_ns in ((GnssPosition, WAY_NS["/fix"]), (CompassHeading, WAY_NS["/compass"])):
+        stamps = [m.stamp_ns for m in recording.measurements if isinstance(m, kind)]
+        assert len(stamps) == 300  # every one of 5 Hz for 60 s
+        assert stamps[:2] == [START_NS + way_ns, START_NS + way_ns + S // 5]
+    assert recording.imu.stamps_ns[0] == START_NS
+    assert any(w.startswith("gnss: stamps: recorded: recording times are used") for w in recording.warnings)
+    said = read(tmp_path, config).warnings  # as drafted, with the receiver's offset
+    assert not any(w.startswith("gnss: stamps: recorded") for w in said)
+
+
+def test_a_truth_without_stamps_is_compared_by_the_recording_times(tmp_path: Path) -> None:
+    items = restamped({})
+    for k in range(200):
+        at_ns = START_NS + k * S // 10
+        items.append(("/truth", at_ns, MAKE.odometry(0, (0.1 * k, 0.0, 0.0))))
+    path = write_bag(tmp_path / "run", MAKE, sorted(items, key=lambda item: item[1]), "mcap")
+    recording = read_recording(path, vessel().model_copy(update={"truth_topic": "/truth"}))
+    assert recording.truth is not None
+    assert recording.truth.stamps_ns.tolist() == [START_NS + k * S // 10 for k in range(200)]
+    assert "/truth: 200 of its headers hold no stamp: recording times are used" in recording.warnings
+
+
+def test_without_the_key_a_message_without_a_stamp_names_it(tmp_path: Path) -> None:
+    _, config, _ = look(tmp_path, restamped({"/fix": lambda _ns: 0}), MAKE)
+    plain = config.sensors["gnss"].model_copy(update={"stamps": "header"})
+    recording = read(tmp_path, config.model_copy(update={"sensors": {**config.sensors, "gnss": plain}}))
+    rows = [r for r in recording.rows if r.sensor == "gnss"]
+    assert len(rows) == 300
+    assert {r.outcome for r in rows} == {Outcome.MALFORMED}
+    assert all("header stamp is zero" in r.reason and "`stamps: recorded`" in r.reason for r in rows)
+
+
+def test_a_clock_that_counts_from_its_start_is_set_by_one_that_tells_the_date(tmp_path: Path) -> None:
+    """IMU and compass of one computer that counts from when it was switched on; the receiver knows the time."""
+    counts = {topic: lambda ns: ns - STARTED_NS for topic in ("/imu", "/compass")}
+    _, config, text = look(tmp_path, restamped(counts), MAKE)
+    recording = read(tmp_path, config)
+    # The receiver's message takes 115 ms longer than the IMU's; recording times cannot tell that.
+    apart_ns = WAY_NS["/fix"] - WAY_NS["/imu"]
+    assert recording.imu.stamps_ns[0] == pytest.approx(START_NS - apart_ns, abs=S // 1000)
+    headings = [m.stamp_ns for m in recording.measurements if isinstance(m, CompassHeading)]
+    assert headings[0] == recording.imu.stamps_ns[0]  # of one clock, though it takes 25 ms longer
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(0.0, abs=0.2)  # by the accelerometer, of its latency
+    assert "its clock is behind one that tells the date, by the recording times" in text
+    assert not any("its clock is" in w for w in recording.warnings)
+
+
+def test_clocks_that_all_count_from_their_start_keep_the_time_of_the_imu(tmp_path: Path) -> None:
+    """A simulator's clock: nothing tells the date, and nothing is set."""
+    _, config, _ = look(tmp_path, restamped(dict.fromkeys(WAY_NS, lambda ns: ns - STARTED_NS)), MAKE)
+    assert all(abs(config.sensors[n].time_offset_s) < 0.2 for n in ("imu", "gnss", "compass"))
+    assert read(tmp_path, config).imu.stamps_ns[0] == START_NS - STARTED_NS
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.01, "gains 0.54 s"), (-0.01, "loses 0.54 s"), (0.001, "")])
+def test_a_clock_that_drifts_is_said(share: float, said: str, tmp_path: Path) -> None:
+    """By a hundredth over 60 s; nine tenths of that lie between the first tenth and the last."""
+    _, config, _ = look(tmp_path, restamped({"/fix": lambda ns: ns + round(share * (ns - START_NS))}), MAKE)
+    lines = [w for w in read(tmp_path, config).warnings if "during the run, by the recording times" in w]
+    assert len(lines) == bool(said)
+    assert all(line.startswith(f"gnss: its clock {said}") for line in lines)
+
+
+@pytest.mark.parametrize("together", [5, 1])
+def test_stamps_that_come_in_bursts_are_said(together: int, tmp_path: Path) -> None:
+    """Fixes at 5 Hz that are recorded a second's at once, and stamped so."""
+    items, fixes = [], 0
+    for topic, at_ns, msg in restamped({"/fix": lambda _ns: 0}):
+        wait_ns = (together - 1 - fixes % together) * (S // 5 - 1_000_000) if topic == "/fix" else 0
+        fixes += topic == "/fix"
+        items.append((topic, at_ns + wait_ns, msg))
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), MAKE)
+    lines = [w for w in read(tmp_path, config).warnings if "stamped in bursts, 1.0 s apart" in w]
+    assert len(lines) == (together > 1)
