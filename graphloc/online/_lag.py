@@ -181,7 +181,7 @@ class Lag:
     def in_doubt(self, stamp_ns: int) -> str:
         """Return why the health cannot be good at a stamp: the only position sensor has jumped; empty where it has not."""
         streams = self.problem.streams.items()  # where a slow error is left out, the bounds include it
-        doubtful = [n for n, s in streams if s.left_out is None and s.jump_detector.doubtful(stamp_ns)]
+        doubtful = [n for n, s in streams if (s.left_out is None or s.jumps) and s.jump_detector.doubtful(stamp_ns)]
         return "; ".join(why_in_doubt(n) for n in doubtful)
 
     def gone(self) -> list[LedgerRow]:
