@@ -28,6 +28,9 @@ _EVEN = 1.5  # steps in time that differ by more than this factor are not compar
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
 _KEPT = 200
 
+MEAN_S = 30.0
+"""Mean duration of a jump, s."""
+
 
 def only_position_sensor(stream: Any, absolute: Collection[Any]) -> bool:
     """Return whether this stream is the only one that measures position, and no slow error that drifts is estimated with it.

@@ -13,7 +13,7 @@ from scipy.integrate import quad
 from graphloc import app
 from graphloc.config import KernelConfig, SlowErrorConfig, VesselConfig
 from graphloc.eval.metrics import compare_to_truth
-from graphloc.eval.simulate import Scenario, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.graph import Residual
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
@@ -281,22 +281,61 @@ def test_a_jump_of_the_only_receiver_is_reported_in_the_run() -> None:
 
 def test_a_jump_of_the_only_receiver_is_not_followed_where_the_imu_contradicts_it() -> None:
     """12 m for 30 s, and back: a drift cannot be separated from motion, a jump can. It was followed, 11 m off, outside the bounds."""
-    run = simulate(Scenario(path="loops", duration_s=100.0, noise="clean", pose_hz=0.0, compass_hz=5.0, imu_hz=50.0), 1)
-    begin_ns = int(run.truth.stamps_ns[0])
-    sensors = {k: v for k, v in run.config.sensors.items() if k in ("imu", "gnss", "compass")}
-
-    def struck(m: Measurement) -> Measurement:
-        if not isinstance(m, GnssPosition) or not 40.0 <= (m.stamp_ns - begin_ns) * 1e-9 < 70.0:
-            return m
-        return replace(m, position=Geodetic(m.position[0] + 12.0 / 111_300.0, *m.position[1:]))
-
-    recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
-    found = app.smooth_recording(recording, run.config.model_copy(update={"sensors": sensors})).solution
+    run, recording, config = jumping_alone(10.0, (40.0, 70.0), 100.0)
+    found = app.smooth_recording(recording, config).solution
     off = compare_to_truth(found.trajectory, run.truth)
     assert off.coverage_95 is not None
     assert off.coverage_95 > 0.95
     assert off.position_max_m < 3.0
     assert any("position jump of 12 m" in w and "treated as its error" in w for w in found.stats.warnings)
+
+
+@pytest.mark.parametrize("gnss_hz", [1.0, 5.0])
+def test_a_jump_of_the_only_receiver_is_not_followed_online(gnss_hz: float) -> None:
+    """12 m for 30 s, and back. It was followed within seconds, past the fixes, with the heading turned."""
+    run, recording, config = jumping_alone(gnss_hz, (40.0, 70.0), 85.0)
+    live = replay(recording, config).solution
+    off = compare_to_truth(live.trajectory, run.truth)
+    assert off.coverage_95 is not None
+    assert off.coverage_95 > 0.95
+    assert off.position_max_m < 2.0
+    assert any("gnss: position jump of 1" in w and "treated as its error" in w for w in live.stats.warnings)
+    assert sum("the window was rebuilt" in w for w in live.stats.warnings) == 2
+    far_off = live.trajectory.stamps_ns > run.truth.stamps_ns[0] + 45_000_000_000
+    assert Health.GOOD not in [h for h, k in zip(live.health, far_off, strict=True) if k]
+
+
+def test_where_a_jump_of_the_only_receiver_may_be_its_end_the_bounds_hold_both_levels() -> None:
+    """Off by 12 m for the first 15 s: the level before the jump is the wrong one, and held until a restart."""
+    run, recording, config = jumping_alone(5.0, (0.0, 15.0), 90.0)
+    track = replay(recording, config).solution.trajectory
+    after = track.where(track.stamps_ns > run.truth.stamps_ns[0] + 18_000_000_000)
+    off = compare_to_truth(after, run.truth)
+    assert off.coverage_95 is not None
+    assert off.coverage_95 > 0.95
+    assert off.position_max_m > 10.0  # or there is nothing to cover
+    last = compare_to_truth(track.where(track.stamps_ns > track.stamps_ns[-1] - 5_000_000_000), run.truth)
+    assert last.position_max_m < 1.0  # it has restarted
+
+
+def jumping_alone(
+    gnss_hz: float, off_s: tuple[float, float], duration_s: float
+) -> tuple[SimulatedRun, Recording, VesselConfig]:
+    """A run whose place one receiver tells, 12 m off to the north from one second to another."""
+    scenario = Scenario(
+        path="loops", duration_s=duration_s, noise="clean", pose_hz=0.0, compass_hz=5.0, imu_hz=50.0, gnss_hz=gnss_hz
+    )
+    run = simulate(scenario, 1)
+    begin_ns = int(run.truth.stamps_ns[0])
+    sensors = {k: v for k, v in run.config.sensors.items() if k in ("imu", "gnss", "compass")}
+
+    def struck(m: Measurement) -> Measurement:
+        if not isinstance(m, GnssPosition) or not off_s[0] <= (m.stamp_ns - begin_ns) * 1e-9 < off_s[1]:
+            return m
+        return replace(m, position=Geodetic(m.position[0] + 12.0 / 111_300.0, *m.position[1:]))
+
+    recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
+    return run, recording, run.config.model_copy(update={"sensors": sensors})
 
 
 def test_a_sensor_that_lies_by_more_than_numbers_hold_is_an_outlier() -> None:

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import expit
 
 from graphloc.graph import Attachment
 from graphloc.measurements import Measurement
 from graphloc.online._live import LiveStream, LiveTimeline
+from graphloc.position_jumps import MEAN_S
 from graphloc.solve._decide import AGREES, Verdict
 
 _CREDIBLE = 6.0  # sigmas of a slow error: a sensor that agrees only by a larger one does not really agree
@@ -73,6 +75,22 @@ class Agreement:
     def back_to(self, mark: _Mark) -> None:
         """Forget what was noted since `marked`: it agreed with choices that were given up."""
         self.agreed_ns, self._refused, self._denied, self._usual_ns, self._jumped_ns = mark
+
+    def inherit(self, before: Agreement) -> None:
+        """Take over when each sensor last agreed, and since when one has been at its usual level; `before`: of the window replaced."""
+        self.agreed_ns.update(before.agreed_ns)
+        self._usual_ns = before._usual_ns
+
+    def wrong_level(self, now_ns: int) -> float:
+        """Return the probability that what is taken for a jump is its end: the level before it was the wrong one.
+
+        By how long either has been held, as jumps last `MEAN_S` on average.
+        """
+        if self._jumped_ns is None:
+            return 0.0
+        begin_ns, end_ns = self._usual_ns or (self._jumped_ns, self._jumped_ns)
+        longer_s = (end_ns - begin_ns - (now_ns - self._jumped_ns)) * 1e-9
+        return float(expit(-longer_s / MEAN_S))
 
     def lost_s(self, now_ns: int) -> float:
         """Return for how long (s) the absolute sensors have disagreed with the estimate; 0 where that is too short to call it lost.

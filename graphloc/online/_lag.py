@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
+from graphloc.build import far_axes
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
@@ -150,8 +151,22 @@ class Lag:
 
     @property
     def others(self) -> tuple[Array, Array]:
-        """What other choices of modes add to the newest position in world: mean (3,), m, and covariance (3, 3), m^2."""
-        return self._judge.others
+        """What other choices of modes, and the other level of a receiver that jumped, add to the newest position in world.
+
+        Mean (3,), m, and covariance (3, 3), m^2.
+        """
+        mean, cov = self._judge.others
+        share, timeline = self._agreement.wrong_level(self.newest.stamp_ns), self.problem.timeline
+        for stream in self.problem.streams.values():
+            if share and stream.jumps and stream.slow is not None:
+                off_m = self._window.values.atVector(keys.slow(stream.number, timeline.slow_of[timeline.last]))
+                off_m = np.where(far_axes(stream.slow), off_m, 0.0)
+                cov = cov + share * np.outer(off_m, off_m)
+        return mean, cov
+
+    def inherit(self, before: Lag) -> None:
+        """Take over when each sensor last agreed; `before`: the window that this one replaces."""
+        self._agreement.inherit(before._agreement)
 
     @property
     def agreed_ns(self) -> dict[str, int]:

@@ -92,7 +92,7 @@ class Tracking:
                 stream.scatter = before.problem.streams[name].scatter
         lag = Lag(problem, anchor, setup.lag_s, guess)
         if before is not None:
-            lag.agreed_ns.update(before.agreed_ns)
+            lag.inherit(before)
         self._ledger.begin()
         self._height_due_ns = {}
         return lag

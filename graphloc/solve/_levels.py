@@ -15,6 +15,7 @@ from graphloc import keys
 from graphloc.build import Problem, StartPrior, Stream, standing_cost
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
+from graphloc.position_jumps import MEAN_S
 from graphloc.recording import Progress
 from graphloc.solve._decide import Verdicts, weigh
 from graphloc.solve._passes import Settled, settle
@@ -22,7 +23,6 @@ from graphloc.time import NS_PER_S
 
 _JUMP = 1.0  # sigmas from one node to the next: ten times the drift
 _FAR = 2.0  # sigmas: nearer, the error is at its usual level
-_LASTS_S = 30.0  # mean duration of a jump
 
 
 def at_usual_level(
@@ -91,7 +91,7 @@ def _cost(slow: SlowProcess | None, path: Array, dt_s: Array) -> float:
     assert slow is not None
     far = [axis in slow.far for axis in slow.axes]
     away = np.linalg.norm(path[:, far] / slow.sigma[far], axis=1) > _FAR
-    return standing_cost(slow, path, dt_s) + float(dt_s @ away[1:]) / _LASTS_S
+    return standing_cost(slow, path, dt_s) + float(dt_s @ away[1:]) / MEAN_S
 
 
 def _moved(problem: Problem, values: gtsam.Values, streams: list[Stream], by_m: Array) -> gtsam.Values:
