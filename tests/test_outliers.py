@@ -2,6 +2,7 @@
 """Fixes far off for seconds are outliers, not the IMU's noise."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -14,12 +15,14 @@ from graphloc import app
 from graphloc.config import KernelConfig, SlowErrorConfig, VesselConfig
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.graph import Residual
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
+from graphloc.online import OnlineSmoother
 from graphloc.position_jumps import JumpDetector, jump_warnings, position_jumps
 from graphloc.recording import Recording
-from graphloc.replay import replay
+from graphloc.replay import arrivals, replay
 from graphloc.solution import Health
 from graphloc.solve._decide import _by_kernel
 
@@ -316,6 +319,22 @@ def test_where_a_jump_of_the_only_receiver_may_be_its_end_the_bounds_hold_both_l
     assert off.position_max_m > 10.0  # or there is nothing to cover
     last = compare_to_truth(track.where(track.stamps_ns > track.stamps_ns[-1] - 5_000_000_000), run.truth)
     assert last.position_max_m < 1.0  # it has restarted
+
+
+def test_a_snapshot_knows_the_jump_of_the_only_receiver(tmp_path: Path) -> None:
+    """Killed in a jump of 12 m and resumed, the track does not follow the fixes, and the bounds still hold both levels."""
+    run, recording, config = jumping_alone(5.0, (40.0, np.inf), 58.0)
+    begin_ns, found = int(run.truth.stamps_ns[0]), []
+    measurements = list(arrivals(recording))
+    for first_s, last_s in ((0.0, 50.0), (51.0, np.inf)):
+        online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, snapshot=tmp_path / "online.json")
+        fed = [online.feed(m) for m in measurements if first_s <= (m.stamp_ns - begin_ns) * 1e-9 < last_s]
+        found.append([estimate for estimate in fed if estimate is not None])
+    assert any("resumed from a snapshot" in said for said in online.events())
+    resumed = found[1][-1]
+    off_m = np.linalg.norm((resumed.p_world_m - run.truth.at(np.array([resumed.stamp_ns])).p_world_m[0])[:2])
+    assert off_m < 2.0
+    assert np.sqrt(np.linalg.eigvalsh(resumed.cov[:2, :2])[-1]) > 5.0
 
 
 def jumping_alone(

@@ -158,7 +158,7 @@ class Lag:
         mean, cov = self._judge.others
         share, timeline = self._agreement.wrong_level(self.newest.stamp_ns), self.problem.timeline
         for stream in self.problem.streams.values():
-            if share and stream.jumps and stream.slow is not None:
+            if share and stream.left_out is not None and stream.slow is not None:
                 off_m = self._window.values.atVector(keys.slow(stream.number, timeline.slow_of[timeline.last]))
                 off_m = np.where(far_axes(stream.slow), off_m, 0.0)
                 cov = cov + share * np.outer(off_m, off_m)
