@@ -202,6 +202,30 @@ def test_a_jump_that_lasts_longer_than_the_level_before_it_is_the_right_level(
     assert [*lost_s, 300][0] == pytest.approx(lost_after_s, abs=1)
 
 
+def test_a_rebuild_does_not_begin_the_wait_for_the_end_of_a_jump_anew() -> None:
+    """The rebuilt window notes what is in it; a level that has been held for longer would seem to begin there."""
+    online = smoother(run_of())
+    feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
+    assert online._tracking is not None  # noqa: SLF001
+    lag = online._tracking.lag  # noqa: SLF001
+    fix = lag.problem.streams["gnss"]
+    entry = lag._judge._group(fix)[-1]  # noqa: SLF001
+    begin_ns = lag.first_ns
+    far_off = replace(entry.verdict, weight=1.0, at=replace(entry.verdict.at, slow_value=np.array([20.0, 0.0, 0.0])))
+    before, after = Agreement(lag.problem.timeline), Agreement(lag.problem.timeline)
+    jumped_ns, now_ns = begin_ns - 50_000_000_000, begin_ns + 12_000_000_000
+    before.note(fix, replace(entry.measurement, stamp_ns=jumped_ns), far_off)
+    after.inherit(before)
+    for stamp_ns in (begin_ns, now_ns):
+        after.note(fix, replace(entry.measurement, stamp_ns=stamp_ns), far_off)
+    assert after.lost_s(now_ns) == pytest.approx(62.0)
+    again = Agreement(lag.problem.timeline)
+    before.forget_refused()
+    before.note(fix, replace(entry.measurement, stamp_ns=begin_ns + 1_000_000_000), far_off)
+    again.inherit(before)  # that is within the window, which notes it anew
+    assert not again.wrong_level(now_ns)
+
+
 def test_a_sensor_found_frozen_does_not_hasten_a_restart() -> None:
     """A receiver that is far off is waited for, whatever a frozen one measured before it was detected."""
     online = smoother(run_of())

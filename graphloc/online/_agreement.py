@@ -77,9 +77,17 @@ class Agreement:
         self.agreed_ns, self._refused, self._denied, self._usual_ns, self._jumped_ns = mark
 
     def inherit(self, before: Agreement) -> None:
-        """Take over when each sensor last agreed, and since when one has been at its usual level; `before`: of the window replaced."""
+        """Take over when each sensor last agreed, and since when one has been at its usual or another level.
+
+        Args:
+            before: of the window replaced. What is in this window will be noted anew, but a level that has been held for longer
+                would seem to begin with it.
+        """
         self.agreed_ns.update(before.agreed_ns)
         self._usual_ns = before._usual_ns
+        begin_ns = self._timeline.stamps_ns[self._timeline.first]
+        if before._jumped_ns is not None and before._jumped_ns < begin_ns:
+            self._jumped_ns = before._jumped_ns
 
     def wrong_level(self, now_ns: int) -> float:
         """Return the probability that what is taken for a jump is its end: the level before it was the wrong one.
