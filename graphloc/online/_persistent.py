@@ -83,7 +83,7 @@ class PersistentState:
         )
 
     def forget_jumps(self) -> None:
-        """Forget position jumps: an estimate that restarts takes a receiver's level as it is. That it jumped stays in doubt."""
+        """Forget position jumps: an estimate that restarts takes a receiver's level as it is."""
         for detector in self.jump_detectors.values():
             detector.jumps = ()
 
