@@ -109,8 +109,8 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         lines.append(f"  reported sigma east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
     if gnss.tf_frame is None:
         lines.append(
-            "  no /tf_static tells where its antenna sits: drafted at 0, 0, 0; measure it: by as much the track is off, which no "
-            "bound includes"
+            "  no /tf_static tells where its antenna sits: drafted at 0, 0, 0; measure it: the track is off by that distance, and no "
+            "bound includes it"
         )
     if gnss.scatter_m is not None:
         lines.append(f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m)} m")
