@@ -151,6 +151,8 @@ class Stream:
             return
         there = (stamps != 0).tolist()
         self.no_stamp = there.count(False)
+        if not self.no_stamp:
+            return
         columns: tuple[list[Any], ...] = (self._stamps, self._logs, self.tuples, self.files)
         for column in columns:
             column[:] = list(compress(column, there))

@@ -375,9 +375,9 @@ def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) 
     lines = []
     for r in sensors:
         types = topics[r.config.topic].msgtypes
-        why = f"{_or(types)} has no stamp" if set(types) & set(UNSTAMPED) else "stamps: recorded"
-        recorded = set(types) & set(UNSTAMPED) or r.config.stamps == "recorded"
-        if recorded and r.config.time_offset_s == 0.0:
+        unstamped = set(types) & set(UNSTAMPED)
+        if (unstamped or r.config.stamps == "recorded") and r.config.time_offset_s == 0.0:
+            why = f"{_or(types)} has no stamp" if unstamped else "stamps: recorded"
             lines.append(
                 f"{r.sensor}: {why}: recording times are used, which are late by as long as a message takes (a receiver's often "
                 "0.1 s and more); no bound includes that: set time_offset_s (negative)"
