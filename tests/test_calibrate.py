@@ -22,7 +22,8 @@ from graphloc.frontends.bag import read_recording
 from graphloc.measurements import GnssVelocity, ImuSeries
 from graphloc.offsets import Misfit, Offset, Offsets, joined
 from graphloc.solve import smooth
-from graphloc.solve._offsets import _imu_misfit, _normal_solver, _Rows
+from graphloc.solve._linearised import Rows, normal_solver
+from graphloc.solve._offsets import _imu_misfit
 from tests.bagfactory import Messages
 from tests.test_inspect import drive, look
 from tests.test_odd_vessels import antenna_velocity
@@ -237,10 +238,10 @@ def test_imu_noise_that_is_configured_too_large_is_seen(times: float, needed: fl
     e = rng.normal(size=9 * n)
     J = csr_array(np.vstack([np.eye(9 * n) / times, np.eye(9 * n) * 100.0]))
     b = np.concatenate([e / times, np.zeros(9 * n)])
-    rows = _Rows(
+    rows = Rows(
         J=J, b=b, states=n + 1, starts=np.arange(2), stamps_ns=np.zeros(len(b), dtype=np.int64), made={}, kernels=[]
     )  # fmt: skip
-    solve = _normal_solver(J)
+    solve = normal_solver(J)
     found = _imu_misfit(rows, np.ones(len(b)), b, (J, b - J @ solve(J.T @ b), solve))
     for misfit, share in zip(found, (3, 6), strict=True):
         assert misfit.freedom == pytest.approx(share * n, rel=0.01)

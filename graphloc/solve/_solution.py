@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from graphloc.solve._batch import BatchResult
 from graphloc.solve._covariances import to_world, unmodelled_covariance, world_covariance
 from graphloc.solve._health import health_over_time, misfits, since_agreed
 from graphloc.solve._ledger import ledger_of
+from graphloc.solve._unmodelled import unmodelled
 from graphloc.solve._warnings import stats_of
 from graphloc.trajectory import Trajectory
 
@@ -46,14 +48,17 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     )
     assert trajectory.cov is not None
     trajectory.cov[:, :3, :3] += unmodelled_covariance(problem.streams) + result.levels_cov
+    v_cov = np.array([tree.marginalCovariance(keys.velocity(k)) for k in range(n)])
+    unsaid = _add_unmodelled(result, trajectory.cov, v_cov)
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = stats_of(problem, result)
+    stats = replace(stats, warnings=(*stats.warnings, *unsaid))
     health, reasons = health_over_time(trajectory, since, misfits(problem, result, stats))
     ledger = ledger_of(problem, recording, result.verdicts)
     return Solution(
         datum=problem.datum,
         trajectory=trajectory,
-        v_cov=np.array([tree.marginalCovariance(keys.velocity(k)) for k in range(n)]),
+        v_cov=v_cov,
         accel_bias_mps2=np.array([b.accelerometer() for b in bias]),
         gyro_bias_radps=gyro_bias,
         gyro_radps=gyro,
@@ -65,6 +70,21 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         ledger=ledger,
         stats=stats,
     )
+
+
+def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
+    """Add what slow errors that are left out do to attitude and velocity; return a warning where that fails."""
+    try:
+        more = unmodelled(result)
+    except (RuntimeError, np.linalg.LinAlgError) as error:
+        said = " ".join(str(error).split())[:100]
+        return [
+            f"the bounds of heading and velocity do not include the slow GNSS error: its effect is not determined ({said})"
+        ]
+    if more is not None:
+        cov[:, 3:, 3:] += more.rotation
+        v_cov += more.velocity
+    return []
 
 
 def _berth_tracks(problem: Problem, result: BatchResult, trajectory: Trajectory) -> Iterator[BerthTrack]:

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A solved run as a sparse linear system J dx = b in whitened rows, for questions that the graph itself does not answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import splu
+
+from graphloc import keys
+from graphloc.build import JUMP, Problem, Stream, build_graph
+from graphloc.config import KernelConfig
+from graphloc.frames import Array
+from graphloc.graph import Attachment, Decision
+from graphloc.solve._batch import BatchResult
+
+_LEAST_WEIGHT = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rows:
+    """The run in whitened rows, J dx = b, without losses.
+
+    Attributes:
+        J: (rows, columns), sparse. b: (rows,). states: poses, whose columns come last; before them their velocities.
+        starts: first row of each factor, and of the end. stamps_ns: (rows,) when each row is.
+        made: range of factors of each measurement. kernels: factors that share a loss, and the loss.
+    """
+
+    J: Any
+    b: Array
+    states: int
+    starts: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
+    made: dict[tuple[int, int], range]
+    kernels: list[tuple[range, KernelConfig]]
+
+    def used(self, stream: Stream) -> list[int]:
+        """Return the indices of the measurements of a stream that have rows."""
+        return [i for i in range(len(stream.measurements)) if (stream.number, i) in self.made]
+
+    def moved(self, stream: Stream, used: list[int], shift: Array) -> Array:
+        """Return by how much (rows, c) the rows change if M measurements, and nothing else, are taken with their states moved.
+
+        Args:
+            used: indices of the M measurements. shift: (M, 9, c), rotation and translation in body axes, velocity in world.
+        """
+        B = np.zeros((len(self.b), shift.shape[2]))
+        spans = [self.made[(stream.number, i)] for i in used]
+        begin, end = self.starts[[s.start for s in spans]], self.starts[[s.stop for s in spans]]
+        of = np.repeat(np.arange(len(used)), end - begin)
+        own = np.concatenate([np.arange(a, b) for a, b in zip(begin, end, strict=True)])
+        part, state = self.J[own].tocoo(), stream.state[used]
+        for width, first, at_shift in ((6, self.first_pose, 0), (3, self.first_velocity, 6)):
+            place = part.col - (first + width * state[of[part.row]])
+            hit = (place >= 0) & (place < width)
+            np.add.at(B, own[part.row[hit]], part.data[hit, None] * shift[of[part.row[hit]], place[hit] + at_shift])
+        return B
+
+    @property
+    def first_pose(self) -> int:
+        """First column of the poses (rotation, translation; body axes): keys are sorted by letter, and x comes last."""
+        return int(self.J.shape[1]) - 6 * self.states
+
+    @property
+    def first_velocity(self) -> int:
+        """First column of the velocities (world axes)."""
+        return self.first_pose - 3 * self.states
+
+
+def linearised(problem: Problem, values: gtsam.Values, result: BatchResult) -> Rows:
+    """Return a solved run, linearised at `values`.
+
+    Args:
+        problem: that of the result, or one with other slow states, which `values` then has.
+    """
+    last, made, decided = len(problem.timeline) - 1, dict[tuple[int, int], range](), {}
+    streams = {s.number: s for s in problem.streams}
+    for key, verdict in result.verdicts.items():
+        if verdict.decision is not None:
+            plain = Decision(mode=verdict.decision.mode, weight=verdict.decision.weight)
+            decided[key] = (plain, _attached(problem, streams[key[0]], key[1], verdict.at, values))
+    graph, guess = build_graph(problem, values, decided, 0, last, result.prior, jumps=False, made=made)
+    kernels = [
+        (factors, kernel)
+        for key, factors in made.items()
+        if (decision := result.verdicts[key].decision) and (kernel := decision.kernel) and kernel.kind != "none"
+    ]
+    held = [graph.at(f).keys() for f in range(graph.size())]
+    kernels += [(range(f, f + 1), JUMP) for f in _jumps(problem, held)]
+    row, column, entry = np.asarray(graph.linearize(guess).sparseJacobian_())
+    row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
+    starts = np.concatenate([[0], np.cumsum([graph.at(f).dim() for f in range(graph.size())])])
+    width = int(column.max())  # the last column is b
+    right = column == width
+    b = np.zeros(int(starts[-1]))
+    b[row[right]] = entry[right]
+    J = csr_array((entry[~right], (row[~right], column[~right])), shape=(len(b), width))
+    stamps = np.repeat(_stamps_ns(problem, held), np.diff(starts))
+    return Rows(J=J, b=b, states=last + 1, starts=starts, stamps_ns=stamps, made=made, kernels=kernels)
+
+
+def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: gtsam.Values) -> Attachment:
+    """Return an attachment of the solution, with the slow states that the stream has here."""
+    if stream.slow is None:
+        return replace(at, slow_key=None, slow_value=None, slow_next=None)
+    key = keys.slow(stream.number, int(problem.timeline.slow_of[stream.state[i]]))
+    return replace(at, slow_key=key, slow_value=np.atleast_1d(values.atVector(key)))
+
+
+def _jumps(problem: Problem, held: list[Any]) -> list[int]:
+    """Return the factors that are steps of slow states which may jump."""
+    nodes = range(len(problem.timeline.slow_stamps_ns))
+    slow = {keys.slow(s.number, j) for s in problem.streams if s.slow is not None and s.slow.jumps for j in nodes}
+    return [f for f, own in enumerate(held) if len(own) == 2 and own[0] in slow and own[1] in slow]
+
+
+def _stamps_ns(problem: Problem, held: list[Any]) -> NDArray[np.int64]:
+    """Return the stamp (ns) of each factor: that of its first state. The prior of a leaf comes before the factor that connects it."""
+    nodes = problem.timeline.slow_stamps_ns.tolist()
+    at = {key(k): n for key in (keys.pose, keys.velocity) for k, n in enumerate(problem.timeline.stamps_ns.tolist())}
+    at |= {keys.bias(j): n for j, n in enumerate(nodes)}
+    at |= {keys.slow(s.number, j): n for s in problem.streams if s.slow is not None for j, n in enumerate(nodes)}
+    stamps, after = np.zeros(len(held), dtype=np.int64), nodes[0]
+    for f in range(len(held) - 1, -1, -1):
+        after = stamps[f] = min((at[key] for key in held[f] if key in at), default=after)
+    return stamps
+
+
+def root_weights(rows: Rows, misfit: Array) -> Array:
+    """Return the root of the weight of each row, by the losses."""
+    total, root = np.concatenate([[0.0], np.cumsum(misfit**2)]), np.ones(len(misfit))
+    for factors, kernel in rows.kernels:
+        a, b = rows.starts[factors.start], rows.starts[factors.stop]
+        root[a:b] = np.sqrt(max(kernel.weight(float(total[b] - total[a])), _LEAST_WEIGHT))
+    return root
+
+
+def normal_solver(J: Any) -> Callable[[Array], Array]:
+    """Return the solution of J'J x = y as a function of y."""
+    N = (J.T @ J).tocsc()
+    scale = 1.0 / np.sqrt(N.diagonal())
+    scaled = (diags_array(scale) @ N @ diags_array(scale)).tocsc()
+    factor = splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+
+    def solve(y: Array) -> Array:
+        by = scale if y.ndim == 1 else scale[:, None]
+        return np.asarray(by * factor.solve(np.asarray(by * y)))
+
+    return solve

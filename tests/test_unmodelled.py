@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a slow GNSS error that nothing tells from motion does to heading and velocity: in their bounds, and not more than that."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphloc import app
+from graphloc.eval.simulate import Scenario, simulate
+from graphloc.frames import Array, Geodetic, wrap_angle
+from graphloc.measurements import GnssPosition, Measurement
+
+SIGMA_M, CORRELATED_S = 2.0, 200.0  # of the default configuration
+
+
+def squares(seed: int) -> tuple[Array, Array]:
+    """Squared errors over their variance, of heading (N,) and of the velocity's two axes (N, 2), of a run whose fixes drift."""
+    scenario = Scenario(
+        path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, compass_hz=0.0, imu_hz=50.0, gnss_hz=2.0, gnss_sigma_m=0.05
+    )  # fmt: skip
+    run = simulate(scenario, seed)
+    rng, off_m, last_ns = np.random.default_rng(seed), np.zeros(2), None
+    moved: list[Measurement] = []
+    for m in run.recording.measurements:
+        if isinstance(m, GnssPosition):
+            kept = 0.0 if last_ns is None else np.exp(-(m.stamp_ns - last_ns) * 1e-9 / CORRELATED_S)
+            off_m = kept * off_m + SIGMA_M * np.sqrt(1.0 - kept**2) * rng.standard_normal(2)
+            last_ns = m.stamp_ns
+            latitude, longitude, height = m.position
+            east = off_m[0] / (111_300.0 * np.cos(np.radians(latitude)))
+            moved.append(replace(m, position=Geodetic(latitude + off_m[1] / 111_300.0, longitude + east, height)))
+        else:
+            moved.append(m)
+    sensors = {name: s for name, s in run.config.sensors.items() if name in ("imu", "gnss")}
+    recording = replace(run.recording, measurements=tuple(moved))
+    solved = app.smooth_recording(recording, run.config.model_copy(update={"sensors": sensors})).solution
+    track = solved.trajectory
+    inside = (track.stamps_ns >= run.truth.stamps_ns[0]) & (track.stamps_ns <= run.truth.stamps_ns[-1])
+    truth = run.truth.at(track.stamps_ns[inside])
+    assert track.cov is not None
+    assert truth.v_world_mps is not None
+    heading = wrap_angle(track.yaw_rad[inside] - truth.yaw_rad) ** 2 / track.cov[inside, 5, 5]
+    assert track.v_world_mps is not None
+    v_off = (track.v_world_mps[inside] - truth.v_world_mps)[:, :2]
+    return heading, v_off**2 / np.diagonal(solved.v_cov[inside], axis1=1, axis2=2)[:, :2]
+
+
+def test_a_drifting_receiver_is_in_the_bounds_of_heading_and_velocity() -> None:
+    """Six draws of the drift that the configuration states: the mean square is that of the covariance, 1."""
+    found = [squares(seed) for seed in range(6)]
+    heading, velocity = np.mean([h.mean() for h, _ in found]), np.mean([v.mean() for _, v in found])
+    assert 0.3 < heading < 2.2  # of some six degrees of freedom
+    assert 0.6 < velocity < 1.2
