@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many runs: sweep."""
+"""The command that runs many cases: sweep."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def sweep(
     mode: Annotated[
         _Mode, typer.Option(help="offline: smooth; online: replay; compare: both, and the EKFs.")
     ] = _Mode.offline,
-    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes on this machine.")] = 1,
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Parallel processes on this machine.")] = 1,
     scheduler: Annotated[str, typer.Option(help="Use a Dask scheduler instead, e.g. tcp://host:8786.")] = "",
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -74,14 +74,14 @@ def sweep(
     if config is not None and not bag:
         raise ConfigError("--config goes with --bag; what a scenario's configuration says, --config-set changes")
     plain = Job(mode=mode.value, hold_out=hold_out or "")
-    jobs = [replace(plain, bag=str(path.absolute()), config=str(config and config.absolute())) for path in bag or ()]
+    cases = [replace(plain, bag=str(path.absolute()), config=str(config and config.absolute())) for path in bag or ()]
     for name, which in itertools.product(scenarios or (), variations(changes or (), "--set")):
-        jobs.append(replace(plain, scenario=name, changes=which))
+        cases.append(replace(plain, scenario=name, changes=which))
     every = variations(config_changes or (), "--config-set")
-    jobs = [replace(job, config_changes=which) for job in jobs for which in every]
-    jobs = [replace(job, seed=seed) for job in jobs for seed in (seeds_of(seeds or "0") if scenarios else (0,))]
+    cases = [replace(case, config_changes=which) for case in cases for which in every]
+    cases = [replace(case, seed=seed) for case in cases for seed in (seeds_of(seeds or "0") if scenarios else (0,))]
     try:
-        table = run_sweep(jobs, out, workers=workers, scheduler=scheduler, overwrite=overwrite, progress=progress())
+        table = run_sweep(cases, out, workers=jobs, scheduler=scheduler, overwrite=overwrite, progress=progress())
     except KeyboardInterrupt:
         raise Stopped(f"{out} keeps the runs that are done; the same command goes on from there") from None
     typer.echo(summary(table))
