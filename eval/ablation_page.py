@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from graphloc.eval.ablation import CONTRADICTS, Ablated, Effect, Vote, suspects
+from graphloc.eval.formatting import percent
+from graphloc.eval.html import drawing
 from graphloc.eval.page import Cell, Grid, write_csv, write_markdown, write_page
-from graphloc.eval.pieces import drawing
 from graphloc.eval.plots import COLOURS, TRUTH, Figure, Line, Mark, Panel, Points, peaks
-from graphloc.eval.words import percent
 from graphloc.time import seconds_since
 
 MARK = "ablation.json"  # a folder with this file is ours to replace

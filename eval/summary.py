@@ -14,8 +14,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from graphloc.errors import InputError
-from graphloc.eval import markdown, pieces
-from graphloc.eval.words import LABELS, number
+from graphloc.eval import html, markdown
+from graphloc.eval.formatting import LABELS, number
 from graphloc.outputs import MARK, fresh_folder
 
 SUMMARY = "summary.csv"  # a folder with this file is ours to replace
@@ -226,8 +226,8 @@ def _page(runs: Sequence[FinishedRun], found: Sequence[Block], folder: Path) -> 
             lines = _lines(block)
             classes = [""] * len(block.rows) + ["part ours", "ours"]
             head = ("", *block.estimates)
-            body.append(f"<h3>{escape(_words(block.metric))}</h3>{pieces.table(head, lines, classes)}")
-    note = pieces.note(
+            body.append(f"<h3>{escape(_words(block.metric))}</h3>{html.table(head, lines, classes)}")
+    note = html.note(
         "Mean and worst are over the runs that have the number; summary.csv has every number of every run."
     )
-    return pieces.page(_title(runs), f"<h1>{_title(runs)}</h1><nav>{links}</nav>{note}{''.join(body)}")
+    return html.page(_title(runs), f"<h1>{_title(runs)}</h1><nav>{links}</nav>{note}{''.join(body)}")

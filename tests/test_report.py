@@ -13,11 +13,11 @@ from plotly.offline import get_plotlyjs
 
 from graphloc import app
 from graphloc.eval.docking import accurate_within_m
+from graphloc.eval.formatting import significant
 from graphloc.eval.metrics import Table
 from graphloc.eval.plots import Underlay
 from graphloc.eval.report import ReportData, Trust, figures, theses_section, verdict, write_report
 from graphloc.eval.simulate import Scenario, simulate
-from graphloc.eval.words import significant
 from graphloc.measurements import GnssPosition
 from graphloc.survey import Survey
 from graphloc.trajectory import Trajectory

@@ -11,7 +11,7 @@ from graphloc.config import VesselConfig
 from graphloc.eval.calibrate._evidence import Estimate, Evidence, Name
 from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
 from graphloc.eval.calibrate._imu import imu_noise
-from graphloc.eval.words import significant
+from graphloc.eval.formatting import significant
 from graphloc.frames import rpy_from_rotation
 from graphloc.offsets import Offset, Probe
 from graphloc.recording import Recording

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
 from graphloc.eval.calibrate._findings import Check, Suggestion
-from graphloc.eval.words import significant
+from graphloc.eval.formatting import significant
 from graphloc.frames import Array
 from graphloc.measurements import ImuSeries
 from graphloc.offsets import Misfit, Offsets

@@ -11,8 +11,8 @@ from pathlib import Path
 from graphloc.eval.drill.figures import against_length, all_failures, over_time
 from graphloc.eval.drill.measure import HELD, HOLDS_S, NEAR_M, NORMAL_TIMES, Drilled, Row, State, summed
 from graphloc.eval.drill.plan import TAIL_S, WINDOW_TAIL_S
+from graphloc.eval.html import drawing
 from graphloc.eval.page import Cell, Grid, write_csv, write_markdown, write_page
-from graphloc.eval.pieces import drawing
 
 MARK = "drill.json"  # a folder with this file is ours to replace
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.chi2 import SIGMAS_95
+from graphloc.eval.formatting import percent
 from graphloc.eval.plots._map import hover
 from graphloc.eval.plots._marks import COLOURS, Band, Figure, Line, Mark, Panel, Points, shown_of, thinned
-from graphloc.eval.words import percent
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.solution import SlowEstimate, Solution
