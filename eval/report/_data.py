@@ -60,9 +60,11 @@ class ReportData:
 
 
 def all_warnings(recording: Recording, solution: Solution, online: Solution | None) -> tuple[str, ...]:
-    """Return the warnings of a run, then those of the online mode under its name."""
-    beside = () if online is None else tuple(f"{online.name}: {line}" for line in online.stats.warnings)
-    return (*recording.warnings, *solution.stats.warnings, *beside)
+    """Return the warnings of a run, then those that only the online mode gave, under its name."""
+    own = (*recording.warnings, *solution.stats.warnings)
+    if online is None:
+        return own
+    return (*own, *(f"{online.name}: {line}" for line in online.stats.warnings if line not in own))
 
 
 def figures(data: ReportData) -> dict[str, plots.Figure]:
