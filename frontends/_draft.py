@@ -39,6 +39,7 @@ _RTK_M = (
     0.1,
 )  # horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error
 _RTK_SCATTER_M = 0.1
+_RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
 _FILTERED = (
     "by its name a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 )
@@ -245,13 +246,13 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     if wanders:
         lines.append(f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m")
     if not gnss.slow_error:
-        lines.append(f"  slow_error: {{enabled: false}}  # guess: {gnss.why}")
+        lines.append(f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {gnss.why}")
     else:
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3) if wanders else None
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
         more = f"vertical_sigma_m: {vertical:.1f}" if vertical else ""
-        off = "; {enabled: false} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
-        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{off}")
+        fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
+        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{fixed}")
     return lines
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
+from graphloc.graph import SlowProcess
 from graphloc.time import NS_PER_S, utc_text
 
 LASTS_S = 200.0
@@ -25,6 +26,7 @@ _JUMP_M, _JUMP, _FEWEST = 3.0, 10.0, 10
 _AROUND = 0.75  # share of the local median, which is usually above that of the whole run
 _SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # stated sigmas; emergency braking of a car to a stop
 _EVEN = 1.5  # steps in time that differ by more than this factor are not compared
+_IN_BOUNDS = 1.5  # sigmas of the slow error that the bounds include: jumps up to there need no word
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
 _KEPT = 200
 
@@ -43,7 +45,7 @@ def only_position_sensor(stream: Any, absolute: Collection[Any]) -> bool:
 
 
 def position_jumps(
-    stamps_ns: NDArray[np.int64], places_m: Array, sigma_m: Array, *, allowed: bool
+    stamps_ns: NDArray[np.int64], places_m: Array, sigma_m: Array, *, allowed_m: float
 ) -> tuple[NDArray[np.int64], Array]:
     """Return stamps (K,) and sizes (K,), m, of the position jumps: steps unlike those before and after.
 
@@ -51,7 +53,7 @@ def position_jumps(
 
     Args:
         stamps_ns: (N,), increasing. places_m: (N, 2), in a local level frame. sigma_m: (N,) as stated.
-        allowed: whether the bounds already include a slow error: then only jumps of metres matter.
+        allowed_m: jumps that the bounds already include (`allowed_jump_m`).
     """
     if len(stamps_ns) < _FEWEST:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -69,10 +71,8 @@ def position_jumps(
     window = np.lib.stride_tricks.sliding_window_view
     even = (window(dt, 3).max(axis=1) < _EVEN * usual_s) & (window(dt, 3).min(axis=1) * _EVEN > usual_s)
     # In a gap the vessel may have gone anywhere; where fixes are seconds apart, any turn or stop differs by metres.
-    least_m = np.full(len(off_m), _JUMP_M * max(usual_s, 1.0) ** 2)
-    if not allowed:  # smaller jumps matter too where the bounds do not include a slow error
-        believed_m = np.maximum(_BRAKES_MPS2 * usual_s**2 / 2.0, _SIGMAS * window(sigma_m, 4).max(axis=1))
-        least_m = np.minimum(least_m, believed_m)
+    believed_m = np.maximum(_BRAKES_MPS2 * usual_s**2 / 2.0, _SIGMAS * window(sigma_m, 4).max(axis=1))
+    least_m = np.minimum(_JUMP_M * max(usual_s, 1.0) ** 2, np.maximum(believed_m, allowed_m))
     least_m = np.maximum(least_m, _JUMP * _usual(off_m))
     far = np.flatnonzero(even & (off_m >= beside) & (off_m > least_m) & (both > off_m / 2.0))
     far = far[(far > 0) & (far < len(off_m) - 1)]  # at either end an outlier looks like half a jump
@@ -80,6 +80,15 @@ def position_jumps(
     back = np.linalg.norm(parts[far][:, None] + parts[far][None], axis=2) < off_m[far] / 2.0
     far = far[~(near & back).any(axis=1)]
     return stamps_ns[far + 2], off_m[far]
+
+
+def allowed_jump_m(left_out: SlowProcess | None) -> float:
+    """Return the size (m) up to which the bounds include a jump.
+
+    Args:
+        left_out: the slow error (east, north, ...) of a receiver that is added to the bounds; None: none is.
+    """
+    return 0.0 if left_out is None else float(_IN_BOUNDS * left_out.sigma[:2].max())
 
 
 def _parts(steps_m: Array) -> Array:
@@ -145,8 +154,10 @@ class JumpDetector:
         self._judged_ns = 0
         self._last_ns: int | None = None
 
-    def note(self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed: bool) -> tuple[NDArray[np.int64], Array]:
-        """Take in a fix; one that is late is ignored. Return new jumps as `position_jumps` does; while in doubt, no further ones."""
+    def note(
+        self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed_m: float
+    ) -> tuple[NDArray[np.int64], Array]:
+        """Take in a fix; ignore a late one. Return new jumps as `position_jumps` does; while in doubt, no further ones."""
         none = np.zeros(0, dtype=np.int64), np.zeros(0)
         if self._seen and stamp_ns <= self._seen[-1][0]:
             return none
@@ -154,7 +165,7 @@ class JumpDetector:
         if len(self._seen) < _FEWEST:
             return none
         stamps_ns, sigmas_m = np.array([at for at, _, _ in self._seen]), np.array([s for _, _, s in self._seen])
-        at_ns, off_m = position_jumps(stamps_ns, np.array([p for _, p, _ in self._seen]), sigmas_m, allowed=allowed)
+        at_ns, off_m = position_jumps(stamps_ns, np.array([p for _, p, _ in self._seen]), sigmas_m, allowed_m=allowed_m)
         until_ns = min(stamps_ns[-3], stamp_ns - int(_BURST_S * NS_PER_S))  # a later one may yet be a burst
         new = (at_ns > self._judged_ns) & (at_ns <= until_ns)
         self._judged_ns = max(int(until_ns), self._judged_ns)

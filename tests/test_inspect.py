@@ -111,7 +111,8 @@ def test_a_whole_draft(tmp_path: Path) -> None:
     assert imu.accel_noise_ug == pytest.approx(0.02 * np.sqrt(0.02) / 9.80665e-6, rel=0.1)
     assert imu.gyro_noise_mdps == pytest.approx(np.degrees(1e-3) * np.sqrt(0.02) * 1e3, rel=0.1)
     assert gnss.statuses == {"gbas": 300}
-    assert config.sensors["gnss"].slow_error.enabled is False
+    assert config.sensors["gnss"].slow_error.enabled is None
+    assert config.sensors["gnss"].slow_error.horizontal_sigma_m == pytest.approx(0.03)
     assert (compass.usable, compass.convention) == (True, "ned")
     assert config.sensors["compass"].convention == "ned"
     assert config.check_speed_topic == "/wheel/odom"

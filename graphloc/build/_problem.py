@@ -22,7 +22,7 @@ from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, Going, InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement
-from graphloc.position_jumps import position_jumps
+from graphloc.position_jumps import allowed_jump_m, position_jumps
 from graphloc.recording import Recording
 from graphloc.time import utc_text
 from graphloc.timeline import Timeline, make_timeline
@@ -167,7 +167,7 @@ def make_problem(
             slow = slow if left_out is None else None
             position_jumps = _NO_JUMPS
             if one_place and slow is None and row.absolute and row.false is None:
-                position_jumps = _position_jumps(row, by_sensor[name], datum, allowed=left_out is not None)
+                position_jumps = _position_jumps(row, by_sensor[name], datum, allowed_jump_m(left_out))
             if left_out is not None and len(position_jumps[0]) and not starts:
                 slow, left_out = without_drift(left_out), None
             streams.append(
@@ -288,15 +288,14 @@ def bridged(problem: Problem, values: gtsam.Values) -> Problem:
     return replace(problem, preintegrated=tuple(preintegrated), inertial=tuple(inertial))
 
 
-def _position_jumps(row: Sensor, measurements: Sequence[Measurement], datum: Datum, *, allowed: bool) -> PositionJumps:
+def _position_jumps(row: Sensor, measurements: Sequence[Measurement], datum: Datum, allowed_m: float) -> PositionJumps:
     """Return stamps and sizes of the position jumps of the only sensor that measures position."""
     hints = [(m.stamp_ns, row.hint(m, 0.0, datum)) for m in measurements]
     told = [(n, hint) for n, hint in hints if np.isfinite(hint.p_world_m[:2]).all()]
     stamps_ns = np.array([n for n, _ in told], dtype=np.int64)
     places_m = np.array([hint.p_world_m[:2] for _, hint in told])
-    return position_jumps(
-        stamps_ns, places_m, np.array([hint.p_sigma_m[:2].max() for _, hint in told]), allowed=allowed
-    )
+    sigma_m = np.array([hint.p_sigma_m[:2].max() for _, hint in told])
+    return position_jumps(stamps_ns, places_m, sigma_m, allowed_m=allowed_m)
 
 
 def apart_s_of(measurements: Sequence[Measurement]) -> Array:

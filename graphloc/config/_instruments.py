@@ -95,7 +95,7 @@ class SlowErrorConfig(Block):
     """The slowly varying part of the GNSS error: a first-order Gauss-Markov process per axis."""
 
     enabled: bool | None = None
-    """false: the GNSS error is treated as white noise (right for RTK in the open, wrong in a harbour). Empty: on if a second
+    """false: the GNSS error is white noise, and a jump is followed; for RTK rather set sigmas of centimetres. Empty: on if a second
     sensor (matches, tags, GNSS velocity, a speed along the vessel, another receiver) can separate it from motion; else it is added to the bounds only."""
     horizontal_sigma_m: Positive = 2.0
     """Stationary sigma of the slow error, each horizontal axis, m."""

@@ -15,7 +15,7 @@ from graphloc.online._entries import Entries
 from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import States
-from graphloc.position_jumps import jump_warnings, largest_sigma, only_position_sensor
+from graphloc.position_jumps import allowed_jump_m, jump_warnings, largest_sigma, only_position_sensor
 
 
 class ReceiverChecks:
@@ -56,7 +56,7 @@ class ReceiverChecks:
     def _check_jump(self, stream: LiveStream, stamp_ns: int, told_m: Array, sigma_m: float) -> None:
         if only_position_sensor(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
             allowed = stream.left_out is not None
-            found = stream.jump_detector.note(stamp_ns, told_m, sigma_m, allowed=allowed)
+            found = stream.jump_detector.note(stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(stream.left_out))
             self._jump_warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
 
     def _reject_since(self, stream: LiveStream, since_s: float) -> None:

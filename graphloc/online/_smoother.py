@@ -319,8 +319,8 @@ class OnlineSmoother:
         self._say(f"started at {utc_text(newest_ns)}: {'; '.join(started.notes)}")
         self._say(started.doubt)
         for stream in tracking.lag.problem.streams.values():
-            if stream.left_out is not None:
-                self._say(slow_error_warning(stream.name, stream.left_out))
+            for said in slow_error_warning(stream.name, stream.left_out):
+                self._say(said)
 
     def _restart(self, why: str) -> None:
         """Give up the estimate, and start from what arrives from now on."""

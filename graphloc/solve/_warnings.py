@@ -19,17 +19,20 @@ from graphloc.solve._passes import outliers_cost
 from graphloc.time import utc_text
 
 _FAR_OFF = 3.0
+_SMALL_M = 0.1  # a slow error below it is that of RTK
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3
 _LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
 
 
-def slow_error_warning(sensor: str, slow: SlowProcess) -> str:
-    """Say what a slow error that nothing can tell from motion does to the bounds."""
-    return (
-        f"{sensor}: no second sensor can separate its slow error (multipath) from motion; the bounds include "
-        f"{slow.sigma[0]:.1f} m (1 sigma) for it; set slow_error.enabled: false if it has none (RTK in the open)"
+def slow_error_warning(sensor: str, left_out: SlowProcess | None) -> list[str]:
+    """Say what a slow error that nothing can tell from motion does to the bounds; nothing if it is that of RTK."""
+    if left_out is None or left_out.sigma[0] < _SMALL_M:
+        return []
+    included = (
+        f"the bounds include {left_out.sigma[0]:.2g} m (1 sigma) for it, slow_error.horizontal_sigma_m (RTK: 0.03)"
     )
+    return [f"{sensor}: no second sensor can separate its slow error (multipath) from motion; {included}"]
 
 
 def disagreement_warning(sensor: str, weights: Array) -> list[str]:
@@ -117,8 +120,7 @@ def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
                         f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
                         "its sigmas"
                     )
-        if stream.left_out is not None:
-            warnings.append(slow_error_warning(stream.name, stream.left_out))
+        warnings += slow_error_warning(stream.name, stream.left_out)
         allowed = stream.left_out is not None
         warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
