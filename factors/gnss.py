@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """GNSS position: lever arm, white noise, and a slow error.
 
-    z = p + R l + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov process per axis
+    z = p + R l + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
 
-z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachment`); C: reported covariance; W: variance of the
-walk of d between its nodes (`Attachment.slow_walk`). The slow state holds n = -d, so that native factors suffice: `A = p + R l`
-is a leaf (`ReferenceFrameFactor`, tied to 5 mm), and `A - N = z` is a `BetweenFactor` under the kernel.
-Without a slow state: `GPSFactorArm`. Not handled: correlation between the axes of d.
+z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachment`); C: the reported
+covariance; W: what d walks between its nodes (`Attachment.slow_walk`). The slow state holds n = -d, so that only native
+factors are needed: `A = p + R l` is a leaf (`ReferenceFrameFactor`, tied within 5 mm), and `A - N = z` is a
+`BetweenFactor` under the kernel.
+Without a slow state: `GPSFactorArm`. Not handled: correlation between axes of d.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ _TIE = gtsam.noiseModel.Isotropic.Sigma(3, _TIE_M)
 
 
 def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
-    """Return the covariance (3, 3) of the white part, m^2: as reported, scaled, with floors."""
+    """Covariance (3, 3) of the white part: reported, scaled, with floors, m^2."""
     horizontal, vertical = config.min_horizontal_sigma_m**2, config.min_vertical_sigma_m**2
     return with_floors(m.cov_enu_m2 * config.sigma_scale**2, np.array([horizontal, horizontal, vertical]))
 
 
 def _covariance(m: GnssPosition, config: GnssConfig, at: Attachment) -> Array:
-    """Return the covariance (3, 3) of a fix, m^2, given a slow error that is constant between its nodes."""
+    """Covariance (3, 3) of a fix about a slow error that is held between its nodes, m^2."""
     white = white_covariance(m, config)
     return white if at.slow_walk is None else white + np.diag(at.slow_walk)
 
@@ -55,7 +56,7 @@ def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
 
 
 def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Return a + d - z (3,), m, in world."""
+    """Residual a + d - z (3,) in m, world axes."""
     lever = at.T_state_sensor.translation()
     d = np.zeros(3) if at.slow_value is None else -at.slow_value
     raw = at.T_world_body.transformFrom(lever) + d - _fix_world_m(m, at)
@@ -94,7 +95,7 @@ def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decis
 
 
 def slow(config: GnssConfig) -> SlowProcess | None:
-    """Return the slow error, as configured; None if it is disabled."""
+    """Return the slow error that the configuration asks for."""
     s = config.slow_error
     if s.enabled is False:
         return None
@@ -112,7 +113,7 @@ def slow(config: GnssConfig) -> SlowProcess | None:
 
 
 def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
-    """Return the noise-free fix at the attachment's state."""
+    """Return the fix that the attachment's estimate would give."""
     antenna = at.T_world_body.transformFrom(at.T_state_sensor.translation())
     d = np.zeros(3) if at.slow_value is None else -at.slow_value
     lat, lon, height = at.datum.geodetic_from_enu(antenna + d)[0]
@@ -128,7 +129,7 @@ def _antenna_jacobian(at: Attachment) -> Array:
 
 
 def hint(m: GnssPosition, mount_yaw_rad: float, datum: Datum) -> Hint:
-    """Return the position of the antenna."""
+    """Return the antenna's place."""
     known = np.array([1.0, 1.0, 1.0 if m.has_height else np.nan])
     return Hint(p_world_m=known * _world_m(m, datum), p_sigma_m=known * np.sqrt(np.diagonal(m.cov_enu_m2)))
 
