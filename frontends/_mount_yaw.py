@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How an IMU is turned in the craft about the vertical, by what it feels and how the craft moves.
+"""Yaw of an IMU's mount in the vessel, from its accelerations and the vessel's motion.
 
-Levelled, with unknown yaw psi, the horizontal acceleration as complex number a = ax + i ay meets that of the craft, m,
-forward + i to port, as m = exp(i psi) a. So psi = arg sum(conj(a) m), and |sum| / sqrt(sum |a|^2 sum |m|^2) says how far
-the data support it.
+Levelled, with unknown yaw psi, the horizontal acceleration as complex number a = ax + i ay relates to that of the vessel, m,
+forward + i to port, by m = exp(i psi) a. So psi = arg sum(conj(a) m), and |sum| / sqrt(sum |a|^2 sum |m|^2) is the coherence.
 """
 
 from __future__ import annotations

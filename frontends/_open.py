@@ -139,7 +139,7 @@ def _not_named(folder: Path) -> list[str]:
 
 
 def _instead(folder: Path) -> str:
-    """Suggest what may have been meant by a folder that is not a bag: one written by graphloc, or its parent or child."""
+    """Suggest what to give instead of a folder that is not a bag: a run folder's bag, or a bag inside it."""
     if (folder / "run.json").exists():
         return "it is the folder of a finished run: give the bag, which its run.json names"
     inside = sorted(p.name for p in folder.iterdir() if (p / "metadata.yaml").exists())

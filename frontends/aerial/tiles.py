@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of Web Mercator tiles as one image: GDAL's own tile reader, told where the files are.
+"""A folder of Web Mercator tiles as one image, by GDAL's tile reader.
 
-GDAL reads the tiles that a window needs, takes a missing file for no data, and makes RGBA of grey, palette, RGB and
-RGBA tiles alike (driver WMS, service TMS, docs: gdal.org/drivers/raster/wms.html). Nothing goes over the network.
+GDAL reads the tiles that a window needs, treats a missing file as no data, and converts grey, palette, RGB and RGBA tiles to
+RGBA (driver WMS, service TMS, docs: gdal.org/drivers/raster/wms.html). It does not access the network.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def _described(folder: Path, datum: Datum) -> str:
 
 
 def _folders(folder: Path) -> dict[int, Path]:
-    """Folders in it that have a number for a name, as GDAL will write it (16, not 016)."""
+    """Return the folders named by a number as GDAL writes it (16, not 016)."""
     return {int(p.name): p for p in folder.iterdir() if _NUMBER.fullmatch(p.name) and p.is_dir()}
 
 
@@ -104,7 +104,7 @@ def _tiles(folder: Path) -> list[Path]:
 
 
 def _part_of(folder: Path) -> str:
-    """What a folder is that is no whole set of tiles, and what to name instead; empty where it is no part of one."""
+    """Return which part of a set of tiles a folder is, and what to name instead; empty if it is not a part of one."""
     here = folder.resolve()
     if _tiles(here):
         return f"one column of a level of tiles; name the folder above both, {here.parent.parent}"
@@ -114,7 +114,7 @@ def _part_of(folder: Path) -> str:
 
 
 def _tile_of(datum: Datum, zoom: int) -> tuple[float, float]:
-    """Column and row of the datum among the tiles of a level, from the top left, fractional."""
+    """Return column and row of the datum among the tiles of a level, from the top left, fractional."""
     latitude = np.radians(np.clip(datum.origin.latitude_deg, -85.0, 85.0))
     down = 0.5 - np.arcsinh(np.tan(latitude)) / (2.0 * np.pi)
     return (datum.origin.longitude_deg / 360.0 + 0.5) % 1.0 * 2**zoom, float(down) * 2**zoom
