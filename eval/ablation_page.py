@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an ablation says, as a page, Markdown and CSV."""
+"""Result of an ablation as a page, Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _BASIS = {
 
 
 def said(ablated: Ablated) -> list[str]:
-    """Return what came out, in sentences."""
+    """Return the result in sentences."""
     lines = _contradictions(ablated) or [
         f"No sensor contradicts the others: each is within {CONTRADICTS:g} sigmas of the run without it."
     ]
@@ -101,7 +101,7 @@ def _verdict(vote: Vote) -> str:
 
 
 def grids(ablated: Ablated) -> list[Grid]:
-    """Return the table of what each sensor bought, and how the sensors fit each other."""
+    """Return the table of contributions, and that of how the sensors fit each other."""
     every = (ablated.full, *ablated.effects)
     held = ablated.basis == "held"
     rows = tuple(_row(e) for e in every)
@@ -142,7 +142,7 @@ def _number(value: float | None, unit: str, digits: int = 2) -> Cell:
 
 
 def _count(e: Effect) -> Cell:
-    """The height prior has none in the recording: the configuration makes it."""
+    """Return the number of measurements as text; the height prior has none in the recording."""
     return Cell(text=str(e.measurements) if e.measurements else "-")
 
 
@@ -168,7 +168,7 @@ def _row(e: Effect) -> tuple[Cell, ...]:
 
 
 def over_time(ablated: Ablated) -> Figure:
-    """Distances over time, a line for the run without each sensor; time as in the table, from the begin of the track."""
+    """Return the figure of distances over time, a line for each sensor that is left out; time since the begin of the track."""
     marks: list[Mark] = []
     for k, (name, away) in enumerate(ablated.over_time.items()):
         step = peaks(away.off_m)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What drills say, as a page, Markdown and CSV."""
+"""Result of drills as a page, Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MARK = "drill.json"  # a folder with this file is ours to replace
 
 
 def said(drilled: Drilled) -> list[str]:
-    """Return what came out, in sentences: the worst outage, lock-outs, and what it was measured against."""
+    """Return the result in sentences: the worst outage, lock-outs, and the reference."""
     rows = summed(drilled.measured)
     lines = [" ".join(_headline(drilled, rows))]
     if drilled.truth:
@@ -91,7 +91,7 @@ def _short(row: Row) -> Cell:
 
 
 def brief(drilled: Drilled) -> list[Grid]:
-    """Return the same for a terminal: farthest off, and how long until back; a star: near, but outside its own bounds."""
+    """Return the tables for a terminal: largest error and time to recover; a star: recovered, but outside its own bounds."""
     by = {(r.failure, r.estimator): r for r in summed(drilled.measured)}
     names = dict.fromkeys(m.failure for m in drilled.measured)
     rows = tuple((Cell(text=n), *(_short(by[n, e]) for e in drilled.estimators)) for n in names)
@@ -100,7 +100,7 @@ def brief(drilled: Drilled) -> list[Grid]:
 
 
 def grids(drilled: Drilled) -> list[Grid]:
-    """Return the table, and the drills that were left out."""
+    """Return the table of failures, and that of failures that were not injected."""
     by = {(r.failure, r.estimator): r for r in summed(drilled.measured)}
     names = dict.fromkeys(m.failure for m in drilled.measured)
     times = max(r.times for r in by.values())

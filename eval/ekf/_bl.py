@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The filter of Bergman & Lindell, as printed."""
+"""EKF of Bergman & Lindell, as printed."""
 
 from __future__ import annotations
 
@@ -17,19 +17,18 @@ from graphloc.recording import Recording
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlConfig:
-    """BL alg. 6. Defaults are the print, with the errata that `thesis-notes` settles (dt, rad, 3 x 5 H).
+    """Parameters of BL alg. 6. Defaults are the printed ones, with errata corrected (dt, rad, 3 x 5 H).
 
     Attributes:
         rate_hz: prediction rate. a1, a2, a3: BL's factors on Q, R_gnss, R_lidar.
         a2_in_loss: factor on R_gnss while the signal is lost, which BL set by hand. loss_ns: (start, stop)
-            stamps of it; None: nobody tells.
-        gate_m: a pose further than this from the prediction is dropped.
+            stamps of that; None: unknown to the filter.
+        gate_m: a pose farther than this from the prediction is dropped.
         accel_noise_mg: printed 37 mg; gyro_noise_dps: 0.008 deg/s; both over the root of the rate (eq. 3.1, 3.2).
-        gnss_rmse_m: receiver's own e; 0 takes it from the fix. heading_rmse_deg: of the GNSS compass.
+        gnss_rmse_m: receiver's own e; 0: from the fix. heading_rmse_deg: of the GNSS compass.
         exact_jacobian: d/dpsi terms in F, which the print lacks.
 
-    R_lidar is a3 times the pose's own covariance: that of eq. 3.33 where the pose comes of BL's matcher
-    (`matcher: bl` of an aerial sensor).
+    R_lidar is a3 times the pose's own covariance: that of eq. 3.33 for poses of BL's matcher (`matcher: bl` of an aerial sensor).
     """
 
     rate_hz: float = 20.0
@@ -47,7 +46,7 @@ class BlConfig:
 
 
 def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: BlConfig | None = None) -> FilterResult:
-    """Run BL alg. 6. It has no GNSS velocity: that is left out."""
+    """Run BL alg. 6. It does not use GNSS velocity."""
     o = options or BlConfig()
     dt = 1.0 / o.rate_hz
     s_acc = o.accel_noise_mg * 1e-3 * 9.81 / np.sqrt(o.rate_hz)  # eq. 3.2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The filter that one would honestly compare with."""
+"""EKF for a fair comparison."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _ACCEL, _GATE, _PATIENCE_S = 0.3, 0.9, 10.0
 
 
 def run_honest(recording: Recording, config: VesselConfig, datum: Datum) -> FilterResult:
-    """Run the filter that one would honestly compare with.
+    """Run an EKF for a fair comparison.
 
-    Exact Jacobian, turning body axes, gyro bias as a state, wave accelerations as process noise, GNSS velocity, a 90 %
-    chi-square gate for every sensor, and a GNSS covariance that owns up to slow errors (1 m), a log's to its scale and the current. While
-    measurements are rejected the covariance grows, so the gate opens again by itself; a sensor that
-    was rejected for 10 s on end is taken again, so that nothing locks it out. The three were chosen on seeds
-    that no figure uses (`benchmarks/tune_filter.py`).
+    Exact Jacobian, rotating body axes, gyro bias as a state, wave accelerations as process noise, GNSS velocity, a 90 % chi-square
+    gate for every sensor, a GNSS covariance that includes slow errors (1 m), and a speed log's that includes scale and current.
+    While measurements are rejected the covariance grows, so the gate opens again by itself; a sensor that was rejected for 10 s is
+    accepted again, so that nothing locks it out. The three values were chosen on seeds that no figure uses
+    (`benchmarks/tune_filter.py`).
     """
     rate_hz, dt = 20.0, 0.05
     imu = recording.imu

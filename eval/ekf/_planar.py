@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What both filters share: the planar model, the loop over steps and measurements, the track that comes out."""
+"""Parts that both EKFs share: the planar model, the loop over steps and measurements, the resulting track."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from graphloc.trajectory import Trajectory
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilterResult:
-    """What a filter gives.
+    """Result of a filter.
 
     Attributes:
         name: of the filter. trajectory: with covariance. ledger: of absolute measurements.
-        why: what explains how far off it is, where that takes a word.
+        why: explanation of its errors, if needed.
     """
 
     name: str
@@ -43,7 +43,7 @@ class FilterResult:
 
 
 def _measurement(event: Event, x: Array, rate: float, datum: Datum) -> tuple[Array, Array, Array]:
-    """Return innovation (k,), H (k, 5) and R of a measurement, its lever arm taken off with psi."""
+    """Return innovation (k,), H (k, 5) and R of a measurement, corrected for its lever arm with psi."""
     m, lever = event.m, event.lever
     c, s = np.cos(x[4]), np.sin(x[4])
     turn = np.array([[c, -s], [s, c]])
@@ -113,7 +113,7 @@ def run_filter(
     predict: Predict,
     judge: Judge,
 ) -> FilterResult:
-    """Predict from step to step, and take each measurement at the first step after it."""
+    """Predict step by step, and apply each measurement at the first step after it."""
     intervals, events = intervals_of(recording, config, rate_hz), events_of(recording, config)
     x, P = start(start_of(events, recording, datum))
     first = intervals[0].stop_ns - round(NS_PER_S / rate_hz) if intervals else 0
@@ -146,7 +146,7 @@ def _update(x: Array, P: Array, r: Array, H: Array, R: Array) -> tuple[Array, Ar
 def filter_row(
     m: Measurement, recording: Recording, nis: float | None, refused: str, away_m: float | None = None
 ) -> LedgerRow:
-    """Return the row of a measurement that a filter took, or refused for a reason."""
+    """Return the row of a measurement that a filter used, or rejected with a reason."""
     return LedgerRow(
         seq=m.seq,
         stamp_ns=m.stamp_ns,

@@ -75,7 +75,7 @@ def match_bag(
 
 
 def _nearest(feed: Iterable[Turn], submap: int, track: Trajectory, at_ns: int) -> list[Turn]:
-    """Yield the usable turn nearest to a time, after those that are stacked with it."""
+    """Return the usable turn nearest to a time, after those that are stacked with it."""
     window: deque[Turn] = deque(maxlen=submap)
     nearest: list[Turn] = []
     for turn in feed:
