@@ -190,8 +190,10 @@ class _Session:
         self.update_s: list[float] = []
         self.rows: list[LedgerRow] = []
         self.events: list[tuple[int, str]] = []
-        stamps_ns = () if recording.imu is None else recording.imu.stamps_ns
-        self.first_ns, self.last_ns = (int(stamps_ns[0]), int(stamps_ns[-1])) if len(stamps_ns) else (0, 0)
+        imu = recording.imu
+        self.first_ns, self.last_ns = (
+            (int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])) if imu is not None and len(imu) else (0, 0)
+        )
         self._length_s, self._begun_s, self._shown_s = (self.last_ns - self.first_ns) / 1e9, time.monotonic(), -1
 
     def play(self, arriving: Iterator[Measurement], matchings: Sequence[_Matching], speed: float | None) -> None:
