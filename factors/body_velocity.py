@@ -22,7 +22,7 @@ from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Se
 from graphloc.linear import linear_factor
 from graphloc.measurements import BodyVelocity
 
-_SCALE, _CURRENT = slice(0, 1), slice(1, 3)  # of the slow state, where all of it is there
+_CURRENT = slice(1, 3)  # after the scale error, in a slow state that has both
 
 
 def _there(config: BodyVelocityConfig) -> NDArray[np.bool_]:

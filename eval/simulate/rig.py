@@ -15,7 +15,7 @@ import shapely
 from pydantic import Field, model_validator
 
 from graphloc.blocks import Block, Finite, MountConfig, NonNegative, Positive
-from graphloc.eval.simulate._files import load_block, shipped_names
+from graphloc.eval.simulate._files import load_block
 from graphloc.eval.simulate.harbour import RESERVED, Outline
 from graphloc.frames import Array
 
@@ -160,8 +160,3 @@ def load_rig(name_or_path: str) -> RigConfig:
     """
     rig, _ = load_block("rig", name_or_path, _SHIPPED, RigConfig)
     return rig
-
-
-def shipped_rigs() -> tuple[str, ...]:
-    """Names of the rigs that come with graphloc."""
-    return shipped_names(_SHIPPED)
