@@ -45,23 +45,27 @@ class BlConfig:
     exact_jacobian: bool = False
 
 
-def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: BlConfig | None = None) -> FilterResult:
-    """Run BL alg. 6. It does not use GNSS velocity."""
-    o = options or BlConfig()
-    dt = 1.0 / o.rate_hz
-    s_acc = o.accel_noise_mg * 1e-3 * 9.81 / np.sqrt(o.rate_hz)  # eq. 3.2
-    s_gyro = np.radians(o.gyro_noise_dps) / np.sqrt(o.rate_hz)  # eq. 3.1
-    Qa = np.diag([0.0, 0.0, s_acc**2, s_acc**2, s_gyro**2]) * dt  # eq. 3.28
+class _BlEkf:
+    """BL alg. 6. It does not use GNSS velocity."""
 
-    def start(x: Array) -> tuple[Array, Array]:
+    name = "BL EKF"
+
+    def __init__(self, options: BlConfig) -> None:
+        self._options, self.rate_hz, self._dt = options, options.rate_hz, 1.0 / options.rate_hz
+        s_acc = options.accel_noise_mg * 1e-3 * 9.81 / np.sqrt(options.rate_hz)  # eq. 3.2
+        s_gyro = np.radians(options.gyro_noise_dps) / np.sqrt(options.rate_hz)  # eq. 3.1
+        self._Qa = np.diag([0.0, 0.0, s_acc**2, s_acc**2, s_gyro**2]) * self._dt  # eq. 3.28
+
+    def start(self, x: Array) -> tuple[Array, Array]:
         return x, np.diag([0.1, 0.1, 0.1, 0.1, 0.01])
 
-    def predict(x: Array, P: Array, step: Interval) -> tuple[Array, Array]:
-        F = transition(x, dt, exact=o.exact_jacobian)
-        Q = o.a1 * (F @ Qa @ F.T) + (SILENT_Q * dt if step.silent else 0.0)  # eq. 3.29
-        return advance(x, step.accel - step.leak, step.rate, dt), F @ P @ F.T + Q
+    def predict(self, x: Array, P: Array, step: Interval) -> tuple[Array, Array]:
+        F = transition(x, self._dt, exact=self._options.exact_jacobian)
+        Q = self._options.a1 * (F @ self._Qa @ F.T) + (SILENT_Q * self._dt if step.silent else 0.0)  # eq. 3.29
+        return advance(x, step.accel - step.leak, step.rate, self._dt), F @ P @ F.T + Q
 
-    def judge(m: Measurement, r: Array, H: Array, P: Array, R: Array) -> Array | str:
+    def gate(self, m: Measurement, r: Array, H: Array, P: Array, R: Array) -> Array | str:
+        o = self._options
         if isinstance(m, PoseFix):
             away = float(np.linalg.norm(r[H[:, :2].any(axis=1)]))
             return o.a3 * R if away < o.gate_m else f"outside the {o.gate_m:g} m gate"
@@ -73,4 +77,7 @@ def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: Bl
             return a2 * np.eye(2) * (o.gnss_rmse_m**2 if o.gnss_rmse_m else float(np.trace(R))) / 2.0
         return a2 * np.array([[np.radians(o.heading_rmse_deg) ** 2 / 2.0]])
 
-    return run_filter("BL EKF", recording, config, datum, o.rate_hz, start, predict, judge)
+
+def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: BlConfig | None = None) -> FilterResult:
+    """Run BL alg. 6. It does not use GNSS velocity."""
+    return run_filter(_BlEkf(options or BlConfig()), recording, config, datum)
