@@ -74,21 +74,26 @@ def _described(folder: Path, datum: Datum) -> str:
             f"another `datum:`, or not z/x/y (z/y/x?): {_WANTED}"
         )
     first = tiles[int(rows[0])]
+    overviews = next(k for k in range(zoom + 1) if zoom - k - 1 not in levels)
+    return _xml(folder, first, zoom, overviews, "top" if from_top <= from_below else "bottom")
+
+
+def _xml(folder: Path, tile: Path, zoom: int, overviews: int, rows_from: str) -> str:
+    """Return GDAL's description of the folder; `tile`: one of its tiles, for their size."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(first) as tile:
-                width, height = tile.width, tile.height
+            with rasterio.open(tile) as opened:
+                width, height = opened.width, opened.height
     except rasterio.errors.RasterioError as error:
-        raise InputError(f"{first}: not an image that GDAL can read ({error})") from None
-    overviews = next(k for k in range(zoom + 1) if zoom - k - 1 not in levels)
+        raise InputError(f"{tile}: not an image that GDAL can read ({error})") from None
     # as_uri: GDAL wants blanks and such quoted. 404: no file. 200: a file without content, which some tools write.
     return (
-        f'<GDAL_WMS><Service name="TMS"><ServerUrl>{folder.resolve().as_uri()}/${{z}}/${{x}}/${{y}}{first.suffix}</ServerUrl>'
+        f'<GDAL_WMS><Service name="TMS"><ServerUrl>{folder.resolve().as_uri()}/${{z}}/${{x}}/${{y}}{tile.suffix}</ServerUrl>'
         f"</Service><DataWindow><UpperLeftX>{-_HALF_M!r}</UpperLeftX><UpperLeftY>{_HALF_M!r}</UpperLeftY>"
         f"<LowerRightX>{_HALF_M!r}</LowerRightX><LowerRightY>{-_HALF_M!r}</LowerRightY><TileLevel>{zoom}</TileLevel>"
         f"<TileCountX>1</TileCountX><TileCountY>1</TileCountY>"
-        f"<YOrigin>{'top' if from_top <= from_below else 'bottom'}</YOrigin></DataWindow><Projection>EPSG:3857</Projection>"
+        f"<YOrigin>{rows_from}</YOrigin></DataWindow><Projection>EPSG:3857</Projection>"
         f"<BlockSizeX>{width}</BlockSizeX><BlockSizeY>{height}</BlockSizeY><BandsCount>4</BandsCount>"
         f"<OverviewCount>{overviews}</OverviewCount><ZeroBlockHttpCodes>404,200</ZeroBlockHttpCodes></GDAL_WMS>"
     )
