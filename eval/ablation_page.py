@@ -87,8 +87,8 @@ def _verdict(vote: Vote) -> str:
     offs = {vote.one: vote.one_off, vote.other: vote.other_off}
     if vote.one_off is None or vote.other_off is None:
         return f"Without both {vote.one} and {vote.other} there is no track: nothing tells which of them is wrong."
-    told = " and ".join(f"{n} by {v:.1f} sigmas" for n, v in offs.items())
-    start = f"Without both {vote.one} and {vote.other}, what is left contradicts {told}: "
+    distances = " and ".join(f"{n} by {v:.1f} sigmas" for n, v in offs.items())
+    start = f"Without both {vote.one} and {vote.other}, what is left contradicts {distances}: "
     bad = [n for n, v in offs.items() if v is not None and v > CONTRADICTS]
     if len(bad) == 1:
         return f"{start}{bad[0]} is the likelier culprit."
@@ -196,6 +196,6 @@ def write(ablated: Ablated, folder: Path, command: str) -> None:
     every = [asdict(e) for e in (ablated.full, *ablated.effects)]
     flat = [{k: v for k, v in e.items() if k != "fits"} for e in every]
     write_csv(folder / "ablation.csv", flat)
-    told = {"command": command, "basis": ablated.basis, "said": lines, "runs": every,
-            "votes": [asdict(v) for v in ablated.votes], "warnings": ablated.warnings}  # fmt: skip
-    (folder / MARK).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    content = {"command": command, "basis": ablated.basis, "said": lines, "runs": every,
+               "votes": [asdict(v) for v in ablated.votes], "warnings": ablated.warnings}  # fmt: skip
+    (folder / MARK).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

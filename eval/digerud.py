@@ -42,8 +42,8 @@ from graphloc.time import NS_PER_S, seconds_between
 from graphloc.trajectory import Trajectory
 
 _H = np.kron(np.eye(3), [1.0, 0.0])  # (3, 6): places of x, vx, y, vy, z, vz
-_FOCAL_PX = 1069.38  # his; OpenCV refines too little where it is given rays instead of pixels
-_ATTITUDE_RAD = float(np.radians(10.0))  # of a pose at about 10 m, unless it is flipped; his filter has no attitude
+_FOCAL_PX = 1069.38  # of D's camera; OpenCV refines too little where it is given rays instead of pixels
+_ATTITUDE_RAD = float(np.radians(10.0))  # of a pose at about 10 m, unless it is flipped; the filter has no attitude
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,16 +89,16 @@ def run_digerud(
     if not seen:
         return None
     chosen = seen.most_common(1)[0][0]
-    his = chosen[2]
+    own_tag = chosen[2]
     ledger = Ledger()
     off_m: dict[int, float] = {}
     out: dict[int, tuple[_State, Array]] = {}
     state: _State | None = None
     for m in sightings:
-        if (m.sensor, m.camera, his) != chosen or his not in m.tags:
+        if (m.sensor, m.camera, own_tag) != chosen or own_tag not in m.tags:
             ledger.add(filter_row(m, recording, None, "not of the one tag and camera that it uses"))
             continue
-        pose = single_tag_pose(m, his)
+        pose = single_tag_pose(m, own_tag)
         if pose is None:
             ledger.add(filter_row(m, recording, None, "no pose from its corners"))
             continue

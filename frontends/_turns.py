@@ -72,19 +72,19 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
     ]
 
 
-def refuse_unit(imu: ImuSeries, config: ImuConfig, told: Mapping[str, Yaws]) -> None:
+def refuse_unit(imu: ImuSeries, config: ImuConfig, yaws_by_source: Mapping[str, Yaws]) -> None:
     """Refuse rates in another unit than configured: they turn by 57 times too little or too much, compared with headings.
 
     The solver would take the missing part of a turn for a bias, and the heading for known.
 
     Args:
-        told: headings or courses, by their name in the message.
+        yaws_by_source: headings or courses, by their name in the message.
 
     Raises:
         InputError: they are.
     """
     wrong, right = ("less", "rad/s") if config.gyro_unit == "deg/s" else ("more", "deg/s")
-    for source, yaws in told.items():
+    for source, yaws in yaws_by_source.items():
         times = _times_turned(imu, yaws)
         off = times * np.radians(1.0) if wrong == "less" else times / np.radians(1.0)
         if 1.0 / _UNIT < off < _UNIT:

@@ -331,16 +331,16 @@ def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str
 
 def _refuse_unit(imu: ImuSeries, sensors: Sequence[Readings]) -> None:
     (config,) = (r.config for r in sensors if r.sensor == imu.sensor and isinstance(r.config, ImuConfig))
-    told: dict[str, Yaws] = {}
+    yaws: dict[str, Yaws] = {}
     for readings in sensors:
         yaw = np.array([_yaw_of(v) for v in readings.values])
         fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
         if np.isfinite(yaw).any():
-            told[f"the headings of {readings.sensor}"] = readings.stamps()[np.isfinite(yaw)], yaw[np.isfinite(yaw)]
+            yaws[f"the headings of {readings.sensor}"] = readings.stamps()[np.isfinite(yaw)], yaw[np.isfinite(yaw)]
         elif fixes:
             courses = courses_of_fixes(fixes)
-            told[f"the courses of {readings.sensor}"] = courses.stamps_ns, courses.course_rad
-    refuse_unit(imu, config, told)
+            yaws[f"the courses of {readings.sensor}"] = courses.stamps_ns, courses.course_rad
+    refuse_unit(imu, config, yaws)
 
 
 def _yaw_of(value: Decoded) -> float:
@@ -366,8 +366,8 @@ def _mount_warnings(
     """Return a line if the IMU's mount has a wrong yaw, by the motion of the fixes; no heading sensor would contradict it."""
     mount = config.sensors[imu.sensor].mount
     R = mounts[imu.sensor][1] if imu.sensor in mounts else mount.R_body_sensor
-    told = {r.sensor: [v for v in r.values if isinstance(v, GnssPosition)] for r in sensors}
-    motions = [m for sensor, fixes in told.items() if (m := motion_of_fixes(sensor, fixes))]
+    fixes = {r.sensor: [v for v in r.values if isinstance(v, GnssPosition)] for r in sensors}
+    motions = [m for sensor, own in fixes.items() if (m := motion_of_fixes(sensor, own))]
     found = (
         yaw_in_craft(imu.stamps_ns, imu.accel_mps2 @ R.T, imu.gyro_radps @ R.T, motions) if len(imu.stamps_ns) else None
     )

@@ -34,7 +34,6 @@ from graphloc.frontends._assess_world import world_of
 from graphloc.frontends._clock import refuse_woven
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
-from graphloc.frontends._lag import lag, lag_of_way
 from graphloc.frontends._reports import (
     CompassReport,
     GnssReport,
@@ -51,6 +50,7 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._time_offsets import heading_time_offset, motion_time_offset
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends._unused import unused_topics
 from graphloc.frontends.aerial.cloud import CLOUD
@@ -239,7 +239,7 @@ def _late_s(
 ) -> dict[str, tuple[float, float] | None]:
     """Return by topic what should be added to the stamps of a motion by the best IMU, s, and its sigma."""
     felt = felt_of(bag.aligned[imus[0].topic], imus[0], bag.tree, bag.tree.body()) if imus else None
-    return {motion.source: lag_of_way(felt, motion) for motion in motions} if felt else {}
+    return {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
 
 
 def _compass_reports(bag: _Contents, imus: Sequence[ImuReport], courses: Courses | None) -> tuple[CompassReport, ...]:
@@ -287,7 +287,7 @@ def _timed(report: CompassReport, stream: Stream, recorded: Stream, turning: Tur
     if turning is None or not report.usable:
         return report
     stamps, angle = headings(stream)
-    found = lag(turning, stamps, angle if report.convention == "enu" else -angle)
+    found = heading_time_offset(turning, stamps, angle if report.convention == "enu" else -angle)
     if found is None:
         return report
     value, sigma = found

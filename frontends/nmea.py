@@ -159,8 +159,8 @@ def _number(said: Any, name: str) -> float:
 
 def _speed_mps(said: Any, knots: str, km_per_h: str) -> float:
     """Return a speed given in knots or km/h, m/s; NaN if it is given in neither."""
-    told = _number(said, knots)
-    return KNOT_MPS * told if isfinite(told) else KM_PER_H_MPS * _number(said, km_per_h)
+    in_knots = _number(said, knots)
+    return KNOT_MPS * in_knots if isfinite(in_knots) else KM_PER_H_MPS * _number(said, km_per_h)
 
 
 def _east(said: Any, name: str) -> float:

@@ -120,7 +120,7 @@ def grids(drilled: Drilled) -> list[Grid]:
     found = [table]
     why = dict.fromkeys((m.failure, m.estimator, m.why) for m in drilled.measured if m.why)
     if why:
-        rows = tuple(tuple(Cell(text=text) for text in told) for told in why)
+        rows = tuple(tuple(Cell(text=text) for text in line) for line in why)
         found.append(Grid(title="No estimate", head=("failure", "estimator", "why"), rows=rows))
     if drilled.left:
         left = tuple((Cell(text=name), Cell(text=why_not)) for name, why_not in drilled.left)
@@ -145,7 +145,7 @@ def write(drilled: Drilled, folder: Path, command: str) -> None:
     write_page(folder / "drill.html", title, lines, parts)
     write_markdown(folder / "drill.md", title, lines, tables)
     write_csv(folder / "drill.csv", [asdict(m) for m in drilled.measured])
-    told = {
+    content = {
         "command": command,
         "said": lines,
         "truth": drilled.truth,
@@ -153,4 +153,4 @@ def write(drilled: Drilled, folder: Path, command: str) -> None:
         "left": dict(drilled.left),
         "warnings": drilled.warnings,
     }
-    (folder / MARK).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    (folder / MARK).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

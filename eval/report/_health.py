@@ -74,8 +74,8 @@ def stretches(solution: Solution, begin_ns: int) -> list[Stretch]:
 def said_of(solution: Solution) -> str:
     """Return the states of health with shares and durations, such as 'good for 80 % (64 s), degraded for 20 % (16 s)'."""
     lasting = durations_s(solution)
-    told = [f"{_words(h)} for {percent(share)} ({_seconds(lasting[h])})" for h, share in shares(solution).items()]
-    return ", ".join(told)
+    parts = [f"{_words(h)} for {percent(share)} ({_seconds(lasting[h])})" for h, share in shares(solution).items()]
+    return ", ".join(parts)
 
 
 def cure(health: Health, reason: str) -> str:

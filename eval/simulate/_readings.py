@@ -71,13 +71,13 @@ def gnss_fixes(s: Scenario, motion: Motion, datum: Datum, lever: Array, rng: np.
     fixes = p + R @ lever + gnss_error_m(rng, t, s.noise, s.case, s.gnss_sigma_m)
     geodetic = datum.geodetic_from_enu(fixes)
     claimed = s.gnss_reported_sigma_m or s.gnss_sigma_m
-    told = np.full(len(t), claimed)
+    sigmas = np.full(len(t), claimed)
     if s.gnss_reported_spread > 0.0:
-        told = reported_sigma_m(rng, t, claimed, s.gnss_reported_spread)
+        sigmas = reported_sigma_m(rng, t, claimed, s.gnss_reported_spread)
     shape = np.diag([1.0, 1.0, 4.0])
     return [
         GnssPosition(stamp_ns=int(n), sensor="gnss", seq=0, position=Geodetic(*g), cov_enu_m2=sigma**2 * shape)
-        for n, g, sigma, silent in zip(stamps(t), geodetic, told, _silent(s, t), strict=True)
+        for n, g, sigma, silent in zip(stamps(t), geodetic, sigmas, _silent(s, t), strict=True)
         if not silent
     ]
 

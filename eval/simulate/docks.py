@@ -74,7 +74,7 @@ def tag_pose(tag: Tag, harbour: Harbour) -> tuple[Array, Array]:
 
 
 def survey(harbour: Harbour, rng: np.random.Generator) -> dict[str, object]:
-    """Return what a surveyor would write down: `tags.yaml`. Each tag is off by his errors."""
+    """Return the survey, `tags.yaml`, with the errors of a surveyor."""
     tags = []
     for tag in harbour.config.tags:
         p, R = tag_pose(tag, harbour)

@@ -40,14 +40,14 @@ def summary(
     page = summaries.write_summary(out, read, overwrite=overwrite)
     found = summaries.blocks(read)
     if as_json:
-        told = {
+        numbers = {
             f"{b.title}: {b.metric}": {
                 name: dict(zip(b.estimates, values, strict=True))
                 for name, values in (("mean", b.mean), ("worst", b.worst))
             }
             for b in found
         }
-        typer.echo(json.dumps(told, indent=2))
+        typer.echo(json.dumps(numbers, indent=2))
     else:
         typer.echo(summaries.as_markdown(read, found))
     typer.echo(str(page))

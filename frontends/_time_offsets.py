@@ -16,7 +16,7 @@ _CLEAR, _LEAST_S = 4.0, 0.02  # sigmas, s
 _MOST_S, _APART_S, _LEAST_OF_WAY_S = 1.5, 0.05, 0.1  # how far, and how closely, is looked; from which it is said
 
 
-def lag(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[float, float] | None:
+def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[float, float] | None:
     """Return what should be added to the stamps of headings, s, and its sigma; None if the gyroscope does not show it.
 
     If stamps are off by dt, heading minus integrated rate w is w dt. Within twenty seconds gyro bias, compass offset and magnetic
@@ -53,7 +53,7 @@ def lag(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[f
     return (value, sigma) if clear else None
 
 
-def lag_of_way(felt: Felt, motion: Motion) -> tuple[float, float] | None:
+def motion_time_offset(felt: Felt, motion: Motion) -> tuple[float, float] | None:
     """Return what should be added to the stamps of a motion, s, and its sigma; None if the accelerometer does not show it.
 
     Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. With correlation
