@@ -26,15 +26,15 @@ _WANTED = "a folder of tiles has z/x/y.png (or jpg, jpeg, webp), Web Mercator, a
 
 
 def describe_tiles(folder: Path, datum: Datum) -> str:
-    """Return GDAL's description (XML, to be opened as if it were a file) of a folder of tiles z/x/y.png, jpg, webp.
+    """Return GDAL's description (XML, to be opened like a file) of a folder of tiles z/x/y.png, jpg, webp.
 
-    The image is the deepest zoom level that is there (22 at most); the levels without a gap above it are its
-    overviews. Rows count from the top (XYZ) or from below (TMS): whichever brings the tiles nearer to the datum, XYZ
-    on a tie (which needs a datum within a tile or so of the equator, or tiles of both hemispheres).
+    The image is the deepest zoom level (22 at most); the levels above it without a gap are its overviews. Rows count from the top
+    (XYZ) or from below (TMS): whichever places the tiles nearer to the datum, XYZ if equal (which takes a datum within a tile or so
+    of the equator, or tiles of both hemispheres).
 
     Raises:
-        InputError: no such tiles, a part of such a folder, several kinds of files, what cannot be listed, or tiles that
-            are more than 100 km from the datum either way.
+        InputError: no such tiles, a part of such a folder, several kinds of files, a folder that cannot be listed, or tiles more
+            than 100 km from the datum either way.
     """
     try:
         return _described(folder, datum)
