@@ -59,7 +59,7 @@ class Clock(NamedTuple):
 def reference_of(imu: Clock, others: Iterable[Clock]) -> Clock:
     """Return the clock that others are compared with: the IMU's; if that counts from its start, the first one that has a date.
 
-    With the IMU's own clock the track would lie in 1970.
+    Compared with a clock that counts from its start, the track would be dated 1970.
     """
     return next((c for c in (imu, *others) if c.first_ns >= NO_DATE_NS), imu)
 

@@ -26,7 +26,7 @@ SCATTERS = 2.0
 
 
 def held(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
-    """Return (N,) which fixes repeat the position of the one before under a new stamp; None if the driver does so rarely.
+    """Return (N,) which fixes repeat the position of the one before under a new stamp; if that is rare, no fix is marked.
 
     Only repetitions before a change count: at rest, a receiver's filter may output one position several times.
     """

@@ -75,7 +75,7 @@ class Measured:
 
 
 def compared(track: Trajectory | None, reference: Trajectory, window: Window, *, sure: bool) -> Times:
-    """Return the errors of an estimate over a window.
+    """Return the errors of an estimate over a window; None: there is no estimate.
 
     Args:
         sure: the reference is truth; otherwise its own covariance is added to the estimate's.

@@ -142,9 +142,9 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield antennas whose suggested or unchecked position moves the track by more than its bounds.
+    """Yield antennas that calibration puts elsewhere, or whose configured position is the default, and whether the bounds cover that.
 
-    Neither the bounds nor held-out fixes of the same receiver show such an error.
+    Neither the bounds nor held-out fixes of the same receiver include such an error.
     """
     track = solution.trajectory
     if data.recording.truth is not None or track.cov is None:

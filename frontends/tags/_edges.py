@@ -172,7 +172,7 @@ def _settle(pixels: Array, cells: NDArray[np.uint8], prior: _Prior, start: _Rest
 
 
 def _together(A: Array, b: Array, inverse: Array, variance: float) -> float:
-    """Return the ratio of a block's gradient to that of independent pixels (Huber's sandwich)."""
+    """Return the variance of the blocks' pull on the corners, relative to that of independent pixels (Huber's sandwich)."""
     P = inverse[:8] @ A / variance
     alone = np.trace(inverse[:8] @ A @ inverse[:, :8] / variance - P @ inverse @ P.transpose(0, 2, 1), axis1=1, axis2=2)
     return float(((b @ inverse[:, :8] / variance) ** 2).sum() / alone.sum())

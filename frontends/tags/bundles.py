@@ -102,9 +102,9 @@ class Bundle:
         return np.asarray(block_diag(*shares))
 
     def doubt(self) -> None:
-        """Apply a robust loss to the image: corners that fit no pose as expected are blurred or partly hidden.
+        """Widen the noise of the corners if no pose fits as expected, since they are then blurred or partly hidden; drop poor minima.
 
-        Minima are excluded only afterwards: with the claimed noise of blurred corners, all but one would be.
+        Minima are dropped only afterwards: with the claimed noise of blurred corners, all but one would be.
         """
         if self.excess > chi2_95(self.dof) / self.dof:
             self.cov, self.seen_cov = self.cov * self.excess, self.seen_cov * self.excess
