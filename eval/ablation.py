@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each sensor bought: the run without it, measured, and whether it contradicts the others."""
+"""Contribution of each sensor: a run without it, its errors, and whether the sensor contradicts the others."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Basis = str
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Off:
-    """Distances from the basis over time: stamps (N,), horizontal m, heading deg or None."""
+    """Distances from the reference over time: stamps (N,), horizontal m, heading deg or None."""
 
     stamps_ns: NDArray[np.int64]
     off_m: Array
@@ -33,15 +33,16 @@ class Off:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effect:
-    """A run, with all sensors (`without` is '') or without one.
+    """Result with all sensors (`without` is '') or without one.
 
     Attributes:
-        measurements: of the sensor, in the recording (0: the configuration makes them). rmse_m, worst_m, heading_rmse_deg: against the basis. worst_at_s: since the run's begin.
-        bound_m, bound_deg: the solution's own 95 % bounds, median. missing: share of the full track that it lacks.
+        measurements: number of the sensor's in the recording (0: the configuration makes them).
+        rmse_m, worst_m, heading_rmse_deg: distances from the reference. worst_at_s: since the run's begin.
+        bound_m, bound_deg: median 95 % bounds of the solution. missing: share of the full track that it lacks.
         cost_ratio: cost over its expectation. contradiction: of the sensor with this solution, in sigmas
             (`graphloc.eval.consistency`).
-        fits: of each other sensor, how far what is used of it is from this solution, in its own sigmas.
-        why_not: why there is no run without it.
+        fits: by other sensor, how far its used measurements are from this solution, in its own sigmas.
+        why_not: why there is no solution without it.
     """
 
     without: str
@@ -63,7 +64,7 @@ class Effect:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vote:
-    """Two sensors that contradict the rest, and how far each is from what is left without both, in sigmas."""
+    """Two sensors that contradict the rest, and the distance of each from a solution without both, in sigmas."""
 
     one: str
     other: str
@@ -73,10 +74,12 @@ class Vote:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Ablated:
-    """What an ablation gives: the run with all sensors, without each, over time, and what the rest says of suspects.
+    """Result of an ablation.
 
     Attributes:
-        basis: what distances are from. begin_ns: of the track with all, from which on times count. matched: sensors whose measurements were made around the run with all.
+        basis: reference of the distances ('truth', 'held' or 'full'). begin_ns: origin of times, begin of the full track.
+        full, effects: with all sensors, and without each. over_time: distances by sensor that is left out.
+        votes: between suspects. matched: sensors whose measurements were made around the full solution.
     """
 
     source: str
@@ -92,7 +95,7 @@ class Ablated:
 
 
 def off(solution: Solution, full: Solution, truth: Trajectory | None, held: Sequence[GnssPosition], levers: Levers) -> Off:  # fmt: skip
-    """Compare a solution with truth, else with fixes that were held out, else with the solution with all sensors.
+    """Compare a solution with truth, else with held-out fixes, else with the solution with all sensors.
 
     Raises:
         NoCommonTimeError: they share no time.
@@ -112,7 +115,7 @@ def effect(
     without: str, measurements: int, solution: Solution, full: Solution, away: Off,
     contradicts: Contradiction | None, fits: Mapping[str, float | None],
 ) -> Effect:  # fmt: skip
-    """Return what a solution is like."""
+    """Return the effect of leaving out a sensor."""
     track, stats = solution.trajectory, solution.stats
     assert track.cov is not None
     bounds, worst = np.median(bounds_95(track.cov), axis=0), int(np.argmax(away.off_m))
@@ -135,6 +138,6 @@ def effect(
 
 
 def suspects(effects: Sequence[Effect]) -> list[str]:
-    """Return the sensors that contradict what is left without them, most first."""
+    """Return the sensors that contradict the solution without them, strongest first."""
     found = [(e.contradiction, e.without) for e in effects if (e.contradiction or 0.0) > CONTRADICTS]
     return [name for _, name in sorted(found, key=lambda pair: -(pair[0] or 0.0))]

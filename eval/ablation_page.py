@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an ablation says, as a page, Markdown and CSV."""
+"""Result of an ablation as a page, Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from graphloc.eval.ablation import CONTRADICTS, Ablated, Effect, Vote, suspects
+from graphloc.eval.formatting import percent
+from graphloc.eval.html import drawing
 from graphloc.eval.page import Cell, Grid, write_csv, write_markdown, write_page
-from graphloc.eval.pieces import drawing
 from graphloc.eval.plots import COLOURS, TRUTH, Figure, Line, Mark, Panel, Points, peaks
-from graphloc.eval.words import percent
 from graphloc.time import seconds_since
 
 MARK = "ablation.json"  # a folder with this file is ours to replace
@@ -31,7 +31,7 @@ _BASIS = {
 
 
 def said(ablated: Ablated) -> list[str]:
-    """Return what came out, in sentences."""
+    """Return the result in sentences."""
     lines = _contradictions(ablated) or [
         f"No sensor contradicts the others: each is within {CONTRADICTS:g} sigmas of the run without it."
     ]
@@ -87,8 +87,8 @@ def _verdict(vote: Vote) -> str:
     offs = {vote.one: vote.one_off, vote.other: vote.other_off}
     if vote.one_off is None or vote.other_off is None:
         return f"Without both {vote.one} and {vote.other} there is no track: nothing tells which of them is wrong."
-    told = " and ".join(f"{n} by {v:.1f} sigmas" for n, v in offs.items())
-    start = f"Without both {vote.one} and {vote.other}, what is left contradicts {told}: "
+    distances = " and ".join(f"{n} by {v:.1f} sigmas" for n, v in offs.items())
+    start = f"Without both {vote.one} and {vote.other}, what is left contradicts {distances}: "
     bad = [n for n, v in offs.items() if v is not None and v > CONTRADICTS]
     if len(bad) == 1:
         return f"{start}{bad[0]} is the likelier culprit."
@@ -101,7 +101,7 @@ def _verdict(vote: Vote) -> str:
 
 
 def grids(ablated: Ablated) -> list[Grid]:
-    """Return the table of what each sensor bought, and how the sensors fit each other."""
+    """Return the table of contributions, and that of how the sensors fit each other."""
     every = (ablated.full, *ablated.effects)
     held = ablated.basis == "held"
     rows = tuple(_row(e) for e in every)
@@ -142,7 +142,7 @@ def _number(value: float | None, unit: str, digits: int = 2) -> Cell:
 
 
 def _count(e: Effect) -> Cell:
-    """The height prior has none in the recording: the configuration makes it."""
+    """Return the number of measurements as text; the height prior has none in the recording."""
     return Cell(text=str(e.measurements) if e.measurements else "-")
 
 
@@ -168,7 +168,7 @@ def _row(e: Effect) -> tuple[Cell, ...]:
 
 
 def over_time(ablated: Ablated) -> Figure:
-    """Distances over time, a line for the run without each sensor; time as in the table, from the begin of the track."""
+    """Return the figure of distances over time, a line for each sensor that is left out; time since the begin of the track."""
     marks: list[Mark] = []
     for k, (name, away) in enumerate(ablated.over_time.items()):
         step = peaks(away.off_m)
@@ -196,6 +196,6 @@ def write(ablated: Ablated, folder: Path, command: str) -> None:
     every = [asdict(e) for e in (ablated.full, *ablated.effects)]
     flat = [{k: v for k, v in e.items() if k != "fits"} for e in every]
     write_csv(folder / "ablation.csv", flat)
-    told = {"command": command, "basis": ablated.basis, "said": lines, "runs": every,
-            "votes": [asdict(v) for v in ablated.votes], "warnings": ablated.warnings}  # fmt: skip
-    (folder / MARK).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    content = {"command": command, "basis": ablated.basis, "said": lines, "runs": every,
+               "votes": [asdict(v) for v in ablated.votes], "warnings": ablated.warnings}  # fmt: skip
+    (folder / MARK).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a sensor agree with a solution that has not seen it?
+"""Consistency of a sensor with a solution that did not use it.
 
-Of each measurement z, in the solution without its sensor:  r = h(x) - z,  S = R + J P J^T + K Q K^T, with R what it claims
-of itself, P the solution's covariance of the pose, and Q the standing size of the sensor's own slow error (K: d r / d slow).
-r^T S^-1 r is a chi-square of dim r where both are honest about themselves. The measure is
+For each measurement z, in the solution without its sensor:  r = h(x) - z,  S = R + J P J^T + K Q K^T, with R the claimed covariance,
+P the solution's covariance of the pose, and Q the stationary covariance of the sensor's own slow error (K: d r / d slow).
+r^T S^-1 r is chi-square with dim r degrees of freedom if both covariances are honest. The measure is
 
     contradiction = sqrt(median of r^T S^-1 r / median of that chi-square)
 
-in sigmas: 1 where all is well, below 1 where slow errors are smaller than they might be. A median is not moved by the false
-ones; where a sensor owns to a share f of these, the quantile 0.5 (1 - f) stands in: the median of the others.
-Successive residuals share their errors, so no significance is claimed.
+in sigmas: 1 if all is well, below 1 if slow errors are smaller than they might be. The median is robust against false
+measurements; for a sensor with a share f of them, the quantile 0.5 (1 - f), the median of the others, replaces it.
+Successive residuals share their errors, so no significance is stated.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _FEWEST = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _There:
-    """What a solution knows at one stamp."""
+    """Pose and covariance of a solution at one stamp."""
 
     T_world_body: gtsam.Pose3
     P_tangent: Array  # (6, 6) of the pose, gtsam's body tangent
@@ -48,7 +48,7 @@ class _There:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contradiction:
-    """How far a sensor is from a solution without it: in sigmas, and the median in m and deg, where it measures such."""
+    """Distance of a sensor from a solution without it: in sigmas, and the median in m and deg, if it measures such."""
 
     sigmas: float
     apart_m: float | None
@@ -58,7 +58,7 @@ class Contradiction:
 def contradiction(
     solution: Solution, recording: Recording, config: VesselConfig, name: str, rows: Sequence[Sensor]
 ) -> Contradiction | None:
-    """Return how far a sensor's measurements are from a solution without it; None: too few to tell."""
+    """Return the distance of a sensor's measurements from a solution without it; None if there are too few."""
     sensor = config.sensors[name]
     row = next(r for r in rows if r.kind == sensor.kind)
     own = [m for m in recording.measurements if m.sensor == name]
@@ -112,7 +112,7 @@ def _at(solution: Solution, measurements: Sequence[Measurement]) -> list[_There]
 
 
 def _attachment(solution: Solution, there: _There, t: Array, R: Array) -> Attachment:
-    """A state at the body's origin and at the measurement's stamp, which is no state of the graph."""
+    """Return an attachment to a state at body's origin and at the measurement's stamp, which is not in the graph."""
     return Attachment(
         pose_key=0,
         velocity_key=0,
@@ -130,7 +130,7 @@ def _attachment(solution: Solution, there: _There, t: Array, R: Array) -> Attach
 
 
 def _nis(m: Measurement, config: object, row: Sensor, at: Attachment, there: _There) -> tuple[float, Residual]:
-    """Return the smallest normalised square of its hypotheses, and that one."""
+    """Return the smallest normalised square of the hypotheses, and that hypothesis."""
     slow = row.slow(config)
     if slow is not None:
         at = replace(at, slow_key=0, slow_value=np.zeros(len(slow.sigma)))
@@ -154,7 +154,7 @@ def _nis(m: Measurement, config: object, row: Sensor, at: Attachment, there: _Th
 
 
 def fit(solution: Solution, name: str) -> float | None:
-    """Return how far what is used of a sensor is from a solution with it, in its own sigmas; 1: as it claims."""
+    """Return the distance of a sensor's used measurements from a solution with it, in its own sigmas; 1: as it claims."""
     used = [
         (row.nis, row.dof)
         for row in solution.ledger

@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Digerud's Kalman filter (D app. B), the baseline on docking runs: one tag, one pose of it, a 2 m gate.
 
-State x, vx, y, vy, z, vz of the camera; at each sighting k of his tag, with z_k the place that its pose gives:
+State x, vx, y, vy, z, vz of the camera; at each sighting k of the tag, with z_k the position by its pose:
 
     |z_k - H x_(k-1)| < 2 m:   predict, then update with R = 11 I      x- = F x,  P- = F P F' + Q
-    otherwise:                 predict only                            Q = I, the default of his library, pykalman
-    start:                     x_0 = (z_1, at rest), P_0 = I, and z_1 is then filtered as the others are
+    otherwise:                 predict only                            Q = I, the default of the library pykalman
+    start:                     x_0 = (z_1, at rest), P_0 = I, and z_1 is then filtered like the others
 
-The gate looks at the state before prediction, as the print has it (sec. 2.6 compares z with the predicted one). It
-opens for nothing but a pose near the state: when z_1 is the flipped pose, right ones are dropped until the state,
-which then only flipped poses move, comes within 2 m of them: at close range it may (sec. 4.5), else never (sec. 4.4).
+The gate compares with the state before prediction, as printed (sec. 2.6 compares z with the predicted one). Only a pose near the
+state opens it: if z_1 is the flipped pose, right ones are dropped until the state, which then only flipped poses move, comes
+within 2 m of them: at close range it may (sec. 4.5), otherwise never (sec. 4.4).
 
-He has the camera in the tag's frame; here it is in world, the tags' frame at rest. With Q, R, P_0 and the gate alike
-on every axis that is the same filter, turned. A dock that moves is not known to it: its place in world moves along.
+D has the camera in the tag's frame; here it is in world, the tags' frame at rest. With Q, R, P_0 and the gate equal on every axis
+that is the same filter, rotated. It does not model a moving dock: its position in world moves along.
 
-The pose: sec. 2.7.4 names `cv2.solvePnP` (Levenberg-Marquardt), app. A calls swatbotics' `detection_pose`. Either
-descends from the homography's pose into a minimum of the reprojection error nearby, and nobody chooses between the two.
-Here both are found and the lower one is taken: at 5-25 m and 0.3 px it is the flipped one as often as that of
-`cv2.solvePnP`, within 1 % of sightings (400 draws at each of 18 places).
+The pose: sec. 2.7.4 names `cv2.solvePnP` (Levenberg-Marquardt), app. A calls swatbotics' `detection_pose`. Both descend from the
+homography's pose to a nearby minimum of the reprojection error, without a choice between the two. Here both are found and the
+lower one is used: at 5-25 m and 0.3 px it is the flipped one as often as that of `cv2.solvePnP`, within 1 % of sightings (400
+draws at each of 18 positions).
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ from graphloc.time import NS_PER_S, seconds_between
 from graphloc.trajectory import Trajectory
 
 _H = np.kron(np.eye(3), [1.0, 0.0])  # (3, 6): places of x, vx, y, vy, z, vz
-_FOCAL_PX = 1069.38  # his; OpenCV refines too little where it is given rays instead of pixels
-_ATTITUDE_RAD = float(np.radians(10.0))  # of a pose at about 10 m, unless it is flipped; his filter has no attitude
+_FOCAL_PX = 1069.38  # of D's camera; OpenCV refines too little where it is given rays instead of pixels
+_ATTITUDE_RAD = float(np.radians(10.0))  # of a pose at about 10 m, unless it is flipped; the filter has no attitude
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,11 +51,11 @@ class DigerudConfig:
     """D app. B as printed.
 
     Attributes:
-        dt_s: time step, the same for every sighting, s; None: the true one. Q is one step's in either case.
-        r: variance of the measured place, each axis, m^2.
-        gate_m: poses that far from the state, or farther, are dropped.
-        number: id of the tag that is used (his: 227), of the family that is seen most with it; None: the tag seen most
-            often. One camera: that which sees it most.
+        dt_s: time step, the same for every sighting, s; None: the true one. Q is that of one step in either case.
+        r: variance of the measured position, each axis, m^2.
+        gate_m: poses this far from the state, or farther, are dropped.
+        number: id of the tag to use (printed: 227), of the family in which it is seen most; None: the tag seen most often.
+            Only the camera that sees it most is used.
     """
 
     dt_s: float | None = 0.04
@@ -67,16 +67,16 @@ class DigerudConfig:
 def run_digerud(
     recording: Recording, config: VesselConfig, datum: Datum, options: DigerudConfig | None = None
 ) -> FilterResult | None:
-    """Run the filter; None where its tag was sighted fewer than two times, which makes no track.
+    """Run the filter; None if its tag was sighted less than twice, which does not make a track.
 
-    The track is of the body at the sightings' stamps, its attitude that of the last pose that was taken (10 deg of sigma
-    about each axis), so a flip turns the vessel. With the printed step it has no velocity: that of the filter is per
-    0.04 s, whatever time passed, and would bend the interpolation. P is the filter's own, of the camera.
+    The track is of the body at the sightings' stamps, with the attitude of the last accepted pose (sigma 10 deg about each axis),
+    so a flip turns the vessel. With the printed step it has no velocity: the filter's is per 0.04 s, whatever time passed, and
+    would distort the interpolation. P is the filter's own, of the camera.
 
     Args:
-        recording: its sightings of enabled sensors are used; those of other tags are rows of the ledger.
-        config: says which sensors are enabled.
-        datum: not needed, tags are surveyed in world; it is here so that all filters are called alike.
+        recording: sightings of enabled sensors are used; those of other tags get rows in the ledger.
+        config: which sensors are enabled.
+        datum: not used, since tags are surveyed in world; for the same signature as other filters.
         options: None: as printed.
     """
     o = options or DigerudConfig()
@@ -89,16 +89,16 @@ def run_digerud(
     if not seen:
         return None
     chosen = seen.most_common(1)[0][0]
-    his = chosen[2]
+    own_tag = chosen[2]
     ledger = Ledger()
     off_m: dict[int, float] = {}
     out: dict[int, tuple[_State, Array]] = {}
     state: _State | None = None
     for m in sightings:
-        if (m.sensor, m.camera, his) != chosen or his not in m.tags:
+        if (m.sensor, m.camera, own_tag) != chosen or own_tag not in m.tags:
             ledger.add(filter_row(m, recording, None, "not of the one tag and camera that it uses"))
             continue
-        pose = single_tag_pose(m, his)
+        pose = single_tag_pose(m, own_tag)
         if pose is None:
             ledger.add(filter_row(m, recording, None, "no pose from its corners"))
             continue
@@ -121,7 +121,7 @@ def run_digerud(
 
 
 def _off_m(p_world_camera: Array, m: TagSighting, truth: Trajectory | None) -> float:
-    """How far a pose puts the camera from where it is: by truth, else by the likeliest pose of all tags in the image."""
+    """Return the camera's position error by a pose: against truth, else against the likeliest pose of all tags in the image."""
     there, at = m.modes[0].p_world_camera_m, np.array([m.stamp_ns])
     if truth is not None and truth.covers(at)[0]:
         true = truth.at(at)
@@ -130,10 +130,10 @@ def _off_m(p_world_camera: Array, m: TagSighting, truth: Trajectory | None) -> f
 
 
 def _why(ledger: Ledger, off_m: Mapping[int, float], o: DigerudConfig) -> str:
-    """Say what the gate did: how many it dropped, for how long on end, how many of them right, and what it started on.
+    """Return what the gate did: how many poses it dropped, for how long in a row, how many of them right, and the first pose.
 
     Args:
-        off_m: by arrival number, how far off the pose was (`_off_m`).
+        off_m: by arrival number, error of the pose (`_off_m`).
     """
     tried = [row for row in ledger if row.seq in off_m]
     dropped = [row for row in tried if row.outcome is Outcome.REJECTED]
@@ -153,11 +153,10 @@ def _why(ledger: Ledger, off_m: Mapping[int, float], o: DigerudConfig) -> str:
 
 
 def single_tag_pose(m: TagSighting, tag: tuple[str, int]) -> tuple[Array, Array] | None:
-    """Return p_world_camera (3,) m and R_world_camera (3, 3) by one tag alone: of its two poses that which fits better.
+    """Return p_world_camera (3,) m and R_world_camera (3, 3) by one tag alone: the better of its two poses.
 
-    Infinitesimal plane-based pose estimation gives both, Levenberg-Marquardt brings each to its minimum of the
-    reprojection error, all corners weighing the same. The tag's frame is taken at rest. None: the solver finds none, as
-    for corners on a line.
+    Infinitesimal plane-based pose estimation gives both; Levenberg-Marquardt brings each to its minimum of the reprojection error,
+    with equal weights of all corners. The tag's frame is taken at rest. None if the solver finds none, as for corners on a line.
     """
     first = 4 * m.tags.index(tag)
     corners, pixels = m.points_m[first : first + 4], m.rays[first : first + 4] * _FOCAL_PX
@@ -185,7 +184,7 @@ def single_tag_pose(m: TagSighting, tag: tuple[str, int]) -> tuple[Array, Array]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
-    """x (6,), P (6, 6) at a stamp, and the attitude (3, 3) of the last pose that was taken."""
+    """x (6,), P (6, 6) at a stamp, and the attitude (3, 3) of the last accepted pose."""
 
     stamp_ns: int
     x: Array
@@ -196,7 +195,7 @@ class _State:
 def _filtered(
     before: _State, stamp_ns: int, z: Array, R_world_body: Array | None, o: DigerudConfig
 ) -> tuple[_State, float]:
-    """Return the state one sighting on, and the NIS of its place z (3,); R_world_body None: it is not taken."""
+    """Return the state after a sighting, and the NIS of its position z (3,); R_world_body None: it is not used."""
     dt_s = o.dt_s if o.dt_s is not None else seconds_between(before.stamp_ns, stamp_ns)
     F = np.kron(np.eye(3), [[1.0, dt_s], [0.0, 1.0]])
     x, P = F @ before.x, F @ before.P @ F.T + np.eye(6)
@@ -209,7 +208,7 @@ def _filtered(
 
 
 def _track(out: dict[int, tuple[_State, Array]], *, timed: bool) -> Trajectory:
-    """Track of the body by states and lever arms (3,); `timed`: the filter's velocity (of the camera) is one."""
+    """Return the track of the body from states and lever arms (3,); `timed`: the filter's velocity (of the camera) is valid."""
     states = [state for state, _ in out.values()]
     x, R = np.array([s.x for s in states]), np.array([s.R_world_body for s in states])
     cov = np.zeros((len(out), 6, 6))
@@ -229,8 +228,8 @@ class Losses:
     """How a filter lost the vessel.
 
     Attributes:
-        at_end: more than 2 m off, horizontally, all through its last 5 s.
-        lost_s: for how long it was more than 2 m off. covered_s: for how long it could be compared.
+        at_end: more than 2 m off, horizontally, throughout the last 5 s.
+        lost_s: time with an error above 2 m. covered_s: time that was compared.
     """
 
     at_end: bool
@@ -239,7 +238,7 @@ class Losses:
 
 
 def losses(result: FilterResult, truth: Trajectory) -> Losses:
-    """Return how a filter fared against truth, at the truth's stamps that it covers.
+    """Return the losses of a filter against truth, at the truth's stamps that it covers.
 
     Raises:
         NoCommonTimeError: it covers none.

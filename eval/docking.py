@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a docking run shows: error by distance to the tags, where the vessel ended up, where it lies at its berth."""
+"""Errors of a docking run: by distance to the tags, at the end, and relative to the berth."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ _NOTE = (
 
 
 def tags_at_rest(survey: Survey) -> tuple[Array, Array]:
-    """Return middles (T, 3) m and axes (T, 3, 3) in world of all tags, docks at rest."""
+    """Return the middles (T, 3), m, and axes (T, 3, 3) of all tags in world, docks at rest."""
     frames = [survey.rest(tag.frame) for tag in survey.tags]
     places = [p + R @ tag.xyz_m for (p, R), tag in zip(frames, survey.tags, strict=True)]
     return np.array(places), np.array([R @ tag.R_frame_tag for (_, R), tag in zip(frames, survey.tags, strict=True)])
 
 
 def tag_range_m(track: Trajectory, survey: Survey, lever_m: Array | None = None) -> Array:
-    """Return the horizontal distance (N,) m to the nearest tag, docks at rest, at the track's stamps.
+    """Return the horizontal distance (N,), m, to the nearest tag, docks at rest, at the track's stamps.
 
     Args:
         track: of the body.
-        survey: with one tag at least.
-        lever_m: (3,) point in body to measure from, a camera's say; None: the body's origin.
+        survey: with at least one tag.
+        lever_m: (3,) point in body to measure from, such as a camera; None: the body's origin.
     """
     p = track.p_world_m if lever_m is None else track.p_world_m + track.R_world_body @ lever_m
     away = p[:, None, :2] - tags_at_rest(survey)[0][None, :, :2]
@@ -60,11 +60,11 @@ def docking_table(
     sightings_ns: Stamps,
     lever_m: Array | None = None,
 ) -> Table:
-    """Return one row an estimate; None where an estimate does not cover any of the time that a number is of.
+    """Return a table with a row per estimate; None where an estimate does not cover the period of a number.
 
     Args:
         estimates: names and tracks of the body. truth: of the body.
-        survey: with one tag at least.
+        survey: with at least one tag.
         sightings_ns: stamps (S,) of the sightings; without any, only the columns of the end are filled.
         lever_m: (3,) point in body that distances to tags are measured from; None: the body's origin.
     """
@@ -103,15 +103,13 @@ def accurate_within_m(
     lever_m: Array | None = None,
     limit_m: float = DNV_M,
 ) -> float | None:
-    """Return the largest distance (m) to the tags within which 95 % of horizontal errors are below a limit.
+    """Return the largest distance (m) to the tags within which 95 % of horizontal errors are below a limit; None if there is none.
 
     Args:
-        estimate, truth: of the body. survey: with one tag at least. sightings_ns: (S,), one at least: time counts from
-            the first on; what the estimate does not cover counts as missed.
+        estimate, truth: of the body. survey: with at least one tag.
+        sightings_ns: (S,), at least one: only stamps after the first count; those that the estimate does not cover count
+            as errors above the limit.
         lever_m: (3,) point in body that distances are measured from; None: the body's origin.
-
-    Returns:
-        None where there is no such distance.
     """
     seen = truth.stamps_ns >= sightings_ns.min()
     range_m = tag_range_m(truth, survey, lever_m)[seen]
@@ -127,7 +125,7 @@ def _p95(error: Array) -> float | None:
 
 
 def _off(estimate: Trajectory, truth: Trajectory) -> Array:
-    """Horizontal estimate less truth (N, 2) at the truth's stamps; NaN where the estimate does not cover them."""
+    """Return the horizontal error (N, 2) at the truth's stamps; NaN where the estimate does not cover them."""
     covered = estimate.covers(truth.stamps_ns)
     off = np.full((len(truth), 2), np.nan)
     if covered.any():
@@ -136,11 +134,7 @@ def _off(estimate: Trajectory, truth: Trajectory) -> Array:
 
 
 def _wrong_side(off: Array, true: Array, survey: Survey) -> int | None:
-    """1 where estimate and truth lie, on the mean, on two sides of the nearest tag's face or middle, > 1 m apart.
-
-    Args:
-        off: (M, 2) estimate less truth in world. true: (M, 2 or 3) truth in world.
-    """
+    """Return 1 if mean estimate and truth are > 1 m apart, on different sides of the nearest tag's face or middle."""
     if not len(off):
         return None
     middles, axes = tags_at_rest(survey)
@@ -154,19 +148,19 @@ def _wrong_side(off: Array, true: Array, survey: Survey) -> int | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DockMotion:
-    """How a dock moved: at stamps (M,), `moved` (M, 4): east, north, up in m, yaw in rad, from rest."""
+    """Motion of a dock from rest at stamps (M,): `moved` (M, 4), east, north, up in m, yaw in rad."""
 
     stamps_ns: Stamps
     moved: Array
 
 
 def relative(track: Trajectory, berth: Berth, dock: DockMotion | None = None) -> BerthTrack:
-    """Return a track as it is seen from a berth: across, along, angle, as `graphloc.berths` draws them, and their rates.
+    """Return a track relative to a berth: across, along, angle, as in `graphloc.berths`, and their rates.
 
     Args:
         track: of the body.
         berth: at rest.
-        dock: how it truly moved, or was said to; None: it did not. Interpolated linearly, and held beyond its ends.
+        dock: its motion, true or estimated; None: at rest. Interpolated linearly, and constant beyond its ends.
     """
     moved = np.zeros((len(track), 4))
     if dock is not None:

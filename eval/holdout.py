@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keep GNSS fixes out of a run, to predict them: every n-th, or gaps of some seconds."""
+"""Hold GNSS fixes out of a run to measure its accuracy: every n-th fix, or gaps of some seconds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graphloc.recording import Recording
 
 @dataclass(frozen=True, slots=True)
 class HoldOut:
-    """`every` n-th fix, or `gaps` gaps of `gap_s` seconds spread evenly over the fixes' span."""
+    """Every `every`-th fix, or `gaps` gaps of `gap_s` seconds each, spread evenly over the span of the fixes."""
 
     every: int = 0
     gaps: int = 0
@@ -24,10 +24,10 @@ class HoldOut:
 
     @staticmethod
     def parse(text: str) -> HoldOut:
-        """Read `every:N` or `gaps:COUNTxSECONDS`.
+        """Parse `every:N` or `gaps:COUNTxSECONDS`.
 
         Raises:
-            ConfigError: it is neither.
+            ConfigError: the text has neither form.
         """
         if match := re.fullmatch(r"every:(\d+)", text):
             if int(match[1]) >= 2:
@@ -37,10 +37,10 @@ class HoldOut:
         raise ConfigError(f"--hold-out {text}: use every:N (N of 2 or more) or gaps:COUNTxSECONDS, e.g. gaps:8x10")
 
     def split(self, recording: Recording) -> tuple[Recording, tuple[GnssPosition, ...]]:
-        """Return the recording without the held fixes (their ledger rows say so), and the held fixes.
+        """Return the recording without the held-out fixes, which keep a row in its ledger, and these fixes.
 
         Raises:
-            ConfigError: the run has too few fixes, or the gaps would run into each other.
+            ConfigError: there are too few fixes, or the gaps would overlap.
         """
         fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)]
         if len(fixes) < 3:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Markdown of tables."""
+"""Tables in Markdown."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from collections.abc import Sequence
 
 
 def row(cells: Sequence[str]) -> str:
-    """Return a row of a table; what would end a cell or the row is escaped."""
+    """Return a row of a table; characters that would end a cell or the row are escaped."""
     return "| " + " | ".join(" ".join(cell.split("\n")).replace("|", "\\|") for cell in cells) + " |"

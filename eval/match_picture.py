@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of one aerial match: the scan on the image, the score as a heat map, the modes with their ellipses."""
+"""Picture of an aerial match: the scan on the image, the score as a heat map, the modes with their 95 % ellipses."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _MODES = ((0, 255, 255), (255, 0, 255), (255, 255, 0), (200, 200, 200), (120, 12
 
 
 class Gallery:
-    """Of all matches of a run the best, the worst, the most ambiguous and the first without a mode, as pictures."""
+    """Pictures of some matches of a run: the best, the worst, the most ambiguous, and the first without a mode."""
 
     def __init__(self) -> None:
         self._kept: dict[str, tuple[float, str, str, bytes]] = {}
 
     def offer(self, match: Match, sensor: str, at_s: float) -> None:
-        """Keep a match where none before was better, worse or more ambiguous."""
+        """Keep a match if it is the best, worst or most ambiguous so far."""
         if match.score is None:
             return
         if not match.modes:
@@ -60,7 +60,7 @@ class Gallery:
         self._kept[what] = (mark, where, said, coded.tobytes())
 
     def pictures(self) -> list[tuple[str, bytes]]:
-        """Return captions and JPEGs; a match that is two of these comes once."""
+        """Return captions and JPEGs; a match that is kept for two reasons comes once."""
         found: dict[str, tuple[str, bytes]] = {}
         for what, (_, where, said, coded) in self._kept.items():
             before = f"{found[where][0]}; " if where in found else ""
@@ -72,7 +72,7 @@ def write_picture(match: Match, path: Path) -> None:
     """Write the picture of a match.
 
     Raises:
-        OutputError: there is nothing to draw, or the disk refuses.
+        OutputError: there is nothing to draw, or the file cannot be written.
     """
     canvas = drawn(match)
     try:
@@ -85,7 +85,7 @@ def write_picture(match: Match, path: Path) -> None:
 
 
 def drawn(match: Match) -> Pixels:
-    """Return the picture (rows, columns, 3), blue, green, red; the scan lies where the best mode has it, or the prior.
+    """Return the picture (rows, columns, 3) in BGR; the scan is placed by the best mode, or else by the prior.
 
     Raises:
         OutputError: there is nothing to draw.
@@ -120,7 +120,7 @@ def drawn(match: Match) -> Pixels:
 
 
 def _image(match: Match, pose: Array) -> tuple[Pixels, Array]:
-    """The image around a pose, enlarged, and the cell of its top left corner."""
+    """Return the enlarged image around a pose, and the map cell of its top-left corner."""
     assert match.layers is not None
     patch = match.layers.patch
     half = int(_AROUND_M / patch.cell_m)
@@ -148,14 +148,14 @@ def _arrow(canvas: Pixels, match: Match, pose: Array, corner: Array, colour: tup
 def _ellipse(
     canvas: Pixels, match: Match, pose: Array, cov: Array, corner: Array, colour: tuple[int, int, int]
 ) -> None:
-    """95 % of a mode."""
+    """Draw the 95 % ellipse of a mode."""
     angle = np.linspace(0.0, 2.0 * np.pi, 60)
     ring = np.column_stack([np.cos(angle), np.sin(angle)]) @ np.linalg.cholesky(chi2_95(2) * cov).T + pose[:2]
     cv2.polylines(canvas, [_pixels(match, ring, corner).astype(np.int32)], True, colour, 2, cv2.LINE_AA)
 
 
 def _heat(match: Match, rows: int) -> Pixels:
-    """The score, the best heading of each place; below, what the picture shows."""
+    """Return the score at the best heading of each position, with a legend below."""
     assert match.score is not None
     assert match.grid is not None
     best = match.score.max(axis=0)

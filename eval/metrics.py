@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good an estimate is: BL eq. 2.29-2.32, percentiles, NEES, coverage, held-out fixes, speed.
+"""Accuracy of an estimate: errors (BL eq. 2.29-2.32), percentiles, NEES, coverage; against truth, held-out fixes or speed.
 
-The estimate is interpolated to the truth's stamps; nothing is aligned; the matched fraction is always
-given, since a track that covers half a run must not look better for it.
+The estimate is interpolated at the stamps of the truth and not aligned to it. The matched share is always reported, so that
+a track that covers half of a run does not look better for it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from graphloc.chi2 import chi2_95
 from graphloc.errors import InputError
-from graphloc.eval.words import number
+from graphloc.eval.formatting import number
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.recording import SpeedSeries
@@ -25,12 +25,12 @@ Levers = Mapping[str, Array]
 
 
 class NoCommonTimeError(InputError):
-    """An estimate and what it is to be compared with share no time."""
+    """An estimate and its reference have no time in common."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Numbers for people: a title, column names, rows of a name and values, and a note."""
+    """A table of numbers: title, names of columns, rows (name, values), and a note."""
 
     title: str
     columns: tuple[str, ...]
@@ -38,11 +38,11 @@ class Table:
     note: str = ""
 
     def as_dict(self) -> dict[str, dict[str, float | None]]:
-        """Return row name -> column -> value."""
+        """Return the values by name of row and column."""
         return {name: dict(zip(self.columns, values, strict=True)) for name, values in self.rows}
 
     def as_text(self) -> str:
-        """Return the table as aligned text, estimates as columns: it fits a terminal."""
+        """Return the table as aligned text with a column per estimate, so that it fits a terminal."""
         numbers = [[number(vs[k]) for _, vs in self.rows] for k in range(len(self.columns))]
         cells = [["", *(name for name, _ in self.rows)]]
         cells += [[column, *values] for column, values in zip(self.columns, numbers, strict=True)]
@@ -56,10 +56,10 @@ class Table:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TruthMetrics:
-    """Errors against truth: position horizontal (BL eq. 2.29, 2.30), heading (2.31, 2.32).
+    """Errors against truth: horizontal position (BL eq. 2.29, 2.30) and heading (eq. 2.31, 2.32).
 
-    NEES is of the horizontal position, 2 degrees of freedom: 2.0 if the covariance is honest. Coverage:
-    share of times at which the 95 % region holds the truth. None where there is no covariance.
+    `nees` is of the horizontal position: 2.0 (degrees of freedom) where the covariance is honest. `coverage_95` is the share of
+    stamps at which the 95 % region holds the truth. None without a covariance.
     """
 
     position_rmse_m: float
@@ -76,7 +76,14 @@ class TruthMetrics:
 
 
 def errors(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], Array, Array, Trajectory, float]:
-    """Return t (M,) ns, position error (M, 3) m, heading error (M,) rad, the estimate there, matched share."""
+    """Return the errors of an estimate at the stamps of the truth that it covers.
+
+    Returns:
+        Stamps (M,) ns, position error (M, 3) m in world, heading error (M,) rad, the interpolated estimate, covered share.
+
+    Raises:
+        NoCommonTimeError: it covers none of them.
+    """
     covered = estimate.covers(truth.stamps_ns)
     stamps = truth.stamps_ns[covered]
     if not len(stamps):
@@ -92,13 +99,21 @@ def errors(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], 
 
 
 def squared_over_covariance(error: Array, cov: Array) -> Array:
-    """Return the horizontal error (N, 3 or 2) m squared over its covariance (N, 6, 6): chi-square of 2 if that is honest."""
+    """Return the squared Mahalanobis norm (N,) of horizontal errors.
+
+    Args:
+        error: (N, 2 or 3) m. cov: (N, 6, 6), position first.
+    """
     solved = np.linalg.solve(cov[:, :2, :2], error[:, :2, None])[..., 0]
     return np.asarray(np.einsum("ni,ni->n", error[:, :2], solved))
 
 
 def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
-    """Return the metrics of an estimate against truth."""
+    """Return the errors of an estimate against truth.
+
+    Raises:
+        NoCommonTimeError: it covers no stamp of the truth.
+    """
     _, error, heading, there, matched = errors(estimate, truth)
     horizontal = np.hypot(error[:, 0], error[:, 1])
     nees = coverage = heading_coverage = None
@@ -123,9 +138,9 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOutMetrics:
-    """Predicted antenna against held-out fixes.
+    """Errors of the predicted antenna position against held-out fixes.
 
-    `outage_drift_m`: RMS of the largest error of each gap; None where the fixes form no several gaps.
+    `outage_drift_m`: RMS over the gaps of the largest error in each; None if the fixes do not form several gaps.
     """
 
     horizontal_rmse_m: float
@@ -140,13 +155,16 @@ class HeldOutMetrics:
 def held_out_errors(
     estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers
 ) -> tuple[NDArray[np.int64], Array, float]:
-    """Return stamps (M,), error (M, 3) of the predicted antenna, and the matched share.
+    """Return the errors of the predicted antenna position at held-out fixes.
 
     Args:
-        levers_m: by receiver, its antenna in body.
+        levers_m: antenna of each receiver in body, (3,) m.
+
+    Returns:
+        Stamps (M,) ns, errors (M, 3) m in world, and the covered share.
 
     Raises:
-        NoCommonTimeError: the estimate covers none of them.
+        NoCommonTimeError: the estimate covers none of the fixes.
     """
     stamps = np.array([m.stamp_ns for m in held], dtype=np.int64)
     fixes = world_from_fixes(held, datum)
@@ -163,7 +181,14 @@ def held_out_errors(
 def compare_to_held_out(
     estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers
 ) -> HeldOutMetrics:
-    """Return the metrics of an estimate against held-out fixes."""
+    """Return the errors of an estimate against held-out fixes.
+
+    Args:
+        levers_m: antenna of each receiver in body, (3,) m.
+
+    Raises:
+        NoCommonTimeError: the estimate covers none of the fixes.
+    """
     stamps, error, matched = held_out_errors(estimate, held, datum, levers_m)
     horizontal = np.hypot(error[:, 0], error[:, 1])
     solid = all(m.has_height for m in held)
@@ -184,7 +209,7 @@ def compare_to_held_out(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpeedMetrics:
-    """Forward speed of the estimate less that of a sensor that was not fused."""
+    """Forward speed of the estimate minus that of a sensor that was not fused."""
 
     mean_mps: float
     std_mps: float
@@ -192,7 +217,11 @@ class SpeedMetrics:
 
 
 def compare_speed(estimate: Trajectory, check: SpeedSeries) -> SpeedMetrics:
-    """Return how the forward speed (body x) agrees with an independent one."""
+    """Compare the forward speed (along body x) with an independent one.
+
+    Raises:
+        NoCommonTimeError: the estimate covers none of its stamps. ValueError: the estimate has no velocity.
+    """
     covered = estimate.covers(check.stamps_ns)
     if not covered.any():
         raise NoCommonTimeError(f"the track and {check.topic} share no time: check its stamps")
@@ -219,18 +248,18 @@ def _table(title: str, rows: Sequence[tuple[str, object]], note: str) -> Table:
 
 
 def truth_table(estimates: _Named, truth: Trajectory) -> Table:
-    """Return one row an estimate, against truth."""
+    """Return a table with a row per estimate, against truth."""
     rows = [(name, compare_to_truth(t, truth)) for name, t in estimates]
     return _table("Against truth", rows, "position: horizontal; interpolated to the truth's stamps, not aligned")
 
 
 def held_out_table(estimates: _Named, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers) -> Table:
-    """Return one row an estimate, against held-out fixes."""
+    """Return a table with a row per estimate, against held-out fixes; `levers_m` as for `held_out_errors`."""
     rows = [(name, compare_to_held_out(t, held, datum, levers_m)) for name, t in estimates]
     return _table("Against held-out fixes", rows, "the fixes' own noise is part of the error")
 
 
 def speed_table(estimates: _Named, check: SpeedSeries) -> Table:
-    """Return one row an estimate, against an independent forward speed."""
+    """Return a table with a row per estimate, against an independent forward speed."""
     rows = [(name, compare_speed(t, check)) for name, t in estimates if t.v_world_mps is not None]
     return _table("Forward speed", rows, f"estimate less {check.topic}, which was not fused")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page with tables and figures, and the same tables as Markdown and CSV: what drills and ablations are shown on."""
+"""Pages of drills and ablations: tables and figures as HTML, the tables also as Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pathlib import Path
 
 from plotly.offline import get_plotlyjs
 
-from graphloc.eval import markdown, pieces
+from graphloc.eval import html, markdown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """A cell of a table: its text, and 'bad' or 'doubt' where a reader's eye should fall."""
+    """A cell of a table: its text, and '' or a highlight ('bad' or 'doubt')."""
 
     text: str
     mark: str = ""
@@ -25,7 +25,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
-    """A table of text: a title, a head, rows of cells as long as the head, and a note below."""
+    """A table of text: title, head, rows of cells (as long as the head), and a note below."""
 
     title: str
     head: tuple[str, ...]
@@ -33,7 +33,7 @@ class Grid:
     note: str = ""
 
     def as_html(self) -> str:
-        """Return the table with its heading; text to the left, numbers to the right."""
+        """Return the table with its heading; words are left-aligned, numbers right-aligned."""
         left = ["" if not k or all(_number(r[k].text) for r in self.rows) else "text" for k in range(len(self.head))]
         head = "".join(f'<th class="{c}">{escape(h)}</th>' for h, c in zip(self.head, left, strict=True))
         rows = "".join(
@@ -46,16 +46,16 @@ class Grid:
             for row in self.rows
         )
         table = f'<div class="scroll"><table><tr>{head}</tr>{rows}</table></div>'
-        return f"<h2>{escape(self.title)}</h2>{table}{pieces.note(self.note)}"
+        return f"<h2>{escape(self.title)}</h2>{table}{html.note(self.note)}"
 
     def as_markdown(self) -> str:
-        """Return the table as Markdown, its title above it, its note below."""
+        """Return the table as Markdown, with its title above and its note below."""
         lines = [f"**{self.title}**", "", markdown.row(self.head), "|" + "---|" * len(self.head)]
         lines += [markdown.row([cell.text for cell in row]) for row in self.rows]
         return "\n".join([*lines, *(["", self.note] if self.note else [])]) + "\n"
 
     def as_text(self) -> str:
-        """Return the table aligned, for a terminal."""
+        """Return the table as aligned text."""
         cells = [self.head, *(tuple(cell.text for cell in row) for row in self.rows)]
         widths = [max(len(row[k]) for row in cells) for k in range(len(self.head))]
         lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in cells]
@@ -67,20 +67,24 @@ def _number(text: str) -> bool:
 
 
 def write_page(path: Path, title: str, said: Sequence[str], parts: Sequence[str]) -> None:
-    """Write a self-contained page: a title, sentences that say what came out, and parts of HTML."""
+    """Write a self-contained page.
+
+    Args:
+        said: sentences that summarise it, the main one first. parts: HTML.
+    """
     lead = "".join(f'<p class="{"note" if k else "lead"}">{escape(line)}</p>' for k, line in enumerate(said))
     body = "\n".join([f"<h1>{escape(title)}</h1>{lead}", *parts])
-    path.write_text(pieces.page(title, body, get_plotlyjs()), encoding="utf-8")
+    path.write_text(html.page(title, body, get_plotlyjs()), encoding="utf-8")
 
 
 def write_markdown(path: Path, title: str, said: Sequence[str], grids: Sequence[Grid]) -> None:
-    """Write the same as Markdown."""
+    """Write title, summary (`said`) and tables as Markdown."""
     text = "\n\n".join([f"# {title}", *said, *(grid.as_markdown() for grid in grids)])
     path.write_text(text.rstrip() + "\n", encoding="utf-8")
 
 
 def write_csv(path: Path, rows: Sequence[dict[str, object]]) -> None:
-    """Write rows that share their keys; None is empty."""
+    """Write rows with equal keys; None becomes an empty field."""
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, fieldnames=list(rows[0]) if rows else [])
         writer.writeheader()

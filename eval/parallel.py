@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Solves beside each other, in processes."""
+"""Run jobs in parallel processes."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ Result = TypeVar("Result")
 def run_jobs(
     work: Callable[[Job], Result], jobs: Sequence[Job], workers: int, stage: str, progress: Progress
 ) -> Iterator[tuple[int, Result]]:
-    """Yield the number of each job and its result, as they get done; `work` is a function of a module.
+    """Yield the index of each job and its result, in order of completion.
 
-    Where a job raises, or the caller stops, those that have not begun are not run.
+    If a job raises, or the caller stops, jobs that have not begun are not run.
+
+    Args:
+        work: function of a module, since it is pickled. workers: number of processes; 1: in this one.
 
     Raises:
         SolveError: a process died.
@@ -48,5 +51,5 @@ def run_jobs(
 
 
 def _end_on_interrupt() -> None:
-    """Ctrl-C reaches the workers too: they end at once and without a word, and the process that started them tells."""
+    """End a worker silently on Ctrl-C, which reaches the workers too; the parent process reports it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run as a recording for the rerun viewer: tracks, scans on the image, tags, matches and weights over the bag's time.
+"""A run for the rerun viewer: tracks, scans on the image, tags, matches and weights over the time of the bag.
 
 World is as in graphloc: x east, y north, z up, metres. Entities: docs/rerun.md.
 """
@@ -58,10 +58,10 @@ def write_rerun(
 
     Args:
         solution: of the recording. filters: other estimates of it.
-        bags: where scans are read from; none: no scans. folder: relative paths of images count from there.
+        bags: source of scans; empty: no scans. folder: base of relative paths of images.
 
     Raises:
-        ExtraError: the optional part is not installed. OutputError: the disk refuses.
+        ExtraError: rerun is not installed. OutputError: the file cannot be written.
         InputError: an image or a bag that can no longer be read.
     """
     rr = need("rerun", "rerun")
@@ -97,10 +97,10 @@ def write_rerun(
 
 
 def make_folder(path: Path) -> None:
-    """Make the folder that a file is to lie in.
+    """Create the folder of a file.
 
     Raises:
-        OutputError: the disk refuses.
+        OutputError: it cannot be created.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -119,12 +119,12 @@ def _blueprint() -> Any:
 
 
 def _pixels(size: float) -> Any:
-    """A radius that is seen from any distance."""
+    """Return a radius that is visible from any distance."""
     return need("rerun", "rerun").Radius.ui_points(size)
 
 
 def _entity(name: str) -> str:
-    """A name as a part of an entity path, of its own whatever other names there are: what a path cannot hold is escaped."""
+    """Return a name as a unique part of an entity path, with escaped characters."""
     return str(need("rerun", "rerun").escape_entity_path_part(name))
 
 
@@ -135,7 +135,7 @@ def _columns(stream: Any, entity: str, stamps_ns: Any, columns: Any) -> None:
 
 
 def _log_track(stream: Any, name: str, track: Trajectory, colour: str, config: VesselConfig) -> None:
-    """The whole path, and the body that moves along it."""
+    """Log the whole path, and the body that moves along it."""
     rr = need("rerun", "rerun")
     entity, thin = f"world/{_entity(name)}", slice(None, None, -(-len(track) // _POSES))
     rgb = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
@@ -154,7 +154,7 @@ def _log_track(stream: Any, name: str, track: Trajectory, colour: str, config: V
 
 
 def _log_health(stream: Any, solution: Solution) -> None:
-    """A line wherever health, or its reason, changes."""
+    """Log a line at each change of health or its reason."""
     rr = need("rerun", "rerun")
     said = list(zip(solution.health, solution.health_reason, strict=True))
     new = [0, *(k for k, (before, now) in enumerate(pairwise(said), start=1) if before != now)]
@@ -164,7 +164,7 @@ def _log_health(stream: Any, solution: Solution) -> None:
 
 
 def _log_measurements(stream: Any, recording: Recording, solution: Solution) -> None:
-    """The weight of each measurement; and where it says the body (of a fix: the antenna) is, red if not believed."""
+    """Log the weight of each measurement, and the position that it gives for body (of a fix: its antenna), red if rejected."""
     rr = need("rerun", "rerun")
     rows = {row.seq: row for row in solution.ledger if row.weight is not None and row.seq >= 0}
     by_sensor: dict[str, list[tuple[Measurement, LedgerRow]]] = {}
@@ -187,7 +187,7 @@ def _log_measurements(stream: Any, recording: Recording, solution: Solution) -> 
 
 
 def _said_m(m: Measurement, row: LedgerRow, datum: Datum, height_m: float) -> Array | None:
-    """Where a measurement says that the body, or the antenna, is (3,) in world; None: it says no place."""
+    """Return the position (3,) in world that a measurement gives for body, or the antenna; None if it gives none."""
     if isinstance(m, GnssPosition):
         place = np.array(world_from_fixes([m], datum)[0])
         place[2] = place[2] if m.has_height else height_m
@@ -200,7 +200,7 @@ def _said_m(m: Measurement, row: LedgerRow, datum: Datum, height_m: float) -> Ar
 
 
 def _log_tags(stream: Any, config: VesselConfig) -> None:
-    """The surveyed tags; those of a floating dock where they are at rest."""
+    """Log the surveyed tags; those of a floating dock at rest."""
     rr = need("rerun", "rerun")
     for name, sensor in config.of_kind("apriltag").items():
         survey = sensor.surveyed
@@ -217,7 +217,7 @@ def _log_tags(stream: Any, config: VesselConfig) -> None:
 
 
 def _log_image(stream: Any, name: str, sensor: AerialConfig, solution: Solution, folder: Path) -> None:
-    """The image about the track, just below the water."""
+    """Log the image around the track, just below the water."""
     if not sensor.image:
         return
     rr = need("rerun", "rerun")
@@ -243,7 +243,7 @@ def _log_image(stream: Any, name: str, sensor: AerialConfig, solution: Solution,
 def _log_scans(
     stream: Any, name: str, sensor: AerialConfig, config: VesselConfig, track: Trajectory, bags: Bags
 ) -> None:
-    """Turns of the LiDARs, as often as they may be matched, each from where the track has its LiDARs."""
+    """Log the turns of the LiDARs at the matching interval, each from where the track has its LiDARs."""
     rr = need("rerun", "rerun")
     with Bag(bags) as bag:
         feed = ScanFeed(bag, sensor, config.body_frame)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several finished runs in one summary: each run, the mean, the worst; as HTML, Markdown and CSV."""
+"""Summary of several finished runs: each run, mean and worst, as HTML, Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from graphloc.errors import InputError
-from graphloc.eval import markdown, pieces
-from graphloc.eval.words import LABELS, number
+from graphloc.eval import html, markdown
+from graphloc.eval.formatting import LABELS, number
 from graphloc.outputs import MARK, fresh_folder
 
 SUMMARY = "summary.csv"  # a folder with this file is ours to replace
@@ -34,11 +34,11 @@ Numbers = Mapping[str, Mapping[str, Mapping[str, float | None]]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FinishedRun:
-    """What a run folder says of itself.
+    """Content of a run folder.
 
     Attributes:
-        name: its folder, as short as tells it from the others. tables: title -> estimate -> number -> value.
-        warnings: what was said. converged: whether the solver did.
+        name: shortest unique path of the folder. tables: title -> estimate -> number -> value.
+        warnings: of the run. converged: whether the solver did.
     """
 
     name: str
@@ -50,7 +50,7 @@ class FinishedRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
-    """One number of all runs: a row each, a column for each estimate; then mean and worst."""
+    """One number of all runs: a row per run, a column per estimate; then mean and worst."""
 
     title: str
     metric: str
@@ -61,15 +61,15 @@ class Block:
 
 
 def is_run(folder: Path) -> bool:
-    """Return whether a folder is that of a finished run."""
+    """Return whether a folder is a finished run."""
     return (folder / MARK).is_file()
 
 
 def read_runs(folders: Sequence[Path]) -> tuple[FinishedRun, ...]:
-    """Read what run folders say.
+    """Read run folders.
 
     Raises:
-        InputError: a folder is given twice, is none of a run, or its run.json cannot be read.
+        InputError: a folder is given twice, is not a run, or its run.json cannot be read.
     """
     whole = [folder.resolve() for folder in folders]
     twice = next((folder for k, folder in enumerate(whole) if folder in whole[:k]), None)
@@ -103,12 +103,12 @@ def _read(folder: Path, name: str) -> FinishedRun:
 
 
 def _number(value: object) -> float | None:
-    """A count stays one."""
+    """Return a value as a number; integers stay integers."""
     return value if value is None or type(value) is int else float(value)  # type: ignore[arg-type]
 
 
 def blocks(runs: Sequence[FinishedRun], *, shown_only: bool = True) -> list[Block]:
-    """Return each number of each table that a run has; `shown_only`: those that a reader looks for first."""
+    """Return each number of each table that a run has; `shown_only`: only the main ones."""
     found = []
     for title in dict.fromkeys(t for run in runs for t in run.tables):
         having = [run for run in runs if title in run.tables]
@@ -143,7 +143,7 @@ def write_summary(folder: Path, runs: Sequence[FinishedRun], *, overwrite: bool)
     """Write `summary.html`, `.md` and `.csv` into a folder; return the path of the page.
 
     Raises:
-        OutputError: the folder exists and may not be replaced, or the disk refuses.
+        OutputError: the folder exists and may not be replaced, or cannot be written.
     """
     found = blocks(runs)
     with fresh_folder(folder, overwrite=overwrite, mark=SUMMARY) as fresh:
@@ -157,7 +157,7 @@ def write_summary(folder: Path, runs: Sequence[FinishedRun], *, overwrite: bool)
 
 
 def _csv_rows(runs: Sequence[FinishedRun]) -> Iterator[tuple[str, ...]]:
-    """Every number of every run; mean and worst as two more runs, whose names no folder has."""
+    """Return every number of every run; mean and worst as two more runs, with names that no folder has."""
     for block in blocks(runs, shown_only=False):
         for run, values in (*block.rows, ("(mean)", block.mean), ("(worst)", block.worst)):
             for estimate, value in zip(block.estimates, values, strict=True):
@@ -166,7 +166,7 @@ def _csv_rows(runs: Sequence[FinishedRun]) -> Iterator[tuple[str, ...]]:
 
 
 def _lines(block: Block) -> list[tuple[str, ...]]:
-    """The rows of a block as text, at the end how many times as large as the first estimate's the others' are."""
+    """Return the rows of a block as text; the last one has the ratio of each estimate to the first."""
     rows = [*block.rows, ("mean of the runs", block.mean), ("worst of the runs", block.worst)]
     whole = all(v is None or isinstance(v, int) for _, values in block.rows for v in values)
     digits = 1 if whole else 3  # a mean of counts
@@ -183,7 +183,7 @@ def _words(metric: str) -> str:
 
 
 def _over_first(rows: Sequence[Sequence[float | None]], k: int) -> float | None:
-    """The mean of column k over that of the first, both over the runs that have both."""
+    """Return the mean of column k over that of the first one, over the runs that have both."""
     both = [(a, b) for row in rows if (a := row[0]) is not None and (b := row[k]) is not None]
     mine = sum(a for a, _ in both)
     return sum(b for _, b in both) / mine if mine else None
@@ -206,7 +206,7 @@ def _title(runs: Sequence[FinishedRun]) -> str:
 
 
 def _remarks(runs: Sequence[FinishedRun]) -> list[str]:
-    """What a mean does not say."""
+    """Return a line for each run that did not converge, for each warning, and for each run without a reference."""
     said = [f"- {run.name}: the solver did not converge" for run in runs if not run.converged]
     said += [f"- {run.name}: warning: {line}" for run in runs for line in run.warnings]
     said += [f"- {run.name}: nothing to compare it with" for run in runs if not run.tables]
@@ -226,8 +226,8 @@ def _page(runs: Sequence[FinishedRun], found: Sequence[Block], folder: Path) -> 
             lines = _lines(block)
             classes = [""] * len(block.rows) + ["part ours", "ours"]
             head = ("", *block.estimates)
-            body.append(f"<h3>{escape(_words(block.metric))}</h3>{pieces.table(head, lines, classes)}")
-    note = pieces.note(
+            body.append(f"<h3>{escape(_words(block.metric))}</h3>{html.table(head, lines, classes)}")
+    note = html.note(
         "Mean and worst are over the runs that have the number; summary.csv has every number of every run."
     )
-    return pieces.page(_title(runs), f"<h1>{_title(runs)}</h1><nav>{links}</nav>{note}{''.join(body)}")
+    return html.page(_title(runs), f"<h1>{_title(runs)}</h1><nav>{links}</nav>{note}{''.join(body)}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of a sweep: rows of a run, `table.parquet`, and `summary.md` with mean and worst of each case."""
+"""Table of a sweep: rows of a run, `table.parquet`, and `summary.md` with mean and worst of each case."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _FAILURES = 20  # that the summary names
 
 
 def rows_of(solution: Solution, tables: Sequence[Table], warnings: int) -> list[dict[str, Any]]:
-    """Return one row an estimate, its numbers as columns; what the solver said stands in the row of the solution.
+    """Return a row per estimate, its numbers as columns; statistics of the solver are in the row of the solution.
 
     Args:
-        tables: of the run, an estimate a row. warnings: how many there are beside the solver's own.
+        tables: of the run, with a row per estimate. warnings: number of them, without the solver's own.
     """
     found: dict[str, dict[str, Any]] = {}
     for table in tables:
@@ -56,7 +56,7 @@ def write(table: Sequence[Row], folder: Path) -> None:
     """Write the table and its summary.
 
     Raises:
-        OutputError: the disk refuses.
+        OutputError: a file cannot be written.
     """
     pyarrow, parquet = need("pyarrow", "sweep"), need("pyarrow.parquet", "sweep")
     names = list(dict.fromkeys(name for row in table for name in row))
@@ -69,7 +69,7 @@ def write(table: Sequence[Row], folder: Path) -> None:
 
 
 def _column(values: list[Any]) -> list[Any]:
-    """Numbers where all are numbers: parameters come as they were typed."""
+    """Return a column as numbers if all are numbers: parameters come as text."""
     try:
         return [float(v) if isinstance(v, str) else v for v in values]
     except ValueError:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a solved run says of the survey of its tags, and of the clock of the cameras that see them.
+"""Check the survey of tags, and the mounts and clocks of cameras, by a solved run.
 
-Tags that stand elsewhere, sizes that cannot be, images that come late.
+It finds tags at another position, wrong sizes, and late images.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Key = tuple[str, tuple[str, int]]  # of a tag: its sensor; its family and id
 
 
 def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution) -> list[str]:
-    """Return a line for each tag most of whose sightings disagree with the run, and what would explain it."""
+    """Return a line for each tag most of whose sightings disagree with the run, with a possible explanation."""
     rows = {row.seq: row for row in solution.ledger if row.seq >= 0}
     track = solution.trajectory
     sightings = [
@@ -74,12 +74,12 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
 
 
 def _key(m: TagSighting) -> Key:
-    """Of a sighting of one tag."""
+    """Return sensor and tag of a sighting of one tag."""
     return m.sensor, m.tags[0]
 
 
 def _by_image(sightings: list[TagSighting]) -> list[list[TagSighting]]:
-    """What one image shows of one frame."""
+    """Group sightings by image and frame."""
     images: dict[tuple[str, str, str, int], list[TagSighting]] = defaultdict(list)
     for m in sightings:
         images[(m.sensor, m.camera, m.frame, m.stamp_ns)].append(m)
@@ -96,15 +96,15 @@ def _size_m(m: TagSighting) -> float:
 
 
 def _in_camera(m: TagSighting) -> Array:
-    """The tags' middle, by the likeliest pose."""
+    """Return the tags' middle in camera, by the likeliest pose."""
     mode = m.modes[0]
     return np.asarray(mode.R_world_camera.T @ (m.points_m.mean(axis=0) - mode.p_world_camera_m))
 
 
 def _by_spacing(images: list[list[TagSighting]]) -> dict[Key, str]:
-    """Return a line by tag where tags of one image, none of which fits another, are all of a wrong size.
+    """Return a line for tags that all have a wrong size, because no two of an image fit together.
 
-    How far apart they look, in units of their size, holds for any track, and the one that they gave may be wrong.
+    Their spacing in units of their size is independent of the track, which may be wrong because of them.
     """
     ratios: dict[Key, list[float]] = defaultdict(list)
     size_m: dict[Key, float] = {}
@@ -128,9 +128,9 @@ def _by_spacing(images: list[list[TagSighting]]) -> dict[Key, str]:
 
 
 def _by_the_others(images: list[list[TagSighting]]) -> dict[Key, str]:
-    """Return a line by tag for each that others of its images, which agree, show in another place.
+    """Return a line by tag for each that others in its images, which agree, show at another position.
 
-    It holds for any track: one that follows the wrong tag, and turns the vessel by 13 deg to do so, finds nothing amiss.
+    That is independent of the track: one that follows the wrong tag, with the vessel turned by 13 deg, shows no disagreement.
     """
     shown: dict[Key, list[Array]] = defaultdict(list)
     for own in images:
@@ -171,10 +171,10 @@ def _explained(own: list[TagSighting], p: Array, R: Array) -> str:
 
 
 def _scale(camera: Array, toward: Array, middle: Array) -> tuple[float, bool]:
-    """How many times larger than the survey says a tag is, and whether that is certain.
+    """Return the ratio of a tag's size to the surveyed one, and whether it is certain.
 
-    It stands still, camera + scale toward = place, wherever that is: views from several distances tell, even with a track
-    that is off by the same all the while. Those from one distance only do if the tag is where the survey has it.
+    A tag at rest satisfies camera + scale toward = position, wherever it is: views from several distances determine the scale,
+    even if the track has a constant error. Views from one distance only do so if the tag is at its surveyed position.
     """
     ranges = np.linalg.norm(toward, axis=1)
     if ranges.max() > _RANGES * ranges.min():
@@ -188,7 +188,7 @@ def _scale(camera: Array, toward: Array, middle: Array) -> tuple[float, bool]:
 
 
 def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], solution: Solution) -> list[str]:
-    """Return a line for each camera whose sightings are refused and agree on another attitude on the vessel, or place."""
+    """Return a line for each camera whose sightings are rejected and agree on another attitude or position on the vessel."""
     lines = []
     track = solution.trajectory
     for sensor, camera in sorted({(m.sensor, m.camera) for m in sightings}):
@@ -215,14 +215,14 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
 
 
 def mount_off(solution: Solution, sensor: str, camera: str) -> Rotation:
-    """Return what the run has found a camera's mount to be off, about the body's axes: `mount_off * mount` is the true one."""
+    """Return the estimated error of a camera's mount about the body's axes: `mount_off * mount` is the true one."""
     slow = solution.slow.get(sensor)
     off_deg = None if slow is None else slow.surest([f"{camera} mount {axis}" for axis in ("roll", "pitch", "yaw")])
     return Rotation.identity() if off_deg is None else Rotation.from_rotvec(off_deg, degrees=True)
 
 
 def _estimated_mounts(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:
-    """Say of each camera whose mount the run has estimated far from the one that is configured."""
+    """Return a line for each camera whose estimated mount is far from the configured one."""
     given = {(m.sensor, m.camera): m.R_body_camera for m in sightings}
     for (sensor, camera), R_body_camera in sorted(given.items()):
         off = mount_off(solution, sensor, camera)
@@ -240,16 +240,16 @@ def _looks_elsewhere(sensor: str, camera: str, off_deg: float, mount: Rotation) 
 
 
 def _by_tags(m: TagSighting, R_world_body: Array) -> Array:
-    """Where a sighting puts the body (3,), its attitude as in the run."""
+    """Return the position (3,) of body by a sighting, with the attitude of the run."""
     toward = R_world_body @ m.R_body_camera @ _in_camera(m)
     return np.asarray(m.points_m.mean(axis=0) - toward - R_world_body @ m.t_body_camera_m)
 
 
 def _late(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:
-    """Say of each camera whether its stamps are late or early, by how it rolls about its optical axis.
+    """Return a line for each camera whose stamps are late or early, by its roll about the optical axis.
 
-    Stamps that are late by d come with the attitude of d ago: the camera's roll less the run's is -d times its rate. The
-    roll is what tags tell best: to first order, and whichever of two poses is the right one.
+    Stamps that are late by d come with the attitude of d ago: the camera's roll minus the run's is -d times its rate. Tags
+    determine the roll best: to first order, and with either of two poses.
     """
     track = solution.trajectory
     by_camera: dict[tuple[str, str], list[TagSighting]] = defaultdict(list)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The aerial image under the map of a report: its part around a run, coarse enough for a page."""
+"""Aerial image under the map of a report: the part around a run, at a resolution that suits a page."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _QUALITY = 72
 
 
 def underlay(config: VesselConfig, folder: Path, datum: Datum, p_world_m: Array) -> tuple[Underlay | None, str]:
-    """Return the image around places, and why there is none where one was asked for.
+    """Return the image around a track; without one, the reason if an image was configured, else ''.
 
     Args:
-        config: its `output.map_image`, or the image of its first aerial sensor, is taken.
-        folder: relative paths count from there.
-        p_world_m: (N, 2 or 3) that it is to show.
+        config: its `output.map_image` is used, or the image of its first aerial sensor.
+        folder: base of relative paths.
+        p_world_m: (N, 2 or 3) positions to show.
     """
     images = [config.output.map_image, *(sensor.image for sensor in config.of_kind("aerial").values())]
     name = next((image for image in images if image), "")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one table of sensors. A new sensor is its measurement, its config, its file here, and one entry.
+"""Table of sensors. A sensor is its measurement, its configuration, its file here, and one entry in the table.
 
-Or it comes in a package of its own, which names its row as an entry point (docs/adding-a-sensor.md).
+Sensors of other packages join it by entry points (docs/adding-a-sensor.md).
 """
 
 from graphloc.config import SensorConfig
@@ -21,7 +21,7 @@ def _theirs() -> tuple[Sensor, ...]:
     """Return the rows of installed packages.
 
     Raises:
-        ConfigError: one is no row, goes by another kind than its entry point, or has a kind that is taken.
+        ConfigError: an entry is not a row, its kind differs from the name of the entry point, or its kind is taken.
     """
     taken = {INERTIAL.kind, *(row.kind for row in _OURS)}
     for name, row in added(GROUP).items():

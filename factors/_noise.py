@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one function that builds noise models and robust kernels."""
+"""Noise models and robust kernels of all sensors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LOSSES: dict[str, Any] = {
 
 
 def with_floors(cov: Array, floors: Array | float) -> Array:
-    """Return a covariance (k, k) whose variances are at least `floors` (k,): sensors are too sure of themselves."""
+    """Return a covariance (k, k) with variances of at least `floors` (k,): sensors often claim too little noise."""
     raised = np.array(cov)
     variances = raised.ravel()[:: len(raised) + 1]
     np.maximum(variances, floors, out=variances)
@@ -30,7 +30,7 @@ def with_floors(cov: Array, floors: Array | float) -> Array:
 
 
 def noise_model(cov: Array, decision: Decision) -> Any:
-    """Return a noise model of covariance (k, k) / weight, under the decision's kernel."""
+    """Return a noise model of covariance (k, k) / weight, with the kernel of the decision."""
     scaled = np.asarray(cov, dtype=float) / decision.weight
     return _shared(scaled.tobytes(), len(scaled), decision.kernel)
 
@@ -46,7 +46,7 @@ def _shared(scaled: bytes, size: int, kernel: KernelConfig | None) -> Any:
 
 
 def robust(base: Any, kernel: KernelConfig | None) -> Any:
-    """Put a kernel on a noise model; none, or kind `none`, leaves it as it is."""
+    """Return a noise model with a kernel; unchanged for None or kind `none`."""
     if kernel is None or kernel.kind == "none":
         return base
     return gtsam.noiseModel.Robust.Create(_LOSSES[kernel.kind].Create(kernel.scale), base)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Matches of LiDAR scans to an aerial image, with several modes; the image itself is off by some decimetres.
 
-    z = (x, y, yaw)(T_world_body) + (d, 0) + w,   w ~ N(0, C) of the mode,   d (2,): the image's misregistration
+    z = (x, y, yaw)(T_world_body) + (d, 0) + w,   w ~ N(0, C) of the mode,   d (2,): misregistration of the image
 
-d is constant over the run. The modes are those of `pose`; with d in it the factor has two states, and is
-linearised anew at every pass (`_linear`).
+d is constant over the run. The modes are those of `pose`; with d the factor has two states, and is relinearised at every pass
+(`graphloc.linear`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from graphloc.config import AerialConfig
 from graphloc.factors import pose
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
-from graphloc.linear import Term, linear_update, pose_term
+from graphloc.linear import linear_factor
 from graphloc.measurements import PoseFix, PoseMode
 
 
@@ -27,7 +27,7 @@ def _shown_off(axes: tuple[str, ...]) -> Array:
 
 
 def residuals(m: PoseFix, config: AerialConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Residuals predicted - measured (k,), m and rad, one for each mode."""
+    """Return predicted - measured (k,), m and rad, for each mode."""
     plain = pose.residuals(m, config, at)
     if at.slow_value is None:
         return plain
@@ -48,12 +48,7 @@ def factors(m: PoseFix, config: AerialConfig, at: Attachment, decision: Decision
     """Return the factor of the chosen mode."""
     if at.slow_key is None:
         return pose.factors(m, config, at, decision)
-    residual = residuals(m, config, at)[decision.mode]
-    terms = [
-        pose_term(at, residual.jacobian()),
-        Term(at.slow_key, np.array(at.slow_value), _shown_off(m.axes)),
-    ]
-    return linear_update(residual, terms, decision)
+    return linear_factor(residuals(m, config, at)[decision.mode], at, decision)
 
 
 def slow(config: AerialConfig) -> SlowProcess | None:
@@ -71,7 +66,7 @@ def slow(config: AerialConfig) -> SlowProcess | None:
 
 
 def ideal(at: Attachment, config: AerialConfig) -> PoseFix:
-    """Return the match that the attachment's estimate would give."""
+    """Return the noise-free match at the attachment's state."""
     found = pose.ideal(at, config)
     moved = np.zeros(len(config.axes)) if at.slow_value is None else _shown_off(config.axes) @ at.slow_value
     mode = PoseMode(value=found.modes[0].value + moved, cov=found.modes[0].cov)

@@ -3,11 +3,11 @@
 
     z = (1 + s) S u + w,   u = Q^T (R^T (v + dv - c) + omega x l),   w ~ N(0, C)
 
-v: velocity of body in world at the state; dv: what the IMU says it gains until the measurement; c: the water's current,
-east and north, a first-order Gauss-Markov process (over ground: none); R: body in world; omega: body rate from the
-gyroscope, bias removed; l: sensor in body; Q: the sensor's axes in body; S: picks the measured axes; s: error of the scale, a
-constant of the run. With a = R^T (v + dv - c), the derivatives of u are Q^T R^T by v, -Q^T R^T by c, and Q^T [a]_x by the
-body tangent theta of R <- R Exp(theta). Not handled: slip of wheels, other than as outliers; scales that differ between axes.
+v: velocity of body in world at the state; dv: its change until the measurement, by the IMU; c: the water's current, east and
+north, a first-order Gauss-Markov process (over ground: none); R: body in world; omega: body rate from the gyroscope, bias
+removed; l: sensor in body; Q: the sensor's axes in body; S: selects the measured axes; s: scale error, a constant of the run.
+With a = R^T (v + dv - c), the derivatives of u are Q^T R^T by v, -Q^T R^T by c, and Q^T [a]_x by the body tangent theta of
+R <- R Exp(theta). Not handled: slip of wheels, other than as outliers; scales that differ between axes.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from graphloc.config import BodyVelocityConfig
 from graphloc.factors._noise import with_floors
 from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import Term, linear_update, pose_term
+from graphloc.linear import linear_factor
 from graphloc.measurements import BodyVelocity
 
-_SCALE, _CURRENT = slice(0, 1), slice(1, 3)  # of the slow state, where all of it is there
+_CURRENT = slice(1, 3)  # after the scale error, in a slow state that has both
 
 
 def _there(config: BodyVelocityConfig) -> NDArray[np.bool_]:
-    """Which of scale, current east and north the slow state has (3,)."""
+    """Return which of scale error, current east and current north are in the slow state (3,)."""
     return np.array([config.scale_sigma > 0.0, *[config.through == "water"] * 2])
 
 
 def _slow_value(at: Attachment, config: BodyVelocityConfig) -> Array:
-    """Error of the scale and current (3,), zero where there is none."""
+    """Return scale error and current (3,), m/s; zero where they are not modelled."""
     full = np.zeros(3)
     if at.slow_value is not None:
         full[_there(config)] = at.slow_value
@@ -39,7 +39,7 @@ def _slow_value(at: Attachment, config: BodyVelocityConfig) -> Array:
 
 
 def _moving(at: Attachment, config: BodyVelocityConfig) -> tuple[Array, Array, Array]:
-    """Return u (3,), a (3,) and the sensor's axes in body Q (3, 3)."""
+    """Return u (3,), a (3,) and Q (3, 3), as in the module's docstring."""
     current = np.append(_slow_value(at, config)[_CURRENT], 0.0)
     along = at.T_world_body.rotation().matrix().T @ (at.v_world_mps + at.dv_world_mps - current)
     Q = at.T_state_sensor.rotation().matrix()
@@ -47,7 +47,7 @@ def _moving(at: Attachment, config: BodyVelocityConfig) -> tuple[Array, Array, A
 
 
 def residuals(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Residual predicted - measured (k,) in m/s, the sensor's axes."""
+    """Return predicted - measured (k,), m/s, in the sensor's axes."""
     u, along, Q = _moving(at, config)
     picked = ["xyz".index(axis) for axis in m.axes]
     scale = 1.0 + float(_slow_value(at, config)[0])
@@ -77,16 +77,11 @@ def residuals(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment) -> tu
 
 def factors(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one velocity."""
-    residual = residuals(m, config, at)[0]
-    assert residual.velocity_jacobian is not None
-    terms = [pose_term(at, residual.jacobian()), Term(at.velocity_key, at.v_world_mps, residual.velocity_jacobian())]
-    if at.slow_key is not None and residual.slow_jacobian is not None:
-        terms.append(Term(at.slow_key, np.array(at.slow_value), residual.slow_jacobian()))
-    return linear_update(residual, terms, decision)
+    return linear_factor(residuals(m, config, at)[0], at, decision)
 
 
 def slow(config: BodyVelocityConfig) -> SlowProcess | None:
-    """Return the error of the scale, and the current, as far as the configuration asks for them."""
+    """Return the process of scale error and current, as configured; None if neither is modelled."""
     there = _there(config)
     if not there.any():
         return None
@@ -102,7 +97,7 @@ def slow(config: BodyVelocityConfig) -> SlowProcess | None:
 
 
 def ideal(at: Attachment, config: BodyVelocityConfig) -> BodyVelocity:
-    """Return the velocity that the attachment's estimate would give."""
+    """Return the noise-free velocity at the attachment's state."""
     u, _, _ = _moving(at, config)
     value = (1.0 + _slow_value(at, config)[0]) * u[["xyz".index(axis) for axis in config.axes]]
     return BodyVelocity(
@@ -111,7 +106,7 @@ def ideal(at: Attachment, config: BodyVelocityConfig) -> BodyVelocity:
 
 
 def hint(m: BodyVelocity, mount_yaw_rad: float, datum: Datum) -> Hint:
-    """Without a heading it tells no velocity in world."""
+    """Return nothing: without a heading, it gives no velocity in world."""
     return Hint()
 
 

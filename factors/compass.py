@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compass heading with a mount offset, the vessel's magnetic deviation, and what turns it for a while.
+"""Compass heading with mount offset, magnetic deviation, and a slow error.
 
     z = y + A + B sin(h) + C cos(h) + D sin(2h) + E cos(2h) + e + w,   w ~ N(0, s^2)
     y = yaw(R_world_body R_body_sensor),   h = 90 deg - y: heading of the sensor's own x axis, clockwise from north
 
-A: offset of the mount. B to E: what the vessel's iron does, as navigators write it (A. Smith's coefficients; east is
-positive): constants of the run. e: the wander, a first-order Gauss-Markov process, of what passes: a crane, a quay of
-sheet piles, the filter in the compass. Taken for noise instead, deviation or wander of some degrees bends the heading by
-half of it, ten readings a second being sure of it, and takes aerial matches for false.
+A: mount offset. B to E: deviation by the vessel's iron, as in navigation (A. Smith's coefficients; east is positive), constants
+of the run. e: wander, a first-order Gauss-Markov process, of what passes: a crane, a quay of sheet piles, the compass's filter.
+Modelled as noise instead, deviation or wander of some degrees bends the heading by half of it, since ten readings per second
+seem certain, and true aerial matches are rejected.
 
-yaw(R) = atan2(R10, R00). With R <- R Exp(theta): d yaw / d theta = -(row 2 of R) . (x-hat cross-terms),
-worked out in `_yaw_jacobian`. GTSAM has no native factor with yaw and offset in one, so this one is
-linearised anew at every pass (`_linear`): yaw is nearly linear in the correction (0.02 deg at 3 deg
-of roll and pitch and 5 deg of correction). Not handled: pitch near +-90 deg.
+yaw(R) = atan2(R10, R00). With R <- R Exp(theta), d yaw / d theta is worked out in `_yaw_jacobian`. GTSAM has no factor of yaw
+and offset, so this one is relinearised at every pass (`graphloc.linear`): yaw is nearly linear in the correction (0.02 deg at
+3 deg of roll and pitch and 5 deg of correction). Not handled: pitch near +-90 deg.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ import numpy as np
 from graphloc.config import CompassConfig
 from graphloc.frames import Array, Datum, skew, wrap_angle
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import Term, linear_update, pose_term
+from graphloc.linear import linear_factor
 from graphloc.measurements import CompassHeading
 from graphloc.thinning import HEADINGS_APART_NS
 
@@ -35,7 +34,7 @@ _SHARES = (1.0, 1.0, 0.5, 0.5)  # B and C come of permanent magnetism; D and E, 
 
 
 def _sigmas(config: CompassConfig) -> Array:
-    """Standing sigmas (6,) of A to E and of the wander, rad, 0 where there is none."""
+    """Return stationary sigmas (6,), rad, of A to E and of the wander; 0 for those that are not modelled."""
     return _sigmas_of(config.mount_offset_sigma_deg, config.deviation_sigma_deg, config.wander_sigma_deg)
 
 
@@ -48,7 +47,11 @@ def _sigmas_of(mount_deg: float, deviation_deg: float, wander_deg: float) -> Arr
 
 
 def _yaw_jacobian(R: Array, x_body: Array, x_world: Array) -> Array:
-    """Derivative (6,) of yaw(R Exp(theta) R_state_sensor) by the body tangent (theta, rho); x_*: the sensor's x axis."""
+    """Return the derivative (6,) of yaw(R Exp(theta) R_state_sensor) by the body tangent (theta, rho).
+
+    Args:
+        R: (3, 3) body in world. x_body, x_world: (3,) the sensor's x axis.
+    """
     # d(R Exp(theta) x)/d theta = -R [x]_x, of which a row r of R gives x x r; yaw = atan2(y, x)
     horizontal = x_world[0] ** 2 + x_world[1] ** 2
     jacobian = np.zeros(6)
@@ -57,13 +60,13 @@ def _yaw_jacobian(R: Array, x_body: Array, x_world: Array) -> Array:
 
 
 def _axis(at: Attachment) -> tuple[Array, Array, Array]:
-    """The attitude (3, 3), and the sensor's x axis in body and in world."""
+    """Return the attitude R_world_body (3, 3), and the sensor's x axis (3,) in body and in world."""
     R, x_body = at.T_world_body.rotation().matrix(), at.T_state_sensor.rotation().matrix()[:, 0]
     return R, x_body, R @ x_body
 
 
 def _read(at: Attachment, config: CompassConfig, yaw: float) -> tuple[float, Array, float]:
-    """What a compass reads, d / d its slow state (k,), and d / d yaw."""
+    """Return the predicted reading, rad, and its derivatives by the slow state (k,) and by yaw."""
     if at.slow_value is None:
         return yaw, np.zeros(0), 1.0
     s, c = math.sin(yaw), math.cos(yaw)
@@ -74,7 +77,7 @@ def _read(at: Attachment, config: CompassConfig, yaw: float) -> tuple[float, Arr
 
 
 def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Residual predicted - measured (1,) in rad."""
+    """Return predicted - measured (1,), rad."""
     R, x_body, x = _axis(at)
     read, terms, slope = _read(at, config, math.atan2(x[1], x[0]))
     raw = np.array([math.remainder(read - m.yaw_rad, math.tau)])
@@ -94,15 +97,11 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
 
 def factors(m: CompassHeading, config: CompassConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one heading."""
-    residual = residuals(m, config, at)[0]
-    terms = [pose_term(at, residual.jacobian())]
-    if at.slow_key is not None and residual.slow_jacobian is not None:
-        terms.append(Term(at.slow_key, np.array(at.slow_value), residual.slow_jacobian()))
-    return linear_update(residual, terms, decision)
+    return linear_factor(residuals(m, config, at)[0], at, decision)
 
 
 def slow(config: CompassConfig) -> SlowProcess | None:
-    """Return mount offset, deviation and wander, as far as the configuration asks for them."""
+    """Return the process of mount offset, deviation and wander, as configured; None if none is modelled."""
     sigma, time_constant_s = _sigmas(config), np.array([np.inf] * 5 + [config.wander_time_constant_s])
     there = sigma > 0.0
     if not there.any():
@@ -119,14 +118,14 @@ def slow(config: CompassConfig) -> SlowProcess | None:
 
 
 def ideal(at: Attachment, config: CompassConfig) -> CompassHeading:
-    """Return the heading that the attachment's estimate would give."""
+    """Return the noise-free heading at the attachment's state."""
     _, _, x = _axis(at)
     yaw = float(wrap_angle(np.array(_read(at, config, math.atan2(x[1], x[0]))[0])))
     return CompassHeading(stamp_ns=0, sensor="compass", seq=0, yaw_rad=yaw, sigma_rad=np.radians(config.sigma_deg))
 
 
 def hint(m: CompassHeading, mount_yaw_rad: float, datum: Datum) -> Hint:
-    """Return the body's heading."""
+    """Return the heading of body."""
     return Hint(yaw_rad=m.yaw_rad - mount_yaw_rad, yaw_sigma_rad=m.sigma_rad)
 
 

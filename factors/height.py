@@ -3,10 +3,10 @@
 
     z = (p + R l)_up + d^2 / 2 R_earth - t + w,   w ~ N(0, s^2)
 
-p, R: state in world; l: body origin from it; d: horizontal distance from the datum, below whose tangent
-plane the sea falls off (2 m at 5 km), taken from the estimate at every pass; t: how far tide and load hold the vessel
-above what is configured, a slow state (taken for noise, a tide of 0.2 m is refuted 120 times in two minutes, and bends
-what tags on a quay say of the height). Without it a native `GPSFactorArm` whose horizontal sigmas are 1 km wide.
+p, R: state in world; l: body origin from it; d: horizontal distance from the datum, since the sea falls below its tangent plane
+(2 m at 5 km), taken from the estimate at every pass; t: rise of the vessel by tide and load, a slow state. Modelled as noise,
+a tide of 0.2 m is contradicted 120 times in two minutes, and biases the height that tags on a quay give. Without t: a native
+`GPSFactorArm` whose horizontal sigmas are 1 km.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graphloc.config import HeightConfig
 from graphloc.factors._noise import robust
 from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import Term, linear_update, pose_term
+from graphloc.linear import linear_factor
 from graphloc.measurements import HeightPrior
 from graphloc.time import duration_ns
 
@@ -30,12 +30,12 @@ _TIDE_S = 6.0 * 3600.0
 
 
 def _fall_m(p_world_m: Array) -> float:
-    """How far the ellipsoid lies below the datum's tangent plane."""
+    """Return how far the ellipsoid lies below the datum's tangent plane."""
     return float(p_world_m[0] ** 2 + p_world_m[1] ** 2) / (2.0 * _EARTH_M)
 
 
 def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Residual predicted - expected (1,) in m."""
+    """Return predicted - expected (1,), m."""
     lever = np.asarray(at.T_state_sensor.translation())
     point = at.T_world_body.transformFrom(lever)
     tide = 0.0 if at.slow_value is None else float(at.slow_value[0])
@@ -61,12 +61,7 @@ def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Res
 def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one height."""
     if at.slow_key is not None:
-        (residual,) = residuals(m, config, at)
-        terms = [
-            pose_term(at, residual.jacobian()),
-            Term(at.slow_key, np.array(at.slow_value), -np.eye(1)),
-        ]
-        return linear_update(residual, terms, decision)
+        return linear_factor(residuals(m, config, at)[0], at, decision)
     sigmas = np.array([_WIDE_M, _WIDE_M, m.sigma_m / np.sqrt(decision.weight)])
     model = robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas), decision.kernel)
     lever = np.asarray(at.T_state_sensor.translation())
@@ -76,7 +71,7 @@ def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Deci
 
 
 def ideal(at: Attachment, config: HeightConfig) -> HeightPrior:
-    """Return the height that the attachment's estimate would give."""
+    """Return the noise-free height at the attachment's state."""
     point = at.T_world_body.transformFrom(at.T_state_sensor.translation())
     tide = 0.0 if at.slow_value is None else float(at.slow_value[0])
     height_m = float(point[2]) + _fall_m(point) - tide
@@ -84,7 +79,7 @@ def ideal(at: Attachment, config: HeightConfig) -> HeightPrior:
 
 
 def slow(config: HeightConfig) -> SlowProcess | None:
-    """Return how far tide and load may hold the vessel above or below the configured height."""
+    """Return the rise by tide and load, as configured; None if it is not modelled."""
     if config.tide_sigma_m == 0.0:
         return None
     return SlowProcess(
@@ -98,7 +93,11 @@ def slow(config: HeightConfig) -> SlowProcess | None:
 
 
 def synthetic(name: str, config: HeightConfig, span_ns: Sequence[int], height_m: float) -> list[HeightPrior]:
-    """Return one prior every `period_s` over the span (start, stop), at `height_m` over the datum's."""
+    """Return a prior every `period_s` over a span.
+
+    Args:
+        span_ns: (start, stop). height_m: height of the body origin over the datum's.
+    """
     stamps = range(span_ns[0], span_ns[1], duration_ns(config.period_s))
     return [HeightPrior(stamp_ns=s, sensor=name, seq=-1, height_m=height_m, sigma_m=config.sigma_m) for s in stamps]
 

@@ -3,25 +3,25 @@
 
     R_j = R_i Exp(int (w - b_g)),  v_j = v_i + g dt + R_i int (f - b_a),  p_j = p_i + v_i dt + ...
 
-Forster et al., TRO 2017, as in GTSAM's `PreintegratedImuMeasurements` and `ImuFactor`. The bias is a
-state of its own at the slow period, held between its nodes, with a random walk from node to node
-(docs/decisions): at 1 s that walk is far below the noise of a sample. Samples are interpolated at
-the interval's ends and averaged between stamps (trapezoid). Gravity removed by the driver: the same
-integral with g = 0. The states stand at the IMU (see `graphloc.build`), so there is no lever arm here:
-`setBodyPSensor` would leave out the Euler term (angular acceleration x lever), 0.07 m/s^2 in harbour
-waves at 1 m, which lost whole runs. Not handled: coning faster than the sample rate.
+Forster et al., TRO 2017, as in GTSAM's `PreintegratedImuMeasurements` and `ImuFactor`. The bias is a separate state at the slow
+period, constant between its nodes, with a random walk from node to node (docs/decisions): over 1 s that walk is far below the
+noise of a sample. Samples are interpolated at the ends of the interval and averaged between stamps (trapezoid). If the driver
+removed gravity: the same integral with g = 0. The states are at the IMU (see `graphloc.build`), so there is no lever arm here:
+`setBodyPSensor` would omit the Euler term (angular acceleration x lever), 0.07 m/s^2 in harbour waves at 1 m, which lost whole
+runs. Not handled: coning faster than the sample rate.
 
-**A hole of the data** of up to 2 s is interpolated across, with noise that lets a vessel do anything a vessel does. In a longer
-one, and in what lies after the end of the data, what a sample says of the motion is forgotten within a second,
+**A gap in the data** of up to 2 s is interpolated linearly, with noise that covers what a vessel may do. In a longer one, and
+after the end of the data, the motion of the last sample decays within a second to the mean of the seconds before,
 
     w(t) = w_m + (w_a - w_m) sinh((t_b - t) / tau) / sinh(T / tau) + (w_b - w_m) sinh((t - t_a) / tau) / sinh(T / tau)
 
-the mean of an Ornstein-Uhlenbeck process between both sides, w_m the mean of the seconds before, and straight from there
-to that after, which holds the bias and a steady turn. The force likewise, less its own mean, and with g = 0: what a vessel feels on
-average holds it up. In its place comes (w_m - b_g) x v with the velocity in body axes when the hole began: it goes on where it points.
-Integrated with gravity, a roll that is not known turns into an acceleration (after 13 s: 250 m), though vessels stay upright: in one
-hole roll and pitch wander by no more than in a second. Bias and velocity are those that are known when a link is laid
-(`graphloc.graph.Going`), and are not solved for by it: preintegration wants its samples before it knows the velocity.
+the mean of an Ornstein-Uhlenbeck process between both ends. w_m goes linearly from the mean before the gap to that after it,
+which preserves the bias and a steady turn. The specific force is treated likewise, less its own mean and with g = 0, since on
+average it supports the vessel. (w_m - b_g) x v replaces the mean, v: velocity in body axes when the gap began, so the vessel
+continues in the direction of its bow. Integrated with gravity, an unknown roll would become an acceleration (250 m after 13 s),
+but vessels stay upright: over a gap, roll and pitch wander no more than in one second. Bias and velocity are the values known
+when a link is made (`graphloc.graph.Going`) and are not estimated by it: preintegration needs its samples before the velocity
+is known.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from graphloc.frames import Array
 from graphloc.graph import Going
 from graphloc.measurements import ImuSeries
 
-_UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # of motion in a hole, white beyond what a sample says
-_SHORT_S = 2.0  # a hole that is interpolated across
-_FORGET_S, _AROUND_S = 1.0, 10.0  # in a hole, what a sample says; the means are of so long to either side
-_HOLE_STEP_S = 0.1  # of integrating across a hole
+_UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
+_SHORT_S = 2.0  # longest gap that is interpolated linearly
+_FORGET_S, _AROUND_S = 1.0, 10.0  # decay of the last sample in a gap; length of the means on either side
+_GAP_STEP_S = 0.1  # integration step across a gap
 _INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz)-like floor that keeps position covariance positive
 
 
@@ -62,7 +62,7 @@ class Links:
         self._params = self._make_params(self._gravity_mps2, config.accel_noise_mps2 * noise_scale, np.full(3, gyro))
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
-        """Add samples (N, 6) at stamps that are new: specific force, rate; late ones go where they belong."""
+        """Add samples (N, 6), specific force and rate, at new stamps, in any order."""
         stamps, rows = np.concatenate([self._stamps, stamps_ns]), np.concatenate([self._samples, samples])
         if (np.diff(stamps[-len(stamps_ns) - 1 :]) <= 0).any():
             order = np.argsort(stamps, kind="stable")
@@ -70,12 +70,12 @@ class Links:
         self._stamps, self._samples = stamps, rows
 
     def forget(self, before_ns: int) -> None:
-        """Drop the samples before a stamp, but for the last of them."""
+        """Drop the samples before a stamp except the last of them."""
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
         self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()
 
     def _make_params(self, gravity_mps2: float, accel: float, gyro: Array) -> Any:
-        """Params with noise densities: of the accelerometer, and of the gyroscope (3,) about the body's axes."""
+        """Return parameters with noise densities of the accelerometer and, about the axes of body, of the gyroscope (3,)."""
         # Every covariance of fresh params is 1.0: set them all.
         params = gtsam.PreintegrationParams.MakeSharedU(gravity_mps2)
         params.setAccelerometerCovariance(np.eye(3) * accel**2)
@@ -85,26 +85,30 @@ class Links:
         return params
 
     def integrate(self, start_ns: int, stop_ns: int, bias: Any, going: Going | None = None) -> Any:
-        """Return the preintegrated measurement over [start_ns, stop_ns], at least two sub-steps."""
+        """Return the preintegrated measurement over [start_ns, stop_ns], in at least two steps.
+
+        Args:
+            bias: `gtsam.imuBias.ConstantBias`. going: bias and velocity at the begin of a gap.
+        """
         first = int(np.searchsorted(self._stamps, start_ns, side="right"))
         last = int(np.searchsorted(self._stamps, stop_ns, side="left"))
         edges = np.concatenate([[start_ns], self._stamps[first:last], [stop_ns]])
-        hole = self._hole_of(start_ns, stop_ns)
-        if hole is not None:
-            a, b = max(start_ns, hole[0]), min(stop_ns, hole[1])
-            steps = np.linspace(a, b, 3 + int((b - a) * 1e-9 / _HOLE_STEP_S)).astype(np.int64)
+        gap = self._gap_of(start_ns, stop_ns)
+        if gap is not None:
+            a, b = max(start_ns, gap[0]), min(stop_ns, gap[1])
+            steps = np.linspace(a, b, 3 + int((b - a) * 1e-9 / _GAP_STEP_S)).astype(np.int64)
             edges = np.unique(np.concatenate([edges, steps]))
         elif len(edges) < 3:
             edges = np.array([start_ns, (start_ns + stop_ns) // 2, stop_ns])
         dts = np.diff(edges) * 1e-9
         middles = (edges[:-1] + edges[1:]) // 2
         samples, params = self._at(middles), self._params
-        if hole is not None and hole[1] - hole[0] <= _SHORT_S * 1e9 and hole[1] <= self._stamps[-1]:
+        if gap is not None and gap[1] - gap[0] <= _SHORT_S * 1e9 and gap[1] <= self._stamps[-1]:
             params = self._make_params(self._gravity_mps2, _UNKNOWN_MPS2, np.full(3, _UNKNOWN_RADPS))
-        elif hole is not None:
+        elif gap is not None:
             going = going or Going(bias, np.zeros(3))
-            samples, bias = self._across(middles, samples, hole, going), going.bias
-            params = self._params_across(start_ns, stop_ns, hole)
+            samples, bias = self._bridge(middles, samples, gap, going), going.bias
+            params = self._gap_params(start_ns, stop_ns, gap)
         pim = gtsam.PreintegratedImuMeasurements(params, bias)
         for sample, dt in zip(samples, dts, strict=True):
             if dt > 0.0:
@@ -112,14 +116,14 @@ class Links:
         return pim
 
     def _at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Samples (M, 6) interpolated at stamps; held beyond the ends."""
+        """Return samples (M, 6) interpolated at stamps, constant beyond the ends."""
         right = np.clip(np.searchsorted(self._stamps, stamps_ns), 1, len(self._stamps) - 1)
         a, b = self._stamps[right - 1], self._stamps[right]
         share = np.clip((stamps_ns - a) / np.maximum(b - a, 1), 0.0, 1.0)[:, None]
         return np.asarray(self._samples[right - 1] * (1.0 - share) + self._samples[right] * share)
 
-    def _hole_of(self, start_ns: int, stop_ns: int) -> tuple[int, int] | None:
-        """The longest hole (start, stop) that an interval reaches into, if any; what lies after the last sample is one, too."""
+    def _gap_of(self, start_ns: int, stop_ns: int) -> tuple[int, int] | None:
+        """Return the longest gap (start, stop) that overlaps an interval, if any; the time after the last sample is one too."""
         left = max(int(np.searchsorted(self._stamps, start_ns, side="right")) - 1, 0)
         right = int(np.searchsorted(self._stamps, stop_ns, side="left"))
         stamps = self._stamps[left : right + 1]
@@ -130,15 +134,15 @@ class Links:
             return None
         return int(stamps[n]), int(stamps[n + 1])
 
-    def _across(self, stamps_ns: NDArray[np.int64], samples: Array, hole: tuple[int, int], going: Going) -> Array:
-        """Return samples (M, 6) for an interval with a hole, to be integrated without gravity."""
-        start_ns, stop_ns = hole
-        mean_before, mean_after = self._means_beside(start_ns, stop_ns)
+    def _bridge(self, stamps_ns: NDArray[np.int64], samples: Array, gap: tuple[int, int], going: Going) -> Array:
+        """Return samples (M, 6) for an interval with a gap, to be integrated without gravity."""
+        start_ns, stop_ns = gap
+        mean_before, mean_after = self._means_around(start_ns, stop_ns)
         length, t = (stop_ns - start_ns) * 1e-9 / _FORGET_S, (stamps_ns - start_ns)[:, None] * 1e-9 / _FORGET_S
         inside = (t > 0.0) & (t < length)
         t = np.clip(t, 0.0, length)
         mean = mean_before + t / length * (mean_after - mean_before)
-        before, after = self._at(np.array(hole)) - [mean_before, mean_after]
+        before, after = self._at(np.array(gap)) - [mean_before, mean_after]
         if stop_ns > self._stamps[-1]:
             across = mean + np.exp(-t) * before
         else:
@@ -151,34 +155,34 @@ class Links:
         )
         return samples
 
-    def _params_across(self, start_ns: int, stop_ns: int, hole: tuple[int, int]) -> Any:
-        """Return the params of an interval with a hole.
+    def _gap_params(self, start_ns: int, stop_ns: int, gap: tuple[int, int]) -> Any:
+        """Return the parameters of an interval with a gap.
 
-        Of what one hole tilts it has its share: by time, or, while nobody knows how long the hole will be, of what fades.
+        An interval gets its share of the tilt of the whole gap: by time, or, if the end of the gap is not known yet, by the decay.
         """
-        begin, end = ((np.clip(at_ns, *hole) - hole[0]) * 1e-9 / _FORGET_S for at_ns in (start_ns, stop_ns))
-        if hole[1] > self._stamps[-1]:
+        begin, end = ((np.clip(at_ns, *gap) - gap[0]) * 1e-9 / _FORGET_S for at_ns in (start_ns, stop_ns))
+        if gap[1] > self._stamps[-1]:
             share = np.exp(-begin) - np.exp(-end)
         else:
-            share = (end - begin) * _FORGET_S * 1e9 / (hole[1] - hole[0])
+            share = (end - begin) * _FORGET_S * 1e9 / (gap[1] - gap[0])
         white = self._config.gyro_noise_radps * self._noise_scale
         tilt = np.hypot(white, _UNKNOWN_RADPS * np.sqrt(share / ((stop_ns - start_ns) * 1e-9)))
         return self._make_params(0.0, _UNKNOWN_MPS2, np.array([tilt, tilt, _UNKNOWN_RADPS]))
 
-    def _means_beside(self, start_ns: int, stop_ns: int) -> tuple[Array, Array]:
-        """Means (6,) of the seconds before and after a hole; a side of which too little is there says what the other does."""
+    def _means_around(self, start_ns: int, stop_ns: int) -> tuple[Array, Array]:
+        """Return the means (6,) of the seconds before and after a gap; a side with too few samples takes the mean of the other."""
         around_ns = int(_AROUND_S * 1e9)
         first, start, stop, last = np.searchsorted(
             self._stamps, [start_ns - around_ns, start_ns + 1, stop_ns, stop_ns + around_ns]
         )
         sides = [(first, start), (stop, last)]
-        means = [self._samples[a:b].mean(axis=0) for a, b in sides if self._heard_ns(a, b) > around_ns // 2]
+        means = [self._samples[a:b].mean(axis=0) for a, b in sides if self._covered_ns(a, b) > around_ns // 2]
         if not means:
             means = [self._samples[first:last].mean(axis=0)]
         return means[0], means[-1]
 
-    def _heard_ns(self, a: int, b: int) -> int:
-        """For how long samples a to b speak, their holes left out."""
+    def _covered_ns(self, a: int, b: int) -> int:
+        """Return the time that samples a to b cover, without gaps."""
         steps = np.diff(self._stamps[a:b])
         return int(steps[steps <= self._max_gap_ns].sum())
 
@@ -189,33 +193,33 @@ class Links:
         )
 
     def gyro_at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Return the raw rates (M, 3) in body axes."""
+        """Return the raw rates (M, 3), rad/s, in body axes."""
         return np.asarray(self._at(stamps_ns)[:, 3:] @ self._R_body_imu.T)
 
     def bias_steps(self, dt_s: float) -> Array:
-        """Return sigmas (6,) of the random walk over `dt_s`."""
+        """Return the sigmas (6,) of the bias's random walk over `dt_s`: m/s^2, rad/s."""
         c = self._config
         sigmas = np.array([c.accel_bias_walk_mps2] * 3 + [c.gyro_bias_walk_radps] * 3)
         return np.asarray(sigmas * np.sqrt(dt_s) * self._noise_scale)
 
     def bias_sigmas(self) -> Array:
-        """Return turn-on sigmas (6,)."""
+        """Return the turn-on sigmas (6,) of the bias: m/s^2, rad/s."""
         c = self._config
         return np.array([c.accel_bias_sigma_mps2] * 3 + [c.gyro_bias_sigma_radps] * 3)
 
     def gaps(self) -> list[tuple[int, int]]:
-        """Return the holes in the data."""
+        """Return the gaps in the data, (start, stop) in ns."""
         wide = np.flatnonzero(np.diff(self._stamps) > self._max_gap_ns)
         return [(int(self._stamps[i]), int(self._stamps[i + 1])) for i in wide]
 
 
 def _sinh_share(t: Array, length: float) -> Array:
-    """sinh(t) / sinh(length), 0 <= t <= length, however long."""
+    """Return sinh(t) / sinh(length) for 0 <= t <= length, without overflow."""
     return np.asarray((np.exp(t - length) - np.exp(-t - length)) / (1.0 - np.exp(-2.0 * length)))
 
 
 class ImuRow:
-    """The row of the inertial sensor."""
+    """Row of the inertial sensor."""
 
     kind = "imu"
     config = ImuConfig

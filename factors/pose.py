@@ -44,7 +44,7 @@ def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor:
 
 
 def residuals(m: PoseFix, config: AnyPoseConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Residuals predicted - measured (k,), m and rad, one for each mode."""
+    """Return predicted - measured (k,), m and rad, for each mode."""
     T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
     R = T_world_sensor.rotation().matrix()
     picked = [AXES.index(a) for a in m.axes]
@@ -74,12 +74,12 @@ def _stated(m: PoseFix) -> float:
 
 
 def _false_probability(m: PoseFix, config: AnyPoseConfig) -> float:
-    """The front-end's own 'none of them' where it states one, else the configured fraction."""
+    """Return the front-end's own probability of 'none of the modes' where it states one, else the configured share."""
     return float(np.clip(m.none_probability if m.none_probability > 1e-6 else config.false_fraction, 1e-4, 0.99))
 
 
 def false(m: PoseFix, config: AnyPoseConfig) -> FalseModel:
-    """Return what is expected of a false pose: anywhere in BL's search window, and likely to stay there."""
+    """Return the model of a false pose: anywhere in BL's search window, and likely to repeat."""
     sigmas = np.array([FALSE_SPREAD_M if AXES.index(a) < 3 else FALSE_SPREAD_RAD for a in m.axes])
     return FalseModel(probability=_false_probability(m, config), cov=np.diag(sigmas**2), repeats=config.false_repeats)
 
@@ -105,13 +105,13 @@ def factors(m: PoseFix, config: AnyPoseConfig, at: Attachment, decision: Decisio
 
 
 def _world_jacobian(R_world_sensor: Array, T_state_sensor: Any) -> Array:
-    """d(translation, rotation of the sensor, world axes) / d(body tangent of the state), (6, 6)."""
+    """Return d(translation, rotation of the sensor about world axes) / d(body tangent of the state), (6, 6)."""
     adjoint = np.asarray(T_state_sensor.inverse().AdjointMap())
     return np.vstack([R_world_sensor @ adjoint[3:], R_world_sensor @ adjoint[:3]])
 
 
 def ideal(at: Attachment, config: AnyPoseConfig) -> PoseFix:
-    """Return the pose that the attachment's estimate would give."""
+    """Return the noise-free pose at the attachment's state."""
     T = at.T_world_body.compose(at.T_state_sensor)
     values = np.concatenate([T.translation(), T.rotation().rpy()])
     sigmas = np.where(np.arange(6) < 3, 0.3, np.radians(2.0))
@@ -121,7 +121,7 @@ def ideal(at: Attachment, config: AnyPoseConfig) -> PoseFix:
 
 
 def hint(m: PoseFix, mount_yaw_rad: float, datum: Datum) -> Hint:
-    """Return the likeliest mode's place and heading, as far as it has them."""
+    """Return position and heading of the likeliest mode, as far as it has them."""
     best = max(m.modes, key=lambda mode: mode.probability)
     value, sigma = np.full(6, np.nan), np.full(6, np.nan)
     picked = [AXES.index(a) for a in m.axes]

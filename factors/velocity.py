@@ -3,11 +3,10 @@
 
     z = v + dv + R (omega x l) + w,   w ~ N(0, C)
 
-v: velocity of body in world at the state; dv: what the IMU says it gains until the measurement; omega:
-body rate from the gyroscope, bias removed; l: antenna in body. d z / d v = I, d z / d theta = -R [omega x l]_x.
-The swing is no nuisance but a measurement: in waves it tells the heading. With R held at the estimate
-instead, passes crept (6 of them, and not there yet). dv and omega are taken from the estimate, anew at
-every pass; dv within half a period of the states turns by 9 mm/s for 1 deg of attitude.
+v: velocity of body in world at the state; dv: its change until the measurement, by the IMU; omega: body rate from the gyroscope,
+bias removed; l: antenna in body. d z / d v = I, d z / d theta = -R [omega x l]_x. The lever-arm term carries information: in
+waves it shows the heading. With R fixed at the estimate in it, passes converged slowly (not after 6). dv and omega are taken
+from the estimate at every pass; dv within half a period of the states turns by 9 mm/s for 1 deg of attitude.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from graphloc.config import VelocityConfig
 from graphloc.factors._noise import with_floors
 from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor
-from graphloc.linear import Term, linear_update, pose_term
+from graphloc.linear import linear_factor
 from graphloc.measurements import GnssVelocity
 
 
@@ -28,13 +27,13 @@ def _antenna_mps(at: Attachment) -> Array:
 
 
 def _attitude_jacobian(at: Attachment) -> Array:
-    """Derivative (3, 6) of R Exp(theta) (omega x l) by the body tangent (theta, rho)."""
+    """Return the derivative (3, 6) of R Exp(theta) (omega x l) by the body tangent (theta, rho)."""
     swing = skew(np.cross(at.gyro_radps, at.lever_m))
     return np.hstack([-at.T_world_body.rotation().matrix() @ swing, np.zeros((3, 3))])
 
 
 def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Residual predicted - measured (3,) in m/s, world axes."""
+    """Return predicted - measured (3,), m/s, in world."""
     raw = _antenna_mps(at) - m.v_world_mps
     return (
         Residual(
@@ -51,20 +50,18 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
 
 def factors(m: GnssVelocity, config: VelocityConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one velocity."""
-    residual = residuals(m, config, at)[0]
-    swing = pose_term(at, residual.jacobian())
-    return linear_update(residual, [swing, Term(at.velocity_key, at.v_world_mps, np.eye(3))], decision)
+    return linear_factor(residuals(m, config, at)[0], at, decision)
 
 
 def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
-    """Return the velocity that the attachment's estimate would give."""
+    """Return the noise-free velocity at the attachment's state."""
     return GnssVelocity(
         stamp_ns=0, sensor="gnss_velocity", seq=0, v_world_mps=_antenna_mps(at), cov_m2ps2=np.eye(3) * 0.01
     )
 
 
 def hint(m: GnssVelocity, mount_yaw_rad: float, datum: Datum) -> Hint:
-    """Return the antenna's velocity."""
+    """Return the velocity of the antenna."""
     return Hint(v_world_mps=m.v_world_mps)
 
 

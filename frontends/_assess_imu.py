@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judging an IMU: units, gravity, standstill, noise, and which way it is mounted."""
+"""Assess an IMU: units, gravity, standstill, noise and mount."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, o
 
 
 def samples_of(imu: Stream) -> tuple[NDArray[np.intp], list[str]]:
-    """Return which messages are samples, in order of stamps, and a warning on frozen ones, which are not among them."""
+    """Return the indices of usable samples, sorted by stamp, and warnings on frozen ones, which are dropped."""
     keep = sane(imu)
     bad = frozen_samples(imu.stamps_ns[keep], imu.rows[keep, :6] if len(keep) else np.zeros((0, 6)))
     return keep[~bad], frozen_imu_warning(imu.topic, imu.stamps_ns[keep], bad)
@@ -38,10 +39,10 @@ def samples_of(imu: Stream) -> tuple[NDArray[np.intp], list[str]]:
 def mount_guess(
     imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion], tree: StaticTree, body: str
 ) -> MountGuess:
-    """Return how an IMU sits in the body: from /tf_static, else levelled by gravity and turned by motion.
+    """Return the IMU's mount in body: from /tf_static, else levelled by gravity and aligned with the motion.
 
     Args:
-        accel: (N, 3) m/s^2; gyro: (N, 3) rad/s, of the samples that are kept.
+        accel, gyro: (N, 3) m/s^2, (N, 3) rad/s, of usable samples.
     """
     up = np.median(accel, axis=0)
     size = float(np.linalg.norm(up))
@@ -71,7 +72,7 @@ def mount_guess(
 
 
 def _turned(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion], level: Array, said: str) -> MountGuess:
-    """Return the mount of a sensor that `level` (3, 3) levels, turned by motion; `said`: how that is known."""
+    """Return the mount of a sensor that `level` (3, 3) levels, aligned with the motion; `said`: why it is known."""
     yaw, evidence = _mount_yaw(imu, accel @ level.T, gyro @ level.T, motions)
     turn = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
     rpy = vec(np.round(np.degrees(rpy_from_rotation(turn @ level)), 1) + 0.0)
@@ -90,9 +91,9 @@ def _level(axis: Array) -> Array:
 
 
 def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion]) -> tuple[float, str]:
-    """Return the turn (deg) that fits the motion, and the evidence; `accel`, `gyro` are levelled.
+    """Return the yaw (deg) that fits the motion, with the evidence; `accel`, `gyro` are levelled.
 
-    A quarter turn, unless the motion tells clearly that it is none.
+    It is a multiple of 90 deg unless the motion clearly contradicts that.
     """
     if not motions:
         return 0.0, "no motion to find its yaw from: taken as 0"
@@ -109,7 +110,7 @@ def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion]
 
 
 def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Turning | None:
-    """Return how the craft turned, by an IMU whose mount is known or guessed; its gyro bias taken off where found."""
+    """Return the integrated rate of an IMU whose mount is known or guessed, with its gyro bias removed if known."""
     said = _in_body(imu, report, tree, body)
     if said is None:
         return None
@@ -119,7 +120,7 @@ def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> T
 
 
 def felt_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Felt | None:
-    """Return what an IMU felt whose mount is known or guessed, in the axes of the craft."""
+    """Return the motion by an IMU whose mount is known or guessed, in the axes of the vessel."""
     said = _in_body(imu, report, tree, body)
     return None if said is None else Felt.of(*said)
 
@@ -127,7 +128,7 @@ def felt_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Felt
 def _in_body(
     imu: Stream, report: ImuReport, tree: StaticTree, body: str
 ) -> tuple[NDArray[np.int64], Array, Array] | None:
-    """Stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the craft; None of few samples."""
+    """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel; None of few samples."""
     keep, _ = samples_of(imu)
     keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)] if len(keep) else keep
     if len(keep) < 20:
@@ -141,7 +142,7 @@ def _in_body(
 
 
 def _against_courses(imu: Stream, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str) -> int:
-    """Return +1 where the gyro turns as the course of the fixes does, -1 where the other way round, 0 where nothing tells."""
+    """Return +1 if the gyro turns like the course of the fixes, -1 if opposite, 0 if unclear."""
     if courses is None or len(courses.stamps_ns) < 20:
         return 0
     turning, course = turning_of(imu, report, tree, body), np.unwrap(courses.course_rad)
@@ -157,13 +158,13 @@ def _righted(
     tree: StaticTree,
     body: str,
 ) -> ImuReport:
-    """Return the report, its accelerations taken with the opposite sign where that alone fits the courses.
+    """Return the report with accelerations of the opposite sign, if only that fits the courses.
 
-    Levelled by accelerations of the wrong sign, a sensor lies on its back, and its gyroscope turns the wrong way.
-    Where /tf_static knows the mount, the gyroscope turns rightly, and gravity points down.
+    Levelled by accelerations of the wrong sign, the sensor is upside down and its gyroscope turns the wrong way. If the mount is from
+    /tf_static, the gyroscope turns correctly, and gravity points down.
 
     Args:
-        samples: acceleration (N, 3) m/s^2 and rate (N, 3) rad/s of the samples that are kept.
+        samples: acceleration (N, 3) m/s^2 and rate (N, 3) rad/s of usable samples.
     """
     sense = _against_courses(imu, report, courses, tree, body)
     accel, gyro = samples
@@ -197,7 +198,7 @@ def _righted(
 def imu_report(
     imu: Stream, motions: Sequence[Motion], courses: Courses | None, tree: StaticTree, body: str
 ) -> ImuReport | None:
-    """Return units, gravity, standstill, noise and mount of an IMU."""
+    """Return units, gravity, standstill, noise and mount of an IMU; None if it has less than 20 samples."""
     keep, frozen = samples_of(imu)
     rows = imu.rows[keep] if len(keep) else np.zeros((0, 13))
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(rows[:, :6]).all(axis=1))
@@ -205,35 +206,14 @@ def imu_report(
         return None
     stamps = imu.stamps_ns[keep]
     accel, gyro = np.where(finite[:, None], rows[:, :3], 0.0), np.where(finite[:, None], rows[:, 3:6], 0.0)
-    size = float(np.median(np.linalg.norm(accel, axis=1)))
-    rate = float(np.median(np.linalg.norm(gyro, axis=1)))
-    why = frozen
     missing = missing_half(accel, gyro)
-    if missing:
-        why.append(f"all its {missing} are 0: {HALF}")
-    gravity = "removed" if without_gravity(accel) else "included"
-    accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
-    gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS else "rad/s"
-    if accel_unit == "g":
-        why.append(f"median acceleration is {size:.2f}: looks like g")
-    if gravity == "removed":
-        why.append(f"median acceleration is {size:.2f}: looks like gravity was removed by the driver")
-    if accel_unit == "m/s^2" and gravity == "included" and not 8.5 < size < 11.5:
-        why.append(f"median acceleration is {size:.2f}: neither m/s^2 nor g with gravity; check the sensor")
-    if gyro_unit == "deg/s":
-        why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")
-    accel = accel * (STANDARD_GRAVITY_MPS2 if accel_unit == "g" else 1.0)
-    gyro = gyro * (np.pi / 180.0 if gyro_unit == "deg/s" else 1.0)
+    units = _units_of(accel, gyro)
+    accel = accel * (STANDARD_GRAVITY_MPS2 if units.accel == "g" else 1.0)
+    gyro = gyro * (np.pi / 180.0 if units.gyro == "deg/s" else 1.0)
     up = np.median(accel, axis=0)
     still = _standstill(stamps, accel, gyro, next((m for m in motions if m.rests), None))
     root_dt = float(np.sqrt(np.median(np.diff(stamps)) / NS_PER_S))
     quiet = still.sum() > 20
-
-    def density(columns: Array) -> float:
-        """Of the worst axis over the whole run: what hull, engine and wheels shake is noise to the graph."""
-        # Third differences remove motion; those of white noise have 20 x its variance.
-        usual = np.median(np.abs(np.diff(columns, n=3, axis=0)), axis=0)
-        return float(1.4826 * usual.max() / np.sqrt(20.0)) * root_dt
 
     def reported(column: int, unit: float) -> float | None:
         variance = float(np.median(rows[:, column]))
@@ -242,16 +222,16 @@ def imu_report(
     ug, mdps = 1e-6 * STANDARD_GRAVITY_MPS2, np.radians(1e-3)
     report = ImuReport(
         topic=imu.topic,
-        gravity_size=size,
+        gravity_size=units.gravity_size,
         gravity_axis=vec(up / max(float(np.linalg.norm(up)), 1e-9)),
-        accel_unit=accel_unit,
-        gyro_unit=gyro_unit,
-        gravity=gravity,
-        why=tuple(why),
+        accel_unit=units.accel,
+        gyro_unit=units.gyro,
+        gravity=units.gravity,
+        why=(*frozen, *([f"all its {missing} are 0: {HALF}"] if missing else []), *units.why),
         still_s=float(still.sum()) * root_dt**2,
         gyro_bias_radps=vec(gyro[still].mean(axis=0)) if quiet else None,
-        accel_noise_ug=density(accel) / ug,
-        gyro_noise_mdps=density(gyro) / mdps,
+        accel_noise_ug=_scatter(accel) * root_dt / ug,
+        gyro_noise_mdps=_scatter(gyro) * root_dt / mdps,
         reported_accel_ug=reported(10, ug),
         reported_gyro_mdps=reported(11, mdps),
         mount=mount_guess(imu, accel, gyro, motions, tree, body),
@@ -260,10 +240,48 @@ def imu_report(
     return _righted(report, imu, (accel, gyro), motions, courses, tree, body)
 
 
-def _standstill(stamps: NDArray[np.int64], accel: Array, gyro: Array, motion: Motion | None) -> NDArray[np.bool_]:
-    """Return (N,) whether a sample lies in quiet seconds in a row (and the speed, where known, is zero).
+class _Units(NamedTuple):
+    """Units of accelerations and rates, whether gravity is in them, and the median acceleration, as `ImuReport` has them."""
 
-    A vessel that rolls is quiet for a second where she turns back, and what she does then is no bias.
+    accel: str
+    gyro: str
+    gravity: str
+    gravity_size: float
+    why: tuple[str, ...]
+
+
+def _units_of(accel: Array, gyro: Array) -> _Units:
+    """Return the likely units of accelerations (N, 3) and rates (N, 3)."""
+    size = float(np.median(np.linalg.norm(accel, axis=1)))
+    rate = float(np.median(np.linalg.norm(gyro, axis=1)))
+    gravity = "removed" if without_gravity(accel) else "included"
+    accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
+    gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS else "rad/s"
+    why = []
+    if accel_unit == "g":
+        why.append(f"median acceleration is {size:.2f}: looks like g")
+    if gravity == "removed":
+        why.append(f"median acceleration is {size:.2f}: looks like gravity was removed by the driver")
+    if accel_unit == "m/s^2" and gravity == "included" and not 8.5 < size < 11.5:
+        why.append(f"median acceleration is {size:.2f}: neither m/s^2 nor g with gravity; check the sensor")
+    if gyro_unit == "deg/s":
+        why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")
+    return _Units(accel_unit, gyro_unit, gravity, size, tuple(why))
+
+
+def _scatter(columns: Array) -> float:
+    """Return the white noise of the worst axis of (N, 3), in their unit, with the vibration of hull, engine and wheels.
+
+    Third differences remove motion; those of white noise have 20 times its variance.
+    """
+    usual = np.median(np.abs(np.diff(columns, n=3, axis=0)), axis=0)
+    return float(1.4826 * usual.max() / np.sqrt(20.0))
+
+
+def _standstill(stamps: NDArray[np.int64], accel: Array, gyro: Array, motion: Motion | None) -> NDArray[np.bool_]:
+    """Return (N,) whether a sample is in several quiet seconds in a row, at a speed of zero if that is known.
+
+    A rolling vessel is quiet for a second at each end of its motion, and its rate then is not a bias.
     """
     second = (stamps - stamps[0]) // NS_PER_S
     quiet = np.zeros(int(second[-1]) + 1, dtype=bool)

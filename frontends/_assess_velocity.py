@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judging velocities by the GNSS track: in which axes are they, and which of them tells how the craft moves?"""
+"""Assess velocities by the GNSS track: in which axes they are, and which gives the vessel's motion best."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _FEWEST = 20
 def axes_of(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float = 0.0) -> tuple[str | None, str]:
     """Return the axes in which the velocities of a stream fit chords of a track, and the evidence in words.
 
-    The axes are None where nothing tells, 'unknown' where none fits.
+    The axes are None if the data do not show them, 'unknown' if none fits.
 
     Args:
         stream: velocities in its last three columns. stamps_ns: (N,) of the track. p_m: (N, 3) the track, east, north, up.
-        scatter_m: noise of its places, 1 sigma of an axis.
+        scatter_m: noise of its positions, 1 sigma of an axis.
     """
     keep = sane(stream)
     v = stream.rows[keep, -3:] if len(keep) else np.zeros((0, 3))
@@ -55,14 +55,14 @@ def axes_of(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m:
 
 
 def _less(rms: float, noise: float) -> float:
-    """What is left of an RMS without its noise."""
+    """Return an RMS without the part of its noise."""
     return float(np.sqrt(max(rms**2 - noise**2, 0.0)))
 
 
 def velocity_report(
     stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, tf_frame: str | None, scatter_m: float = 0.0
 ) -> VelocityReport:
-    """Return the axes of a twist or vector; `tf_frame`: its frame, where /tf_static knows it; else as `axes_of`."""
+    """Return the axes of a twist or vector: of `tf_frame`, if /tf_static has its frame; else as `axes_of`."""
     axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
     if through_water(stream.topic):
         axes, why = BODY_AXES, f"a speed through the water; {why}"
@@ -72,7 +72,7 @@ def velocity_report(
 def odometry_report(
     stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, world: World, scatter_m: float = 0.0
 ) -> OdometryReport:
-    """Guess what an odometry or pose topic is, by its name and whether it reports the speed of the craft.
+    """Return the likely role of an odometry or pose topic, by its name and whether it reports the speed of the vessel.
 
     Args:
         world: its frame, by `world_of`; else as `axes_of`.
@@ -106,11 +106,11 @@ def odometry_report(
 def motions_of(
     wheels: Sequence[Stream], twists: Sequence[tuple[Stream, VelocityReport]], fixes: Sequence[Stream]
 ) -> list[Motion]:
-    """Return how the craft moved, by wheels, by velocities and by fixes: what tells its speed best first.
+    """Return the motion of the vessel by wheels, velocities and fixes, the most accurate source of speed first.
 
     Args:
-        wheels: odometry that reports the speed along the craft. twists: velocities, and in which axes they are: what fits
-            the track in none is something else, as a `Vector3Stamped` may be anything.
+        wheels: odometry that reports the speed along the vessel. twists: velocities and their axes; those that fit the track in
+            no axes are something else, as a `Vector3Stamped` may be anything.
     """
     found = [m for s in wheels if (m := _told(s, BODY_AXES)) and float(np.ptp(m.speed_mps)) > 0.2]
     for stream, report in twists:
@@ -128,7 +128,7 @@ def motions_of(
 
 
 def _told(stream: Stream, axes: str) -> Motion | None:
-    """The motion that a stream of velocities tells; NaN: before the first fix."""
+    """Return the motion by a stream of velocities; NaN before the first fix."""
     keep = sane(stream)
     keep = keep[np.isfinite(stream.rows[keep, -3:-1]).all(axis=1)] if len(keep) else keep
     if len(keep) <= _FEWEST:

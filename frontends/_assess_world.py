@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judging poses by the GNSS track: is their frame east-north-up, and where is its origin?"""
+"""Assess poses by the GNSS track: whether their frame is east-north-up, and its origin."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _APART_M, _APART = 5.0, 0.02  # largest distance that still fits: metres, share 
 
 
 class World(NamedTuple):
-    """The frame of some poses: its origin, None where it is not east-north-up or nothing tells; the evidence in words.
+    """Frame of poses: its origin, None if it is not east-north-up or unknown; the evidence in words.
 
-    `pose`: whether they may be poses of the vessel about a datum: no map grid, nor what stays where it is while she moves.
+    `pose`: whether they may be poses of the vessel about a datum, neither in a map grid nor of something else.
     """
 
     origin: Vec | None
@@ -36,11 +36,11 @@ class World(NamedTuple):
 def world_of(
     poses: Stream, stamps_ns: NDArray[np.int64], p_m: Array, first_fix: Vec | None, antenna_m: Array | None
 ) -> World:
-    """Return where the origin of the poses' frame is: latitude, longitude, deg, and height, m.
+    """Return the origin of the poses' frame: latitude, longitude, deg, and height, m.
 
     Args:
         poses: odometry or poses. stamps_ns: (N,) of the fixes. p_m: (N, 3) m about `first_fix`, ENU.
-        antenna_m: (3,) in body, where /tf_static knows it.
+        antenna_m: (3,) in body, if /tf_static has it.
     """
     keep = sane(poses)
     keep = keep[np.isfinite(poses.rows[keep, :3]).all(axis=1)] if len(keep) else keep
@@ -87,7 +87,7 @@ def world_of(
 
 
 def _quaternions(rows: Array) -> Array:
-    """Quaternions (N, 4) that rotate; those that cannot are taken level."""
+    """Return valid quaternions (N, 4); invalid ones are replaced by the identity."""
     size = np.linalg.norm(rows, axis=1)
     good = np.isfinite(size) & (np.abs(size - 1.0) < 0.1)
     return np.where(good[:, None], rows, [0.0, 0.0, 0.0, 1.0])

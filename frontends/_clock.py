@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps that cannot be true: clock jumps, repeated and backward stamps, clocks in different epochs."""
+"""Implausible stamps: clock jumps, repeated and backward stamps, clocks in different epochs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def usual_latency_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
 def gain_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
     """Return by how much a clock gains on the recording times from the first tenth of its messages to the last, s.
 
-    Of each tenth the messages that were recorded soonest are asked: others waited somewhere.
+    In each tenth the smallest latencies count, since other messages were delayed.
     """
     tenth = len(stamps_ns) // 10
     if tenth < _FEWEST:
@@ -50,31 +50,31 @@ def gain_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
 
 
 class Clock(NamedTuple):
-    """Of a topic: its first stamp, ns, and the usual latency by it, s."""
+    """Clock of a topic: its first stamp, ns, and its usual latency, s."""
 
     first_ns: int
     latency_s: float
 
 
 def reference_of(imu: Clock, others: Iterable[Clock]) -> Clock:
-    """Return the clock that the others are set by: the IMU's, or the first that tells a date where that counts from its start.
+    """Return the clock that others are compared with: the IMU's; if that counts from its start, the first one that has a date.
 
-    By the latter the track would lie in 1970.
+    Compared with a clock that counts from its start, the track would be dated 1970.
     """
     return next((c for c in (imu, *others) if c.first_ns >= NO_DATE_NS), imu)
 
 
 def behind_s(own: Clock, imu: Clock, reference: Clock) -> float:
-    """Return by how much a clock is behind the reference, s; of one that looks the IMU's, by how much the IMU's is.
+    """Return by how much a clock is behind the reference, s; of a clock that agrees with the IMU's, by how much the IMU's is.
 
-    Messages of one computer take longer or shorter, and its stamps must not be pulled apart by that.
+    Messages from one computer have different latencies, and their stamps must not be shifted against each other for that.
     """
     same = abs(own.latency_s - imu.latency_s) <= EPOCH_LIMIT_S
     return (imu if same else own).latency_s - reference.latency_s
 
 
 def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps, limit_s: float = JUMP_LIMIT_S) -> NDArray[np.bool_]:
-    """Return (N,) whether a stamp lies further than `limit_s` from its topic's usual latency."""
+    """Return (N,) whether a stamp differs by more than `limit_s` from the usual latency of its topic."""
     if len(stamps_ns) == 0:
         return np.zeros(0, dtype=bool)
     latency_ns = logs_ns - stamps_ns
@@ -84,8 +84,8 @@ def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps, limit_s: float = JUMP_LIMIT_
 def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
     """Return (N,) which readings to keep so that as many as possible remain with strictly increasing stamps.
 
-    Dropping whatever is not later than its forerunner would let one stamp that jumped ahead throw
-    away all readings until the clock has caught up; this drops the one. Patience sorting, N log N.
+    If each stamp only had to be later than the one before, one that jumped ahead would remove all readings until the clock has
+    caught up; this removes that one. Patience sorting, N log N.
     """
     n = len(stamps_ns)
     if n < 2 or bool((np.diff(stamps_ns) > 0).all()):
@@ -112,9 +112,9 @@ def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def in_order_or_late(stamps_ns: Stamps) -> NDArray[np.bool_]:
-    """Return (N,) which samples of an IMU to keep: those that arrived in order, and those that came late into their holes.
+    """Return (N,) which IMU samples to keep: those in order, and late ones that fill a gap.
 
-    A stamp that lies closer to another is repeated, or of another clock.
+    A stamp close to another one is a repetition, or from another clock.
     """
     keep = longest_increasing(stamps_ns)
     kept, late = stamps_ns[keep], np.flatnonzero(~keep)
@@ -131,9 +131,9 @@ def in_order_or_late(stamps_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def set_backs(stamps_ns: Stamps) -> list[int]:
-    """Return where, in order of arrival, a clock was set back: from there on it goes through times that it said before.
+    """Return the indices at which a clock was set back, in order of arrival: from there on stamps repeat a period already covered.
 
-    Samples that were held up on their way come from a hole, which none was said of.
+    Samples that were only delayed fill a gap instead.
     """
     found: list[int] = []
     tries = np.flatnonzero(np.diff(stamps_ns) < -duration_ns(_SET_BACK_S)) + 1
@@ -153,9 +153,9 @@ def set_backs(stamps_ns: Stamps) -> list[int]:
 def refuse_woven(
     topic: str, stamps_ns: Stamps, logs_ns: Stamps, contents: Sequence[Hashable], files: Sequence[str]
 ) -> None:
-    """Refuse files, or parts of one, that lie over each other by the recording clock too: nothing can part them again.
+    """Refuse files, or parts of one, that overlap by stamps and recording times, since they cannot be separated.
 
-    Two recordings of the same messages are none.
+    Copies of the same messages are accepted.
 
     Args:
         stamps_ns, logs_ns, contents, files: (N,) of an IMU's messages, in order of arrival.
@@ -190,9 +190,9 @@ def refuse_woven(
 
 
 def refuse_set_back(topic: str, file: str, logs_ns: Stamps) -> None:
-    """Refuse a file whose recording clock was set back while it was written: readers put it in order of time, and so weave it.
+    """Refuse a file whose recording clock was set back: readers sort by time, and so mix both parts.
 
-    Messages that a file holds twice are none.
+    Duplicated messages are accepted.
 
     Args:
         logs_ns: (N,) recording times of an IMU's messages, in the order in which they were written.
@@ -215,7 +215,7 @@ def refuse_set_back(topic: str, file: str, logs_ns: Stamps) -> None:
 
 
 def busiest_section(stamps_ns: Stamps, hole_s: float = HOLE_LIMIT_S) -> tuple[int, int]:
-    """Return first and last stamp of the section with most readings, sections being parted by holes."""
+    """Return first and last stamp of the section with most readings; sections are separated by gaps."""
     ordered = np.sort(stamps_ns)
     cuts = np.flatnonzero(np.diff(ordered) > duration_ns(hole_s)) + 1
     section = max(np.split(ordered, cuts), key=len)

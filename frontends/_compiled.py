@@ -10,9 +10,9 @@ import numba
 
 
 def compiled(**options: Any) -> Callable[[Any], Any]:
-    """Return a decorator as `numba.njit(**options)`, which caches where it may write.
+    """Return a decorator like `numba.njit(**options)` that caches on disk where a folder is writable.
 
-    A service without a home, of a package that it may not write to, has no such place: it compiles anew at each start.
+    A service without a home folder, with graphloc installed read-only, has none: it compiles at each start.
     """
 
     def compile_(function: Any) -> Any:

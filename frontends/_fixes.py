@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixes that tell less than they say: places that a driver repeats, stamps that it cuts, noise that a receiver hides."""
+"""Deficiencies of fixes: positions that a driver repeats, stamps that it truncates, noise that a receiver understates."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ SCATTERS = 2.0
 
 
 def held(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
-    """Return (N,) which fixes only repeat, under a new stamp, the place of the one before, which then moves on.
+    """Return (N,) which fixes repeat the position of the one before under a new stamp; if that is rare, no fix is marked.
 
-    None where that is no habit: at rest a receiver's filter may well say the same twice.
+    Only repetitions before a change count: at rest, a receiver's filter may output one position several times.
     """
     bad = np.zeros(len(fixes), dtype=bool)
     order = sorted(range(len(fixes)), key=lambda i: (fixes[i].stamp_ns, fixes[i].seq))
@@ -42,7 +42,7 @@ def held(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
 
 
 def held_warning(sensor: str, bad: NDArray[np.bool_]) -> list[str]:
-    """Return a line where a driver repeats places, as `held` found."""
+    """Return a line if a driver repeats positions, as `held` found."""
     if not bad.any():
         return []
     said = f"{sensor}: {int(bad.sum())} of {len(bad)} fixes repeat the previous position under a new stamp: the driver "
@@ -50,7 +50,7 @@ def held_warning(sensor: str, bad: NDArray[np.bool_]) -> list[str]:
 
 
 def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
-    """Return a line where stamps (N,) of different measurements are often the same, as a driver cuts them, or come in bursts."""
+    """Return a line if stamps (N,) of different measurements are often equal, as a driver truncates them, or come in bursts."""
     moments = np.unique(stamps_ns)
     steps_s = np.diff(moments) / NS_PER_S
     if len(moments) > 3 and float((steps_s < _AT_ONCE * steps_s.mean()).mean()) > _CUT:
@@ -69,7 +69,7 @@ def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
 
 
 def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:
-    """Return a line where fixes have no height."""
+    """Return a line if fixes have no height."""
     flat = sum(not m.has_height for m in fixes)
     if not flat:
         return []
@@ -80,7 +80,7 @@ def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:
 
 
 def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConfig) -> list[str]:
-    """Return a line where fixes scatter from one to the next by far more than they claim, or claim to tell next to nothing."""
+    """Return a line if fixes scatter by far more than they claim, or claim an uncertainty so large that they are of no use."""
     if len(fixes) < _FEWEST:
         return []
     ordered = sorted(fixes, key=lambda m: (m.stamp_ns, m.seq))
@@ -102,9 +102,9 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
 
 
 def scatter_m(stamps_ns: NDArray[np.int64], p_m: Array) -> float | None:
-    """Return the white part of the noise of places (N, 2), m, of the worst axis; None where it could be motion.
+    """Return the white noise of positions (N, 2), m, of the worst axis; None if it could be motion.
 
-    Third differences remove a steady acceleration; those of white noise have 20 times its variance.
+    Third differences remove a constant acceleration; those of white noise have 20 times its variance.
     """
     steps = np.diff(stamps_ns) / NS_PER_S
     if len(steps) < _FEWEST:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How an IMU is turned in the craft about the vertical, by what it feels and how the craft moves.
+"""Yaw of an IMU's mount in the vessel, from its accelerations and the vessel's motion.
 
-Levelled, with unknown yaw psi, the horizontal acceleration as complex number a = ax + i ay meets that of the craft, m,
-forward + i to port, as m = exp(i psi) a. So psi = arg sum(conj(a) m), and |sum| / sqrt(sum |a|^2 sum |m|^2) says how far
-the data support it.
+Levelled, with unknown yaw psi, the horizontal acceleration as complex number a = ax + i ay relates to that of the vessel, m,
+forward + i to port, by m = exp(i psi) a. So psi = arg sum(conj(a) m), and |sum| / sqrt(sum |a|^2 sum |m|^2) is the coherence.
 """
 
 from __future__ import annotations
@@ -61,9 +60,9 @@ class YawInCraft:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Felt:
-    """What a levelled IMU felt: times (N,) s since `origin_ns`, how far it has turned, rad, and where its accelerations lead.
+    """Motion by a levelled IMU: times (N,), s since `origin_ns`, angle turned, rad, and the double integral of its acceleration.
 
-    That is (N,) m, x + i y, in the axes of its beginning.
+    The latter is (N,) m, x + i y, in the axes at the begin.
     """
 
     origin_ns: int
@@ -88,7 +87,7 @@ class Felt:
 def yaw_in_craft(
     stamps_ns: NDArray[np.int64], accel: Array, gyro: Array, motions: Sequence[Motion]
 ) -> YawInCraft | None:
-    """Return what is told most clearly by any motion over any time; None where none is long enough.
+    """Return the clearest estimate over all motions and window lengths; None if no motion is long enough.
 
     Args:
         stamps_ns: (N,), increasing. accel, gyro: (N, 3) m/s^2, rad/s, levelled.
@@ -99,10 +98,10 @@ def yaw_in_craft(
 
 
 def _yaw_by(felt: Felt, motion: Motion, half_s: float) -> YawInCraft | None:
-    """Return what a motion tells over one time.
+    """Return the estimate by one motion and one window length.
 
-    Places p tell the mean acceleration about t as p(t + h) - 2 p(t) + p(t - h), and p(t + h) - p(t - h) where the craft
-    heads; so does the sensor, in its own axes at t. h: `half_s`.
+    Of positions p, p(t + h) - 2 p(t) + p(t - h) gives the mean acceleration about t, and p(t + h) - p(t - h) the course; the
+    sensor gives the same in its own axes at t. h: `half_s`.
     """
     t, at = felt.t_s, felt.times_of(motion)
     there = np.interp(at, t, felt.turned)
@@ -127,6 +126,6 @@ def _yaw_by(felt: Felt, motion: Motion, half_s: float) -> YawInCraft | None:
 def bent(
     times_s: Array, places: NDArray[np.complex128], middle_s: Array, half_s: float
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Return the second difference of places about some times, and the first, over twice as long."""
+    """Return the second difference of positions about some times, and the first difference over twice the time."""
     behind, here, ahead = (np.interp(middle_s + k * half_s, times_s, places) for k in (-1, 0, 1))
     return ahead - 2.0 * here + behind, ahead - behind

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mounts of the sensors that a block lists (LiDARs, cameras): from the configuration, or from `/tf_static`."""
+"""Mounts of sensors that a block lists (LiDARs, cameras): from the configuration or from `/tf_static`."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ from graphloc.frontends._tf import StaticTree
 def mounts_of(
     bag: Bag, mounts: Mapping[str, MountConfig], body_frame: str, block: str
 ) -> dict[str, tuple[Array, Array]]:
-    """Return (t (3,), R (3, 3)) in body of each sensor, by name; `block` is what vessel.yaml calls their list.
+    """Return (t (3,) m, R (3, 3)) in body of each sensor, by name.
 
-    What of `/tf_static` cannot be decoded is told to `bag.warnings`: another message may be whole.
+    A message of `/tf_static` that cannot be decoded is reported in `bag.warnings`: another one may be intact.
+
+    Args:
+        block: name of their list in vessel.yaml, for messages.
 
     Raises:
-        InputError: no chain of transforms leads from the body to a sensor.
+        InputError: no chain of transforms connects a sensor with body.
     """
     tree = StaticTree()
     if any(mount.tf_frame for mount in mounts.values()):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening bags with rosbags: files, folders, and what is readable of damaged ones."""
+"""Open bags with rosbags: files, folders, and the readable part of damaged ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HINTS = {
 
 
 class Opened(NamedTuple):
-    """A file or folder, and its reader."""
+    """An open file or folder, and its reader."""
 
     path: Path
     reader: Reader1 | Reader2
@@ -38,9 +38,9 @@ class Opened(NamedTuple):
     def messages(
         self, wanted: list[Connection], start_ns: int | None, end_ns: int | None
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Return messages that were recorded from `start_ns` to before `end_ns`: connection, time (ns), bytes.
+        """Return messages recorded in [start_ns, end_ns): connection, time (ns), bytes.
 
-        MCAP without an index is taken in the order of the file, which need not be that of time.
+        MCAP without an index is read in the order of the file, which may differ from that of time.
         """
         if isinstance(self.reader, Reader2) and isinstance(self.reader.storage, McapReader):
             storage = self.reader.storage
@@ -50,10 +50,10 @@ class Opened(NamedTuple):
 
 
 class BagOpener:
-    """Opens one path after another.
+    """Opens paths one after another.
 
     Args:
-        stack: closes the readers. warnings: gets a line for each file that was damaged and could be read in part.
+        stack: closes the readers. warnings: gets a line for each damaged file that could be read in part.
 
     Attributes:
         opened: in order. broken: why others could not be opened.
@@ -65,7 +65,7 @@ class BagOpener:
         self.broken: list[str] = []
 
     def open(self, path: Path) -> None:
-        """Open a file, or a folder, or what is readable of it."""
+        """Open a file or a folder, or the readable part of it."""
         if not path.exists():
             raise InputError(f"{path}: no such file or folder")
         if path.is_dir():
@@ -98,7 +98,7 @@ class BagOpener:
             self.broken.append(f"{reason}; and no readable .bag, .mcap or .db3 file lies in it ({_instead(path)})")
 
     def _try(self, path: Path, kind: type[Reader1 | Reader2]) -> bool:
-        """Open with rosbags; a file that is cut short is opened again as far as it is whole."""
+        """Open with rosbags; a truncated file is opened again as far as it is intact."""
         try:
             view = as_ros2(path) if path.is_file() else None
             reader = _open_reader(kind, view or path)
@@ -133,13 +133,13 @@ class BagOpener:
 
 
 def _not_named(folder: Path) -> list[str]:
-    """Files of a folder that its metadata.yaml does not name: of a recorder that died, say, or copied there."""
+    """Return the files of a folder that its metadata.yaml does not name, such as those of a recorder that crashed."""
     named = (folder / "metadata.yaml").read_text(encoding="utf-8", errors="replace")
     return sorted(p.name for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.name not in named)
 
 
 def _instead(folder: Path) -> str:
-    """Say what may have been meant by a folder that is no bag: one of graphloc's own, or one level up."""
+    """Suggest what to give instead of a folder that is not a bag: a run folder's bag, or a bag inside it."""
     if (folder / "run.json").exists():
         return "it is the folder of a finished run: give the bag, which its run.json names"
     inside = sorted(p.name for p in folder.iterdir() if (p / "metadata.yaml").exists())
@@ -147,7 +147,7 @@ def _instead(folder: Path) -> str:
 
 
 def _open_reader(kind: type[Reader1 | Reader2], path: Path | Recovered) -> Reader1 | Reader2:
-    """Open with rosbags, and look at what it says of its topics: sqlite3 gives back whatever bytes were damaged to."""
+    """Open with rosbags and check the topics: sqlite3 returns damaged bytes as they are."""
     reader = kind(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a YAML reader thinks of metadata.yaml
@@ -160,12 +160,12 @@ def _open_reader(kind: type[Reader1 | Reader2], path: Path | Recovered) -> Reade
 
 
 def _of_others(path: Path, encoding: str) -> str:
-    """What is said of an MCAP file with a schema in an encoding that rosbags does not know."""
+    """Return the message on an MCAP file with a schema encoding that rosbags does not know."""
     if "ros1" in encoding:
         return f"{path}: holds messages of ROS 1, which are read from a .bag only: give the one that it was made of"
     return f"{path}: holds messages that are not ROS 2's ({encoding}): write its ROS topics to a file of their own (`mcap filter`)"
 
 
 def text_of(error: BaseException) -> str:
-    """Return an error of any library in one short line."""
+    """Return an error of any library as one short line."""
     return " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__

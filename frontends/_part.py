@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A part of a bag: which one is asked for, and when the messages of a file were recorded."""
+"""Selection of a part of a bag by recording times."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _MCAP_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entrie
 
 @dataclass(frozen=True, slots=True)
 class BagPart:
-    """Bags, and which part of them is the run, by recording times, as `rosbag play` counts them.
+    """Bags, and the part of them that is used, by recording times as in `rosbag play`.
 
     Attributes:
-        paths: of one recording. start_s: of the part, since the earliest message of them all.
+        paths: of one recording. start_s: of the part, since the earliest message of all files.
         duration_s: of the part; None: to the end.
 
     Raises:
-        InputError: times that are none.
+        InputError: invalid times.
     """
 
     paths: tuple[Path, ...]
@@ -50,7 +50,7 @@ class BagPart:
 
     @property
     def whole(self) -> bool:
-        """Whether it is all of the bag."""
+        """Whether it is the whole bag."""
         return self.start_s == 0.0 and self.duration_s is None
 
 
@@ -59,10 +59,10 @@ Bags = Path | str | Sequence[Path | str] | BagPart
 
 
 def recording_times(reader: Reader1 | Reader2, only: str | None = None) -> Times:
-    """Yield topics (or `only` one) and recording times (N,) ns of their messages, in pieces, from a file's index.
+    """Yield topics (or `only` one) and recording times (N,) ns of their messages, in chunks, from a file's index.
 
-    In the order in which they were written, which is not that of time where a clock was set back; nothing is unpacked.
-    An MCAP file without chunks has no index and is walked through. Raises whatever rosbags raises on bad bytes.
+    They come in the order of the file, which differs from that of time where a clock was set back; nothing is decompressed.
+    An MCAP file without chunks has no index and is read through. Raises whatever rosbags raises on damaged bytes.
     """
     if isinstance(reader, Reader1):
         for c in _only(reader.connections, only):
@@ -109,5 +109,5 @@ def _times_mcap(storage: McapReader, only: str | None) -> Times:
 
 
 def _signed(times: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Times of which those that no clock shows stay far in the future."""
+    """Return times as signed integers; times that no clock shows remain far in the future."""
     return np.minimum(times, np.uint64(2**63 - 1)).astype(np.int64)

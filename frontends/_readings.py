@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one sensor of a recording gave, in order of arrival, and what is thrown out of it afterwards."""
+"""Readings of one sensor in order of arrival, and the checks of a whole run that drop some of them."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ class Readings:
         return np.array(self.logs_ns, dtype=np.int64)
 
     def drop(self, bad: NDArray[np.bool_], rejection: Rejection) -> list[LedgerRow]:
-        """Take readings out; return their rows."""
+        """Remove readings and return their ledger rows."""
         rows = [self.row(self.seqs[i], self.stamps_ns[i], rejection) for i in np.flatnonzero(bad)]
         for column in self._columns() if rows else ():
             column[:] = list(compress(column, ~bad))
         return rows
 
     def sort(self) -> None:
-        """Put the readings in the order of their stamps."""
+        """Sort the readings by stamp."""
         order = np.argsort(self.stamps(), kind="stable").tolist()
         for column in self._columns():
             column[:] = [column[i] for i in order]
@@ -89,7 +89,7 @@ class Readings:
 
 
 def reject_jumps(sensors: Sequence[Readings], warnings: list[str]) -> list[LedgerRow]:
-    """Drop readings whose stamps left the clock of their topic, or lie in another epoch than the run."""
+    """Drop readings whose stamps left the clock of their topic, or are in another epoch than the run."""
     rows: list[LedgerRow] = []
     jump = rejected(f"clock jump: the stamp is over {_clock.JUMP_LIMIT_S:.0f} s off its topic's usual latency")
     for readings in sensors:
@@ -108,12 +108,12 @@ def reject_jumps(sensors: Sequence[Readings], warnings: list[str]) -> list[Ledge
 
 
 def reject_set_back(sensors: Sequence[Readings], beside: Sequence[Reference], warnings: list[str]) -> list[LedgerRow]:
-    """Keep the longest part of a run in which the IMU's clock was set back, by recording times; say where that was.
+    """Keep the longest part of a run in which the IMU's clock was set back, by recording times, and report where that was.
 
-    Two parts that bear the same times would be laid over each other.
+    Parts with the same stamps would otherwise be merged.
 
     Raises:
-        InputError: they do so by the recording times, too.
+        InputError: the parts overlap by recording times, too.
     """
     for imu in (r for r in sensors if r.config.kind == "imu"):
         stamps, logs = imu.stamps(), imu.logs()
@@ -147,7 +147,7 @@ def _drop(readings: Readings, bad: NDArray[np.bool_], rejection: Rejection, warn
 
 
 def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
-    """Say which sensor's clock stands apart from that of the IMU (or, without one, of the first sensor)."""
+    """Return a line for each sensor whose clock differs from that of the IMU (or, without one, of the first sensor)."""
     latency = {r.sensor: _clock.usual_latency_s(r.stamps(), r.logs()) for r in sensors if r.stamps_ns}
     if len(latency) < 2:
         return []
@@ -174,10 +174,10 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
 
 
 def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | None, list[LedgerRow]]:
-    """Return the samples in strictly increasing time, those that came late in their places, and rows of what has none.
+    """Return the samples in strictly increasing time, late ones in their places, and rows of the messages that are not used.
 
     Raises:
-        InputError: their rates cannot be rad/s, or they are half an IMU.
+        InputError: their rates cannot be rad/s, or accelerations or rates are missing.
     """
     assert isinstance(readings.config, ImuConfig)
     bad = ~_clock.in_order_or_late(readings.stamps())
@@ -201,7 +201,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
 
 
 def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop the repetitions of a frozen IMU: the solver bridges them as it does a gap."""
+    """Drop the repetitions of a frozen IMU: the solver bridges them like a gap."""
     stamps = readings.stamps()
     samples = np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)])
     bad = frozen_samples(stamps, samples.reshape(-1, 6))  # of none: (0,)
@@ -210,7 +210,7 @@ def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
 
 
 def reject_repeats(readings: Readings) -> list[LedgerRow]:
-    """Drop messages that say the same at the same stamp again: they are no new evidence."""
+    """Drop messages that repeat a measurement at the same stamp: they are no new evidence."""
     seen: set[tuple[int, object]] = set()
     bad = np.zeros(len(readings.values), dtype=bool)
     for i, (stamp_ns, value) in enumerate(zip(readings.stamps_ns, readings.values, strict=True)):
@@ -221,7 +221,7 @@ def reject_repeats(readings: Readings) -> list[LedgerRow]:
 
 
 def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop fixes that a driver only repeats; say so, and where stamps are cut or the claimed noise is far too small."""
+    """Drop fixes that a driver only repeats; warn of that, of truncated stamps, and of claimed noise that is far too small."""
     if isinstance(readings.config, (GnssConfig, CompassConfig, VelocityConfig, BodyVelocityConfig)):
         warnings += _fixes.stamp_warning(readings.sensor, readings.stamps())
     if not isinstance(readings.config, GnssConfig):
@@ -236,9 +236,9 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
 
 
 def thin_headings(readings: Readings) -> list[LedgerRow]:
-    """Drop headings that come faster than a compass errs anew: an orientation at 500 Hz costs four times the memory of all else.
+    """Drop headings that come faster than a compass's error changes: at 500 Hz they would take four times the memory of all else.
 
-    They must be in order of their stamps to be dropped evenly; those that are not stay.
+    Only headings in order of their stamps are dropped, evenly.
     """
     if not isinstance(readings.config, CompassConfig):
         return []
@@ -248,7 +248,7 @@ def thin_headings(readings: Readings) -> list[LedgerRow]:
 
 
 def reject_scattered(imu: ImuSeries | None, readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop headings that have nothing to do with those beside them."""
+    """Drop headings that are unrelated to their neighbours."""
     if imu is None or not isinstance(readings.config, CompassConfig):
         return []
     bad = scattered(imu, [v for v in readings.values if isinstance(v, CompassHeading)])
@@ -256,7 +256,7 @@ def reject_scattered(imu: ImuSeries | None, readings: Readings, warnings: list[s
 
 
 def _content(value: Decoded) -> object:
-    """What a measurement says, as something hashable."""
+    """Return the content of a measurement as a hashable value."""
     match value:
         case GnssPosition():
             return value.position
@@ -273,7 +273,7 @@ def _content(value: Decoded) -> object:
 
 
 def reject_far(readings: Readings, config: VesselConfig, warnings: list[str]) -> list[LedgerRow]:
-    """Drop fixes that lie far from all others."""
+    """Drop fixes that are far from all others."""
     fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
     if not fixes:
         return []
@@ -283,7 +283,7 @@ def reject_far(readings: Readings, config: VesselConfig, warnings: list[str]) ->
 
 
 def reject_far_poses(sensors: Sequence[Readings], warnings: list[str]) -> list[LedgerRow]:
-    """Drop poses that lie far from the datum, of a run that has fixes about it: the solver would be at them for minutes, and fail."""
+    """Drop poses far from the datum, in a run with fixes near it: the solver would need minutes and fail."""
     if not any(isinstance(v, GnssPosition) for readings in sensors for v in readings.values):
         return []
     rows = []

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that were cut short (power lost, disk full): read as far as they are whole, without a copy.
+"""Truncated files (power failure, disk full): read as far as they are intact, without a copy.
 
-A bag writes its index last, so a cut file has none. `recover` walks the whole records of the file and
-presents it to rosbags as head + whole records + a new end. sqlite3 files need no such thing here:
-their own tools (`.recover`) do it.
+A bag's index comes last, so a truncated file has none. `recover` scans the intact records of the file and presents it to rosbags
+as head + intact records + a new end. sqlite3 files do not need this: sqlite3 has a tool of its own (`.recover`).
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from rosbags.rosbag1.reader import Header, ReaderError, RecordType, decompressor
 
 
 class Recovered:
-    """A damaged file as the readers of rosbags should see it: patched head, whole records, new tail.
+    """A damaged file as rosbags should see it: patched head, intact records, new tail.
 
     Attributes:
         path: the file on disk.
-        whole_bytes: its length up to the end of the last whole record; file_bytes: its length.
+        whole_bytes: its length up to the end of the last intact record; file_bytes: its length.
     """
 
     def __init__(self, path: Path, head: bytes, whole_bytes: int, tail: bytes) -> None:
@@ -108,7 +107,7 @@ class _View(io.RawIOBase):
 
 
 def recover(path: Path) -> Recovered | None:
-    """Return a view of the whole part of a damaged file; None where nothing of it can be read."""
+    """Return a view of the intact part of a damaged file; None if nothing of it is readable."""
     repair = {".bag": _recover_ros1, ".mcap": _recover_mcap}.get(path.suffix)
     if repair is None:
         return None
@@ -124,7 +123,7 @@ _MCAP_FOOTER, _MCAP_MESSAGE, _MCAP_CHUNK, _MCAP_DATA_END = 0x02, 0x05, 0x06, 0x0
 
 
 def _recover_mcap(path: Path) -> Recovered | None:
-    """Cut behind the last whole record of the data section; a footer without summary makes rosbags scan."""
+    """Cut after the last intact record of the data section; a footer without summary makes rosbags scan."""
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
@@ -141,16 +140,16 @@ def _recover_mcap(path: Path) -> Recovered | None:
 
 
 def as_ros2(path: Path) -> Recovered | None:
-    """Return a view of an MCAP file of another profile as one of `ros2`; None where it is that, or no MCAP file.
+    """Return a view of an MCAP file of another profile with profile `ros2`; None if it has that, or is not MCAP.
 
-    rosbags reads no other; yet tools that merge or filter files leave the profile empty, and the messages are what they were.
+    rosbags reads no other profile, but tools that merge or filter files leave it empty without changing the messages.
     """
     head = _ros2_head(path) if path.suffix == ".mcap" else b""
     return Recovered(path, head, path.stat().st_size, b"") if head else None
 
 
 def _ros2_head(path: Path) -> bytes:
-    """The first record of an MCAP file, as long as it is, with `ros2` for its profile; empty where that stands there."""
+    """Return the first record of an MCAP file, at its length, with profile `ros2`; empty if it has that."""
     with path.open("rb") as file:
         start = file.read(len(_MCAP_MAGIC) + 9)
         if not start.startswith(_MCAP_MAGIC) or len(start) < len(_MCAP_MAGIC) + 9:
@@ -170,9 +169,9 @@ class _Chunk(NamedTuple):
 
 
 def _recover_ros1(path: Path) -> Recovered | None:
-    """Rebuild the index (connections and chunk infos) of the chunks that are whole, as `rosbag reindex` does.
+    """Rebuild the index (connections and chunk infos) of the intact chunks, like `rosbag reindex`.
 
-    A chunk counts as whole when its index records, which follow it, are there too.
+    A chunk is intact if the index records that follow it are there too.
     """
     size = path.stat().st_size
     connections: dict[int, bytes] = {}
@@ -232,13 +231,13 @@ def _read_chunk(data: bytes, connections: dict[int, bytes]) -> set[int]:
 
 
 def _ros1_header(**fields: bytes) -> bytes:
-    """A record header with its length in front."""
+    """Return a record header, preceded by its length."""
     body = b"".join(struct.pack("<L", len(k) + 1 + len(v)) + k.encode() + b"=" + v for k, v in fields.items())
     return struct.pack("<L", len(body)) + body
 
 
 def _ros1_head(magic: bytes, head_bytes: int, index_pos: int, connections: int, chunks: int) -> bytes:
-    """The file's first bytes, as long as they were, with the bag header pointing to the new index."""
+    """Return the first bytes of the file, at their length, with the bag header pointing to the new index."""
     head = magic + _ros1_header(
         op=bytes([RecordType.BAGHEADER]),
         index_pos=struct.pack("<Q", index_pos),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Topics that are read beside the sensors and never fused: the truth, and a speed to compare with."""
+"""Topics that are read but never fused: the truth, and a speed for comparison."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graphloc.trajectory import Trajectory
 
 @dataclass(slots=True)
 class Reference:
-    """A topic that is read beside the sensors: truth or check speed; `unstamped`: messages that stand at their recording times."""
+    """A topic that is read but not fused; `unstamped`: messages without a stamp, which get their recording times."""
 
     topic: str
     reason: str
@@ -33,7 +33,7 @@ class Reference:
     messages: list[Any] = field(default_factory=list)
 
     def keep(self, first_ns: int, last_ns: int) -> None:
-        """Drop what was not recorded between two times."""
+        """Drop messages that were not recorded between two times."""
         kept = [first_ns <= log_ns <= last_ns for log_ns in self.logs_ns]
         columns: tuple[list[Any], ...] = (self.stamps_ns, self.logs_ns, self.messages)
         for column in columns:
@@ -57,10 +57,10 @@ def true_trajectory(item: Reference, warnings: list[str]) -> Trajectory | None:
 
 
 def _true_velocity(stamps_ns: NDArray[np.int64], p_m: Array, R: Array, messages: Sequence[Any]) -> Array:
-    """Return velocity (N, 3), m/s, in world.
+    """Return the velocity (N, 3), m/s, in world.
 
-    That is the twist (in the child frame, as nav_msgs has it) where it agrees with the positions, else
-    their derivative: writers differ in the twist's frame, or leave it at zero.
+    That is the twist (in the child frame, as in nav_msgs) if it agrees with the positions, else their derivative: some programs
+    write the twist in another frame, or zeros.
     """
     derivative = np.gradient(p_m, seconds_since(int(stamps_ns[0]), stamps_ns), axis=0)
     if not all(hasattr(m, "twist") for m in messages):
@@ -76,7 +76,7 @@ def _true_velocity(stamps_ns: NDArray[np.int64], p_m: Array, R: Array, messages:
 
 
 def check_speed(item: Reference) -> SpeedSeries | None:
-    """Return the forward speed of an odometry topic, in stamp order."""
+    """Return the forward speed of an odometry topic, sorted by stamp."""
     stamps = np.array(item.stamps_ns, dtype=np.int64)
     speed = np.array([float(m.twist.twist.linear.x) for m in item.messages])
     keep = np.flatnonzero(_clock.longest_increasing(stamps))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a message that gives no measurement is answered with."""
+"""Results of decoding a message that gives no measurement."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ class Rejection(NamedTuple):
 
 
 def malformed(reason: str) -> Rejection:
-    """A message whose content cannot be used."""
+    """Return the rejection of a message with unusable content."""
     return Rejection(Outcome.MALFORMED, reason)
 
 
 def rejected(reason: str) -> Rejection:
-    """A well-formed message that says itself that it is not to be used, or is not believed."""
+    """Return the rejection of a well-formed message that declares itself invalid, or is not plausible."""
     return Rejection(Outcome.REJECTED, reason)
 
 
 def ignored(reason: str) -> Rejection:
-    """A message on the sensor's topic that is not for it."""
+    """Return the rejection of a message that is not meant for the sensor."""
     return Rejection(Outcome.IGNORED, reason)

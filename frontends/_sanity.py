@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What looks wrong in a whole run: units, gravity, fixes from elsewhere. Said in a warning, never fixed in silence."""
+"""Signs of a wrong configuration in a whole run: units, gravity, fixes far from the datum. Warned of, never corrected silently."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _STEP_S = 0.2  # at most, of a step that rates are integrated over
 
 
 def without_gravity(accel: Array) -> bool:
-    """Return whether accelerations (N, 3), m/s^2 or g, lack gravity: small, and without a direction that stays."""
+    """Return whether accelerations (N, 3), m/s^2 or g, lack gravity: they are small, without a constant direction."""
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     steady = float(np.linalg.norm(np.median(accel, axis=0)))
     return size < 0.5 or (size < 2.0 and steady < 0.5 * size)
 
 
 def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> list[str]:
-    """Return lines on units and gravity of samples (N, 3), (N, 3) as the configuration reads them."""
+    """Return lines on units and gravity of accelerations (N, 3) and rates (N, 3), converted as configured."""
     if len(accel_mps2) < 10:
         return []
     g = float(np.median(np.linalg.norm(accel_mps2, axis=1)))
@@ -55,9 +55,9 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
 
 
 def missing_half(accel: Array, gyro: Array) -> str:
-    """Return 'rates' or 'accelerations' where all of samples (N, 3), (N, 3) are 0, as where a driver publishes halves; else ''.
+    """Return 'rates' or 'accelerations' if all of these (N, 3) are 0, as some drivers publish; else ''.
 
-    A simulated IMU without noise has no rates at rest, but then steady accelerations.
+    A simulated IMU without noise has zero rates at rest, but then constant accelerations.
     """
     if len(accel) < _FEWEST:
         return ""
@@ -67,7 +67,7 @@ def missing_half(accel: Array, gyro: Array) -> str:
 
 
 def refuse_half(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> None:
-    """Refuse samples (N, 3), (N, 3) that are half an IMU: the other half would be believed to be 0.
+    """Refuse accelerations or rates (N, 3) that are all 0, since the solver would believe them.
 
     Raises:
         InputError: they are.
@@ -80,10 +80,10 @@ def refuse_half(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuCo
 def refuse_degrees(
     sensor: str, stamps_ns: NDArray[np.int64], accel_mps2: Array, gyro_radps: Array, config: ImuConfig
 ) -> None:
-    """Refuse rates (N, 3) that are deg/s: the solver would be at them for many minutes.
+    """Refuse rates (N, 3) in deg/s, with which the solver would run for many minutes.
 
-    How far they roll and pitch it within 5 s is asked: a small boat in chop has high rates, too, and a craft may pivot
-    fast, but none rolls to and fro by a quarter turn all the while.
+    The test is by how much they roll and pitch the vessel within 5 s: a small boat in chop has high rates, and a vehicle may pivot
+    fast, but none rolls by a quarter turn all the time.
 
     Raises:
         InputError: they are.
@@ -106,12 +106,12 @@ def refuse_degrees(
 
 
 def _together(longitude_deg: Array) -> Array:
-    """Return longitudes about the first one, so that a run across the date line stays together."""
+    """Return longitudes relative to the first one, so that a run across the date line is continuous."""
     return np.asarray(longitude_deg[0] + (longitude_deg - longitude_deg[0] + 180.0) % 360.0 - 180.0)
 
 
 def far_fixes_of(lla: Array) -> NDArray[np.bool_]:
-    """Return (N,) whether a fix (N, 3), deg, deg, m, lies further than `FAR_M` from the median of all."""
+    """Return (N,) whether a position (N, 3), deg, deg, m, is farther than `FAR_M` from the median of all."""
     if len(lla) == 0:
         return np.zeros(0, dtype=bool)
     lon = float(np.median(_together(lla[:, 1])))
@@ -121,18 +121,18 @@ def far_fixes_of(lla: Array) -> NDArray[np.bool_]:
 
 
 def far_fixes(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
-    """Return (N,) whether a fix lies further than `FAR_M` from the median of all fixes."""
+    """Return (N,) whether a fix is farther than `FAR_M` from the median of all fixes."""
     return far_fixes_of(np.array([f.position for f in fixes]).reshape(-1, 3))
 
 
 def far_pose(pose: PoseFix) -> bool:
-    """Return whether no mode of a pose lies within `FAR_M` of the origin of world."""
+    """Return whether no mode of a pose is within `FAR_M` of the origin of world."""
     level = [pose.axes.index(axis) for axis in ("x", "y") if axis in pose.axes]
     return all(float(np.linalg.norm(np.asarray(mode.value)[level])) > FAR_M for mode in pose.modes)
 
 
 def gnss_warnings(sensor: str, fixes: Sequence[GnssPosition], config: VesselConfig) -> list[str]:
-    """Return a line where the fixes lie far from the configured datum; says so if swapping explains it."""
+    """Return a line if the fixes are far from the configured datum, and say so if swapped coordinates explain it."""
     if config.datum is None or not fixes:
         return []
     datum = Datum(config.datum.geodetic)

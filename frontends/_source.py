@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded bags as one stream of raw messages: ROS 1, ROS 2 sqlite3 and MCAP, split and compressed.
 
-This stands on the readers of rosbags and not on its `AnyReader`, because that one registers every
-type of the bag (one bad definition on a topic nobody asked for makes the whole bag unreadable), and
-because a folder whose metadata or last file is damaged can still be read file by file.
+This uses the readers of rosbags but not its `AnyReader`. That registers every type of the bag, so one bad definition on an
+unused topic makes the whole bag unreadable; and a folder whose metadata or last file is damaged can still be read file by file.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ TF_STATIC = "/tf_static"
 
 
 class RawMessage(NamedTuple):
-    """A message as recorded: nothing is decoded yet."""
+    """A message as recorded, not decoded."""
 
     topic: str
     msgtype: str
@@ -47,7 +46,7 @@ class RawMessage(NamedTuple):
 
 
 class TopicSummary(NamedTuple):
-    """What the bag's index says about a topic: of a part of a bag, how many messages lie in that."""
+    """What the index of a bag, or of the selected part, states about a topic."""
 
     topic: str
     msgtypes: tuple[str, ...]
@@ -55,13 +54,13 @@ class TopicSummary(NamedTuple):
 
 
 class Bag:
-    """An open recording. Use as a context manager.
+    """An open recording, used as a context manager.
 
     Attributes:
         name: its path(s), for messages.
-        warnings: what was wrong with the files; grows while messages are read.
+        warnings: problems of the files; grows while messages are read.
         ros1: whether messages are in ROS 1 serialisation.
-        span: which part of the bag is read, with its topics; None: the whole bag.
+        span: the part of the bag that is read, with its topics; None: the whole bag.
     """
 
     def __init__(self, bags: Bags) -> None:
@@ -110,7 +109,7 @@ class Bag:
         self._stack.close()
 
     def _cut(self) -> None:
-        """Find out where the part lies, and how many messages of each topic lie in it."""
+        """Find the limits of the part, and the number of messages of each topic in it."""
         times: dict[str, list[NDArray[np.int64]]] = {}
         for opened in self._opened:
             for topic, recorded in self._times(opened):
@@ -139,7 +138,7 @@ class Bag:
         )  # fmt: skip
 
     def _times(self, opened: Opened) -> list[tuple[str, NDArray[np.int64]]]:
-        """Topics and recording times of a file, from its index; where that is damaged, from as much as can be read."""
+        """Return topics and recording times of a file from its index; if that is damaged, from all that is readable."""
         try:
             return list(recording_times(opened.reader))
         except Exception as error:  # noqa: BLE001 - as below
@@ -154,7 +153,7 @@ class Bag:
 
     @property
     def topics(self) -> dict[str, TopicSummary]:
-        """Topics by name, with their types and the number of messages that the index announces, of a part in that."""
+        """Topics by name, with their types and the number of messages by the index, in the selected part."""
         found: dict[str, TopicSummary] = {}
         for opened in self._opened:
             for c in opened.reader.connections:
@@ -166,13 +165,13 @@ class Bag:
         return dict(sorted(found.items()))
 
     def messages(self, topics: Collection[str], *, whole: bool = False) -> Iterator[RawMessage]:
-        """Yield the raw messages of some topics in order of arrival; others are never unpacked.
+        """Yield the raw messages of some topics in order of arrival; others are never decompressed.
 
-        Of a part of a bag those that were recorded in it, after all of /tf_static, which drivers send but once.
-        A file that turns out damaged midway ends there, with a line in `warnings`.
+        Of a part of a bag: those recorded in it, after all of /tf_static, which drivers send only once.
+        At damage in the middle of a file, the file ends, with a line in `warnings`.
 
         Args:
-            whole: of the whole bag: for what is sent once, or stays as it is.
+            whole: read the whole bag, for messages that are sent once or do not change.
         """
         if self.span is None or whole:
             yield from self._merged(topics, (None, None))
@@ -204,7 +203,7 @@ class Bag:
             )
 
     def refuse_set_back(self, topics: Collection[str]) -> None:
-        """Refuse the bag, or the part of it, where the recorder's clock was set back while these topics were written.
+        """Refuse the bag, or the part, if the recorder's clock was set back while these topics were written.
 
         Raises:
             InputError: it was.
@@ -222,7 +221,7 @@ class Bag:
                 refuse_set_back(topic, str(opened.path), times[inside])
 
     def decode(self, message: RawMessage) -> object:
-        """Return the deserialised message. Raises whatever rosbags raises on bad bytes."""
+        """Return the deserialised message. Raises whatever rosbags raises on damaged bytes."""
         return self._types.decode(message.data, message.msgtype)
 
 

@@ -120,9 +120,9 @@ _MOST = 1e12
 
 @dataclass(slots=True)
 class Stream:
-    """One topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`).
+    """Columns of one topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`).
 
-    recorded: whether the stamps are the recording times, as the headers of a type that has stamps hold none.
+    recorded: whether the stamps are recording times, because the headers hold none.
     """
 
     topic: str
@@ -144,7 +144,7 @@ class Stream:
         self.tuples.append(row)
 
     def settle(self) -> None:
-        """Leave out what has no stamp; where no message has one of its own, put the recording times in their place."""
+        """Drop messages without a stamp; if no message has one, use the recording times."""
         stamps = self.stamps_ns
         if len(stamps) > 1 and bool((stamps == stamps[0]).all()):
             self.recorded, self._stamps = True, list(self._logs)
@@ -173,7 +173,7 @@ class Stream:
 
     @property
     def rows(self) -> Array:
-        """The numbers (N, k); NaN for what nothing measures, whose square is no number."""
+        """Values (N, k); NaN for values too large to be measurements, whose squares would overflow."""
         rows = np.array(self.tuples, dtype=float)
         rows[np.abs(rows) > _MOST] = np.nan
         return rows
@@ -185,8 +185,7 @@ class Stream:
 def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
     """Read all topics of the types in `ROWS`, and the static transforms.
 
-    A topic of NMEA gives a stream for each sentence of each talker, named 'TOPIC GPGGA', as if it were of the type that
-    says the same.
+    An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type.
     """
     streams = {
         t.topic: Stream(t.topic, t.msgtypes[0])
@@ -223,7 +222,7 @@ def _plain(raw: RawMessage, msg: Any, streams: dict[str, Stream]) -> list[tuple[
 
 
 def _sentences(topic: str, msg: Any, streams: dict[str, Stream]) -> list[tuple[Stream, Row | None]]:
-    """The stream of each sentence, made where it is the first one."""
+    """Return the stream, created at first use, and the row of each sentence."""
     said: list[tuple[Stream, Row | None]] = []
     text = nmea.text_of(msg)
     for talker, kind in nmea.identities(text):

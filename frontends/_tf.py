@@ -24,10 +24,10 @@ Pose = tuple[Array, Array]  # t (3,), R (3, 3): T_parent_child
 
 
 class StaticTree:
-    """Static transforms by frame, walked in both directions.
+    """Static transforms by frame, searched in both directions.
 
     Attributes:
-        broken: messages that were of no use: another one may be whole.
+        broken: messages that could not be used: another one may be intact.
     """
 
     def __init__(self) -> None:
@@ -37,7 +37,7 @@ class StaticTree:
         self.broken = 0
 
     def take(self, msgtype: str, msg: Any) -> None:
-        """Take a message of `/tf_static` as it comes: None where it cannot be decoded; of another type it says nothing."""
+        """Take a message of `/tf_static`; None if it could not be decoded. Other types are ignored."""
         whole = msg is not None
         if whole and msgtype == TF:
             try:
@@ -48,11 +48,11 @@ class StaticTree:
 
     @property
     def damage(self) -> str:
-        """What is to be said of messages that were of no use; empty where all are whole."""
+        """A line on messages that could not be used; empty if there are none."""
         return f"{TF_STATIC}: messages that cannot be decoded: {self.broken}" if self.broken else ""
 
     def add(self, msg: Any) -> None:
-        """Take the transforms of a `tf2_msgs/TFMessage`; a later one of the same pair replaces an earlier one."""
+        """Add the transforms of a `tf2_msgs/TFMessage`; a later one replaces an earlier one of the same frames."""
         for stamped in msg.transforms:
             parent, child = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
             t, q = stamped.transform.translation, stamped.transform.rotation
@@ -71,13 +71,13 @@ class StaticTree:
         return tuple(sorted(self._edges))
 
     def body(self) -> str:
-        """Return the frame that is the craft's body: by its usual names, else the root of most frames, else `base_link`."""
+        """Return the body frame: by its usual names, else the root of most frames, else `base_link`."""
         roots = [f for f in self._edges if f not in self._children and f not in _WORLD_NAMES]
         roots.sort(key=lambda root: -sum(self.resolve(root, frame) is not None for frame in self._edges))
         return next((name for name in (*_BODY_NAMES, *roots) if name in self._edges), _BODY_NAMES[0])
 
     def resolve(self, body: str, sensor: str) -> Pose | None:
-        """Return T_body_sensor along the shortest chain; None where there is no chain."""
+        """Return T_body_sensor along the shortest chain; None if there is none."""
         body, sensor = body.lstrip("/"), sensor.lstrip("/")
         found: dict[str, Pose] = {body: (np.zeros(3), np.eye(3))}
         queue = deque([body])
@@ -94,7 +94,7 @@ class StaticTree:
         """Return T_body_sensor.
 
         Raises:
-            InputError: no chain leads there; the line names the frames that exist.
+            InputError: no chain connects the frames; the line lists those that exist.
         """
         pose = self.resolve(body, sensor)
         if pose is None:

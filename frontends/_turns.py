@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do headings turn as the gyroscope does, or at all alike? The solver, which holds both for true, would blame the IMU's noise."""
+"""Consistency of headings with the gyroscope and with each other. The solver trusts both and would blame the IMU's noise."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ _UNIT, _UNIT_CLEAR, _BY_CHANCE = 2.3, 0.8, 5.0
 
 
 def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading], convention: str) -> list[str]:
-    """Return a line where headings turn against the gyroscope, or part from it by far more than they claim.
+    """Return a line if headings turn against the gyroscope, or deviate from it by far more than they claim.
 
-    The vertical is that of the median acceleration, so no mount is asked; an IMU without gravity tells nothing.
+    The vertical is the median acceleration, so no mount is needed; an IMU without gravity gives no warning.
 
     Args:
-        headings: of one compass, as the configuration reads them. convention: by which it does.
+        headings: of one compass, converted as configured. convention: the configured one.
     """
     together, power, apart, turns = 0.0, 0.0, [], []
     for _, turned, yaw, at_s in _blocks(imu, _said(headings)):
@@ -72,19 +72,19 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
     ]
 
 
-def refuse_unit(imu: ImuSeries, config: ImuConfig, told: Mapping[str, Yaws]) -> None:
-    """Refuse rates in another unit than is configured: they turn as headings do, by 57 times as little, or as much.
+def refuse_unit(imu: ImuSeries, config: ImuConfig, yaws_by_source: Mapping[str, Yaws]) -> None:
+    """Refuse rates in another unit than configured: they turn by 57 times too little or too much, compared with headings.
 
-    The solver would take what is missing of a turn for a bias, and the heading for known.
+    The solver would take the missing part of a turn for a bias, and the heading for known.
 
     Args:
-        told: headings or courses, by what they are called.
+        yaws_by_source: headings or courses, by their name in the message.
 
     Raises:
         InputError: they are.
     """
     wrong, right = ("less", "rad/s") if config.gyro_unit == "deg/s" else ("more", "deg/s")
-    for source, yaws in told.items():
+    for source, yaws in yaws_by_source.items():
         times = _times_turned(imu, yaws)
         off = times * np.radians(1.0) if wrong == "less" else times / np.radians(1.0)
         if 1.0 / _UNIT < off < _UNIT:
@@ -95,7 +95,7 @@ def refuse_unit(imu: ImuSeries, config: ImuConfig, told: Mapping[str, Yaws]) -> 
 
 
 def _times_turned(imu: ImuSeries, yaws: Yaws) -> float:
-    """How many times as far headings turn as the gyroscope, to whichever side; 0 where they have nothing clear in common."""
+    """Return the ratio of the turn by headings to that by the gyroscope, unsigned; 0 if they are not clearly correlated."""
     by_gyro, by_heading, alone = [np.zeros(0)], [np.zeros(0)], 0.0
     for _, turned, yaw, at_s in _blocks(imu, yaws):
         if len(at_s) < 20 or at_s[-1] - at_s[0] <= _LONG_S:
@@ -120,14 +120,14 @@ def _times_turned(imu: ImuSeries, yaws: Yaws) -> float:
 
 
 def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | None:
-    """Return how far a compass's error wanders beside the gyroscope, 1 sigma, deg, as one that lasts for a minute; None of a short run.
+    """Return a compass's wander against the gyroscope, 1 sigma, deg, at a correlation time of a minute; None of a short run.
 
-    What is left of heading minus integrated rate, when each block's straight line (offset, bias), what goes with the heading
-    (deviation), with the turn (scale) and with the rate (delay) are taken off, grows from some seconds to half a minute by
-    q t where it diffuses, on top of white noise. A first-order Gauss-Markov process does so with q = 2 sigma^2 / tau.
+    Of heading minus integrated rate, a straight line per block (offset, bias) and the parts proportional to heading (deviation),
+    turn (scale) and rate (delay) are removed. If the rest diffuses, its mean square step grows by q t from some seconds to half a
+    minute, on top of white noise. For a first-order Gauss-Markov process, q = 2 sigma^2 / tau.
 
     Args:
-        headings: of one compass, as the configuration reads them.
+        headings: of one compass, converted as configured.
     """
     blocks = []
     for _, turned, yaw, at_s in _blocks(imu, _said(headings), _WANDER_BLOCK_S):
@@ -155,7 +155,7 @@ def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | No
 
 
 def wander_warning(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading], config: CompassConfig) -> list[str]:
-    """Return a line where a compass wanders by far more than is configured: the heading's bounds would be too small."""
+    """Return a line if a compass wanders by far more than configured: the bounds of the heading would be too small."""
     found = wander_deg(imu, headings)
     if found is None or config.mount_offset_sigma_deg == 0.0 or found < max(WANDERS_DEG, 2.0 * config.wander_sigma_deg):
         return []
@@ -166,7 +166,7 @@ def wander_warning(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeadin
 
 
 def _squared_steps(blocks: Sequence[tuple[NDArray[np.intp], Array]], left: Sequence[Array], steps: int) -> float:
-    """Mean square of the changes over so many cells."""
+    """Return the mean square of changes over some cells."""
     changes = [np.zeros(0)]
     for (cells, _), rest in zip(blocks, left, strict=True):
         along = np.full(int(cells[-1]) + 1, np.nan)
@@ -176,10 +176,10 @@ def _squared_steps(blocks: Sequence[tuple[NDArray[np.intp], Array]], left: Seque
 
 
 def scattered(imu: ImuSeries, headings: Sequence[CompassHeading]) -> NDArray[np.bool_]:
-    """Return (N,) which headings agree with less than half of those beside them, whether the craft turned or not.
+    """Return (N,) which headings agree with fewer than half of their neighbours, with or without the gyroscope's turn.
 
-    So are those that a receiver takes from its way while it has none: each of them claims to be good to a degree or two.
-    What the gyroscope alone speaks against is left in, be it a pivot: its unit, or the headings' convention, may be wrong.
+    Such are headings that a receiver derives from its motion while it has none: each claims to be good to a degree or two. Headings
+    that only the gyroscope contradicts are kept, pivots included: its unit, or the headings' convention, may be wrong.
     """
     bad = np.zeros(len(headings), dtype=bool)
     for own, turned, yaw, at_s in _blocks(imu, _said(headings)):
@@ -196,7 +196,7 @@ def scattered(imu: ImuSeries, headings: Sequence[CompassHeading]) -> NDArray[np.
 
 
 def _smooth(yaw: Array, at_s: Array) -> NDArray[np.bool_]:
-    """Return (N,) which headings lie on a turn that they tell without the gyroscope: steady within `_NEAR_S` to either side."""
+    """Return (N,) which headings fit a steady turn within `_NEAR_S` to either side, without the gyroscope."""
     steps = wrap_angle(np.diff(yaw))
     way = np.concatenate([[0.0], np.cumsum(steps)])
     too_far = np.concatenate([[0], np.cumsum(np.abs(steps) > np.radians(_LEAP_DEG))])
@@ -216,7 +216,7 @@ def _said(headings: Sequence[CompassHeading]) -> Yaws:
 def _blocks(
     imu: ImuSeries, yaws: Yaws, block_s: float = _BLOCK_S
 ) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
-    """Yield places in `yaws`, turned angle by the gyroscope, yaw, and time (s), at the yaws of each block without a hole in the IMU."""
+    """Yield for each block without an IMU gap: indices into `yaws`, turn by the gyroscope, yaw, and time (s)."""
     up = np.median(imu.accel_mps2, axis=0) if len(imu.stamps_ns) else np.zeros(3)
     size = float(np.linalg.norm(up))
     if size < 5.0 or len(yaws[0]) < 20:  # m/s^2: no gravity in it

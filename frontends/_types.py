@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message types: the definitions that a bag carries, and standard ones elsewhere."""
+"""Message types: definitions in the bag, and standard ones otherwise."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ uint16 position_source
 
 
 class MessageTypes:
-    """Definitions of the message types of a bag, each read when it is first asked for.
+    """Definitions of the message types of a bag, each read at first use.
 
     Args:
         name: of the bag, for warnings. connections: all of its topics. ros1: whether it is of ROS 1.
@@ -96,7 +96,7 @@ class MessageTypes:
         self._stores: dict[str, Typestore] = {}
 
     def decode(self, data: bytes, msgtype: str) -> object:
-        """Return the deserialised message. Raises whatever rosbags raises on bad bytes."""
+        """Return the deserialised message. Raises whatever rosbags raises on damaged bytes."""
         if msgtype not in self._stores:
             self._stores[msgtype] = self._store_of(msgtype)
         store = self._stores[msgtype]
@@ -104,7 +104,7 @@ class MessageTypes:
         return (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(data, msgtype)
 
     def _store_of(self, msgtype: str) -> Typestore:
-        """Return the type's definition from the bag where it carries one; the standard one elsewhere."""
+        """Return the definition of the type in the bag, if it has one, else the standard one."""
         definitions = (c.msgdef for c in self._connections if c.msgtype == msgtype)
         for definition in definitions:
             if definition.format == MessageDefinitionFormat.NONE:

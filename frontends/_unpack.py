@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unpacking with a limit: a chunk of a few kB may be made to unpack to more than memory or disk hold.
+"""Decompression with a limit: a chunk of a few kB may be made to expand to more than memory or disk hold.
 
-rosbags unpacks in one go, however much comes out. `limit_unpacking` puts these in place of the functions in its tables.
+rosbags decompresses in one call without limit. `limit_unpacking` replaces these functions in its tables.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _zstd = storage_mcap.zstd
 
 
 class _Decompressor(Protocol):
-    """What the decompressors of bz2, lz4 and zstd have in common."""
+    """Common interface of the decompressors of bz2, lz4 and zstd."""
 
     @property
     def eof(self) -> bool: ...
@@ -36,10 +36,10 @@ class _Decompressor(Protocol):
 
 
 def unpacked(data: bytes, decompressor: Callable[[], _Decompressor], said: int | None = None) -> bytes:
-    """Return what frames of compressed bytes hold; `said` is how many bytes that should be, where it is known.
+    """Return the content of compressed frames; `said`: its stated size in bytes, if known.
 
     Raises:
-        ValueError: it is more than `said` or `MOST_BYTES`, or cut short.
+        ValueError: it is larger than `said` or `MOST_BYTES`, or truncated.
     """
     most = MOST_BYTES if said is None else min(said, MOST_BYTES)
     parts = []
@@ -56,10 +56,10 @@ def unpacked(data: bytes, decompressor: Callable[[], _Decompressor], said: int |
 
 
 class _Kept:
-    """Unpacks chunks and keeps the last ones, packed and unpacked, up to 64 MiB.
+    """Decompresses chunks and caches the last ones, up to 64 MiB, compressed and decompressed.
 
-    rosbags keeps one. The messages of a ROS 1 bag come in order of their recording times; where the clock was set in
-    between, that order goes back and forth between chunks, and each would be unpacked once for each of its messages.
+    rosbags caches one. Messages of a ROS 1 bag come in order of recording time; if the clock was set in between, that order
+    alternates between chunks, and each would be decompressed once per message.
     """
 
     def __init__(self, decompressor: Callable[[], _Decompressor]) -> None:
@@ -80,7 +80,7 @@ class _Kept:
 
 
 class _Bounded(io.RawIOBase):
-    """A compressed file, read only; raises `OSError` where more comes out than is believed."""
+    """A compressed file, read only; raises `OSError` at more content than the limit."""
 
     def __init__(self, file: Any, most: int) -> None:
         self._file, self._left = file, most
@@ -101,7 +101,7 @@ class _Bounded(io.RawIOBase):
 
 
 class _Zstd:
-    """As the module that rosbags knows by this name."""
+    """Stand-in for the module that rosbags imports under this name."""
 
     @staticmethod
     def decompress(data: bytes) -> bytes:
@@ -114,12 +114,12 @@ class _Zstd:
 
 
 def _of_chunks(decompressor: Callable[[], _Decompressor]) -> Callable[[bytes, int], bytes]:
-    """As rosbags wants it for MCAP, whose chunks say what they unpack to."""
+    """Decompress an MCAP chunk, which states its size."""
     return lambda data, size: unpacked(data, decompressor, size)
 
 
 def limit_unpacking() -> None:
-    """Have rosbags unpack with these."""
+    """Make rosbags use the decompressors of this module."""
     lz4_frame: Callable[[], _Decompressor] = lz4.frame.LZ4FrameDecompressor
     reader1.decompressors["bz2"] = _Kept(bz2.BZ2Decompressor)
     reader1.decompressors["lz4"] = _Kept(lz4_frame)

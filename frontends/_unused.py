@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which IMU and GNSS topics of a bag give nothing, and why."""
+"""IMU and GNSS topics of a bag that are not used, with reasons."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 
 
 def unused_topics(streams: Sequence[Stream], used: Container[str]) -> list[str]:
-    """Say which IMU and GNSS topics gave nothing, and why: silence would read as if they were not there."""
+    """Return a line for each IMU and GNSS topic that is not used, with the reason: otherwise they would seem to be missing."""
     lines = (
         []
         if any(len(s) or s.undecodable or s.no_stamp for s in streams)

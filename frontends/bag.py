@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag becomes a `Recording`: measurements, inertial samples, and one ledger row for whatever gave none.
+"""Read a bag as a `Recording`: measurements, inertial samples, and a ledger row for each message that gave none.
 
-Steps: subscribe to the topics that the configuration names; decode them one message at a time;
-throw out stamps that cannot be true; look at the whole run for wrong units; hand over. Messages of
-other topics are counted from the bag's index and never unpacked, so memory does not grow with them.
+Steps: subscribe to the topics that the configuration names; decode them message by message; reject implausible stamps; check the
+whole run for wrong units. Messages of other topics are counted from the bag's index and never decompressed, so they need no memory.
 """
 
 from __future__ import annotations
@@ -60,10 +59,10 @@ _REPORT_EVERY = 2000  # messages between two calls of `progress`
 
 
 def check_bag(bags: Bags, config: VesselConfig) -> None:
-    """Open a bag and look for the topics that the configuration names, without reading it.
+    """Check that a bag can be opened and has the topics that the configuration names, without reading it.
 
     Raises:
-        InputError: no readable bag, or a topic that is not there or has another type.
+        InputError: no readable bag, a missing topic, or one of another type.
     """
     with Bag(bags) as bag:
         _asked_for(config, bag)
@@ -73,17 +72,17 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
     """Read the topics that the configuration names.
 
     Args:
-        bags: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, several of one kind (split bags), or a part of them.
-        config: which topics belong to which sensors, units, mounts.
-        progress: called now and then with the stage, messages done and messages in all.
+        bags: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, several files of a split bag, or a part of them.
+        config: topics, units and mounts of the sensors.
+        progress: is called now and then with the stage, messages done and messages in all.
 
     Returns:
-        The recording. Its measurements, IMU samples and rows add up to its `message_count`, in which
-        a message that several sensors read counts once for each.
+        The recording. Its measurements, IMU samples and rows add up to its `message_count`, in which a message that several
+        sensors read counts once for each.
 
     Raises:
-        InputError: no readable bag, a topic that is not there or has another type, a broken mount chain, a part of
-            the bag in which there is nothing.
+        InputError: no readable bag, a missing topic or one of another type, a mount without a chain of transforms, or an empty
+            part of the bag.
     """
     with Bag(bags) as bag:
         topics = bag.topics
@@ -99,16 +98,8 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
     rows += reject_set_back(sensors, [b for b in (truth, check) if b], warnings)
     warnings += clock_warnings(sensors)
     mounts = _mounts(config, tree, bag.name)
-    imu: ImuSeries | None = None
-    measurements: list[Measurement] = []
-    for readings in sorted(sensors, key=lambda r: r.config.kind != "imu"):
-        if readings.config.kind == "imu":
-            imu, more = imu_series(readings, warnings)
-            rows += more
-        else:
-            rows += reject_repeats(readings) + reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
-            rows += thin_headings(readings) + reject_scattered(imu, readings, warnings)
-            measurements += [v for v in readings.values if isinstance(v, Measurement)]
+    imu, measurements, dropped = _usable(sensors, config, warnings)
+    rows += dropped
     if imu is not None:
         _refuse_unit(imu, sensors)
         warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, sensors, mounts, config)
@@ -133,8 +124,26 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
     )
 
 
+def _usable(
+    sensors: Sequence[Readings], config: VesselConfig, warnings: list[str]
+) -> tuple[ImuSeries | None, list[Measurement], list[LedgerRow]]:
+    """Return the IMU samples and measurements that pass the checks of a whole run, and rows of those that do not."""
+    imu: ImuSeries | None = None
+    measurements: list[Measurement] = []
+    rows: list[LedgerRow] = []
+    for readings in sorted(sensors, key=lambda r: r.config.kind != "imu"):  # headings are compared with the gyroscope
+        if readings.config.kind == "imu":
+            imu, more = imu_series(readings, warnings)
+            rows += more
+        else:
+            rows += reject_repeats(readings) + reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
+            rows += thin_headings(readings) + reject_scattered(imu, readings, warnings)
+            measurements += [v for v in readings.values if isinstance(v, Measurement)]
+    return imu, measurements, rows
+
+
 def _span(bag: Bag, config: VesselConfig) -> Span | None:
-    """The part of the bag, with counts of the topics that the configuration names."""
+    """Return the part of the bag, with counts of the topics that the configuration names."""
     if bag.span is None:
         return None
     sensors = [sensor for sensor in config.sensors.values() if sensor.enabled]
@@ -151,7 +160,7 @@ def _span(bag: Bag, config: VesselConfig) -> Span | None:
 
 
 def _asked_for(config: VesselConfig, bag: Bag) -> tuple[list[Readings], Reference | None, Reference | None]:
-    """What is read of a bag: for each sensor, for the truth, and for the speed to check with."""
+    """Return what is read of a bag: for each sensor, for the truth, and for the speed to compare with."""
     sensors = _subscriptions(config, bag.topics, bag.name)
     truth = _reference(config.truth_topic, "truth_topic", "truth, never fused", bag.topics, bag.name)
     check = _reference(config.check_speed_topic, "check_speed_topic", "check, never fused", bag.topics, bag.name)
@@ -159,7 +168,7 @@ def _asked_for(config: VesselConfig, bag: Bag) -> tuple[list[Readings], Referenc
 
 
 class _Reader:
-    """One pass over the bag: each message goes to whoever asked for its topic."""
+    """One pass over the bag, which gives each message to the sensors and references that read its topic."""
 
     def __init__(
         self,
@@ -223,7 +232,7 @@ class _Reader:
             self._tree.take(raw.msgtype, msg)
 
     def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:
-        """Hand a message to its decoder; what gives no reading gives a row."""
+        """Decode a message for a sensor; add a row if it gives no reading."""
         stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=readings.config.stamps == "recorded")
         if stamp_ns is None:
             text = f"{raw.file}: header stamp is zero or negative, recorded at {utc_text(raw.log_ns)}: {NO_STAMP}"
@@ -249,7 +258,7 @@ class _Reader:
             self._rows.append(readings.row(seq, stamp_ns, value))
 
     def _topic_rows(self, read: Counter[str]) -> list[LedgerRow]:
-        """Rows that stand for whole topics: not asked for, read beside the sensors, or unreadable."""
+        """Return rows for whole topics: unused, read but not fused, or unreadable."""
         rows: list[LedgerRow] = []
 
         def add(topic: str, count: int, outcome: Outcome, reason: str) -> None:
@@ -273,7 +282,7 @@ class _Reader:
 
 
 def _subscriptions(config: VesselConfig, topics: Mapping[str, TopicSummary], bag: str) -> list[Readings]:
-    """One `Readings` per enabled sensor that reads a topic."""
+    """Return `Readings` for each enabled sensor that reads a topic."""
     found = []
     for name, sensor in config.sensors.items():
         types = supported_types(sensor.kind)
@@ -284,7 +293,7 @@ def _subscriptions(config: VesselConfig, topics: Mapping[str, TopicSummary], bag
 
 
 def _check_topic(topic: str, key: str, types: tuple[str, ...], topics: Mapping[str, TopicSummary], bag: str) -> None:
-    """Raise an `InputError` where a topic is not in the bag, or holds something else."""
+    """Raise an `InputError` if a topic is missing or has another type."""
     fitting = [t.topic for t in topics.values() if set(t.msgtypes) & set(types)]
     offer = f"topics of a fitting type: {', '.join(fitting)}" if fitting else f"no topic holds {_or(types)}"
     if topic not in topics:
@@ -310,7 +319,7 @@ def _reference(
 
 
 def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str, tuple[Array, Array]]:
-    """Mounts of all enabled sensors that name a frame of /tf_static, also of those that read no topic."""
+    """Return the mounts of all enabled sensors that name a frame of /tf_static, including those that read no topic."""
     if tree is None:
         return {}
     return {
@@ -322,20 +331,20 @@ def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str
 
 def _refuse_unit(imu: ImuSeries, sensors: Sequence[Readings]) -> None:
     (config,) = (r.config for r in sensors if r.sensor == imu.sensor and isinstance(r.config, ImuConfig))
-    told: dict[str, Yaws] = {}
+    yaws: dict[str, Yaws] = {}
     for readings in sensors:
         yaw = np.array([_yaw_of(v) for v in readings.values])
         fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
         if np.isfinite(yaw).any():
-            told[f"the headings of {readings.sensor}"] = readings.stamps()[np.isfinite(yaw)], yaw[np.isfinite(yaw)]
+            yaws[f"the headings of {readings.sensor}"] = readings.stamps()[np.isfinite(yaw)], yaw[np.isfinite(yaw)]
         elif fixes:
             courses = courses_of_fixes(fixes)
-            told[f"the courses of {readings.sensor}"] = courses.stamps_ns, courses.course_rad
-    refuse_unit(imu, config, told)
+            yaws[f"the courses of {readings.sensor}"] = courses.stamps_ns, courses.course_rad
+    refuse_unit(imu, config, yaws)
 
 
 def _yaw_of(value: Decoded) -> float:
-    """What a compass says, or a pose by its likeliest mode; NaN of anything else."""
+    """Return the yaw of a heading, or of a pose's likeliest mode; NaN for anything else."""
     if isinstance(value, PoseFix) and "yaw" in value.axes:
         return float(max(value.modes, key=lambda mode: mode.probability).value[value.axes.index("yaw")])
     return value.yaw_rad if isinstance(value, CompassHeading) else float("nan")
@@ -354,11 +363,11 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
 def _mount_warnings(
     imu: ImuSeries, sensors: Sequence[Readings], mounts: Mapping[str, tuple[Array, Array]], config: VesselConfig
 ) -> list[str]:
-    """Say where the IMU is turned in the craft by how the fixes move: sensors that tell the heading would not contradict."""
+    """Return a line if the IMU's mount has a wrong yaw, by the motion of the fixes; no heading sensor would contradict it."""
     mount = config.sensors[imu.sensor].mount
     R = mounts[imu.sensor][1] if imu.sensor in mounts else mount.R_body_sensor
-    told = {r.sensor: [v for v in r.values if isinstance(v, GnssPosition)] for r in sensors}
-    motions = [m for sensor, fixes in told.items() if (m := motion_of_fixes(sensor, fixes))]
+    fixes = {r.sensor: [v for v in r.values if isinstance(v, GnssPosition)] for r in sensors}
+    motions = [m for sensor, own in fixes.items() if (m := motion_of_fixes(sensor, own))]
     found = (
         yaw_in_craft(imu.stamps_ns, imu.accel_mps2 @ R.T, imu.gyro_radps @ R.T, motions) if len(imu.stamps_ns) else None
     )
@@ -386,7 +395,7 @@ def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) 
 
 
 def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary]) -> list[str]:
-    """Say which sensors gave nothing at all, and mostly why."""
+    """Return a line for each sensor without a reading, with the main reason."""
     lines = []
     for readings in (r for r in sensors if not r.values):
         reasons = Counter(r.reason for r in rows if r.sensor == readings.sensor)

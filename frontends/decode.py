@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One table of decoders: (sensor kind, message type) -> a pure function from message to measurement.
+"""Decoders by (sensor kind, message type): pure functions from message to measurement.
 
-A decoder says what the message says, in the project's frames and units. It fills in uncertainty only
-where the message carries none; floors, scales and kernels belong to the factors.
+A decoder gives what the message states, in the project's frames and units. It sets an uncertainty only if the message has none;
+floors, scales and kernels belong to the factors.
 """
 
 from __future__ import annotations
@@ -94,27 +94,26 @@ def header_stamp_ns(msg: Any) -> int | None:
 
 
 def stamp_ns_of(msg: Any, msgtype: str, log_ns: int, *, recorded: bool = False) -> int | None:
-    """Return the stamp of a message, ns: its header's; when it was recorded, if that is asked for or its type has none.
+    """Return the stamp of a message, ns: that of its header, or its recording time if that is configured or its type has no stamp.
 
-    None where the header has none.
+    None if the header's stamp is zero or negative.
     """
     return log_ns if recorded or msgtype in UNSTAMPED else header_stamp_ns(msg)
 
 
 def covariance_translation_first(values: ArrayLike) -> Array:
-    """Return the 6x6 of ROS (36 values, row-major) in its order: x, y, z, then rotations about x, y, z.
+    """Return a ROS 6x6 covariance (36 values, row-major) in its order: x, y, z, then small rotations about fixed x, y, z axes.
 
-    The rotations are small ones about fixed axes. This is the only door for a ROS 6x6; GTSAM's order
-    (rotation first, body side) is made from it in the factors.
+    Every ROS 6x6 enters by this function; the factors make GTSAM's order (rotation first, in body) of it.
     """
     return np.asarray(values, dtype=float).reshape(6, 6)
 
 
 def usable_covariance(cov: Array, default_variances: Array) -> Array:
-    """Return `cov` (k, k) with axes that carry no variance (zero, negative, NaN) set to the default.
+    """Return `cov` (k, k) with the default on axes whose variance is zero, negative or NaN.
 
-    A replaced axis loses its correlations, as does one whose variance is beyond (1 nm)^2 to (1000 km)^2, which becomes
-    the nearer of these; a matrix that is then still not positive definite keeps its diagonal only.
+    Such an axis loses its correlations. So does one with a variance outside (1 nm)^2 to (1000 km)^2, which is clipped. If the matrix
+    is still not positive definite, only its diagonal is kept.
     """
     variance = np.diagonal(cov)
     good = np.isfinite(variance) & (variance > 0.0)
@@ -132,7 +131,7 @@ def usable_covariance(cov: Array, default_variances: Array) -> Array:
 def yaw_of_x_axis(x: float, y: float, z: float, w: float) -> float | Rejection:
     """Return the direction (rad, about the up or down axis of the frame) of the x axis of a quaternion.
 
-    Drivers that know heading only write NaN for x and y; then z and w alone give the yaw.
+    Drivers that only know a heading write NaN for x and y; then z and w alone give the yaw.
     """
     if np.isfinite(z) and np.isfinite(w) and not (np.isfinite(x) and np.isfinite(y)):
         x = y = 0.0
@@ -153,7 +152,7 @@ def yaw_of_x_axis(x: float, y: float, z: float, w: float) -> float | Rejection:
 
 
 def nav_sat_status(status: int) -> int:
-    """Return a status of NavSatFix or GPSFix as NavSatFix has it: differential (18) and WAAS (33) are `sbas` there."""
+    """Return the status of a NavSatFix or GPSFix as in NavSatFix: differential (18) and WAAS (33) become `sbas`."""
     return 1 if status in (18, 33) else status
 
 
@@ -210,7 +209,7 @@ def _gnss_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfi
 def _placed(
     place: tuple[float, float, float], cov: Array, stamp_ns: int, seq: int, sensor: str, config: GnssConfig
 ) -> Decoded:
-    """A fix at latitude and longitude, deg, and height, m (NaN: not told)."""
+    """Return a fix at latitude and longitude, deg, and height, m (NaN: unknown)."""
     lat, lon, height = place
     if not np.isfinite([lat, lon]).all():
         return malformed("latitude or longitude is NaN")
@@ -286,7 +285,7 @@ def _compass_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Comp
 
 
 def _twist(msg: Any) -> tuple[tuple[float, float, float], Array]:
-    """Linear velocity of a message, and its covariance (3, 3): zero where it has none."""
+    """Return the linear velocity of a message and its covariance (3, 3), zero if it has none."""
     with_covariance = hasattr(msg.twist, "covariance")
     v = msg.twist.twist.linear if with_covariance else msg.twist.linear
     cov = covariance_translation_first(msg.twist.covariance)[:3, :3] if with_covariance else np.zeros((3, 3))
@@ -305,7 +304,7 @@ def _velocity_vector(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Vel
 def _in_enu(
     v: tuple[float, float, float], cov: Array, config: VelocityConfig
 ) -> tuple[tuple[float, float, float], Array]:
-    """A velocity and its covariance in east, north, up."""
+    """Return a velocity and its covariance in east, north, up."""
     if config.convention == "enu":
         return v, cov
     return (v[1], v[0], -v[2]), _ENU_FROM_NED @ cov @ _ENU_FROM_NED.T
@@ -362,7 +361,7 @@ def _body_velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: 
 def _along(
     v_mps: tuple[float, ...], cov: Array, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig
 ) -> Decoded:
-    """Velocity along the first axes of the sensor, of which those are taken that the configuration asks for."""
+    """Return the velocity along the configured axes of the sensor."""
     axes = tuple(axis for axis in "xyz"[: len(v_mps)] if axis in config.axes)
     if not axes:
         return rejected(f"it tells the speed along x alone, and axes is [{', '.join(config.axes)}]")
@@ -376,14 +375,14 @@ def _along(
 
 
 def is_unit(quaternion: Array) -> bool:
-    """Return whether a quaternion (4,) is one of a rotation, to the digits that drivers write."""
+    """Return whether a quaternion (4,) has unit norm, to the digits that drivers write."""
     return bool((np.abs(quaternion) < 2.0).all()) and abs(float(np.linalg.norm(quaternion)) - 1.0) < 0.1
 
 
 def pose_of(msg: Any) -> tuple[Array, Array | None]:
     """Return position (3,) and rotation (3, 3) of an Odometry, PoseWithCovarianceStamped or PoseStamped message.
 
-    The rotation is None where the quaternion is not one.
+    The rotation is None if the quaternion is invalid.
     """
     pose = getattr(msg.pose, "pose", msg.pose)
     p, q = pose.position, pose.orientation
@@ -440,10 +439,10 @@ GROUP = "graphloc.decoders"  # of entry points: name a kind, load a mapping of m
 
 
 def decoder_of(kind: str, msgtype: str) -> Decoder | None:
-    """Return what reads messages of a type for a kind of sensor, ours or an installed package's; None: nothing does."""
+    """Return the decoder of a message type for a kind of sensor, ours or an installed package's; None if there is none."""
     return DECODERS.get((kind, msgtype)) or added(GROUP).get(kind, {}).get(msgtype)
 
 
 def supported_types(kind: str) -> tuple[str, ...]:
-    """Return the message types that a sensor kind can be read from; empty where the kind reads no topic."""
+    """Return the message types that a kind of sensor is read from; empty if the kind reads no topic."""
     return (*(msgtype for have, msgtype in DECODERS if have == kind), *added(GROUP).get(kind, {}))

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import (
+    Courses,
+    Motion,
     Turning,
     compass_report,
     courses_of,
@@ -32,7 +34,6 @@ from graphloc.frontends._assess_world import world_of
 from graphloc.frontends._clock import refuse_woven
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
-from graphloc.frontends._lag import lag, lag_of_way
 from graphloc.frontends._reports import (
     CompassReport,
     GnssReport,
@@ -49,6 +50,7 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._time_offsets import heading_time_offset, motion_time_offset
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends._unused import unused_topics
 from graphloc.frontends.aerial.cloud import CLOUD
@@ -92,109 +94,173 @@ _MOST_NAMED = 6
 _COVERS = 0.8  # of the run, from which a receiver is there throughout
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Contents:
+    """What is read of a bag.
+
+    Attributes:
+        source: its name, for messages. topics: by name, from its index.
+        streams: by topic, as recorded. aligned: those with messages, on one clock.
+        tree: of /tf_static. lidars, cameras: frame of the first message, by topic.
+    """
+
+    source: str
+    topics: Mapping[str, TopicSummary]
+    streams: Mapping[str, Stream]
+    aligned: Mapping[str, Stream]
+    tree: StaticTree
+    lidars: Mapping[str, str]
+    cameras: Mapping[str, str]
+    warnings: tuple[str, ...]
+
+    def of_type(self, *msgtypes: str) -> list[Stream]:
+        """Return the aligned streams of some message types."""
+        return [stream for stream in self.aligned.values() if stream.msgtype in msgtypes]
+
+    def tf_frame(self, stream: Stream) -> str | None:
+        """Return the frame of a stream where /tf_static connects it with the body."""
+        frame = stream.frame_id
+        return frame if self.tree.resolve(self.tree.body(), frame) and frame in self.tree.frames else None
+
+
+class _Track(NamedTuple):
+    """Track of the best receiver: stamps (N,), positions (N, 3) m about the first fix, their noise (m, 1 sigma), first fix."""
+
+    stamps_ns: NDArray[np.int64]
+    p_m: Array
+    scatter_m: float
+    first: Vec | None
+
+
 def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
-    """Look at a whole bag.
+    """Inspect a whole bag.
+
+    Receivers come first, since the other sensors are judged by the track of the best one.
 
     Args:
         paths: as for `read_recording`.
 
     Raises:
-        InputError: the bag cannot be opened, or its parts lie over each other.
+        InputError: the bag cannot be opened, or its parts overlap in time.
     """
+    bag = _read(paths)
+    tree, body = bag.tree, bag.tree.body()
+    gnss = _gnss_reports(bag)
+    reference = _best_track(bag, gnss)
+    odometry = _odometry_reports(bag, gnss, reference)
+    velocities = [
+        (s, velocity_report(s, reference.stamps_ns, reference.p_m, bag.tf_frame(s), reference.scatter_m))
+        for s in bag.of_type(TWIST, PLAIN_TWIST, VECTOR)
+    ]
+    wheels = [s for s, report in odometry if report.role == "check_speed"]
+    motions = motions_of(wheels, velocities, bag.of_type(*_FIXES))
+    courses = courses_of(reference.stamps_ns, reference.p_m, reference.scatter_m) if gnss else None
+    imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, motions, courses, tree, body))]
+    imus.sort(key=lambda i: (bool(i.missing), i.gravity == "removed", i.gyro_noise_mdps))
+    late = _late_s(bag, imus, motions)
+    compasses = _compass_reports(bag, imus, courses)
+    used = {g.topic for g in gnss} | {i.topic for i in imus} | {c.topic for c in compasses if c.usable}
+    reports = [report for _, report in odometry]
+    return Inspection(
+        source=bag.source,
+        topics=_topic_reports(bag),
+        imus=tuple(imus),
+        gnss=tuple(replace(report, late_s=late.get(report.topic)) for report in gnss),
+        compasses=compasses,
+        odometry=tuple(reports),
+        velocities=tuple(replace(report, late_s=late.get(report.topic)) for _, report in velocities),
+        lidars=_mounted(bag, bag.lidars),
+        cameras=tuple(_camera(bag, camera) for camera in _mounted(bag, bag.cameras)),
+        tf_frames=tree.frames,
+        body_frame=body,
+        warnings=(
+            *bag.warnings,
+            *(report.frozen for report in gnss if report.frozen),
+            *unused_topics(list(bag.streams.values()), used),
+            *_lacking(bag, imus, gnss, reports),
+        ),
+    )
+
+
+def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
     with Bag(paths) as bag:
         topics = bag.topics
         bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
         streams, tree = read_streams(bag)
-        clouds = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
-        images = _frames_of(bag, _pictures(bag))
+        lidars = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
+        cameras = _frames_of(bag, _pictures(bag))
         source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
     for stream in streams:
         if stream.msgtype == IMU:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
-    by_topic = {s.topic: s for s in streams}
-    filled = on_one_clock([s for s in streams if len(s)])
-    heard = {s.topic: s for s in filled}
-    fixes = [s for s in filled if s.msgtype in _FIXES]
-    poses = [s for s in filled if s.msgtype in (ODOMETRY, POSE, PLAIN_POSE)]
-    body = tree.body()
-    # The best first: what they say is what the others are judged by.
-    found_gnss = [g for s in fixes if (g := gnss_report(by_topic[s.topic], _known(s, tree, body)))]
-    longest_s = max((g.spans_s for g in found_gnss), default=0.0)
-    found_gnss.sort(
-        key=lambda g: (filtered(g.topic), g.slow_error or g.spans_s < _COVERS * longest_s, -g.fixes, g.without_height)
-    )
-    stamps, p_m, scatter_m, first = _best_track(heard, found_gnss)
-    frame = found_gnss[0].tf_frame if found_gnss else None
-    mount = tree.resolve(body, frame) if frame else None
-    antenna = None if mount is None else mount[0]
-    courses = courses_of(stamps, p_m, scatter_m) if found_gnss else None
-    told = [(s, odometry_report(s, stamps, p_m, world_of(s, stamps, p_m, first, antenna), scatter_m)) for s in poses]
-    twists = [
-        (s, velocity_report(s, stamps, p_m, _known(s, tree, body), scatter_m))
-        for s in filled
-        if s.msgtype in (TWIST, PLAIN_TWIST, VECTOR)
+    return _Contents(
+        source=source, topics=topics, streams={s.topic: s for s in streams},
+        aligned={s.topic: s for s in on_one_clock([s for s in streams if len(s)])},
+        tree=tree, lidars=lidars, cameras=cameras, warnings=warnings,
+    )  # fmt: skip
+
+
+def _topic_reports(bag: _Contents) -> tuple[TopicReport, ...]:
+    """Report every topic of the bag, then every NMEA sentence."""
+    topics = [
+        topic_report(bag.streams[t.topic], t.messages)
+        if t.topic in bag.streams
+        else TopicReport(topic=t.topic, msgtype=" or ".join(t.msgtypes), count=t.messages)
+        for t in bag.topics.values()
     ]
-    motions = motions_of([s for s, report in told if report.role == "check_speed"], twists, fixes)
-    found_imus = [i for s in filled if s.msgtype == IMU and (i := imu_report(s, motions, courses, tree, body))]
-    found_imus.sort(key=lambda i: (bool(i.missing), i.gravity == "removed", i.gyro_noise_mdps))
-    turning = turning_of(heard[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
-    felt = felt_of(heard[found_imus[0].topic], found_imus[0], tree, body) if found_imus else None
-    late = {m.source: lag_of_way(felt, m) for m in motions} if felt else {}
-    candidates = [s for s in filled if s.msgtype in (QUATERNION, IMU, *NUMBERS)]
-    found_compasses = _without_echoes([(c, s) for s in candidates if (c := compass_report(s, courses, turning))])
-    used = (
-        {g.topic for g in found_gnss}
-        | {i.topic for i in found_imus}
-        | {c.topic for c, _ in found_compasses if c.usable}
+    return (*topics, *(topic_report(s, len(s)) for s in bag.streams.values() if s.topic not in bag.topics))
+
+
+def _gnss_reports(bag: _Contents) -> list[GnssReport]:
+    """Report the receivers, the best one first."""
+    found = [r for s in bag.of_type(*_FIXES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
+    longest_s = max((r.spans_s for r in found), default=0.0)
+    found.sort(
+        key=lambda r: (filtered(r.topic), r.slow_error or r.spans_s < _COVERS * longest_s, -r.fixes, r.without_height)
     )
-    return Inspection(
-        source=source,
-        topics=tuple(
-            topic_report(by_topic[t.topic], t.messages)
-            if t.topic in by_topic
-            else TopicReport(topic=t.topic, msgtype=" or ".join(t.msgtypes), count=t.messages)
-            for t in topics.values()
-        )
-        + tuple(topic_report(s, len(s)) for s in streams if s.topic not in topics),
-        imus=tuple(found_imus),
-        gnss=tuple(replace(g, late_s=late.get(g.topic)) for g in found_gnss),
-        compasses=tuple(
-            _asked_together(_timed(c, s, by_topic[s.topic], turning), s, [(i, heard[i.topic]) for i in found_imus])
-            for c, s in found_compasses
-        ),
-        odometry=tuple(report for _, report in told),
-        velocities=tuple(replace(report, late_s=late.get(report.topic)) for _, report in twists),
-        lidars=_mounted(clouds, tree, body),
-        cameras=tuple(
-            replace(camera, listed=bool(set(LISTS) & set(topics[camera.topic].msgtypes)))
-            for camera in _mounted(images, tree, body, {t.topic for t in topics.values() if INFO in t.msgtypes})
-        ),
-        tf_frames=tree.frames,
-        body_frame=body,
-        warnings=(
-            *warnings,
-            *(g.frozen for g in found_gnss if g.frozen),
-            *unused_topics(streams, used),
-            *_lacking(found_imus, found_gnss, [report for _, report in told], bool(clouds or images), topics, by_topic),
-        ),
-    )
+    return found
+
+
+def _odometry_reports(
+    bag: _Contents, gnss: Sequence[GnssReport], reference: _Track
+) -> list[tuple[Stream, OdometryReport]]:
+    frame = gnss[0].tf_frame if gnss else None
+    mount = bag.tree.resolve(bag.tree.body(), frame) if frame else None
+    antenna_m = None if mount is None else mount[0]
+    found = []
+    for stream in bag.of_type(ODOMETRY, POSE, PLAIN_POSE):
+        world = world_of(stream, reference.stamps_ns, reference.p_m, reference.first, antenna_m)
+        found.append((stream, odometry_report(stream, reference.stamps_ns, reference.p_m, world, reference.scatter_m)))
+    return found
+
+
+def _late_s(
+    bag: _Contents, imus: Sequence[ImuReport], motions: Sequence[Motion]
+) -> dict[str, tuple[float, float] | None]:
+    """Return by topic what should be added to the stamps of a motion by the best IMU, s, and its sigma."""
+    felt = felt_of(bag.aligned[imus[0].topic], imus[0], bag.tree, bag.tree.body()) if imus else None
+    return {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
+
+
+def _compass_reports(bag: _Contents, imus: Sequence[ImuReport], courses: Courses | None) -> tuple[CompassReport, ...]:
+    """Report every orientation that may be a heading; see `_without_echoes` for their order."""
+    turning = turning_of(bag.aligned[imus[0].topic], imus[0], bag.tree, bag.tree.body()) if imus else None
+    candidates = bag.of_type(QUATERNION, IMU, *NUMBERS)
+    found = _without_echoes([(r, s) for s in candidates if (r := compass_report(s, courses, turning))])
+    best = (imus[0], bag.aligned[imus[0].topic]) if imus else None
+    return tuple(_beside_gyro(_timed(r, s, bag.streams[s.topic], turning), s, best) for r, s in found)
 
 
 def _lacking(
-    imus: Sequence[ImuReport],
-    gnss: Sequence[GnssReport],
-    odometry: Sequence[OdometryReport],
-    sees: bool,
-    topics: Mapping[str, TopicSummary],
-    read: Container[str],
+    bag: _Contents, imus: Sequence[ImuReport], gnss: Sequence[GnssReport], odometry: Sequence[OdometryReport]
 ) -> list[str]:
-    """Say what no run can do without, and which topics are of no type that is read: it may be there."""
+    """Say which required sensors are missing, and then also which topics have an unsupported type: they may be it."""
     lines = []
     if not any(not imu.missing for imu in imus):
         lines.append("no whole IMU in it: smooth, replay and compare need one")
-    if not gnss and not sees and not any(report.role == "pose" for report in odometry):
+    if not (gnss or bag.lidars or bag.cameras or any(report.role == "pose" for report in odometry)):
         lines.append("nothing in it tells the place: no GNSS fix that can be used, no pose")
-    others = [t for t in topics.values() if t.topic not in read and not _KNOWN.match(t.msgtypes[0])]
+    others = [t for t in bag.topics.values() if t.topic not in bag.streams and not _KNOWN.match(t.msgtypes[0])]
     if lines and others:
         named = ", ".join(f"{t.topic} ({' or '.join(t.msgtypes).replace('/msg/', '/')})" for t in others[:_MOST_NAMED])
         lines.append(f"of no type that is read here: {named}{', ...' if len(others) > _MOST_NAMED else ''}")
@@ -202,38 +268,38 @@ def _lacking(
 
 
 def _without_echoes(compasses: Sequence[tuple[CompassReport, Stream]]) -> list[tuple[CompassReport, Stream]]:
-    """The compasses, those that have no stamp last; of those that say what one before them says, what that is."""
-    own: list[tuple[CompassReport, Stream]] = []
+    """Return the compasses, those of types without a stamp last; one that repeats another names it in `like`."""
+    distinct: list[tuple[CompassReport, Stream]] = []
     found = []
     for report, stream in sorted(compasses, key=lambda pair: pair[1].msgtype in NUMBERS):
-        for other, heard in own if report.usable else ():
-            if says_the_same(heard, stream, mirrored=report.convention != other.convention):
+        for other, other_stream in distinct if report.usable else ():
+            if says_the_same(other_stream, stream, mirrored=report.convention != other.convention):
                 report = replace(report, like=other.topic)
                 break
         else:
-            own += [(report, stream)] if report.usable else []
+            distinct += [(report, stream)] if report.usable else []
         found.append((report, stream))
     return found
 
 
-def _timed(report: CompassReport, stream: Stream, told: Stream, turning: Turning | None) -> CompassReport:
-    """The report, with what the gyroscope says of the stamps, as they were told."""
+def _timed(report: CompassReport, stream: Stream, recorded: Stream, turning: Turning | None) -> CompassReport:
+    """Add the time offset that the gyroscope shows, relative to the stamps as recorded."""
     if turning is None or not report.usable:
         return report
     stamps, angle = headings(stream)
-    found = lag(turning, stamps, angle if report.convention == "enu" else -angle)
+    found = heading_time_offset(turning, stamps, angle if report.convention == "enu" else -angle)
     if found is None:
         return report
     value, sigma = found
-    value += float(stream.stamps_ns[0] - told.stamps_ns[0]) / NS_PER_S
+    value += float(stream.stamps_ns[0] - recorded.stamps_ns[0]) / NS_PER_S
     return replace(report, why=f"{report.why}; by the gyro, time_offset_s should be {value:.3f} +- {sigma:.3f}")
 
 
-def _asked_together(report: CompassReport, stream: Stream, imus: Sequence[tuple[ImuReport, Stream]]) -> CompassReport:
-    """The report, with what the gyroscope of the best IMU says: how far it wanders, how many readings are none of a heading."""
-    if not imus or not report.usable:
+def _beside_gyro(report: CompassReport, stream: Stream, best: tuple[ImuReport, Stream] | None) -> CompassReport:
+    """Add the wander and the number of scattered headings, both relative to the gyroscope of the best IMU."""
+    if best is None or not report.usable:
         return report
-    imu, samples = imus[0]
+    imu, samples = best
     keep = samples_of(samples)[0]
     keep = keep[np.isfinite(samples.rows[keep, :6]).all(axis=1)]
     rows = samples.rows[keep]
@@ -247,39 +313,43 @@ def _asked_together(report: CompassReport, stream: Stream, imus: Sequence[tuple[
     )
     stamps, angle = headings(stream)
     yaw = angle if report.convention == "enu" else np.pi / 2.0 - angle
-    said = [
+    measured = [
         CompassHeading(stamp_ns=int(s), sensor=stream.topic, seq=0, yaw_rad=float(y), sigma_rad=1.0)
         for s, y in zip(stamps, wrap_angle(yaw), strict=True)
     ]
-    report = replace(report, wander_deg=wander_deg(series, said))
-    bad = int(scattered(series, said).sum())
-    return replace(report, why=f"{report.why}; {bad} of {len(said)}: {SCATTERED}") if bad else report
+    report = replace(report, wander_deg=wander_deg(series, measured))
+    bad = int(scattered(series, measured).sum())
+    return replace(report, why=f"{report.why}; {bad} of {len(measured)}: {SCATTERED}") if bad else report
 
 
-def _mounted(
-    frames: Mapping[str, str], tree: StaticTree, body: str, infos: Container[str] = ()
-) -> tuple[MountedTopic, ...]:
-    found = []
-    for topic, frame in sorted(frames.items()):
-        beside = camera_info_topic(topic)
-        tf_frame = frame if tree.resolve(body, frame) else None
-        info = beside if beside in infos else ""
-        found.append(MountedTopic(topic=topic, frame_id=frame, tf_frame=tf_frame, info_topic=info))
-    return tuple(found)
+def _mounted(bag: _Contents, frames: Mapping[str, str]) -> tuple[MountedTopic, ...]:
+    body = bag.tree.body()
+    return tuple(
+        MountedTopic(topic=topic, frame_id=frame, tf_frame=frame if bag.tree.resolve(body, frame) else None)
+        for topic, frame in sorted(frames.items())
+    )
+
+
+def _camera(bag: _Contents, camera: MountedTopic) -> MountedTopic:
+    """Add the topic of the CameraInfo, if there is one, and whether the topic lists tags instead of images."""
+    beside = camera_info_topic(camera.topic)
+    has_info = beside in bag.topics and INFO in bag.topics[beside].msgtypes
+    listed = bool(set(LISTS) & set(bag.topics[camera.topic].msgtypes))
+    return replace(camera, info_topic=beside if has_info else "", listed=listed)
 
 
 def _pictures(bag: Bag) -> list[str]:
-    """Topics that tags may be seen in: of one camera the compressed images, where there are two kinds; no depth."""
+    """Return the topics of images and tag lists; of a camera that has both kinds of images, the compressed one; no depth images."""
     kinds = (*IMAGES, *LISTS)
     every = [t.topic for t in bag.topics.values() if set(kinds) & set(t.msgtypes) and t.messages]
     return [t for t in every if f"{t}/compressed" not in every and "depth" not in t.lower()]
 
 
 def _frames_of(bag: Bag, topics: Sequence[str]) -> dict[str, str]:
-    """The frame of the first readable message of each topic, if that is among the first 200.
+    """Return the frame of the first readable message of each topic, if that is among the first 200.
 
-    Each topic is read by itself, so that one without messages, or with none that is readable, does not unpack those of
-    the others to the end of the bag.
+    Each topic is read separately: a topic without any readable message would otherwise cause all others to be unpacked
+    to the end of the bag.
     """
     found: dict[str, str] = {}
     for topic in topics:
@@ -293,18 +363,11 @@ def _frames_of(bag: Bag, topics: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def _known(stream: Stream, tree: StaticTree, body: str) -> str | None:
-    """Return the stream's frame where /tf_static leads to it from the body."""
-    return stream.frame_id if tree.resolve(body, stream.frame_id) and stream.frame_id in tree.frames else None
-
-
-def _best_track(
-    by_topic: dict[str, Stream], gnss: Sequence[GnssReport]
-) -> tuple[NDArray[np.int64], Array, float, Vec | None]:
-    """Return stamps, places about the first fix (m), scatter (m) and first fix of the best receiver, without frozen fixes."""
+def _best_track(bag: _Contents, gnss: Sequence[GnssReport]) -> _Track:
+    """Return the track of the first receiver, without frozen fixes; an empty one where there is no receiver."""
     if not gnss:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None
+        return _Track(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None)
     best = gnss[0]
-    stamps, p, rows = track(by_topic[best.topic])
-    good = ~frozen_fixes(stamps, rows[:, :2], p[:, :2])
-    return stamps[good], p[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first
+    stamps_ns, p_m, rows = track(bag.aligned[best.topic])
+    good = ~frozen_fixes(stamps_ns, rows[:, :2], p_m[:, :2])
+    return _Track(stamps_ns[good], p_m[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lines of JSON -> measurements (docs/online-stream.md).
+"""Lines of JSON to measurements (docs/online-stream.md).
 
-A line becomes the message that a bag would hold and goes through the decoders of bags, so that a stream and a bag of
-one run give the same measurements.
+A line becomes the message that a bag would hold and passes the decoders of bags, so that a stream and a bag of one run give the
+same measurements.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _Groups = tuple[tuple[str, ...], ...]
 
 
 class _At(NamedTuple):
-    """When, which arrival, by which sensor: of a measurement."""
+    """Stamp, arrival number and sensor of a measurement."""
 
     stamp_ns: int
     seq: int
@@ -65,7 +65,7 @@ class _At(NamedTuple):
 
 
 class _Said(Block, strict=True):
-    """Part of a line: no key but these, no number that is a string or a bool."""
+    """Part of a line; unknown keys, and numbers given as strings or bools, are refused."""
 
     one_of: ClassVar[_Groups] = ()
     at_most_one_of: ClassVar[_Groups] = ()
@@ -93,7 +93,7 @@ class _Stamped(_Said):
 
     @property
     def ns(self) -> int | None:
-        """The stamp as the sender has it, ns."""
+        """The stamp as sent, ns."""
         if self.stamp is None:
             return self.stamp_ns
         whole, _, rest = self.stamp.partition(".")
@@ -101,14 +101,14 @@ class _Stamped(_Said):
 
 
 class _Line(_Stamped):
-    """A measurement; `sensor` may be left out where only one of its kind is switched on."""
+    """A measurement; `sensor` may be omitted if only one of its kind is enabled."""
 
     one_of: ClassVar[_Groups] = (("stamp", "stamp_ns"),)
     kind: ClassVar[str]  # of the sensor that says it
     sensor: str = ""
 
     def sensor_in(self, config: VesselConfig) -> str | Rejection:
-        """Return the name of the sensor that is meant."""
+        """Return the name of the sensor."""
         names = [name for name, sensor in config.sensors.items() if sensor.kind == self.kind]
         enabled = list(config.of_kind(self.kind))
         if self.sensor and self.sensor not in names:
@@ -137,7 +137,7 @@ class ImuLine(_Line):
 
 
 class GnssLine(_Line):
-    """A fix of the antenna on WGS 84, height above the ellipsoid, if it has one; noise east, north, up."""
+    """A fix of the antenna on WGS 84, with height above the ellipsoid if known; noise east, north, up."""
 
     kind = "gnss"
     at_most_one_of = (("sigma_m", "cov_enu_m2"),)
@@ -150,7 +150,7 @@ class GnssLine(_Line):
     status: Literal["none", "fix", "sbas", "gbas"] = "fix"
 
     def measured(self, at: _At, config: GnssConfig) -> Measurement | Rejection:
-        """Return the fix, or why it is none."""
+        """Return the fix, or its rejection."""
         fix = SimpleNamespace(
             status=SimpleNamespace(status=_STATUS[self.status]), latitude=self.lat_deg, longitude=self.lon_deg,
             altitude=math.nan if self.height_m is None else self.height_m, position_covariance=_covariance(self.cov_enu_m2, self.sigma_m or _ZERO),
@@ -170,7 +170,7 @@ class HeadingLine(_Line):
     sigma_deg: Positive | None = None
 
     def measured(self, at: _At, config: CompassConfig) -> Measurement | Rejection:
-        """Return the heading, with the configured sigma where the line has none or is not to be believed."""
+        """Return the heading; its sigma is the configured one if the line has none, or an implausible one."""
         yaw = wrap_angle(self.yaw_rad) if self.yaw_rad is not None else yaw_from_heading_deg(self.heading_deg or 0.0)
         sigma_deg = (self.sigma_deg if config.use_reported_sigma else None) or config.sigma_deg
         sigma = float(np.radians(sigma_deg))
@@ -194,7 +194,7 @@ class VelocityLine(_Line):
 
 
 class BodyVelocityLine(_Line):
-    """Velocity along the sensor's axes x, y, z, of which those are read that its configuration has."""
+    """Velocity along the sensor's axes x, y, z; the configured ones are used."""
 
     kind = "body_velocity"
     at_most_one_of = (("sigma_mps", "cov_m2ps2"),)
@@ -209,7 +209,7 @@ class BodyVelocityLine(_Line):
 
 
 class ModeSaid(_Said):
-    """One pose of the sensor in world; covariance x, y, z (m), then small rotations about world's axes (rad)."""
+    """One pose of the sensor in world; covariance of x, y, z (m), then small rotations about the axes of world (rad)."""
 
     at_most_one_of = (("rpy_deg", "quaternion_xyzw"), ("sigma_m", "cov_m_rad"), ("sigma_deg", "cov_m_rad"))
     xyz_m: Triple
@@ -231,14 +231,14 @@ class ModeSaid(_Said):
 
 
 class PoseLine(_Line):
-    """A pose of the sensor in world, as one mode or several; `axes` of its configuration are used."""
+    """A pose of the sensor in world, with one or several modes; the configured `axes` are used."""
 
     kind = "pose"
     type: Literal["pose"]
     modes: Annotated[tuple[ModeSaid, ...], Field(min_length=1, max_length=64)]
 
     def measured(self, at: _At, config: PoseConfig) -> Measurement | Rejection:
-        """Return the pose with its modes; each goes through the decoder of a pose."""
+        """Return the pose with its modes; each passes the decoder of a pose."""
         modes: list[PoseMode] = []
         for said in self.modes:
             fix = _decoded(POSE, said.message(), at, config)
@@ -249,7 +249,7 @@ class PoseLine(_Line):
 
 
 class PredictLine(_Stamped):
-    """Ask for the pose at a stamp, or at that of the newest IMU sample."""
+    """Request for the pose at a stamp, or at the newest IMU sample."""
 
     at_most_one_of = (("stamp", "stamp_ns"),)
     type: Literal["predict"]
@@ -269,24 +269,24 @@ _LINES: dict[str, type[_Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A line that asks for the pose at `stamp_ns`; None: at that of the newest IMU sample."""
+    """Request for the pose at `stamp_ns`; None: at the newest IMU sample."""
 
     stamp_ns: int | None
 
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """A line that gave no measurement: its row of the ledger, which says why."""
+    """A line that gave no measurement, with its ledger row."""
 
     row: LedgerRow
 
 
 def parse(line: bytes, number: int, seq: int, config: VesselConfig) -> Measurement | Request | Trouble:
-    """Return what a line says; never raises.
+    """Return the measurement, request or trouble in a line; never raises.
 
     Args:
         line: one JSON object. number: of the line, from 1. seq: arrival number of a measurement.
-        config: the sensors, whose `time_offset_s` is added to the stamps as it is for bags.
+        config: the sensors; their `time_offset_s` is added to the stamps as it is for bags.
     """
     stamp_ns, sensor = 0, ""
 
@@ -332,7 +332,7 @@ def parse(line: bytes, number: int, seq: int, config: VesselConfig) -> Measureme
 
 
 def _first_of(error: ValidationError, model: type[Block]) -> str:
-    """What is wrong with a line; a long one may have thousands of errors."""
+    """Return the first error of a line; a long line may have thousands."""
     first = error.errors(include_url=False)[0]
     key = ".".join(str(part) for part in first["loc"])[:60]
     if first["type"] == "extra_forbidden":
@@ -350,7 +350,7 @@ def _decoded(msgtype: str, msg: SimpleNamespace, at: _At, config: SensorConfig) 
 
 
 def _xyz(values: Sequence[float]) -> SimpleNamespace:
-    """A vector of three, or a quaternion, as ROS has them."""
+    """Return a vector of three, or a quaternion, as ROS messages hold them."""
     return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
 
 
@@ -362,5 +362,5 @@ def _twist(v_mps: Sequence[float], cov: Array) -> SimpleNamespace:
 
 
 def _covariance(full: Sequence[Sequence[float]] | None, sigmas: Sequence[float]) -> Array:
-    """The matrix, or that of the sigmas; decoders take zeros for 'not known'."""
+    """Return the covariance, or that of the sigmas; zeros mean 'unknown' to the decoders."""
     return np.array(full, dtype=float) if full else np.diag(np.square(sigmas))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sentence of NMEA 0183 says (`nmea_msgs/Sentence`, `std_msgs/String`): a place, a heading, a velocity, a speed.
+"""Sentences of NMEA 0183 (`nmea_msgs/Sentence`, `std_msgs/String`): position, heading, velocity, speed.
 
-Velocities are over ground, speeds through the water. Reading the fields is left to pynmeagps. A sentence that was not asked for is not read at all.
+Velocities are over ground, speeds through the water. pynmeagps parses the fields. Only requested sentences are parsed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _NOT_MEASURED = {0: "no fix", 6: "dead reckoned by the receiver", 7: "typed in b
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:
-    """A place: deg; height above the ellipsoid, m, NaN where it is not told; quality as in GGA; horizontal dilution."""
+    """A position: deg; height above the ellipsoid, m, NaN if unknown; quality as in GGA; horizontal dilution."""
 
     latitude_deg: float
     longitude_deg: float
@@ -45,20 +45,20 @@ class Fix:
 
 
 def text_of(msg: Any) -> str:
-    """Return what a message of either type says."""
+    """Return the text of a message of either type."""
     return str(msg.sentence if hasattr(msg, "sentence") else msg.data)
 
 
 def identities(text: str) -> list[tuple[str, str]]:
-    """Return talker and sentence ('GP', 'GGA') of each sentence, once; some drivers put a whole burst into a message."""
+    """Return talker and sentence ('GP', 'GGA') of each distinct sentence; some drivers put a whole burst into a message."""
     return list(dict.fromkeys((found[1], found[2]) for found in _SENTENCE.finditer(text)))
 
 
 def fix(text: str, wanted: Collection[str]) -> Fix | Rejection:
-    """Return the place.
+    """Return the position.
 
     Args:
-        text: the sentence. wanted: sentences that are read, with a talker ('GPGGA') or of any ('GGA').
+        text: the sentence. wanted: accepted sentences, with a talker ('GPGGA') or of any ('GGA').
     """
     said = _read(text, wanted, PLACES, "place")
     if isinstance(said, Rejection):
@@ -120,7 +120,7 @@ def water_speed_mps(text: str, wanted: Collection[str]) -> float | Rejection:
 
 
 def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str) -> Any | Rejection:
-    """The fields of the first sentence that is wanted, as pynmeagps names them."""
+    """Return the fields of the first accepted sentence, as pynmeagps names them."""
     sentences = list(_SENTENCE.finditer(text))
     if not sentences and (foreign := _FOREIGN.search(text)):
         return ignored(f"{foreign[0]}...: AIS or a maker's own sentence: not read")
@@ -140,7 +140,7 @@ def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str)
 
 
 def _quality(said: Any) -> int:
-    """The best of a sentence's modes, one letter each constellation; old receivers have a status, or nothing."""
+    """Return the best of a sentence's modes, a letter per constellation; old receivers have a status, or nothing."""
     if getattr(said, "status", "A") != "A":
         return 0
     modes = [_QUALITIES[letter] for letter in str(_field(said, "posMode")) if letter in _QUALITIES]
@@ -148,7 +148,7 @@ def _quality(said: Any) -> int:
 
 
 def _field(said: Any, name: str) -> Any:
-    """A field; empty where the sentence ends before it."""
+    """Return a field; empty if the sentence ends before it."""
     return getattr(said, name, "")
 
 
@@ -158,12 +158,12 @@ def _number(said: Any, name: str) -> float:
 
 
 def _speed_mps(said: Any, knots: str, km_per_h: str) -> float:
-    """A speed that is told in knots or in km/h, m/s; NaN where it is in neither."""
-    told = _number(said, knots)
-    return KNOT_MPS * told if isfinite(told) else KM_PER_H_MPS * _number(said, km_per_h)
+    """Return a speed given in knots or km/h, m/s; NaN if it is given in neither."""
+    in_knots = _number(said, knots)
+    return KNOT_MPS * in_knots if isfinite(in_knots) else KM_PER_H_MPS * _number(said, km_per_h)
 
 
 def _east(said: Any, name: str) -> float:
-    """A deviation or variation, east positive; 0 where it is not told."""
+    """Return a deviation or variation, east positive; 0 if it is not given."""
     size = _number(said, name)
     return (-size if _field(said, f"{name}EW") == "W" else size) if isfinite(size) else 0.0

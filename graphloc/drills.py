@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drills: a recording with scripted harbour failures, for the smoother, its online mode and the filters."""
+"""Drills: harbour failures injected into a recording, for the smoother, the online mode and the EKFs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Tracks = dict[str, tuple[Trajectory | None, str]]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Job:
-    """What a worker needs: a window of the recording, how to start there, and the failure or None."""
+    """Task of a worker: a window of the recording, the configuration to start there, and the failure or None."""
 
     part: Recording
     config: VesselConfig
@@ -50,68 +50,93 @@ def drill(
     jobs: int = 1,
     progress: Progress = quiet,
 ) -> Drilled:
-    """Strike a recording with failures, and measure what each estimator makes of them.
+    """Inject failures into a recording, and measure the errors of each estimator.
 
     Scans are matched once, around the undisturbed run; these matches are the measurements of every drill.
 
     Args:
-        times: how often each failure strikes. only: parts of the names of those wanted; none: all.
-        jobs: processes beside each other.
+        times: how often each failure is injected. only: parts of the names of failures to inject; empty: all.
+        jobs: parallel processes.
 
     Raises:
-        ConfigError: `only` names none. InputError: no failure fits the recording.
+        ConfigError: `only` matches none. InputError: no failure fits the recording.
     """
     _refuse_unknown(recording, only)
     run = app.smooth_recording(recording, config, scans=scans, progress=progress)
-    recording, datum = run.recording, run.solution.datum
-    failures, left = script(recording)
+    failures, left = script(run.recording)
     failures = _wanted(failures, only)
-    parts = windows(recording, max(f.length_s for f in failures), times)
-    pieces = [cut(recording, part) for part in parts]
-    configs = [_started_there(config, recording, part, run.solution.trajectory) for part in parts]
-
-    def job(window: int, case: Case | None) -> _Job:
-        part = pieces[window] if case is None else cut(pieces[window], judged_until(case, parts[window]))
-        return _Job(part=part, config=configs[window], datum=datum, window=window, case=case)
-
-    undisturbed = dict(run_jobs(_tracks, [job(k, None) for k in range(len(parts))], jobs, "undisturbed", progress))
-    normal = [undisturbed[k] for k in range(len(parts))]
-    ready_ns = [_first_ns(tracks, part) for tracks, part in zip(normal, parts, strict=True)]
-    cases, too_long = schedule(failures, parts, ready_ns, times, seed)
+    parts = windows(run.recording, max(f.length_s for f in failures), times)
+    bench = _Bench(run, parts, jobs, progress)
+    cases, too_long = schedule(failures, parts, bench.ready_ns(), times, seed)
     if not cases:
         raise InputError(f"{recording.source}: no failure fits: {'; '.join(f'{n}: {why}' for n, why in too_long[:2])}")
-    reference = recording.truth or run.solution.trajectory
-    sure, origin_ns = recording.truth is not None, parts[0].begin_ns if parts[0].whole else int(_stamps(recording)[0])
-
-    def against(tracks: Tracks, window: int) -> dict[str, Times]:
-        return {name: compared(t, reference, parts[window], sure=sure) for name, (t, _) in tracks.items()}
-
-    usual = [against(tracks, k) for k, tracks in enumerate(normal)]
-    measured: dict[int, list[Measured]] = {}
-    shown: dict[int, dict[str, Times]] = {}
-    for number, tracks in run_jobs(_tracks, [job(c.window, c) for c in cases], jobs, "drills", progress):
-        case = cases[number]
-        tracks = {**normal[case.window], **tracks}
-        struck = against(tracks, case.window)
-        shown[number] = struck
-        measured[number] = [
-            judge(case, name, struck[name], usual[case.window][name], origin_ns, tracks[name][1]) for name in ESTIMATORS
-        ]
+    shown, measured = bench.drill(cases)
     return Drilled(
         source=recording.source,
         vessel=config.vessel,
-        truth=sure,
+        truth=run.recording.truth is not None,
         bound_m=_typical_bound_m(run.solution.trajectory),
-        measured=tuple(m for k in sorted(measured) for m in measured[k]),
-        shown=tuple((cases[k], shown[k]) for k in sorted(shown)),
+        measured=tuple(measured),
+        shown=tuple(zip(cases, shown, strict=True)),
         left=tuple((name, why) for name, why in (*left, *too_long) if _asked_for(name, only)),
         windows=parts,
         warnings=run.recording.warnings,
     )
 
 
+class _Bench:
+    """Windows of a run, and the undisturbed tracks in them.
+
+    Args:
+        run: its track is the reference where there is no truth. parts: the windows. jobs: parallel processes.
+    """
+
+    def __init__(self, run: app.Run, parts: Sequence[Window], jobs: int, progress: Progress) -> None:
+        self._run, self._parts, self._processes, self._progress = run, parts, jobs, progress
+        self._pieces = [cut(run.recording, part) for part in parts]
+        track = run.solution.trajectory
+        self._configs = [_started_there(run.config, run.recording, part, track) for part in parts]
+        undisturbed = [self._job(k, None) for k in range(len(parts))]
+        normal = dict(run_jobs(_tracks, undisturbed, jobs, "undisturbed", progress))
+        self._normal = [normal[k] for k in range(len(parts))]
+
+    def ready_ns(self) -> list[int]:
+        """Return the stamp of the first online pose in each window."""
+        return [_first_ns(tracks, part) for tracks, part in zip(self._normal, self._parts, strict=True)]
+
+    def drill(self, cases: Sequence[Case]) -> tuple[list[dict[str, Times]], list[Measured]]:
+        """Return the errors over time of each estimator in each case, and what these amount to."""
+        recording, whole = self._run.recording, self._parts[0].whole
+        origin_ns = self._parts[0].begin_ns if whole else int(_stamps(recording)[0])
+        usual = [self._errors(tracks, k) for k, tracks in enumerate(self._normal)]
+        shown: dict[int, dict[str, Times]] = {}
+        measured: dict[int, list[Measured]] = {}
+        jobs = [self._job(case.window, case) for case in cases]
+        for number, disturbed in run_jobs(_tracks, jobs, self._processes, "drills", self._progress):
+            case = cases[number]
+            tracks = {**self._normal[case.window], **disturbed}
+            errors = shown[number] = self._errors(tracks, case.window)
+            measured[number] = [
+                judge(case, name, errors[name], usual[case.window][name], origin_ns, tracks[name][1])
+                for name in ESTIMATORS
+            ]
+        every = range(len(cases))
+        return [shown[k] for k in every], [m for k in every for m in measured[k]]
+
+    def _job(self, window: int, case: Case | None) -> _Job:
+        piece = self._pieces[window]
+        part = piece if case is None else cut(piece, judged_until(case, self._parts[window]))
+        datum = self._run.solution.datum
+        return _Job(part=part, config=self._configs[window], datum=datum, window=window, case=case)
+
+    def _errors(self, tracks: Tracks, window: int) -> dict[str, Times]:
+        truth = self._run.recording.truth
+        reference, sure = truth or self._run.solution.trajectory, truth is not None
+        return {name: compared(t, reference, self._parts[window], sure=sure) for name, (t, _) in tracks.items()}
+
+
 def _refuse_unknown(recording: Recording, only: Sequence[str]) -> None:
-    """A name that no drill has is said before the run is smoothed."""
+    """Refuse an unknown name before the run is smoothed."""
     found, left = script(recording)
     names = [*(f.name for f in found), *(name for name, _ in left)]
     for part in only:
@@ -148,7 +173,7 @@ def _typical_bound_m(track: Trajectory) -> float:
 
 
 def _started_there(config: VesselConfig, recording: Recording, part: Window, track: Trajectory) -> VesselConfig:
-    """Where no sensor tells the heading, a window begins with the one that the run had come to."""
+    """Return the configuration for a window; without a heading sensor, it starts with the heading of the run there."""
     told = any(isinstance(m, CompassHeading) for m in recording.measurements)
     at = np.array([max(part.begin_ns, int(track.stamps_ns[0]))])
     if part.whole or told or not track.covers(at)[0]:
@@ -158,7 +183,7 @@ def _started_there(config: VesselConfig, recording: Recording, part: Window, tra
 
 
 def _tracks(job: _Job) -> Tracks:
-    """Run every estimator on a window, struck or not."""
+    """Run every estimator on a window, with or without a failure."""
     struck = Struck(recording=job.part)
     if job.case is not None:
         struck = job.case.failure.on(job.part, job.case.begin_ns, job.case.seed)
@@ -193,7 +218,7 @@ def _or_why_not(solve: Callable[[], Trajectory]) -> tuple[Trajectory | None, str
 
 
 def as_it_comes(recording: Recording, late_ns: Mapping[int, int]) -> Recording:
-    """Return what a filter that knows no delays takes a late measurement for: one of when it comes."""
+    """Return the recording as a filter without a model of delays sees it: late measurements stamped with their arrival."""
     if not late_ns:
         return recording
     moved = [replace(m, stamp_ns=m.stamp_ns + late_ns.get(m.seq, 0)) for m in recording.measurements]

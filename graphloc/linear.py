@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Factors that GTSAM has no native one for: linearised by hand, anew at every pass.
+"""Factors for residuals that GTSAM has no native factor for: linearised here, anew at every pass.
 
-Measured: a `CustomFactor` calls back into Python at every linearisation, 25 times the cost (style.md rule 14).
+A `CustomFactor` calls back into Python at every linearisation, which costs 25 times as much (measured).
 """
 
 from __future__ import annotations
@@ -51,10 +51,20 @@ def pose_term(at: Attachment, jacobian: Array) -> Term:
     return Term(at.pose_key, at.T_solver, carried, at.T_solver.localCoordinates(at.T_world_body))
 
 
-def linear_update(residual: Residual, terms: Sequence[Term], decision: Decision) -> GraphUpdate:
-    """Return the factor of a residual that is linear in some states.
+def linear_factor(residual: Residual, at: Attachment, decision: Decision) -> GraphUpdate:
+    """Return the factor of a residual in the states that it has Jacobians for: pose, velocity and slow state."""
+    terms = [pose_term(at, residual.jacobian())]
+    if residual.velocity_jacobian is not None:
+        terms.append(Term(at.velocity_key, at.v_world_mps, residual.velocity_jacobian()))
+    if at.slow_key is not None and residual.slow_jacobian is not None:
+        terms.append(Term(at.slow_key, np.array(at.slow_value), residual.slow_jacobian()))
+    return linear_update(residual, terms, decision)
 
-    A linear factor carries no kernel: the weight that the kernel gives the residual stands in.
+
+def linear_update(residual: Residual, terms: Sequence[Term], decision: Decision) -> GraphUpdate:
+    """Return the factor of a residual that is linearised in any states.
+
+    A linear factor cannot carry a robust kernel, so the information is scaled by the weight that the kernel gives the residual.
 
     Args:
         residual: raw (k,) and its covariance, at the estimate.

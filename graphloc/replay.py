@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording through the online mode: what a vessel would have known at the time.
+"""Replay of a recording through the online mode, to show what a vessel would have known at the time.
 
-Messages come in the order in which they arrived; sightings of tags and matches of scans, which take a
-front-end, when the IMU has reached their stamp. A match is made around the smoother's own prediction.
+Messages come in the order in which they arrived. Sightings of tags and matches of scans, which a front-end computes, come when
+the IMU has reached their stamp. A match is made around the smoother's own prediction.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ _BUSY = "not tried: the previous scan was still being matched"
 
 
 def silent(_at_s: float, _whole_s: float, _estimate: Estimate | None, _waiting: str) -> None:
-    """A `Status` that says nothing."""
+    """Ignore the status."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Replayed:
-    """What a replay gives.
+    """Result of a replay.
 
     Attributes:
-        recording: with the matches that were made. solution: each pose as it was known then. estimates: N of these.
-        update_s: (N,) time that each took, s.
+        recording: with the matches that were made. solution: each pose as known at its time. estimates: N of these.
+        update_s: (N,) computing time of each, s.
     """
 
     recording: Recording
@@ -72,12 +72,12 @@ class Replayed:
 
 
 def arrivals(recording: Recording, late_ns: Mapping[int, int] | None = None) -> Iterator[Measurement]:
-    """Yield IMU samples and measurements as they arrived; those that a front-end made, when the IMU got there.
+    """Yield IMU samples and measurements as they arrived; those that a front-end computed, when the IMU has reached them.
 
-    A simulation without a bag has no order of arrival: its stamps stand in.
+    A simulation without a bag has no order of arrival: its stamps are used.
 
     Args:
-        late_ns: by arrival number, how long after its stamp a measurement comes instead.
+        late_ns: by arrival number, delay of a measurement after its stamp, instead of its arrival.
     """
     late_ns = late_ns or {}
     imu = recording.imu
@@ -106,9 +106,9 @@ def arrivals(recording: Recording, late_ns: Mapping[int, int] | None = None) -> 
 
 
 class _Matching:
-    """The scans of one aerial sensor, each matched as soon as the smoother has got there.
+    """Scans of one aerial sensor, each matched as soon as the smoother has reached it.
 
-    With a `pool` the vessel does not wait: a match comes when it is done, and what came meanwhile is not matched.
+    With a `pool` the replay does not wait for a match: it comes when it is done, and scans that arrived meanwhile are not matched.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class _Matching:
         )
 
     def due(self, smoother: OnlineSmoother, now_ns: int) -> Iterator[Measurement]:
-        """Yield the matches that there are now."""
+        """Yield the matches that are ready."""
         if self._underway is not None and self._underway.done():
             found, self._underway = self._underway.result(), None
             if found == "wait":  # offered too early, and too late to be offered again
@@ -157,7 +157,7 @@ class _Matching:
                 yield from self._taken(found)
 
     def end(self) -> Iterator[Measurement]:
-        """Yield the match that is still being made; what is left of the scans is refused."""
+        """Yield the match in progress; the remaining scans are refused."""
         if self._underway is not None:
             found = self._underway.result()
             if found is not None and found != "wait":
@@ -176,6 +176,69 @@ class _Matching:
             self._gathering.refuse(self._name, found.stamp_ns, found.why_not)
 
 
+class _Session:
+    """A smoother that is fed a recording, and all that it returned.
+
+    Attributes:
+        estimates: in order. update_s: the time that each took. rows: of its ledger.
+        events: IMU stamp (ns) and text. first_ns, last_ns: of the IMU.
+    """
+
+    def __init__(self, smoother: OnlineSmoother, recording: Recording, status: Status) -> None:
+        self.smoother, self._status = smoother, status
+        self.estimates: list[Estimate] = []
+        self.update_s: list[float] = []
+        self.rows: list[LedgerRow] = []
+        self.events: list[tuple[int, str]] = []
+        imu = recording.imu
+        self.first_ns, self.last_ns = (
+            (int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])) if imu is not None and len(imu) else (0, 0)
+        )
+        self._length_s, self._begun_s, self._shown_s = (self.last_ns - self.first_ns) / 1e9, time.monotonic(), -1
+
+    def play(self, arriving: Iterator[Measurement], matchings: Sequence[_Matching], speed: float | None) -> None:
+        """Feed measurements, and matches of the scans as the IMU reaches them."""
+        for m in arriving:
+            if not isinstance(m, ImuSample):
+                self.feed(m)
+                continue
+            if speed is not None:
+                self._wait_for(m.stamp_ns, speed)
+            self.feed(m)
+            for matching in matchings:
+                for match in matching.due(self.smoother, m.stamp_ns):
+                    self.feed(match)
+            self._show_waiting(m.stamp_ns)
+
+    def feed(self, m: Measurement) -> None:
+        """Feed one measurement."""
+        before_s = time.perf_counter()
+        estimate = self.smoother.feed(m)
+        if estimate is not None:
+            self.update_s.append(time.perf_counter() - before_s)
+            self.estimates.append(estimate)
+            self._status((estimate.stamp_ns - self.first_ns) / 1e9, self._length_s, estimate, "")
+        self.rows += self.smoother.rows()
+        self.events += [(m.stamp_ns, event) for event in self.smoother.events()]
+
+    def finish(self) -> None:
+        """Take the last rows and events of the smoother."""
+        self.rows += self.smoother.finish()
+        self.events += [(self.last_ns, event) for event in self.smoother.events()]
+
+    def _wait_for(self, stamp_ns: int, speed: float) -> None:
+        ahead_s = (stamp_ns - self.first_ns) / 1e9 / speed - (time.monotonic() - self._begun_s)
+        if ahead_s > 0.0:
+            time.sleep(ahead_s)
+
+    def _show_waiting(self, stamp_ns: int) -> None:
+        """Report once per second of the run what the start waits for."""
+        second = (stamp_ns - self.first_ns) // 1_000_000_000
+        if self.smoother.waiting_for and second != self._shown_s:
+            self._shown_s = second
+            self._status(float(second), self._length_s, None, self.smoother.waiting_for)
+
+
 def replay(
     recording: Recording,
     config: VesselConfig,
@@ -192,10 +255,10 @@ def replay(
     """Run a recording through the online mode.
 
     Args:
-        scans: where the scans of aerial sensors are matched from; None: matches that are in the recording are taken.
-        speed: times real time; None: as fast as it can. datum: origin of world; None: as `OnlineSmoother` finds it.
-        smoother: another than a fresh one, for tests. late_ns: as `arrivals` takes it.
-        stoppable: Ctrl-C ends it early, and what there is until then is returned.
+        scans: scans to match for the aerial sensors; None: use the matches in the recording.
+        speed: times real time; None: as fast as possible. datum: origin of world; None: as `OnlineSmoother` finds it.
+        smoother: to use instead of a new one, for tests. late_ns: as for `arrivals`.
+        stoppable: Ctrl-C ends the replay early, and the result up to then is returned.
 
     Raises:
         SolveError: it never started. InputError: a map or LiDAR that cannot be used.
@@ -204,30 +267,11 @@ def replay(
         config, rows=SENSORS, inertial=INERTIAL, datum=datum, mounts=recording.mounts, lag_s=lag_s
     )
     if scans is not None:
-        recording = replace(
-            recording,
-            measurements=tuple(m for m in recording.measurements if m.sensor not in config.of_kind("aerial")),
-        )
+        made = config.of_kind("aerial")
+        recording = replace(recording, measurements=tuple(m for m in recording.measurements if m.sensor not in made))
     gathering = Gathering(recording)
-    estimates: list[Estimate] = []
-    took_s: list[float] = []
-    rows: list[LedgerRow] = []
-    said: list[tuple[int, str]] = []  # when, in the IMU's time, and what
-    cut = False
-    imu = recording.imu
-    first_ns, last_ns = (int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])) if imu is not None and len(imu) else (0, 0)
-    begun = time.monotonic()
-
-    def feed(m: Measurement) -> None:
-        before = time.perf_counter()
-        estimate = smoother.feed(m)
-        if estimate is not None:
-            took_s.append(time.perf_counter() - before)
-            estimates.append(estimate)
-            status((estimate.stamp_ns - first_ns) / 1e9, (last_ns - first_ns) / 1e9, estimate, "")
-        rows.extend(smoother.rows())
-        said.extend((m.stamp_ns, event) for event in smoother.events())
-
+    session = _Session(smoother, recording, status)
+    interrupted = False
     with ExitStack() as stack:
         pool = None if speed is None else stack.enter_context(ThreadPoolExecutor(1))
         matchings = [
@@ -235,64 +279,58 @@ def replay(
             for name in (config.of_kind("aerial") if scans is not None else ())
             if scans is not None
         ]
-        tried = -1
         try:
-            for m in arrivals(recording, late_ns):
-                if speed is not None and isinstance(m, ImuSample):
-                    ahead_s = (m.stamp_ns - first_ns) / 1e9 / speed - (time.monotonic() - begun)
-                    if ahead_s > 0.0:
-                        time.sleep(ahead_s)
-                feed(m)
-                if isinstance(m, ImuSample):
-                    for matching in matchings:
-                        for match in matching.due(smoother, m.stamp_ns):
-                            feed(match)
-                    second = (m.stamp_ns - first_ns) // 1_000_000_000
-                    if smoother.waiting_for and second != tried:
-                        tried = second
-                        status(float(second), (last_ns - first_ns) / 1e9, None, smoother.waiting_for)
+            session.play(arrivals(recording, late_ns), matchings, speed)
         except KeyboardInterrupt:
             if not stoppable:
                 raise
-            cut = True
-        for matching in () if cut else matchings:
+            interrupted = True
+        for matching in () if interrupted else matchings:
             for match in matching.end():
-                feed(match)
+                session.feed(match)
     waiting = smoother.waiting_for
-    rows += smoother.finish()
-    said += [(last_ns, event) for event in smoother.events()]
-    if not estimates:
+    session.finish()
+    if not session.estimates:
         lost = recording.lost(config.of_kind("imu"))
         raise SolveError(f"{recording.source}: never started: still waiting for {waiting or 'IMU data'}{lost}")
-    recording = gathering.recording()
-    told_of = _timed(said, estimates)
-    if len(took_s) > 1:
-        p50, p99, most = (1e3 * float(np.quantile(took_s[1:], q)) for q in (0.5, 0.99, 1.0))
-        told_of.append(
-            f"time per update: {p50:.1f} ms (median), {p99:.0f} ms (99 %), {most:.0f} ms (largest); start {1e3 * took_s[0]:.0f} ms"
+    recording = _with_busy_warning(gathering.recording(), config)
+    return _result(session, recording, config, interrupted=interrupted)
+
+
+def _with_busy_warning(recording: Recording, config: VesselConfig) -> Recording:
+    """Add a warning if many scans were skipped because the matcher was busy."""
+    busy = sum(row.reason == _BUSY for row in recording.rows)
+    scans = sum(row.reason == _BUSY or row.sensor in config.of_kind("aerial") for row in recording.rows)
+    if busy <= 0.2 * scans:
+        return recording
+    warning = f"the matcher did not keep up: {busy} scans were never tried"
+    return replace(recording, warnings=(*recording.warnings, warning))
+
+
+def _result(session: _Session, recording: Recording, config: VesselConfig, *, interrupted: bool) -> Replayed:
+    estimates, update_s = session.estimates, np.array(session.update_s)
+    events = _timed(session.events, estimates)
+    if len(update_s) > 1:
+        p50, p99, most = (1e3 * float(np.quantile(update_s[1:], q)) for q in (0.5, 0.99, 1.0))
+        events.append(
+            f"time per update: {p50:.1f} ms (median), {p99:.0f} ms (99 %), {most:.0f} ms (largest); start {1e3 * update_s[0]:.0f} ms"
         )
-    behind = sum(row.reason == _BUSY for row in recording.rows)
-    if behind > 0.2 * sum(row.reason == _BUSY or row.sensor in config.of_kind("aerial") for row in recording.rows):
-        recording = replace(
-            recording, warnings=(*recording.warnings, f"the matcher did not keep up: {behind} scans were never tried")
-        )
-    told = {row.seq for row in rows}
-    rows += [row for row in recording.rows if row.seq not in told or row.seq < 0]
-    if cut:
-        told_of.append(
-            f"interrupted at {(estimates[-1].stamp_ns - first_ns) / 1e9:.1f} s: the track ends there, the run does not"
-        )
+    fed = {row.seq for row in session.rows}
+    rows = session.rows + [row for row in recording.rows if row.seq not in fed or row.seq < 0]
+    if interrupted:
+        end_s = (estimates[-1].stamp_ns - session.first_ns) / 1e9
+        events.append(f"interrupted at {end_s:.1f} s: the track ends there, the run does not")
         rows += [
             LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=recording.topics.get(m.sensor, ""),
                       outcome=Outcome.IGNORED, reason="the replay was interrupted before it")
-            for m in arrivals(recording) if m.seq >= 0 and m.seq not in told
+            for m in arrivals(recording) if m.seq >= 0 and m.seq not in fed
         ]  # fmt: skip
-    solution = _solution(estimates, Ledger(rows), smoother, told_of, config, _false_of(recording, config))
-    return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=np.array(took_s))
+    solution = _solution(estimates, Ledger(rows), session.smoother, events, config, _false_of(recording, config))
+    return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=update_s)
 
 
 def _timed(said: Sequence[tuple[int, str]], estimates: Sequence[Estimate]) -> list[str]:
-    """Return events with their times, s since the first pose; of a guessed heading also until when, and what ends it."""
+    """Return events with their times, s since the first pose; of a guessed heading also until when, and what would end that."""
     begin_ns = estimates[0].stamp_ns
     lines = []
     for stamp_ns, event in said:
@@ -314,7 +352,7 @@ def _timed(said: Sequence[tuple[int, str]], estimates: Sequence[Estimate]) -> li
 
 
 def _false_of(recording: Recording, config: VesselConfig) -> dict[int, float]:
-    """How probable it is that each measurement is false, where its sensor has such."""
+    """Return the prior probability that each measurement is false, by arrival number, for sensors that have one."""
     rows = {row.kind: row for row in SENSORS}
     found = {}
     for m in recording.measurements:
@@ -332,7 +370,7 @@ def _solution(
     config: VesselConfig,
     false_of: Mapping[int, float],
 ) -> Solution:
-    """Each pose as it was known then; where a restart went back in time, the newer one counts."""
+    """Return the solution of each pose as known at its time; where a restart went back in time, the newer one counts."""
     kept: list[Estimate] = []
     for estimate in estimates:
         while kept and kept[-1].stamp_ns >= estimate.stamp_ns:

@@ -1,4 +1,4 @@
-"""The house: which room may import which, and what importing graphloc does not do."""
+"""Which folder may import which, and that importing graphloc loads nothing heavy and writes nothing."""
 
 import ast
 import os
@@ -103,7 +103,7 @@ def test_rooms_are_no_top_level_modules(room: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", [p for p in MODULES if kind_of(p) == "graph"], ids=lambda p: p.name)
 def test_graph_and_solvers_name_no_sensor(path: Path) -> None:
-    """They know the inertial sensor and measurements as such; what a measurement says, its row says."""
+    """They only know the inertial sensor and the base class of measurements; the rest is in the rows of the sensors."""
     known = {"Measurement", "ImuSeries", "ImuSample"} | ({"GnssPosition"} if path.stem == "origin" else set())
     named = {i for i in imports_of(path) if i.startswith("graphloc.measurements.")}
     assert named <= {f"graphloc.measurements.{name}" for name in known}

@@ -17,7 +17,7 @@ from graphloc.eval.calibrate._imu import density, imu_noise
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frontends._assess import Turning
-from graphloc.frontends._lag import lag
+from graphloc.frontends._time_offsets import heading_time_offset
 from graphloc.frontends.bag import read_recording
 from graphloc.measurements import GnssVelocity, ImuSeries
 from graphloc.offsets import Misfit, Offset, Offsets, joined
@@ -362,8 +362,8 @@ def headings(late_s: float, seed: int) -> tuple[Turning, Any, Any]:
 
 
 def test_headings_with_wrong_stamps_are_seen_in_the_bag() -> None:
-    found = lag(*headings(-0.15, 1))
+    found = heading_time_offset(*headings(-0.15, 1))
     assert found is not None
     assert found[0] == pytest.approx(-0.15, abs=0.012)  # 5 % by what iron does to the compass
     assert found[1] < 0.02
-    assert all(lag(*headings(0.0, seed)) is None for seed in range(20))
+    assert all(heading_time_offset(*headings(0.0, seed)) is None for seed in range(20))

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.rosbag2.storage_mcap import McapReader
 
 from graphloc import app
-from graphloc.cli._shared import Wanted
+from graphloc.cli._shared import BagOptions
 from graphloc.errors import InputError
 from graphloc.eval.simulate import Scenario, find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag as write_simulated
@@ -329,8 +329,8 @@ def test_scans_of_a_part_are_matched_and_no_others(tmp_path: Path, monkeypatch: 
         simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "14", "rig": "launch"}), 3), folder, ros=2
     )
     begin_ns = first_of(bag)
-    wanted = Wanted(bag=[bag], config=config, out=tmp_path, overwrite=False, as_json=False, start=4.0, duration=8.0)
-    recording, loaded, where = wanted.load(quiet)
+    options = BagOptions(bag=[bag], config=config, start=4.0, duration=8.0)
+    recording, loaded, where = options.load(quiet)
     scans = [row for row in recording.rows if row.topic.startswith("/mast")]
     with AnyReader([bag]) as reader:
         inside = [

@@ -13,12 +13,13 @@ from plotly.offline import get_plotlyjs
 
 from graphloc import app
 from graphloc.eval.docking import accurate_within_m
+from graphloc.eval.formatting import significant
 from graphloc.eval.metrics import Table
 from graphloc.eval.plots import Underlay
 from graphloc.eval.report import ReportData, Trust, figures, theses_section, verdict, write_report
 from graphloc.eval.simulate import Scenario, simulate
-from graphloc.eval.words import significant
 from graphloc.measurements import GnssPosition
+from graphloc.solution import Solution
 from graphloc.survey import Survey
 from graphloc.trajectory import Trajectory
 from tests.browser import CHROMIUM, Browser
@@ -87,6 +88,19 @@ def test_trust_follows_coverage_warnings_and_convergence(
     said = verdict(replace(data, solution=solution, tables=covered(share)))
     assert said.trust is expected
     assert any("did not converge" in r.text for r in said.reasons) == (change == {"converged": False})
+
+
+def test_a_warning_on_both_tracks_is_listed_once(data: ReportData) -> None:
+    def warned(*warnings: str, online: bool) -> Solution:
+        return replace(data.solution, stats=replace(data.solution.stats, warnings=warnings, online=online))
+
+    both = replace(
+        data,
+        recording=replace(data.recording, warnings=("imu: in g",)),
+        solution=warned("gnss: jumps", online=False),
+        online=warned("gnss: jumps", "gnss: frozen", online=True),
+    )
+    assert both.warnings == ("imu: in g", "gnss: jumps", "graphloc online: gnss: frozen")
 
 
 def test_a_run_that_nothing_measures_is_not_vouched_for(data: ReportData) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration aids: levers, stamps, mounts and IMU noise that a run contradicts. Suggested, never applied."""
+"""Calibration suggestions: lever arms, time offsets, mounts and IMU noise that a run contradicts. They are never applied."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graphloc.config import VesselConfig
 from graphloc.eval.calibrate._evidence import Estimate, Evidence, Name
 from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
 from graphloc.eval.calibrate._imu import imu_noise
-from graphloc.eval.words import significant
+from graphloc.eval.formatting import significant
 from graphloc.frames import rpy_from_rotation
 from graphloc.offsets import Offset, Probe
 from graphloc.recording import Recording
@@ -53,11 +53,11 @@ _MEANS: dict[Offset, str] = {
 
 
 def calibrate(recording: Recording, config: VesselConfig, solution: Solution) -> Calibration:
-    """Say what a smoothed run contradicts of its configuration (docs/calibration.md).
+    """Return what a smoothed run contradicts of its configuration (docs/calibration.md).
 
     Args:
-        recording, config: as they were smoothed. solution: with `offsets`, as `PROBE` asks for; without, only the IMU's
-            samples are judged.
+        recording, config: as smoothed. solution: with `offsets`, as `PROBE` requests them; without, only the noise of the
+            IMU's samples is checked.
     """
     suggestions, checks = [], []
     if solution.offsets is not None and len(solution.offsets.names):
@@ -79,7 +79,7 @@ def calibrate(recording: Recording, config: VesselConfig, solution: Solution) ->
 
 
 def _configured(name: Name, recording: Recording, config: VesselConfig) -> tuple[str, float]:
-    """Return the key in vessel.yaml and the value there, in the key's unit."""
+    """Return the key in vessel.yaml and its value, in the unit of the key."""
     sensor, what = name
     block = config.sensors[sensor]
     if what == "time":
@@ -91,7 +91,7 @@ def _configured(name: Name, recording: Recording, config: VesselConfig) -> tuple
 
 
 def _of_one_antenna(sensor: str, recording: Recording, config: VesselConfig) -> list[str]:
-    """Names of sensors of other kinds at the same place: what is found of its lever is found of them together."""
+    """Return the sensors of other kinds at the same position: their lever arm is estimated from all of them together."""
     own = config.sensors[sensor]
     place = mount_of(sensor, own, recording.mounts)[0]
     others = [n for kind in PROBE if kind != own.kind and "x" in PROBE[kind] for n in config.of_kind(kind)]

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From how the cost of a run changes with its offsets to those that must be wrong.
+"""Which offsets must be wrong, from the dependence of a run's cost on them.
 
-With H, g of all blocks, those offsets F that are free come out as theta = H_FF^-1 g_F, with covariance H_FF^-1 if the
-noise is as configured. Whether it is, is seen from block to block: the jackknife leaves each block of ten seconds out in
-turn. The larger of the two sigmas counts. GNSS errors that wander for minutes are in H already, as slow states.
+With H, g summed over all blocks, free offsets F are theta = H_FF^-1 g_F, with covariance H_FF^-1 if the noise is as configured.
+The jackknife, leaving out each block of ten seconds in turn, checks that; the larger of the two sigmas counts. Slow GNSS errors
+are in H already, as slow states.
 
-Offsets are freed one by one, the clearest first, each with those before it: two that do the same to the run (a lever
-forward and a late stamp, at a steady speed) are never both believed, and each is named as the other's alternative.
+Offsets are freed one by one, the most significant first, each with those before it. Of two that affect the run alike (a lever
+arm forward and a late stamp, at a steady speed) only one is ever believed, and each is named as the other's alternative.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _UNSEEN = 1e-9  # a curvature below this is rounding
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """An offset: m, rad or s, its 1 sigma, and how much the cost drops if it is free."""
+    """An offset (m, rad or s), its 1 sigma, and the decrease of the cost if it is free."""
 
     value: float
     sigma: float
@@ -38,15 +38,15 @@ class Estimate:
 
     @property
     def z(self) -> float:
-        """How many sigmas it is from zero."""
+        """The offset in sigmas."""
         return self.value / self.sigma
 
 
 class Evidence:
-    """The sums of a run, in blocks long enough to be nearly independent.
+    """Sums of a run in blocks that are long enough to be nearly independent.
 
     Args:
-        order: sorts the offsets, those that are wrong most often first; by default as they come.
+        order: sorts the offsets, those that are most often wrong first; default: as given.
     """
 
     def __init__(self, offsets: Offsets, order: Callable[[Name], int] = lambda _name: 0) -> None:
@@ -60,7 +60,7 @@ class Evidence:
         self.names = tuple(sorted(found, key=order))
 
     def estimates(self, free: tuple[Name, ...]) -> dict[Name, Estimate]:
-        """Return the free offsets, all others as configured."""
+        """Return the free offsets, with all others as configured."""
         if not free:
             return {}
         own = [self._all[name] for name in free]
@@ -76,7 +76,7 @@ class Evidence:
         }
 
     def wrong(self) -> tuple[Name, ...]:
-        """Return the offsets that must be wrong, clearest first."""
+        """Return the offsets that must be wrong, the most significant first."""
         free: tuple[Name, ...] = ()
         while len(free) < len(self.names):
             tried = {name: self.estimates((*free, name)) for name in self.names if name not in free}
@@ -90,7 +90,7 @@ class Evidence:
         return tuple(name for name in free if self._stands(name, found[name]))
 
     def alternatives(self, name: Name, free: tuple[Name, ...]) -> dict[Name, Estimate]:
-        """Return what explains the run about as well as `name`, the others of `free` being free."""
+        """Return the offsets that explain the run about as well as `name`, with the others of `free` free."""
         rest = tuple(n for n in free if n != name)
         drop = self.estimates((*rest, name))[name].drop
         tried = {n: self.estimates((*rest, n))[n] for n in self.names if n not in free}
@@ -106,7 +106,7 @@ def _solvable(found: dict[Name, Estimate]) -> bool:
 
 
 def _jackknife(g: Array, H: Array) -> Array:
-    """Return variances (k,) of the solution by leaving out each block in turn; zero where a block holds all there is."""
+    """Return the variances (k,) of the solution by the jackknife over blocks; zero if one block holds all information."""
     n, total, whole = len(g), H.sum(axis=0), g.sum(axis=0)
     if n < 3:
         return np.zeros(g.shape[1])

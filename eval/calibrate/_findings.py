@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What calibration aids hand over: values, never changes."""
+"""Results of the calibration checks."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class Suggestion:
     """A setting that the run contradicts.
 
     Attributes:
-        sensor: its name. key: where the setting stands in vessel.yaml; unit: of the numbers.
-        configured, suggested: the value now, and the one that fits the run best.
-        sigma: of `suggested`, 1 sigma. z: how many of these the two are apart.
-        evidence: why, in one sentence. action: what to do.
+        sensor: its name. key: of the setting in vessel.yaml; unit: of the numbers.
+        configured, suggested: the current value, and the one that fits the run best.
+        sigma: of `suggested`, 1 sigma. z: their difference in sigmas.
+        evidence: the reason, in one sentence. action: what to do.
     """
 
     sensor: str
@@ -41,11 +41,11 @@ class Suggestion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """A setting that was looked at.
+    """A setting that was checked.
 
     Attributes:
-        key, unit, configured: as in `Suggestion`. change, sigma: what the run would add to it, and how sure it is of that.
-        said: what that means, or which manoeuvre would tell.
+        key, unit, configured: as in `Suggestion`. change, sigma: the estimated correction and its 1 sigma.
+        said: what that means, or which manoeuvre would determine it.
     """
 
     key: str
@@ -58,19 +58,19 @@ class Check:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """What a run says about its own configuration."""
+    """Calibration checks and suggestions of a run."""
 
     suggestions: tuple[Suggestion, ...] = ()
     checks: tuple[Check, ...] = ()
 
     def table(self) -> Table:
-        """Return all settings that were looked at, with what the run would add to each."""
+        """Return all settings that were checked, with the estimated correction of each."""
         rows = tuple((f"{c.key}, {c.unit}", (c.configured, c.change, c.sigma)) for c in self.checks)
         note = "change: correction that the run suggests if this alone were wrong; sigma: its 1 sigma. Nothing was applied."
         return Table("Calibration", ("configured", "change", "sigma"), rows, note)
 
     def lines(self) -> tuple[str, ...]:
-        """Return what to do, and what this run could not tell, a line each."""
+        """Return the suggestions, and what this run could not determine, a line each."""
         return (*(str(s) for s in self.suggestions), *(f"{c.key}: {c.said}" for c in self.checks))
 
     def as_dict(self) -> dict[str, Any]:
@@ -83,7 +83,7 @@ class Calibration:
 
 
 def _number(value: float, sigma: float = np.inf) -> str:
-    """Three digits, or as many as its sigma tells: clocks may be years apart, and known to milliseconds."""
+    """Return a value to three digits, or to as many as its sigma supports: clocks may differ by years, known to milliseconds."""
     digits = 4 if abs(value) >= 1000.0 else 3
     if value and 0.0 < sigma < abs(value):
         digits = max(digits, 2 + int(np.floor(np.log10(abs(value) / sigma))))

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The IMU's noise: what its samples scatter by, and whether the run needs as much as is configured.
+"""Noise of the IMU: by the scatter of its samples, and by the residuals of the solved run.
 
-Samples tell the white noise, engine and hull included: third differences take motion out, and those of white noise have
-20 times its variance. A configured noise below that is too small, whatever else holds. A configured noise above it may
-be meant (what shakes slowly does not scatter from sample to sample), so it is called too large only where the solved run
-leaves less misfit at the IMU than so much noise would.
+Samples show the white noise, with engine and hull: third differences remove motion, and those of white noise have 20 times its
+variance. A configured noise below that is too small. One above it may be intended (slow vibration does not scatter from sample
+to sample), so it is called too large only if the residuals at the IMU in the solved run are smaller, too.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
 from graphloc.eval.calibrate._findings import Check, Suggestion
-from graphloc.eval.words import significant
+from graphloc.eval.formatting import significant
 from graphloc.frames import Array
 from graphloc.measurements import ImuSeries
 from graphloc.offsets import Misfit, Offsets
@@ -28,10 +27,10 @@ _UG, _MDPS = 1e-6 * STANDARD_GRAVITY_MPS2, float(np.radians(1e-3))
 
 
 def density(stamps_ns: NDArray[np.int64], columns: Array) -> tuple[float, float]:
-    """Return the white-noise density of the worst axis, and its sigma from how it varies along the run.
+    """Return the white-noise density of the worst axis, and its sigma, from its variation along the run.
 
     Args:
-        stamps_ns: (N,). columns: (N, 3) in some unit; the density is in that per sqrt(Hz).
+        stamps_ns: (N,). columns: (N, 3) in some unit; the density is in that unit per sqrt(Hz).
     """
     root_dt = float(np.sqrt(np.median(np.diff(stamps_ns)) * 1e-9))
     step = np.abs(np.diff(columns, n=3, axis=0))
@@ -46,7 +45,7 @@ def density(stamps_ns: NDArray[np.int64], columns: Array) -> tuple[float, float]
 
 
 def imu_noise(imu: ImuSeries, config: ImuConfig, offsets: Offsets | None) -> Iterator[Suggestion | Check]:
-    """Yield what is to be said of both noises: a suggestion, or a check."""
+    """Yield a suggestion or a check for the accelerometer's and the gyroscope's noise."""
     samples = (
         (
             "accel_noise_ug_per_sqrt_hz",

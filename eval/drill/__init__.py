@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drills: harbour failures scripted into a recording, and what estimators make of them."""
+"""Drills: harbour failures injected into a recording, and the errors of estimators with them."""
 
 from graphloc.eval.drill.failures import Failure, Struck, script
 from graphloc.eval.drill.measure import Measured, Times, judge

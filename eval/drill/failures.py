@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Harbour failures, as functions from a recording to a recording. Same seed, same failure.
+"""Harbour failures, as functions from a recording to a recording. The same seed gives the same failure.
 
-What a failure takes away stays in the account: a row each, as for fixes that are held out.
+Each measurement that a failure removes keeps a row in the ledger, as held-out fixes do.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ _FALSE_M, _FALSE_DEG = (1.5, 5.0), 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Struck:
-    """A recording that a failure has struck.
+    """A recording with a failure in it.
 
     Attributes:
-        recording: with what the sensors then say. late_ns: by arrival number, how much later than usual it arrives.
+        recording: with the changed measurements. late_ns: by arrival number, the additional delay of its arrival.
     """
 
     recording: Recording
@@ -51,11 +51,11 @@ Strike = Callable[[Recording, int, int, np.random.Generator], Struck]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """A failure that a script knows.
+    """A failure that can be injected.
 
     Attributes:
-        name: for tables, unique. family: the same for failures that differ in length only; what curves are drawn of.
-        length_s: how long it lasts.
+        name: for tables, unique. family: shared by failures that differ only in length, which form a curve.
+        length_s: how long it lasts. strike: the change of a recording.
     """
 
     name: str
@@ -64,13 +64,13 @@ class Failure:
     strike: Strike
 
     def on(self, recording: Recording, begin_ns: int, seed: int) -> Struck:
-        """Strike a recording from `begin_ns` on."""
+        """Inject the failure into a recording, beginning at `begin_ns`."""
         rng = np.random.default_rng([seed, *self.name.encode()])
         return self.strike(recording, begin_ns, begin_ns + round(self.length_s * NS_PER_S), rng)
 
 
 def script(recording: Recording) -> tuple[tuple[Failure, ...], tuple[tuple[str, str], ...]]:
-    """Return the failures that a recording's sensors permit, and the names of the others, each with why not."""
+    """Return the failures that are possible with a recording's sensors; of the others, names and reasons."""
     has = {kind: any(isinstance(m, kind) for m in recording.measurements) for kind in _KINDS}
     found: list[Failure] = []
     left: list[tuple[str, str]] = []
@@ -137,7 +137,7 @@ def _during(m: Measurement, begin_ns: int, end_ns: int) -> bool:
 
 
 def _silent(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator, *, kinds: tuple[type[Measurement], ...]) -> Struck:  # fmt: skip
-    """Sensors of these kinds say nothing."""
+    """Remove the measurements of some kinds."""
     gone = [m for m in recording.measurements if isinstance(m, kinds) and _during(m, begin_ns, end_ns)]
     left = {id(m) for m in gone}
     return Struck(
@@ -154,7 +154,7 @@ def _changed(recording: Recording, change: Callable[[Measurement], Measurement])
 
 
 def _moved_fixes(recording: Recording, begin_ns: int, end_ns: int, error_m: Callable[[Array], Array]) -> Struck:
-    """Fixes are off by `error_m` of their times (N,), s since the failure began: (N, 2) east, north."""
+    """Add errors to fixes; `error_m` maps times (N,), s since the failure began, to (N, 2) m, east, north."""
     fixes = [m for m in recording.measurements if isinstance(m, GnssPosition) and _during(m, begin_ns, end_ns)]
     if not fixes:
         return Struck(recording=recording)
@@ -168,7 +168,7 @@ def _moved_fixes(recording: Recording, begin_ns: int, end_ns: int, error_m: Call
 
 
 def _drift(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Generator, *, rmse_m: float) -> Struck:
-    """Multipath that grows, levels out, turns slowly and fades, as in the simulator (BL section 3.1.5)."""
+    """Add multipath that grows, levels out, turns slowly and fades, as in the simulator (BL section 3.1.5)."""
     length_s = (end_ns - begin_ns) / NS_PER_S
 
     def error_m(t: Array) -> Array:
@@ -180,7 +180,7 @@ def _drift(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gene
 
 
 def _jump(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Generator, *, size_m: float) -> Struck:
-    """All fixes are off by the same, and then at once no more."""
+    """Add a constant error to all fixes, which begins and ends suddenly."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return _moved_fixes(
         recording, begin_ns, end_ns, lambda t: np.tile(size_m * np.array([np.cos(angle), np.sin(angle)]), (len(t), 1))
@@ -188,7 +188,7 @@ def _jump(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gener
 
 
 def _turned(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Generator, *, off_deg: float) -> Struck:
-    """The compass is off by the same angle: iron, or a current."""
+    """Turn the compass by a constant angle, as iron or a current does."""
     off = float(np.radians(off_deg) * rng.choice([-1.0, 1.0]))
 
     def change(m: Measurement) -> Measurement:
@@ -200,7 +200,7 @@ def _turned(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gen
 
 
 def _false(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Generator, *, share: float, alike: bool) -> Struck:  # fmt: skip
-    """A share of the poses is elsewhere: each somewhere else, or all alike, as when a pier is taken for its neighbour."""
+    """Displace a share of the poses: each independently, or all alike, as when a pier is taken for its neighbour."""
 
     def draw() -> dict[str, float]:
         size, angle = rng.uniform(*_FALSE_M), rng.uniform(0.0, 2.0 * np.pi)
@@ -221,7 +221,7 @@ def _false(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gene
 
 
 def _flipped(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator) -> Struck:
-    """The wrong one of a tag's poses fits the image best: probabilities change places."""
+    """Exchange the probabilities of a tag's poses, so that the wrong one fits the image best."""
 
     def change(m: Measurement) -> Measurement:
         if not (isinstance(m, TagSighting) and _during(m, begin_ns, end_ns) and len(m.modes) > 1):
@@ -235,13 +235,13 @@ def _flipped(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.G
 
 
 def _late(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator, *, late_s: float) -> Struck:
-    """What takes a computer time comes late; its stamps stay right."""
+    """Delay measurements that take a computer time; their stamps stay right."""
     late = [m for m in recording.measurements if isinstance(m, PoseFix | TagSighting) and _during(m, begin_ns, end_ns)]
     return Struck(recording=recording, late_ns={m.seq: round(late_s * NS_PER_S) for m in late})
 
 
 def _imu_gap(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator) -> Struck:
-    """The IMU says nothing."""
+    """Remove the samples of the IMU."""
     imu = recording.imu
     assert imu is not None  # the script asks for one
     gone = (imu.stamps_ns >= begin_ns) & (imu.stamps_ns < end_ns)

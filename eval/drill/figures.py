@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of drills: against the length of an outage, of all failures, over time."""
+"""Figures of drills: errors against the length of an outage, for all failures, and over time."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _PANEL_PX, _BESIDE_PX = 190, 100
 
 
 def _range_m(most_m: float) -> tuple[float, float]:
-    """What an axis of m shows, the same wherever it is used."""
+    """Return the common range of an axis in m."""
     return 0.8 * _FEWEST_M, 1.4 * max(most_m, 1.0)
 
 
 def against_length(drilled: Drilled) -> Figure | None:
-    """Farthest off against the length of an outage, a panel for each kind; a cross where it never came back."""
+    """Return the figure of largest errors against the length of an outage, a panel per kind; a cross: never recovered."""
     rows = summed(drilled.measured)
     families = [
         f for f in dict.fromkeys(r.family for r in rows) if len({r.length_s for r in rows if r.family == f}) > 1
@@ -54,7 +54,7 @@ def _off_m(rows: Sequence[Row]) -> np.ndarray:
 
 
 def _points(rows: Sequence[Row], name: str, x: np.ndarray, y: np.ndarray, size: float, *, listed: bool) -> list[Mark]:
-    """A circle for each, a cross where it never came back."""
+    """Yield a circle for each failure, or a cross if the estimator never recovered."""
     never = np.array([bool(r.lost or r.none) for r in rows], dtype=bool)
     shapes: tuple[tuple[Shape, np.ndarray], ...] = (("circle", ~never), ("x", never))
     text = [f"{r.failure}<br>{name}: {r.off_m:.2f} m" for r in rows]
@@ -69,7 +69,7 @@ def _points(rows: Sequence[Row], name: str, x: np.ndarray, y: np.ndarray, size: 
 
 
 def all_failures(drilled: Drilled) -> Figure:
-    """Farthest off in each failure: a mark an estimator, a cross where it never came back; hollow: undisturbed."""
+    """Return the figure of the largest error in each failure: a mark per estimator, a cross: never recovered; hollow: undisturbed."""
     rows = summed(drilled.measured)
     names = list(dict.fromkeys(r.failure for r in rows))[::-1]
     marks: list[Mark] = []
@@ -89,7 +89,7 @@ def all_failures(drilled: Drilled) -> Figure:
 
 
 def over_time(drilled: Drilled) -> Figure:
-    """How far off each estimator is over time: the first time of each failure, which is shaded."""
+    """Return the figure of each estimator's error over time, at the first injection of each failure, which is shaded."""
     first: dict[str, tuple[Case, dict[str, Times]]] = {}
     for case, times in drilled.shown:
         first.setdefault(case.failure.name, (case, times))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an estimator makes of a failure: how far off, how long until it is back, whether its bounds held."""
+"""Errors of an estimator with a failure: how large, how long until it recovers, whether its bounds hold."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HOLDS_S, HELD = 5.0, 0.9  # for so long, this share of it within its own 95 % bo
 
 
 class State(enum.StrEnum):
-    """How a failure ended for an estimator."""
+    """Outcome of a failure for an estimator."""
 
     BACK = "back"
     UNSURE = "unsure"  # near again, but outside its own 95 % bounds
@@ -33,11 +33,11 @@ class State(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Times:
-    """How far an estimate is from the reference, at times (N,).
+    """Errors of an estimate relative to the reference, at times (N,).
 
     Attributes:
         stamps_ns: a grid of `RATE_HZ`. there: whether there is an estimate. off_m, off_deg: horizontal distance and
-            difference of heading, NaN where there is none. held: whether its 95 % region holds the reference.
+            difference of heading, NaN without an estimate. held: whether its 95 % region holds the reference.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -49,12 +49,12 @@ class Times:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
-    """What one estimator made of one failure at one time; what is `normal_` it has there undisturbed.
+    """Errors of one estimator with one failure at one time; `normal_*`: the same without the failure.
 
     Attributes:
         begin_s: since the recording begins. off_m, off_deg: largest, until `TAIL_S` after the failure.
-        coverage: share of that time in which the 95 % region of the place holds the reference; None: never there.
-        back_s: from the failure's end until it is back. missing: share of the time without an estimate. why: of those.
+        coverage: share of that time in which the 95 % region of the position holds the reference; None: no estimate.
+        back_s: from the failure's end until it has recovered. missing: share of the time without an estimate. why: of that.
     """
 
     failure: str
@@ -75,9 +75,10 @@ class Measured:
 
 
 def compared(track: Trajectory | None, reference: Trajectory, window: Window, *, sure: bool) -> Times:
-    """Compare an estimate with the reference all over a window.
+    """Return the errors of an estimate over a window; None: there is no estimate.
 
-    `sure`: the reference is truth; else its own covariance is added to the estimate's.
+    Args:
+        sure: the reference is truth; otherwise its own covariance is added to the estimate's.
     """
     count = int((window.end_ns - window.begin_ns) / NS_PER_S * RATE_HZ)
     stamps = window.begin_ns + np.rint(np.arange(count) * NS_PER_S / RATE_HZ).astype(np.int64)
@@ -97,7 +98,7 @@ def compared(track: Trajectory | None, reference: Trajectory, window: Window, *,
 
 
 def judge(case: Case, estimator: str, struck: Times, normal: Times, origin_ns: int, why: str = "") -> Measured:
-    """Return what an estimator made of a failure.
+    """Return the errors of an estimator with a failure.
 
     Args:
         struck, normal: of the same window, with the failure and without. origin_ns: begin of the recording.
@@ -136,7 +137,7 @@ def _share(times: Times, judged: NDArray[np.bool_]) -> float | None:
 
 
 def _back(times: Times, end_ns: int, near_m: float) -> tuple[State, float | None]:
-    """Return whether it comes back after the failure, and after how many s it has."""
+    """Return whether the estimate recovers after the failure, and after how many seconds."""
     after = np.flatnonzero(times.stamps_ns >= end_ns)
     near = times.there & (np.nan_to_num(times.off_m, nan=np.inf) < near_m)
     length, was_near = round(HOLDS_S * RATE_HZ), False
@@ -150,7 +151,7 @@ def _back(times: Times, end_ns: int, near_m: float) -> tuple[State, float | None
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """All times of one failure with one estimator: the worst of them, and how many it did not come back from."""
+    """All injections of one failure, for one estimator: the worst errors, and how often it did not recover."""
 
     failure: str
     family: str
@@ -169,7 +170,7 @@ class Row:
 
 
 def summed(measured: Sequence[Measured]) -> tuple[Row, ...]:
-    """Return a row for each failure and estimator, in the order in which they come."""
+    """Return a row for each failure and estimator, in order of appearance."""
     groups: dict[tuple[str, str], list[Measured]] = {}
     for m in measured:
         groups.setdefault((m.failure, m.estimator), []).append(m)
@@ -204,13 +205,13 @@ def _row(own: Sequence[Measured]) -> Row:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drilled:
-    """What a drill gives.
+    """Result of a drill.
 
     Attributes:
-        source, vessel: what was drilled. truth: whether the reference is truth, else the undisturbed smoother.
-        bound_m: that smoother's own 95 % bound, median over the run.
-        measured: each failure, time and estimator. shown: how far off each estimator was over time, by case.
-        left: failures that were not drilled, each with why not. windows: parts of the recording that were used.
+        source, vessel: of the recording. truth: whether the reference is truth, else the undisturbed smoother.
+        bound_m: median 95 % bound of that smoother.
+        measured: each failure, time and estimator. shown: errors of each estimator over time, by case.
+        left: failures that were not injected, with reasons. windows: parts of the recording that were used.
     """
 
     source: str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What drills say, as a page, Markdown and CSV."""
+"""Result of drills as a page, Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pathlib import Path
 from graphloc.eval.drill.figures import against_length, all_failures, over_time
 from graphloc.eval.drill.measure import HELD, HOLDS_S, NEAR_M, NORMAL_TIMES, Drilled, Row, State, summed
 from graphloc.eval.drill.plan import TAIL_S, WINDOW_TAIL_S
+from graphloc.eval.html import drawing
 from graphloc.eval.page import Cell, Grid, write_csv, write_markdown, write_page
-from graphloc.eval.pieces import drawing
 
 MARK = "drill.json"  # a folder with this file is ours to replace
 
 
 def said(drilled: Drilled) -> list[str]:
-    """Return what came out, in sentences: the worst outage, lock-outs, and what it was measured against."""
+    """Return the result in sentences: the worst outage, lock-outs, and the reference."""
     rows = summed(drilled.measured)
     lines = [" ".join(_headline(drilled, rows))]
     if drilled.truth:
@@ -91,7 +91,7 @@ def _short(row: Row) -> Cell:
 
 
 def brief(drilled: Drilled) -> list[Grid]:
-    """Return the same for a terminal: farthest off, and how long until back; a star: near, but outside its own bounds."""
+    """Return the tables for a terminal: largest error and time to recover; a star: recovered, but outside its own bounds."""
     by = {(r.failure, r.estimator): r for r in summed(drilled.measured)}
     names = dict.fromkeys(m.failure for m in drilled.measured)
     rows = tuple((Cell(text=n), *(_short(by[n, e]) for e in drilled.estimators)) for n in names)
@@ -100,7 +100,7 @@ def brief(drilled: Drilled) -> list[Grid]:
 
 
 def grids(drilled: Drilled) -> list[Grid]:
-    """Return the table, and the drills that were left out."""
+    """Return the table of failures, and that of failures that were not injected."""
     by = {(r.failure, r.estimator): r for r in summed(drilled.measured)}
     names = dict.fromkeys(m.failure for m in drilled.measured)
     times = max(r.times for r in by.values())
@@ -120,7 +120,7 @@ def grids(drilled: Drilled) -> list[Grid]:
     found = [table]
     why = dict.fromkeys((m.failure, m.estimator, m.why) for m in drilled.measured if m.why)
     if why:
-        rows = tuple(tuple(Cell(text=text) for text in told) for told in why)
+        rows = tuple(tuple(Cell(text=text) for text in line) for line in why)
         found.append(Grid(title="No estimate", head=("failure", "estimator", "why"), rows=rows))
     if drilled.left:
         left = tuple((Cell(text=name), Cell(text=why_not)) for name, why_not in drilled.left)
@@ -145,7 +145,7 @@ def write(drilled: Drilled, folder: Path, command: str) -> None:
     write_page(folder / "drill.html", title, lines, parts)
     write_markdown(folder / "drill.md", title, lines, tables)
     write_csv(folder / "drill.csv", [asdict(m) for m in drilled.measured])
-    told = {
+    content = {
         "command": command,
         "said": lines,
         "truth": drilled.truth,
@@ -153,4 +153,4 @@ def write(drilled: Drilled, folder: Path, command: str) -> None:
         "left": dict(drilled.left),
         "warnings": drilled.warnings,
     }
-    (folder / MARK).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    (folder / MARK).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

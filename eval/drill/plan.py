@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When each failure strikes, and how much of the recording an estimator needs to see for it."""
+"""Schedule of failures, and the part of the recording that an estimator needs for each."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SETTLED_S = 10.0  # after the online mode's first pose
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Window:
-    """A part of the recording that estimators see: its stamps, and whether it is all of it."""
+    """A part of the recording for the estimators: its stamps, and whether it is the whole."""
 
     begin_ns: int
     end_ns: int
@@ -29,7 +29,7 @@ class Window:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """One failure at one time, in a window (its number); `seed` draws what the failure leaves to chance."""
+    """One failure at one time, in a window (its number); `seed` of its random choices."""
 
     failure: Failure
     window: int
@@ -38,12 +38,12 @@ class Case:
 
     @property
     def end_ns(self) -> int:
-        """The stamp at which the failure is over."""
+        """Stamp at which the failure ends."""
         return self.begin_ns + round(self.failure.length_s * NS_PER_S)
 
 
 def windows(recording: Recording, longest_s: float, times: int) -> tuple[Window, ...]:
-    """Return the whole of a recording, or `times` parts of a long one, spread evenly."""
+    """Return the whole recording, or `times` parts of a long one, spread evenly."""
     assert recording.imu is not None
     begin, end = int(recording.imu.stamps_ns[0]), int(recording.imu.stamps_ns[-1])
     if end - begin <= WHOLE_S * NS_PER_S:
@@ -56,12 +56,12 @@ def windows(recording: Recording, longest_s: float, times: int) -> tuple[Window,
 def schedule(
     failures: Sequence[Failure], parts: Sequence[Window], ready_ns: Sequence[int], times: int, seed: int
 ) -> tuple[tuple[Case, ...], tuple[tuple[str, str], ...]]:
-    """Return when each failure strikes, and the failures that do not fit, each with why.
+    """Return the cases, and the failures that do not fit, with reasons.
 
-    In a whole recording the times are spread evenly over where the failure fits; in a window it strikes at one time.
+    In a whole recording the times are spread evenly over those at which the failure fits; in a window it is injected once.
 
     Args:
-        ready_ns: by window, the first pose of the online mode there.
+        ready_ns: by window, the first pose of the online mode.
     """
     cases: list[Case] = []
     left: list[tuple[str, str]] = []
@@ -87,13 +87,13 @@ def schedule(
 
 
 def judged_until(case: Case, window: Window) -> Window:
-    """Return the window without what lies more than `WINDOW_TAIL_S` behind the failure: nobody looks there."""
+    """Return the window without what is more than `WINDOW_TAIL_S` after the failure, which is not evaluated."""
     end_ns = min(window.end_ns, case.end_ns + round(WINDOW_TAIL_S * NS_PER_S))
     return replace(window, end_ns=end_ns, whole=window.whole and end_ns == window.end_ns)
 
 
 def cut(recording: Recording, window: Window) -> Recording:
-    """Return the part of a recording that lies in a window; truth stays whole, rows of other messages are left out."""
+    """Return the part of a recording in a window, with the whole truth, without the rows of other messages."""
     if window.whole or recording.imu is None:
         return recording
     inside = (recording.imu.stamps_ns >= window.begin_ns) & (recording.imu.stamps_ns <= window.end_ns)

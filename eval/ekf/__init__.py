@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The filters that the graph is compared with, on the same measurements.
+"""EKFs for comparison with the graph, on the same measurements.
 
-`run_bl` is BL alg. 6 as printed, 2 m gate included; its missing Jacobian is a switch. `run_honest` is the planar
-filter that one would honestly compare with: exact Jacobian, gyro bias, GNSS velocity, chi-square gates
-that open as the covariance grows. State of both: x, y (m, world), surge, sway (m/s, body), heading psi
-(rad); then the gyro bias.
+`run_bl` is BL alg. 6 as printed, with its 2 m gate; the Jacobian that it lacks is an option. `run_honest` is a planar EKF that a
+fair comparison needs: exact Jacobian, gyro bias, GNSS velocity, chi-square gates that open as the covariance grows. State of both:
+x, y (m, world), surge, sway (m/s, body), heading psi (rad); then the gyro bias.
 """
 
 from __future__ import annotations
@@ -23,5 +22,5 @@ __all__ = ["BlConfig", "FilterResult", "as_pose", "filter_row", "run_all", "run_
 def run_all(
     recording: Recording, config: VesselConfig, datum: Datum, options: BlConfig | None = None
 ) -> tuple[FilterResult, ...]:
-    """Run both filters; `options` are those of BL's."""
+    """Run both EKFs; `options`: of BL's."""
     return (run_bl(recording, config, datum, options), run_honest(recording, config, datum))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The filter of Bergman & Lindell, as printed."""
+"""EKF of Bergman & Lindell, as printed."""
 
 from __future__ import annotations
 
@@ -17,19 +17,18 @@ from graphloc.recording import Recording
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlConfig:
-    """BL alg. 6. Defaults are the print, with the errata that `thesis-notes` settles (dt, rad, 3 x 5 H).
+    """Parameters of BL alg. 6. Defaults are the printed ones, with errata corrected (dt, rad, 3 x 5 H).
 
     Attributes:
         rate_hz: prediction rate. a1, a2, a3: BL's factors on Q, R_gnss, R_lidar.
         a2_in_loss: factor on R_gnss while the signal is lost, which BL set by hand. loss_ns: (start, stop)
-            stamps of it; None: nobody tells.
-        gate_m: a pose further than this from the prediction is dropped.
+            stamps of that; None: unknown to the filter.
+        gate_m: a pose farther than this from the prediction is dropped.
         accel_noise_mg: printed 37 mg; gyro_noise_dps: 0.008 deg/s; both over the root of the rate (eq. 3.1, 3.2).
-        gnss_rmse_m: receiver's own e; 0 takes it from the fix. heading_rmse_deg: of the GNSS compass.
+        gnss_rmse_m: receiver's own e; 0: from the fix. heading_rmse_deg: of the GNSS compass.
         exact_jacobian: d/dpsi terms in F, which the print lacks.
 
-    R_lidar is a3 times the pose's own covariance: that of eq. 3.33 where the pose comes of BL's matcher
-    (`matcher: bl` of an aerial sensor).
+    R_lidar is a3 times the pose's own covariance: that of eq. 3.33 for poses of BL's matcher (`matcher: bl` of an aerial sensor).
     """
 
     rate_hz: float = 20.0
@@ -46,23 +45,27 @@ class BlConfig:
     exact_jacobian: bool = False
 
 
-def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: BlConfig | None = None) -> FilterResult:
-    """Run BL alg. 6. It has no GNSS velocity: that is left out."""
-    o = options or BlConfig()
-    dt = 1.0 / o.rate_hz
-    s_acc = o.accel_noise_mg * 1e-3 * 9.81 / np.sqrt(o.rate_hz)  # eq. 3.2
-    s_gyro = np.radians(o.gyro_noise_dps) / np.sqrt(o.rate_hz)  # eq. 3.1
-    Qa = np.diag([0.0, 0.0, s_acc**2, s_acc**2, s_gyro**2]) * dt  # eq. 3.28
+class _BlEkf:
+    """BL alg. 6. It does not use GNSS velocity."""
 
-    def start(x: Array) -> tuple[Array, Array]:
+    name = "BL EKF"
+
+    def __init__(self, options: BlConfig) -> None:
+        self._options, self.rate_hz, self._dt = options, options.rate_hz, 1.0 / options.rate_hz
+        s_acc = options.accel_noise_mg * 1e-3 * 9.81 / np.sqrt(options.rate_hz)  # eq. 3.2
+        s_gyro = np.radians(options.gyro_noise_dps) / np.sqrt(options.rate_hz)  # eq. 3.1
+        self._Qa = np.diag([0.0, 0.0, s_acc**2, s_acc**2, s_gyro**2]) * self._dt  # eq. 3.28
+
+    def start(self, x: Array) -> tuple[Array, Array]:
         return x, np.diag([0.1, 0.1, 0.1, 0.1, 0.01])
 
-    def predict(x: Array, P: Array, step: Interval) -> tuple[Array, Array]:
-        F = transition(x, dt, exact=o.exact_jacobian)
-        Q = o.a1 * (F @ Qa @ F.T) + (SILENT_Q * dt if step.silent else 0.0)  # eq. 3.29
-        return advance(x, step.accel - step.leak, step.rate, dt), F @ P @ F.T + Q
+    def predict(self, x: Array, P: Array, step: Interval) -> tuple[Array, Array]:
+        F = transition(x, self._dt, exact=self._options.exact_jacobian)
+        Q = self._options.a1 * (F @ self._Qa @ F.T) + (SILENT_Q * self._dt if step.silent else 0.0)  # eq. 3.29
+        return advance(x, step.accel - step.leak, step.rate, self._dt), F @ P @ F.T + Q
 
-    def judge(m: Measurement, r: Array, H: Array, P: Array, R: Array) -> Array | str:
+    def gate(self, m: Measurement, r: Array, H: Array, P: Array, R: Array) -> Array | str:
+        o = self._options
         if isinstance(m, PoseFix):
             away = float(np.linalg.norm(r[H[:, :2].any(axis=1)]))
             return o.a3 * R if away < o.gate_m else f"outside the {o.gate_m:g} m gate"
@@ -74,4 +77,7 @@ def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: Bl
             return a2 * np.eye(2) * (o.gnss_rmse_m**2 if o.gnss_rmse_m else float(np.trace(R))) / 2.0
         return a2 * np.array([[np.radians(o.heading_rmse_deg) ** 2 / 2.0]])
 
-    return run_filter("BL EKF", recording, config, datum, o.rate_hz, start, predict, judge)
+
+def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: BlConfig | None = None) -> FilterResult:
+    """Run BL alg. 6. It does not use GNSS velocity."""
+    return run_filter(_BlEkf(options or BlConfig()), recording, config, datum)

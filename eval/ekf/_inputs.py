@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the filters are fed: the IMU step by step, measurements with their mounts, where to start."""
+"""Inputs of the EKFs: the IMU in steps, measurements with their mounts, the start."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from graphloc.time import NS_PER_S, seconds_since
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """What the IMU says between two filter steps: means in body axes, and whether it was silent."""
+    """Mean IMU data between two filter steps, in body axes, and whether it was missing."""
 
     stop_ns: int
     accel: Array  # (2,) surge, sway, with what tilt leaves of gravity
@@ -87,10 +87,10 @@ def events_of(recording: Recording, config: VesselConfig) -> list[Event]:
 
 
 def as_pose(m: TagSighting, survey: Survey) -> PoseFix:
-    """Return the planar poses of the body that a sighting of tags gives, likeliest first.
+    """Return the planar poses of body that a sighting of tags gives, likeliest first.
 
-    With t from the camera to the tags' middle, the place is c - t: what its own error and that of the attitude make of
-    it. A dock is as likely here as there within what it wanders.
+    With t from the camera to the tags' middle c, the position is c - t; its covariance includes the errors of the attitude. The
+    position of a dock is uncertain by its configured motion.
     """
     modes, dock = [], survey.dock(m.frame)
     for mode in m.modes:
@@ -109,7 +109,7 @@ def as_pose(m: TagSighting, survey: Survey) -> PoseFix:
 
 
 def start_of(events: list[Event], recording: Recording, datum: Datum) -> Array:
-    """Start as BL does: at the true pose where there is truth, else by the first fixes and heading."""
+    """Start as BL does: at the true pose if there is truth, else by the first fixes and heading."""
     truth, imu = recording.truth, recording.imu
     if truth is not None and imu is not None and truth.covers(imu.stamps_ns[:1]).all():
         there = truth.at(imu.stamps_ns[:1])
@@ -134,7 +134,7 @@ def start_of(events: list[Event], recording: Recording, datum: Datum) -> Array:
 
 
 def _first_velocity(fixes: list[GnssPosition], track: Array) -> Array:
-    """Velocity (2,) of the first 5 seconds of fixes, by their slope."""
+    """Return the velocity (2,), m/s, by the slope of the first 5 s of fixes."""
     t = np.array([(f.stamp_ns - fixes[0].stamp_ns) / NS_PER_S for f in fixes[:100]])
     soon = t < 5.0
     if soon.sum() < 3 or np.ptp(t[soon]) < 1.0:

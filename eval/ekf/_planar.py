@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What both filters share: the planar model, the loop over steps and measurements, the track that comes out."""
+"""Parts that both EKFs share: the planar model, the loop over steps and measurements, the resulting track."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,11 @@ from graphloc.trajectory import Trajectory
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilterResult:
-    """What a filter gives.
+    """Result of a filter.
 
     Attributes:
         name: of the filter. trajectory: with covariance. ledger: of absolute measurements.
-        why: what explains how far off it is, where that takes a word.
+        why: explanation of its errors, if needed.
     """
 
     name: str
@@ -43,7 +43,7 @@ class FilterResult:
 
 
 def _measurement(event: Event, x: Array, rate: float, datum: Datum) -> tuple[Array, Array, Array]:
-    """Return innovation (k,), H (k, 5) and R of a measurement, its lever arm taken off with psi."""
+    """Return innovation (k,), H (k, 5) and R of a measurement, corrected for its lever arm with psi."""
     m, lever = event.m, event.lever
     c, s = np.cos(x[4]), np.sin(x[4])
     turn = np.array([[c, -s], [s, c]])
@@ -97,41 +97,53 @@ def advance(x: Array, accel: Array, rate: float, dt: float) -> Array:
     return new
 
 
-# Given x, P and an interval: x, P one step on. Given a measurement, r, H, P, R: the R to take, or why not.
-Predict = Callable[[Array, Array, Interval], tuple[Array, Array]]
-Judge = Callable[[Measurement, Array, Array, Array, Array], "Array | str"]
-SILENT_Q = np.diag([0.0, 0.0, 1.0, 1.0, 0.2**2])  # density of unknown motion in a hole of the IMU's data
+SILENT_Q = np.diag([0.0, 0.0, 1.0, 1.0, 0.2**2])  # density of unknown motion in a gap of the IMU's data
 
 
-def run_filter(
-    name: str,
-    recording: Recording,
-    config: VesselConfig,
-    datum: Datum,
-    rate_hz: float,
-    start: Callable[[Array], tuple[Array, Array]],
-    predict: Predict,
-    judge: Judge,
-) -> FilterResult:
-    """Predict from step to step, and take each measurement at the first step after it."""
-    intervals, events = intervals_of(recording, config, rate_hz), events_of(recording, config)
-    x, P = start(start_of(events, recording, datum))
-    first = intervals[0].stop_ns - round(NS_PER_S / rate_hz) if intervals else 0
+class PlanarEkf(Protocol):
+    """What distinguishes one EKF from another. State x (n,), n >= 5: x, y, surge, sway, heading; covariance P (n, n).
+
+    Attributes:
+        name: for tables. rate_hz: of predictions.
+    """
+
+    name: str
+    rate_hz: float
+
+    def start(self, x: Array) -> tuple[Array, Array]:
+        """Return state and covariance at the start, from the first five states (5,)."""
+
+    def predict(self, x: Array, P: Array, step: Interval) -> tuple[Array, Array]:
+        """Return state and covariance one step later."""
+
+    def gate(self, m: Measurement, r: Array, H: Array, P: Array, R: Array) -> Array | str:
+        """Return the covariance (k, k) to use for a measurement, or the reason to reject it.
+
+        Args:
+            r: (k,) innovation. H: (k, n). R: (k, k) covariance of the measurement.
+        """
+
+
+def run_filter(ekf: PlanarEkf, recording: Recording, config: VesselConfig, datum: Datum) -> FilterResult:
+    """Predict step by step, and apply each measurement at the first step after it."""
+    intervals, events = intervals_of(recording, config, ekf.rate_hz), events_of(recording, config)
+    x, P = ekf.start(start_of(events, recording, datum))
+    first = intervals[0].stop_ns - round(NS_PER_S / ekf.rate_hz) if intervals else 0
     ledger, out, k = Ledger(), [(first, x.copy(), P.copy())], 0
     for step in intervals:
-        x, P = predict(x, P, step)
+        x, P = ekf.predict(x, P, step)
         while k < len(events) and events[k].m.stamp_ns <= step.stop_ns:
             event, k = events[k], k + 1
             r, planar, R = _measurement(event, x[:5], step.rate - (x[5] if len(x) > 5 else 0.0), datum)
             H = np.hstack([planar, np.zeros((len(r), len(x) - 5))])
-            taken = judge(event.m, r, H, P, R)
+            taken = ekf.gate(event.m, r, H, P, R)
             nis = float(r @ np.linalg.solve(H @ P @ H.T + R, r))
             if not isinstance(taken, str):
                 x, P = _update(x, P, r, H, taken)
             if event.m.seq >= 0:
                 ledger.add(filter_row(event.m, recording, nis, taken if isinstance(taken, str) else ""))
         out.append((step.stop_ns, x.copy(), P.copy()))
-    return FilterResult(name=name, trajectory=_planar(out), ledger=ledger)
+    return FilterResult(name=ekf.name, trajectory=_planar(out), ledger=ledger)
 
 
 def _update(x: Array, P: Array, r: Array, H: Array, R: Array) -> tuple[Array, Array]:
@@ -146,7 +158,7 @@ def _update(x: Array, P: Array, r: Array, H: Array, R: Array) -> tuple[Array, Ar
 def filter_row(
     m: Measurement, recording: Recording, nis: float | None, refused: str, away_m: float | None = None
 ) -> LedgerRow:
-    """Return the row of a measurement that a filter took, or refused for a reason."""
+    """Return the row of a measurement that a filter used, or rejected with a reason."""
     return LedgerRow(
         seq=m.seq,
         stamp_ns=m.stamp_ns,

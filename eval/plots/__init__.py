@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a run: what they show, and who draws it (`interactive`; `paper`, which is imported by itself)."""
+"""Figures of a run as data, and their rendering (`interactive`; `paper`, which has to be imported separately)."""
 
 from graphloc.eval.plots._errors import HEALTH, consistency, coverage, error_over_time, outages
 from graphloc.eval.plots._interactive import interactive

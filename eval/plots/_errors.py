@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far off an estimate is over time, and whether its bounds are honest."""
+"""Figures of errors over time, and of the consistency of the bounds."""
 
 from __future__ import annotations
 
@@ -53,32 +53,16 @@ def error_over_time(
     held: Sequence[GnssPosition],
     levers_m: Levers,
 ) -> Figure:
-    """Position and heading error where truth or held-out fixes exist, 95 % bounds, and when something was missing."""
-    track = solution.trajectory
-    assert track.cov is not None
-    start = int(track.stamps_ns[0])
-    some = thinned(len(track))
-    bound, t = bounds_95(track.cov[some]), seconds_since(start, track.stamps_ns[some])
-    name = f"95 % bound of {solution.name}"
-    position: list[Mark] = [*spans(recording, solution)]
-    heading: list[Mark] = [*position]
-    for marks, k in ((position, 0), (heading, 2)):
-        marks.append(
-            Band(
-                name=name,
-                x=t,
-                low=np.zeros(len(t)),
-                high=bound[:, k],
-                colour=colour_of(solution.name),
-                listed=marks is position,
-            )
-        )
+    """Return the errors of position and heading against truth, else held-out fixes; 95 % bounds; outages and health."""
+    start = int(solution.trajectory.stamps_ns[0])
+    shades = tuple(spans(recording, solution))
+    position: list[Mark] = [*shades, _bound(solution, 0, listed=True)]
+    heading: list[Mark] = [*shades, _bound(solution, 2, listed=False)]
     largest_m: dict[str, float] = {}
     for who, estimate, colour in reversed(_named(solution, filters)):  # ours last, on top
         if recording.truth is not None:
             stamps, error, turned, _, _ = errors(estimate, recording.truth)
             size = np.hypot(error[:, 0], error[:, 1])
-            largest_m[who] = float(size.max())
             width = 2.0 if who == solution.name else 1.3
             for marks, value in ((position, size), (heading, np.degrees(np.abs(turned)))):
                 at = peaks(value)
@@ -87,23 +71,33 @@ def error_over_time(
         elif held:
             stamps, error, _ = held_out_errors(estimate, held, solution.datum, levers_m)
             size = np.hypot(error[:, 0], error[:, 1])
-            largest_m[who] = float(size.max())
             at = peaks(size)
             where = seconds_since(start, stamps[at])
             position.append(Points(name=f"{who}, held-out", x=where, y=size[at], colour=colour))
+        else:
+            continue
+        largest_m[who] = float(size.max())
     title, limit = _zoomed(largest_m)
     panels = (
-        Panel(
-            title=title, y="m", marks=tuple(position), from_zero=True,
-            range_y=limit,
-        ),
+        Panel(title=title, y="m", marks=tuple(position), from_zero=True, range_y=limit),
         Panel(title="heading error" if recording.truth else "heading, 95 % bound", y="deg", marks=tuple(heading), from_zero=True),
     )  # fmt: skip
     return Figure(name="errors", x="time, s", panels=panels, height=540)
 
 
+def _bound(solution: Solution, column: int, *, listed: bool) -> Band:
+    """Return the band of a 95 % bound of the solution (`bounds_95`)."""
+    track = solution.trajectory
+    assert track.cov is not None
+    some = thinned(len(track))
+    t = seconds_since(int(track.stamps_ns[0]), track.stamps_ns[some])
+    high = bounds_95(track.cov[some])[:, column]
+    name, colour = f"95 % bound of {solution.name}", colour_of(solution.name)
+    return Band(name=name, x=t, low=np.zeros(len(t)), high=high, colour=colour, listed=listed)
+
+
 def _zoomed(largest_m: Mapping[str, float]) -> tuple[str, tuple[float, float] | None]:
-    """Title and range of the position error: one that is lost would press the others flat; a double click shows all."""
+    """Return title and range of the position error, so that an estimate that is lost does not flatten the others."""
     *_, second, first = [0.0, 0.0, *sorted(largest_m.values())]
     if not first > _LOST * second > 0.0:
         return "position error", None
@@ -112,7 +106,7 @@ def _zoomed(largest_m: Mapping[str, float]) -> tuple[str, tuple[float, float] | 
 
 
 def spans(recording: Recording, solution: Solution) -> Iterator[Span]:
-    """Yield when no fix came, and when the estimate says that it is not good; of too many the longest."""
+    """Yield the periods without fixes and those in which health was not good; of too many, the longest."""
     start, found = int(solution.trajectory.stamps_ns[0]), []
     for a, b in outages(recording):
         found.append(Span(name="no GNSS fix", start=(a - start) / 1e9, stop=(b - start) / 1e9, colour=OUTAGE))
@@ -128,9 +122,9 @@ def spans(recording: Recording, solution: Solution) -> Iterator[Span]:
 
 
 def outages(recording: Recording) -> list[tuple[int, int]]:
-    """Return stamps (ns) between which no GNSS position came for 3 s, and for five times what is usual.
+    """Return stamps (ns) of periods without a GNSS position for 3 s and five times the usual interval.
 
-    The time before the first and after the last one counts, too, as far as there is an IMU.
+    The periods before the first and after the last one count, too, as far as there is an IMU.
     """
     stamps = np.unique([m.stamp_ns for m in recording.measurements if isinstance(m, GnssPosition)])
     if len(stamps) < 3:
@@ -143,7 +137,7 @@ def outages(recording: Recording) -> list[tuple[int, int]]:
 
 
 def consistency(recording: Recording, solution: Solution, filters: Sequence[FilterResult]) -> Figure | None:
-    """NEES of the horizontal position over time with the band that 95 % of it should lie in; None without truth."""
+    """Return the NEES of the horizontal position over time, with the band of 95 % probability; None without truth."""
     if recording.truth is None:
         return None
     start = int(solution.trajectory.stamps_ns[0])
@@ -171,7 +165,7 @@ def consistency(recording: Recording, solution: Solution, filters: Sequence[Filt
 
 
 def coverage(recording: Recording, solution: Solution, filters: Sequence[FilterResult]) -> Figure | None:
-    """How often the stated region of p % held the truth, for all p: on the diagonal where it is honest."""
+    """Return how often the stated p % region held the truth, for all p: on the diagonal if it is honest."""
     if recording.truth is None:
         return None
     wanted = 100.0 * _SHARES

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of the report: plotly, interactive, in the page itself."""
+"""Interactive figures in the report, drawn by plotly."""
 
 from __future__ import annotations
 
@@ -20,18 +20,11 @@ _WEIGHTS = {"colorscale": "Cividis", "cmin": 0, "cmax": 1}
 
 
 def interactive(figure: Figure) -> go.Figure:
-    """Return a figure for plotly; names in the legend switch what they name on and off."""
+    """Return the figure for plotly; names in the legend switch lines on and off."""
     n, columns = len(figure.panels), figure.columns
-    rows = -(-n // columns)
     named = any(not isinstance(m, Span) and m.listed and not p.keyed for p in figure.panels for m in p.marks)
     above_px = _ABOVE_PX + _LEGEND_PX * named
-    gap_px = _GAP_PX + (_TICKS_PX if columns > 1 else 0)  # beside each other, each has its own axis
-    drawn = make_subplots(
-        rows=rows, cols=columns, shared_xaxes=columns == 1, subplot_titles=[_title(p) for p in figure.panels],
-        vertical_spacing=min(gap_px / max(figure.height - above_px - _BELOW_PX, 1), 0.9 / rows),
-        horizontal_spacing=_BESIDE if columns > 1 else None,
-        specs=[[{} if row * columns + col < n else None for col in range(columns)] for row in range(rows)],
-    )  # fmt: skip
+    drawn = _empty(figure, above_px)
     listed: set[str] = set()
     shades: list[dict[str, Any]] = []
     for number, panel in enumerate(figure.panels):
@@ -45,16 +38,7 @@ def interactive(figure: Figure) -> go.Figure:
             trace.update(legendgroup=mark.name, showlegend=in_legend)
             listed |= {mark.name} if in_legend else set()
             drawn.add_trace(trace, **place)
-        axis: dict[str, Any] = {"title": {"text": panel.y, "standoff": 4}}
-        if panel.from_zero:
-            axis["rangemode"] = "tozero"
-        if panel.log_y:
-            axis |= {"type": "log", "dtick": 1}
-        if panel.range_y is not None:
-            axis["range"] = list(np.log10(panel.range_y)) if panel.log_y else list(panel.range_y)
-        if panel.ticks_y:
-            axis |= {"tickvals": list(range(len(panel.ticks_y))), "ticktext": list(panel.ticks_y)}
-        drawn.update_yaxes(**axis, **place)
+        drawn.update_yaxes(**_y_axis(panel), **place)
         if number >= n - columns:  # the last of its column
             drawn.update_xaxes(title=figure.x, **place)
     if figure.log_x:
@@ -72,8 +56,34 @@ def interactive(figure: Figure) -> go.Figure:
     return drawn
 
 
+def _empty(figure: Figure, above_px: int) -> go.Figure:
+    """Return the axes of all panels, `above_px` below the top."""
+    n, columns = len(figure.panels), figure.columns
+    rows = -(-n // columns)
+    gap_px = _GAP_PX + (_TICKS_PX if columns > 1 else 0)  # beside each other, each has its own axis
+    return make_subplots(
+        rows=rows, cols=columns, shared_xaxes=columns == 1, subplot_titles=[_title(p) for p in figure.panels],
+        vertical_spacing=min(gap_px / max(figure.height - above_px - _BELOW_PX, 1), 0.9 / rows),
+        horizontal_spacing=_BESIDE if columns > 1 else None,
+        specs=[[{} if row * columns + col < n else None for col in range(columns)] for row in range(rows)],
+    )  # fmt: skip
+
+
+def _y_axis(panel: Panel) -> dict[str, Any]:
+    axis: dict[str, Any] = {"title": {"text": panel.y, "standoff": 4}}
+    if panel.from_zero:
+        axis["rangemode"] = "tozero"
+    if panel.log_y:
+        axis |= {"type": "log", "dtick": 1}
+    if panel.range_y is not None:
+        axis["range"] = list(np.log10(panel.range_y)) if panel.log_y else list(panel.range_y)
+    if panel.ticks_y:
+        axis |= {"tickvals": list(range(len(panel.ticks_y))), "ticktext": list(panel.ticks_y)}
+    return axis
+
+
 def _shade(span: Span, number: int) -> dict[str, Any]:
-    """A rectangle over the height of a panel; all are given to plotly at once, one by one they take seconds."""
+    """Return a rectangle over the height of a panel; plotly takes all at once, since one by one they take seconds."""
     axis = str(number) if number > 1 else ""
     return {
         "type": "rect", "xref": f"x{axis}", "yref": f"y{axis} domain", "x0": span.start, "x1": span.stop, "y0": 0, "y1": 1,
@@ -82,13 +92,13 @@ def _shade(span: Span, number: int) -> dict[str, Any]:
 
 
 def _title(panel: Panel) -> str:
-    """The title, with the names of the lines in their colours where the panel says them itself."""
+    """Return the title; of a panel with its own key, with the names of the lines in their colours."""
     names = [f'<span style="color:{m.colour}">{m.name}</span>' for m in panel.marks if isinstance(m, Line)]
     return f"{panel.title} ({', '.join(names)})" if panel.keyed else panel.title
 
 
 def _light(values: Array) -> NDArray[np.float32]:
-    """Half the page for digits that cannot be seen."""
+    """Return values in single precision, which halves the size of the page."""
     return np.asarray(values, dtype=np.float32)
 
 

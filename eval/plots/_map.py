@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map of a run: tracks, truth, and every absolute measurement coloured by its final weight."""
+"""Map of a run: tracks, truth, and every absolute measurement, coloured by its final weight."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _HEIGHT_PX = 620
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """An absolute measurement: where it puts the body (a fix: the antenna), its kind, and its row of the ledger."""
+    """An absolute measurement: the position that it gives for body (a fix: its antenna), its kind, and its ledger row."""
 
     p_m: Array
     kind: type[Measurement]
@@ -47,7 +47,7 @@ class Placed:
 
 
 def placed(recording: Recording, solution: Solution) -> Iterator[Placed]:
-    """Yield every measurement that says a place, at the mode that was chosen, or its likeliest."""
+    """Yield every measurement that gives a position, by the mode that was chosen, or its likeliest."""
     rows = {row.seq: row for row in solution.ledger if row.seq >= 0}
     for m in recording.measurements:
         row = rows.get(m.seq)
@@ -67,7 +67,7 @@ def _place(m: Measurement, row: LedgerRow, datum: Datum) -> Array | None:
 
 
 def hover(row: LedgerRow) -> str:
-    """Return a row of the ledger as lines for a pointer."""
+    """Return a ledger row as the lines of a tooltip."""
     said = [f"{row.sensor}: {row.outcome.value}" + ("" if row.weight is None else f", weight {row.weight:.2f}")]
     if row.mode is not None and row.mode_probability is not None:
         said.append(f"mode {row.mode}, probability {row.mode_probability:.2f}")
@@ -121,7 +121,7 @@ def _measured(recording: Recording, solution: Solution) -> Iterator[Points]:
 
 
 def _tags(solution: Solution, recording: Recording) -> Iterator[Points]:
-    """Where the tags that were seen hang, docks at rest."""
+    """Return the positions of the tags that were seen, docks at rest."""
     seen: dict[tuple[str, int], tuple[Array, str]] = {}
     for m in recording.measurements:
         if isinstance(m, TagSighting):

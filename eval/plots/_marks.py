@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a figure shows, apart from who draws it: `interactive` draws it for the report, `paper` as PNG and SVG.
+"""Content of a figure, independent of its rendering: `interactive` draws it for the report, `paper` as PNG and SVG.
 
-Colours are those of Okabe and Ito, safe for colour-blind eyes.
+Colours are those of Okabe and Ito, which colour-blind people can distinguish.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Shape = Literal["circle", "circle-open", "diamond", "square", "x"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Line:
-    """A line through x, y (N,). `listed`: whether the legend names it; NaN in y breaks it."""
+    """A line through x, y (N,). `listed`: whether the legend names it; NaN in y interrupts it."""
 
     name: str
     x: Array
@@ -40,7 +40,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Points:
-    """Points x, y (N,), all of one colour, or coloured by `weight` (N,) in [0, 1]; `text` (N,) is shown on hover."""
+    """Points x, y (N,) in one colour, or coloured by `weight` (N,) in [0, 1]; `text` (N,) are tooltips."""
 
     name: str
     x: Array
@@ -79,7 +79,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Underlay:
-    """A picture that lies under a map, north up.
+    """A picture under a map, north up.
 
     Attributes:
         jpeg: the picture. west_m, south_m, east_m, north_m: its edges in world.
@@ -101,9 +101,9 @@ class Panel:
 
     Attributes:
         title: above it; may be empty. y: label of the axis. marks: drawn in this order.
-        range_y: what of the axis is shown at first; None: all.
+        range_y: initial range of the axis; None: all.
         from_zero: the axis begins at zero. log_y: it is logarithmic.
-        keyed: its lines are named in itself, not in the legend of the figure.
+        keyed: its lines are named in its title instead of the legend of the figure.
         ticks_y: names of 0, 1, 2, ... on the axis, instead of numbers.
     """
 
@@ -119,13 +119,13 @@ class Panel:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Figure:
-    """Panels above each other with one x axis, or beside each other, in `columns`, with one each.
+    """Panels below each other with a common x axis, or in `columns` with one each.
 
     Attributes:
         name: of its files, and in the page. x: label of the axis. height: of the whole, px.
-        columns: panels beside each other, row by row. log_x: the x axes are logarithmic.
-        range_x: what of them is shown at first; None: all.
-        is_map: x and y have the same scale; underlay: what lies below.
+        columns: number of panels in a row. log_x: the x axes are logarithmic.
+        range_x: initial range of these; None: all.
+        is_map: x and y have the same scale; underlay: picture below.
     """
 
     name: str
@@ -140,19 +140,19 @@ class Figure:
 
 
 def colour_of(name: str) -> str:
-    """Return the colour of an estimator's track, the same in every figure, whoever else is there."""
+    """Return the colour of an estimator's track, the same in every figure."""
     return _TRACKS.get(name, COLOURS[-1])
 
 
 def thinned(n: int, most: int = MOST) -> NDArray[np.int64]:
-    """Indices of at most `most` of n things, evenly, the first and last among them."""
+    """Return the indices of at most `most` of n items, evenly spaced, with the first and the last."""
     if n <= most:
         return np.arange(n)
     return np.unique(np.linspace(0, n - 1, most).round().astype(np.int64))
 
 
 def peaks(values: Array, most: int = MOST) -> NDArray[np.int64]:
-    """Indices of at most `most` of n values in order: of each stretch the largest, so that no spike is lost."""
+    """Return the indices of at most `most` of n values in order: the largest of each section, so that no peak is lost."""
     n = len(values)
     if n <= most:
         return np.arange(n)
@@ -161,7 +161,7 @@ def peaks(values: Array, most: int = MOST) -> NDArray[np.int64]:
 
 
 def shown_of(weight: Array, most: int = MOST) -> NDArray[np.int64]:
-    """Indices of at most `most` measurements: of those not fully believed as many as of the others, or more."""
+    """Return the indices of at most `most` measurements; at least half of them have a weight below 0.5, if there are as many."""
     odd, even = np.flatnonzero(weight < 0.5), np.flatnonzero(weight >= 0.5)
     of_odd = min(len(odd), max(most // 2, most - len(even)))
     return np.sort(np.concatenate([odd[thinned(len(odd), of_odd)], even[thinned(len(even), most - of_odd)]]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was estimated beside the track, and how each sensor agreed with it."""
+"""Estimated states beside the track, and residuals of each sensor."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.chi2 import SIGMAS_95
+from graphloc.eval.formatting import percent
 from graphloc.eval.plots._map import hover
 from graphloc.eval.plots._marks import COLOURS, Band, Figure, Line, Mark, Panel, Points, shown_of, thinned
-from graphloc.eval.words import percent
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.solution import SlowEstimate, Solution
@@ -27,7 +27,7 @@ def _stacked(name: str, panels: Sequence[Panel]) -> Figure:
 
 
 def berths_over_time(solution: Solution) -> Figure | None:
-    """The vessel seen from each berth: across and along, angle, with 95 % bands; None where it came near none."""
+    """Return the vessel's position relative to each berth: across and along, angle, with 95 % bands; None if it was near none."""
     start, panels = int(solution.trajectory.stamps_ns[0]), []
     for track in solution.berths:
         assert track.cov is not None
@@ -49,7 +49,7 @@ def _banded(
     names: Sequence[str],
     first_colour: int = 0,
 ) -> tuple[Mark, ...]:
-    """A line for each column of `value` (N, k), with its 95 % band where sigma is known."""
+    """Return a line for each column of `value` (N, k), with its 95 % band if sigma is known."""
     some, marks = thinned(len(stamps)), list[Mark]()
     t = seconds_since(start, stamps[some])
     for k, name in enumerate(names):
@@ -62,7 +62,7 @@ def _banded(
 
 
 def residuals_over_time(solution: Solution) -> Figure | None:
-    """Residual of each sensor in its own sigmas, coloured by weight; None where none has one."""
+    """Return the residuals of each sensor in its own sigmas, coloured by weight; None if there are none."""
     by_sensor: defaultdict[str, list[LedgerRow]] = defaultdict(list)
     for row in solution.ledger:
         if row.seq >= 0 and row.nis is not None and row.dof:
@@ -88,7 +88,7 @@ def residuals_over_time(solution: Solution) -> Figure | None:
 
 
 def slow_over_time(solution: Solution) -> Figure:
-    """Estimated slow states (GNSS error, compass offset, map offset) with 95 % bands, and IMU biases."""
+    """Return the slow states (GNSS error, compass offset, map offset) with 95 % bands, and IMU biases."""
     start = int(solution.trajectory.stamps_ns[0])
     panels = [panel for sensor, estimate in solution.slow.items() for panel in _slow_panels(start, sensor, estimate)]
     stamps, axes = solution.trajectory.stamps_ns, ("x", "y", "z")
@@ -101,7 +101,7 @@ def slow_over_time(solution: Solution) -> Figure:
 
 
 def _slow_panels(start: int, sensor: str, e: SlowEstimate) -> list[Panel]:
-    """A panel for each unit, of three axes at most."""
+    """Return a panel per unit, of at most three axes."""
     panels = []
     for unit in dict.fromkeys(e.units):
         every = [k for k, u in enumerate(e.units) if u == unit]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures for papers: matplotlib, PNG and SVG. Imported only by who wants them: it takes a second to load."""
+"""Figures for papers, drawn by matplotlib as PNG and SVG. Import it only if needed: it takes a second to load."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write_figures(figures: Sequence[Figure], folder: Path) -> None:
 
 
 def drawn(figure: Figure) -> Sheet:
-    """Return the figure as matplotlib has it; no window is opened, nothing global is touched."""
+    """Return the figure of matplotlib, without opening a window or changing global settings."""
     height_in = _map_height_in(figure.underlay) if figure.is_map else figure.height / _PX_PER_IN
     sheet = Sheet(figsize=(_WIDTH_IN, height_in), layout="constrained")
     FigureCanvasAgg(sheet)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report shows, before anything is drawn."""
+"""Everything that a report needs, as one value."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from graphloc.solution import Solution
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ReportData:
-    """What a report shows.
+    """Everything that a report needs.
 
     Attributes:
-        truth_statement: says plainly what the numbers were measured against. pictures: captions and JPEGs of matches.
-        underlay: the aerial image under the map. calibration: what the run says of mounts and stamps; offline.
-        online: of the same measurements, where it is beside an offline run. command: that made the run.
+        solution: of the run. online: of the online mode on the same measurements, if it was compared.
+        held: fixes that were held out. levers_m: their antennas in body, (3,) m, by receiver.
+        tables: the metrics. truth_statement: what these were measured against.
+        pictures: captions and JPEGs of matches. underlay: the aerial image under the map.
+        calibration: suggestions of an offline run. command: the command line.
     """
 
     title: str
@@ -43,28 +45,30 @@ class ReportData:
 
     @property
     def solutions(self) -> tuple[Solution, ...]:
-        """The run's own, and that of the online mode beside it."""
+        """The run's own solution, and that of the online mode if it was compared."""
         return (self.solution,) if self.online is None else (self.solution, self.online)
 
     @property
     def begin_ns(self) -> int:
-        """Where time begins in figures and words: at the first pose of the run's own track."""
+        """Origin of the time axes: stamp of the first pose of the run's own solution."""
         return int(self.solution.trajectory.stamps_ns[0])
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """All that was said on the way."""
-        return said_on_the_way(self.recording, self.solution, self.online)
+        """All warnings, as `all_warnings` gives them."""
+        return all_warnings(self.recording, self.solution, self.online)
 
 
-def said_on_the_way(recording: Recording, solution: Solution, online: Solution | None) -> tuple[str, ...]:
-    """Return the warnings of a run, those of the online mode beside it with its name."""
-    beside = () if online is None else tuple(f"{online.name}: {line}" for line in online.stats.warnings)
-    return (*recording.warnings, *solution.stats.warnings, *beside)
+def all_warnings(recording: Recording, solution: Solution, online: Solution | None) -> tuple[str, ...]:
+    """Return the warnings of a run, then those that only the online mode gave, under its name."""
+    own = (*recording.warnings, *solution.stats.warnings)
+    if online is None:
+        return own
+    return (*own, *(f"{online.name}: {line}" for line in online.stats.warnings if line not in own))
 
 
 def figures(data: ReportData) -> dict[str, plots.Figure]:
-    """Return the figures of a run by name; those that it has no data for are left out."""
+    """Return the figures of a run by name, without those that it has no data for."""
     recording, solution, filters = data.recording, data.solution, data.filters
     found = (
         plots.run_map(recording, solution, filters, data.held, data.underlay),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an estimate says of itself over time: how long it was good, and when not, why, and what would end that."""
+"""Health of an estimate over time: how long it was in each state, why, and what would end that."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from itertools import groupby
 
 import numpy as np
 
-from graphloc.eval.pieces import note, table
-from graphloc.eval.words import percent
+from graphloc.eval.formatting import percent
+from graphloc.eval.html import note, table
 from graphloc.frames import Array
 from graphloc.solution import Health, Solution
 from graphloc.time import seconds_since
@@ -22,7 +22,7 @@ _STEP_S = 1.0  # between two poses: beyond, there was no estimate (as `Trajector
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stretch:
-    """A time in which an estimate says the same of itself, s since the begin of the run's track; `reason`: its first."""
+    """A period of constant health: begin and end in s since the run's track begins, and the reason at its begin."""
 
     health: Health
     reason: str
@@ -31,26 +31,30 @@ class Stretch:
 
 
 def _lasting_s(solution: Solution) -> Array:
-    """How long (N,) s each pose stands for: until the next, but not over a hole."""
+    """Return for how long each pose is valid (N,), s: until the next one, but not across a gap."""
     t = seconds_since(int(solution.trajectory.stamps_ns[0]), solution.trajectory.stamps_ns)
     step = np.diff(t, append=t[-1])
     return np.asarray(np.where(step <= _STEP_S, step, 0.0))
 
 
 def durations_s(solution: Solution) -> dict[Health, float]:
-    """Return how long an estimate calls itself what, s; only of what it has been."""
+    """Return the time in each state of health that occurs, s."""
     lasting = _lasting_s(solution)
     called = np.array([h.value for h in solution.health])
     return {health: float(lasting[called == health.value].sum()) for health in Health if health.value in called}
 
 
 def shares(solution: Solution) -> dict[Health, float]:
-    """Return the share of its poses that an estimate calls good and so on; only of what it has been."""
+    """Return the share of poses in each state of health that occurs."""
     return {h: solution.health.count(h) / len(solution.health) for h in Health if h in solution.health}
 
 
 def stretches(solution: Solution, begin_ns: int) -> list[Stretch]:
-    """Return when it was not good. Reasons that differ in numbers alone are one."""
+    """Return the periods in which health was not good; neighbours whose reasons differ only in numbers are one.
+
+    Args:
+        begin_ns: origin of their times.
+    """
     t = seconds_since(begin_ns, solution.trajectory.stamps_ns)
     ends = t + _lasting_s(solution)
 
@@ -68,14 +72,14 @@ def stretches(solution: Solution, begin_ns: int) -> list[Stretch]:
 
 
 def said_of(solution: Solution) -> str:
-    """Return the states with their shares and durations, as 'good for 80 % (64 s), degraded for 20 % (16 s)'."""
+    """Return the states of health with shares and durations, such as 'good for 80 % (64 s), degraded for 20 % (16 s)'."""
     lasting = durations_s(solution)
-    told = [f"{_words(h)} for {percent(share)} ({_seconds(lasting[h])})" for h, share in shares(solution).items()]
-    return ", ".join(told)
+    parts = [f"{_words(h)} for {percent(share)} ({_seconds(lasting[h])})" for h, share in shares(solution).items()]
+    return ", ".join(parts)
 
 
 def cure(health: Health, reason: str) -> str:
-    """Say what would end a state that is less than good."""
+    """Return what would end a state of health that is not good."""
     if "heading is a guess" in reason:
         return "a heading sensor (compass, dual antenna), or start.heading_deg"
     if health is Health.LOST:
@@ -91,7 +95,11 @@ def cure(health: Health, reason: str) -> str:
 
 
 def section(solutions: Sequence[Solution], begin_ns: int) -> str:
-    """Return why each estimate was less than good, a row per reason, the lasting ones first, as HTML; empty where all are good."""
+    """Return the reasons for which each solution was not good as HTML tables, longest first; empty if all were good.
+
+    Args:
+        begin_ns: origin of the times.
+    """
     parts = []
     for solution in solutions:
         alike: dict[tuple[Health, str], list[Stretch]] = {}
@@ -114,7 +122,7 @@ def section(solutions: Sequence[Solution], begin_ns: int) -> str:
 
 
 def _kind(reason: str) -> str:
-    """A reason without its numbers."""
+    """Return a reason with its numbers masked."""
     return re.sub(r"\d[\d.]*", "#", reason)
 
 

@@ -13,8 +13,8 @@ from plotly.offline import get_plotlyjs
 from graphloc import __version__
 from graphloc.config import effective
 from graphloc.errors import OutputError
-from graphloc.eval import pieces, plots
-from graphloc.eval.pieces import drawing, note
+from graphloc.eval import plots
+from graphloc.eval.html import drawing, note, page
 from graphloc.eval.report import _health as health
 from graphloc.eval.report import _sections as sections
 from graphloc.eval.report._data import ReportData, figures
@@ -60,7 +60,7 @@ def write_report(path: Path, data: ReportData) -> None:
     """Write the page.
 
     Raises:
-        OutputError: the disk refuses.
+        OutputError: the file cannot be written.
     """
     parts = _parts(data, figures(data))
     links = " ".join(f'<a href="#{at}">{escape(title)}</a>' for at, title, _ in parts)
@@ -69,10 +69,10 @@ def write_report(path: Path, data: ReportData) -> None:
     body = (
         f"<h1>{escape(data.title)}</h1>{sections.first_screen(data, verdict(data))}<nav>{links}</nav>",
         sections.warnings_list(data),
-        *(f'<h2 id="{at}">{escape(title)}</h2>{html}' for at, title, html in parts),
+        *(f'<h2 id="{at}">{escape(title)}</h2>{content}' for at, title, content in parts),
         f"<details><summary>Effective configuration</summary><pre>{config}</pre></details>{note(made)}",
     )
-    whole = pieces.page(data.title, "\n".join(body), get_plotlyjs() + _SCRIPT)
+    whole = page(data.title, "\n".join(body), get_plotlyjs() + _SCRIPT)
     try:
         path.write_text(whole, encoding="utf-8")
     except OSError as error:
@@ -80,7 +80,7 @@ def write_report(path: Path, data: ReportData) -> None:
 
 
 def _parts(data: ReportData, drawn: Mapping[str, plots.Figure]) -> list[tuple[str, str, str]]:
-    """Anchor, title and HTML of each part that this run has something for."""
+    """Return anchor, title and HTML of each section that is not empty."""
 
     def show(name: str, said: str = "") -> str:
         return said + drawing(drawn[name]) if name in drawn else ""

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of the report that are words, tables and pictures; figures come of `graphloc.eval.plots`."""
+"""Sections of the report that are text, tables and pictures; figures come from `graphloc.eval.plots`."""
 
 from __future__ import annotations
 
 import base64
 from html import escape
 
+from graphloc.eval.formatting import number, percent, significant
+from graphloc.eval.html import note, table
 from graphloc.eval.metrics import Table
-from graphloc.eval.pieces import note, table
 from graphloc.eval.plots import HEALTH, OUTAGE
 from graphloc.eval.report._data import ReportData
-from graphloc.eval.report._judged import Trust, main_table, times
+from graphloc.eval.report._track_verdict import Trust, main_table, times
 from graphloc.eval.report._verdict import Verdict
-from graphloc.eval.words import number, percent, significant
 from graphloc.solution import Solution
 
 _REASONS = 60
@@ -33,7 +33,7 @@ _WIDE = ("95 %, m", "worst, m", "covered")  # a phone does without
 
 
 def first_screen(data: ReportData, verdict: Verdict) -> str:
-    """How good, compared with the filters, whether to trust it, and what was truth; each track by itself."""
+    """Return the verdict on each track, the key numbers, what they were measured against, and the reasons."""
     several = len(verdict.tracks) > 1
     boxes, lists = [], []
     for track in verdict.tracks:
@@ -54,7 +54,7 @@ def first_screen(data: ReportData, verdict: Verdict) -> str:
 
 
 def _key_numbers(data: ReportData) -> str:
-    """Ours against each filter: an estimate a row, so that it fits a phone."""
+    """Return the main table, one row per estimate, so that it fits a phone."""
     found = main_table(data)
     if found is None:
         return ""
@@ -82,27 +82,27 @@ def _key_numbers(data: ReportData) -> str:
 
 
 def warnings_list(data: ReportData) -> str:
-    """Return what was said on the way."""
+    """Return the list of warnings; empty if there are none."""
     items = "".join(f'<li class="warning">{escape(line)}</li>' for line in data.warnings)
     return f'<h2 id="warnings">Warnings</h2><ul class="warnings">{items}</ul>' if items else ""
 
 
 def numbers(given: Table) -> str:
-    """Return a whole table, estimates as columns, numbers as rows: it fits a phone."""
+    """Return a whole table with a column per estimate, so that it fits a phone."""
     head = ["", *(name for name, _ in given.rows)]
     rows = [[column, *(number(values[k]) for _, values in given.rows)] for k, column in enumerate(given.columns)]
     return f"<h3>{escape(given.title)}</h3>{table(head, rows)}{note(given.note)}"
 
 
 def shades() -> str:
-    """Return what the shades of a time axis mean."""
+    """Return the legend of the shaded periods on a time axis."""
     said = {"no GNSS fix": OUTAGE, **{health.value.replace("_", " "): colour for health, colour in HEALTH.items()}}
     keys = "".join(f'<i style="background:{colour}55"></i>{name}' for name, colour in said.items())
     return f'<p class="note shades">Shades:{keys}. Blue: the bound that the estimate states.</p>'
 
 
 def ledger(solution: Solution) -> str:
-    """Return what became of every message, and why."""
+    """Return how many messages of each sensor had each outcome, and the most frequent reasons."""
     counts = solution.ledger.counts()
     outcomes = sorted({o for c in counts.values() for o in c})
     head = ["", *(o.replace("_", " ") for o in outcomes)]
@@ -115,7 +115,7 @@ def ledger(solution: Solution) -> str:
 
 
 def matches(data: ReportData) -> str:
-    """Return pictures of matches."""
+    """Return the pictures of matches."""
     if not data.pictures:
         return ""
     said = (
@@ -131,7 +131,7 @@ def matches(data: ReportData) -> str:
 
 
 def calibration(data: ReportData) -> str:
-    """Return what the run says of levers, mounts, stamps and IMU noise."""
+    """Return the table of calibration checks and suggestions; empty if there are none."""
     found = data.calibration
     if found is None or not found.checks + found.suggestions:
         return ""
@@ -151,7 +151,7 @@ def calibration(data: ReportData) -> str:
 
 
 def solver(solution: Solution) -> str:
-    """Return how the solver fared."""
+    """Return the solver's statistics and events."""
     s = solution.stats
     events = "<ul>" + "".join(f"<li>{escape(event)}</li>" for event in s.events) + "</ul>" if s.events else ""
     if s.online:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of the theses (BL 4.1 to 4.8, D 4.13) in their form, with this run beside what they printed."""
+"""Tables of the theses (BL 4.1 to 4.8, D 4.13) in their own form, with this run beside the published numbers."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 from graphloc.build import mount_of
 from graphloc.eval.docking import accurate_within_m
+from graphloc.eval.formatting import number
+from graphloc.eval.html import note, table
 from graphloc.eval.metrics import NoCommonTimeError, compare_to_truth, held_out_errors
-from graphloc.eval.pieces import note, table
 from graphloc.eval.report._data import ReportData
-from graphloc.eval.report._printed import BL_RUNS, DIGERUD_RUNS
-from graphloc.eval.words import number
+from graphloc.eval.report._published import BL_RUNS, DIGERUD_RUNS
 from graphloc.measurements import GnssPosition, PoseFix, TagSighting
 from graphloc.trajectory import Trajectory
 
@@ -69,7 +69,7 @@ def _classes(printed: int, mine: int) -> list[str]:
 
 
 def _gnss_error_m(data: ReportData, truth: Trajectory) -> list[tuple[str, float, float]]:
-    """RMSE and largest horizontal error of each receiver, at its antenna."""
+    """Return RMSE and largest horizontal error (m) of each receiver, at its antenna."""
     found = []
     for name in data.config.of_kind("gnss"):
         fixes = [m for m in data.recording.measurements if isinstance(m, GnssPosition) and m.sensor == name]
@@ -108,7 +108,7 @@ def _digerud(data: ReportData) -> Iterator[str]:
 
 
 def _farthest(seen: list[TagSighting], truth: Trajectory) -> str:
-    """True distance from the camera to the tags, docks at rest, of the farthest sighting."""
+    """Return the true distance from the camera to the tags, docks at rest, of the farthest sighting."""
     stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
     covered = np.flatnonzero(truth.covers(stamps))
     if not len(covered):

@@ -1,35 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good a run is, compared with the filters, and whether it can be trusted."""
+"""Verdict of a report: how accurate a run is, compared with the filters, and whether it can be trusted."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from graphloc.eval.report._data import ReportData
-from graphloc.eval.report._judged import Judged, Reason, Trust, judged, worst
+from graphloc.eval.report._track_verdict import Reason, TrackVerdict, Trust, track_verdict, worst
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """What a report says first.
+    """Verdict on a run.
 
     Attributes:
-        tracks: the run's own, and where it has one beside it, that of the online mode.
+        tracks: the run's own, then that of the online mode if it was compared.
     """
 
-    tracks: tuple[Judged, ...]
+    tracks: tuple[TrackVerdict, ...]
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Those of all tracks."""
+        """Reasons of all tracks."""
         return tuple(reason for track in self.tracks for reason in track.reasons)
 
     @property
     def trust(self) -> Trust:
-        """That of the worst track."""
+        """The lowest level of trust among the tracks."""
         return worst(track.trust for track in self.tracks)
 
 
 def verdict(data: ReportData) -> Verdict:
-    """Say how good a run is, compared with the filters, and whether it can be trusted, offline and online."""
-    return Verdict(tracks=tuple(judged(data, solution) for solution in data.solutions))
+    """Return the verdict on each track of a run."""
+    return Verdict(tracks=tuple(track_verdict(data, solution) for solution in data.solutions))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulator of a harbour, a vessel in it, its sensors and its recordings, so that truth exists."""
+"""Simulator of a harbour, a vessel in it, its sensors and recordings, with known truth."""
 
 from graphloc.eval.simulate._run import SimulatedRun, simulate
 from graphloc.eval.simulate._scenario import Scenario, bl_scenario, find_scenario, harbour_scenarios

@@ -17,15 +17,15 @@ _Block = TypeVar("_Block", bound=Block)
 
 
 def shipped_names(folder: Traversable) -> tuple[str, ...]:
-    """Names of the YAML files of a folder."""
+    """Return the names of the YAML files in a folder."""
     return tuple(sorted(e.name.removesuffix(".yaml") for e in folder.iterdir() if e.name.endswith(".yaml")))
 
 
 def load_block(what: str, name_or_path: str, folder: Traversable, model: type[_Block]) -> tuple[_Block, str]:
-    """Read and validate a file: one of a folder, by name, or a path; return it, and its name for messages.
+    """Read and validate a file, by name in a folder or by path; return it, and its name for messages.
 
     Raises:
-        ConfigError: one line that names the file, the block and what is wrong with it.
+        ConfigError: one line that names the file, the block and the error.
     """
     shipped = shipped_names(folder)
     where, path = f"{name_or_path}.yaml", folder / f"{name_or_path}.yaml"
@@ -43,7 +43,7 @@ def validated(raw: Mapping[str, object], where: str, model: type[_Block]) -> _Bl
     """Validate a mapping.
 
     Raises:
-        ConfigError: one line that names `where`, the block and what is wrong with it.
+        ConfigError: one line that names `where`, the block and the error.
     """
     try:
         return model.model_validate(dict(raw))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What lens and sensor do to the light: blur, glare, drops, motion, exposure, noise, eight bits."""
+"""Effects of lens and sensor: blur, glare, drops, motion, exposure, noise, quantisation to eight bits."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def exposure(picture: Picture, camera: CameraConfig) -> tuple[float, float]:
 def through_lens(
     picture: Picture, camera: CameraConfig, stray_times: float, drops: tuple[Drop, ...], t_s: float, motion_px: Array
 ) -> Picture:
-    """Return the light on the sensor: stray light, drops, blur, and motion (2,) px during the exposure."""
+    """Return the light on the sensor: with stray light, drops, blur, and motion (2,) px during the exposure."""
     rows, columns = picture.shape
     kept = 1.0 - stray_times * sum(share for _, share in _HALOES)
     stray: Picture = np.zeros((rows // 4, columns // 4), dtype=np.float32)
@@ -86,7 +86,7 @@ def through_lens(
 
 
 def _streak(motion_px: Array) -> Array:
-    """The kernel of a straight motion, sum 1."""
+    """Return the kernel of a straight motion, with sum 1."""
     reach = int(np.ceil(np.abs(motion_px).max() / 2.0)) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     for x, y in np.linspace(-0.5, 0.5, 64)[:, None] * motion_px + reach:
@@ -96,7 +96,7 @@ def _streak(motion_px: Array) -> Array:
 
 
 def _wet(picture: Picture, drop: Drop, t_s: float) -> None:
-    """A drop shows its surroundings upside down and out of focus."""
+    """Add drops, in which the surroundings appear upside down and out of focus."""
     x, y = drop.at[0], drop.at[1] + drop.slides * (t_s - drop.from_s)
     low = np.maximum(np.floor([x - drop.radius, y - drop.radius]).astype(int), 0)
     high = np.minimum(np.ceil([x + drop.radius, y + drop.radius]).astype(int), picture.shape[::-1])

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The light that reaches a camera: sky, water, walls and boats at a third of its resolution, tags at its full one.
+"""Light that reaches a camera: sky, water, walls and boats at a third of its resolution, tags at full resolution.
 
-Radiance is linear and in units of `weather`. What is far from a tag only has to look as cluttered as a
-harbour; a tag's edges have to be where they are, to a hundredth of a pixel, so its pixels are the mean of
-many rays.
+Radiance is linear, in units of `weather`. Away from tags it only has to look as cluttered as a harbour; edges of tags have to be
+right to a hundredth of a pixel, so their pixels are the mean of many rays.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ def rays(camera: CameraConfig, u_px: Array, v_px: Array) -> Rays:
 
 
 def project(camera: CameraConfig, points_m: Array) -> Array:
-    """Return image points (N, 2), px, of points (N, 3) in camera that lie before it."""
+    """Return image points (N, 2), px, of points (N, 3) in camera that are in front of it."""
     turn_none = np.zeros(3)
     if camera.model == "equidistant":
         flat, _ = cv2.fisheye.projectPoints(
@@ -78,7 +77,7 @@ def cells(number: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=1)
 def _grain() -> Picture:
-    """A tile (512, 512) of grain of several sizes, mean 0, that can be laid side by side."""
+    """Return a tile (512, 512) of grain of several sizes, mean 0, that can be repeated seamlessly."""
     rng = np.random.default_rng(3)
     spectrum = np.fft.fft2(rng.normal(size=(_GRAIN, _GRAIN)))
     f = np.hypot(*np.meshgrid(np.fft.fftfreq(_GRAIN), np.fft.fftfreq(_GRAIN)))
@@ -93,7 +92,7 @@ def _grain_at(x_m: Rays, y_m: Rays, cell_m: float) -> Rays:
 
 
 class View(NamedTuple):
-    """A moment: the camera's pose in world, the time in s, and the direction (3,) to the sun, or None."""
+    """A view: the camera's pose in world, the time in s, and the direction (3,) to the sun, or None."""
 
     pose: Pose
     t_s: float
@@ -101,7 +100,7 @@ class View(NamedTuple):
 
 
 def tag_in_world(tag: Tag, harbour: Harbour, scene: Scene, t_s: float) -> Pose:
-    """Return where a tag truly is."""
+    """Return the true pose of a tag."""
     p, R = tag_pose(tag, harbour)
     for dock in scene.docks:
         if dock.dock.name == tag.dock:
@@ -146,7 +145,7 @@ class Light:
         return picture
 
     def sees(self, p_m: Array) -> bool:
-        """Whether a point (3,) in camera lies in its view: a lens's formulae mean nothing outside of it."""
+        """Return whether a point (3,) in camera is in its view: the lens model is invalid outside."""
         if p_m[2] < _NEAREST_M:
             return False
         flat = p_m[:2] / p_m[2]
@@ -223,7 +222,7 @@ class Light:
         return _WALL if sun is None else 0.5 * _WALL  # a wall before the sun lies in its own shade
 
     def _lamps(self, at: Rays) -> Rays | float:
-        """Light of the harbour's lamps on a place: one every 30 m, 6 m high."""
+        """Return the light of the harbour's lamps at a point: one every 30 m, 6 m high."""
         if not self._weather.lamps:
             return 0.0
         off2 = (np.mod(at[:, 0], 30.0) - 15.0) ** 2 + (np.mod(at[:, 1], 30.0) - 15.0) ** 2 + (at[:, 2] - 6.0) ** 2
@@ -271,7 +270,7 @@ class Light:
         patch[:] = patch * (1.0 - free * mean(covered.astype(float))) + free * mean(np.where(covered, shown, 0.0))
 
     def _free(self, view: View, low: NDArray[np.int64], rows: int, width: int, T_camera_tag: Pose) -> Array:
-        """1 where nothing stands between the camera and a tag's plane, (rows, width)."""
+        """Return 1 where the line of sight from the camera to a tag's plane is free, else 0, (rows, width)."""
         (p, R), (at, turned) = view.pose, T_camera_tag
         v, u = np.meshgrid(low[1] + np.arange(rows), low[0] + np.arange(width), indexing="ij")
         ahead = rays(self._camera, u.ravel().astype(float), v.ravel().astype(float))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What IMU, receiver, compass and a made-up matcher measure of a motion."""
+"""Measurements of a motion by IMU, receiver, compass, speed log and an ideal matcher."""
 
 from __future__ import annotations
 
@@ -71,13 +71,13 @@ def gnss_fixes(s: Scenario, motion: Motion, datum: Datum, lever: Array, rng: np.
     fixes = p + R @ lever + gnss_error_m(rng, t, s.noise, s.case, s.gnss_sigma_m)
     geodetic = datum.geodetic_from_enu(fixes)
     claimed = s.gnss_reported_sigma_m or s.gnss_sigma_m
-    told = np.full(len(t), claimed)
+    sigmas = np.full(len(t), claimed)
     if s.gnss_reported_spread > 0.0:
-        told = reported_sigma_m(rng, t, claimed, s.gnss_reported_spread)
+        sigmas = reported_sigma_m(rng, t, claimed, s.gnss_reported_spread)
     shape = np.diag([1.0, 1.0, 4.0])
     return [
         GnssPosition(stamp_ns=int(n), sensor="gnss", seq=0, position=Geodetic(*g), cov_enu_m2=sigma**2 * shape)
-        for n, g, sigma, silent in zip(stamps(t), geodetic, told, _silent(s, t), strict=True)
+        for n, g, sigma, silent in zip(stamps(t), geodetic, sigmas, _silent(s, t), strict=True)
         if not silent
     ]
 
@@ -97,7 +97,7 @@ def compass_headings(s: Scenario, motion: Motion, rng: np.random.Generator) -> l
 
 
 def log_speeds(s: Scenario, motion: Motion, rng: np.random.Generator) -> list[Measurement]:
-    """Speed ahead, of the body's origin, over ground or through the water."""
+    """Return the forward speed of body's origin, over ground or through the water."""
     if s.log_hz == 0.0:
         return []
     t = times(s.duration_s - 0.05, s.log_hz) + 0.029
@@ -113,7 +113,7 @@ def log_speeds(s: Scenario, motion: Motion, rng: np.random.Generator) -> list[Me
 
 
 def made_up_matches(s: Scenario, motion: Motion, rng: np.random.Generator) -> list[Measurement]:
-    """Matches of the body pose; the false ones lie in BL's window, 1.5 to 5 m and up to 5 deg away."""
+    """Return matches of the body pose; false ones are in BL's window, 1.5 to 5 m and up to 5 deg away."""
     if s.pose_hz == 0.0:
         return []
     t = times(s.duration_s - 0.5, s.pose_hz) + 0.437

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run that comes of a scenario with a seed: truth, measurements, and an honest vessel.yaml."""
+"""Simulated run of a scenario and a seed: truth, measurements, and a correct vessel.yaml."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _DATUM = Geodetic(57.7, 11.7, 36.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SimulatedRun:
-    """A run: what the sensors said, the truth, and the vessel.yaml an honest engineer would write."""
+    """A run: measurements, truth, and the vessel.yaml that a careful engineer would write."""
 
     scenario: Scenario
     seed: int
@@ -142,14 +142,14 @@ def _config(s: Scenario, rig: RigConfig, motion: Motion, datum: Datum) -> Vessel
 
 
 def _tags(rig: RigConfig, s: Scenario) -> AprilTagConfig:
-    """What looks for tags in the rig's cameras."""
+    """Return the configuration of the tag sensor for the rig's cameras."""
     topic = "/{}/image_raw" if s.camera_raw else "/{}/image_raw/compressed"
     cameras = {name: CameraConfig(topic=topic.format(name), mount=camera.mount) for name, camera in rig.cameras.items()}
     return AprilTagConfig(survey="tags.yaml", cameras=cameras)
 
 
 def _matcher(rig: RigConfig) -> AerialConfig:
-    """What matches the rig's scans to the image; the hull with a hand's breadth around it."""
+    """Return the configuration of the aerial sensor for the rig's LiDARs, with a small margin around the hull."""
     hull = shapely.Polygon(rig.hull.outline).buffer(0.3, join_style="mitre")
     return AerialConfig(
         image="aerial.tif",

@@ -135,7 +135,7 @@ def find_scenario(name: str, changes: Mapping[str, str]) -> Scenario:
     """Return a scenario by name, with some of its fields changed.
 
     Raises:
-        ConfigError: there is none of that name, no such field, or a value that it cannot have.
+        ConfigError: an unknown name or field, or an invalid value.
     """
     known = harbour_scenarios()
     if name not in known:
@@ -166,10 +166,10 @@ def _near(name: str, known: Iterable[str]) -> str:
 
 
 def _refuse_nonsense(s: Scenario) -> None:
-    """Refuse numbers that no harbour has.
+    """Refuse values that no harbour has.
 
     Raises:
-        ConfigError: the first of them.
+        ConfigError: at the first of them.
     """
     numbers = {
         key: value for key in _FIELDS if isinstance(value := getattr(s, key), float) and key != "compass_until_s"
@@ -194,10 +194,10 @@ def _refuse_nonsense(s: Scenario) -> None:
 
 
 def _in_harbour(base: Scenario, **changes: object) -> Scenario:
-    """A scenario with LiDARs, on the tide, its fixes as a receiver reports them.
+    """Return a scenario with LiDARs and tide, and fixes as a receiver reports them.
 
-    Where GNSS errs, the receiver scatters by 5 cm from fix to fix and claims BL's 0.3 m. So the largest error of a
-    drifting signal is that of BL table 4.1, whose truth was the receiver itself.
+    Where GNSS errs, the receiver scatters by 5 cm from fix to fix and claims BL's 0.3 m. So the largest error of a drifting signal is
+    that of BL table 4.1, whose truth was the receiver itself.
     """
     placed = replace(base, lidar_hz=1.0, tide_m=0.2, gnss_reported_spread=0.3, **changes)  # type: ignore[arg-type]
     if placed.noise == "clean":

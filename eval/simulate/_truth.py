@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The true motion: a planar path from speed and yaw-rate profiles, with waves and lean on top.
+"""True motion: a planar path by profiles of speed and yaw rate, with waves and heel added.
 
-Velocity is a spline, position its integral and acceleration its derivative; attitude is analytic. So
-truth and inertial data agree to the accuracy of the arithmetic.
+Velocity is a spline, position its integral and acceleration its derivative; attitude is analytic. So truth and inertial data
+agree to the accuracy of the arithmetic.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def make_motion(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Way:
-    """A smooth way through waypoints, by its length (m): place (N, 2), heading (rad) and its change (rad/m)."""
+    """A smooth path through waypoints, by its length (m): position (N, 2), heading (rad) and its change (rad/m)."""
 
     length_m: float
     heading: CubicSpline
@@ -133,7 +133,7 @@ class Way:
 
     @staticmethod
     def through(waypoints_m: Array) -> Way:
-        """Return the way through two waypoints (N, 2) or more."""
+        """Return the path through two waypoints (N, 2) or more."""
         chord = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(waypoints_m, axis=0).T))])
         curve = CubicSpline(chord, waypoints_m, bc_type="natural")
         along = np.linspace(0.0, chord[-1], max(20, int(chord[-1] / 0.25)))
@@ -154,9 +154,9 @@ def make_way_motion(
     tide_m: float,
     swing: Waves | None = None,
 ) -> Motion:
-    """Build the motion along a way, from end to end in the given time; `slowing` (N,) is the speed's shape.
+    """Build the motion along a path, from end to end in the given time; `slowing` (N,): shape of the speed.
 
-    The bow swings about the way's direction by `swing`, rad.
+    The bow swings about the direction of the path by `swing`, rad.
     """
     t = np.arange(-1.0, duration_s + 1.0 + _STEP_S, _STEP_S)
     shape = slowing(t)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the vessel goes: in open water, or along a harbour's route without running into anything."""
+"""Motion of the vessel: in open water, or along a harbour's route without collisions."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ def _waves(s: Scenario, rng: np.random.Generator) -> tuple[Waves, tuple[Waves, W
 
 
 def harbour_motion(s: Scenario, harbour: Harbour, rig: RigConfig, rng: np.random.Generator) -> Motion:
-    """Along the route from end to end, slower towards its end; or swaying about its only waypoint.
+    """Return the motion along the route from end to end, slower towards its end; or swaying about its only waypoint.
 
     Raises:
-        ConfigError: the route runs into something.
+        ConfigError: the route collides with something.
     """
     points = harbour.waypoints(s.route)
     sway, waves = _waves(s, rng)
@@ -113,12 +113,12 @@ def _refuse_collision(s: Scenario, harbour: Harbour, rig: RigConfig, motion: Mot
 
 
 def _docking(share: Array) -> Array:
-    """Speed's shape of a vessel that slows steadily and lies still for the last sixth of its time."""
+    """Return the shape of the speed of a vessel that decelerates steadily and lies still for the last sixth of its time."""
     left = 1.0 - share / 0.83
     return 0.5 * (left + np.sqrt(left**2 + 0.001))
 
 
 def _touring(share: Array) -> Array:
-    """Speed's shape of a tour: a halt of a twentieth of its time amid it, and docking at its end."""
+    """Return the shape of the speed of a tour: a stop of a twentieth of its time on the way, and docking at its end."""
     halt = _ramp(share, 0.62, 0.004) - _ramp(share, 0.67, 0.004)
     return (1.0 - halt) * _docking(np.clip((share - 0.85) / 0.15, 0.0, None))

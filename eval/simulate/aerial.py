@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An aerial image of a harbour, as cluttered as a real one, written as GeoTIFF in UTM.
+"""Aerial image of a harbour, as cluttered as a real one, written as GeoTIFF in UTM.
 
-Grid north of UTM differs from true north by the meridian convergence, so what reads the image has to
-handle it. The image is taken on another day than the run: other boats, its own season and sun; and it is
-misregistered: what it shows lies `shift_m` off.
+Grid north of UTM differs from true north by the meridian convergence, so a reader has to handle that. The image is of another day
+than the run: other boats, season and sun; and it is misregistered by `shift_m`.
 """
 
 from __future__ import annotations
@@ -59,12 +58,12 @@ _SEASONS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AerialImage:
-    """An image and where it lies.
+    """An image with its georeference.
 
     Attributes:
         pixels: (rows, columns, 3) uint8, red, green, blue. epsg: of its grid.
         left_m, top_m: grid coordinates of the outer corner of the top-left pixel. pixel_m: size of a pixel.
-        shift_m: (2,) east, north: the image shows things this far from where they are.
+        shift_m: (2,) east, north: misregistration, from the true position to that in the image.
     """
 
     pixels: Image
@@ -75,10 +74,10 @@ class AerialImage:
     shift_m: Array
 
     def write(self, path: Path) -> None:
-        """Write a GeoTIFF; the shift stays unsaid, as in life.
+        """Write a GeoTIFF; it does not contain the shift, as in reality.
 
         Raises:
-            OutputError: the disk refuses.
+            OutputError: the file cannot be written.
         """
         rows, columns, _ = self.pixels.shape
         profile = {
@@ -239,7 +238,7 @@ def _draw(pen: _Pen, harbour: Harbour, season: _Season, rng: np.random.Generator
 
 
 def _joints_and_cars(pen: _Pen, polygon: shapely.Polygon, surface: str, rng: np.random.Generator) -> None:
-    """Joints of slabs, planks, cars: the clutter that an edge detector meets."""
+    """Draw joints of slabs, planks, cars: clutter for edge detectors."""
     low, high = np.array(polygon.bounds[:2]), np.array(polygon.bounds[2:])
     size, inner = high - low, polygon.buffer(-2.6)
     if surface == "wood":

@@ -71,13 +71,12 @@ def write_bag(
 ) -> tuple[Path, Path]:
     """Write `run` into `folder`; return the paths of the bag and of its vessel.yaml.
 
-    Header stamps are the sensors'; log stamps come later by each sensor's latency. A pose message holds
-    one mode: the first. A run in a harbour gets its aerial image and the survey of its tags, and scans and images
-    where the scenario has them; they are made while the bag is written, a few at a time, so memory does not grow
-    with the run.
+    Header stamps are the sensors'; log stamps are later by each sensor's latency. A pose message holds one mode, the first. A run
+    in a harbour gets its aerial image and the survey of its tags, and scans and images if the scenario has them. These are rendered
+    while the bag is written, a few at a time, so memory does not grow with the run.
 
     Raises:
-        OutputError: the folder exists, or the disk refuses.
+        OutputError: the folder exists, or cannot be written.
     """
     with fresh_folder(folder, overwrite=overwrite, mark=TRUTH) as fresh:
         bag = _write(run, fresh, ros, storage, progress)
@@ -113,7 +112,7 @@ def _write(run: SimulatedRun, folder: Path, ros: int, storage: str, progress: Pr
 
 
 def _connect(writer: Writer1 | Writer2, item: _Item, make: Messages) -> Any:
-    """Announce a topic. Mounts are latched, as drivers publish them: a listener that comes late gets them."""
+    """Announce a topic. Mounts are latched, as drivers publish them, so that late subscribers get them."""
     latched = item.topic == "/tf_static"
     if isinstance(writer, Writer1):
         return writer.add_connection(item.topic, item.kind, typestore=make.store, latching=1 if latched else None)
@@ -127,7 +126,7 @@ def _start_ns(run: SimulatedRun) -> int:
 
 
 def _beside(run: SimulatedRun, folder: Path) -> None:
-    """The aerial image, the survey of the tags, and what only a simulator knows."""
+    """Write the aerial image, the survey of the tags, and truth that only a simulator has."""
     secret: dict[str, Any] = {
         "seed": run.seed,
         "scenario": {k: v for k, v in dataclasses.asdict(run.scenario).items() if v != float("inf")},
@@ -149,7 +148,7 @@ def _beside(run: SimulatedRun, folder: Path) -> None:
 
 
 def _seen(run: SimulatedRun, make: Messages) -> list[Iterator[_Item]]:
-    """Scans and images, if the run has any."""
+    """Yield scans and images, if the run has any."""
     lidars, cameras = _lidars(run), _cameras(run)
     if not (lidars or cameras):
         return []
@@ -159,17 +158,17 @@ def _seen(run: SimulatedRun, make: Messages) -> list[Iterator[_Item]]:
 
 
 def _lidars(run: SimulatedRun) -> dict[str, LidarConfig]:
-    """The LiDARs whose scans are in the bag."""
+    """Return the LiDARs whose scans are in the bag."""
     return run.rig.lidars if run.harbour is not None and run.scenario.lidar_hz > 0.0 else {}
 
 
 def _cameras(run: SimulatedRun) -> dict[str, CameraConfig]:
-    """The cameras whose images are in the bag."""
+    """Return the cameras whose images are in the bag."""
     return run.rig.cameras if run.harbour is not None and run.scenario.camera_hz > 0.0 else {}
 
 
 def _clouds(run: SimulatedRun, make: Messages, scene: Scene) -> Iterator[_Item]:
-    """LiDAR scans in turn; all LiDARs turn together."""
+    """Yield LiDAR scans in order; all LiDARs turn together."""
     rng = np.random.default_rng([run.seed, 14])
     for k in range(int((run.scenario.duration_s - 0.2) * run.scenario.lidar_hz)):
         t = k / run.scenario.lidar_hz
@@ -182,7 +181,7 @@ def _clouds(run: SimulatedRun, make: Messages, scene: Scene) -> Iterator[_Item]:
 
 
 def _images(run: SimulatedRun, make: Messages, scene: Scene, name: str) -> Iterator[_Item]:
-    """A camera's images in turn, each with its `CameraInfo`; some are made ahead, one on each core."""
+    """Yield a camera's images in order, each with its `CameraInfo`; some are rendered ahead, one per core."""
     s, config, frame = run.scenario, run.rig.cameras[name], f"{name}_optical_frame"
     camera = Camera(name, scene, run)
 
@@ -210,7 +209,7 @@ def _images(run: SimulatedRun, make: Messages, scene: Scene, name: str) -> Itera
 
 
 def _small(run: SimulatedRun, make: Messages) -> list[_Item]:
-    """All other messages, by the time of their recording."""
+    """Yield all other messages, by recording time."""
     items: list[_Item] = [_Item(_start_ns(run), "/tf_static", TF, make.mounts(_start_ns(run), _mounts(run)))]
 
     def add(stamp: int, topic: str, kind: str, message: Any) -> None:
@@ -242,7 +241,7 @@ def _small(run: SimulatedRun, make: Messages) -> list[_Item]:
 
 
 def _mounts(run: SimulatedRun) -> dict[str, Any]:
-    """Where each sensor whose messages are in the bag sits in body, by frame."""
+    """Return the mount in body of each sensor whose messages are in the bag, by frame."""
     found = {"imu_link": run.rig.imu, "gnss": run.rig.gnss}
     found |= {name: lidar.mount for name, lidar in _lidars(run).items()}
     found |= {f"{name}_optical_frame": camera.mount for name, camera in _cameras(run).items()}

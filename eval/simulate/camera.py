@@ -20,7 +20,7 @@ _SUN_OFF_DEG = 10.0  # how far the low sun stands beside the tags, 1 sigma
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """An image, and what only a simulator knows of it.
+    """An image, with truth that only a simulator has.
 
     Attributes:
         pixels: (rows, columns). exposure_ms, gain: of it. blur_px: motion during the exposure.
@@ -33,7 +33,7 @@ class Shot:
 
 
 class Camera:
-    """Takes images along a run. An image depends on its time and number only, not on those before it."""
+    """Takes images along a run. An image depends only on its time and number, not on earlier ones."""
 
     def __init__(self, name: str, scene: Scene, run: SimulatedRun) -> None:
         assert run.harbour is not None  # or there were no scene
@@ -70,7 +70,7 @@ class Camera:
         return found
 
     def radiance(self, t_s: float) -> Picture:
-        """Return the light (rows, columns) that reaches the lens, in units of `weather`."""
+        """Return the radiance (rows, columns) at the lens, in units of `weather`."""
         return self._light.radiance(View(self.pose(t_s), t_s, self._sun))
 
     def take(self, t_s: float, number: int) -> Shot:
@@ -85,7 +85,7 @@ class Camera:
         return Shot(pixels, ms, gain, float(np.hypot(*moved)))
 
     def _moved_px(self, t_s: float, exposed_s: float) -> Array:
-        """How far the nearest tag in view, or what is 20 m ahead, moves in the image (2,) during an exposure, px."""
+        """Return the motion (2,), px, of the nearest tag in view, or of a point 20 m ahead, during an exposure."""
         seen = [p for p, _ in self.tag_poses(t_s).values() if self._light.sees(p)]
         target = min(seen, key=lambda p: float(p @ p)) if seen else np.array([0.0, 0.0, 20.0])
         p, R = self.pose(t_s)

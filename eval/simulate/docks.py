@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Floating docks as they move, and the tags that stand on quays and ride on docks."""
+"""Motion of floating docks, and the tags on quays and docks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class MovingDock:
 
 
 def moving_docks(harbour: Harbour, tide_m: float, rng: np.random.Generator) -> tuple[MovingDock, ...]:
-    """Draw how the docks of a harbour move; within four hours each wanders as far as its block says, and no farther."""
+    """Draw the motion of a harbour's docks; within four hours each wanders as far as its block states, and no farther."""
     t = np.arange(0.0, 4.0 * 3600.0, 0.5)
 
     def wander(size: float, period_s: float) -> Waves:
@@ -74,7 +74,7 @@ def tag_pose(tag: Tag, harbour: Harbour) -> tuple[Array, Array]:
 
 
 def survey(harbour: Harbour, rng: np.random.Generator) -> dict[str, object]:
-    """Return what a surveyor would write down: `tags.yaml`. Each tag is off by his errors."""
+    """Return the survey, `tags.yaml`, with the errors of a surveyor."""
     tags = []
     for tag in harbour.config.tags:
         p, R = tag_pose(tag, harbour)

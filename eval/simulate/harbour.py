@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A harbour from a text file: what stands where, how high, and what moves with the tide.
+"""A harbour from a text file: its objects, their heights, and those that move with the tide.
 
-Metres east and north of the harbour's datum, heights over mean water. Outlines are polygons; `repeat`
-sets copies of a thing beside each other. Shipped: `harbours/*.yaml`; docs/simulator.md explains the file.
+Metres east and north of the harbour's datum, heights over mean water. Outlines are polygons; `repeat` places copies of an object.
+Shipped: `harbours/*.yaml`; docs/simulator.md explains the file.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ class Boat:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Harbour:
-    """A harbour that was checked, its copies spelt out.
+    """A validated harbour, with all copies.
 
     Attributes:
         config: the file. datum: its datum. quays, buildings, pontoons, docks: (polygon, block) each. poles: (at, block).
@@ -200,7 +200,7 @@ class Harbour:
         """Return the waypoints (N, 2) of a route.
 
         Raises:
-            ConfigError: there is none of that name.
+            ConfigError: an unknown name.
         """
         routes = self.config.routes
         if route not in routes:
@@ -219,10 +219,10 @@ class Harbour:
         return points
 
     def refuse_collision(self, hulls: Sequence[shapely.Polygon], clear_m: float, route: str) -> None:
-        """Refuse a run whose hulls, as they follow each other, come nearer than `clear_m` to something solid.
+        """Refuse a run whose successive hulls come nearer than `clear_m` to a solid object.
 
         Raises:
-            ConfigError: one does; the line says to what, and where.
+            ConfigError: one does; the line names the object and the position.
         """
         solids = [("quay", polygon) for polygon, _ in self.quays]
         solids += [("building", polygon) for polygon, _ in self.buildings]
@@ -266,7 +266,7 @@ def make_harbour(raw: Mapping[str, object], where: str) -> Harbour:
     """Validate a harbour.
 
     Raises:
-        ConfigError: one line that names the file, the block and what is wrong with it.
+        ConfigError: one line that names the file, the block and the error.
     """
     return _built(validated(raw, where, HarbourConfig), where)
 
@@ -312,9 +312,9 @@ def shipped() -> tuple[str, ...]:
 
 
 def load_harbour(name_or_path: str) -> Harbour:
-    """Read a harbour: one that is shipped, by name, or a file.
+    """Read a harbour, shipped by name or from a file.
 
     Raises:
-        ConfigError: there is none, or it cannot be used.
+        ConfigError: there is none, or it is invalid.
     """
     return _built(*load_block("harbour", name_or_path, _SHIPPED, HarbourConfig))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """LiDARs in a harbour, ray-cast with Open3D.
 
-Each column of a scan is taken at its own time, from where the vessel then is. Range noise, drop-outs, the
-vessel's own hull, and water, of which little comes back.
+Each column of a scan is taken at its own time and vessel pose. Modelled are range noise, drop-outs, the vessel's own hull, and
+water, which returns little.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Scan:
 
     Attributes:
         lidar: its name. t_s: time of the first column. points_m: (N, 3) in the sensor's axes, each at its own
-            time. dt_s: (N,) of it since `t_s`. ring: (N,) beam. intensity: (N,), 0 to 255.
+            time. dt_s: (N,) of that, since `t_s`. ring: (N,) beam. intensity: (N,), 0 to 255.
     """
 
     lidar: str
@@ -66,7 +66,7 @@ def scan(name: str, lidar: LidarConfig, scene: Scene, motion: Motion, t_s: float
 def _rays(
     step_deg: float, lowest_deg: float, highest_deg: float, beams: int
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array]:
-    """Azimuth (C,) rad of each column; column (N,), beam (N,) and direction (N, 3) of each ray. Each turn has the same."""
+    """Return azimuth (C,) rad of each column; column (N,), beam (N,) and direction (N, 3) of each ray, the same for each turn."""
     azimuth = np.radians(np.arange(0.0, 360.0, step_deg))
     elevation = np.radians(np.linspace(lowest_deg, highest_deg, beams))
     column = np.repeat(np.arange(len(azimuth)), beams)
@@ -79,7 +79,7 @@ def _rays(
 
 
 def world_points(scan: Scan, lidar: LidarConfig, motion: Motion) -> Array:
-    """Return the points (N, 3) of a scan in world, each from where the vessel truly was at its time."""
+    """Return the points (N, 3) of a scan in world, each by the true pose of the vessel at its time."""
     p, R, _ = motion.pose(scan.t_s + scan.dt_s)
     T = lidar.T_body_lidar
     return np.asarray(p + np.einsum("nij,nj->ni", R, scan.points_m @ T[:3, :3].T + T[:3, 3]))

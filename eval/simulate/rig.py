@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a vessel carries, from a text file: its hull, where IMU and antenna sit, its LiDARs and cameras.
+"""Equipment of a vessel, from a text file: hull, positions of IMU and antenna, LiDARs and cameras.
 
 Shipped: `rigs/*.yaml`; docs/simulator.md explains the file.
 """
@@ -15,7 +15,7 @@ import shapely
 from pydantic import Field, model_validator
 
 from graphloc.blocks import Block, Finite, MountConfig, NonNegative, Positive
-from graphloc.eval.simulate._files import load_block, shipped_names
+from graphloc.eval.simulate._files import load_block
 from graphloc.eval.simulate.harbour import RESERVED, Outline
 from graphloc.frames import Array
 
@@ -29,7 +29,7 @@ LIDAR_MAKES: dict[str, dict[str, float]] = {  # BL table 3.1
 
 
 class HullConfig(Block):
-    """What of the vessel its own sensors see; metres in body, heights over the waterline."""
+    """Part of the vessel that its own sensors see; metres in body, heights over the waterline."""
 
     outline: Outline
     """Corners of the hull, forward and port, m."""
@@ -153,15 +153,10 @@ class RigConfig(Block):
 
 @lru_cache(maxsize=8)
 def load_rig(name_or_path: str) -> RigConfig:
-    """Read a rig: one that is shipped, by name, or a file.
+    """Read a rig, shipped by name or from a file.
 
     Raises:
-        ConfigError: there is none, or it cannot be used.
+        ConfigError: there is none, or it is invalid.
     """
     rig, _ = load_block("rig", name_or_path, _SHIPPED, RigConfig)
     return rig
-
-
-def shipped_rigs() -> tuple[str, ...]:
-    """Names of the rigs that come with graphloc."""
-    return shipped_names(_SHIPPED)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What rays meet on the day of the run: the harbour at its tide, that day's boats, moving docks, the own hull."""
+"""Scene for ray casting on the day of the run: the harbour at its tide, that day's boats, moving docks, the vessel's hull."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _SEABED_M = -4.0  # walls of quays reach down to here
 
 
 class Hit(NamedTuple):
-    """What rays meet first.
+    """First hits of rays.
 
     Attributes:
-        range_m: (N,) in lengths of the ray; inf: nothing, and then the others mean nothing.
-        surface: (N,) index into `Scene.surfaces`. normal: (N, 3) in world, to either side.
+        range_m: (N,) in lengths of the ray; inf: no hit, and then the others are undefined.
+        surface: (N,) index into `Scene.surfaces`. normal: (N, 3) in world, of either sign.
     """
 
     range_m: Rays
@@ -45,10 +45,10 @@ class _Part:
 
 
 def scene_of(run: SimulatedRun) -> Scene:
-    """Build what a run's LiDARs and cameras meet.
+    """Build the scene for a run's LiDARs and cameras.
 
     Raises:
-        ConfigError: the run lies in no harbour. InputError: Open3D cannot be loaded.
+        ConfigError: the run is not in a harbour. InputError: Open3D cannot be loaded.
     """
     if run.harbour is None:
         raise ConfigError("this scenario lies in no harbour: there is nothing to see")
@@ -115,7 +115,7 @@ class Scene:
         scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(triangles.astype(np.uint32)))
 
     def cast(self, origin_m: Rays, direction: Rays, t_s: float) -> Hit:
-        """Return what rays meet: origin (3,) or (N, 3) m and direction (N, 3) in world, docks as of time t_s."""
+        """Return first hits of rays: origin (3,) or (N, 3) m and direction (N, 3) in world, docks as of time t_s."""
         still, *moving = self._parts
         hit = self._cast(still.rays, origin_m, direction)
         found = Hit(
@@ -137,15 +137,15 @@ class Scene:
         return found
 
     def water_range(self, height_m: Array | float, up: Array | Rays) -> Array:
-        """Return the range (N,) of the water, in lengths of the rays, inf where they miss it.
+        """Return the range (N,) of the water, in lengths of the rays, inf if they miss it.
 
         Args:
-            height_m: where rays begin, in world. up: (N,) their directions' third component.
+            height_m: of the origins of rays in world. up: (N,) third component of their directions.
         """
         return np.where(up < -1e-3, (self.tide_m - height_m) / np.minimum(up, -1e-3), np.inf)
 
     def own_range_m(self, origin_m: Rays, direction: Rays) -> Rays:
-        """Return the range (N,) of the own hull along rays in body, inf where they miss it."""
+        """Return the range (N,) of the vessel's hull along rays in body, inf if they miss it."""
         return np.asarray(self._cast(self._own, origin_m, direction)["t_hit"].numpy())
 
     def _cast(self, scene: Any, origin_m: Rays, direction: Rays) -> Any:
@@ -156,11 +156,11 @@ class Scene:
     def ranges(
         self, origin_m: Array, direction: Array, R: Array, p_m: Array, t_s: float
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Return range (N,) m of rays, inf where nothing is met, and whether it is water (N,).
+        """Return the range (N,), m, of rays, inf without a hit, and whether it is water (N,).
 
         Args:
-            origin_m, direction: (N, 3) in body. R: (N, 3, 3), p_m: (N, 3): the body in world at each ray's time.
-            t_s: one time for the docks: they are slow.
+            origin_m, direction: (N, 3) in body. R: (N, 3, 3), p_m: (N, 3): body in world at each ray's time.
+            t_s: one time for the docks, which are slow.
         """
         own = self.own_range_m(origin_m.astype(np.float32), direction.astype(np.float32))
         start = p_m + np.einsum("nij,nj->ni", R, origin_m)
@@ -172,7 +172,7 @@ class Scene:
 
 
 def _may_meet(origin_m: Rays, direction: Rays, middle_m: Rays, reach_m: float) -> NDArray[np.bool_]:
-    """Which rays pass within `reach_m` of a point: all others need not be cast."""
+    """Return which rays pass within `reach_m` of a point: others need not be cast."""
     to = middle_m - origin_m
     along = direction @ to if to.ndim == 1 else np.einsum("ni,ni->n", direction, to)
     length2 = np.einsum("ni,ni->n", direction, direction)

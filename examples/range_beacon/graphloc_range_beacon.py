@@ -18,7 +18,7 @@ from graphloc.blocks import Positive, Triple
 from graphloc.config import SensorConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor
-from graphloc.linear import linear_update, pose_term
+from graphloc.linear import linear_factor
 from graphloc.measurements import Measurement
 
 
@@ -65,7 +65,7 @@ def residuals(m: BeaconRange, config: RangeBeaconConfig, at: Attachment) -> tupl
 def factors(m: BeaconRange, config: RangeBeaconConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factor of one range."""
     (residual,) = residuals(m, config, at)
-    return linear_update(residual, [pose_term(at, residual.jacobian())], decision)
+    return linear_factor(residual, at, decision)
 
 
 def false(m: BeaconRange, config: RangeBeaconConfig) -> FalseModel:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LiDAR scans laid on an aerial image: `Matcher` turns a levelled cloud and a prior into a `PoseFix` with modes."""
+"""LiDAR scans matched to an aerial image: `Matcher` turns a levelled cloud and a prior into a `PoseFix` with modes."""
 
 from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
 from graphloc.frontends.aerial.scans import match_bag

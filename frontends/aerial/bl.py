@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The matcher of BL as printed (alg. 2 to 5, eq. 3.16): the baseline of ours, not used by the package itself.
+"""BL's matcher as printed (alg. 2 to 5, eq. 3.16), a baseline.
 
-Edges of the image are a binary image, so are lines through the scan's stacked points; a particle swarm looks for the
-turn at which the best shift of one over the other has most pixels in common. No window bounds the shift and none of the
-other maxima is looked at: that is left to the 2 m gate of the filter (alg. 6). The cloud is level, which BL's was not.
+Edges of the image form a binary image, and so do lines through the scan's stacked points; a particle swarm finds the rotation
+at which the best shift of one over the other has most pixels in common. The shift is not limited to a window, and no other
+maximum is considered: the filter's 2 m gate (alg. 6) does that. The cloud is level, unlike BL's.
 """
 
 from __future__ import annotations
@@ -132,19 +132,19 @@ class BLMatcher:
 
 
 def _turn(yaw: float) -> Array:
-    """R (2, 2) of eq. 3.14: takes level to the axes of world."""
+    """Return R (2, 2) of eq. 3.14, from level to the axes of world."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s], [s, c]])
 
 
 def _laid(points_m: Array, patch: Patch, pose: Array) -> Cells:
-    """Column and row (K, 2) of points (N, 2) in level seen from a pose (3,): those that are on the image (eq. 3.13)."""
+    """Return column and row (K, 2) of the points (N, 2) in level, seen from a pose (3,), that are on the image (eq. 3.13)."""
     cells = np.rint(patch.cells(points_m @ _turn(pose[2]).T + pose[:2])).astype(np.int64)
     return np.asarray(cells[((cells >= 0) & (cells < _SIDE_PX)).all(axis=1)])
 
 
 def _canny(patch: Patch) -> NDArray[np.bool_]:
-    """B_w: edges (rows, columns) of the grey image, thresholds by its own gradients as in Matlab."""
+    """Return the edges B_w (rows, columns) of the grey image, with thresholds from its gradients as in Matlab."""
     # 16: gradients go on as whole numbers, and a faint one must not be rounded away.
     grey = 16.0 * cv2.cvtColor(patch.pixels, cv2.COLOR_RGB2GRAY).astype(np.float32)
     soft = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX)
@@ -158,13 +158,13 @@ def _canny(patch: Patch) -> NDArray[np.bool_]:
 
 
 def _most_frequent(cells: Cells) -> Cells:
-    """BL alg. 3: the pairs (K, 2) that occur most often among pairs (N, 2); of equals, those that Matlab has first."""
+    """Return the most frequent pairs (K, 2) among pairs (N, 2) (BL alg. 3); of equals, the first in Matlab's order."""
     pairs, count = np.unique(cells, axis=0, return_counts=True)
     return np.asarray(pairs[np.argsort(-count, kind="stable")[:_MOST_FREQUENT]])
 
 
 def _line(cells: Cells, rng: np.random.Generator) -> Cells:
-    """Pixels (L, 2) of the line through pixels (K, 2): RANSAC, then least squares of its inliers, end to end."""
+    """Return the pixels (L, 2) of the line through pixels (K, 2): RANSAC, then least squares of the inliers, from end to end."""
     first = rng.integers(len(cells), size=_TRIALS)
     second = (first + rng.integers(1, len(cells), size=_TRIALS)) % len(cells)
     along = (cells[second] - cells[first]).astype(float)
@@ -180,7 +180,7 @@ def _line(cells: Cells, rng: np.random.Generator) -> Cells:
 
 
 def _swarm(objective: Callable[[float], float], rng: np.random.Generator) -> float:
-    """Return the turn, deg, of the least objective that BL alg. 1 sees; as printed, particles may leave +-5 deg."""
+    """Return the rotation, deg, of the lowest objective that BL alg. 1 evaluates; as printed, particles may leave +-5 deg."""
     x = rng.uniform(-_SEARCH_DEG, _SEARCH_DEG, _PARTICLES)
     v = rng.uniform(-_SEARCH_DEG, _SEARCH_DEG, _PARTICLES)
     own, own_f = x.copy(), np.full(_PARTICLES, np.inf)
@@ -198,9 +198,9 @@ def _swarm(objective: Callable[[float], float], rng: np.random.Generator) -> flo
 
 
 def _correlation(cells: Cells, edges: _Edges) -> NDArray[np.float32]:
-    """C of eq. 2.17, element by element: at (o, l) the pixels (K, 2) on edges when o rows down, l columns right.
+    """Return C of eq. 2.17: element (o, l) counts the pixels (K, 2) on edges when shifted o rows down, l columns right.
 
-    Indices past the image's side are negative shifts. Counts are whole, and rounded so that chance bits order nothing.
+    Indices past the image's side are negative shifts. Counts are integers, rounded so that rounding errors do not decide order.
     """
     lit = np.zeros((_PADDED_PX, _PADDED_PX), dtype=np.float32)
     lit[cells[:, 1], cells[:, 0]] = 1.0
@@ -210,7 +210,7 @@ def _correlation(cells: Cells, edges: _Edges) -> NDArray[np.float32]:
 
 
 def _best_shift_m(shared: NDArray[np.float32], cell_m: float) -> Array:
-    """East and north (2,) of the highest count; of equals (ours) the nearest, since the gate lets no other pass."""
+    """Return the shift (2,), east and north, of the highest count; of equals the nearest (our choice: the gate passes no other)."""
     shifts = np.argwhere(shared == shared.max())
     shifts = np.where(shifts < _SIDE_PX, shifts, shifts - _PADDED_PX)
     down, right = shifts[np.hypot(*shifts.T).argmin()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LiDAR scans from a bag, each point moved to one time by the vessel's own motion, levelled."""
+"""LiDAR scans of a bag: motion-compensated by the vessel's track, and levelled."""
 
 from __future__ import annotations
 
@@ -45,18 +45,17 @@ class Cloud:
 
 
 def decode_cloud(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
-    """Return the finite points of a `PointCloud2`, each with its time where a field says it.
+    """Return the finite points of a `PointCloud2`, each with its time if a field has it.
 
-    Times may be s, ms, us or ns, since the header's stamp or absolute, on its clock or another (`_since_header_s`).
-    No stamp is further than 1 s from the header's: points that say so, or no finite time, are dropped, not clamped,
-    as they would be laid where they were not seen. If no reading of the times makes sense, all points get the
-    header's stamp, and a warning says so once. Of fields with one name the first counts (PCL does so too).
+    Times may be s, ms, us or ns, since the header's stamp or absolute, on its clock or another (`_since_header_s`). Points with a time
+    more than 1 s from the header's, or not finite, are dropped, since a clamped time would misplace them. If no interpretation of the
+    times makes sense, all points get the header's stamp, with one warning. Of fields with equal names the first counts (as in PCL).
 
     Args:
         stamp_ns: the header's.
 
     Raises:
-        ValueError: no x, y, z, a field of unknown type or outside the point, or fewer bytes than it says.
+        ValueError: no x, y, z, a field of unknown type or outside the point, or fewer bytes than stated.
     """
     layout = _layout(msg)
     count = msg.width * msg.height
@@ -76,7 +75,7 @@ def decode_cloud(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
 
 
 def _layout(msg: Any) -> np.dtype[Any]:
-    """The fields that are read of a point, those of its place first."""
+    """Return the fields to read of a point, its coordinates first."""
     fields: dict[str, Any] = {}
     for field in msg.fields:
         fields.setdefault(field.name, field)
@@ -99,7 +98,7 @@ def _layout(msg: Any) -> np.dtype[Any]:
 
 
 def _rows(msg: Any, count: int) -> NDArray[np.uint8]:
-    """The bytes of all points, one after the other."""
+    """Return the bytes of all points, one after the other."""
     raw = np.asarray(msg.data, dtype=np.uint8).reshape(-1)
     if len(raw) == msg.point_step * count:  # no padding, whatever row_step says: some drivers leave it 0 or wrong
         return np.ascontiguousarray(raw)
@@ -110,18 +109,18 @@ def _rows(msg: Any, count: int) -> NDArray[np.uint8]:
 
 
 def _since_header_s(time: NDArray[Any], stamp_ns: int, count: int, lidar: str) -> Array:
-    """What a driver's time field says, in s since the header's stamp; NaN or far off where it says nonsense.
+    """Return a driver's time field in s since the header's stamp; NaN or implausible values if it makes no sense.
 
     The first of these that fits all but 1 % at each end:
 
-    1. Since the header, in the unit usual for the field's type, if the furthest is as far as a scan or packet is long.
-    2. Absolute, in the unit that makes it about as large as the header's stamp. Where the two differ by more than
-       1 s (TAI is 37 s ahead of UTC), as 4.
-    3. Since the header, in another unit, if that gives the length of a scan. Not that of a packet, which cannot be
-       told from a slow scan in a unit 1000 times smaller; the header is right for a packet to within its length.
-    4. Absolute on another clock, such as time since boot, in the unit that gives the length of a scan. Only the
-       differences are used: the first point is at the header's stamp, as Ouster, Hesai and Livox have it (and
-       `LaserScan`, and Autoware's rules); with RoboSense, whose headers tell the last, this errs by one turn.
+    1. Since the header, in the usual unit of the field's type, if the latest is within a scan or a packet.
+    2. Absolute, in the unit that makes it about as large as the header's stamp. If the two differ by more than 1 s (TAI is
+       37 s ahead of UTC), as 4.
+    3. Since the header, in another unit, if that gives the length of a scan. Not that of a packet, which is the same as a slow
+       scan in a unit 1000 times smaller; the header is right for a packet to within its length.
+    4. Absolute on another clock, such as time since boot, in the unit that gives the length of a scan. Only the differences
+       are used: the first point is at the header's stamp, as for Ouster, Hesai and Livox (and in `LaserScan`, and by
+       Autoware's rules); for RoboSense, whose headers are of the last point, this is wrong by one turn.
     """
     with np.errstate(all="ignore"):  # signalling NaNs; 1e308 in ns
         value = time.astype(float)
@@ -156,14 +155,14 @@ def _since_header_s(time: NDArray[Any], stamp_ns: int, count: int, lidar: str) -
 
 
 def _ends(value: Array) -> tuple[float, float]:
-    """Smallest and largest, less 1 % at each end, which may be anything; fewer than 10 values are all believed."""
+    """Return smallest and largest value without 1 % at each end, which may be outliers; of fewer than 10 values, of all."""
     cut = -(-len(value) // 100) if len(value) >= 10 else 0
     ordered = np.partition(value, (cut, len(value) - 1 - cut))
     return float(ordered[cut]), float(ordered[len(value) - 1 - cut])
 
 
 def _is_epoch(low_s: float, high_s: float, stamp_s: float) -> bool:
-    """Whether times are as large as a stamp, to a half; soon after zero nothing tells them from times since it."""
+    """Return whether times are as large as a stamp, to a half; soon after zero, times since it look the same."""
     return (
         stamp_s > 4.0 * _LONGEST_S
         and high_s - low_s <= _LONGEST_S
@@ -190,11 +189,11 @@ def _warn_once(lidar: str, text: str) -> None:
 def level(
     clouds: list[Cloud], mounts: Mapping[str, tuple[Array, Array]], track: Trajectory, at_ns: int, waterline_m: float
 ) -> LevelCloud:
-    """Return the points of clouds in `level` at a time: each from where the track says its LiDAR then was.
+    """Return the points of clouds in `level` at a time, each from where the track has its LiDAR at the time of the point.
 
-    Points that the track does not cover are left out. Of the others,
+    Points that the track does not cover are omitted. For the others,
     p_level = R_level_world (p_world_body + R_world_body (R_body_lidar p_lidar + t_body_lidar) - p_world_level),
-    with the pose of the body at the middle of the 2 ms that the point lies in.
+    with the pose of the body at the middle of the 2 ms that contain the point.
 
     Args:
         mounts: T_body_lidar by name. waterline_m: height of the waterline in body.
@@ -239,7 +238,7 @@ def level(
 
 
 def _move(points: Array, R: Array, t: Array, row: NDArray[np.int64], out: Array) -> None:
-    """Write R[row] points + t[row]; a rotation of each point at once would take 72 bytes a point."""
+    """Write R[row] points + t[row]; one rotation matrix per point would take 72 bytes each."""
     for k in range(0, len(points), _CHUNK):
         part = slice(k, k + _CHUNK)
         np.einsum("nij,nj->ni", R[row[part]], points[part], out=out[part])
@@ -255,9 +254,9 @@ def _during(cloud: Cloud, track: Trajectory) -> Cloud:
 
 
 def _shared_bins(numbers: list[NDArray[np.int64]]) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
-    """The numbers that occur, ascending, and for each array where its own are among them.
+    """Return the distinct numbers, ascending, and for each array the indices of its own among them.
 
-    As `np.unique`, without its sort; numbers lie within a track, so that a table of them all is small.
+    Like `np.unique` without sorting; the numbers are within a track, so a table of all of them is small.
     """
     some = [n for n in numbers if len(n)]
     first, last = min(int(n.min()) for n in some), max(int(n.max()) for n in some)

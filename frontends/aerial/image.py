@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An aerial image on the grid of world: read through its CRS, part by part.
+"""An aerial image resampled on the grid of world, part by part.
 
-What is read is whatever GDAL reads: one file, an MBTiles, or a folder of tiles (`tiles.py`), of any kind of pixels.
-Grid north is not true north and a map's metre is not always a metre, so no affine map is assumed between the image and
-world: the image is sampled point by point (on a net of 8 m, linear between, which is off by less than a millimetre).
+GDAL reads it: a file, an MBTiles, or a folder of tiles (`tiles.py`), with any kind of pixels. Since grid north is not true north
+and a map's metre not always a metre, no affine map between image and world is assumed: the image is sampled point by point (on
+a net of 8 m, linearly between, with errors below a millimetre).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Patch:
     cell_m: float
 
     def cells(self, p_m: Array) -> Array:
-        """Return column and row (N, 2), fractional, of points (N, 2) east, north in world."""
+        """Return column and row (N, 2), fractional, of points (N, 2) east, north in world, m."""
         return np.column_stack([p_m[:, 0] - self.west_m, self.north_m - p_m[:, 1]]) / self.cell_m
 
 
@@ -115,7 +115,7 @@ class AerialImage:
         """Return the square of `half_m` around a point (2,) in world.
 
         Raises:
-            InputError: the image does not reach there, has no data there, or cannot be read there.
+            InputError: the image does not cover it, has no data there, or cannot be read there.
         """
         n = int(np.ceil(2.0 * half_m / cell_m))
         west, north = centre_m[0] - half_m + 0.5 * cell_m, centre_m[1] + half_m - 0.5 * cell_m
@@ -159,14 +159,14 @@ class AerialImage:
         return Patch(np.asarray(pixels, dtype=np.uint8), np.asarray(covered), float(west), float(north), cell_m)
 
     def _pixels_of(self, p_m: Array) -> Array:
-        """Image column and row (N, 2), 0 at the centre of the top-left pixel, of points (N, 2) in world."""
+        """Return image column and row (N, 2), 0 at the centre of the top-left pixel, of points (N, 2) in world, m."""
         geodetic = self._datum.geodetic_from_enu(np.column_stack([p_m, np.zeros(len(p_m))]))
         x, y = self._to_image.transform(geodetic[:, 1], geodetic[:, 0])
         back = ~self._source.transform
         return np.column_stack([back.a * x + back.b * y + back.c, back.d * x + back.e * y + back.f]) - 0.5
 
     def _pixels_of_grid(self, west: float, north: float, n: int, cell_m: float) -> Array:
-        """Image column and row (2, n, n) of a grid in world."""
+        """Return image column and row (2, n, n) of a grid in world."""
         net_m = max(_NET_M, 2.0 * cell_m)  # a picture of kilometres needs no net finer than its pixels
         knots = np.linspace(0.0, n - 1.0, max(2, int(np.ceil(n * cell_m / net_m)) + 1))
         columns, rows = np.meshgrid(knots, knots)
@@ -177,7 +177,7 @@ class AerialImage:
         return np.stack([between @ net[:, k].reshape(len(knots), -1) @ between.T for k in (0, 1)])
 
     def _read(self, low: NDArray[np.int_], size: NDArray[np.int_], shrink: int) -> tuple[Any, Any]:
-        """Colours (rows, columns, 3) uint8 of a window, made smaller by a factor, and where it has data, uint8."""
+        """Return colours (rows, columns, 3) uint8 of a window, reduced by a factor, and the mask of data, uint8."""
         columns, rows = (-(-int(s) // shrink) for s in size)
         window = rasterio.windows.Window(*low, *size)
         how = Resampling.nearest if shrink == 1 else Resampling.average
@@ -198,7 +198,7 @@ class AerialImage:
         return np.ascontiguousarray(np.moveaxis(np.broadcast_to(bands, (3, rows, columns)), 0, 2)), has
 
     def _span(self) -> tuple[float, float]:
-        """2 and 98 % of samples all over the image."""
+        """Return the 2 and 98 % quantiles of samples over the image."""
         size = np.array([self._source.width, self._source.height])
         least = np.minimum(size, _SAMPLE_PX)
         found = [np.zeros(0)]
@@ -217,7 +217,7 @@ class AerialImage:
 
 
 def _palette_of(source: Any) -> Pixels:
-    """Red, green, blue, alpha (256 or more, 4) by number; numbers without a colour have no data."""
+    """Return red, green, blue, alpha (256 or more, 4) by index; indices without a colour have no data."""
     colours = np.zeros((65536 if source.dtypes[0] == "uint16" else 256, 4), dtype=np.uint8)
     for number, colour in source.colormap(1).items():
         colours[number] = colour
@@ -225,7 +225,7 @@ def _palette_of(source: Any) -> Pixels:
 
 
 def _why_not(source: Any, path: Path) -> str:
-    """What keeps an image from being used: its bands or its georeference; empty where nothing does."""
+    """Return why an image cannot be used, by its bands or georeference; empty if it can."""
     sizes = {n for shape in source.block_shapes for n in shape} if source.driver in ("MBTiles", "WMS") else set()
     if any(not 64 <= n <= 4096 for n in sizes):  # a tile of 1 kB may say that it has 30000 x 30000 pixels
         return f"its tiles have {max(sizes)} pixels a side: 64 to 4096 are read"
@@ -250,5 +250,5 @@ def _why_not(source: Any, path: Path) -> str:
 
 
 def _line(error: Exception) -> str:
-    """What GDAL says, without what GDAL says next."""
+    """Return GDAL's message without the ones that follow from it."""
     return " ".join(str(error.__cause__ or error).splitlines()[:1])

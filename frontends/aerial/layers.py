@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an aerial image says about edges and water, as likelihood layers that a scan is laid on.
+"""Likelihood layers of edges and water in an aerial image, to which a scan is compared.
 
-A layer is (bins, rows, columns), values 0 to 1: how near a cell is to something of that direction. Edges have a
-direction without sense (`EDGE_BINS` over 180 deg); shores have one with sense, from water to land (`SHORE_BINS` over
-360 deg). Edges are sought on a grid twice as fine: blurred to a cell, the bright kerb of a quay moves 0.1 m outwards.
+A layer is (bins, rows, columns) with values 0 to 1: proximity to an edge or shore of that direction. Edges have an undirected
+orientation (`EDGE_BINS` over 180 deg), shores a direction from water to land (`SHORE_BINS` over 360 deg). Edges are detected on
+a grid twice as fine: blurred to a cell, the bright kerb of a quay moves 0.1 m outwards.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MARGIN_M = 0.5  # the image's own rim is no edge
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """What a low and a tall face add to the log-likelihood that are on an edge, and a first return on a shore."""
+    """Log-likelihoods of a low and a tall face on an edge, and of a first return on a shore."""
 
     low: float
     tall: float
@@ -41,11 +41,11 @@ class Weights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layers:
-    """Log-likelihoods that a scan is laid on, in parts of `unit` (they are whole numbers, 0 to 255).
+    """Log-likelihoods in steps of `unit` (whole numbers, 0 to 255).
 
     Attributes:
         low, tall: (EDGE_BINS, rows, columns) of low and tall faces. shores: (SHORE_BINS, rows, columns) of first
-            returns; None where no water is known. drawn: (rows, columns) cells that a user's lines go through, or None.
+            returns; None if no water is known. drawn: (rows, columns) cells that a user's lines pass through, or None.
     """
 
     patch: Patch
@@ -57,9 +57,9 @@ class Layers:
 
 
 def weighed(patch: Patch, sources: Sequence[tuple[Layer, Layer | None, Weights]], drawn: Mask | None) -> Layers:
-    """Lay the edges and shores of several sources over each other, each with its own weights; the largest counts.
+    """Combine the edges and shores of several sources, each with its own weights, by the maximum.
 
-    Added, what two sources show would be told twice.
+    A sum would count twice what two sources show.
     """
     unit = max(max(w.low, w.tall, w.shore) for _, _, w in sources) / 255.0
 
@@ -82,14 +82,14 @@ def weighed(patch: Patch, sources: Sequence[tuple[Layer, Layer | None, Weights]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edges:
-    """Canny's edges on the fine grid: where (rows, columns), and the direction (N,) of the gradient there, rad in world."""
+    """Canny edges on the fine grid: mask (rows, columns), and direction (N,) of the gradient there, rad in world."""
 
     where: Mask
     gradient_rad: Array
 
 
 def find_edges(fine: Patch) -> Edges:
-    """Return the edges of a patch, its margin left out."""
+    """Return the edges of a patch without its margin."""
     grey = cv2.GaussianBlur(cv2.cvtColor(fine.pixels, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
     dx, dy = (cv2.Sobel(grey, cv2.CV_16S, *d) for d in ((1, 0), (0, 1)))
     where = (cv2.Canny(dx, dy, *_CANNY, L2gradient=True) > 0) & _well_inside(fine)
@@ -98,7 +98,7 @@ def find_edges(fine: Patch) -> Edges:
 
 
 def edge_layer(fine: Patch, edges: Edges) -> Layer:
-    """Return edges by the direction of their line, world axes, bin k around k * 180 / EDGE_BINS deg."""
+    """Return edges by the direction of their line in world, bin k around k * 180 / EDGE_BINS deg."""
     rows, columns = np.nonzero(edges.where)
     return _drawn(fine, rows, columns, edges.gradient_rad + 0.5 * np.pi, np.pi, EDGE_BINS, _EDGE_SIGMA_M)
 
@@ -106,8 +106,8 @@ def edge_layer(fine: Patch, edges: Edges) -> Layer:
 def shore_layer(fine: Patch, edges: Edges, water: Mask) -> Layer:
     """Return shores by the direction from water to land, bin k around k * 360 / SHORE_BINS deg.
 
-    The shore is the first edge that water meets: from well within the mask it is grown up to the edges that lie
-    within `_RIM_M` of its rim, and to there where it meets none.
+    The shore is the first edge next to water: the eroded mask is grown up to the edges within `_RIM_M` of its rim, and to the rim
+    where there are none.
 
     Args:
         water: (rows, columns) of the coarse grid.
@@ -130,12 +130,12 @@ def shore_layer(fine: Patch, edges: Edges, water: Mask) -> Layer:
 
 
 def _finer(mask: NDArray[Any], shape: tuple[int, ...]) -> Mask:
-    """A mask of the coarse grid on the fine one."""
+    """Return a mask of the coarse grid on the fine one."""
     return np.asarray(cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def drawn_layers(fine: Patch, drawn: VectorMap) -> tuple[Layer, Layer]:
-    """Return the edges and the shores that a vector layer has within a patch."""
+    """Return the edges and shores of a vector layer within a patch."""
     a, b, kept = _clipped(drawn.segments_m, fine)
     angle = np.arctan2(*(b - a).T[::-1])
     count = np.ceil(np.abs(b - a).max(axis=1) / fine.cell_m).astype(np.int64)  # as many as a line has pixels
@@ -151,7 +151,7 @@ def drawn_layers(fine: Patch, drawn: VectorMap) -> tuple[Layer, Layer]:
 
 
 def _clipped(segments_m: Array, fine: Patch) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Ends (K, 2) of the parts of segments (S, 2, 2) that lie within a patch, and of which each is (Liang, Barsky)."""
+    """Return ends (K, 2) of the parts of segments (S, 2, 2) within a patch, and the segment of each (Liang, Barsky)."""
     a, d = segments_m[:, 0], segments_m[:, 1] - segments_m[:, 0]
     rows, columns = fine.inside.shape
     low = np.array([fine.west_m, fine.north_m - (rows - 1) * fine.cell_m])
@@ -172,9 +172,9 @@ def _well_inside(patch: Patch) -> Mask:
 def _drawn(
     fine: Patch, rows: NDArray[Any], columns: NDArray[Any], angle: Array, turn: float, bins: int, sigma_m: float
 ) -> Layer:  # fmt: skip
-    """Draw pixels of lines into a layer of the coarse grid: exp(-d^2 / 2 sigma^2) beside a line that stands alone.
+    """Draw lines into a layer of the coarse grid: exp(-d^2 / 2 sigma^2) beside a single line.
 
-    Each counts for the bins on both sides of its angle. A slanting line has fewer pixels for its length.
+    Each counts for the bins on both sides of its angle. An oblique line has fewer pixels for its length.
     """
     shape = (fine.inside.shape[0] // FINE, fine.inside.shape[1] // FINE)
     along = angle if turn < 6.0 else angle + 0.5 * np.pi
@@ -215,10 +215,10 @@ def coarse_patch(fine: Patch) -> Patch:
 
 
 def segment_water(patch: Patch, free: Mask, limit: float = 3.0) -> Mask:
-    """Return where water is (rows, columns): like the cells that a LiDAR saw to be free water, and joined to them.
+    """Return where water is (rows, columns): cells similar to those that a LiDAR saw as free water, and connected to them.
 
-    Colour statistics in LAB, robust; darker counts a fifth, so that shadowed water stays water. Blur keeps its rim
-    some decimetres inside.
+    Robust colour statistics in LAB; a darker colour counts a fifth, so that water in shadow stays water. Blur keeps the rim some
+    decimetres inside.
     """
     lab: NDArray[np.float32] = cv2.cvtColor(patch.pixels, cv2.COLOR_RGB2LAB).astype(np.float32)
     lab = np.asarray(cv2.GaussianBlur(lab, (0, 0), 1.5), dtype=np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans matched one turn at a time, around a track that may still grow: offline and online go through here."""
+"""Matching of scans, one turn at a time, around a track that may still grow; used offline and online."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _CARRIED_S = (5.0, 60.0)  # how long inertial sensors carry a place, and a headi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turn:
-    """One scan of each LiDAR; or why one of them cannot be used.
+    """One scan of each LiDAR, or the reason why one of them cannot be used.
 
     Attributes:
-        stamp_ns: of the newest scan; of a message without one, when it arrived.
-        arrival_ns: when the message arrived that ended the turn: its last, or the first of the next one where a LiDAR
-            is silent. Turns come in this order.
+        stamp_ns: of the newest scan; of a message without a stamp, its arrival.
+        arrival_ns: arrival of the message that completed the turn: its last, or the first of the next one if a LiDAR is
+            missing. Turns come in this order.
     """
 
     stamp_ns: int
@@ -42,16 +42,17 @@ class Turn:
 
     @property
     def last_ns(self) -> int:
-        """Stamp of its last point, or of its newest scan if that is later: headers may tell the begin of a scan."""
+        """Stamp of the last point, or of the newest scan if that is later: headers may hold the begin of a scan."""
         return max([self.stamp_ns, *(int(c.stamps_ns.max()) for c in self.clouds if len(c.stamps_ns))])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matched:
-    """A match and its stamp; or why there is none.
+    """A match and its stamp, or the reason why there is none.
 
     Attributes:
-        news: (3,) shares of its east, north and yaw that the match before has not told (`AerialConfig.alike_m`).
+        news: (3,) shares of the information on east, north and yaw that is independent of the match before
+            (`AerialConfig.alike_m`).
     """
 
     stamp_ns: int
@@ -61,17 +62,17 @@ class Matched:
 
 
 class LiveMatcher:
-    """Matches turns as they come, as often as the configuration says.
+    """Matches turns as they come, at the configured interval.
 
-    One caller at a time, from any thread. It holds open files, so another process makes its own: what it is made
-    from, turns and tracks can be pickled. So can answers, but a `Match` holds the map around it (some 50 MB): send
-    its `fix`. Do not fork for it, threads of numba's OpenMP do not survive that.
+    It may be called by one thread at a time. It holds open files, so another process makes its own: its arguments, turns and tracks
+    can be pickled. Results can be too, but a `Match` holds the map around it (some 50 MB): send its `fix`. Do not fork for it:
+    numba's OpenMP threads do not survive that.
 
     Args:
-        folder: relative paths of maps count from there. mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name.
+        folder: base of relative paths of maps. mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name.
 
     Raises:
-        InputError: a map that cannot be used.
+        InputError: a map cannot be used.
     """
 
     def __init__(
@@ -84,16 +85,16 @@ class LiveMatcher:
         self._before: tuple[Array, int] | None = None  # and of the last one that had a mode
 
     def offer(self, turn: Turn, track: Trajectory, *, growing: bool = True) -> Matched | Literal["wait"] | None:
-        """Match a turn if it is due. Turns are offered in their order, the same one again after "wait".
+        """Match a turn if it is due. Turns are offered in order, and the same one again after "wait".
 
         Args:
-            track: body in world about the turn, two poses or more. The submap is laid by this track alone; what it
-                does not cover any more is left out.
-            growing: whether the track will reach further; else nothing waits.
+            track: body in world around the turn, two poses or more. The submap is placed by this track alone, without parts
+                that it no longer covers.
+            growing: whether the track will extend further; otherwise nothing waits.
 
         Returns:
-            A match; or why there is none of a turn that is damaged or lies outside of the track for good. None: not
-            due. "wait": the track ends before the turn does, by little; nothing has changed.
+            A match; or the reason why there is none of a turn that is damaged or outside of the track for good. None: not due.
+            "wait": the track ends slightly before the turn; nothing has changed.
         """
         if turn.why_not:
             return Matched(turn.stamp_ns, None, turn.why_not)
@@ -124,7 +125,7 @@ class LiveMatcher:
         return True
 
     def match(self, turns: Sequence[Turn], track: Trajectory) -> Matched:
-        """Match the last of some turns that a track covers, those before it laid together with it; due or not."""
+        """Match the last of some turns that a track covers, stacked with those before it, whether due or not."""
         newest, config = turns[-1], self._config
         stamps = np.sort(np.concatenate([c.stamps_ns for c in newest.clouds] + [np.array([newest.stamp_ns])]))
         at_ns = int(stamps[len(stamps) // 2])  # not a median, which goes through floats
@@ -142,7 +143,7 @@ class LiveMatcher:
 
 
 def outside(turn: Turn, track: Trajectory) -> str:
-    """Say which scans lie outside of a track; empty: none does."""
+    """Return which scans are outside of a track; empty if none is."""
     stamps = np.array([c.stamp_ns for c in turn.clouds], dtype=np.int64)
     if track.covers(stamps).all():
         return ""
@@ -160,9 +161,9 @@ def _matcher(config: AerialConfig, folder: Path, datum: Datum) -> Matcher | BLMa
 
 
 def _news(before: tuple[Array, int] | None, here: tuple[Array, int], alike_m: float) -> tuple[float, float, float]:
-    """What a match adds to a mean, were errors a first-order Markov process along the way: (1 - r) / (1 + r).
+    """Return the information that a match adds to a mean, with errors that are a first-order Markov process along the path.
 
-    The mean is over what inertial sensors carry: what was known of a place is forgotten sooner than a heading.
+    That is (1 - r) / (1 + r). The mean is over the distance that inertial sensors bridge: shorter for position than for heading.
     """
     if before is None or alike_m == 0.0:
         return (1.0, 1.0, 1.0)

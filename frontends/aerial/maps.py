@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map that scans are laid on: an image, a user's lines, or both; its layers are made once for each part of it."""
+"""Map that scans are matched to: an image, a user's lines, or both; layers are computed once for each part of it."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ ON_IMAGE, ON_LINES = Weights(low=0.88, tall=0.50, shore=1.70), Weights(low=0.74,
 
 
 class Map:
-    """What `image` and `vector` of an aerial sensor show, part by part.
+    """Layers of `image` and `vector` of an aerial sensor, part by part.
 
     Args:
-        on_image, on_lines: weights of either; other than the fitted ones, to fit them.
+        on_image, on_lines: weights of either, to fit them; default: the fitted ones.
 
     Raises:
         InputError: neither is given, or one cannot be used.
@@ -72,10 +72,10 @@ class Map:
         self._tries: Counter[tuple[int, int]] = Counter()
 
     def around(self, pose: Array, found: Outline) -> Layers:
-        """Return the layers around a pose (3,); water is what is like the water that a scan saw from there.
+        """Return the layers around a pose (3,); water is what looks like the water that a scan saw from there.
 
         Raises:
-            InputError: the map does not reach there.
+            InputError: the map does not cover it.
         """
         tile = (int(pose[0] // _TILE_M), int(pose[1] // _TILE_M))
         if tile in self._beyond:
@@ -125,7 +125,7 @@ class Map:
 
 
 def _blank(middle_m: Array, half_m: float, cell_m: float) -> Patch:
-    """A patch of which nothing is known."""
+    """Return a patch without data."""
     n = int(np.ceil(2.0 * half_m / cell_m))
     corner = half_m - 0.5 * cell_m
     return Patch(
@@ -134,7 +134,7 @@ def _blank(middle_m: Array, half_m: float, cell_m: float) -> Patch:
 
 
 def _seen_water(patch: Patch, pose: Array, found: Outline) -> NDArray[np.bool_]:
-    """Cells that the scan saw to be water, were the pose right."""
+    """Return the cells that the scan saw as water, if the pose is right."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     at = found.water_m @ np.array([[c, s], [-s, c]]) + pose[:2]
     cells = np.rint(patch.cells(at)).astype(int)

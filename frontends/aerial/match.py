@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lay a scan's outline on an image's layers: the posterior of the pose over a window, and its modes."""
+"""Posterior of the pose over a window, by comparing a scan's outline with the layers of a map, and its modes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ign
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """Poses that are tried: yaw (H,) rad, north (R,) m and east (C,) m, in world."""
+    """Candidate poses: yaw (H,) rad, north (R,) m and east (C,) m, in world."""
 
     yaw_rad: Array
     north_m: Array
@@ -34,7 +34,7 @@ class Grid:
 
 
 def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) -> Grid:
-    """Return the grid of cells of the layers around a pose (3,): east, north, yaw."""
+    """Return the candidates around a pose (3,): east, north, yaw, on the cells of the layers."""
     patch = layers.patch
     column, row = np.rint(patch.cells(prior[None, :2])[0]).astype(int)
     k = np.arange(-int(np.ceil(half_m / patch.cell_m)), int(np.ceil(half_m / patch.cell_m)) + 1)
@@ -48,10 +48,10 @@ def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) ->
 
 @compiled(parallel=True, fastmath=True)
 def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, columns):  # type: ignore[no-untyped-def]
-    """Sum over points of weight x layer, for each yaw, row and column of the grid: (H, rows, columns).
+    """Return the sum over points of weight x layer for each yaw, row and column of the grid: (H, rows, columns).
 
-    A point falls on one of the cells around it by a sequence that fills [0, 1) evenly: rounded, all points of a wall
-    along the grid would be off by the same part of a cell.
+    A point is assigned to one of the cells around it by a low-discrepancy sequence: rounded, all points of a wall along the grid
+    would be off by the same part of a cell.
     """
     bins, height, width = layer.shape
     out = np.zeros((len(yaw), rows, columns), dtype=np.float32)
@@ -73,8 +73,8 @@ def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, column
 def log_likelihood_of(found: Outline, layers: Layers, grid: Grid) -> Layer:
     """Return the log-likelihood of each pose of the grid (H, R, C).
 
-    The sum over lines grows with their number, and so do chance and what they are wrong by together (boats that lie at
-    other berths than those of the image): it is divided by the root of the evidence there is.
+    The sum over lines grows with their number, but so do chance and common errors (boats at other berths than in the image), so it is
+    divided by the root of the amount of evidence.
     """
     patch = layers.patch
     col0, row0 = np.rint(patch.cells(np.array([[grid.east_m[0], grid.north_m[0]]]))[0]).astype(int)
@@ -109,8 +109,8 @@ def modes_of(
     """Return the modes of a posterior (H, R, C), best first, and the probability that none is right.
 
     Args:
-        none_log: log-likelihood of a pose where the scan fits by chance, over the mean of all.
-        alien: probability that the scan shows what the image does not, whatever the score.
+        none_log: log-likelihood of a pose where the scan fits by chance, relative to the mean of all.
+        alien: probability that the scan shows something that the image does not, whatever the score.
     """
     top = float(log_likelihood.max())
     mass = np.exp(log_likelihood.astype(float) - top)
@@ -139,14 +139,14 @@ def modes_of(
 
 
 def _cut_off(spot: NDArray[np.int64], cells: tuple[NDArray[np.int64], ...], shape: tuple[int, ...]) -> bool:
-    """Whether a peak is that of a slope: it lies on a face of the window and is narrow there. The top lies outside."""
+    """Return whether a peak is only a slope towards a maximum outside: it is at a face of the window, and narrow there."""
     return any(at in (0, n - 1) and np.ptp(axis) < _NARROW for at, axis, n in zip(spot, cells, shape, strict=True))
 
 
 def _moments(
     log_likelihood: NDArray[np.float32], part: tuple[NDArray[np.int64], ...], mass: Array, grid: Grid
 ) -> tuple[Array, Array]:
-    """Mean (3,) and covariance (3, 3) of a part of the posterior; along axes where it is narrow, between cells."""
+    """Return mean (3,) and covariance (3, 3) of a part of the posterior; along narrow axes interpolated between cells."""
     low, high = (np.array([f(axis) for axis in part]) for f in (np.min, np.max))
     narrow = high - low < _NARROW
     cells = np.stack(part).astype(float)

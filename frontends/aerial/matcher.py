@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One match: layers around the prior, the scan's outline on them, and what the posterior says."""
+"""One match: layers around the prior, the scan's outline compared with them, modes of the posterior."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MODES = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Where the vessel is thought to be: pose (3,) east, north, yaw, and its sigmas (3,), m and rad."""
+    """Predicted pose (3,) of the vessel, east, north, yaw, and its sigmas (3,), m and rad."""
 
     pose: Array
     sigma: Array
@@ -34,12 +34,12 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """What a match found.
+    """Result of a match.
 
     Attributes:
-        prior: what it started from. found: the scan. layers: what it was laid on. grid, score: log-likelihood
-            (H, R, C) over the grid. modes: best first. none: probability that no mode is right.
-        why_not: why there is no mode; empty where there is.
+        prior: the prediction. found: the scan's outline. layers: of the map. grid, score: log-likelihood (H, R, C) over the
+            grid. modes: best first. none: probability that no mode is right.
+        why_not: why there is no mode; empty if there is one.
     """
 
     prior: Prior
@@ -61,8 +61,8 @@ class Match:
         """Return the modes as one measurement.
 
         Args:
-            news: shares of east, north, yaw that the match before has not told; variances grow by their inverse.
-            axes: those wanted.
+            news: independent shares of east, north, yaw (`live.Matched`); variances grow by their inverse.
+            axes: to be used.
         """
         wider = 1.0 / np.sqrt(np.outer(news, news))
         picked = [k for k, a in enumerate(("x", "y", "yaw")) if a in axes]
@@ -89,10 +89,10 @@ class Matcher:
         self._hull = np.array(config.hull_m, dtype=float) if config.hull_m else None
 
     def match(self, cloud: LevelCloud, prior: Prior) -> Match:
-        """Lay a cloud on the map around a prior.
+        """Match a cloud to the map around a prior.
 
         Raises:
-            InputError: the map does not reach there.
+            InputError: the map does not cover it.
         """
         config = self._config
         found = outline(cloud, self._hull, config.reach_m)
@@ -110,16 +110,16 @@ class Matcher:
 
 
 def _trust(score: Layer, within: float) -> float:
-    """Probability that the truth lies in the window, after the score was seen.
+    """Return the probability that the truth is in the window, given the score.
 
-    Windows without the truth have peaks as well, of things that look alike; they stand less high over the mean.
+    Windows without the truth have peaks too, of things that look alike; they rise less above the mean.
     """
     contrast = float(score.max()) - float(score.mean())
     return float(special.expit(_CONTRAST[0] + _CONTRAST[1] * contrast + special.logit(min(within, _MOST_WITHIN))))
 
 
 def _within(sigma: Array, half: Array) -> float:
-    """Probability that the truth lies in the window, by the prior's sigmas (3,)."""
+    """Return the probability that the truth is in the window, by the prior's sigmas (3,)."""
     return float(np.prod(special.erf(half / (np.sqrt(2.0) * np.maximum(sigma, 1e-9)))))
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scan says about edges: vertical faces with their direction, and where water ends.
+"""Edges in a scan: vertical faces with their direction, and the limits of free water.
 
-Points come in the frame `level`: origin and yaw of body, its x-y plane horizontal, heights over the waterline.
+Points are in the frame `level`: origin and yaw of body, horizontal x-y plane, heights over the waterline.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class LevelCloud:
     """Points of one or more scans in `level`.
 
     Attributes:
-        points_m: (N, 3). origin_m: (N, 2) where the ray of each began.
+        points_m: (N, 3). origin_m: (N, 2) origin of the ray of each.
     """
 
     points_m: Array
@@ -38,13 +38,12 @@ class LevelCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outline:
-    """A scan as the matcher compares it.
+    """Features of a scan for the matcher.
 
     Attributes:
-        faces_m: (M, 2) cells of faces. line_rad: (M,) direction of the line through each. tall: (M,) 1 where it
-            rises higher than a boat, 0 where not. face_share: (M,) what each counts. shore_m: (K, 2) first things
-            behind water. to_land_rad: (K,) away from the sensor. shore_share: (K,) what each counts. water_m: (L, 2)
-            places that were seen to be free water.
+        faces_m: (M, 2) cells of faces. line_rad: (M,) direction of the line through each. tall: (M,) 1 if higher than a boat,
+            else 0. face_share: (M,) weight of each. shore_m: (K, 2) first objects behind water. to_land_rad: (K,) direction
+            away from the sensor. shore_share: (K,) weight of each. water_m: (L, 2) points seen as free water.
     """
 
     faces_m: Array
@@ -58,12 +57,12 @@ class Outline:
 
     @property
     def evidence(self) -> float:
-        """How many faces and first returns it has, were they independent of each other."""
+        """Number of faces and first returns, if they were independent of each other."""
         return float(self.face_share.sum() + self.shore_share.sum())
 
 
 def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float = 100.0) -> Outline:
-    """Return the outline of a cloud; what lies within `hull` (K, 2) in body, closed, is the vessel itself."""
+    """Return the outline of a cloud; points within `hull` (K, 2) in body, a closed polygon, are the vessel itself."""
     p, away = cloud.points_m, np.hypot(*cloud.points_m[:, :2].T)
     keep = (away < reach_m) & np.isfinite(p).all(axis=1)
     if hull is not None:
@@ -89,7 +88,7 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
 
 
 def inside(polygon: NDArray[np.float64], points_m: Array) -> NDArray[np.bool_]:
-    """Which points (N, 2) lie within a polygon (K, 2)."""
+    """Return which points (N, 2) are within a polygon (K, 2)."""
     a, b = polygon, np.roll(polygon, -1, axis=0)
     x, y = points_m[:, :1], points_m[:, 1:]
     spans = (a[:, 1] > y) != (b[:, 1] > y)
@@ -99,7 +98,7 @@ def inside(polygon: NDArray[np.float64], points_m: Array) -> NDArray[np.bool_]:
 
 
 def _columns(p: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Stack points into columns: mean place (M, 2), lowest and highest (M,), count (M,)."""
+    """Stack points into columns: mean position (M, 2), lowest and highest (M,), count (M,)."""
     key = np.floor(p[:, :2] / _CELL_M).astype(np.int64)
     _, group, count = np.unique(key[:, 0] * 1_000_003 + key[:, 1], return_inverse=True, return_counts=True)
     order = np.argsort(group, kind="stable")
@@ -112,10 +111,10 @@ def _columns(p: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
 
 
 def _lines(at: Array, near_m: float) -> tuple[Array, Array]:
-    """Direction (M,) of the line through each place and its neighbours, and what each place counts (M,).
+    """Return the direction (M,) of the line through each point and its neighbours, and the weight of each point (M,).
 
-    It counts 1 / sqrt(number of those on its line): places of one wall are right or wrong together, so a wall of a
-    hundred tells more than a boat's side of nine, but not eleven times as much.
+    The weight is 1 / sqrt(number of points on its line): points of one wall are right or wrong together, so a wall of a hundred tells
+    more than a boat's side of nine, but not eleven times as much.
     """
     if len(at) < 2:
         return np.zeros(len(at)), np.ones(len(at))
@@ -133,7 +132,7 @@ def _lines(at: Array, near_m: float) -> tuple[Array, Array]:
 
 
 def _first_returns(p: Array, origin: Array, low_limit: float) -> tuple[Array, Array]:
-    """The nearest thing in each direction, and its direction (rad), where it rises out of the water."""
+    """Return the nearest object in each direction that rises out of the water, and the direction (rad)."""
     near = p[:, 2] < low_limit
     d = p[near, :2]
     away, angle = np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0])
@@ -145,6 +144,6 @@ def _first_returns(p: Array, origin: Array, low_limit: float) -> tuple[Array, Ar
 
 
 def _free_water(shore: Array, to_land: Array, wet: Array) -> Array:
-    """Places that are water: returns from it, and what lies between the vessel and the first thing."""
+    """Return points of water: returns from it, and points between the vessel and the first object."""
     between = [shore * s for s in (0.3, 0.5, 0.7)]
     return np.vstack([wet[:, :2], *[b[np.hypot(*b.T) > 8.0] for b in between]])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scans of a bag: those that belong together, and their matches around a whole track."""
+"""Scans of a bag: grouped into turns, and matched around a whole track."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _TURN_S = 0.5  # scans of several LiDARs farther apart than this are not one
 
 
 class ScanFeed:
-    """The scans of an open bag in turns, in order of arrival; a damaged one is a turn that says why.
+    """Scans of an open bag, grouped into turns, in order of arrival; a damaged scan gives a turn with the reason.
 
     Attributes:
         mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name.
 
     Raises:
-        InputError: no LiDAR, a topic that is not there, a mount that no chain leads to.
+        InputError: no LiDAR, a missing topic, or a mount without a chain of transforms.
     """
 
     def __init__(self, bag: Bag, config: AerialConfig, body_frame: str) -> None:
@@ -54,13 +54,13 @@ def match_bag(
     at_ns: int | None = None,
     warn: Callable[[str], None] = log.warning,
 ) -> Iterator[Matched]:
-    """Match the scans of a bag around a track, as often as the configuration says; or the one nearest to `at_ns` alone.
+    """Match the scans of a bag around a track, at the configured interval, or only the one nearest to `at_ns`.
 
     Args:
-        folder: relative paths of maps count from there. warn: is told what is damaged in the bag.
+        folder: base of relative paths of maps. warn: is called with each damage of the bag.
 
     Raises:
-        InputError: no LiDAR, a topic that is not there, a mount that no chain leads to, a map that cannot be used.
+        InputError: no LiDAR, a missing topic, a mount without a chain of transforms, or an unusable map.
     """
     with Bag(bags) as bag:
         feed = ScanFeed(bag, config, body_frame)
@@ -75,7 +75,7 @@ def match_bag(
 
 
 def _nearest(feed: Iterable[Turn], submap: int, track: Trajectory, at_ns: int) -> list[Turn]:
-    """The turn nearest to a time, of those that can be matched, after those that are laid together with it."""
+    """Return the usable turn nearest to a time, after those that are stacked with it."""
     window: deque[Turn] = deque(maxlen=submap)
     nearest: list[Turn] = []
     for turn in feed:
@@ -103,9 +103,9 @@ def _mounts(bag: Bag, config: AerialConfig, body_frame: str) -> dict[str, tuple[
 
 
 def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
-    """Scans that belong together: the newest of each LiDAR, as soon as there is one of each within `_TURN_S`.
+    """Group scans: the newest of each LiDAR, once there is one of each within `_TURN_S`.
 
-    Where one is silent, or comes less often than that, the others go without it.
+    If one is missing, or is slower than that, the others form a turn without it.
     """
     names = {lidar.topic: name for name, lidar in config.lidars.items()}
     offset_ns = duration_ns(config.time_offset_s)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of Web Mercator tiles as one image: GDAL's own tile reader, told where the files are.
+"""A folder of Web Mercator tiles as one image, by GDAL's tile reader.
 
-GDAL reads the tiles that a window needs, takes a missing file for no data, and makes RGBA of grey, palette, RGB and
-RGBA tiles alike (driver WMS, service TMS, docs: gdal.org/drivers/raster/wms.html). Nothing goes over the network.
+GDAL reads the tiles that a window needs, treats a missing file as no data, and converts grey, palette, RGB and RGBA tiles to
+RGBA (driver WMS, service TMS, docs: gdal.org/drivers/raster/wms.html). It does not access the network.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ _WANTED = "a folder of tiles has z/x/y.png (or jpg, jpeg, webp), Web Mercator, a
 
 
 def describe_tiles(folder: Path, datum: Datum) -> str:
-    """Return GDAL's description (XML, to be opened as if it were a file) of a folder of tiles z/x/y.png, jpg, webp.
+    """Return GDAL's description (XML, to be opened like a file) of a folder of tiles z/x/y.png, jpg, webp.
 
-    The image is the deepest zoom level that is there (22 at most); the levels without a gap above it are its
-    overviews. Rows count from the top (XYZ) or from below (TMS): whichever brings the tiles nearer to the datum, XYZ
-    on a tie (which needs a datum within a tile or so of the equator, or tiles of both hemispheres).
+    The image is the deepest zoom level (22 at most); the levels above it without a gap are its overviews. Rows count from the top
+    (XYZ) or from below (TMS): whichever places the tiles nearer to the datum, XYZ if equal (which takes a datum within a tile or so
+    of the equator, or tiles of both hemispheres).
 
     Raises:
-        InputError: no such tiles, a part of such a folder, several kinds of files, what cannot be listed, or tiles that
-            are more than 100 km from the datum either way.
+        InputError: no such tiles, a part of such a folder, several kinds of files, a folder that cannot be listed, or tiles more
+            than 100 km from the datum either way.
     """
     try:
         return _described(folder, datum)
@@ -74,28 +74,33 @@ def _described(folder: Path, datum: Datum) -> str:
             f"another `datum:`, or not z/x/y (z/y/x?): {_WANTED}"
         )
     first = tiles[int(rows[0])]
+    overviews = next(k for k in range(zoom + 1) if zoom - k - 1 not in levels)
+    return _xml(folder, first, zoom, overviews, "top" if from_top <= from_below else "bottom")
+
+
+def _xml(folder: Path, tile: Path, zoom: int, overviews: int, rows_from: str) -> str:
+    """Return GDAL's description of the folder; `tile`: one of its tiles, for their size."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(first) as tile:
-                width, height = tile.width, tile.height
+            with rasterio.open(tile) as opened:
+                width, height = opened.width, opened.height
     except rasterio.errors.RasterioError as error:
-        raise InputError(f"{first}: not an image that GDAL can read ({error})") from None
-    overviews = next(k for k in range(zoom + 1) if zoom - k - 1 not in levels)
+        raise InputError(f"{tile}: not an image that GDAL can read ({error})") from None
     # as_uri: GDAL wants blanks and such quoted. 404: no file. 200: a file without content, which some tools write.
     return (
-        f'<GDAL_WMS><Service name="TMS"><ServerUrl>{folder.resolve().as_uri()}/${{z}}/${{x}}/${{y}}{first.suffix}</ServerUrl>'
+        f'<GDAL_WMS><Service name="TMS"><ServerUrl>{folder.resolve().as_uri()}/${{z}}/${{x}}/${{y}}{tile.suffix}</ServerUrl>'
         f"</Service><DataWindow><UpperLeftX>{-_HALF_M!r}</UpperLeftX><UpperLeftY>{_HALF_M!r}</UpperLeftY>"
         f"<LowerRightX>{_HALF_M!r}</LowerRightX><LowerRightY>{-_HALF_M!r}</LowerRightY><TileLevel>{zoom}</TileLevel>"
         f"<TileCountX>1</TileCountX><TileCountY>1</TileCountY>"
-        f"<YOrigin>{'top' if from_top <= from_below else 'bottom'}</YOrigin></DataWindow><Projection>EPSG:3857</Projection>"
+        f"<YOrigin>{rows_from}</YOrigin></DataWindow><Projection>EPSG:3857</Projection>"
         f"<BlockSizeX>{width}</BlockSizeX><BlockSizeY>{height}</BlockSizeY><BandsCount>4</BandsCount>"
         f"<OverviewCount>{overviews}</OverviewCount><ZeroBlockHttpCodes>404,200</ZeroBlockHttpCodes></GDAL_WMS>"
     )
 
 
 def _folders(folder: Path) -> dict[int, Path]:
-    """Folders in it that have a number for a name, as GDAL will write it (16, not 016)."""
+    """Return the folders named by a number as GDAL writes it (16, not 016)."""
     return {int(p.name): p for p in folder.iterdir() if _NUMBER.fullmatch(p.name) and p.is_dir()}
 
 
@@ -104,7 +109,7 @@ def _tiles(folder: Path) -> list[Path]:
 
 
 def _part_of(folder: Path) -> str:
-    """What a folder is that is no whole set of tiles, and what to name instead; empty where it is no part of one."""
+    """Return which part of a set of tiles a folder is, and what to name instead; empty if it is not a part of one."""
     here = folder.resolve()
     if _tiles(here):
         return f"one column of a level of tiles; name the folder above both, {here.parent.parent}"
@@ -114,7 +119,7 @@ def _part_of(folder: Path) -> str:
 
 
 def _tile_of(datum: Datum, zoom: int) -> tuple[float, float]:
-    """Column and row of the datum among the tiles of a level, from the top left, fractional."""
+    """Return column and row of the datum among the tiles of a level, from the top left, fractional."""
     latitude = np.radians(np.clip(datum.origin.latitude_deg, -85.0, 85.0))
     down = 0.5 - np.arcsinh(np.tan(latitude)) / (2.0 * np.pi)
     return (datum.origin.longitude_deg / 360.0 + 0.5) % 1.0 * 2**zoom, float(down) * 2**zoom

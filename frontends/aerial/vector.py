@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lines of quays, piers and shores that a user drew or took from OpenStreetMap: GeoJSON, on the grid of world.
+"""Lines of quays, piers and shores, drawn by a user or from OpenStreetMap: GeoJSON, in world.
 
-Which side of a line is land is taken from tags of features (keys as in OpenStreetMap, "no" is as if not there):
+The side of a line on which land is comes from the tags of features (keys as in OpenStreetMap; "no" counts as absent):
 
-- a polygon with the property `graphloc` = "water" or "land": as said;
+- a polygon with the property `graphloc` = "water" or "land": as stated;
 - a polygon of land: `building`, `man_made` = pier, quay, breakwater, groyne or jetty, `natural` = land or coastline,
   `place` = island or islet;
 - else a polygon of water: `water`, `natural` = water, bay or strait, `landuse` = basin or reservoir, `harbour`,
   `waterway` = riverbank, river, canal, dock or fairway;
 - a line `natural` = coastline: land is on its left;
-- any other: not known. A line of it is an edge, not a shore.
+- any other: unknown. Its lines are edges, not shores.
 
-Tags that ogr2ogr packs into one text (`other_tags`) are not read. RFC 7946 wants outer rings counter-clockwise, files
-do not care: the side of a ring that is inside is computed. Where two polygons meet that have land on opposite sides of
-their common border (water in two parts, a terrace of houses) there is no shore and nothing to see: it is left out.
+Tags that ogr2ogr packs into one text (`other_tags`) are not read. RFC 7946 requires counter-clockwise outer rings, but files
+often differ: the inside of a ring is computed. A common border of two polygons with land on opposite sides (water in two parts,
+a terrace of houses) is no shore and nothing visible: it is left out.
 """
 
 from __future__ import annotations
@@ -55,13 +55,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VectorMap:
-    """Lines that a user drew (QGIS) or took from OpenStreetMap, in world.
+    """Lines drawn by a user (QGIS) or from OpenStreetMap, in world.
 
     Attributes:
-        segments_m: (S, 2, 2) ends east, north of each straight piece.
-        to_land_rad: (S,) direction across the line towards land, from east, counter-clockwise; NaN where the line
-            does not say.
-        points_left: points of the file that were left out: they are no lines.
+        segments_m: (S, 2, 2) ends east, north of each straight segment.
+        to_land_rad: (S,) direction across the line towards land, from east, counter-clockwise; NaN if unknown.
+        points_left: number of points in the file that are ignored because they are not lines.
     """
 
     segments_m: Array
@@ -69,9 +68,9 @@ class VectorMap:
     points_left: int = 0
 
     def around(self, centre_m: Array, half_m: float) -> VectorMap:
-        """Return the segments, whole, that may reach into the square of `half_m` around a point (2,) in world.
+        """Return the segments, whole, that may intersect the square of `half_m` around a point (2,) in world.
 
-        A slanting segment whose box reaches into the square is returned though it may pass by.
+        An oblique segment whose bounding box intersects the square is returned even if it passes by.
         """
         low, high = self.segments_m.min(axis=1), self.segments_m.max(axis=1)
         near = ((low <= centre_m + half_m) & (high >= centre_m - half_m)).all(axis=1)
@@ -79,9 +78,9 @@ class VectorMap:
 
 
 class _Line(NamedTuple):
-    """A line of a file: positions (P, 2), x and y as written, P > 1; where land is: 1 left, -1 right, 0 not known.
+    """A line of a file: positions (P, 2), x and y as written, P > 1; side of land: 1 left, -1 right, 0 unknown.
 
-    Of a ring that holds where it runs counter-clockwise.
+    Of a ring, the side is that of its counter-clockwise direction.
     """
 
     xy: Array
@@ -98,12 +97,12 @@ class _Found:
 def read_vector(path: Path, datum: Datum) -> VectorMap:
     """Read a GeoJSON file (RFC 7946: longitude, latitude on WGS 84; heights are not used).
 
-    A `crs` member of the older GeoJSON is honoured, with x, y as east, north, as GDAL writes them. Straight in the
-    file is taken for straight in world: 500 m east at 57 deg north bend by less than 1 cm. Pieces longer than 50 km,
-    which bend by 70 m, and those beyond 1000 km from the datum are left out. Longitudes may run from -180 or to 360.
+    A `crs` member of older GeoJSON is honoured, with x, y as east, north, as GDAL writes them. Lines that are straight in the file
+    are taken as straight in world: 500 m east at 57 deg north bend by less than 1 cm. Segments longer than 50 km, which bend by 70 m,
+    and those beyond 1000 km from the datum are omitted. Longitudes may run from -180 or to 360.
 
     Raises:
-        InputError: it cannot be read, is no GeoJSON, has no line, or is farther than 50 km from the datum.
+        InputError: it cannot be read, is not GeoJSON, has no line, or is farther than 50 km from the datum.
     """
     try:
         document = _document(path)
@@ -146,7 +145,7 @@ def _document(path: Path) -> Mapping[str, Any]:
 
 
 def _features(document: Mapping[str, Any]) -> Iterable[tuple[str, Mapping[str, Any]]]:
-    """Each feature, and how to name it."""
+    """Yield each feature, and its name for messages."""
     if document["type"] == "FeatureCollection":
         features = document.get("features")
         if not isinstance(features, list):
@@ -168,7 +167,7 @@ def _tags_of(feature: Mapping[str, Any]) -> Mapping[str, str]:
 
 
 def _gather(found: _Found, tags: Mapping[str, str], geometry: Any) -> None:
-    """Append the lines of a geometry; none has none."""
+    """Append the lines of a geometry; null has none."""
     if geometry is None:
         return
     kind = geometry.get("type") if isinstance(geometry, dict) else geometry
@@ -202,7 +201,7 @@ def _gather(found: _Found, tags: Mapping[str, str], geometry: Any) -> None:
 
 
 def _positions(line: Any) -> Array:
-    """Positions (P, 2), x and y, of a list of them."""
+    """Return positions (P, 2), x and y, of a list of coordinates."""
     try:
         pairs = [(x, y) for x, y, *_ in line]
     except ValueError:
@@ -220,7 +219,7 @@ def _positions(line: Any) -> Array:
 
 
 def _land_of(tags: Mapping[str, str], polygon: bool) -> int:
-    """Where land is: 1 on the left, or inside a polygon, -1 opposite, 0 not known."""
+    """Return the side of land: 1 on the left, or inside a polygon, -1 opposite, 0 unknown."""
     drawn = tags.get("graphloc")
     if drawn is not None and drawn not in ("land", "water"):
         raise ValueError(f"the property `graphloc` is {drawn[:40]!r}: water or land")
@@ -237,7 +236,7 @@ def _land_of(tags: Mapping[str, str], polygon: bool) -> int:
 
 
 def _crs_of(document: Mapping[str, Any]) -> CRS | None:
-    """The CRS that an older GeoJSON names; none where it names none."""
+    """Return the CRS that an older GeoJSON names; None if it names none."""
     member = document.get("crs")
     if member is None:
         return None
@@ -250,7 +249,7 @@ def _crs_of(document: Mapping[str, Any]) -> CRS | None:
 
 
 def _in_world(xy: Array, crs: CRS | None, datum: Datum) -> tuple[Array, Array]:
-    """Place (N, 3) in world, and degrees (N, 2) east, north of the datum, of positions (N, 2) as written."""
+    """Return points (N, 3) in world, and degrees (N, 2) east, north of the datum, of positions (N, 2) as written."""
     to_wgs84 = None if crs is None else Transformer.from_crs(crs, 4326, always_xy=True)
 
     def placed(x: Array, y: Array) -> tuple[Array, Array] | None:
@@ -279,7 +278,7 @@ def _in_world(xy: Array, crs: CRS | None, datum: Datum) -> tuple[Array, Array]:
 
 
 def _segments(found: _Found, p_m: Array, degrees: Array) -> VectorMap:
-    """The pieces of lines through places (N, 3) in world, which are degrees (N, 2) east, north of the datum."""
+    """Return the segments of lines through points (N, 3) in world, which are degrees (N, 2) east, north of the datum."""
     lengths = [len(line.xy) for line in found.lines]
     line = np.repeat(np.arange(len(lengths)), lengths)
     of = line[1:][line[1:] == line[:-1]]
@@ -307,7 +306,7 @@ def _segments(found: _Found, p_m: Array, degrees: Array) -> VectorMap:
 
 
 def _contradicted(ends: Array, left: Array) -> NDArray[np.bool_]:
-    """Which segments (S, 2, 2) are there again with land on the other side; `left` (S,) is 1, -1 or 0."""
+    """Return which segments (S, 2, 2) occur again with land on the other side; `left` (S,) is 1, -1 or 0."""
     back = (ends[:, 0, 0] > ends[:, 1, 0]) | ((ends[:, 0, 0] == ends[:, 1, 0]) & (ends[:, 0, 1] > ends[:, 1, 1]))
     forth = np.where(back[:, None, None], ends[:, ::-1], ends).reshape(-1, 4)
     same = np.unique(forth, axis=0, return_inverse=True)[1].ravel()

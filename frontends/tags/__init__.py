@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AprilTags: from images, or from detections that a bag already holds, to sightings of surveyed tags."""
+"""AprilTags: from images, or from detections in the bag, to sightings of surveyed tags."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The image without distortion that touches a camera's image at a point: sides of tags are straight there."""
+"""Undistorted image that touches a camera's image at a point; sides of tags are straight in it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from graphloc.frontends.tags.camera import Camera
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unbowed:
-    """A pinhole's image, laid along the lens's own about a point; the same there, to first order.
+    """A pinhole image tangent to the lens's image at a point: the same there, to first order.
 
-    Points of it, flat = middle + J (ray - ray of the middle), lie within parts of a pixel of those of the image near the
-    middle, and it is as sharp. J is the lens's d px / d ray at the middle.
+    Its points, flat = middle + J (ray - ray of the middle), differ by fractions of a pixel from those of the image near the
+    middle, at the same sharpness. J is the lens's d px / d ray at the middle.
 
     Attributes:
         middle_px: (2,) of the image. ray: (1, 2) there. J_px: (2, 2).
@@ -28,11 +28,11 @@ class Unbowed:
     J_px: Array
 
     def flat(self, px: Array) -> Array:
-        """Return where points (N, 2), px, of the image are without distortion; NaN where no ray leads to them."""
+        """Return undistorted points (N, 2), px, of points of the image; NaN where no ray leads to them."""
         return np.asarray(self.middle_px + (self.lens.rays(px) - self.ray) @ self.J_px.T)
 
     def bowed(self, flat_px: Array) -> Array:
-        """Return where such points (N, 2) are in the image, px; NaN where the lens sends none."""
+        """Return points (N, 2), px, of the image at undistorted ones; NaN where the lens has none."""
         return self.lens.project(self._rays(flat_px))
 
     def slope(self, flat_px: Array) -> Array:
@@ -44,7 +44,7 @@ class Unbowed:
 
 
 def unbowed(lens: Camera | None, corners_px: Array) -> Unbowed | None:
-    """Return it about a tag's corners (4, 2); None where there is nothing to unbow, or no rays."""
+    """Return the undistorted image at a tag's corners (4, 2); None if there is no distortion, or there are no rays."""
     if lens is None or lens.model == "none":
         return None
     points = np.vstack([corners_px, corners_px.mean(axis=0)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read a tag's bits, and look them up."""
+"""Bits of a tag, and their look-up in the codebook."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ class Codebook:
 
 
 def codebook(family: str, numbers: Collection[int] | None = None) -> Codebook:
-    """Return a family's tags, or those of some numbers.
+    """Return a family's tags, or those with some numbers.
 
     Raises:
-        ConfigError: the family is not known, or has no such number.
+        ConfigError: the family is unknown, or has no such number.
     """
     if family not in FAMILIES:
         raise ConfigError(f"tag family {family!r} is not known: use one of {', '.join(FAMILIES)}")
@@ -69,7 +69,7 @@ def codebook(family: str, numbers: Collection[int] | None = None) -> Codebook:
 
 @compiled
 def homography(corners, side):  # type: ignore[no-untyped-def]
-    """Matrix (3, 3) from cells, x right and y down from the first corner in [0, side], to px; corners (4, 2) clockwise."""
+    """Return the matrix (3, 3) from cells to px; cells: x right, y down from the first corner in [0, side]; corners (4, 2) clockwise."""
     au, av, bu, bv = corners[0, 0], corners[0, 1], corners[1, 0], corners[1, 1]
     cu, cv, du, dv = corners[2, 0], corners[2, 1], corners[3, 0], corners[3, 1]
     su, sv = au - bu + cu - du, av - bv + cv - dv
@@ -84,7 +84,7 @@ def homography(corners, side):  # type: ignore[no-untyped-def]
 
 @compiled
 def bilinear(grey, u, v):  # type: ignore[no-untyped-def]
-    """Grey level at a point, -1 outside of the image."""
+    """Return the grey level at a point, -1 outside of the image."""
     j, i = int(np.floor(u)), int(np.floor(v))
     if not (0 <= j < grey.shape[1] - 1 and 0 <= i < grey.shape[0] - 1):
         return -1.0
@@ -95,7 +95,7 @@ def bilinear(grey, u, v):  # type: ignore[no-untyped-def]
 
 @compiled
 def spots(corners, side):  # type: ignore[no-untyped-def]
-    """Return nine places in each cell of a quadrilateral (4, 2) and of those around it (9 (side + 2)^2, 2), row by row."""
+    """Return nine points in each cell of a quadrilateral (4, 2) and of the cells around it (9 (side + 2)^2, 2), row by row."""
     H = homography(corners, side)
     found = np.empty((9 * (side + 2) ** 2, 2))
     n = 0
@@ -112,7 +112,7 @@ def spots(corners, side):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cell(grey, px, first):  # type: ignore[no-untyped-def]
-    """Mean level of the nine places from the first on, -1 if they are not all in the image."""
+    """Return the mean level of nine points from the first on, -1 if they are not all in the image."""
     total = 0.0
     for k in range(first, first + 9):
         level = bilinear(grey, px[k, 0], px[k, 1])
@@ -124,11 +124,10 @@ def _cell(grey, px, first):  # type: ignore[no-untyped-def]
 
 @compiled
 def _over(grey, px, side, values):  # type: ignore[no-untyped-def]
-    """Write each cell's level over the middle of black and white there (side, side); whether all of the tag is seen.
+    """Write each cell's level above the mean of black and white there (side, side); return whether the whole tag is visible.
 
-    Black is a plane through the border's cells, white one through the cells around it. Both sets are symmetric, so that
-    a plane's three numbers come from three sums; where white's cells are cut
-    off by the image, its slope is left out, and where none is left, the brightest cell is white.
+    Black is a plane through the border's cells, white one through the cells around it. Both sets are symmetric, so three sums give
+    the plane. If the image cuts off cells of the white, its slope is left out; if none is left, the brightest cell is white.
     """
     half = 0.5 * side
     sums, squares, counts = np.zeros((2, 3)), np.zeros(2), np.zeros(2)
@@ -166,7 +165,7 @@ def _over(grey, px, side, values):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bits_off(a, b):  # type: ignore[no-untyped-def]
-    """Number of bits that differ: sums of 2, 4, 8 neighbours, then of all bytes."""
+    """Return the number of different bits: sums of 2, 4, 8 neighbours, then of all bytes."""
     x = a ^ b
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
     x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
@@ -176,15 +175,14 @@ def _bits_off(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def read(grey, px, side, codes):  # type: ignore[no-untyped-def]
-    """Return the tag that the bits in a quadrilateral are nearest to.
+    """Return the tag nearest to the bits in a quadrilateral.
 
     Args:
         px: its `spots`.
 
     Returns:
-        Its index in codes (T, 4), or -1; quarters that it is turned by anticlockwise; bits that differ; the decision
-        margin (AprilTag 3: the mean distance of white or of black data cells to the middle, whichever is less), grey
-        levels.
+        Index in codes (T, 4), or -1; quarter turns anticlockwise; number of different bits; decision margin, grey levels
+        (AprilTag 3: mean distance of white or of black data cells to the mean, whichever is smaller).
     """
     values = np.empty((side, side))
     if not _over(grey, px, side, values):

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Corners of a tag whose cells are known: the image of the whole tag is fitted, all of its edges at once.
+"""Corners of a decoded tag, by fitting the image of the whole tag, all edges at once.
 
-A pixel's grey level is (D black^g + (1 - D) white^g)^(1/g): D is the share of its light that comes from black cells,
-the tag's cells under a homography and a Gaussian blur; black and white are planes over the tag; g is what the camera
-encodes light with. Edges of both kinds, from dark to bright and from bright to dark, are in a tag, so that what widens
-white (gamma, glare, exposure) is told from what moves a corner.
+A pixel's grey level is (D black^g + (1 - D) white^g)^(1/g). D: share of its light from black cells, that is the tag's cells under a
+homography and a Gaussian blur; black and white: planes over the tag; g: the camera's encoding of light. A tag has edges from dark
+to bright and from bright to dark, so effects that widen white (gamma, glare, exposure) are separated from a shift of a corner.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _PEAK = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 class Fit(NamedTuple):
-    """Corners (4, 2) of a tag, their covariance (8, 8) in px^2, and the share of its pixels' variance that is explained."""
+    """Corners (4, 2) of a tag, their covariance (8, 8), px^2, and the share of its pixels' variance that is explained."""
 
     corners_px: Array
     cov_px2: Array
@@ -49,14 +48,14 @@ class Fit(NamedTuple):
 def fit_tag(
     grey: NDArray[np.uint8], about_px: Array, cells: NDArray[np.uint8], straight: Unbowed | None = None
 ) -> Fit | None:
-    """Lay a tag on an image; None if it does not come to rest near where it was thought to be.
+    """Fit a tag to an image; None if it does not converge near the given corners.
 
-    First on some of its pixels, then, from there, on more.
+    First with some of its pixels, then with more.
 
     Args:
-        about_px: (4, 2) about where the corners are: of the cells' first row's left and right end, then clockwise.
+        about_px: (4, 2) approximate corners: left and right end of the cells' first row, then clockwise.
         cells: (side, side), 1 is white.
-        straight: where the tag's sides are straight lines, if not in the image.
+        straight: the image in which the tag's sides are straight, if it is not this one.
     """
     about = about_px if straight is None else straight.flat(about_px)
     prior: _Prior | None = None
@@ -87,14 +86,14 @@ def fit_tag(
 def _pixels(
     grey: NDArray[np.uint8], about_px: Array, corners: Array, side: int, most: int, straight: Unbowed | None
 ) -> tuple[Array, int]:
-    """Pixels (n, 3) of a tag and its quiet zone: u and v where its sides are straight, level; one in so many squared."""
+    """Return the pixels (n, 3) of a tag and its quiet zone: undistorted u and v, and level; one per square of some side."""
     chosen, step = _chosen(grey.shape, about_px, side, most)
     flat = chosen if straight is None else straight.flat(chosen)
     return _inside(grey, chosen, flat, np.linalg.inv(homography(corners, side)), side), step
 
 
 class _Prior(NamedTuple):
-    """What is assumed before the fit (17,), its inverse variances, and white's level over black's."""
+    """Parameters before the fit (17,), their inverse variances, and white's level above black's."""
 
     theta: Array
     info: Array
@@ -125,7 +124,7 @@ def _prior(pixels: Array, about_px: Array, cells: NDArray[np.uint8]) -> _Prior |
 
 
 class _Rest(NamedTuple):
-    """What is fitted (17,), the variance of a pixel, and the normal equations there by block (n, 17, 17), (n, 17)."""
+    """Fitted parameters (17,), variance of a pixel, and normal equations by block (n, 17, 17), (n, 17)."""
 
     theta: Array
     variance: float
@@ -138,7 +137,7 @@ class _Rest(NamedTuple):
 
 
 def _settle(pixels: Array, cells: NDArray[np.uint8], prior: _Prior, start: _Rest | None) -> _Rest | None:
-    """Levenberg-Marquardt, from the prior or from another end; None if the corners leave the tag."""
+    """Levenberg-Marquardt from the prior or an earlier result; None if the corners leave the tag."""
     side, info = len(cells), prior.info
     astray_px = max(_ASTRAY_PX, _ASTRAY_CELLS * math.sqrt(_area(prior.theta[:8].reshape(4, 2))) / side)
     theta, variance = (prior.theta, (0.1 * prior.contrast) ** 2) if start is None else (start.theta, start.variance)
@@ -173,7 +172,7 @@ def _settle(pixels: Array, cells: NDArray[np.uint8], prior: _Prior, start: _Rest
 
 
 def _together(A: Array, b: Array, inverse: Array, variance: float) -> float:
-    """How much more a block's pixels pull at the corners than if each were wrong on its own (Huber's sandwich)."""
+    """Return the variance of the blocks' pull on the corners, relative to that of independent pixels (Huber's sandwich)."""
     P = inverse[:8] @ A / variance
     alone = np.trace(inverse[:8] @ A @ inverse[:, :8] / variance - P @ inverse @ P.transpose(0, 2, 1), axis1=1, axis2=2)
     return float(((b @ inverse[:, :8] / variance) ** 2).sum() / alone.sum())
@@ -186,7 +185,7 @@ def _area(corners: Array) -> float:
 
 @compiled
 def _normal(t):  # type: ignore[no-untyped-def]
-    """Density and distribution of a standard normal, to 1e-7 (Abramowitz and Stegun 7.1.26)."""
+    """Return density and distribution of a standard normal, to 1e-7 (Abramowitz and Stegun 7.1.26)."""
     p = _PEAK * math.exp(-0.5 * t * t)
     z = 1.0 / (1.0 + 0.2316418882 * abs(t))
     tail = (
@@ -201,7 +200,7 @@ def _normal(t):  # type: ignore[no-untyped-def]
 
 @compiled
 def _shares(x, s, first, w, dx, ds):  # type: ignore[no-untyped-def]
-    """Write how much of a point's light comes from each cell from `first` on, blurred by s cells; and derivatives."""
+    """Write the share of light at a point that comes from each cell from `first` on, blurred by s cells, and its derivatives."""
     t0 = (first - x) / s
     p0, c0 = _normal(t0)
     for i in range(len(w)):
@@ -213,18 +212,18 @@ def _shares(x, s, first, w, dx, ds):  # type: ignore[no-untyped-def]
 
 @compiled
 def _place(X, u, v):  # type: ignore[no-untyped-def]
-    """A pixel's place in cells (x, y), and z: what the homography divides by, inverted."""
+    """Return a pixel's position in cells (x, y), and the inverse z of the homography's denominator."""
     z = 1.0 / (X[2, 0] * u + X[2, 1] * v + X[2, 2])
     return (X[0, 0] * u + X[0, 1] * v + X[0, 2]) * z, (X[1, 0] * u + X[1, 1] * v + X[1, 2]) * z, z
 
 
 @compiled
 def _model(theta, X, slopes, cells, u, v, J, w):  # type: ignore[no-untyped-def]
-    """Level of a pixel, its derivatives J (17,), and the share of its light that comes from beyond the quiet zone.
+    """Return a pixel's level, its derivatives J (17,), and the share of light from beyond the quiet zone.
 
     Args:
-        X: (3, 3) matrix from px to cells. slopes: (8, 9) its derivatives by the corners' coordinates, row after row.
-        w: (6, 24) to work in.
+        X: (3, 3) matrix from px to cells. slopes: (8, 9) its derivatives by the corners' coordinates, row by row.
+        w: (6, 24) workspace.
     """
     side = len(cells)
     x, y, z = _place(X, u, v)
@@ -276,10 +275,10 @@ def _model(theta, X, slopes, cells, u, v, J, w):  # type: ignore[no-untyped-def]
 
 @compiled
 def _chosen(shape, corners, side, most):  # type: ignore[no-untyped-def]
-    """Pixels (n, 2) of the box about a tag and its quiet zone: one of each square of so many by so many; so many.
+    """Return pixels (n, 2) of the box around a tag and its quiet zone, one per square of some side, and that side.
 
-    Somewhere in its square, or all pixels of a column were equally far from an edge that is nearly upright: at 1600
-    pixels from 3 to 5 m in optimal light, corners were 0.073 px off, and are 0.044.
+    The position in the square is pseudo-random: otherwise all pixels of a column would have the same distance to an edge that is
+    nearly vertical, and corners would be 0.073 px off instead of 0.044 (1600 pixels from 3 to 5 m in optimal light).
     """
     low_u, high_u, low_v, high_v = 1e9, -1e9, 1e9, -1e9
     area = 0.0
@@ -307,7 +306,7 @@ def _chosen(shape, corners, side, most):  # type: ignore[no-untyped-def]
 
 @compiled
 def _inside(grey, px, flat, X, side):  # type: ignore[no-untyped-def]
-    """Pixels (n, 3): place without distortion, level in [0, 1]; of those px (m, 2) that are in the tag and quiet zone."""
+    """Return pixels (n, 3), undistorted position and level in [0, 1], of those (m, 2) in the tag and quiet zone."""
     found = np.empty((len(px), 3))
     n = 0
     for i in range(len(px)):
@@ -320,10 +319,10 @@ def _inside(grey, px, flat, X, side):  # type: ignore[no-untyped-def]
 
 @compiled
 def _gather(pixels, cells, theta, X, slopes, doubt):  # type: ignore[no-untyped-def]
-    """Normal equations by block (n, 17, 17), (n, 17), for pixels of unit variance; weighted sum of squares, of weights.
+    """Return normal equations by block (n, 17, 17), (n, 17), for pixels of unit variance; weighted sum of squares; sum of weights.
 
     Args:
-        X, slopes: as `_model` takes them. doubt: the variance of what lies beyond the quiet zone over that of a pixel.
+        X, slopes: as for `_model`. doubt: variance of light from beyond the quiet zone over that of a pixel.
     """
     side = len(cells)
     A, b = np.zeros((_BLOCKS * _BLOCKS, _N, _N)), np.zeros((_BLOCKS * _BLOCKS, _N))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where tags may be: dark quadrilaterals on brighter ground."""
+"""Candidates for tags: dark quadrilaterals on a brighter background."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def quads_in(grey: NDArray[np.uint8], min_side_px: float, cells: int) -> Array:
 
 @compiled
 def _quads(grey, toned, low, high, contrast, least_px, cells):  # type: ignore[no-untyped-def]
-    """Return dark quadrilaterals (n, 4, 2), each moved onto its edges."""
+    """Return dark quadrilaterals (n, 4, 2), each aligned with its edges."""
     ends, row, parent = _runs(toned, low, high, contrast)
     found = _hulls(ends, row, parent, least_px)
     n = 0
@@ -48,9 +48,9 @@ def _quads(grey, toned, low, high, contrast, least_px, cells):  # type: ignore[n
 
 @compiled
 def _runs(toned, low, high, contrast):  # type: ignore[no-untyped-def]
-    """Runs of dark pixels along rows (n, 2), first column and the one after the last; row, and a run of its component.
+    """Return runs of dark pixels along rows (n, 2), first column and the one after the last; row, and a run of its component.
 
-    Written without a branch per pixel: guessing wrong at each of some 10^6 ends of runs would take most of the time.
+    There is no branch per pixel: at some 10^6 ends of runs, mispredicted branches would take most of the time.
     """
     rows, columns = toned.shape
     ends = np.empty(2 * rows * (columns // 2 + 1), dtype=np.int32)
@@ -91,7 +91,7 @@ def _root(parent, k):  # type: ignore[no-untyped-def]
 
 @compiled
 def _hulls(ends, row, parent, least):  # type: ignore[no-untyped-def]
-    """Largest quadrilateral (n, 4, 2) in the hull of each component that may be a tag."""
+    """Return the largest quadrilateral (n, 4, 2) in the hull of each component that may be a tag."""
     n = len(row)
     left, right, bottom, area = ends[:, 0].copy(), ends[:, 1].copy(), row.copy(), np.zeros(n, dtype=np.int64)
     for i in range(n):
@@ -126,7 +126,7 @@ def _hulls(ends, row, parent, least):  # type: ignore[no-untyped-def]
 
 @compiled
 def _hull(begin, end, top):  # type: ignore[no-untyped-def]
-    """Convex hull (n, 2), clockwise in the image, of rows of pixels from begin to end."""
+    """Return the convex hull (n, 2), clockwise in the image, of rows of pixels from begin to end."""
     height = len(begin)
     hull = np.empty((2 * height, 2))
     n = 0
@@ -140,7 +140,7 @@ def _hull(begin, end, top):  # type: ignore[no-untyped-def]
 
 @compiled
 def _append(hull, low, n, u, v):  # type: ignore[no-untyped-def]
-    """Append a point after taking back those since `low` that it makes concave; their new number."""
+    """Append a point after removing those since `low` that it makes concave; return their new number."""
     while n > low + 1 and (hull[n - 1, 0] - hull[n - 2, 0]) * (v - hull[n - 2, 1]) <= (
         hull[n - 1, 1] - hull[n - 2, 1]
     ) * (u - hull[n - 2, 0]):
@@ -151,7 +151,7 @@ def _append(hull, low, n, u, v):  # type: ignore[no-untyped-def]
 
 @compiled
 def _farthest(hull, i, j):  # type: ignore[no-untyped-def]
-    """Vertex of a clockwise hull that is farthest outwards from the line from vertex i to j."""
+    """Return the vertex of a clockwise hull that is farthest outwards from the line from vertex i to j."""
     best, at = -1.0, i
     du, dv = hull[j, 0] - hull[i, 0], hull[j, 1] - hull[i, 1]
     for k in range(len(hull)):
@@ -163,7 +163,7 @@ def _farthest(hull, i, j):  # type: ignore[no-untyped-def]
 
 @compiled
 def _largest(hull, quad, dark, least):  # type: ignore[no-untyped-def]
-    """Write a hull's largest quadrilateral, found by moving one corner at a time; whether it may be a tag's."""
+    """Write a hull's largest quadrilateral, found by moving one corner at a time; return whether it may be a tag's."""
     i, j = 0, 0  # the first vertex is a corner of the hull, and what is farthest from it is another
     for k in range(len(hull)):
         if np.hypot(hull[k, 0] - hull[i, 0], hull[k, 1] - hull[i, 1]) > np.hypot(
@@ -190,7 +190,7 @@ def _largest(hull, quad, dark, least):  # type: ignore[no-untyped-def]
 
 @compiled
 def _area(p):  # type: ignore[no-untyped-def]
-    """Area of a polygon (n, 2), positive if clockwise in the image."""
+    """Return the area of a polygon (n, 2), positive if clockwise in the image."""
     total = 0.0
     for k in range(len(p)):
         total += p[k - 1, 0] * p[k, 1] - p[k, 0] * p[k - 1, 1]
@@ -199,7 +199,7 @@ def _area(p):  # type: ignore[no-untyped-def]
 
 @compiled
 def _has_sides(grey, quad):  # type: ignore[no-untyped-def]
-    """Whether it is brighter outside of every side, and about as much."""
+    """Return whether it is brighter outside of every side, by similar amounts."""
     contrast = np.zeros(4)
     for k in range(4):
         p, d = quad[k], quad[(k + 1) % 4] - quad[k]
@@ -212,10 +212,10 @@ def _has_sides(grey, quad):  # type: ignore[no-untyped-def]
 
 @compiled
 def _straighten(grey, quad, cells):  # type: ignore[no-untyped-def]
-    """Move a quadrilateral (4, 2) onto the edges next to it, dark inside; whether there is one along each side.
+    """Align a quadrilateral (4, 2) with the edges next to it, dark inside; return whether each side has one.
 
-    Each side becomes a line through the steepest places of profiles across it. Within a cell to either side there is
-    no other edge from dark to bright.
+    Each side becomes a line through the steepest points of profiles across it. Within a cell to either side there is no other edge
+    from dark to bright.
     """
     shortest, before = 1e9, _area(quad)
     for k in range(4):
@@ -240,7 +240,7 @@ def _straighten(grey, quad, cells):  # type: ignore[no-untyped-def]
 
 @compiled
 def _line(grey, p, q, reach, line):  # type: ignore[no-untyped-def]
-    """Write the line (4,) of an edge near the segment from p to q: a point, a direction; whether there is a straight one."""
+    """Write the line (4,), point and direction, of an edge near the segment from p to q; return whether there is a straight one."""
     long = np.hypot(q[0] - p[0], q[1] - p[1])
     du, dv = (q[0] - p[0]) / long, (q[1] - p[1]) / long
     n = max(8, min(32, int(long)))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a single tag's pose may be from its minimum, beyond what the curvature there says.
+"""Uncertainty of a single tag's pose beyond the curvature at its minimum.
 
-Seen from ahead, a tag's tilt shows as 1 - cos: to second order. The likelihood of a tilt then has two flat-bottomed
-wells that run into each other, and the distance goes along with it on a curve. Here the likelihood is summed over a
-grid of tilts, the rest (place, turn about the normal) solved for at each of them; what comes out is the second moment
-about the minimum, over the tilts that lie nearer to it than to another one.
+Seen frontally, a tag's tilt shows as 1 - cos, to second order. The likelihood of a tilt then has two flat wells that merge, and
+the distance changes with it along a curve. Here the likelihood is summed over a grid of tilts, with the other parameters
+(position, rotation about the normal) optimised at each. The result is the second moment about the minimum, over the tilts nearer
+to it than to another minimum.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _NEAREST = 0.05  # of the distance: where a step may take a corner at most
 def spread(
     corners_m: Array, rays: Array, whiten: Array, R: Array, t_m: Array, curvature: Array, others: Sequence[Array]
 ) -> tuple[Array, float]:
-    """Return the second moment (6, 6) of (place of the tag's middle in camera, rotation about camera's axes); log evidence.
+    """Return the second moment (6, 6) of (position of the tag's middle in camera, rotation about camera's axes), and log evidence.
 
     Args:
         corners_m: (4, 3) in world. rays: (4, 2). whiten: (8, 8), makes the rays' errors unit and uncorrelated.
@@ -71,7 +71,7 @@ def spread(
 def _linear(
     tilted: Array, normal: Array, middle: Array, rest: Array, rays: Array, whiten: Array
 ) -> tuple[Array, Array]:
-    """Whitened errors (G, 8) of tilted corners (G, 4, 3), and their Jacobian (G, 8, 4) by place and turn."""
+    """Return whitened errors (G, 8) of tilted corners (G, 4, 3), and their Jacobian (G, 8, 4) by position and rotation."""
     spun = tilted + rest[:, 3, None, None] * np.cross(normal[:, None, :], tilted)
     there = middle + rest[:, None, :3] + spun
     z = np.maximum(there[:, :, 2:], 0.01)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tags of one image become sightings: those of one frame together, those that contradict the rest alone."""
+"""Sightings from the tags of one image: those of one frame together, those that contradict the rest separately."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class SeenTag:
     """A tag in an image.
 
     Attributes:
-        tag: what the survey says of it. rays, cov: (4, 2) of its corners, and their covariance (8, 8).
-        fitted: the rays come of a pose that somebody else chose: they fit it perfectly, which says nothing for it.
+        tag: its survey. rays, cov: (4, 2) of its corners, and their covariance (8, 8).
+        fitted: the rays were computed from a pose, which they fit perfectly, so that the fit is no evidence for it.
     """
 
     tag: TagConfig
@@ -37,7 +37,7 @@ class SeenTag:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeing:
-    """Who sees, and when; floor: least noise of a ray, each axis, 1 sigma; px: a pixel as a ray."""
+    """Camera and stamp; floor: least noise of a ray per axis, 1 sigma; px: size of a pixel as a ray."""
 
     stamp_ns: int
     sensor: str
@@ -66,10 +66,9 @@ class Bundle:
     """Tags of one frame taken together.
 
     Attributes:
-        points_m, rays: (4 K, 3) corners in world at rest, (4 K, 2). seen_cov, cov: (8 K, 8 K) of the rays by the image,
-            and with the survey's share.
-        poses: that explain them; none where nothing does. excess: how many times larger the squared error is than the
-            noise lets expect.
+        points_m, rays: (4 K, 3) corners in world at rest, (4 K, 2). seen_cov, cov: (8 K, 8 K) covariance of the rays by the
+            image, and with the survey's errors.
+        poses: that explain them; none if nothing does. excess: ratio of the squared error to its expectation.
     """
 
     def __init__(self, group: Sequence[SeenTag], survey: Survey, frame: str) -> None:
@@ -90,7 +89,7 @@ class Bundle:
         return poses_of(self.points_m, self.rays, self.cov, [(pose.R, pose.t_m) for pose in self.poses])
 
     def _surveyed(self, pose: PoseOfCamera) -> Array:
-        """What the survey does not know of each tag, as a covariance of the rays."""
+        """Return the survey errors of each tag as a covariance of the rays."""
         there, shares = self.points_m @ pose.R.T + pose.t_m, []
         projected = pinhole(there)[1]
         for k, s in enumerate(self.group):
@@ -103,9 +102,9 @@ class Bundle:
         return np.asarray(block_diag(*shares))
 
     def doubt(self) -> None:
-        """Robust loss on the image itself: corners that fit no pose as well as they should are blurred or half hidden.
+        """Widen the noise of the corners if no pose fits as expected, since they are then blurred or partly hidden; drop poor minima.
 
-        Which minima are none is judged only now: with the noise that was claimed for blurred corners, all but one are.
+        Minima are dropped only afterwards: with the claimed noise of blurred corners, all but one would be.
         """
         if self.excess > chi2_95(self.dof) / self.dof:
             self.cov, self.seen_cov = self.cov * self.excess, self.seen_cov * self.excess
@@ -115,9 +114,9 @@ class Bundle:
 
 
 def _that_fit(seen: Sequence[SeenTag], survey: Survey, frame: str) -> list[Bundle]:
-    """Groups of tags that one pose explains; three or more can tell who of them is wrong, two cannot.
+    """Return groups of tags that one pose explains; three or more can show which is wrong, two cannot.
 
-    Tags that fit no better without each other are blurred as a whole: they stay together, and are doubted together.
+    Tags that fit no better without each other are all blurred: they stay together and get a larger noise together.
     """
     whole, alone = Bundle(seen, survey, frame), list[Bundle]()
     while len(whole.group) > 1 and whole.excess > CONTRADICTS:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras: from image points to directions in the optical frame and back, as `sensor_msgs/CameraInfo` says.
+"""Cameras: from image points to rays in the optical frame and back, by `sensor_msgs/CameraInfo`.
 
-A ray is (x/z, y/z) in the optical frame (x right, y down, z forward); image points are px, (0, 0) is the middle of the
-top-left pixel. With the lens d: rays -> rays of one of OpenCV's models,
+A ray is (x/z, y/z) in the optical frame (x right, y down, z forward); image points are px, (0, 0) is the centre of the top-left
+pixel. With the lens d: rays -> rays of one of OpenCV's models,
 
     px = K[:2, :2] d(ray) + K[:2, 2].
 """
@@ -32,8 +32,8 @@ class Camera:
     """A camera and its lens.
 
     Attributes:
-        width_px: of its images; 0 where not known, as `height_px`.
-        K: (3, 3), ray through the lens to px.
+        width_px, height_px: of its images; 0 if unknown.
+        K: (3, 3), from rays through the lens to px.
         model: 'plumb_bob', 'rational_polynomial', 'equidistant' or 'none'.
         distortion: the model's coefficients (n,) in OpenCV's order.
     """
@@ -45,11 +45,10 @@ class Camera:
     distortion: Array
 
     def rays(self, corners_px: Array) -> Array:
-        """Return the rays (N, 2) of image points (N, 2), distortion undone.
+        """Return the rays (N, 2) of image points (N, 2), with distortion removed.
 
-        NaN where no ray leads: outside of the image of a lens whose model folds (k1 = -0.5 sends rays beyond
-        0.82 back inwards), hard by that fold, and from 89.9 deg off the axis on. Of several rays that a folding model
-        sends to a point, the one within the fold is returned.
+        NaN where there is none: outside the image of a lens whose model folds (k1 = -0.5 maps rays beyond 0.82 back inwards), close to
+        that fold, and from 89.9 deg off the axis on. Of several rays of one point, the one within the fold is returned.
         """
         flat = (corners_px - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
         if self.model == "none" or not len(flat):
@@ -71,7 +70,7 @@ class Camera:
         return np.asarray(found)
 
     def project(self, rays: Array) -> Array:
-        """Return the image points (N, 2), px, of rays (N, 2); NaN where `rays` would not lead back."""
+        """Return the image points (N, 2), px, of rays (N, 2); NaN where `rays` would not return these."""
         if self.model == "none" or not len(rays):
             flat = rays
         else:
@@ -86,7 +85,7 @@ class Camera:
         return np.asarray(self.K[:2, :2] @ self._through_lens(rays)[1])
 
     def check_size(self, width_px: int, height_px: int) -> None:
-        """Raise ValueError where an image has not the size that this camera's images have, if that is known."""
+        """Raise ValueError if an image does not have the size of this camera's images, if that is known."""
         if not self.width_px or not self.height_px or (width_px, height_px) == (self.width_px, self.height_px):
             return
         hint = ""
@@ -100,7 +99,7 @@ class Camera:
         return _distorted(self.model, self.distortion, rays)
 
     def _within(self, rays: Array, slope: Array) -> NDArray[np.bool_]:
-        """Whether the lens's model can be inverted at rays (N, 2): they lie within its fold, if it has one."""
+        """Return whether the lens's model can be inverted at rays (N, 2): they are within its fold, if it has one."""
         radii, _ = _radii(self.model, tuple(self.distortion))
         return np.asarray((np.linalg.norm(rays, axis=1) <= radii[-1]) & (np.linalg.det(slope) > 0.0))
 
@@ -108,7 +107,7 @@ class Camera:
 def _distorted(model: str, distortion: Array, rays: Array) -> tuple[Array, Array]:
     """Return d(ray) (N, 2) and its derivative (N, 2, 2).
 
-    At z = 1 a ray moves as the translation of a camera does, which OpenCV gives the derivative of.
+    At z = 1 a ray moves like a translation of the camera, for which OpenCV gives the derivative.
     """
     points = np.column_stack([rays, np.ones(len(rays))])[:, None]
     still, plain = np.zeros(3), np.eye(3)
@@ -124,9 +123,9 @@ def _distorted(model: str, distortion: Array, rays: Array) -> tuple[Array, Array
 
 @lru_cache(maxsize=64)
 def _radii(model: str, distortion: tuple[float, ...]) -> tuple[Array, Array]:
-    """Return lengths of rays (n,), ascending, and of their images (n,), up to where the model folds.
+    """Return lengths of rays (n,), ascending, and of their images (n,), up to the fold of the model.
 
-    Only what is round about the axis: without tangential terms, prism and tilt.
+    Only the radial part: without tangential terms, prism and tilt.
     """
     round_only = np.array(distortion)
     if model != "equidistant":
@@ -141,15 +140,15 @@ def _radii(model: str, distortion: tuple[float, ...]) -> tuple[Array, Array]:
 def camera_of(msg: Any, *, rectified: bool) -> Camera:
     """Return the camera of a `sensor_msgs/CameraInfo` of ROS 1 or 2.
 
-    Its region of interest and binning are applied: a pixel of the image is the mean of `binning` ones of the region.
-    `image_geometry` leaves out the half pixel of that.
+    Region of interest and binning are applied: a pixel of the image is the mean of `binning` ones of the region.
+    `image_geometry` omits the half pixel of that.
 
     Args:
-        rectified: the images are `image_rect`: P is theirs, and they have no distortion. Rays are then in the axes of
-            the rectified image; those of a stereo camera are turned by R from its optical frame.
+        rectified: the images are `image_rect`: P is theirs, and they have no distortion. Rays are then in the axes of the
+            rectified image; those of a stereo camera are rotated by R from its optical frame.
 
     Raises:
-        ValueError: the message calibrates no camera, or one with a lens that is not known.
+        ValueError: the message has no calibration, or an unknown lens model.
     """
     K = _matrix(msg, rectified=rectified)
     model, distortion = ("none", np.empty(0)) if rectified else _lens(msg)
@@ -178,7 +177,7 @@ def _matrix(msg: Any, *, rectified: bool) -> Array:
 
 
 def _lens(msg: Any) -> tuple[str, Array]:
-    """Return model and coefficients (n,). No coefficients are none, but for an equidistant lens: that is not plain."""
+    """Return model and coefficients (n,). No coefficients mean no distortion, except for an equidistant lens."""
     named = str(msg.distortion_model)
     model = _ALIASES.get(named.strip().lower(), named.strip().lower())
     coefficients = _field(msg, "D")
@@ -197,5 +196,5 @@ def _lens(msg: Any) -> tuple[str, Array]:
 
 
 def _field(msg: Any, name: str) -> Array:
-    """The values of a field that ROS 1 spells K and ROS 2 k."""
+    """Return the values of a field that ROS 1 spells K and ROS 2 k."""
     return np.array(getattr(msg, name.lower() if hasattr(msg, name.lower()) else name), dtype=float).ravel()

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AprilTags in grey images: which, where their corners are, and how well that is known.
+"""AprilTags in grey images: which they are, their corners, and the covariance of these.
 
-Three steps: dark quadrilaterals (`_quads`), whose bits are in the codebook or nearly (`_decode`), and on which the whole
-tag then fits (`_edges`), its edges bowed by the lens where that is known (`_bow`); the bits are read again at the corners
-that come of it.
+Three steps: dark quadrilaterals (`_quads`), whose bits are in the codebook or nearly (`_decode`), and to which the whole tag is
+fitted (`_edges`), with edges curved by the lens if that is known (`_bow`); the bits are read again at the fitted corners.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ class Detection:
 
 
 class _Candidate(NamedTuple):
-    """A quadrilateral (4, 2), px, whose first corner is that of tag `tag` of `book`; bits that differ from it."""
+    """A quadrilateral (4, 2), px, whose first corner is that of tag `tag` of `book`, and the number of different bits."""
 
     book: Codebook
     tag: int
@@ -62,18 +61,18 @@ class _Candidate(NamedTuple):
 
 
 class Detector:
-    """Finds AprilTags; keeps nothing from one image to the next, and may be shared by threads.
+    """Finds AprilTags. It has no state between images and can be shared by threads.
 
     Args:
-        families: of `16h5`, `25h9`, `36h10`, `36h11`. 16h5 has so few bits that anything dark and square is one: give
-            `numbers`, and no bits to correct.
-        max_hamming: bits that may be wrong.
+        families: of `16h5`, `25h9`, `36h10`, `36h11`. 16h5 has so few bits that any dark square may match: give `numbers`,
+            and no bits to correct.
+        max_hamming: number of bits that may be wrong.
         min_margin: least decision margin, grey levels.
-        min_side_px: tags with sides that are shorter on average are not looked for.
-        numbers: by family, the ids that are looked for, if not all.
+        min_side_px: tags with shorter sides on average are not sought.
+        numbers: by family, the ids to seek, if not all.
 
     Raises:
-        ConfigError: a family is not known, or has no such number.
+        ConfigError: a family is unknown, or has no such number.
     """
 
     def __init__(
@@ -89,11 +88,10 @@ class Detector:
         self._max_hamming, self._min_margin, self._min_side_px = max_hamming, min_margin, min_side_px
 
     def detect(self, grey: NDArray[np.uint8], lens: Camera | None = None) -> list[Detection]:
-        """Return the tags that are seen whole in an image (rows, columns), on two threads; lowest number first.
+        """Return the tags that are wholly visible in an image (rows, columns), on two threads; lowest number first.
 
         Args:
-            lens: the image's, where it may be distorted: then a tag's edges are fitted as they are bowed. Corners stay
-                points of the image as it is.
+            lens: of an image with distortion: edges of a tag are then fitted as curves. Corners stay points of the image.
         """
         if min(grey.shape, default=0) < self._min_side_px or not self._books:
             return []
@@ -105,7 +103,7 @@ class Detector:
         return sorted(found, key=lambda d: (d.family, d.number, d.corners_px[0, 0]))
 
     def _candidates(self, grey: NDArray[np.uint8], scale: float, top: int) -> list[_Candidate]:
-        """Quadrilaterals with nearly a tag's bits, of a part of the image that is so much smaller and begins at row top."""
+        """Return quadrilaterals with nearly a tag's bits, of a part of the image that is reduced by a factor, from row `top` on."""
         found = []
         for quad in quads_in(grey, self._min_side_px / scale, max(book.side for book in self._books)):
             for book in self._books:
@@ -117,7 +115,7 @@ class Detector:
         return found
 
     def _settled(self, grey: NDArray[np.uint8], lens: Camera | None, candidate: _Candidate) -> Detection | None:
-        """The tag, if it is one: laid on the image, read again where it lies."""
+        """Return the tag fitted to the image, if its bits there are those of a tag."""
         book = candidate.book
         straight = unbowed(lens, candidate.corners_px)
         fitted = fit_tag(grey, candidate.corners_px, book.cells[candidate.tag], straight)
@@ -134,9 +132,9 @@ class Detector:
 
 
 def parts_of(grey: NDArray[np.uint8]) -> list[tuple[NDArray[np.uint8], float, int]]:
-    """The image at half the resolution, for tall tags, noise and blur; and strips of it, so that threads share the work.
+    """Return the image at half the resolution, for tall tags, noise and blur, and strips of it, to be shared by threads.
 
-    With each, how much smaller it is, and its first row in the image.
+    Each comes with its reduction and its first row in the image.
     """
     half = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     edges = np.linspace(0, len(grey), _STRIPS + 1).astype(int).tolist()
@@ -145,7 +143,7 @@ def parts_of(grey: NDArray[np.uint8]) -> list[tuple[NDArray[np.uint8], float, in
 
 
 def _distinct(candidates: Iterable[_Candidate]) -> list[_Candidate]:
-    """Without those in the place of another that is off by fewer bits."""
+    """Drop detections at the position of another one with fewer different bits."""
     kept: list[_Candidate] = []
     for candidate in sorted(candidates, key=lambda c: c.off):
         middle, width = candidate.corners_px.mean(axis=0), np.ptp(candidate.corners_px, axis=0).max()

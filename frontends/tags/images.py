@@ -26,10 +26,10 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 
 def grey_image(msg: Any, msgtype: str) -> Grey:
-    """Return the image (rows, columns) of a message as rosbags decodes it; 16 bits are scaled to its brightest pixel.
+    """Return the image (rows, columns) of a message decoded by rosbags; 16 bits are scaled to the brightest pixel.
 
     Raises:
-        ValueError: it has none, or one that is not understood; the text says why.
+        ValueError: it has no image, or one in an unsupported format.
     """
     if msgtype == "sensor_msgs/msg/Image":
         return _raw(msg)
@@ -90,7 +90,7 @@ def _compressed(data: Grey) -> Grey:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in a JPEG's frame header; None if there is none."""
+    """Return width and height in a JPEG's frame header; None if there is none."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AprilTags that another program has detected, as bags hold them: corners in the image, or one pose for each."""
+"""AprilTags detected by another program, from messages in the bag: corners in the image, or a pose of each."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class ListedTag:
     """A detection. Corners are those of the print: top left, top right, bottom right, bottom left.
 
     Attributes:
-        family: such as 'tag36h11'; '' where not said.
-        hamming: bits that were corrected; None where not said, as `margin`.
+        family: such as 'tag36h11'; '' if not stated.
+        hamming: corrected bits; None if not stated, as `margin`.
         margin: AprilTag's decision margin, grey levels.
-        size_m: length of an edge, as the detecting program was told; None where not said.
-        corners_px: (4, 2) px, (0, 0) is the middle of the top-left pixel, in the image that was searched (usually
-            `image_rect`); None where `rays` is given.
-        rays: (4, 2), x/z and y/z in the optical frame. They are the corners of a pose that was fitted: it has no
-            residual in them, so that they do not tell which of the two planar poses fits better.
+        size_m: edge length configured in the detecting program; None if not stated.
+        corners_px: (4, 2) px, (0, 0) is the centre of the top-left pixel, in the image that was searched (usually
+            `image_rect`); None if `rays` is given.
+        rays: (4, 2), x/z and y/z in the optical frame: corners of a pose that was fitted. They have no residual, so that they
+            do not show which of the two planar poses fits better.
     """
 
     number: int
@@ -62,10 +62,10 @@ def read_list(msg: Any, msgtype: str) -> tuple[list[ListedTag], list[str]]:
 
 
 def _with_corners(entry: Any) -> ListedTag:
-    """An `apriltag_msgs/AprilTagDetection`: what AprilTag 3 found, as it found it.
+    """Read an `apriltag_msgs/AprilTagDetection`, the output of AprilTag 3.
 
-    AprilTag counts corners from the print's bottom left, counter-clockwise, and px from the outer corner of the
-    top-left pixel. Messages of 2018 have the corners as eight numbers.
+    AprilTag counts corners from the print's bottom left, counter-clockwise, and px from the outer corner of the top-left pixel.
+    Messages of 2018 have the corners as eight numbers.
     """
     corners = [(c.x, c.y) if hasattr(c, "x") else c for c in entry.corners]
     corners_px = np.array(corners, dtype=float).reshape(4, 2)[::-1] - 0.5
@@ -84,16 +84,16 @@ def _with_corners(entry: Any) -> ListedTag:
 
 
 def _family(name: str) -> str:
-    """AprilTag's own name of a family, which `apriltag_detector` calls 'tf36h11'."""
+    """Return AprilTag's own name of a family, which `apriltag_detector` calls 'tf36h11'."""
     known = re.fullmatch(r"(?:tf|tag)?((?:Standard|Circle|Custom)?\d+h\d+)", name)
     return f"tag{known[1]}" if known else name
 
 
 def _with_pose(entry: Any) -> ListedTag:
-    """An `apriltag_ros/AprilTagDetection` of ROS 1: the pose of the tag in the optical frame, from its four corners.
+    """Read an `apriltag_ros/AprilTagDetection` of ROS 1: the pose of the tag in the optical frame, from its four corners.
 
-    That program takes AprilTag's px for OpenCV's: its rays lie half a pixel, 0.5 px / focal length, too far right and
-    down. The message has no focal length to undo it with.
+    That program takes AprilTag's px for OpenCV's: its rays are half a pixel, 0.5 px / focal length, too far right and down. The
+    message has no focal length to correct that.
     """
     numbers = [int(n) for n in entry.id]
     if len(numbers) != 1 or len(entry.size) != 1:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The poses of a camera that explain what it sees of tags: every minimum of the reprojection error, with its covariance.
+"""Poses of a camera that explain its view of tags: every minimum of the reprojection error, with its covariance.
 
-The four corners of a tag have two poses (infinitesimal plane-based pose estimation, Collins & Bartoli 2014, gives
-both); those of several tags together mostly have one. Each is refined to the minimum of the whitened error.
+The four corners of a tag have two poses (infinitesimal plane-based pose estimation, Collins & Bartoli 2014, gives both); those of
+several tags together mostly have one. Each is refined to the minimum of the whitened error.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _ANY_TILT_RAD = float(np.radians(40.0))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseOfCamera:
-    """A minimum.
+    """A minimum of the reprojection error.
 
     Attributes:
         R, t_m: world in camera: x_camera = R x_world + t. squared: whitened squared error.
-        information: (6, 6) of (place of the points' middle in camera, rotation about camera's axes).
+        information: (6, 6) of (position of the points' middle in camera, rotation about camera's axes).
     """
 
     R: Array
@@ -49,11 +49,11 @@ class PoseOfCamera:
 def poses_of(
     points_m: Array, rays: Array, cov: Array, starts: Sequence[tuple[Array, Array]] = ()
 ) -> list[PoseOfCamera]:
-    """Return the poses that explain what is seen, best first; none where nothing does.
+    """Return the poses that explain the rays, best first; none if nothing does.
 
     Args:
-        points_m: (4 K, 3) corners of K tags in turn, in world. rays: (4 K, 2) where they are seen.
-        cov: (8 K, 8 K) of the rays. starts: (R, t) of world in camera to begin from; none: each tag's own two poses.
+        points_m: (4 K, 3) corners of K tags in turn, in world. rays: (4 K, 2) their rays.
+        cov: (8 K, 8 K) of the rays. starts: initial (R, t), world in camera; default: each tag's own two poses.
     """
     whiten = np.linalg.inv(np.linalg.cholesky(cov))
     found: list[PoseOfCamera] = []
@@ -68,7 +68,7 @@ def poses_of(
 
 
 def _starts(corners_m: Array, rays: Array) -> list[tuple[Array, Array]]:
-    """Both poses (R, t) of world in camera by one tag."""
+    """Return both poses (R, t), world in camera, by one tag."""
     middle = corners_m.mean(axis=0)
     x, y = corners_m[1] - corners_m[0], corners_m[0] - corners_m[3]
     axes = np.column_stack([x / np.linalg.norm(x), y / np.linalg.norm(y), np.zeros(3)])
@@ -93,7 +93,7 @@ def _starts(corners_m: Array, rays: Array) -> list[tuple[Array, Array]]:
 
 
 def _facing(side_m: float, rays: Array) -> tuple[Array, Array]:
-    """The pose (R, t) of a tag that is seen from straight ahead, turned as its corners' rays (4, 2) are."""
+    """Return the frontal pose (R, t) of a tag, rotated as the rays (4, 2) of its corners are."""
     x = 0.5 * (rays[1] + rays[2] - rays[0] - rays[3])
     length = max(float(np.linalg.norm(x)), 1e-9)
     x = x / length if length > 1e-9 else np.array([1.0, 0.0])
@@ -103,7 +103,7 @@ def _facing(side_m: float, rays: Array) -> tuple[Array, Array]:
 
 
 def _mirrored(R: Array, t: Array) -> Array:
-    """The attitude whose normal lies on the other side of the line of sight."""
+    """Return the attitude whose normal is mirrored at the line of sight."""
     sight, normal = t / np.linalg.norm(t), R[:, 2]
     axis = np.cross(normal, -sight)
     length = float(np.linalg.norm(axis))
@@ -114,14 +114,14 @@ def _mirrored(R: Array, t: Array) -> Array:
 
 
 def _errors(arms_m: Array, rays: Array, R: Array, middle_m: Array) -> Array | None:
-    """Errors (8 K,) of points that lie `arms_m` (4 K, 3, in world) about a middle (3,) in camera; None: behind it."""
+    """Return the errors (8 K,) of points at arms `arms_m` (4 K, 3, in world) from a middle (3,) in camera; None if behind it."""
     there = arms_m @ R.T + middle_m
     z = there[:, 2:]
     return None if z.min() < _NEAREST_M else (there[:, :2] / z - rays).ravel()
 
 
 def _jacobian(arms_m: Array, R: Array, middle_m: Array) -> Array:
-    """Of these errors, (8 K, 6) by a shift and a turn about the points' middle, in camera.
+    """Return the derivative (8 K, 6) of these errors by a shift and a rotation about the points' middle, in camera.
 
     With the arm a in camera, and the ray u, v at depth z: d u = (1, 0, -u) / z (shift + turn x a), and so for v.
     """
@@ -143,7 +143,7 @@ def _misfit(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> 
 
 
 def _refine(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> PoseOfCamera | None:
-    """Levenberg-Marquardt from a start."""
+    """Levenberg-Marquardt from an initial pose."""
     middle = points_m.mean(axis=0)
     arms, there = points_m - middle, R @ middle + t
     now = _errors(arms, rays, R, there)
@@ -186,7 +186,7 @@ def modes_of(
 
     Args:
         poses: by `poses_of`, of the same points_m, rays and cov.
-        blind: how well a pose fits says nothing for it.
+        blind: do not use the fit as evidence.
     """
     found = _weighed(poses, points_m, rays, cov)
     logs = np.array([log + (0.5 * pose.squared if blind else 0.0) for (_, log), pose in zip(found, poses, strict=True)])
@@ -208,7 +208,7 @@ def modes_of(
 
 
 def _weighed(poses: Sequence[PoseOfCamera], points_m: Array, rays: Array, cov: Array) -> list[tuple[Array, float]]:
-    """Covariance (6, 6) and log evidence of each pose: summed over tilts for one tag, by the curvature for several."""
+    """Return covariance (6, 6) and log evidence of each pose: summed over tilts for one tag, by the curvature for several."""
     tilted = np.diag([0.0] * 3 + [_ANY_TILT_RAD**-2] * 3)
     curved = [np.asarray(np.linalg.inv(pose.information + tilted), dtype=float) for pose in poses]
     if len(points_m) > 4:

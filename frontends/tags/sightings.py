@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The images of a bag, or the detections that it holds already, one after the other, as sightings of surveyed tags."""
+"""Sightings of surveyed tags, from the images of a bag or from detections in it, message by message."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _OTHER_SIZE = 0.02  # from which a tag's size in a list contradicts the survey's
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What one message gave.
+    """Result of one message.
 
     Attributes:
-        sightings: of surveyed tags; none where it shows none. views: of tags that are not surveyed.
-        troubles: one line for each thing in it that could not be used. doubtful: the same of tags that a limit
-            (`max_hamming`, `min_margin`) refused, which is what it is there for.
+        sightings: of surveyed tags; may be empty. views: of tags that are not surveyed.
+        troubles: a line for each part that could not be used. doubtful: the same for tags that a limit (`max_hamming`,
+            `min_margin`) excluded.
     """
 
     stamp_ns: int
@@ -55,10 +55,10 @@ class Seen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Eye:
-    """A camera of the configuration as the bag has it.
+    """A configured camera, with its topics in the bag.
 
     Attributes:
-        listed: it lists detections; else it takes images. lens: None for lists of poses without a CameraInfo.
+        listed: it lists detections instead of images. lens: None for lists of poses without a CameraInfo.
     """
 
     name: str
@@ -70,7 +70,7 @@ class _Eye:
 
 @dataclass(slots=True)
 class _Raw:
-    """Tags as a message shows them: id, family, rays (4, 2), their covariance (8, 8), size and whether fitted."""
+    """Tags in a message: id, family, rays (4, 2), their covariance (8, 8), size and whether fitted."""
 
     tags: list[tuple[int, str, Array, Array, float | None, bool]] = field(default_factory=list)
     troubles: list[str] = field(default_factory=list)
@@ -80,14 +80,14 @@ class _Raw:
 def sightings_of_bag(
     bags: Bags, sensor: str, config: AprilTagConfig, body_frame: str, *, warn: Callable[[str], None]
 ) -> Iterator[Seen]:
-    """Look for tags in all images of a bag, and read all lists.
+    """Yield the result of each image and list of a bag.
 
     Args:
-        sensor: its name. config: its block, the survey read. warn: is told what is damaged in the bag.
+        sensor: its name. config: its block, with the survey. warn: is called with each damage of the bag.
 
     Raises:
-        InputError: no camera, a topic that is not there or holds something else, no usable CameraInfo, a mount that no
-            chain leads to.
+        InputError: no camera, a missing topic or one of another type, no usable CameraInfo, or a mount without a chain of
+            transforms.
     """
     families = sorted({tag.family for tag in config.surveyed.tags}) or ["36h11"]
     few_bits = [tag.id for tag in config.surveyed.tags if tag.family == "16h5"]  # anything dark is a tag of that family
@@ -113,7 +113,7 @@ def _cores() -> int:
 
 
 def _eyes(bag: Bag, config: AprilTagConfig, body_frame: str, warn: Callable[[str], None]) -> dict[str, _Eye]:
-    """The cameras by the topic that they are read from."""
+    """Return the cameras by topic."""
     if not config.cameras:
         raise InputError("vessel.yaml: an apriltag sensor needs `cameras`: name, topic and mount of each")
     mounts = mounts_of(bag, {name: c.mount for name, c in config.cameras.items()}, body_frame, "cameras")
@@ -138,12 +138,12 @@ def _eyes(bag: Bag, config: AprilTagConfig, body_frame: str, warn: Callable[[str
 
 
 def camera_info_topic(topic: str) -> str:
-    """Return where the CameraInfo of a topic of images lies by custom."""
+    """Return the usual topic of the CameraInfo beside a topic of images."""
     return f"{topic.removesuffix('/compressed').rsplit('/', 1)[0]}/camera_info"
 
 
 def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callable[[str], None]) -> Camera | None:
-    """The camera's calibration, from the first message of its CameraInfo, wherever the run begins."""
+    """Return the camera's calibration, from the first message of its CameraInfo in the whole bag."""
     topic = config.info_topic
     if not topic and listed:
         return None
@@ -188,7 +188,7 @@ def _differs(one: Any, other: Any) -> bool:
 
 
 def _decoded(bag: Bag, raw: RawMessage) -> Any:
-    """The message, or the error that it raises."""
+    """Return the message, or the error that decoding raises."""
     try:
         return bag.decode(raw)
     except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
@@ -196,7 +196,7 @@ def _decoded(bag: Bag, raw: RawMessage) -> Any:
 
 
 def _look(raw: RawMessage, msg: Any, eye: _Eye, sensor: str, config: AprilTagConfig, detector: Detector) -> Seen:
-    """Look for the tags of a message, and solve for poses."""
+    """Return the tags of a message, with poses."""
     try:
         if isinstance(msg, Exception):
             raise msg
@@ -257,7 +257,7 @@ def _refused(tag: ListedTag, config: AprilTagConfig) -> str:
 
 
 def _sorted_out(shown: _Raw, stamp_ns: int, eye: _Eye, sensor: str, config: AprilTagConfig) -> Seen:
-    """Sightings of surveyed tags, views of others, and what cannot be told."""
+    """Return sightings of surveyed tags, views of others, and ambiguous tags."""
     survey, troubles = config.surveyed, list(shown.troubles)
     counts = Counter((number, family) for number, family, *_ in shown.tags)
     seen: list[SeenTag] = []
@@ -290,7 +290,7 @@ def _sorted_out(shown: _Raw, stamp_ns: int, eye: _Eye, sensor: str, config: Apri
 
 
 def _in_survey(tags: Sequence[TagConfig], number: int, family: str) -> TagConfig | None:
-    """The tag of the survey; a list that does not say the family means the only one of that id."""
+    """Return the tag of the survey; of a list without families, the only one with that id."""
     fitting = [tag for tag in tags if tag.id == number and family in ("", tag.family)]
     return fitting[0] if len(fitting) == 1 else None
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the sizes of tags that a survey gives go with how far apart it has them.
+"""Consistency of surveyed sizes of tags with their spacing.
 
-A size scales every distance: if those of all tags are 25 % too large (the white margin was measured, too), no two tags of
-an image fit one pose, each of them by itself fits well, and a run that follows them is metres off. With one more unknown,
-a factor to all sizes, they fit together again; which holds for any track.
+Distances are proportional to the size: if all sizes are 25 % too large (measured with the white margin), no two tags of an
+image fit one pose, each alone fits well, and a run that uses them is metres off. With one more unknown, a factor on all sizes,
+they fit together again, for any track.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _SURE = 5.0  # sigmas, of what image and survey together tell; and of the survey
 
 
 def size_factors(sightings: Sequence[TagSighting], survey: Survey) -> dict[str, float]:
-    """Return by frame what all its sizes must be multiplied with to fit; frames whose sizes fit as they are, are not there.
+    """Return, by frame, the factor by which its sizes would fit; frames whose sizes fit are omitted.
 
     Args:
         sightings: of one sensor. survey: its own.
@@ -50,7 +50,7 @@ def size_factors(sightings: Sequence[TagSighting], survey: Survey) -> dict[str, 
 
 
 def _factor(own: Sequence[TagSighting], survey: Survey, frame: str) -> float | None:
-    """By the tags of one image; None where no factor makes them fit."""
+    """Return the factor by the tags of one image; None if no factor makes them fit."""
     listed = {(str(tag.family), tag.id): tag for tag in survey.tags}
 
     def excess(log_factor: float) -> float:
@@ -74,7 +74,7 @@ def _factor(own: Sequence[TagSighting], survey: Survey, frame: str) -> float | N
 
 
 def _unsure(own: Sequence[TagSighting], listed: Mapping[tuple[str, int], TagConfig]) -> float:
-    """What the survey does not know of how far apart the tags of an image are, as a share of that, 1 sigma."""
+    """Return the survey's uncertainty of the spacing of tags in an image, as a share of it, 1 sigma."""
     middles = np.concatenate([m.points_m.reshape(-1, 4, 3).mean(axis=1) for m in own])
     sigma_m = max(listed[tag].sigma_m for m in own for tag in m.tags)
     return float(np.sqrt(2.0) * sigma_m / max(np.linalg.norm(middles - middles[0], axis=1).max(), 1e-6))

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where tags are that the survey does not list, once the track says where the camera was.
+"""Positions of tags that the survey does not list, from the solved track.
 
-    p_tag = p_i + s R_i t_i        t_i: place of a tag of size 1 in the camera of view i, s: its size
+    p_tag = p_i + s R_i t_i        t_i: position of a tag of size 1 in the camera of view i, s: its size
 
-is linear in place and size; attitude comes from the pose that fits most views; all three are refined on the corners.
-A tag that is seen beside tags of one dock, and of nothing else, is taken to ride on that: p_i, R_i are then as seen from
-the dock at rest.
+is linear in position and size; the attitude is that of the pose that fits most views; all three are refined on the corners. A tag
+that is only seen beside tags of one dock is taken to ride on it: p_i, R_i are then relative to the dock at rest.
 """
 
 from __future__ import annotations
@@ -39,10 +38,10 @@ _UNKNOWN = 100.0  # m, rad, share: sigma of what nothing tells
 
 
 class _View:
-    """A view with its camera in world: place p (3,), axes R (3, 3); rays (4, 2), and what whitens them (8, 8).
+    """A view with its camera in world: position p (3,), axes R (3, 3); rays (4, 2), and their whitening matrix (8, 8).
 
-    A track that is off by 0.1 m shifts all corners of a tag 4 m ahead by 25 px: its covariance goes into that of the
-    rays, or the nearest views decide alone, and by the track's errors.
+    A track that is off by 0.1 m shifts all corners of a tag 4 m ahead by 25 px: its covariance is added to that of the rays;
+    otherwise the nearest views alone would decide, with the track's errors.
     """
 
     def __init__(self, view: TagView, p_world_body_m: Array, R_world_body: Array, track_cov: Array) -> None:
@@ -71,14 +70,14 @@ class _View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Riding:
-    """On which dock tags ride, and how that moved: stamps (M,), `moved` (M, 6), m and small rotations, rad, from rest."""
+    """Dock that tags ride on, and its motion from rest: stamps (M,), `moved` (M, 6), m and small rotations, rad."""
 
     dock: DockConfig
     stamps_ns: NDArray[np.int64]
     moved: Array
 
     def seen_from(self, track: Trajectory) -> Trajectory:
-        """Return a track as it is seen from the dock at rest; its covariance, which has the dock's share in it, is kept."""
+        """Return a track relative to the dock at rest; its covariance, which includes the dock's, is kept."""
         t, s = (seconds_since(int(track.stamps_ns[0]), stamps) for stamps in (track.stamps_ns, self.stamps_ns))
         moved = np.column_stack([np.interp(t, s, self.moved[:, k]) for k in range(6)])
         back, pivot = Rotation.from_rotvec(-moved[:, 3:]).as_matrix(), np.array(self.dock.xyz_m)
@@ -90,7 +89,7 @@ class Riding:
         )
 
     def on_board(self, tag: TagConfig) -> TagConfig:
-        """Return a tag whose place is in world, the dock at rest, as one that rides on it."""
+        """Return a tag that rides on the dock, from its position in world with the dock at rest."""
         p, R = Survey(docks=(self.dock,)).rest(self.dock.name)
         return tag.model_copy(
             update={
@@ -102,7 +101,7 @@ class Riding:
 
 
 def only_beside(views: Sequence[TagView], sightings: Sequence[TagSighting]) -> dict[tuple[str, int], tuple[str, str]]:
-    """Return the sensor and the dock by (family, id) of tags that share images with tags of that dock, and with no others."""
+    """Return sensor and dock, by (family, id), of tags that share images only with tags of that dock."""
     images: dict[tuple[int, str], set[tuple[str, str]]] = defaultdict(set)
     for m in sightings:
         images[(m.stamp_ns, m.camera)].add((m.sensor, m.frame))
@@ -119,12 +118,12 @@ def estimate_tags(
     size_m: float | None,
     riding: Mapping[tuple[str, int], Riding] | None = None,
 ) -> tuple[list[TagConfig], list[str]]:
-    """Return the tags that are seen often and well enough, and a line for each that is not.
+    """Return the tags that are seen often and well enough, and a line for each other one.
 
     Args:
         views: of tags that are not surveyed. track: of the body, with covariance.
-        size_m: of such tags; None: it is estimated too.
-        riding: by (family, id) of those that ride on a dock; the others stand in world.
+        size_m: of these tags; None: estimated too.
+        riding: by (family, id) of those that ride on a dock; the others are at rest in world.
     """
     found: list[TagConfig] = []
     left: list[str] = []
@@ -201,7 +200,7 @@ def _rpy_deg(R: Array) -> tuple[float, float, float]:
 
 
 def _placed(views: Sequence[_View], size_m: float | None) -> tuple[Array, float]:
-    """Place (3,) and size of a tag, by the linear equations of all views; twice, far-off ones left out at last."""
+    """Return position (3,) and size of a tag by the linear equations of all views, the second time without outliers."""
     toward = np.array([v.R @ v.poses[0].t_m for v in views])
     p = np.array([v.p for v in views])
     kept = np.ones(len(views), dtype=bool)

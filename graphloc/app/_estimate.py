@@ -13,10 +13,10 @@ from graphloc.app._run import Run, made_comparable
 from graphloc.config import VesselConfig, load_config
 from graphloc.errors import InputError, SolveError
 from graphloc.eval import calibrate, ekf, holdout
-from graphloc.eval.apart import apart_warnings
 from graphloc.eval.digerud import run_digerud
+from graphloc.eval.gnss_check import gnss_offset_warnings
 from graphloc.eval.match_picture import Gallery
-from graphloc.eval.posture import posture_warnings
+from graphloc.eval.mount_check import mount_warnings
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.tag_check import suspect_tags
 from graphloc.eval.underlay import underlay
@@ -91,10 +91,10 @@ def smooth_recording(
         beside = ekf.FilterResult(name=online.name, trajectory=online.trajectory, ledger=online.ledger)
         filters = (beside, *filters)
     tags, said = found_tags.about_tags(recording, config, solution)
-    postures, apart = _track_warnings(solution, recording, config)
-    if postures:
-        solution = solution.doubted(postures[0].partition(":")[0])
-    said += [*postures, *apart, *([never] if never else [])]
+    mounts, offsets = _track_warnings(solution, recording, config)
+    if mounts:
+        solution = solution.doubted(mounts[0].partition(":")[0])
+    said += [*mounts, *offsets, *([never] if never else [])]
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
         filters=filters, online=online, pictures=tuple(gallery.pictures()), tags=tags,
@@ -126,7 +126,7 @@ def _filters(
 def _track_warnings(solution: Solution, recording: Recording, config: VesselConfig) -> tuple[list[str], list[str]]:
     """What a solved track, offline or online, tells of the configuration: of how the craft lies and goes, and of its sensors."""
     track = solution.trajectory
-    return posture_warnings(track, recording, config), apart_warnings(track, solution.datum, recording, config)
+    return mount_warnings(track, recording, config), gnss_offset_warnings(track, solution.datum, recording, config)
 
 
 def _online(
@@ -152,8 +152,8 @@ def replay_recording(
     """Run a recording through the online mode (see `graphloc.replay`)."""
     replayed = replay(recording, config, scans=scans, speed=speed, lag_s=lag_s, stoppable=True, status=status)
     recording, solution = replayed.recording, replayed.solution
-    postures, apart = _track_warnings(solution, recording, config)
-    said = [*suspect_tags(recording, config, solution), *postures, *apart]
+    mounts, offsets = _track_warnings(solution, recording, config)
+    said = [*suspect_tags(recording, config, solution), *mounts, *offsets]
     run = Run(recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution)
     return made_comparable(_with_underlay(run, scans))
 

@@ -35,7 +35,7 @@ class Run:
     @property
     def warnings(self) -> tuple[str, ...]:
         """All that was said on the way."""
-        return report.said_on_the_way(self.recording, self.solution, self.online)
+        return report.all_warnings(self.recording, self.solution, self.online)
 
 
 def made_comparable(run: Run) -> Run:

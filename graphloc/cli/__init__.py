@@ -12,7 +12,7 @@ import typer
 
 from graphloc import __version__
 from graphloc.cli import _about, _estimate, _evidence, _experiments, _simulate, _sweep
-from graphloc.cli._shared import Stopped
+from graphloc.cli._shared import Stopped, with_options
 from graphloc.errors import GraphlocError
 
 app = typer.Typer(
@@ -38,7 +38,7 @@ for _command in (
     _sweep.sweep,
     _about.sensors,
 ):
-    app.command()(_command)
+    app.command()(with_options(_command))
 app.command("config")(_about.show_config)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be configured: sensors, config."""
+"""Commands that explain the configuration: sensors, config."""
 
 from __future__ import annotations
 

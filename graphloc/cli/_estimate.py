@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a bag to a track: inspect, smooth, replay, stream, match."""
+"""Commands that make a track or a part of it: inspect, smooth, replay, stream, match."""
 
 from __future__ import annotations
 
@@ -13,17 +13,13 @@ import typer
 
 from graphloc.cli._shared import (
     BagArgument,
+    BagOptions,
     ConfigOption,
-    DurationOption,
-    FiguresOption,
     HoldOutOption,
     JsonOption,
     LagOption,
-    OutOption,
     OverwriteOption,
-    RerunOption,
-    StartOption,
-    Wanted,
+    RunOptions,
     progress,
     smooth_bags,
     status_line,
@@ -54,54 +50,29 @@ def inspect(
     typer.echo(f"wrote {config}: check each line marked 'guess'", err=True)
 
 
-def smooth(
-    bag: BagArgument,
-    config: ConfigOption,
-    out: OutOption,
-    start: StartOption = 0.0,
-    duration: DurationOption = None,
-    hold_out: HoldOutOption = None,
-    figures: FiguresOption = False,
-    rerun: RerunOption = None,
-    overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
-) -> None:
+def smooth(options: RunOptions, hold_out: HoldOutOption = None) -> None:
     """Smooth a whole run, or a part of it, and write the run folder with its report."""
-    wanted = Wanted(
-        bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun, start=start, duration=duration
-    )  # fmt: skip
-    smooth_bags(wanted, hold_out, compare=False)
+    smooth_bags(options, hold_out, compare=False)
 
 
 def replay(
-    bag: BagArgument,
-    config: ConfigOption,
-    out: OutOption,
-    start: StartOption = 0.0,
-    duration: DurationOption = None,
+    options: RunOptions,
     speed: Annotated[
         float | None,
         typer.Option(min=0.01, help="Times real time: 1 plays as recorded; default: as fast as possible."),
     ] = None,
     lag: LagOption = 10.0,
-    figures: FiguresOption = False,
-    rerun: RerunOption = None,
-    overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Run a bag through the online mode, as if live on board, and write the run folder."""
     from graphloc import app as application
 
-    wanted = Wanted(
-        bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun, start=start, duration=duration
-    )  # fmt: skip
-    wanted.check()
-    recording, vessel, scans = wanted.load(progress())
+    options.check_outputs()
+    recording, vessel, scans = options.load(progress())
     gc.freeze()  # as in `graphloc.stream`: what is loaded stays
     run = application.replay_recording(recording, vessel, scans=scans, speed=speed, lag_s=lag, status=status_line())
     if sys.stderr.isatty():
         sys.stderr.write("\r\033[K")
-    wanted.write(run)
+    options.write(run)
 
 
 def stream(
@@ -121,12 +92,9 @@ def stream(
 
 
 def match(
-    bag: BagArgument,
-    config: ConfigOption,
+    options: BagOptions,
     at: Annotated[float, typer.Option("--at", help="Time since the start of the run, s.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("match.png"),
-    start: StartOption = 0.0,
-    duration: DurationOption = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Match one LiDAR scan to the aerial image and draw it: scan on image, score, modes."""
@@ -140,8 +108,7 @@ def match(
     if out.exists() and not overwrite:
         raise OutputError(f"{out}: exists already; give another --out, or --overwrite")
     show = progress()
-    wanted = Wanted(bag=bag, config=config, out=out, overwrite=overwrite, as_json=False, start=start, duration=duration)
-    recording, vessel, scans = wanted.load(show)
+    recording, vessel, scans = options.load(show)
     found, _ = application.match_at(recording, vessel, scans, at, show)
     east, north, yaw = found.prior.pose
     typer.echo(

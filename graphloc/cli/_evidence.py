@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good runs are: compare, summary."""
+"""Commands that measure how good runs are: compare, summary."""
 
 from __future__ import annotations
 
@@ -9,49 +9,22 @@ from typing import Annotated
 
 import typer
 
-from graphloc.cli._shared import (
-    BagArgument,
-    ConfigOption,
-    DurationOption,
-    FiguresOption,
-    HoldOutOption,
-    JsonOption,
-    OutOption,
-    OverwriteOption,
-    RerunOption,
-    StartOption,
-    Wanted,
-    smooth_bags,
-)
+from graphloc.cli._shared import HoldOutOption, JsonOption, OutOption, OverwriteOption, RunOptions, smooth_bags
 
 RunsArgument = Annotated[list[Path], typer.Argument(help="The run folders of `smooth`, `compare` or `replay`.")]
 
 
-def compare(
-    bag: BagArgument,
-    config: ConfigOption,
-    out: OutOption,
-    start: StartOption = 0.0,
-    duration: DurationOption = None,
-    hold_out: HoldOutOption = None,
-    figures: FiguresOption = False,
-    rerun: RerunOption = None,
-    overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
-) -> None:
+def compare(options: RunOptions, hold_out: HoldOutOption = None) -> None:
     """Smooth a run, run the online mode and the EKFs on the same measurements, and report all of them."""
     from graphloc.errors import ConfigError
     from graphloc.eval.summary import is_run
 
-    finished = next((folder for folder in bag if is_run(folder)), None)
+    finished = next((folder for folder in options.bag if is_run(folder)), None)
     if finished is not None:
         raise ConfigError(
             f"{finished}: is a finished run, not a bag; `graphloc summary` puts finished runs into one table"
         )
-    wanted = Wanted(
-        bag=bag, config=config, out=out, overwrite=overwrite, as_json=as_json, figures=figures, rerun=rerun, start=start, duration=duration
-    )  # fmt: skip
-    smooth_bags(wanted, hold_out, compare=True)
+    smooth_bags(options, hold_out, compare=True)
 
 
 def summary(
@@ -67,14 +40,14 @@ def summary(
     page = summaries.write_summary(out, read, overwrite=overwrite)
     found = summaries.blocks(read)
     if as_json:
-        told = {
+        numbers = {
             f"{b.title}: {b.metric}": {
                 name: dict(zip(b.estimates, values, strict=True))
                 for name, values in (("mean", b.mean), ("worst", b.worst))
             }
             for b in found
         }
-        typer.echo(json.dumps(told, indent=2))
+        typer.echo(json.dumps(numbers, indent=2))
     else:
         typer.echo(summaries.as_markdown(read, found))
     typer.echo(str(page))

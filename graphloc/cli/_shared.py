@@ -1,28 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What commands share: options, progress, how a run is told."""
+"""Options, progress bars and output that several commands share."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from graphloc.errors import GraphlocError
 
-if TYPE_CHECKING:  # heavy: they wait until a command runs
+if TYPE_CHECKING:  # these load gtsam and more, which would delay --help
     from graphloc.app import Run, Scans
     from graphloc.config import VesselConfig
+    from graphloc.eval.report import ReportData
     from graphloc.frontends._part import BagPart
-    from graphloc.recording import Recording
+    from graphloc.recording import Progress, Recording
 
 
 class Stopped(GraphlocError):
-    """Ctrl-C, and what became of the work so far."""
+    """Ctrl-C; the message says what is kept of the work so far."""
 
 
 BagArgument = Annotated[list[Path], typer.Argument(help="A ROS 1 or ROS 2 bag; give all files of a split one.")]
@@ -50,8 +53,8 @@ SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Random seed: the
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the numbers as JSON.")]
 
 
-def progress() -> Callable[[str, int, int], None]:
-    """A progress bar on stderr, on a terminal only."""
+def progress() -> Progress:
+    """Return a progress bar on stderr; it is silent where that is not a terminal."""
     from tqdm import tqdm
 
     state: dict[str, tqdm[None]] = {}
@@ -70,7 +73,7 @@ def progress() -> Callable[[str, int, int], None]:
 
 
 def status_line() -> Callable[[float, float, object, str], None]:
-    """A live line on stderr, on a terminal only."""
+    """Return a line on stderr that shows the current estimate; it is silent where that is not a terminal."""
     import time
 
     from graphloc.estimate import Estimate
@@ -95,56 +98,59 @@ def status_line() -> Callable[[float, float, object, str], None]:
     return show
 
 
-def print_run(run: Run, page: Path, as_json: bool, rerun: Path | None = None) -> None:
+def print_run(run: Run, page: Path, as_json: bool) -> None:
+    """Print the numbers, verdict, ledger counts and warnings of a run, then the path of its report."""
     from graphloc import app as application
-    from graphloc.eval import report
 
     data = application.report_data(run)
-    found, warnings = data.tables, data.warnings
     if as_json:
-        numbers = {t.title: t.as_dict() for t in found}
-        verdicts = {
-            t.name: {"said": t.trust.said, "why": [r.text for r in t.reasons]} for t in report.verdict(data).tracks
-        }
-        told: dict[str, object] = {
-            "verdict": verdicts,
-            "ledger": run.solution.ledger.counts(),
-            "converged": run.solution.stats.converged,
-            "warnings": warnings,
-        }
-        if run.calibration is not None:
-            told["calibration"] = run.calibration.as_dict()
-        typer.echo(json.dumps({**numbers, **told}, indent=2))
+        typer.echo(json.dumps(_as_json(run, data), indent=2))
     else:
-        if not found:
-            typer.echo(application.truth_statement(run))
-        for table in found:
-            typer.echo(table.as_text())
-        for track in report.verdict(data).tracks:
-            typer.echo(f"{track.name}: {track.trust.said}. {track.accuracy}")
-            for reason in track.reasons:
-                if reason.trust is not report.Trust.YES:
-                    typer.echo(f"  {reason.text}")
-        for name, counts in run.solution.ledger.counts().items():
-            typer.echo(f"  {name}: " + ", ".join(f"{n} {outcome}" for outcome, n in counts.items()))
-        for warning in warnings:
+        for line in _as_text(run, data):
+            typer.echo(line)
+        for warning in data.warnings:
             typer.echo(f"warning: {warning}", err=True)
         for suggestion in run.calibration.suggestions if run.calibration is not None else ():
             typer.echo(f"calibration: {suggestion}", err=True)
     typer.echo(str(page))
-    if rerun is not None:
-        typer.echo(str(rerun))
 
 
-def check_rerun(path: Path | None, overwrite: bool) -> None:
-    """Say before the run is solved what would be said after."""
+def _as_json(run: Run, data: ReportData) -> dict[str, object]:
+    from graphloc.eval import report
+
+    tracks = report.verdict(data).tracks
+    result: dict[str, object] = {table.title: table.as_dict() for table in data.tables}
+    result |= {
+        "verdict": {t.name: {"said": t.trust.said, "why": [r.text for r in t.reasons]} for t in tracks},
+        "ledger": run.solution.ledger.counts(),
+        "converged": run.solution.stats.converged,
+        "warnings": data.warnings,
+    }
+    if run.calibration is not None:
+        result["calibration"] = run.calibration.as_dict()
+    return result
+
+
+def _as_text(run: Run, data: ReportData) -> Iterator[str]:
+    from graphloc.eval import report
+
+    yield from (table.as_text() for table in data.tables)
+    if not data.tables:
+        yield data.truth_statement
+    for track in report.verdict(data).tracks:
+        yield f"{track.name}: {track.trust.said}. {track.accuracy}"
+        yield from (f"  {reason.text}" for reason in track.reasons if reason.trust is not report.Trust.YES)
+    for name, counts in run.solution.ledger.counts().items():
+        yield f"  {name}: " + ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
+
+
+def _check_rerun(path: Path, overwrite: bool) -> None:
+    """Refuse a rerun recording that could not be written, before the run is solved."""
     from graphloc.errors import OutputError
     from graphloc.eval.rerun_log import make_folder
     from graphloc.extras import need
     from graphloc.outputs import check_writable
 
-    if path is None:
-        return
     need("rerun", "rerun")
     if path.is_dir() or (path.exists() and not overwrite):
         raise OutputError(f"{path}: exists already; give another --rerun, or --overwrite")
@@ -152,44 +158,24 @@ def check_rerun(path: Path | None, overwrite: bool) -> None:
     check_writable(path)
 
 
-def write_rerun(path: Path | None, run: Run, bags: BagPart, config: Path) -> None:
-    from graphloc.eval import rerun_log
-
-    if path is not None:
-        told = (run.solution, run.recording, run.config, run.filters)
-        rerun_log.write_rerun(path, *told, bags=bags, folder=config.parent)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wanted:
-    """What a command is to read and write: as its options have it."""
+class BagOptions:
+    """Options of every command that reads a bag."""
 
-    bag: list[Path]
-    config: Path
-    out: Path
-    overwrite: bool
-    as_json: bool
-    figures: bool = False
-    rerun: Path | None = None
-    start: float = 0.0
-    duration: float | None = None
+    bag: BagArgument
+    config: ConfigOption
+    start: StartOption = 0.0
+    duration: DurationOption = None
 
     @property
     def part(self) -> BagPart:
-        """The bag, or the part of it that is wanted."""
+        """The bag, or the part of it between --start and --duration."""
         from graphloc.frontends._part import BagPart
 
         return BagPart(tuple(self.bag), self.start, self.duration)
 
-    def check(self, mark: str = "") -> None:
-        """Refuse before the work what could not be written after it; `mark`: the file by which a folder is known as ours."""
-        from graphloc import outputs
-
-        outputs.check_folder(self.out, overwrite=self.overwrite, mark=mark or outputs.MARK)
-        check_rerun(self.rerun, self.overwrite)
-
-    def load(self, show: Callable[[str, int, int], None]) -> tuple[Recording, VesselConfig, Scans]:
-        """Read the bag and its vessel.yaml; of a part of the bag say which it is."""
+    def load(self, show: Progress) -> tuple[Recording, VesselConfig, Scans]:
+        """Read the bag and its vessel.yaml; of a part of the bag, print which it is."""
         from graphloc import app as application
 
         recording, vessel = application.load(self.part, self.config, show)
@@ -197,19 +183,35 @@ class Wanted:
             typer.echo(f"{', '.join(str(p) for p in self.bag)}: {recording.span}", err=True)
         return recording, vessel, application.Scans(self.part, self.config.parent)
 
-    def write(self, run: Run) -> None:
-        """Write the run folder, and tell of it."""
-        from graphloc import app as application
 
-        command = " ".join(sys.argv[1:])
-        page = application.write(
-            run, self.out, inputs=self.bag, command=command, overwrite=self.overwrite, figures=self.figures
-        )
-        write_rerun(self.rerun, run, self.part, self.config)
-        print_run(run, page, self.as_json, self.rerun)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FolderOptions(BagOptions):
+    """Options of every command that reads a bag and writes a folder with a page."""
 
-    def write_page(self, page: str, mark: str, write: Callable[[Path, str], None], said: Sequence[str]) -> None:
-        """Write a folder with a page, and tell of it: its `mark`, which is JSON, or the lines `said`."""
+    out: OutOption
+    overwrite: OverwriteOption = False
+    as_json: JsonOption = False
+
+    def check(self, mark: str) -> None:
+        """Refuse an output folder that could not be written, before the work begins.
+
+        Args:
+            mark: name of the file that shows that a folder was written by this command, so that it may be replaced.
+
+        Raises:
+            OutputError: it exists, or the disk refuses.
+        """
+        from graphloc import outputs
+
+        outputs.check_folder(self.out, overwrite=self.overwrite, mark=mark)
+
+    def write_page(self, page: str, mark: str, write: Callable[[Path, str], None], summary: Sequence[str]) -> None:
+        """Write the folder and print a summary of it.
+
+        Args:
+            page: name of the page. mark: as for `check`; it holds JSON, which is printed for --json.
+            write: fills a folder, given the command line. summary: lines to print otherwise.
+        """
         from graphloc import outputs
 
         with outputs.fresh_folder(self.out, overwrite=self.overwrite, mark=mark) as fresh:
@@ -217,18 +219,80 @@ class Wanted:
         if self.as_json:
             typer.echo((self.out / mark).read_text(encoding="utf-8"), nl=False)
         else:
-            for line in said:
+            for line in (*summary, str(self.out / page)):
                 typer.echo(line)
-            typer.echo(str(self.out / page))
 
 
-def smooth_bags(wanted: Wanted, hold_out: str | None = None, *, compare: bool) -> None:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOptions(FolderOptions):
+    """Options of every command that reads a bag and writes a run folder."""
+
+    figures: FiguresOption = False
+    rerun: RerunOption = None
+
+    def check_outputs(self) -> None:
+        """Refuse outputs that could not be written, before the run is solved.
+
+        Raises:
+            OutputError: one exists, or the disk refuses. ExtraError: rerun is not installed.
+        """
+        from graphloc import outputs
+
+        self.check(outputs.MARK)
+        if self.rerun is not None:
+            _check_rerun(self.rerun, self.overwrite)
+
+    def write(self, run: Run) -> None:
+        """Write the run folder and the rerun recording, and print a summary of the run."""
+        from graphloc import app as application
+        from graphloc.eval import rerun_log
+
+        command = " ".join(sys.argv[1:])
+        page = application.write(
+            run, self.out, inputs=self.bag, command=command, overwrite=self.overwrite, figures=self.figures
+        )
+        if self.rerun is not None:
+            rerun_log.write_rerun(
+                self.rerun, run.solution, run.recording, run.config, run.filters, bags=self.part, folder=self.config.parent
+            )  # fmt: skip
+        print_run(run, page, self.as_json)
+        if self.rerun is not None:
+            typer.echo(str(self.rerun))
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that takes the fields of its dataclass parameters one by one, as typer needs them."""
+    groups: dict[str, Any] = {}
+    parameters: list[Parameter] = []
+    for name, parameter in signature(command, eval_str=True).parameters.items():
+        group = parameter.annotation
+        if isinstance(group, type) and is_dataclass(group):
+            groups[name] = group
+            parameters += signature(group, eval_str=True).parameters.values()
+        else:
+            parameters.append(parameter.replace(kind=Parameter.KEYWORD_ONLY))
+
+    @wraps(command)
+    def flat(**values: Any) -> None:
+        made = {name: group(**{f.name: values.pop(f.name) for f in fields(group)}) for name, group in groups.items()}
+        command(**made, **values)
+
+    flat.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+    return flat
+
+
+def smooth_bags(options: RunOptions, hold_out: str | None = None, *, compare: bool) -> None:
+    """Smooth a bag and write its run folder.
+
+    Args:
+        hold_out: as `HoldOut.parse` reads it. compare: also run the online mode and the EKFs.
+    """
     from graphloc import app as application
     from graphloc.eval.holdout import HoldOut
 
     held = None if hold_out is None else HoldOut.parse(hold_out)
-    wanted.check()
+    options.check_outputs()
     show = progress()
-    recording, vessel, scans = wanted.load(show)
+    recording, vessel, scans = options.load(show)
     run = application.smooth_recording(recording, vessel, hold_out=held, compare=compare, scans=scans, progress=show)
-    wanted.write(run)
+    options.write(run)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs that are made up: simulate, demo."""
+"""Commands that simulate a run: simulate, demo."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ from typing import Annotated
 
 import typer
 
-from graphloc.cli._shared import OutOption, OverwriteOption, SeedOption, Wanted, progress, smooth_bags
+from graphloc.cli._shared import OutOption, OverwriteOption, RunOptions, SeedOption, progress, smooth_bags
 
 
 def pairs(changes: list[str]) -> dict[str, str]:
+    """Split `KEY=VALUE` texts.
+
+    Raises:
+        ConfigError: one is written in another way.
+    """
     from graphloc.errors import ConfigError
 
     pairs = [change.partition("=") for change in changes]
@@ -65,4 +70,4 @@ def demo(
 
     run = run_simulation(replace(harbour_scenarios()["bl1-drift"], lidar_hz=0.0), seed)  # its matches are made up
     bag, config = write_bag(run, out.parent / f"{out.name}-bag", ros=2, overwrite=True, progress=progress())
-    smooth_bags(Wanted(bag=[bag], config=config, out=out, overwrite=True, as_json=False), compare=True)
+    smooth_bags(RunOptions(bag=[bag], config=config, out=out, overwrite=True), compare=True)

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many runs: sweep."""
+"""The command that runs many cases: sweep."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from graphloc.cli._shared import HoldOutOption, OutOption, OverwriteOption, Stopped, progress
+
+if TYPE_CHECKING:
+    from graphloc.job import Job
 
 
 class _Mode(StrEnum):
@@ -36,52 +39,77 @@ def seeds_of(text: str) -> list[int]:
     return list(dict.fromkeys(found))
 
 
-def sweep(
-    scenarios: Annotated[list[str] | None, typer.Argument(help="Scenarios of the simulator, e.g. bl1-drift.")] = None,
-    out: OutOption = Path("runs/sweep"),
-    seeds: Annotated[str | None, typer.Option(help="0:50 for seeds 0 to 49, or 1,2,5; default: 0.")] = None,
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaseOptions:
+    """Options that say which cases to run."""
+
+    scenarios: Annotated[list[str] | None, typer.Argument(help="Scenarios of the simulator, e.g. bl1-drift.")] = None
+    seeds: Annotated[str | None, typer.Option(help="0:50 for seeds 0 to 49, or 1,2,5; default: 0.")] = None
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="Vary a field of the scenario: --set gnss_hz=1,10.")
-    ] = None,
+    ] = None
     config_changes: Annotated[
         list[str] | None,
         typer.Option("--config-set", help="Vary a key of vessel.yaml: --config-set sensors.gnss.sigma_scale=1,2."),
-    ] = None,
+    ] = None
     bag: Annotated[
         list[Path] | None, typer.Option(help="A bag instead of scenarios; repeat for more, all with one --config.")
-    ] = None,
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="The vessel.yaml of the bags.")] = None,
-    hold_out: HoldOutOption = None,
-    mode: Annotated[
-        _Mode, typer.Option(help="offline: smooth; online: replay; compare: both, and the EKFs.")
-    ] = _Mode.offline,
-    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes on this machine.")] = 1,
+    ] = None
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="The vessel.yaml of the bags.")] = None
+    hold_out: HoldOutOption = None
+    mode: Annotated[_Mode, typer.Option(help="offline: smooth; online: replay; compare: both, and the EKFs.")] = (
+        _Mode.offline
+    )
+
+    def check(self) -> None:
+        """Refuse options that do not go together.
+
+        Raises:
+            ConfigError: they do not.
+        """
+        from graphloc.errors import ConfigError
+
+        if self.scenarios and self.bag:
+            raise ConfigError("scenarios and --bag: give one of them, each is a sweep of its own")
+        if self.bag and self.config is None:
+            raise ConfigError("--bag: give its vessel.yaml, too: --config")
+        if (self.changes or self.seeds) and not self.scenarios:
+            raise ConfigError(
+                "--set and --seeds are of a scenario, and none is named; for a configuration: --config-set"
+            )
+        if self.config is not None and not self.bag:
+            raise ConfigError("--config goes with --bag; what a scenario's configuration says, --config-set changes")
+
+    def jobs(self) -> list[Job]:
+        """Return every combination of scenarios or bags, changes and seeds."""
+        from graphloc.job import Job, variations
+
+        plain = Job(mode=self.mode.value, hold_out=self.hold_out or "")
+        config = str(self.config and self.config.absolute())
+        jobs = [replace(plain, bag=str(path.absolute()), config=config) for path in self.bag or ()]
+        for name, changes in itertools.product(self.scenarios or (), variations(self.changes or (), "--set")):
+            jobs.append(replace(plain, scenario=name, changes=changes))
+        seeds = seeds_of(self.seeds or "0") if self.scenarios else (0,)
+        varied = variations(self.config_changes or (), "--config-set")
+        return [replace(job, config_changes=c, seed=seed) for job in jobs for c in varied for seed in seeds]
+
+
+def sweep(
+    options: CaseOptions,
+    out: OutOption = Path("runs/sweep"),
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Parallel processes on this machine.")] = 1,
     scheduler: Annotated[str, typer.Option(help="Use a Dask scheduler instead, e.g. tcp://host:8786.")] = "",
     overwrite: OverwriteOption = False,
 ) -> None:
     """Run many scenarios, seeds or bags with varied parameters and write one table of results."""
-    from graphloc.errors import ConfigError, InputError
+    from graphloc.errors import InputError
     from graphloc.eval.sweep_table import summary
-    from graphloc.job import Job, variations
     from graphloc.sweep import sweep as run_sweep
 
-    if scenarios and bag:
-        raise ConfigError("scenarios and --bag: give one of them, each is a sweep of its own")
-    if bag and config is None:
-        raise ConfigError("--bag: give its vessel.yaml, too: --config")
-    if (changes or seeds) and not scenarios:
-        raise ConfigError("--set and --seeds are of a scenario, and none is named; for a configuration: --config-set")
-    if config is not None and not bag:
-        raise ConfigError("--config goes with --bag; what a scenario's configuration says, --config-set changes")
-    plain = Job(mode=mode.value, hold_out=hold_out or "")
-    jobs = [replace(plain, bag=str(path.absolute()), config=str(config and config.absolute())) for path in bag or ()]
-    for name, which in itertools.product(scenarios or (), variations(changes or (), "--set")):
-        jobs.append(replace(plain, scenario=name, changes=which))
-    every = variations(config_changes or (), "--config-set")
-    jobs = [replace(job, config_changes=which) for job in jobs for which in every]
-    jobs = [replace(job, seed=seed) for job in jobs for seed in (seeds_of(seeds or "0") if scenarios else (0,))]
+    options.check()
+    cases = options.jobs()
     try:
-        table = run_sweep(jobs, out, workers=workers, scheduler=scheduler, overwrite=overwrite, progress=progress())
+        table = run_sweep(cases, out, workers=jobs, scheduler=scheduler, overwrite=overwrite, progress=progress())
     except KeyboardInterrupt:
         raise Stopped(f"{out} keeps the runs that are done; the same command goes on from there") from None
     typer.echo(summary(table))

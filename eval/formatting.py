@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers as text, and what their names mean."""
+"""Numbers as text, and labels of the metrics."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import pytest
 
 from graphloc import app
 from graphloc.config import TimelineConfig
-from graphloc.eval.apart import _mean_variance, apart_warnings
+from graphloc.eval.gnss_check import _mean_variance, gnss_offset_warnings
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition, Measurement, PoseFix
@@ -45,7 +45,7 @@ def said(run: SimulatedRun, east_north_m: Array, every_s: int = 1, up_m: float =
         for k, t in enumerate(stamps)
     )
     pose = next(m for m in run.recording.measurements if isinstance(m, PoseFix))
-    return apart_warnings(track, DATUM, replace(run.recording, measurements=(pose, *fixes)), run.config)
+    return gnss_offset_warnings(track, DATUM, replace(run.recording, measurements=(pose, *fixes)), run.config)
 
 
 def process(rng: np.random.Generator, lasts_s: int, every_s: int) -> Array:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a solved track move and float as craft do? Upside down, or sideways all the way, it is a mount that is wrong.
+"""Warn of a solved track on which the vessel moves sideways or lies on its side: a sign of a wrong IMU mount.
 
-Measurements can agree with such a track: a body is any frame that moves with the craft, so a mount of the IMU that is turned
-by a quarter turns the body with it, and where fixes alone tell the place, nothing else speaks against it.
+Measurements can agree with such a track. Body is any frame fixed to the vessel, so an IMU mount that is turned by 90 deg turns body
+with it, and where GNSS positions are the only other measurements, nothing contradicts that.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig
-from graphloc.eval.words import percent
+from graphloc.eval.formatting import percent
 from graphloc.frames import rpy_from_rotation, wrap_angle
 from graphloc.recording import Recording
 from graphloc.trajectory import Trajectory, bounds_95
@@ -23,8 +23,12 @@ _KNOWN_DEG = 20.0  # 95 % bound of a heading that is claimed to be known
 _STEADY = 0.8  # length of the mean direction: 1 where the angle is the same all the way
 
 
-def posture_warnings(track: Trajectory, recording: Recording, config: VesselConfig) -> list[str]:
-    """Return lines on a track that goes sideways or astern for most of its way, or lies on its side or back."""
+def mount_warnings(track: Trajectory, recording: Recording, config: VesselConfig) -> list[str]:
+    """Return a line for a tilted vessel, and one for a course that differs from the heading over most of the distance.
+
+    Args:
+        track: solved, with covariance and velocity. recording, config: name the IMU and its mount.
+    """
     found = (_tilted(track), _sideways(track, recording, config))
     return [line for line in found if line]
 

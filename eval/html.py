@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pieces of pages: style, tables, figures."""
+"""HTML of report pages: style, tables, notes, figures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,11 @@ img{max-width:100%}ul.warnings{padding-left:1.2rem}li.warning{color:#8a3b00;over
 
 
 def page(title: str, body: str, script: str = "") -> str:
-    """Return a whole page that stands by itself: `body` and `script` as they are, the title escaped."""
+    """Return a self-contained page.
+
+    Args:
+        title: is escaped. body, script: are not.
+    """
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">'
@@ -55,11 +59,11 @@ def table(
     wide: Sequence[int] = (),
     kind: str = "",
 ) -> str:
-    """Return a table that scrolls by itself where it is too wide; cells are texts, and are escaped.
+    """Return a table in a container that scrolls horizontally where it is too wide.
 
     Args:
-        classes: of each row. text: columns that hold words, which may break. wide: columns that a phone does without.
-        kind: class of the whole.
+        head, rows: texts, which are escaped. classes: CSS class of each row.
+        text: columns of words, which may wrap. wide: columns that are hidden on a phone. kind: CSS class of the table.
     """
     words = [" ".join(name for name, some in (("text", text), ("wide", wide)) if k in some) for k in range(len(head))]
     marks = [f' class="{word}"' if word else "" for word in words]
@@ -73,17 +77,17 @@ def table(
 
 
 def note(text: str) -> str:
-    """Return a remark, or nothing."""
+    """Return a remark as a paragraph; nothing for an empty text."""
     return f'<p class="note">{escape(text)}</p>' if text else ""
 
 
 def drawing(figure: plots.Figure) -> str:
-    """Return a figure for a page that holds plotly."""
+    """Return the HTML of a figure, for a page that contains plotly."""
     return figure_html(plots.interactive(figure), figure.name)
 
 
 def figure_html(figure: go.Figure, name: str) -> str:
-    """Return a figure of plotly for a page that holds plotly; `name` is its id."""
+    """Return the HTML of a plotly figure, for a page that contains plotly; `name` is its id."""
     html: str = figure.to_html(
         full_html=False,
         include_plotlyjs=False,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the two theses printed of their own runs.
+"""Results that the two theses published.
 
 BL: Bergman & Lindell, *Aerial Imagery Based Position and Heading Estimation*, Chalmers 2023, tables 4.1 to 4.8.
 D: Digerud, *Utilizing vision-based techniques to aid unmanned cargo ships in the auto-docking scenario*, NTNU 2022,
-table in figure 4.13. Their recordings are not published: a number of ours is of another run.
+table in figure 4.13. Their recordings are not published, so our numbers are of other runs.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 
 class BlRun(NamedTuple):
-    """A run of BL: RMSE and largest error, of position (m) and heading (deg); GNSS was its truth."""
+    """A run of BL: RMSE and largest error of position (m) and heading (deg), with GNSS as truth."""
 
     case: int
     noise: str
@@ -24,7 +24,7 @@ class BlRun(NamedTuple):
 
 
 class DigerudRun(NamedTuple):
-    """A condition of D's table 4.13, as printed; n/d: not determined. `range_m`: largest distance of a detection."""
+    """A row of D's table 4.13; n/d: not determined. `range_m`: largest distance of a detection."""
 
     condition: str
     error: str

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do GNSS and the other sensors of place stand apart all the while? The slow error takes that up without a word.
+"""Warn of a constant offset between a GNSS receiver and the other position sensors, which the slow error would absorb.
 
-A receiver's slow error d is a process of sigma s and time constant T_c that comes and goes. Its mean over a run of length T is
+A receiver's slow error d is a first-order Gauss-Markov process with sigma s and time constant T_c. The mean of each axis over
+a run of length T has the variance
 
     sigma_mean^2 = 2 s^2 (T_c / T) (1 - (T_c / T) (1 - exp(-T / T_c)))
 
-so that |mean|^2 / sigma_mean^2 of two axes is a chi-square of 2. What lies beyond its 95 %, and hardly moves, is no multipath:
-a map, a survey or the datum lies as far off, or a lever does. Which of them is wrong nothing here tells. Of a height three sigmas
-are asked, as it is one more that may be off by chance: one above the geoid is, beside one above the ellipsoid.
+so |mean|^2 / sigma_mean^2 over two axes is chi-square with 2 degrees of freedom. An offset beyond its 95 % quantile that
+hardly changes is not multipath: the map, the survey, the datum or a lever arm is wrong. The data do not show which. For height
+the limit is 3 sigmas, since a mix-up of geoid and ellipsoid gives far more.
 """
 
 from __future__ import annotations
@@ -31,8 +32,14 @@ _BLOCK_S, _FEWEST = 10.0, 3  # fewer blocks do not tell what hardly moves
 _PLACES = ("pose", "aerial", "apriltag", "gnss")
 
 
-def apart_warnings(track: Trajectory, datum: Datum, recording: Recording, config: VesselConfig) -> list[str]:
-    """Return a line for each receiver that stands apart from a solved track by more than its slow error explains."""
+def gnss_offset_warnings(track: Trajectory, datum: Datum, recording: Recording, config: VesselConfig) -> list[str]:
+    """Return a line for each receiver with a constant offset from a solved track that its slow error does not explain.
+
+    Args:
+        track: of the body. datum: origin of world.
+        recording: the measurements; only receivers beside another position sensor are checked.
+        config: sensors, their slow errors and mounts.
+    """
     lines = []
     measured = {m.sensor for m in recording.measurements if m.seq >= 0}
     for name, sensor in config.of_kind("gnss").items():
@@ -75,7 +82,7 @@ def _tells_height(sensor: SensorConfig) -> bool:
 
 
 def _steady(off_m: Array) -> tuple[float, Array]:
-    """Return how far off the mean of blocks (N, k) is, 0 where they move, and that mean (k,)."""
+    """Return the length of the mean of blocks (N, k), m, or 0 where they scatter about it, and the mean itself (k,)."""
     mean = off_m.mean(axis=0)
     size = float(np.linalg.norm(mean))
     moves = float(np.sqrt(((off_m - mean) ** 2).sum(axis=1).mean()))
@@ -83,12 +90,13 @@ def _steady(off_m: Array) -> tuple[float, Array]:
 
 
 def _means(stamps_ns: NDArray[np.int64], off_m: Array) -> Array:
-    """Return the mean of each block, in which white noise goes, of (N, k)."""
+    """Return the means (B, k) of errors (N, k), m, over blocks of ten seconds, in which white noise averages out."""
     _, block = np.unique((stamps_ns - stamps_ns[0]) // int(_BLOCK_S * NS_PER_S), return_inverse=True)
     count = np.bincount(block)
     return np.column_stack([np.bincount(block, weights=column) / count for column in off_m.T])
 
 
 def _mean_variance(sigma_m: float, time_constant_s: float, lasts_s: float) -> float:
+    """Return the variance of the mean of a Gauss-Markov process, m^2 (see the module)."""
     share = time_constant_s / lasts_s
     return 2.0 * sigma_m**2 * share * (1.0 - share * (1.0 - float(np.exp(-1.0 / share))))

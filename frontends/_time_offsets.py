@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether headings are stamped early or late, told by the gyroscope, and whether fixes are, told by the accelerometer."""
+"""Time offsets of headings, by the gyroscope, and of positions and velocities, by the accelerometer."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _CLEAR, _LEAST_S = 4.0, 0.02  # sigmas, s
 _MOST_S, _APART_S, _LEAST_OF_WAY_S = 1.5, 0.05, 0.1  # how far, and how closely, is looked; from which it is said
 
 
-def lag(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[float, float] | None:
-    """Return what should be added to the stamps of headings, s, and its sigma; None where the gyroscope does not tell.
+def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[float, float] | None:
+    """Return what should be added to the stamps of headings, s, and its sigma; None if the gyroscope does not show it.
 
-    Read dt later than stamped, a heading is ahead of the integrated rate w by w dt. Within twenty seconds a gyro's bias,
-    a compass's offset and what iron does to it change little, so they go with each block's straight line.
+    If stamps are off by dt, heading minus integrated rate w is w dt. Within twenty seconds gyro bias, compass offset and magnetic
+    deviation hardly change, so a straight line per block removes them.
 
     Args:
-        turning: how the craft turned. stamps_ns: (N,), increasing. angle: (N,) rad, counter-clockwise, unwrapped.
+        turning: integrated rate. stamps_ns: (N,), increasing. angle: (N,) rad, counter-clockwise, unwrapped.
     """
     at = (stamps_ns - turning.origin_ns) / NS_PER_S
     inside = (at > turning.t_s[0] + 1.0) & (at < turning.t_s[-1] - 1.0)
@@ -53,15 +53,14 @@ def lag(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[f
     return (value, sigma) if clear else None
 
 
-def lag_of_way(felt: Felt, motion: Motion) -> tuple[float, float] | None:
-    """Return what should be added to the stamps of a way, s, and its sigma; None where the accelerometer does not tell.
+def motion_time_offset(felt: Felt, motion: Motion) -> tuple[float, float] | None:
+    """Return what should be added to the stamps of a motion, s, and its sigma; None if the accelerometer does not show it.
 
-    Of the accelerations that places tell those along the way are asked: across it, an antenna ahead of the IMU looks as if it
-    were early. Where c is their correlation, N (c^2 - c0^2) / (1 - c^2) is by how much (of chi square) another time fits
-    better, of N windows.
+    Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. With correlation
+    c at the best offset and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
 
     Args:
-        felt: of an IMU in the axes of the craft. motion: of places, or of a velocity over ground.
+        felt: of an IMU in the axes of the vessel. motion: positions, or a velocity over ground.
     """
     if motion.way_m is None:
         return None
@@ -93,7 +92,7 @@ def lag_of_way(felt: Felt, motion: Motion) -> tuple[float, float] | None:
 
 
 def _felt_along(felt: Felt, middle_s: Array, half_s: float) -> Array:
-    """The sensor's own acceleration ahead, times the square of `half_s`."""
+    """Return the sensor's own forward acceleration, times the square of `half_s`."""
     moved, _ = bent(felt.t_s, felt.way_m, middle_s, half_s)
     return np.asarray((moved * np.exp(-1j * np.interp(middle_s, felt.t_s, felt.turned))).real)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a track can be relied on, one reason at a time: the offline one and the online one are asked the same."""
+"""Whether one track can be trusted, with reasons; the same checks for the offline and the online track."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphloc.chi2 import SIGMAS_95, chi2_95
+from graphloc.eval.formatting import percent
 from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
-from graphloc.eval.words import percent
 from graphloc.frames import Array
 from graphloc.solution import Health, Solution
 from graphloc.trajectory import Trajectory, bounds_95
@@ -30,7 +30,7 @@ _WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
 
 
 class Trust(enum.StrEnum):
-    """How far the report says that a run can be relied on; the value is its colour."""
+    """Level of trust; its value is the colour in the report."""
 
     YES = "#009E73"
     WITH_CARE = "#E69F00"
@@ -38,7 +38,7 @@ class Trust(enum.StrEnum):
 
     @property
     def said(self) -> str:
-        """In words."""
+        """The level in words."""
         return {Trust.YES: "can be trusted", Trust.WITH_CARE: "use with care", Trust.NO: "do not rely on it"}[self]
 
 
@@ -47,19 +47,19 @@ _ORDER = (Trust.YES, Trust.WITH_CARE, Trust.NO)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reason:
-    """A sentence, and how far it alone lets a track be trusted."""
+    """A sentence, and the level of trust that it allows."""
 
     trust: Trust
     text: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Judged:
-    """What a report says first of a track.
+class TrackVerdict:
+    """Verdict on one track.
 
     Attributes:
-        name: of the track. accuracy: how good, in a sentence; says so where nothing measures it.
-        reasons: why to trust it, and why not.
+        name: of the track. accuracy: a sentence on its error, or that none was measured.
+        reasons: for and against trusting it.
     """
 
     name: str
@@ -68,26 +68,30 @@ class Judged:
 
     @property
     def trust(self) -> Trust:
-        """That of the worst reason."""
+        """The lowest level among the reasons."""
         return worst(r.trust for r in self.reasons)
 
 
 def worst(of: Iterator[Trust]) -> Trust:
-    """Return the least of some."""
+    """Return the lowest of some levels of trust."""
     return max(of, key=_ORDER.index, default=Trust.YES)
 
 
-def judged(data: ReportData, solution: Solution) -> Judged:
-    """Judge a track of a run."""
+def track_verdict(data: ReportData, solution: Solution) -> TrackVerdict:
+    """Return the verdict on one track of a run.
+
+    Args:
+        solution: one of `data.solutions`.
+    """
     reasons = (
         *_bounds(data, solution), *_late(data, solution), *_levers(data, solution), *_beside(data, solution), *_from_offline(data, solution),
         *_compared(data, solution), *_solved(data, solution),
     )  # fmt: skip
-    return Judged(name=solution.name, accuracy=_accuracy(data, solution.name), reasons=reasons)
+    return TrackVerdict(name=solution.name, accuracy=_accuracy(data, solution.name), reasons=reasons)
 
 
 def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """What the estimate says of itself, and whether that was so."""
+    """Yield the size of the 95 % bounds, the health, and the coverage of the truth."""
     assert solution.trajectory.cov is not None
     bound = float(np.percentile(bounds_95(solution.trajectory.cov)[:, 0], 95))
     called = shares(solution)
@@ -122,7 +126,7 @@ def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Places that are read at another time than they were measured: the track is ahead or behind, and no bound knows it."""
+    """Yield suggested time offsets of position sensors that move the track by more than its bounds."""
     track = solution.trajectory
     if data.calibration is None or track.cov is None or track.v_world_mps is None:
         return
@@ -138,9 +142,9 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Antennas that sit elsewhere than configured, or were left where `inspect` drafts them.
+    """Yield antennas that calibration puts elsewhere, or whose configured position is the default, and whether the bounds cover that.
 
-    The track is off by as much, which neither a bound nor a held-out fix of theirs knows.
+    Neither the bounds nor held-out fixes of the same receiver include such an error.
     """
     track = solution.trajectory
     if data.recording.truth is not None or track.cov is None:
@@ -168,7 +172,7 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """The filters that are nearer the truth, or the fixes that were kept out, over the time that both tracks cover."""
+    """Yield the filters that are more accurate, over the time that both tracks cover."""
     for filtered in data.filters:
         if filtered.name == (data.online.name if data.online else ""):
             continue
@@ -183,7 +187,7 @@ def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _errors_of_both(data: ReportData, ours: Trajectory, theirs: Trajectory) -> tuple[Array, Array] | None:
-    """Horizontal errors (M,) m of two tracks at the stamps that both cover; None where there are none."""
+    """Return the horizontal errors (M,), m, of two tracks at the stamps that both cover; None if there are none."""
     truth = data.recording.truth
     if truth is not None:
         stamps = truth.stamps_ns[ours.covers(truth.stamps_ns) & theirs.covers(truth.stamps_ns)]
@@ -208,7 +212,7 @@ def _rms(values: Array) -> float:
 
 
 def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Where there is no truth, the online track against the offline one, which knows more."""
+    """Yield the distance of the online track from the offline one, where there is no truth."""
     if solution is not data.online or data.recording.truth is not None:
         return
     _, error, turned, there, _ = errors(solution.trajectory, data.solution.trajectory)
@@ -227,7 +231,7 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _compared(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """What there was to hold it against."""
+    """Yield whether accuracy was measured, and over which share of the run."""
     if main_table(data) is None:
         text = "Its accuracy was not measured: there is neither truth nor a held-out fix."
         if solution.stats.online and data.online is None:
@@ -248,7 +252,7 @@ def _compared(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _solved(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """How the solver fared, and what was said on the way."""
+    """Yield convergence, cost and the number of warnings."""
     stats = solution.stats
     if stats.online:
         yield Reason(trust=Trust.YES, text="Online: each pose is what was known at that time.")
@@ -270,12 +274,12 @@ def _solved(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def of(data: ReportData, name: str, column: str) -> float | None:
-    """An estimate's number in the first table that has such a column."""
+    """Return a number of an estimate from the first table that has the column; None if there is none."""
     return next((t.as_dict()[name][column] for t in data.tables if column in t.columns and name in t.as_dict()), None)
 
 
 def main_table(data: ReportData) -> tuple[Table, str] | None:
-    """The table that says how far off the estimates are, and its column that says it shortest."""
+    """Return the first table with an RMSE, and the name of that column."""
     for table in data.tables:
         key = next((k for k in ("position_rmse_m", "horizontal_rmse_m") if k in table.columns), None)
         if key is not None:
@@ -302,6 +306,6 @@ def _accuracy(data: ReportData, name: str) -> str:
 
 
 def times(value: float, mine: float) -> str:
-    """Say how many times as large as ours a number is."""
+    """Return the ratio of a number to ours as text."""
     ratio = value / mine
     return f"{ratio:.0f} x" if ratio >= 9.95 else f"{ratio:.1f} x" if ratio >= 0.095 else f"{ratio:.2f} x"
