@@ -195,7 +195,9 @@ def test_a_prediction_knows_imu_samples_that_came_late() -> None:
     arrivals = arrivals_of(drift())
     end_ns = arrivals[0].true_ns + 9_050_000_000
     arrivals = [a for a in arrivals if a.true_ns < end_ns]
-    late = [a for a in arrivals if isinstance(a.m, ImuSample) and end_ns - 700_000_000 < a.true_ns < end_ns - 350_000_000]
+    late = [
+        a for a in arrivals if isinstance(a.m, ImuSample) and end_ns - 700_000_000 < a.true_ns < end_ns - 350_000_000
+    ]
     ends = []
     for some in (arrivals, [*(a for a in arrivals if a not in late), *late]):
         online = smoother(drift())

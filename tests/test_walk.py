@@ -63,7 +63,9 @@ def test_bounds_hold_beside_fixes_good_to_centimetres_that_walk() -> None:
 
 def test_how_far_apart_fixes_are_does_not_depend_on_the_order_of_arrival() -> None:
     """10 Hz, each up to 2 s late: beside one that has just come every second one or so is still missing."""
-    fixes = [m for m in simulate(bl_scenario(1, "drift"), 0).recording.measurements if isinstance(m, GnssPosition)][:200]
+    fixes = [m for m in simulate(bl_scenario(1, "drift"), 0).recording.measurements if isinstance(m, GnssPosition)][
+        :200
+    ]
     late = np.arange(len(fixes)) * 0.1 + np.random.default_rng(3).uniform(0.0, 2.0, len(fixes))
     spaced = []
     for order in (range(len(fixes)), np.argsort(late)):
