@@ -187,7 +187,27 @@ def test_everything_late_from_the_first_message_on() -> None:
     assert all(row.outcome is Outcome.USED for row in fed.rows if row.sensor == "imu")
     apart = apart_m(lag, in_order()[1])
     assert apart[:-30].max() < 0.01
-    assert apart.max() < 0.03  # 3 s of dead reckoning later: what GNSS weighs depends on what it scattered by then
+    assert apart.max() < 0.01
+
+
+def test_a_prediction_knows_imu_samples_that_came_late() -> None:
+    """Those before the newest state, too, though no further state is made."""
+    arrivals = arrivals_of(drift())
+    end_ns = arrivals[0].true_ns + 9_050_000_000
+    arrivals = [a for a in arrivals if a.true_ns < end_ns]
+    late = [
+        a for a in arrivals if isinstance(a.m, ImuSample) and end_ns - 700_000_000 < a.true_ns < end_ns - 350_000_000
+    ]
+    ends = []
+    for some in (arrivals, [*(a for a in arrivals if a not in late), *late]):
+        online = smoother(drift())
+        feed(online, drift(), some)
+        ends.append(online.predict(arrivals[-1].true_ns))
+    in_time, too_late = ends
+    assert in_time is not None
+    assert too_late is not None
+    assert np.abs(too_late.p_world_m - in_time.p_world_m).max() < 0.001
+    assert np.abs(too_late.v_world_mps - in_time.v_world_mps).max() < 0.001
 
 
 def test_an_imu_step_is_reintegrated_when_its_samples_come_late() -> None:

@@ -7,12 +7,17 @@ import numpy as np
 import pytest
 
 from graphloc.build import walk_between_nodes
+from graphloc.config import GnssConfig
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, bl_scenario, simulate
+from graphloc.factors.gnss import ROW as GNSS
 from graphloc.frames import Datum
-from graphloc.graph import SlowProcess
+from graphloc.graph import Decision, Residual, SlowProcess
 from graphloc.measurements import GnssPosition, world_from_fixes
+from graphloc.online._entries import Entry
+from graphloc.online._live import LiveStream
 from graphloc.replay import replay
+from graphloc.solve._decide import Verdict
 
 SLOW = SlowProcess(
     name="error", axes=("east", "offset"), units=("m", "m"), scale=np.ones(2), sigma=np.array([2.0, 1.0]),
@@ -54,3 +59,34 @@ def test_bounds_hold_beside_fixes_good_to_centimetres_that_walk() -> None:
     found = compare_to_truth(track, run.truth)
     assert found.nees is not None
     assert found.nees < 4.0  # 2 when true
+
+
+def test_how_far_apart_fixes_are_does_not_depend_on_the_order_of_arrival() -> None:
+    """10 Hz, each up to 2 s late: beside one that has just come every second one or so is still missing."""
+    fixes = [m for m in simulate(bl_scenario(1, "drift"), 0).recording.measurements if isinstance(m, GnssPosition)][
+        :200
+    ]
+    late = np.arange(len(fixes)) * 0.1 + np.random.default_rng(3).uniform(0.0, 2.0, len(fixes))
+    spaced = []
+    for order in (range(len(fixes)), np.argsort(late)):
+        stream = LiveStream(0, "gnss", GNSS, GnssConfig(), SLOW, None, (), None)
+        for i in order:
+            stream.measurements.append(fixes[i])
+            stream.space()
+        spaced.append({stream.measurements[k].stamp_ns: stream.apart_s[k] for k in range(len(fixes))})
+    assert spaced[1] == spaced[0]
+    assert list(spaced[0].values()) == pytest.approx([np.inf, *[0.1] * (len(fixes) - 1)])
+
+
+def test_a_factor_is_replaced_where_the_walk_of_its_fix_turns_out_to_be_another() -> None:
+    def verdict(variance_m2: float) -> Verdict:
+        residual = Residual(
+            raw=np.zeros(3), cov=np.eye(3) * variance_m2, jacobian=lambda: np.zeros((3, 6)), prior=1.0, size_m=None,
+            size_deg=None,
+        )  # fmt: skip
+        return Verdict(Decision(), 1.0, 1.0, residual, 0, None)  # type: ignore[arg-type]
+
+    entry = Entry(LiveStream(0, "gnss", GNSS, GnssConfig(), SLOW, None, (), None), 0, verdict(1.0))
+    assert entry.weighs_other(verdict(1.3))
+    assert entry.weighs_other(verdict(0.7))
+    assert not entry.weighs_other(verdict(1.05))

@@ -56,8 +56,9 @@ class Entry:
         return self.state >= first and (carry is None or carry[0] >= first)
 
     def weighs_other(self, verdict: Verdict) -> bool:
-        """Whether the weight differs so much that the factors must be replaced."""
-        return abs(verdict.weight - self.verdict.weight) > _CHANGED
+        """Whether weight or covariance differ so much that the factors must be replaced."""
+        new, old = (float(np.trace(v.residual.cov)) for v in (verdict, self.verdict))
+        return abs(verdict.weight - self.verdict.weight) > _CHANGED or abs(new - old) > _CHANGED * old
 
     def differs(self, verdict: Verdict) -> bool:
         """Whether the factors in the graph must be replaced: decided otherwise, or linearised elsewhere."""
@@ -200,8 +201,7 @@ class Entries:
                 del self._entries[key]
         for stream in problem.streams.values():
             kept = min((i for n, i in self._entries if n == stream.number), default=len(stream.measurements))
-            for tape in (stream.measurements, stream.state, stream.carry, stream.gyro_radps, stream.apart_s):
-                tape.forget(kept)
+            stream.forget(kept)
 
     def gone(self) -> list[LedgerRow]:
         """Return ledger rows of measurements that have left since this was last called."""

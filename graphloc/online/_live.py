@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left, bisect_right, insort
 from collections import deque
 from collections.abc import Collection, MutableMapping, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ from graphloc.position_jumps import JumpDetector, PositionJump
 from graphloc.time import duration_ns
 
 T = TypeVar("T")
-_LAST = 15  # newest measurements, from which a sensor's rate is taken
+_LAST = 15  # measurements up to one, by stamp, from which a sensor's rate at it is taken
 _REMEMBERED = 300  # residuals, and pairs of them, from which the scatter of a sensor is taken
 _LAGS_S, _GOLDEN = (
     (2.0, 4.0),
@@ -184,6 +184,7 @@ class LiveStream:
     Attributes:
         slow: the slow error that is estimated. left_out: the one that is added to the bounds instead, because no second sensor
             separates it from motion; both, once the receiver has jumped: then the window estimates its jumps.
+        by_stamp: stamps (ns) and indices of the measurements that are kept, in order.
         jumps: those that the window estimates.
     """
 
@@ -200,10 +201,31 @@ class LiveStream:
     carry: Tape[Carry | None] = field(default_factory=Tape)
     gyro_radps: Tape[Array] = field(default_factory=Tape)
     apart_s: Tape[float] = field(default_factory=Tape)
+    by_stamp: list[tuple[int, int]] = field(default_factory=list)
     scatter: Scatter = field(default_factory=Scatter)
     frozen_detector: FrozenReceiverDetector = field(default_factory=FrozenReceiverDetector)
     jump_detector: JumpDetector = field(default_factory=JumpDetector)
     jumps: tuple[PositionJump, ...] = ()
+
+    def space(self) -> None:
+        """Note how far apart measurements are at the one taken last, and anew at those after it, if it came late.
+
+        Where each comes up to 2 s late, the newest are every second one or so: taken to be so far apart for good, each would count
+        for more than it tells.
+        """
+        index = len(self.measurements) - 1
+        taken = (self.measurements[index].stamp_ns, index)
+        insort(self.by_stamp, taken)
+        self.apart_s.append(math.inf)
+        first = bisect_left(self.by_stamp, taken)
+        for n in range(first, min(first + _LAST + 1, len(self.by_stamp))):
+            self.apart_s[self.by_stamp[n][1]] = _apart_s(self.by_stamp[max(n - _LAST, 0) : n + 1])
+
+    def forget(self, before: int) -> None:
+        """Forget the measurements before an index."""
+        self.by_stamp = [taken for taken in self.by_stamp if taken[1] >= before]
+        for tape in (self.measurements, self.state, self.carry, self.gyro_radps, self.apart_s):
+            tape.forget(before)
 
     def jump_m(self, begin_ns: int, end_ns: int) -> float:
         """Return the size of the largest jump that its slow error may have made between two stamps, m; 0: none."""
@@ -229,8 +251,8 @@ class LiveProblem:
         carry, gyro_radps = self._motion(m.stamp_ns)
         timeline = self.timeline
         floor, nearest = timeline.floor(m.stamp_ns), timeline.nearest(m.stamp_ns)
-        stream.apart_s.append(_apart_s([*stream.measurements.kept[-_LAST:], m]))
         stream.measurements.append(m)
+        stream.space()
         stream.state.append(state_of(m, floor, nearest, timeline.stamps_ns, self.links.gaps()))
         stream.carry.append(carry)
         stream.gyro_radps.append(gyro_radps)
@@ -302,7 +324,6 @@ def live_problem(
     )
 
 
-def _apart_s(last: Sequence[Measurement]) -> float:
-    """Return the median time (s) between the last measurements of a sensor, whatever their order of arrival; inf for a single one."""
-    stamps_ns = sorted(m.stamp_ns for m in last)
-    return float(median(b - a for a, b in pairwise(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else math.inf
+def _apart_s(last: Sequence[tuple[int, int]]) -> float:
+    """Return the median time (s) between measurements, given by stamp (ns) and index in order; inf for a single one."""
+    return float(median(b - a for (a, _), (b, _) in pairwise(last))) * 1e-9 if len(last) > 1 else math.inf

@@ -119,6 +119,10 @@ class OnlineSmoother:
         at_ns = newest.stamp_ns if stamp_ns is None else stamp_ns
         if at_ns - newest.stamp_ns > self._setup.bridge_s * 1e9:
             return None
+        try:
+            self._tracking.solve_late_imu()
+        except Exception as error:  # noqa: BLE001 - as in `_advance`
+            self._rebuild(failure_text(error))
         return self._estimate(at_ns)
 
     def window(self) -> Trajectory | None:

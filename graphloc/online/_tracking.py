@@ -162,6 +162,12 @@ class Tracking:
             holes, self._holes = self._holes, []
             self.lag.reintegrate(holes)
 
+    def solve_late_imu(self) -> None:
+        """Solve with the IMU samples that came late since the newest state: it was predicted across the holes that they fill."""
+        if self._holes:
+            self._read_imu()
+            self.lag.commit()
+
     def _grow(self, until_ns: int) -> None:
         """Stage the next states: as many as one commit takes."""
         timeline, made, closed = self.lag.problem.timeline, 0, False
