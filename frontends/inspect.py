@@ -29,11 +29,13 @@ from graphloc.frontends._assess import (
 from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import world_of
-from graphloc.frontends._clock import refuse_woven
+from graphloc.frontends._clock import refuse_woven, usual_latency_s
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
 from graphloc.frontends._lag import lag, lag_of_way
 from graphloc.frontends._reports import (
+    EAST_AXES,
+    NORTH_AXES,
     CompassReport,
     GnssReport,
     ImuReport,
@@ -89,6 +91,7 @@ _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MOST_TRIED = 200  # messages of a topic that cannot be decoded
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
 _MOST_NAMED = 6
+_SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _COVERS = 0.8  # of the run, from which a receiver is there throughout
 
 
@@ -157,7 +160,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         )
         + tuple(topic_report(s, len(s)) for s in streams if s.topic not in topics),
         imus=tuple(found_imus),
-        gnss=tuple(replace(g, late_s=late.get(g.topic)) for g in found_gnss),
+        gnss=tuple(_late(g, late, twists, by_topic) for g in found_gnss),
         compasses=tuple(
             _asked_together(_timed(c, s, by_topic[s.topic], turning), s, [(i, heard[i.topic]) for i in found_imus])
             for c, s in found_compasses
@@ -254,6 +257,29 @@ def _asked_together(report: CompassReport, stream: Stream, imus: Sequence[tuple[
     report = replace(report, wander_deg=wander_deg(series, said))
     bad = int(scattered(series, said).sum())
     return replace(report, why=f"{report.why}; {bad} of {len(said)}: {SCATTERED}") if bad else report
+
+
+def _late(
+    gnss: GnssReport,
+    late: Mapping[str, tuple[float, float] | None],
+    twists: Sequence[tuple[Stream, VelocityReport]],
+    by_topic: Mapping[str, Stream],
+) -> GnssReport:
+    """The report, with how late its stamps are: by its own places, or by a velocity over ground where that tells it better.
+
+    A receiver measures both at once. One that is recorded at another time after its stamps is taken for another device.
+    """
+    told = {gnss.topic: late.get(gnss.topic)}
+    fixes = by_topic[gnss.topic]
+    way_s = usual_latency_s(fixes.stamps_ns, fixes.logs_ns)
+    for stream, report in twists:
+        own = by_topic[stream.topic]
+        same = abs(usual_latency_s(own.stamps_ns, own.logs_ns) - way_s) < _SAME_WAY_S and own.recorded == fixes.recorded
+        if report.axes in (EAST_AXES, NORTH_AXES) and same and not filtered(stream.topic):
+            told[stream.topic] = late.get(stream.topic)
+    known = {topic: found for topic, found in told.items() if found is not None}
+    by = min(known, key=lambda topic: known[topic][1], default="")
+    return replace(gnss, late_s=known.get(by), late_by=by)
 
 
 def _mounted(

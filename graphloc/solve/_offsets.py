@@ -33,7 +33,7 @@ from graphloc import keys
 from graphloc.build import JUMP, Problem, Stream, build_graph
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, SlowProcess
+from graphloc.graph import Attachment, Constant, Decision, SlowProcess
 from graphloc.offsets import Misfit, Offset, Offsets, Probe
 from graphloc.solve._batch import BatchResult
 
@@ -152,8 +152,13 @@ def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values]:
             slow = left_out
             for j in range(len(problem.timeline.slow_stamps_ns)):
                 values.insert(keys.slow(stream.number, j), np.zeros(len(slow.sigma)))
-        streams.append(replace(stream, slow=slow, left_out=None))
+        streams.append(replace(stream, slow=slow, left_out=None, constants=_surveyed(stream)))
     return replace(problem, streams=tuple(streams)), values
+
+
+def _surveyed(stream: Stream) -> tuple[Constant, ...]:
+    """Return a stream's constants without those that correct a setting: as configured, they are zero."""
+    return tuple(constant for constant in stream.constants if not constant.corrects)
 
 
 def _linearised(problem: Problem, values: gtsam.Values, result: BatchResult) -> _Rows:
@@ -194,7 +199,9 @@ def _without_mount(problem: Problem, stream: Stream, slow: SlowProcess, values: 
 
 
 def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: gtsam.Values) -> Attachment:
-    """Return an attachment of the solution, with the slow states that the stream has here."""
+    """Return an attachment of the solution, with the slow states and constants that the stream has here."""
+    if not stream.constants:
+        at = replace(at, constants=())
     if stream.slow is None:
         return replace(at, slow_key=None, slow_value=None, slow_next=None)
     key = keys.slow(stream.number, int(problem.timeline.slow_of[stream.state[i]]))
