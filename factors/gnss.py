@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """GNSS position: lever arm, white noise, and a slow error.
 
-    z = p + R l + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
+    z = p + R l + u tau + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
 
-z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachment`); C: the reported
+z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachment`); u: velocity of the antenna; tau: how
+much later than stamped the fix was measured (negative: it is stamped late), a constant of the run; C: the reported
 covariance; W: what d walks between its nodes (`Attachment.slow_walk`). The slow state holds n = -d, so that only native
-factors are needed: `A = p + R l` is a leaf (`ReferenceFrameFactor`, tied within 5 mm), and `A - N = z` is a
-`BetweenFactor` under the kernel.
-Without a slow state: `GPSFactorArm`. Not handled: correlation between axes of d.
+factors are needed where tau is known to be 0: `A = p + R l` is a leaf (`ReferenceFrameFactor`, tied within 5 mm), and
+`A - N = z` is a `BetweenFactor` under the kernel; without a slow state: `GPSFactorArm`. With tau: one factor that is linearised
+anew at every pass. Not handled: correlation between axes of d; of tau what u changes by in that time.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ import numpy as np
 from graphloc.config import GnssConfig
 from graphloc.factors._noise import noise_model, with_floors
 from graphloc.frames import Array, Datum, Geodetic, skew
-from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
+from graphloc.graph import Attachment, Constant, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
+from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import GnssPosition, world_from_fixes
 
 _TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
@@ -55,11 +57,25 @@ def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
     return _world_m(m, at.datum)
 
 
+def _velocity_mps(at: Attachment) -> Array:
+    """Velocity (3,) of the antenna in world, m/s."""
+    around = at.T_world_body.rotation().matrix() @ np.cross(at.gyro_radps, at.lever_m)
+    return np.asarray(at.v_world_mps + at.dv_world_mps + around)
+
+
+def _predicted_m(at: Attachment) -> Array:
+    """The fix (3,) without white noise, in world."""
+    place = at.T_world_body.transformFrom(at.T_state_sensor.translation())
+    if at.slow_value is not None:
+        place = place - at.slow_value
+    for _, late in at.constants:
+        place = place + _velocity_mps(at) * late
+    return np.asarray(place)
+
+
 def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Residual a + d - z (3,) in m, world axes."""
-    lever = at.T_state_sensor.translation()
-    d = np.zeros(3) if at.slow_value is None else -at.slow_value
-    raw = at.T_world_body.transformFrom(lever) + d - _fix_world_m(m, at)
+    """Residual predicted - measured (3,) in m, world axes."""
+    raw = _predicted_m(at) - _fix_world_m(m, at)
     size = float(np.hypot(raw[0], raw[1]))
     white, cov = white_covariance(m, config), _covariance(m, config, at)
     return (
@@ -78,6 +94,13 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
 
 def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factors of one fix."""
+    if at.constants:
+        residual = residuals(m, config, at)[0]
+        terms = [pose_term(at, residual.jacobian())]
+        if at.slow_key is not None:
+            terms.append(Term(at.slow_key, np.array(at.slow_value), -np.eye(3)))
+        terms += [Term(key, np.array(late), _velocity_mps(at)[:, None]) for key, late in at.constants]
+        return linear_update(residual, terms, decision)
     z = _fix_world_m(m, at)
     lever = np.asarray(at.T_state_sensor.translation())
     model = noise_model(_covariance(m, config, at), decision)
@@ -112,11 +135,16 @@ def slow(config: GnssConfig) -> SlowProcess | None:
     )
 
 
+def constants(config: GnssConfig) -> tuple[Constant, ...]:
+    """Return how much later than stamped fixes were measured, s, where that is not known."""
+    if config.stamp_sigma_s == 0.0:
+        return ()
+    return (Constant(name="time offset", sigma=np.array([config.stamp_sigma_s]), corrects="time_offset_s"),)
+
+
 def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
     """Return the fix that the attachment's estimate would give."""
-    antenna = at.T_world_body.transformFrom(at.T_state_sensor.translation())
-    d = np.zeros(3) if at.slow_value is None else -at.slow_value
-    lat, lon, height = at.datum.geodetic_from_enu(antenna + d)[0]
+    lat, lon, height = at.datum.geodetic_from_enu(_predicted_m(at))[0]
     return GnssPosition(
         stamp_ns=0, sensor="gnss", seq=0, position=Geodetic(lat, lon, height), cov_enu_m2=np.diag([0.25, 0.25, 1.0])
     )
@@ -143,6 +171,7 @@ ROW = Sensor(
     ideal=ideal,
     hint=hint,
     slow=slow,
+    constants=constants,
     absolute=True,
     company=True,
 )

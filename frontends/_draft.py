@@ -43,6 +43,8 @@ _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off:
 _FILTERED = (
     "by its name a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 )
+_STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
+_STAMPS = "stamped when measured, or later? estimated with the run; 0 where a receiver's clock stamps"
 _SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clocks are set
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
@@ -160,27 +162,35 @@ def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
     kind = next((line.split()[1] for line in block if line.startswith("  kind:")), "")
     topic = next((line.split()[1] for line in block if line.startswith("  topic:")), "")
     if topic in topics and topics[topic].recorded:
-        said = "guess: its headers hold no stamps; they are late by as long as a message takes, which no bound includes"
+        unknown = "" if kind == "gnss" else ", which no bound includes"
+        said = f"guess: its headers hold no stamps; they are late by as long as a message takes{unknown}"
         block = [*block, f"  stamps: recorded  # {said}"]
     if imu is None or kind not in _SET or topic not in clocks:
         return block
     own = (c for n, c in clocks.items() if not topics[n].recorded and topics[n].msgtype not in UNSTAMPED)
     reference = reference_of(imu, own)
     told = inspection.gnss if kind == "gnss" else inspection.velocities if kind == "gnss_velocity" else ()
-    late = next((r.late_s for r in told if r.topic.partition(" ")[0] == topic and r.late_s), None)
-    offset_s, why = 0.0, []
+    found = next((r for r in told if r.topic.partition(" ")[0] == topic and r.late_s), None)
+    late = found.late_s if found else None
+    unstamped = topics[topic].recorded or topics[topic].msgtype in UNSTAMPED
+    offset_s, why, sigma_s = 0.0, [], _ON_ITS_WAY_S if unstamped else _STAMPED_LATE_S
     behind = behind_s(clocks[topic], imu, reference)
     if abs(behind) > EPOCH_LIMIT_S:
-        offset_s += behind
+        offset_s, sigma_s = offset_s + behind, _ON_ITS_WAY_S
         clock = "the IMU's" if reference is imu else "one that tells the date"
         why.append(
             f"its clock is {'behind' if behind > 0 else 'ahead of'} {clock}, by the recording times; how much longer one "
-            "message takes than the other is in it, which no bound includes"
+            f"message takes than the other is in it{'' if kind == 'gnss' else ', which no bound includes'}"
         )
     if late is not None:
-        offset_s += late[0]
-        why.append(f"what the IMU feels fits its motion {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
-    return [*block, f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else block
+        offset_s, sigma_s = offset_s + late[0], max(late[1], _STAMPED_LATE_S)
+        by = found.late_by if isinstance(found, GnssReport) and found.late_by.partition(" ")[0] != topic else ""
+        whose = f"the motion of {by}, taken for the same receiver's," if by else "its motion"
+        why.append(f"what the IMU feels fits {whose} {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
+    lines = [f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else []
+    if kind == "gnss":
+        lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}")
+    return [*block, *lines]
 
 
 def _topic_lines(topic: str) -> list[str]:

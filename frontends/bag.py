@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from graphloc.config import CompassConfig, ImuConfig, VesselConfig
+from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import courses_of_fixes, motion_of_fixes
@@ -385,11 +385,13 @@ def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) 
     for r in sensors:
         types = topics[r.config.topic].msgtypes
         unstamped = set(types) & set(UNSTAMPED)
-        if (unstamped or r.config.stamps == "recorded") and r.config.time_offset_s == 0.0:
+        estimated = isinstance(r.config, GnssConfig) and r.config.stamp_sigma_s > 0.0
+        if (unstamped or r.config.stamps == "recorded") and r.config.time_offset_s == 0.0 and not estimated:
             why = f"{_or(types)} has no stamp" if unstamped else "stamps: recorded"
             lines.append(
                 f"{r.sensor}: {why}: recording times are used, which are late by as long as a message takes (a receiver's often "
                 "0.1 s and more); no bound includes that: set time_offset_s (negative)"
+                + (", or stamp_sigma_s" if r.config.kind == "gnss" else "")
             )
     return lines
 

@@ -31,10 +31,12 @@ from graphloc.frontends._assess import (
 from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import world_of
-from graphloc.frontends._clock import refuse_woven
+from graphloc.frontends._clock import refuse_woven, usual_latency_s
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
 from graphloc.frontends._reports import (
+    EAST_AXES,
+    NORTH_AXES,
     CompassReport,
     GnssReport,
     ImuReport,
@@ -91,6 +93,7 @@ _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MOST_TRIED = 200  # messages of a topic that cannot be decoded
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
 _MOST_NAMED = 6
+_SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _COVERS = 0.8  # of the run, from which a receiver is there throughout
 
 
@@ -165,7 +168,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         source=bag.source,
         topics=_topic_reports(bag),
         imus=tuple(imus),
-        gnss=tuple(replace(report, late_s=late.get(report.topic)) for report in gnss),
+        gnss=tuple(_timed_fixes(report, late, velocities, bag.streams) for report in gnss),
         compasses=compasses,
         odometry=tuple(reports),
         velocities=tuple(replace(report, late_s=late.get(report.topic)) for _, report in velocities),
@@ -320,6 +323,32 @@ def _beside_gyro(report: CompassReport, stream: Stream, best: tuple[ImuReport, S
     report = replace(report, wander_deg=wander_deg(series, measured))
     bad = int(scattered(series, measured).sum())
     return replace(report, why=f"{report.why}; {bad} of {len(measured)}: {SCATTERED}") if bad else report
+
+
+def _timed_fixes(
+    gnss: GnssReport,
+    late: Mapping[str, tuple[float, float] | None],
+    velocities: Sequence[tuple[Stream, VelocityReport]],
+    streams: Mapping[str, Stream],
+) -> GnssReport:
+    """Return the report with how late the fixes' stamps are: by the fixes, or by a velocity over ground that tells it better.
+
+    A receiver measures both at once. One that is recorded at another time after its stamps is taken for another device.
+    """
+    candidates = {gnss.topic: late.get(gnss.topic)}
+    fixes = streams[gnss.topic]
+    latency_s = usual_latency_s(fixes.stamps_ns, fixes.logs_ns)
+    for stream, report in velocities:
+        own = streams[stream.topic]
+        same = (
+            abs(usual_latency_s(own.stamps_ns, own.logs_ns) - latency_s) < _SAME_WAY_S
+            and own.recorded == fixes.recorded
+        )
+        if report.axes in (EAST_AXES, NORTH_AXES) and same and not filtered(stream.topic):
+            candidates[stream.topic] = late.get(stream.topic)
+    known = {topic: found for topic, found in candidates.items() if found is not None}
+    by = min(known, key=lambda topic: known[topic][1], default="")
+    return replace(gnss, late_s=known.get(by), late_by=by)
 
 
 def _mounted(bag: _Contents, frames: Mapping[str, str]) -> tuple[MountedTopic, ...]:

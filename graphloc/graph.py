@@ -166,10 +166,12 @@ class Constant:
 
     Attributes:
         name: for warnings. sigma: (k,).
+        corrects: the key of vessel.yaml that it is added to, in its unit; '' for what was surveyed.
     """
 
     name: str
     sigma: Array
+    corrects: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -50,7 +50,8 @@ def test_headers_without_stamps_are_read_by_the_recording_times(tmp_path: Path, 
     late_s, _ = found.gnss[0].late_s or (0.0, 0.0)
     assert late_s == pytest.approx(-0.12, abs=0.02)  # the accelerometer tells how long a fix is on its way
     assert config.sensors["gnss"].time_offset_s == pytest.approx(late_s, abs=1e-3)
-    gnss = config.sensors["gnss"].model_copy(update={"time_offset_s": 0.0})
+    assert config.sensors["gnss"].stamp_sigma_s == 0.05
+    gnss = config.sensors["gnss"].model_copy(update={"time_offset_s": 0.0, "stamp_sigma_s": 0.0})
     recording = read(tmp_path, config.model_copy(update={"sensors": {**config.sensors, "gnss": gnss}}))
     for kind, way_ns in ((GnssPosition, WAY_NS["/fix"]), (CompassHeading, WAY_NS["/compass"])):
         stamps = [m.stamp_ns for m in recording.measurements if isinstance(m, kind)]

@@ -7,7 +7,7 @@ import numpy as np
 
 from graphloc.build import mount_of
 from graphloc.chi2 import SIGMAS_95
-from graphloc.config import VesselConfig
+from graphloc.config import GnssConfig, VesselConfig
 from graphloc.eval.calibrate._evidence import Estimate, Evidence, Name
 from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
 from graphloc.eval.calibrate._imu import imu_noise
@@ -104,6 +104,9 @@ def _suggestion(
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
     action = "measure it, then set it"
+    block = config.sensors[name[0]]
+    if name[1] == "time" and isinstance(block, GnssConfig) and block.stamp_sigma_s > 0.0:
+        action = "the track has it in it already, by stamp_sigma_s"
     if name[1] in _AXIS and (shares := _of_one_antenna(name[0], recording, config)):
         action += f", also of {', '.join(shares)}, taken for the same antenna"
     if name[1] != "time" and name[0] in recording.mounts:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphloc.chi2 import SIGMAS_95, chi2_95
+from graphloc.config import GnssConfig
 from graphloc.eval.formatting import percent
 from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
@@ -132,8 +133,10 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
         return
     speed_mps, bound_m = _rms(_away(track.v_world_mps)), float(np.median(bounds_95(track.cov)[:, 0]))
     for found in data.calibration.suggestions:
-        off_s = abs(found.suggested - found.configured)
-        if found.unit == "s" and data.config.sensors[found.sensor].kind in _PLACES and off_s * speed_mps > bound_m:
+        off_s, block = abs(found.suggested - found.configured), data.config.sensors[found.sensor]
+        if isinstance(block, GnssConfig) and block.stamp_sigma_s > 0.0:
+            continue  # it is estimated, and in the bounds
+        if found.unit == "s" and block.kind in _PLACES and off_s * speed_mps > bound_m:
             yield Reason(
                 trust=Trust.WITH_CARE,
                 text=f"{found.sensor} and the IMU are {off_s:.2g} s apart (Calibration, below): at this run's {speed_mps:.1f} m/s the "

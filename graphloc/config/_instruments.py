@@ -126,6 +126,9 @@ class GnssConfig(SensorConfig):
     """The same for height, m."""
     slow_error: SlowErrorConfig = SlowErrorConfig()
     """The modelled slow error."""
+    stamp_sigma_s: NonNegative = 0.0
+    """Unknown delay of its stamps beyond `time_offset_s`, 1 sigma, s; it is estimated, to first order: of half a second only
+    roughly. Many drivers stamp a fix when it arrives, 0.05 to 0.5 s after it was measured; `inspect` drafts it. 0: stamps are right."""
     nmea: Places = ("GGA",)
     """NMEA sentences to read, from one talker (`GPGGA`) or any (`GGA`): GGA, GNS, RMC, GLL."""
 

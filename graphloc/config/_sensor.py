@@ -60,7 +60,8 @@ class SensorConfig(Block):
     """Where the sensor sits on the vessel."""
     stamps: Literal["header", "recorded"] = "header"
     """When its messages were measured: `header`, as their headers say; `recorded`, when they were recorded, for a driver that
-    leaves the headers' stamps empty. They are then late by as long as the message took, which no bound includes; see `time_offset_s`."""
+    leaves the headers' stamps empty. They are then late by as long as the message took, which no bound includes (but `stamp_sigma_s` of
+    `gnss`); see `time_offset_s`."""
     time_offset_s: Annotated[float, Field(ge=-4e9, le=4e9)] = 0.0
     """Added to the sensor's stamps, s."""
     kernel: KernelConfig = KernelConfig()

@@ -107,7 +107,9 @@ def linearised(problem: Problem, values: gtsam.Values, result: BatchResult) -> R
 
 
 def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: gtsam.Values) -> Attachment:
-    """Return an attachment of the solution, with the slow states that the stream has here."""
+    """Return an attachment of the solution, with the slow states and constants that the stream has here."""
+    if not stream.constants:
+        at = replace(at, constants=())
     if stream.slow is None:
         return replace(at, slow_key=None, slow_value=None, slow_next=None)
     key = keys.slow(stream.number, int(problem.timeline.slow_of[stream.state[i]]))

@@ -31,7 +31,7 @@ from scipy.stats import chi2
 from graphloc import keys
 from graphloc.build import Problem, Stream
 from graphloc.frames import Array
-from graphloc.graph import SlowProcess
+from graphloc.graph import Constant, SlowProcess
 from graphloc.offsets import Misfit, Offset, Offsets, Probe
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._linearised import Rows, linearised, normal_solver, root_weights
@@ -131,8 +131,13 @@ def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values]:
             slow = left_out
             for j in range(len(problem.timeline.slow_stamps_ns)):
                 values.insert(keys.slow(stream.number, j), np.zeros(len(slow.sigma)))
-        streams.append(replace(stream, slow=slow, left_out=None))
+        streams.append(replace(stream, slow=slow, left_out=None, constants=_surveyed(stream)))
     return replace(problem, streams=tuple(streams)), values
+
+
+def _surveyed(stream: Stream) -> tuple[Constant, ...]:
+    """Return a stream's constants without those that correct a setting: as configured, they are zero."""
+    return tuple(constant for constant in stream.constants if not constant.corrects)
 
 
 def _without_mount(problem: Problem, stream: Stream, slow: SlowProcess, values: gtsam.Values) -> SlowProcess | None:

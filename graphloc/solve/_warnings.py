@@ -92,7 +92,7 @@ def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
             cure = (
                 "set accel_noise_ug_per_sqrt_hz and gyro_noise_mdps_per_sqrt_hz accordingly, or look for a wrong mount"
             )
-            if any(stream.constants for stream in problem.streams):
+            if any(not constant.corrects for stream in problem.streams for constant in stream.constants):
                 cure += ", or for tags on a floating dock that the survey has as fixed"
         warnings.append(f"{said}; {cure}")
     cost = 2.0 * float(result.graph.error(result.values)) - outliers_cost(result.verdicts)
@@ -114,8 +114,13 @@ def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
             )
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
             if result.values.exists(key):
-                off = float(np.abs(np.atleast_1d(result.values.atVector(key)) / constant.sigma).max())
-                if off > _FAR_OFF:
+                value = np.atleast_1d(result.values.atVector(key))
+                off = float(np.abs(value / constant.sigma).max())
+                if off > _FAR_OFF and constant.corrects:
+                    warnings.append(
+                        f"{stream.name}: {constant.name} is {off:.1f} sigmas from zero: add {value[0]:+.3f} to its {constant.corrects}"
+                    )
+                elif off > _FAR_OFF:
                     warnings.append(
                         f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
                         "its sigmas"

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixes stamped later than they were measured, by a time that is not known: it is estimated, and the bounds include it."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.config import GnssConfig
+from graphloc.eval.metrics import TruthMetrics, compare_to_truth
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors.gnss import ROW
+from graphloc.graph import Decision
+from graphloc.measurements import GnssPosition
+from graphloc.replay import replay
+from tests.test_factors import attachment, values_of
+
+LATE_S = 0.1
+SCENARIO = Scenario(
+    path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, gnss_hz=5.0, gnss_sigma_m=0.02, imu_hz=50.0
+)
+
+
+@cache
+def late(stamp_sigma_s: float, late_s: float = LATE_S, *, slow: bool = False) -> SimulatedRun:
+    """A run with fixes good to 2 cm, each stamped `late_s` after it was measured."""
+    run = simulate(SCENARIO, 3)
+    late_ns = round(late_s * 1e9)
+    moved = [
+        replace(m, stamp_ns=m.stamp_ns + late_ns) if isinstance(m, GnssPosition) else m
+        for m in run.recording.measurements
+    ]
+    recording = replace(run.recording, measurements=tuple(sorted(moved, key=lambda m: (m.stamp_ns, m.seq))))
+    gnss = run.config.sensors["gnss"]
+    assert isinstance(gnss, GnssConfig)
+    settings = {
+        "stamp_sigma_s": stamp_sigma_s,
+        "slow_error": gnss.slow_error.model_copy(update={"enabled": slow, "horizontal_sigma_m": 0.05}),
+    }
+    sensors = {**run.config.sensors, "gnss": gnss.model_copy(update=settings)}
+    return replace(run, recording=recording, config=run.config.model_copy(update={"sensors": sensors}))
+
+
+def offline(run: SimulatedRun) -> TruthMetrics:
+    return compare_to_truth(app.simulated(run).solution.trajectory, run.truth)
+
+
+def online(run: SimulatedRun) -> TruthMetrics:
+    return compare_to_truth(replay(run.recording, run.config).solution.trajectory, run.truth)
+
+
+def test_the_jacobians_are_those_of_the_residual() -> None:
+    """By place, slow error and time, against differences of the residual itself."""
+    config = GnssConfig(kind="gnss", stamp_sigma_s=0.1)
+    at = replace(attachment(ROW, config), constants=((6, np.array([0.07])),))
+    assert at.slow_value is not None
+    m = ROW.ideal(at, config)
+    (factor,) = ROW.factors(m, config, at, Decision()).factors
+    values = values_of(at, ())
+    values.insert(6, np.array([0.07]))
+    found = factor.linearize(values)
+    residual = ROW.residuals(m, config, at)[0]
+    assert residual.raw == pytest.approx(np.zeros(3), abs=1e-6)
+    ahead = at.T_world_body.retract(np.array([0.0, 0.0, 0.0, 1e-4, 0.0, 0.0]))
+    moved = (
+        replace(at, T_world_body=ahead),
+        replace(at, slow_value=at.slow_value + np.array([1e-4, 0.0, 0.0])),
+        replace(at, constants=((6, np.array([0.07 + 1e-4])),)),
+    )
+    changes = [ROW.residuals(m, config, there)[0].raw / 1e-4 for there in moved]
+    assert list(found.keys()) == [at.pose_key, at.slow_key, 6]
+    assert np.linalg.norm(changes[2]) > 0.5  # m/s
+    for change, column in zip(changes, found.jacobian()[0].T[[3, 6, 9]], strict=True):
+        np.testing.assert_allclose(np.linalg.cholesky(residual.cov) @ column, change, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("mode", [offline, online], ids=["offline", "online"])
+@pytest.mark.parametrize("slow", [False, True], ids=["white", "slow"])
+def test_late_fixes_are_found_out(mode: object, slow: bool) -> None:
+    assert callable(mode)
+    believed, estimated = mode(late(0.0, slow=slow)), mode(late(0.1, slow=slow))
+    assert believed.coverage_95 < 0.5
+    assert estimated.coverage_95 > 0.9
+    assert estimated.position_rmse_m < 0.6 * believed.position_rmse_m
+
+
+def test_fixes_in_time_stay_where_they_are() -> None:
+    """What a time that is not known costs where it is 0: the bounds."""
+    believed, estimated = offline(late(0.0, 0.0)), offline(late(0.1, 0.0))
+    assert estimated.position_rmse_m < believed.position_rmse_m + 0.02
+    assert estimated.coverage_95 is not None
+    assert estimated.coverage_95 > 0.9
+
+
+def test_calibration_names_it_all_the_same_and_that_the_track_has_it() -> None:
+    found = app.simulated(late(0.1)).calibration
+    assert found is not None
+    (line,) = (s for s in found.suggestions if s.key == "sensors.gnss.time_offset_s")
+    assert line.suggested == pytest.approx(-LATE_S, abs=0.03)
+    assert line.action == "the track has it in it already, by stamp_sigma_s"
+
+
+def test_a_time_far_beyond_its_sigma_is_said() -> None:
+    warnings = app.simulated(late(0.01)).solution.stats.warnings
+    assert any(w.startswith("gnss: time offset is ") and "to its time_offset_s" in w for w in warnings)
