@@ -28,6 +28,15 @@ from graphloc.time import NS_PER_S
 _TURNS_DEG, _SAME_DEG = 5.0, 0.2
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
 _BLOCK_S = 30
+_SCATTERS_DEG, _RELATIVE_DEG = (
+    15.0,
+    30.0,
+)  # scatter of a heading about the course; offset, beyond which an IMU's north is its own
+_STEADY_S, _FOLLOWS_DEG, _FOLLOWS = (
+    120.0,
+    8.0,
+    3.0,
+)  # a gyro's bias is steady; RMS of what follows it, and turns over that
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
 
 
@@ -271,6 +280,35 @@ def against_turning(
     return int(np.sign(together)) if abs(together) > clear else 0
 
 
+def follows_turning(turning: Turning | None, at_ns: NDArray[np.int64], yaw: Array) -> bool:
+    """Return whether a heading turns as the gyroscope does, by far more than the two differ.
+
+    In blocks of two minutes, a straight line removed from each: the bias of the gyroscope, and what a heading is off by throughout.
+
+    Args:
+        at_ns: (N,), increasing. yaw: (N,) rad, unwrapped, positive to port.
+    """
+    if turning is None:
+        return False
+    at = (at_ns - turning.origin_ns) / NS_PER_S
+    inside = (at > turning.t_s[0]) & (at < turning.t_s[-1])
+    at, own = at[inside], yaw[inside]
+    turned = np.interp(at, turning.t_s, turning.turned_rad)
+    apart, turns = [np.zeros(0)], [np.zeros(0)]
+    for block in np.split(
+        np.arange(len(at)), np.searchsorted(at, np.arange(at[0], at[-1], _STEADY_S)[1:]) if len(at) else []
+    ):
+        if len(block) < 20:
+            continue
+        line = np.column_stack([np.ones(len(block)), at[block] - at[block].mean()])
+        for values, rest in ((own - turned, apart), (turned, turns)):
+            rest.append(values[block] - line @ np.linalg.lstsq(line, values[block], rcond=None)[0])
+    off, turn = (
+        np.degrees(np.sqrt(np.mean(np.concatenate(part) ** 2))) if len(part) > 1 else np.inf for part in (apart, turns)
+    )
+    return bool(off < min(_FOLLOWS_DEG, turn / _FOLLOWS)) and np.isfinite(turn)
+
+
 def unit_of(stream: Stream) -> str | None:
     """Return the unit of a stream of bare numbers, if they are headings; None where it is none."""
     if stream.msgtype not in NUMBERS:
@@ -385,9 +423,20 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
         convention = min(fits, key=lambda c: fits[c][1])
     offset, scatter = fits[convention]
     apart = (measured if convention == "enu" else np.pi / 2.0 - measured) - courses.course_rad
-    usable = scatter < 15.0
+    # Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
+    # an IMU's own orientation follows the gyroscope wherever north is.
+    fits_course = bool(scatter < _SCATTERS_DEG)
+    sideways = (
+        not fits_course
+        and by_gyro is not None
+        and (stream.msgtype != IMU or abs(offset) < _RELATIVE_DEG)
+        and follows_turning(turning, spoke_ns, angle if convention == "enu" else np.pi / 2.0 - angle)
+    )
+    usable = fits_course or bool(sideways)
     why = f"yaw minus GNSS course: {offset:+.0f} deg, scatter {scatter:.0f} deg over {len(measured)} courses"
-    if not usable:
+    if sideways:
+        why += ": a vessel that often goes sideways, since it turns as the gyro does"
+    elif not usable:
         why += ": a relative or a disturbed heading, or a vessel that often goes sideways"
     elif by_gyro:
         why += "; convention from the gyro"
@@ -397,9 +446,9 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
         **plain,
         usable=usable,
         convention=convention,
-        offset_deg=offset,
+        offset_deg=None if sideways else offset,
         scatter_deg=scatter,
-        leeway_deg=_wanders_deg(courses.stamps_ns, apart),
+        leeway_deg=None if sideways else _wanders_deg(courses.stamps_ns, apart),
         samples=len(measured),
         why=why,
     )

@@ -305,6 +305,32 @@ def test_a_course_that_wanders_about_the_heading_tells_no_compass_to_a_degree(
     assert ("its offset to the GNSS course wanders" in text) == bool(leeway_deg)
 
 
+@pytest.mark.parametrize("turns", [True, False])
+def test_a_compass_of_a_vessel_that_goes_sideways_is_one_if_it_turns_as_the_gyro_does(
+    turns: bool, tmp_path: Path
+) -> None:
+    """Set by wind up to 40 deg off her course, she had no compass; a heading that is off by as much while she does not turn is none."""
+    make, crab_rad, per_s = Messages(2), np.radians(40.0), 2.0 * np.pi / 90.0
+    items = [item for item in drive(make, seconds=200) if item[0] not in ("/compass", "/imu")]
+    for topic, at, m in drive(make, seconds=200):
+        t = (at - START_NS) / S
+        if topic == "/compass":  # clockwise from north
+            own = 2.0 * np.arctan2(m.quaternion.z, m.quaternion.w) - crab_rad * np.sin(per_s * t)
+            items.append((topic, at, make.compass(at, (0.0, 0.0, np.sin(own / 2.0), np.cos(own / 2.0)))))
+        elif topic == "/imu":
+            a, w = m.linear_acceleration, m.angular_velocity
+            rate = crab_rad * per_s * np.cos(per_s * t) if turns else 0.0
+            items.append((topic, at, make.imu(at, (a.x, a.y, a.z), (w.x, w.y, w.z + rate))))
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert bool(config.of_kind("compass")) == turns
+    assert ("often goes sideways, since it turns as the gyro does" in text) == turns
+    if turns:  # no course tells how it is mounted
+        compass = config.sensors["compass"]
+        assert isinstance(compass, CompassConfig)
+        assert compass.convention == "ned"
+        assert compass.mount_offset_sigma_deg == pytest.approx(10.0)
+
+
 @pytest.mark.parametrize("late_s", [0.0, 0.4, -0.4])
 def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path) -> None:
     """Drivers of serial lines stamp when they hear. The IMU tells it where the craft brakes, whatever the antenna's lever."""
