@@ -8,7 +8,7 @@ import numpy as np
 from graphloc.build import mount_of
 from graphloc.chi2 import SIGMAS_95
 from graphloc.config import GnssConfig, VesselConfig
-from graphloc.eval.calibrate._evidence import Estimate, Evidence, Name
+from graphloc.eval.calibrate._evidence import LEAST, Estimate, Evidence, Name
 from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
 from graphloc.eval.calibrate._imu import imu_noise
 from graphloc.eval.formatting import significant
@@ -29,6 +29,7 @@ PROBE: Probe = {
 }
 """What is looked at, by kind of sensor, those first that are wrong most often; heights show too little."""
 
+_DOUBTFUL = 3.0  # sigmas: too few for a suggestion, too many for one that fits
 _AXIS: dict[Offset, int] = {"x": 0, "y": 1}
 _UNIT: dict[Offset, tuple[str, float]] = {
     "x": ("m", 1.0),
@@ -133,6 +134,8 @@ def _check(name: Name, found: Estimate, recording: Recording, config: VesselConf
     unit, factor = _UNIT[name[1]]
     if found.sigma > _USEFUL[name[1]]:
         said = f"this run does not show it (1 sigma {significant(factor * found.sigma, 2)} {unit}); it would take {_WOULD_TELL[name[1]]}"
+    elif abs(found.z) > _DOUBTFUL and abs(found.value) > LEAST[name[1]]:
+        said = f"off by {significant(factor * found.value, 2)} {unit}, {abs(found.z):.1f} sigmas: doubtful"
     else:
         said = f"fits, within {significant(SIGMAS_95 * factor * found.sigma, 2)} {unit} (95 %)"
     return Check(
