@@ -13,7 +13,7 @@ Row = dict[str, Any]
 
 def row(item: str, name: str, value: float, unit: str, bound: float | None = None, direction: str = "info") -> Row:
     command = f"python benchmarks/results.py --only {item}"
-    return {"item": item, "name": name, "value": round(float(value), 4), "unit": unit, "bound": bound,
+    return {"item": item, "name": name, "value": float(f"{value:.6g}"), "unit": unit, "bound": bound,
             "direction": direction, "command": command, "commit": commit()}  # fmt: skip
 
 
