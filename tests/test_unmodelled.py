@@ -4,11 +4,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from graphloc import app
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.measurements import GnssPosition, Measurement
+from graphloc.solve import _solution
+from graphloc.solve._batch import BatchResult
+from graphloc.solve._unmodelled import Unmodelled, unmodelled
 
 SIGMA_M, CORRELATED_S = 2.0, 200.0  # of the default configuration
 
@@ -51,3 +55,27 @@ def test_a_drifting_receiver_is_in_the_bounds_of_heading_and_velocity() -> None:
     heading, velocity = np.mean([h.mean() for h, _ in found]), np.mean([v.mean() for _, v in found])
     assert 0.3 < heading < 2.2  # of some six degrees of freedom
     assert 0.6 < velocity < 1.2
+
+
+def test_a_receiver_whose_fixes_are_all_rejected_adds_nothing() -> None:
+    """Then the heading comes from the matches alone; an empty table was indexed."""
+    scenario = Scenario(path="loops", duration_s=20.0, noise="clean", pose_hz=1.0, imu_hz=50.0, gnss_hz=2.0)
+    run = simulate(scenario, 1)
+    found: list[BatchResult] = []
+
+    def keep(result: BatchResult) -> Unmodelled | None:
+        found.append(result)
+        return None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_solution, "unmodelled", keep)
+        app.smooth_recording(run.recording, run.config)
+    (result,) = found
+    gnss = next(s for s in result.problem.streams if s.name == "gnss")
+    alone = replace(gnss, slow=None, left_out=gnss.slow)
+    silent = {k: replace(v, decision=None) if k[0] == gnss.number else v for k, v in result.verdicts.items()}
+    streams = tuple(alone if s.name == "gnss" else s for s in result.problem.streams)
+    more = unmodelled(replace(result, problem=replace(result.problem, streams=streams), verdicts=silent))
+    assert more is not None
+    assert not more.rotation.any()
+    assert not more.velocity.any()

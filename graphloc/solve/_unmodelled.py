@@ -53,7 +53,8 @@ def unmodelled(result: BatchResult) -> Unmodelled | None:
     for _ in range(_DRAWS // _AT_ONCE):
         off = np.zeros((len(rows.b), _AT_ONCE))
         for slow, stream in streams:
-            used = rows.used(stream)
+            if not (used := rows.used(stream)):
+                continue  # all were rejected
             shift = np.zeros((len(used), 9, _AT_ONCE))
             shift[:, 3:6] = np.einsum("nji,njd->nid", R[stream.state[used]], _drawn(slow, stream, used, rng))
             off += rows.moved(stream, used, shift)
