@@ -63,6 +63,8 @@ def unmodelled(result: BatchResult) -> Unmodelled | None:
         faster = dx[rows.first_velocity : rows.first_pose].reshape(n, 3, _AT_ONCE)
         for cov, part in zip(found, (turned, faster), strict=True):
             cov += part @ part.transpose(0, 2, 1) / _DRAWS
+    if not all(np.isfinite(cov).all() for cov in found):
+        raise RuntimeError("not finite")
     return found
 
 
