@@ -22,7 +22,7 @@ from graphloc.config import GnssConfig
 from graphloc.factors._noise import noise_model, with_floors
 from graphloc.frames import Array, Datum, Geodetic, skew
 from graphloc.graph import Attachment, Constant, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import Term, linear_update, pose_term
+from graphloc.linear import Term, linear_factor
 from graphloc.measurements import GnssPosition, world_from_fixes
 
 _TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
@@ -57,19 +57,13 @@ def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
     return _world_m(m, at.datum)
 
 
-def _velocity_mps(at: Attachment) -> Array:
-    """Velocity (3,) of the antenna in world, m/s."""
-    around = at.T_world_body.rotation().matrix() @ np.cross(at.gyro_radps, at.lever_m)
-    return np.asarray(at.v_world_mps + at.dv_world_mps + around)
-
-
 def _predicted_m(at: Attachment) -> Array:
     """The fix (3,) without white noise, in world."""
     place = at.T_world_body.transformFrom(at.T_state_sensor.translation())
     if at.slow_value is not None:
         place = place - at.slow_value
     for _, late in at.constants:
-        place = place + _velocity_mps(at) * late
+        place = place + at.sensor_velocity_mps() * late
     return np.asarray(place)
 
 
@@ -95,12 +89,8 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
 def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factors of one fix."""
     if at.constants:
-        residual = residuals(m, config, at)[0]
-        terms = [pose_term(at, residual.jacobian())]
-        if at.slow_key is not None:
-            terms.append(Term(at.slow_key, np.array(at.slow_value), -np.eye(3)))
-        terms += [Term(key, np.array(late), _velocity_mps(at)[:, None]) for key, late in at.constants]
-        return linear_update(residual, terms, decision)
+        delay = [Term(key, np.array(late), at.sensor_velocity_mps()[:, None]) for key, late in at.constants]
+        return linear_factor(residuals(m, config, at)[0], at, decision, *delay)
     z = _fix_world_m(m, at)
     lever = np.asarray(at.T_state_sensor.translation())
     model = noise_model(_covariance(m, config, at), decision)

@@ -21,11 +21,6 @@ from graphloc.linear import linear_factor
 from graphloc.measurements import GnssVelocity
 
 
-def _antenna_mps(at: Attachment) -> Array:
-    swing = at.T_world_body.rotation().matrix() @ np.cross(at.gyro_radps, at.lever_m)
-    return np.asarray(at.v_world_mps + at.dv_world_mps + swing)
-
-
 def _attitude_jacobian(at: Attachment) -> Array:
     """Return the derivative (3, 6) of R Exp(theta) (omega x l) by the body tangent (theta, rho)."""
     swing = skew(np.cross(at.gyro_radps, at.lever_m))
@@ -34,7 +29,7 @@ def _attitude_jacobian(at: Attachment) -> Array:
 
 def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - measured (3,), m/s, in world."""
-    raw = _antenna_mps(at) - m.v_world_mps
+    raw = at.sensor_velocity_mps() - m.v_world_mps
     return (
         Residual(
             raw=raw,
@@ -56,7 +51,7 @@ def factors(m: GnssVelocity, config: VelocityConfig, at: Attachment, decision: D
 def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
     """Return the noise-free velocity at the attachment's state."""
     return GnssVelocity(
-        stamp_ns=0, sensor="gnss_velocity", seq=0, v_world_mps=_antenna_mps(at), cov_m2ps2=np.eye(3) * 0.01
+        stamp_ns=0, sensor="gnss_velocity", seq=0, v_world_mps=at.sensor_velocity_mps(), cov_m2ps2=np.eye(3) * 0.01
     )
 
 

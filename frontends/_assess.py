@@ -20,6 +20,7 @@ from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec, two_antennas
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import Stream
+from graphloc.frontends._turns import without_line
 from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE, QUATERNION, UNSTAMPED, yaw_of_x_axis
 from graphloc.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.measurements import GnssPosition, world_from_fixes
@@ -28,15 +29,10 @@ from graphloc.time import NS_PER_S
 _TURNS_DEG, _SAME_DEG = 5.0, 0.2
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
 _BLOCK_S = 30
-_SCATTERS_DEG, _RELATIVE_DEG = (
-    15.0,
-    30.0,
-)  # scatter of a heading about the course; offset, beyond which an IMU's north is its own
-_STEADY_S, _FOLLOWS_DEG, _FOLLOWS = (
-    120.0,
-    8.0,
-    3.0,
-)  # a gyro's bias is steady; RMS of what follows it, and turns over that
+_SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
+_RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
+_STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
+_FOLLOWS_DEG, _FOLLOWS = 8.0, 3.0  # most RMS of what a heading and the gyroscope differ by; turns over that
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
 
 
@@ -266,15 +262,11 @@ def against_turning(
         at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: time over which changes are compared: a gyro's bias
             must be small beside them, and the angle's noise average out. clear: correlation that is believed.
     """
-    if turning is None:
+    at, own, turned = _beside(turning, at_ns, angle)
+    if len(at) < 20:
         return 0
-    at = (at_ns - turning.origin_ns) / NS_PER_S
-    inside = (at > turning.t_s[0]) & (at < turning.t_s[-1])
-    if inside.sum() < 20:
-        return 0
-    step = max(1, round(over_s / max(float(np.median(np.diff(at[inside]))), 1e-3)))
-    turned = np.interp(at[inside], turning.t_s, turning.turned_rad)
-    a, b = (v[step:] - v[:-step] for v in (angle[inside], turned))
+    step = max(1, round(over_s / max(float(np.median(np.diff(at))), 1e-3)))
+    a, b = (v[step:] - v[:-step] for v in (own, turned))
     power = float(np.sqrt((a**2).sum() * (b**2).sum()))
     together = float((a * b).sum()) / power if power > 0.0 else 0.0
     return int(np.sign(together)) if abs(together) > clear else 0
@@ -288,25 +280,26 @@ def follows_turning(turning: Turning | None, at_ns: NDArray[np.int64], yaw: Arra
     Args:
         at_ns: (N,), increasing. yaw: (N,) rad, unwrapped, positive to port.
     """
-    if turning is None:
+    at, own, turned = _beside(turning, at_ns, yaw)
+    apart, turns = [], []
+    blocks = (at - at[:1]) // _STEADY_S
+    for block in (blocks == k for k in np.unique(blocks)):
+        if block.sum() >= 20:
+            apart.append(without_line((own - turned)[block], at[block]))
+            turns.append(without_line(turned[block], at[block]))
+    if not apart:
         return False
+    off_deg, turns_deg = (float(np.degrees(np.sqrt(np.mean(np.concatenate(part) ** 2)))) for part in (apart, turns))
+    return off_deg < min(_FOLLOWS_DEG, turns_deg / _FOLLOWS)
+
+
+def _beside(turning: Turning | None, at_ns: NDArray[np.int64], angle: Array) -> tuple[Array, Array, Array]:
+    """Return times (M,), s, of the angles that lie within a turning, these (M,) and the turning (M,) there; empty without one."""
+    if turning is None:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
     at = (at_ns - turning.origin_ns) / NS_PER_S
     inside = (at > turning.t_s[0]) & (at < turning.t_s[-1])
-    at, own = at[inside], yaw[inside]
-    turned = np.interp(at, turning.t_s, turning.turned_rad)
-    apart, turns = [np.zeros(0)], [np.zeros(0)]
-    for block in np.split(
-        np.arange(len(at)), np.searchsorted(at, np.arange(at[0], at[-1], _STEADY_S)[1:]) if len(at) else []
-    ):
-        if len(block) < 20:
-            continue
-        line = np.column_stack([np.ones(len(block)), at[block] - at[block].mean()])
-        for values, rest in ((own - turned, apart), (turned, turns)):
-            rest.append(values[block] - line @ np.linalg.lstsq(line, values[block], rcond=None)[0])
-    off, turn = (
-        np.degrees(np.sqrt(np.mean(np.concatenate(part) ** 2))) if len(part) > 1 else np.inf for part in (apart, turns)
-    )
-    return bool(off < min(_FOLLOWS_DEG, turn / _FOLLOWS)) and np.isfinite(turn)
+    return at[inside], angle[inside], np.interp(at[inside], turning.t_s, turning.turned_rad)
 
 
 def unit_of(stream: Stream) -> str | None:
@@ -432,7 +425,7 @@ def compass_report(stream: Stream, courses: Courses | None, turning: Turning | N
         and (stream.msgtype != IMU or abs(offset) < _RELATIVE_DEG)
         and follows_turning(turning, spoke_ns, angle if convention == "enu" else np.pi / 2.0 - angle)
     )
-    usable = fits_course or bool(sideways)
+    usable = fits_course or sideways
     why = f"yaw minus GNSS course: {offset:+.0f} deg, scatter {scatter:.0f} deg over {len(measured)} courses"
     if sideways:
         why += ": a vessel that often goes sideways, since it turns as the gyro does"

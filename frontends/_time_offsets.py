@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.frontends._assess import Motion, Turning
 from graphloc.frontends._mount_yaw import FEWEST, HALF_S, MOVES_M, STEP_S, Felt, bent
+from graphloc.frontends._turns import without_line
 from graphloc.time import NS_PER_S
 
 _BLOCK_S = 20.0
@@ -38,8 +39,7 @@ def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: A
     for k in range(int((at[-1] - at[0]) // _BLOCK_S) + 1):
         own = (at - at[0]) // _BLOCK_S == k
         if own.sum() >= 10:
-            line = np.column_stack([np.ones(own.sum()), at[own] - at[own].mean(), turned[own]])
-            w, ahead = (v - line @ np.linalg.lstsq(line, v, rcond=None)[0] for v in (rate[own], (angle - turned)[own]))
+            w, ahead = (without_line(v[own], at[own], turned[own]) for v in (rate, angle - turned))
             found.append((float(w @ ahead), float(w @ w)))
     if len(found) < 3:
         return None

@@ -53,10 +53,8 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
         by_gyro, by_compass = turned[step:] - turned[:-step], wrap_angle(yaw[step:] - yaw[:-step])
         together += float((by_gyro * by_compass).sum())
         power += float(np.sqrt((by_gyro**2).sum() * (by_compass**2).sum()))
-        line = np.column_stack([np.ones(len(at_s)), at_s - at_s.mean()])
-        rest = np.unwrap(yaw - turned)
-        apart.append(rest - line @ np.linalg.lstsq(line, rest, rcond=None)[0])
-        turns.append(turned - line @ np.linalg.lstsq(line, turned, rcond=None)[0])
+        apart.append(without_line(np.unwrap(yaw - turned), at_s))
+        turns.append(without_line(turned, at_s))
     if not apart or np.degrees(_rms(turns)) < _TURNS_DEG:
         return []
     if together < -_CLEAR * power:
@@ -70,6 +68,12 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
     return [
         f"{said}magnetic deviation, frozen or late headings (enabled: false may be better); or the unit of {imu.sensor}'s rates"
     ]
+
+
+def without_line(values: Array, at_s: Array, *columns: Array) -> Array:
+    """Return values (N,) less their best fit by a straight line in time, at_s (N,), s, and by other columns (N,)."""
+    line = np.column_stack([np.ones(len(at_s)), at_s - at_s.mean(), *columns])
+    return np.asarray(values - line @ np.linalg.lstsq(line, values, rcond=None)[0])
 
 
 def refuse_unit(imu: ImuSeries, config: ImuConfig, yaws_by_source: Mapping[str, Yaws]) -> None:

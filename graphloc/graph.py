@@ -77,6 +77,11 @@ class Attachment:
     constants: tuple[tuple[int, Array], ...] = ()
     T_solver: Any | None = None
 
+    def sensor_velocity_mps(self) -> Array:
+        """Return the velocity (3,) of the sensor at the measurement, world axes, m/s."""
+        swing = self.T_world_body.rotation().matrix() @ np.cross(self.gyro_radps, self.lever_m)
+        return np.asarray(self.v_world_mps + self.dv_world_mps + swing)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Residual:

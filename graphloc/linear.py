@@ -51,14 +51,14 @@ def pose_term(at: Attachment, jacobian: Array) -> Term:
     return Term(at.pose_key, at.T_solver, carried, at.T_solver.localCoordinates(at.T_world_body))
 
 
-def linear_factor(residual: Residual, at: Attachment, decision: Decision) -> GraphUpdate:
-    """Return the factor of a residual in the states that it has Jacobians for: pose, velocity and slow state."""
+def linear_factor(residual: Residual, at: Attachment, decision: Decision, *more: Term) -> GraphUpdate:
+    """Return the factor of a residual in the states that it has Jacobians for, pose, velocity and slow state, and in `more`."""
     terms = [pose_term(at, residual.jacobian())]
     if residual.velocity_jacobian is not None:
         terms.append(Term(at.velocity_key, at.v_world_mps, residual.velocity_jacobian()))
     if at.slow_key is not None and residual.slow_jacobian is not None:
         terms.append(Term(at.slow_key, np.array(at.slow_value), residual.slow_jacobian()))
-    return linear_update(residual, terms, decision)
+    return linear_update(residual, [*terms, *more], decision)
 
 
 def linear_update(residual: Residual, terms: Sequence[Term], decision: Decision) -> GraphUpdate:

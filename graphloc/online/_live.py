@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right, insort
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Collection, MutableMapping, Sequence
 from dataclasses import dataclass, field
@@ -215,9 +215,9 @@ class LiveStream:
         """
         index = len(self.measurements) - 1
         taken = (self.measurements[index].stamp_ns, index)
-        insort(self.by_stamp, taken)
-        self.apart_s.append(math.inf)
         first = bisect_left(self.by_stamp, taken)
+        self.by_stamp.insert(first, taken)
+        self.apart_s.append(math.inf)
         for n in range(first, min(first + _LAST + 1, len(self.by_stamp))):
             self.apart_s[self.by_stamp[n][1]] = _apart_s(self.by_stamp[max(n - _LAST, 0) : n + 1])
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.berths import Berth, BerthTrack, rates, seen_from
 from graphloc.build import Problem, Stream
+from graphloc.errors import in_one_line
 from graphloc.frames import Array
 from graphloc.recording import Recording
 from graphloc.solution import SlowEstimate, Solution
@@ -76,11 +77,9 @@ def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
     """Add what slow errors that are left out do to attitude and velocity; return a warning where that fails."""
     try:
         more = unmodelled(result)
-    except (RuntimeError, np.linalg.LinAlgError) as error:
-        said = " ".join(str(error).split())[:100]
-        return [
-            f"the bounds of heading and velocity do not include the slow GNSS error: its effect is not determined ({said})"
-        ]
+    except RuntimeError as error:
+        said = "the bounds of heading and velocity do not include the slow GNSS error: its effect is not determined"
+        return [f"{said} ({in_one_line(error)})"]
     if more is not None:
         cov[:, 3:, 3:] += more.rotation
         v_cov += more.velocity

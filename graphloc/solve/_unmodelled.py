@@ -41,10 +41,13 @@ def unmodelled(result: BatchResult) -> Unmodelled | None:
         RuntimeError: a state is not determined.
     """
     problem, values = result.problem, result.values
-    streams = [(stream.left_out, stream) for stream in problem.streams if stream.left_out is not None]
-    if not streams:
+    if all(stream.left_out is None for stream in problem.streams):
         return None
     rows = linearised(problem, values, result)
+    followed = [
+        (stream.left_out, stream, used) for stream in problem.streams
+        if stream.left_out is not None and (used := rows.used(stream))  # else all its fixes were rejected
+    ]  # fmt: skip
     root = root_weights(rows, -rows.b)
     J = diags_array(root) @ rows.J
     solve, rng, n = normal_solver(J), np.random.default_rng(0), rows.states
@@ -52,9 +55,7 @@ def unmodelled(result: BatchResult) -> Unmodelled | None:
     found = Unmodelled(np.zeros((n, 3, 3)), np.zeros((n, 3, 3)))
     for _ in range(_DRAWS // _AT_ONCE):
         off = np.zeros((len(rows.b), _AT_ONCE))
-        for slow, stream in streams:
-            if not (used := rows.used(stream)):
-                continue  # all were rejected
+        for slow, stream, used in followed:
             shift = np.zeros((len(used), 9, _AT_ONCE))
             shift[:, 3:6] = np.einsum("nji,njd->nid", R[stream.state[used]], _drawn(slow, stream, used, rng))
             off += rows.moved(stream, used, shift)
