@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from graphloc.build import attach
+from graphloc.frames import Array
 from graphloc.graph import Attachment, Residual
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
@@ -95,6 +97,23 @@ class Entries:
     def _all_reachable(self) -> Iterator[Entry]:
         first = self._problem.timeline.first
         return (e for e in self._entries.values() if e.reaches(first))
+
+    def information(self, stream: LiveStream, since: int) -> Array:
+        """Return what the measurements of a stream from an index on tell of their states, as judged.
+
+        (9, 9), on rotation, position and velocity, in axes of world.
+        """
+        total = np.zeros((9, 9))
+        for index in range(max(since, stream.measurements.first), len(stream.measurements)):
+            entry = self._entries.get((stream.number, index))
+            if entry is not None and entry.held is not None:
+                found, R = entry.verdict.residual, entry.verdict.at.T_world_body.rotation().matrix()
+                by_velocity = (
+                    np.zeros((len(found.raw), 3)) if found.velocity_jacobian is None else found.velocity_jacobian()
+                )
+                J = np.hstack([found.jacobian() @ block_diag(R.T, R.T), by_velocity])
+                total += entry.verdict.weight * J.T @ np.linalg.solve(found.cov, J)
+        return total
 
     def residuals_at(self, stream: LiveStream, index: int) -> tuple[Attachment, tuple[Residual, ...]]:
         """Return the attachment of a measurement at the present estimate, and its residuals there, one per mode."""

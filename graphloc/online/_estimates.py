@@ -12,6 +12,7 @@ from graphloc.online._anchor import sound
 from graphloc.online._lag import Lag
 from graphloc.online._odometry import Odometry
 from graphloc.online._propagate import Propagated
+from graphloc.online._unmodelled import UnmodelledError
 from graphloc.solve._covariances import unmodelled_covariance, world_covariance
 from graphloc.solve._health import health_of
 
@@ -25,12 +26,14 @@ def estimate_of(
     absolute: Sequence[str],
     doubt: str,
     heading_off_rad: float,
+    unmodelled: UnmodelledError | None,
 ) -> Estimate:
     """Return the estimate at a state of the window, or propagated beyond it.
 
     Args:
         agreed_ns: stamp at which each absolute sensor last agreed. absolute: names of all absolute sensors.
         doubt: why the health cannot be good, or empty.
+        unmodelled: what slow errors that are left out do to the newest state; the covariances then include it.
         heading_off_rad: by how much the motion shows the heading to be off; the covariance then includes it.
     """
     newest, problem = lag.newest, lag.problem
@@ -39,6 +42,10 @@ def estimate_of(
     gyro = problem.links.gyro_at(np.array([at_ns]))[0] - problem.R_body_imu @ newest.bias.gyroscope()
     cov = world_covariance(sound(now.pose_cov), R, lever)
     cov[:3, :3] += unmodelled_covariance(list(problem.streams.values()))
+    v_cov = now.velocity_cov
+    if unmodelled is not None:
+        cov[3:, 3:] += unmodelled.rotation
+        v_cov = v_cov + unmodelled.velocity
     others_m, others_cov = lag.others
     cov[:3, :3] += others_cov
     cov[5, 5] += heading_off_rad**2
@@ -52,7 +59,7 @@ def estimate_of(
         R_world_body=R,
         v_world_mps=now.velocity + R @ np.cross(gyro, lever),
         cov=cov,
-        v_cov=now.velocity_cov,
+        v_cov=v_cov,
         p_odom_m=np.array(now.p_odom_m),
         R_odom_body=np.array(now.R_odom_body),
         step_cov=odometry.step_cov,

@@ -26,6 +26,7 @@ from graphloc.online._entries import Entries
 from graphloc.online._judge import Judge
 from graphloc.online._live import LiveProblem
 from graphloc.online._states import Newest, States
+from graphloc.online._unmodelled import UnmodelledError
 from graphloc.online._window import Window
 from graphloc.position_jumps import why_in_doubt
 
@@ -60,6 +61,7 @@ class Lag:
         self._agreement = Agreement(problem.timeline)
         self._judge = Judge(problem, self._window, self._states, self._entries, self._agreement)
         self._page_s = 0.0
+        self._followed: dict[str, int] = {}  # index of the first measurement that `follow` has not told, by sensor
         self.fresh = False
         """Whether the last commit relinearised the states that had moved."""
 
@@ -121,6 +123,18 @@ class Lag:
         """Relinearise after many states came at once."""
         self._window.settle()
         self._states.read()
+
+    def follow(self, unmodelled: UnmodelledError) -> None:
+        """Bring what left-out slow errors do to the newest state up to date with it."""
+        told = {}
+        for name, stream in self.problem.streams.items():
+            told[name] = self._entries.information(stream, self._followed.get(name, 0))
+            self._followed[name] = len(stream.measurements)
+        unmodelled.advance(self.newest, self.problem.links, told)
+
+    def covariance(self) -> Array:
+        """Return the joint covariance (15, 15) of the newest pose, velocity and bias, rotation and position in axes of world."""
+        return self._states.covariance()
 
     def anchor(self) -> Anchor:
         """Return the anchor at the newest state, to rebuild or resume from."""

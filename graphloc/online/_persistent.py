@@ -14,6 +14,7 @@ from graphloc.online._motion_model import MotionModel
 from graphloc.online._noise import ImuNoise
 from graphloc.online._odometry import Odometry
 from graphloc.online._snapshot import Snapshot
+from graphloc.online._unmodelled import UnmodelledError
 from graphloc.position_jumps import JumpDetector
 
 
@@ -31,6 +32,7 @@ class PersistentState:
         motion_model: motion model. heading_check: whether the heading fits the motion.
         jump_detectors: detectors of position jumps, by sensor: a restart does not make a level right.
         frozen: receivers that were last reported as frozen.
+        unmodelled: what slow errors that are left out do to the newest state; None where none is left out.
     """
 
     datum: Datum | None
@@ -43,6 +45,7 @@ class PersistentState:
     heading_check: HeadingCheck = field(default_factory=HeadingCheck)
     jump_detectors: dict[str, JumpDetector] = field(default_factory=dict)
     frozen: set[str] = field(default_factory=set)
+    unmodelled: UnmodelledError | None = None
 
     @classmethod
     def resumed(cls, found: Snapshot, noise: ImuNoise, sensors: Collection[str]) -> PersistentState:
@@ -80,6 +83,7 @@ class PersistentState:
             doubt=self.doubt,
             p_odom_m=self.odometry.p_m,
             R_odom_body=self.odometry.R,
+            unmodelled=None if self.unmodelled is None else self.unmodelled.cov,
         )
 
     def forget_jumps(self) -> None:

@@ -16,7 +16,7 @@ from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
 from graphloc.solve._batch import LARGEST_NOISE_SCALE
 
-_VERSION = 2
+_VERSION = 3
 _EVERY_S = 2.0
 
 
@@ -30,6 +30,7 @@ class Snapshot:
         agreed_ns: stamp at which each absolute sensor last agreed. noise_scale: factor on the IMU noise.
         doubt: why the health cannot be good, or empty.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
+        unmodelled: covariance of `UnmodelledError`; None where no slow error is left out.
     """
 
     vessel: str
@@ -42,6 +43,7 @@ class Snapshot:
     doubt: str
     p_odom_m: Array
     R_odom_body: Array
+    unmodelled: Array | None
 
     def write(self, path: Path) -> None:
         """Replace the file atomically: a kill leaves the old one or the new one.
@@ -60,6 +62,7 @@ class Snapshot:
             "doubt": self.doubt,
             "agreed_ns": dict(self.agreed_ns),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
+            "unmodelled": None if self.unmodelled is None else self.unmodelled.tolist(),
         }
         part = path.with_name(path.name + ".part")
         with part.open("w", encoding="utf-8") as stream:
@@ -83,7 +86,17 @@ class Snapshot:
         heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
         scale = float(raw["noise_scale"])
         datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
-        numbers = np.concatenate([p, R.ravel(), datum.origin, list(heights_m.values()), [scale]])
+        unmodelled = None if raw["unmodelled"] is None else np.array(raw["unmodelled"], dtype=np.float64)
+        numbers = np.concatenate(
+            [
+                p,
+                R.ravel(),
+                datum.origin,
+                list(heights_m.values()),
+                [scale],
+                [] if unmodelled is None else unmodelled.ravel(),
+            ]
+        )
         if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
             raise ValueError("it is damaged")
         return cls(
@@ -97,6 +110,7 @@ class Snapshot:
             doubt=str(raw["doubt"]),
             p_odom_m=p,
             R_odom_body=R,
+            unmodelled=unmodelled,
         )
 
 

@@ -30,6 +30,7 @@ from graphloc.solve._covariances import world_covariance
 from graphloc.solve._decide import AGREES, decisions
 from graphloc.solve._ledger import row_of
 from graphloc.solve._stretch import StretchStep, past_at
+from graphloc.solve._unmodelled import Unmodelled, unmodelled
 from graphloc.time import duration_ns
 
 LEAST_S = 5.0  # of IMU data: gives gyro bias, roll and pitch of a vessel in waves
@@ -57,6 +58,7 @@ class Started:
             (6,), accelerometer first.
         heights_m: configured heights (m, up in world), by sensor.
         doubt: why the health cannot be good, or empty. noise_scale: factor on the IMU noise.
+        unmodelled: what slow errors that are left out did to that state; None: nothing that is known.
         notes: what the alignment was based on. rows: ledger rows of what was measured before the first state.
     """
 
@@ -68,6 +70,7 @@ class Started:
     heights_m: Mapping[str, float]
     doubt: str
     noise_scale: float
+    unmodelled: Unmodelled | None
     notes: tuple[str, ...]
     rows: tuple[LedgerRow, ...]
 
@@ -164,9 +167,19 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         heights_m=heights,
         doubt=doubt,
         noise_scale=result.noise_scale,
+        unmodelled=_unmodelled(result, k),
         notes=result.notes,
         rows=tuple(before),
     )
+
+
+def _unmodelled(result: BatchResult, k: int) -> Unmodelled | None:
+    """Return what left-out slow errors did to state `k`, the first of the window; at the first data nothing has done anything yet."""
+    try:
+        found = unmodelled(result) if k else None
+    except RuntimeError:  # not determined; the window that follows says what it can
+        return None
+    return None if found is None else Unmodelled(found.rotation[k], found.velocity[k])
 
 
 def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:

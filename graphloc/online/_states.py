@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from graphloc import keys
 from graphloc.build import bias_step, closing_variance, far_axes, nav_state, slow_begin, slow_end, slow_step
@@ -42,6 +44,12 @@ class Newest:
     bias: gtsam.imuBias.ConstantBias
     pose_cov: Array
     velocity_cov: Array
+
+
+def in_world(pose: Any) -> Array:
+    """Return the rotation (15, 15) of pose, velocity and bias from the tangent at a pose (body axes) to the axes of world."""
+    R = pose.rotation().matrix()
+    return np.asarray(block_diag(R, R, np.eye(9)))
 
 
 def propagated_covariance(cov: Array, newest: Newest, R: Array, dt_s: float, noise: Array) -> Array:
@@ -238,6 +246,13 @@ class States:
             if stream.slow is not None and size > 6 and (jump_m := stream.jump_m(from_ns, to_ns)):
                 P[6:, 6:] += np.diag(np.where(far_axes(stream.slow), jump_m**2, 0.0))
         return prediction_of(residual, at, P, newest.velocity_cov)
+
+    def covariance(self) -> Array:
+        """Return the joint covariance (15, 15) of the newest pose, velocity and bias, rotation and position in axes of world."""
+        k, window = self._newest.number, self._window
+        turn = in_world(self._newest.pose)
+        joint = window.covariance([keys.pose(k), keys.velocity(k), keys.bias(self._problem.timeline.slow_of[k])])
+        return np.asarray(turn @ joint @ turn.T)
 
     def joint(self, attached: Sequence[Attachment], residuals: Sequence[Residual]) -> Array:
         """Return the joint covariance of the newest position in world (3 rows first) and of the residuals, as far as the estimate causes it."""

@@ -149,6 +149,8 @@ class Tracking:
             advance_odometry(self._odometry, lag.problem, lag.newest, reached_ns)
             lag.commit()
             lag.try_others()
+            if self._persistent.unmodelled is not None:
+                lag.follow(self._persistent.unmodelled)
         self._ledger.enter(lag.gone())
 
     def _read_imu(self) -> None:
@@ -226,6 +228,7 @@ class Tracking:
             absolute=self._setup.absolute,
             doubt="; ".join(doubt for doubt in doubts if doubt),
             heading_off_rad=persistent.heading_check.off_rad,
+            unmodelled=persistent.unmodelled,
         )
 
     def trajectory(self, now: Estimate) -> Trajectory:
