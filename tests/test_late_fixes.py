@@ -24,9 +24,11 @@ SCENARIO = Scenario(
 
 
 @cache
-def late(stamp_sigma_s: float, late_s: float = LATE_S, *, slow: bool = False) -> SimulatedRun:
+def late(
+    stamp_sigma_s: float, late_s: float = LATE_S, *, slow: bool = False, compass_hz: float = SCENARIO.compass_hz
+) -> SimulatedRun:
     """A run with fixes good to 2 cm, each stamped `late_s` after it was measured."""
-    run = simulate(SCENARIO, 3)
+    run = simulate(replace(SCENARIO, compass_hz=compass_hz), 3)
     late_ns = round(late_s * 1e9)
     moved = [
         replace(m, stamp_ns=m.stamp_ns + late_ns) if isinstance(m, GnssPosition) else m
@@ -92,6 +94,14 @@ def test_fixes_in_time_stay_where_they_are() -> None:
     assert estimated.position_rmse_m < believed.position_rmse_m + 0.02
     assert estimated.coverage_95 is not None
     assert estimated.coverage_95 > 0.9
+
+
+def test_online_a_heading_that_is_found_later_turns_the_fixes_before_it() -> None:
+    """Without a compass they were written where the heading was 20 deg off, and kept it there."""
+    found = online(late(0.05, 0.0, compass_hz=0.0))
+    assert found.coverage_95 is not None
+    assert found.coverage_95 > 0.95
+    assert found.position_rmse_m < 0.1
 
 
 def test_calibration_names_it_all_the_same_and_that_the_track_has_it() -> None:
