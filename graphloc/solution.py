@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,7 @@ class Solution:
         ledger: every message of the run.
         stats: how the solver fared.
         offsets: what the run says of levers, mounts and stamps; None where it was not asked.
+        time_offsets_s: by sensor, what is to be added to its stamps beyond the configured offset, s, where the run estimates it.
     """
 
     datum: Datum
@@ -112,6 +113,7 @@ class Solution:
     ledger: Ledger
     stats: SolveStats
     offsets: Offsets | None = None
+    time_offsets_s: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def name(self) -> str:

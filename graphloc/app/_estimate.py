@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -33,6 +33,7 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.replay import Status, replay, silent
 from graphloc.solution import Solution
 from graphloc.solve import smooth
+from graphloc.time import NS_PER_S
 
 
 def configured(config_path: Path, changes: Mapping[str, object] = MappingProxyType({})) -> VesselConfig:
@@ -96,11 +97,22 @@ def smooth_recording(
         solution = solution.doubted(mounts[0].partition(":")[0])
     said += [*mounts, *offsets, *([never] if never else [])]
     run = Run(
-        recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution, held=held,
+        recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution,
+        held=_when_measured(held, solution),
         filters=filters, online=online, pictures=tuple(gallery.pictures()), tags=tags,
         calibration=calibrate.calibrate(recording, config, solution),
     )  # fmt: skip
     return made_comparable(_with_underlay(run, scans))
+
+
+def _when_measured(held: Sequence[GnssPosition], solution: Solution) -> tuple[GnssPosition, ...]:
+    """Return fixes at the stamps at which they were measured, where a run estimates how late they are stamped.
+
+    At the stamps as they are, a track that follows late fixes would agree with them, and the right one would not.
+    """
+    late_ns = {name: round(offset_s * NS_PER_S) for name, offset_s in solution.time_offsets_s.items()}
+    restamped = (replace(m, stamp_ns=m.stamp_ns + late_ns.get(m.sensor, 0)) for m in held)
+    return tuple(sorted(restamped, key=lambda m: m.stamp_ns))
 
 
 def _with_underlay(run: Run, scans: Scans | None) -> Run:

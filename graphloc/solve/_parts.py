@@ -148,6 +148,10 @@ def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Se
         ledger=Ledger([*rows, *(row for s in solutions for row in s.ledger)]),
         stats=_join_stats([s.stats for s in solutions], warnings),
         offsets=joined(offsets) if (offsets := [s.offsets for s in solutions if s.offsets is not None]) else None,
+        time_offsets_s={
+            name: float(np.mean([s.time_offsets_s[name] for s in solutions if name in s.time_offsets_s]))
+            for name in dict.fromkeys(n for s in solutions for n in s.time_offsets_s)
+        },
     )
 
 
