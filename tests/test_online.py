@@ -20,7 +20,7 @@ from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, wrap_angle
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix, PoseMode
-from graphloc.online import OnlineSmoother
+from graphloc.online import OnlineSmoother, _waiting
 from graphloc.thinning import THINNED
 from graphloc.trajectory import Trajectory, bounds_95
 from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, delayed, feed, finish
@@ -292,6 +292,13 @@ def test_starts_from_fix_and_compass() -> None:
     assert fed.errors_m[0] < 3.0
 
 
+@pytest.fixture
+def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A start that waits is tried four times in half a minute, not thirteen times: each solves all that there is."""
+    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.6)
+
+
+@pytest.mark.usefixtures("few_tries")
 def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
     run = slowly(
         simulate(
@@ -314,6 +321,7 @@ def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
     assert abs(wrap_angle(begun.yaw_rad - yaw_of(run.truth, fed.true_ns[0]))) < begun.heading_bound_95_rad
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_a_start_that_waited_longer_than_the_lag_keeps_what_it_found() -> None:
     """Fixes alone hardly tell a heading in half a minute: told again by ten seconds of them at a time, it is another one."""
     run = slowly(
@@ -347,6 +355,7 @@ def test_a_start_that_waited_longer_than_the_lag_keeps_what_it_found() -> None:
     assert np.degrees(begun.heading_bound_95_rad) == pytest.approx(bounds_95(whole.cov)[-1, 2], rel=0.25)
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_a_start_that_waited_uses_what_came_just_before_its_first_state() -> None:
     """Fixes 60 ms before the states that they are tied to: of the one tied to the first state of the lag, too, the start has made use."""
     run = slowly(simulate(replace(Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0), 1))
@@ -362,6 +371,7 @@ def test_a_start_that_waited_uses_what_came_just_before_its_first_state() -> Non
     assert [row.seq for row in refused if row.stamp_ns > imu.stamps_ns[0]] == []
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_what_closes_a_slow_chain_counts_once_after_a_start_that_waited() -> None:
     """Slow states as far apart as the lag is long, or farther: the last of them is not the first of the lag."""
     run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0), 1)
@@ -382,6 +392,7 @@ def test_what_closes_a_slow_chain_counts_once_after_a_start_that_waited() -> Non
     np.testing.assert_allclose(sigmas_m[0][2], sigmas_m[1][2], rtol=0.05)
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_a_start_whose_heading_is_a_guess_is_no_surer_of_its_place_than_the_receiver() -> None:
     """Fixes whose slow error is 2 m and no compass: a heading that goes on turning in the lag tells no place."""
     run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=50.0, gnss_hz=2.0, imu_hz=50.0), 1)
