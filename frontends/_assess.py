@@ -30,6 +30,7 @@ _TURNS_DEG, _SAME_DEG = 5.0, 0.2
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
 _BLOCK_S = 30
 _SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
+_FEWEST_STAMPS = 100  # that tell of a clock
 _RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
 _STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
 _FOLLOWS_DEG, _FOLLOWS = 8.0, 3.0  # most RMS of what a heading and the gyroscope differ by; turns over that
@@ -95,6 +96,7 @@ def topic_report(stream: Stream, count: int) -> TopicReport:
         no_stamp=stream.no_stamp,
         recorded=stream.recorded,
         latency_s=vec(latency),
+        drift_ppm=stream.drift_ppm,
     )
 
 
@@ -102,6 +104,25 @@ def sane(stream: Stream) -> NDArray[np.intp]:
     """Return indices of messages in order of strictly increasing stamps, without clock jumps."""
     good = np.flatnonzero(~_clock.clock_jumps(stream.stamps_ns, stream.logs_ns))
     return good[_clock.longest_increasing(stream.stamps_ns[good])]
+
+
+def without_drift(streams: Sequence[Stream]) -> list[Stream]:
+    """Return streams whose clocks do not drift against each other, by the recording times: the steadiest clock is believed.
+
+    Clocks that gain as much as that one are left as they are: then it is the recorder's that drifts.
+    """
+    ppm = {s.topic: 0.0 if s.recorded or not len(s) else _clock.drift_ppm(s.stamps_ns, s.logs_ns) for s in streams}
+    clocks = [
+        ppm[s.topic] for s in streams if len(s) >= _FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED
+    ]
+    steadiest = min(clocks, key=abs, default=0.0)
+    found = []
+    for stream in streams:
+        span_s = float(np.ptp(stream.logs_ns)) / NS_PER_S if len(stream) else 0.0
+        apart_s = 1e-6 * (ppm[stream.topic] - steadiest) * span_s
+        drifts = ppm[stream.topic] and abs(apart_s) > _clock.GAIN_LIMIT_S
+        found.append(stream.without_drift(ppm[stream.topic] - steadiest) if drifts else stream)
+    return found
 
 
 def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:

@@ -61,7 +61,7 @@ def draft_config(inspection: Inspection) -> str:
         _datum_line(inspection.odometry),
         "sensors:" if inspection.usable else "sensors: {}  # nothing in this bag can be used",
     ]
-    blocks = [_with_offset(block, inspection) for block in _blocks(inspection)]
+    blocks = [_with_clock(block, inspection) for block in _blocks(inspection)]
     lines += [f"  {line}" for block in blocks for line in block]
     lines += _beside(inspection.odometry)
     return "\n".join(lines) + "\n"
@@ -151,7 +151,7 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
     return lines
 
 
-def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
+def _with_clock(block: list[str], inspection: Inspection) -> list[str]:
     """Say where recording times stand for stamps; where a clock is off by them, or stamps are late by the motion, add an offset.
 
     Poses may take their time.
@@ -165,6 +165,9 @@ def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
         unknown = "" if kind == "gnss" else ", which no bound includes"
         said = f"guess: its headers hold no stamps; they are late by as long as a message takes{unknown}"
         block = [*block, f"  stamps: recorded  # {said}"]
+    if topic in topics and (ppm := topics[topic].drift_ppm):
+        said = f"it gains {1e-6 * ppm * (topics[topic].span_s or 0.0):+.2f} s on the steadiest clock, by the recording times"
+        block = [*block, f"  clock_drift_ppm: {ppm:.1f}  # guess: {said}"]
     if imu is None or kind not in _SET or topic not in clocks:
         return block
     own = (c for n, c in clocks.items() if not topics[n].recorded and topics[n].msgtype not in UNSTAMPED)

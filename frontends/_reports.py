@@ -41,7 +41,8 @@ class TopicReport:
         gaps: intervals longer than 5 usual ones (and 0.1 s); max_gap_s: the longest interval.
         repeated, backward: stamps equal to, or before, the one before; no_stamp: zero stamps.
         recorded: whether the headers hold no stamps, so that the recording times stand for them here.
-        latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points.
+        latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points; without what the clock gains.
+        drift_ppm: by how much the clock runs fast, where that is clear; else 0.
     """
 
     topic: str
@@ -59,6 +60,7 @@ class TopicReport:
     no_stamp: int | None = None
     recorded: bool = False
     latency_s: Vec | None = None
+    drift_ppm: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,6 +27,7 @@ from graphloc.frontends._assess import (
     says_the_same,
     topic_report,
     track,
+    without_drift,
 )
 from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
@@ -193,6 +194,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
         lidars = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
         cameras = _frames_of(bag, _pictures(bag))
         source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
+    streams = without_drift(streams)
     for stream in streams:
         if stream.msgtype == IMU:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)

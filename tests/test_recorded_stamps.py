@@ -10,6 +10,7 @@ from graphloc.config import VesselConfig
 from graphloc.frontends.bag import read_recording
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.time import duration_ns
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag_bad_input import accounted, vessel
 from tests.test_inspect import drive, look
@@ -108,12 +109,37 @@ def test_clocks_that_all_count_from_their_start_keep_the_time_of_the_imu(tmp_pat
 
 
 @pytest.mark.parametrize(("share", "said"), [(0.01, "gains 0.54 s"), (-0.01, "loses 0.54 s"), (0.001, "")])
-def test_a_clock_that_drifts_is_said(share: float, said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("topic", ["/fix", "/imu"])
+def test_a_clock_that_drifts_is_drafted_and_set_right(topic: str, share: float, said: str, tmp_path: Path) -> None:
     """By a hundredth over 60 s; nine tenths of that lie between the first tenth and the last."""
-    _, config, _ = look(tmp_path, restamped({"/fix": lambda ns: ns + round(share * (ns - START_NS))}), MAKE)
-    lines = [w for w in read(tmp_path, config).warnings if "during the run, by the recording times" in w]
-    assert len(lines) == bool(said)
-    assert all(line.startswith(f"gnss: its clock {said}") for line in lines)
+    _, config, _ = look(tmp_path, restamped({topic: lambda ns: ns + round(share * (ns - START_NS))}), MAKE)
+    name = topic.strip("/").replace("fix", "gnss")
+    drifts = {n: s.clock_drift_ppm for n, s in config.sensors.items() if s.clock_drift_ppm}
+    assert drifts == ({name: pytest.approx(1e6 * share, rel=0.02)} if said else {})
+    recording = read(tmp_path, config)
+    assert not any("during the run" in w for w in recording.warnings)
+    fixes = [m.stamp_ns for m in recording.measurements if isinstance(m, GnssPosition)]
+    last_ns = (
+        fixes[-1] - duration_ns(config.sensors["gnss"].time_offset_s)
+        if topic == "/fix"
+        else recording.imu.stamps_ns[-1]
+    )
+    true_ns = START_NS + (299 * S // 5 if topic == "/fix" else 2999 * S // 50)
+    assert abs(last_ns - true_ns) < (5_000_000 if said else 70_000_000)
+    plain = {n: sensor.model_copy(update={"clock_drift_ppm": 0.0}) for n, sensor in config.sensors.items()}
+    warnings = read(tmp_path, config.model_copy(update={"sensors": plain})).warnings
+    lines = [w for w in warnings if "during the run, by the recording times" in w]
+    assert bool(lines) == bool(said)
+    told = said if topic == "/fix" else ""  # else that the others' clocks do
+    assert all(told in line and "set its clock_drift_ppm to" in line for line in lines)
+
+
+def test_a_clock_that_is_set_during_the_run_does_not_drift(tmp_path: Path) -> None:
+    """A step is no drift: nothing is drafted, and the warning stays."""
+    _, config, _ = look(tmp_path, restamped({"/fix": lambda ns: ns + S // 2 * (ns > START_NS + 30 * S)}), MAKE)
+    assert config.sensors["gnss"].clock_drift_ppm == 0.0
+    (line,) = [w for w in read(tmp_path, config).warnings if "during the run, by the recording times" in w]
+    assert "synchronise the clocks" in line
 
 
 @pytest.mark.parametrize("together", [5, 1])
