@@ -125,6 +125,11 @@ def without_drift(streams: Sequence[Stream]) -> list[Stream]:
     return found
 
 
+def evenly(imu: Stream) -> Stream:
+    """Return an IMU's stream, samples that were stamped in bursts laid out evenly."""
+    return imu.stamped(_clock.evened(imu.stamps_ns, _clock.fresh(imu.rows[:, :6])))
+
+
 def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:
     """Return streams with messages, each on the clock of the first IMU where its own is another one, by the recording times.
 

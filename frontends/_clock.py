@@ -30,6 +30,11 @@ _TENTHS, _FEWEST = 10, 10  # of a run; messages that tell how soon they are reco
 _EVEN = 0.15  # of the gain, that a clock may be off an even one
 _SET_BACK_S = 0.5
 _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
+_AT_ONCE, _BURSTS, _AFTER_GAP = (
+    0.1,
+    0.3,
+    1.3,
+)  # usual steps, within a burst; share of samples in bursts; usual steps, at a gap
 _HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing, as online
 _IN_ORDER = 0.8  # of those that follow, at the least: others come late
 
@@ -140,6 +145,37 @@ def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
         keep[i] = True
         i = int(before[i])
     return keep
+
+
+def fresh(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return (N,) which samples (N, k) differ from the one before, as no copies do."""
+    return np.concatenate([[True], (values[1:] != values[:-1]).any(axis=1)])[: len(values)]
+
+
+def evened(stamps_ns: Stamps, fresh: NDArray[np.bool_]) -> Stamps:
+    """Return the stamps (N,) of IMU samples, those of bursts laid out evenly; as they are where few samples come in bursts.
+
+    A driver that reads a buffer stamps all that is in it at once. Of a burst, the last sample is as old as its stamp; the others precede
+    it in equal steps since the burst before, after a gap in usual ones.
+
+    Args:
+        stamps_ns: (N,) in order of arrival. fresh: (N,) whether a sample differs from the one before.
+    """
+    if len(stamps_ns) <= 2 * _FOLLOW:
+        return stamps_ns
+    usual_ns = float(np.median(stamps_ns[_FOLLOW:] - stamps_ns[:-_FOLLOW])) / _FOLLOW
+    steps_ns = np.diff(stamps_ns)
+    together = (steps_ns >= 0) & (steps_ns < _AT_ONCE * usual_ns) & fresh[1:]
+    if float(together.mean()) < _BURSTS:
+        return stamps_ns
+    burst = np.concatenate([[0], np.cumsum(~together)])
+    counts = np.bincount(burst)
+    last = np.cumsum(counts) - 1
+    since_ns = np.diff(stamps_ns[last], prepend=stamps_ns[last[0]] - round(usual_ns * counts[0]))
+    step_ns = np.maximum(since_ns / counts, 0.0)
+    step_ns[step_ns > _AFTER_GAP * usual_ns] = usual_ns
+    before = last[burst] - np.arange(len(stamps_ns))
+    return np.asarray(stamps_ns[last][burst] - np.rint(before * step_ns[burst]).astype(np.int64))
 
 
 def in_order_or_late(stamps_ns: Stamps) -> NDArray[np.bool_]:

@@ -183,6 +183,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
         InputError: their rates cannot be rad/s, or accelerations or rates are missing.
     """
     assert isinstance(readings.config, ImuConfig)
+    _even_out(readings, warnings)
     bad = ~_clock.in_order_or_late(readings.stamps())
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
     readings.sort()
@@ -201,6 +202,21 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     _sanity.refuse_degrees(readings.sensor, series.stamps_ns, series.accel_mps2, series.gyro_radps, readings.config)
     warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     return series, rows
+
+
+def _even_out(readings: Readings, warnings: list[str]) -> None:
+    """Lay out samples that were stamped in bursts evenly."""
+    stamps = readings.stamps()
+    values = np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)]).reshape(
+        -1, 6
+    )
+    even = _clock.evened(stamps, _clock.fresh(values))
+    if even is not stamps:
+        readings.stamps_ns[:] = even.tolist()
+        said = "they are laid out evenly between them; `graphloc stream` cannot do that: fix the driver"
+        warnings.append(
+            f"{readings.sensor}: its samples are stamped in bursts, as when a driver reads a buffer: {said}"
+        )
 
 
 def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:

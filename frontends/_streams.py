@@ -165,6 +165,10 @@ class Stream:
         """Return the stream with `by_ns` added to its stamps."""
         return replace(self, _stamps=[stamp_ns + by_ns for stamp_ns in self._stamps])
 
+    def stamped(self, stamps_ns: NDArray[np.int64]) -> Stream:
+        """Return the stream with other stamps (N,)."""
+        return replace(self, _stamps=stamps_ns.tolist())
+
     def without_drift(self, ppm: float) -> Stream:
         """Return the stream with what a clock that runs fast has gained taken off its stamps."""
         gained = np.rint(1e-6 * ppm * np.array(self.elapsed, dtype=float)).astype(np.int64)

@@ -21,6 +21,7 @@ from graphloc.frontends._assess import (
     Turning,
     compass_report,
     courses_of,
+    evenly,
     gnss_report,
     headings,
     on_one_clock,
@@ -194,7 +195,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
         lidars = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
         cameras = _frames_of(bag, _pictures(bag))
         source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
-    streams = without_drift(streams)
+    streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
     for stream in streams:
         if stream.msgtype == IMU:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)

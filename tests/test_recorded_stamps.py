@@ -4,9 +4,10 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from graphloc.config import VesselConfig
+from graphloc.config import ImuConfig, VesselConfig
 from graphloc.frontends.bag import read_recording
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
@@ -140,6 +141,33 @@ def test_a_clock_that_is_set_during_the_run_does_not_drift(tmp_path: Path) -> No
     assert config.sensors["gnss"].clock_drift_ppm == 0.0
     (line,) = [w for w in read(tmp_path, config).warnings if "during the run, by the recording times" in w]
     assert "synchronise the clocks" in line
+
+
+@pytest.mark.parametrize("apart_ns", [0, 20_000])
+def test_imu_samples_that_are_stamped_in_bursts_are_laid_out_evenly(apart_ns: int, tmp_path: Path) -> None:
+    """Five samples at 50 Hz are read, and stamped, when the last of them is there; a second of them is lost."""
+    tick_ns = S // 50
+
+    def burst(ns: int) -> int:
+        k = (ns - START_NS) // tick_ns
+        return START_NS + (k // 5 * 5 + 4) * tick_ns - (4 - k % 5) * apart_ns
+
+    items = [i for i in restamped({"/imu": burst}) if i[0] != "/imu" or not 20 * S <= i[1] - START_NS < 21 * S]
+    _, config, _ = look(tmp_path, items, MAKE)
+    recording = read(tmp_path, config)
+    true_ns = np.array([START_NS + k * tick_ns for k in range(3000) if not 1000 <= k < 1050])
+    assert len(recording.imu) == len(true_ns)
+    assert np.abs(recording.imu.stamps_ns - true_ns).max() < 1_000_000
+    assert any("imu: its samples are stamped in bursts" in w for w in recording.warnings)
+    assert config.sensors["imu"].gyro_noise_mdps_per_sqrt_hz == ImuConfig().gyro_noise_mdps_per_sqrt_hz
+
+
+def test_copies_of_imu_samples_are_no_burst(tmp_path: Path) -> None:
+    items = [i for item in restamped({}) for i in ([item, item] if item[0] == "/imu" else [item])]
+    _, config, _ = look(tmp_path, items, MAKE)
+    recording = read(tmp_path, config)
+    assert len(recording.imu) == 3000
+    assert not any("bursts" in w for w in recording.warnings)
 
 
 @pytest.mark.parametrize("together", [5, 1])
