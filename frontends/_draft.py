@@ -244,7 +244,9 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     lines = [f"{name}:", "  kind: gnss", *_topic_lines(gnss.topic)]
     if not enabled:
         why = (
-            _FILTERED if filtered(gnss.topic) else "one receiver is used: RTK throughout, or else that with most fixes"
+            _FILTERED
+            if filtered(gnss.topic)
+            else "one receiver is used: RTK throughout, else the most accurate by its claims, of equal ones that with most fixes"
         )
         lines.append(f"  enabled: false  # guess: {why}")
     else:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.config import STANDARD_GRAVITY_MPS2
+from graphloc.config import STANDARD_GRAVITY_MPS2, GnssConfig
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import (
     Courses,
@@ -222,9 +223,22 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     found = [r for s in bag.of_type(*_FIXES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
     longest_s = max((r.spans_s for r in found), default=0.0)
     found.sort(
-        key=lambda r: (filtered(r.topic), r.slow_error or r.spans_s < _COVERS * longest_s, -r.fixes, r.without_height)
+        key=lambda r: (
+            filtered(r.topic),
+            r.spans_s < _COVERS * longest_s,
+            r.slow_error,
+            _octave(r),
+            -r.fixes,
+            r.without_height,
+        )
     )
     return found
+
+
+def _octave(gnss: GnssReport) -> int:
+    """Return how large the fixes' error is by what they claim, or scatter by, in powers of two: closer ones are taken for equal."""
+    claimed = gnss.reported_sigma_m[:2] if gnss.reported_sigma_m else (GnssConfig().default_horizontal_sigma_m,)
+    return round(math.log2(max(*claimed, *(gnss.scatter_m or ())[:2], 1e-3)))
 
 
 def _odometry_reports(
