@@ -199,7 +199,7 @@ def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
     if len(fixes) < 20:
         return Courses(np.zeros(0, dtype=np.int64), np.zeros(0))
     p = world_from_fixes(fixes, Datum(fixes[0].position))[:, :2]
-    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(_scatter(p).max()))
+    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(white_noise_m(p).max()))
 
 
 def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> Motion | None:
@@ -224,7 +224,7 @@ def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> M
     return Motion(source, int(stamps_ns[0]), t, speed, p_m[:, 0] + 1j * p_m[:, 1], rests=fast)
 
 
-def _scatter(p_m: Array) -> Array:
+def white_noise_m(p_m: Array) -> Array:
     """Return the white noise of each axis of places (N, k), m."""
     # Third differences remove position, velocity and acceleration; those of white noise have 20 x its variance.
     return np.asarray(1.4826 * np.median(np.abs(np.diff(p_m, n=3, axis=0)), axis=0) / np.sqrt(20.0))
@@ -240,7 +240,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
     sigma = np.sqrt(np.median(rows[known, 5:8], axis=0)) if known.any() else None
     bad = frozen_fixes(stamps, rows[:, :2], p[:, :2])
     own = p[~bad]
-    scatter = _scatter(own) if len(own) > 10 else None
+    scatter = white_noise_m(own) if len(own) > 10 else None
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
     precise = sigma is not None and float(sigma[:2].max()) < 0.1 and float(np.median(rows[:, 3])) >= 2.0
     if precise:

@@ -58,7 +58,7 @@ def draft_config(inspection: Inspection) -> str:
         f"vessel: {json.dumps(name)}",
         f"body_frame: {inspection.body_frame}"
         + ("" if inspection.body_frame == "base_link" else "  # guess: the body, by /tf_static"),
-        _datum_line(inspection.odometry),
+        _datum_line(inspection),
         "sensors:" if inspection.usable else "sensors: {}  # nothing in this bag can be used",
     ]
     blocks = [_with_clock(block, inspection) for block in _blocks(inspection)]
@@ -72,6 +72,8 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         yield _imu_block(_numbered("imu", k), imu, enabled=k == 0 and not imu.missing)
     for k, gnss in enumerate(inspection.gnss):
         yield _gnss_block(_numbered("gnss", k), gnss, enabled=k == 0)
+    for k, item in enumerate(_in_a_grid(inspection)):
+        yield _grid_block(_numbered("gnss", k), item, enabled=k == 0)
     compasses = sorted((c for c in inspection.compasses if c.usable), key=lambda c: c.topic.endswith(_MAGNETIC))
     seen: set[str] = set()
     for k, compass in enumerate(compasses):
@@ -89,14 +91,33 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
             f"  # its frame '{item.frame_id}': {item.world}",
             "  enabled: false  # guess: true if its frame is east-north-up at the datum and no fix went into it",
         ]
-    for item in (o for o in inspection.odometry if o.role == "other"):
-        yield [f"# {item.topic}: left out, {item.world}"]
+    in_a_grid = _in_a_grid(inspection)
+    for item in (o for o in inspection.odometry if o.role == "other" and o not in in_a_grid):
+        instead = ": take the receiver's NavSatFix" if inspection.gnss and item.grid else ""
+        yield [f"# {item.topic}: left out, {item.world}{instead}"]
     if inspection.lidars:
         yield _aerial_block(inspection.lidars)
     if inspection.cameras:
         yield _tags_block(inspection.cameras)
     if inspection.gnss:
         yield ["height:", "  enabled: false  # guess: true for a vessel that floats"]
+
+
+def _in_a_grid(inspection: Inspection) -> list[OdometryReport]:
+    """Positions in a map grid, where nothing tells a latitude."""
+    return [] if inspection.gnss else [item for item in inspection.odometry if item.grid]
+
+
+def _grid_block(name: str, item: OdometryReport, *, enabled: bool) -> list[str]:
+    lines = [f"{name}:", "  kind: gnss", f"  topic: {item.topic}"]
+    lines += [] if enabled else ["  enabled: false  # guess: one receiver is used"]
+    zone = "EPSG:32632 for UTM zone 32 north, EPSG:32732 for zone 32 south"
+    return [
+        *lines,
+        f"  grid: ''  # set it, the zone is not in the bag: {zone}; {item.world}",
+        "  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: of base_link, if /tf_static was applied; else of the antenna",
+        "  slow_error: {}  # guess: where RTK is fixed throughout, {" + _RTK_SLOW_ERROR + "}",
+    ]
 
 
 def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
@@ -424,14 +445,18 @@ def _mount_lines(compass: CompassReport) -> list[str]:
     return lines
 
 
-def _datum_line(odometry: tuple[OdometryReport, ...]) -> str:
+def _datum_line(inspection: Inspection) -> str:
     """The datum is where the frame of true or measured poses has its origin; without them any place will do."""
     for role in ("truth", "pose"):
-        for item in odometry:
+        for item in inspection.odometry:
             if item.role == role and item.origin is not None:
                 lat, lon, height = item.origin
                 where = f"latitude_deg: {lat:.8f}, longitude_deg: {lon:.8f}, height_m: {height:.2f}"
                 return f"datum: {{{where}}}  # guess: the origin of {item.topic}; {item.world}"
+    frames = [item.frame_id for item in inspection.odometry if item.role == "pose"]
+    if frames and not (inspection.gnss or _in_a_grid(inspection)):
+        where = "latitude_deg: , longitude_deg: , height_m: 0"
+        return f"# datum: {{{where}}}  # set it where the origin of '{frames[0]}' lies: nothing in the bag tells"
     return "# datum: the median of the first five fixes"
 
 

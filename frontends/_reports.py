@@ -183,7 +183,7 @@ class OdometryReport:
     """An odometry or pose topic: role is 'truth', 'check_speed', 'pose', or 'other' of what is no pose of the vessel.
 
     `origin`: latitude, longitude (deg) and height (m) of its frame's origin, where the frame is
-    east-north-up by the fixes; `world`: the evidence.
+    east-north-up by the fixes; `world`: the evidence. `grid`: whether its positions are as large as in a map grid.
     """
 
     topic: str
@@ -194,6 +194,7 @@ class OdometryReport:
     why: str
     origin: Vec | None
     world: str
+    grid: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,7 +233,7 @@ class Inspection:
     @property
     def usable(self) -> bool:
         """Whether any of it can be a sensor."""
-        poses = any(o.role == "pose" for o in self.odometry)
+        poses = any(o.role == "pose" or o.grid for o in self.odometry)
         compasses = any(c.usable for c in self.compasses)
         return bool(self.imus or self.gnss or compasses or poses or self.velocities or self.lidars or self.cameras)
 

@@ -25,15 +25,18 @@ from graphloc.frontends._assess import (
     evenly,
     gnss_report,
     headings,
+    motion_of_places,
     on_one_clock,
+    sane,
     says_the_same,
     topic_report,
     track,
+    white_noise_m,
     without_drift,
 )
 from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
-from graphloc.frontends._assess_world import world_of
+from graphloc.frontends._assess_world import in_map_grid, world_of
 from graphloc.frontends._clock import refuse_woven, usual_latency_s
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
@@ -97,6 +100,7 @@ _MOST_TRIED = 200  # messages of a topic that cannot be decoded
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
 _MOST_NAMED = 6
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
+_FEWEST = 20  # places of a track
 _COVERS = 0.8  # of the run, from which a receiver is there throughout
 
 
@@ -160,7 +164,10 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     ]
     wheels = [s for s, report in odometry if report.role == "check_speed"]
     motions = motions_of(wheels, velocities, bag.of_type(*_FIXES))
-    courses = courses_of(reference.stamps_ns, reference.p_m, reference.scatter_m) if gnss else None
+    if not gnss and (motion := motion_of_places("the poses in a map grid", reference.stamps_ns, reference.p_m)):
+        motions.append(motion)
+    known = len(reference.stamps_ns) > 0
+    courses = courses_of(reference.stamps_ns, reference.p_m, reference.scatter_m) if known else None
     imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, motions, courses, tree, body))]
     imus.sort(key=lambda i: (bool(i.missing), i.gravity == "removed", i.gyro_noise_mdps))
     late = _late_s(bag, imus, motions)
@@ -278,7 +285,7 @@ def _lacking(
     lines = []
     if not any(not imu.missing for imu in imus):
         lines.append("no whole IMU in it: smooth, replay and compare need one")
-    if not (gnss or bag.lidars or bag.cameras or any(report.role == "pose" for report in odometry)):
+    if not (gnss or bag.lidars or bag.cameras or any(report.role == "pose" or report.grid for report in odometry)):
         lines.append("nothing in it tells the place: no GNSS fix that can be used, no pose")
     others = [t for t in bag.topics.values() if t.topic not in bag.streams and not _KNOWN.match(t.msgtypes[0])]
     if lines and others:
@@ -410,10 +417,22 @@ def _frames_of(bag: Bag, topics: Sequence[str]) -> dict[str, str]:
 
 
 def _best_track(bag: _Contents, gnss: Sequence[GnssReport]) -> _Track:
-    """Return the track of the first receiver, without frozen fixes; an empty one where there is no receiver."""
+    """Return the track of the first receiver, without frozen fixes; without one, that of poses in a map grid; else an empty one."""
     if not gnss:
-        return _Track(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None)
+        return _grid_track(bag)
     best = gnss[0]
     stamps_ns, p_m, rows = track(bag.aligned[best.topic])
     good = ~frozen_fixes(stamps_ns, rows[:, :2], p_m[:, :2])
     return _Track(stamps_ns[good], p_m[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first)
+
+
+def _grid_track(bag: _Contents) -> _Track:
+    """Return the first track in a map grid, about its first position; the grid's north is off by a few degrees."""
+    for stream in bag.of_type(ODOMETRY, POSE, PLAIN_POSE):
+        keep = sane(stream)
+        p_m = stream.rows[keep, :3]
+        good = np.isfinite(p_m).all(axis=1)
+        if in_map_grid(stream) and good.sum() > _FEWEST:
+            p_m = p_m[good] - p_m[good][0]
+            return _Track(stream.stamps_ns[keep][good], p_m, float(white_noise_m(p_m)[:2].max()), None)
+    return _Track(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None)
