@@ -32,6 +32,8 @@ _TURNED_DEG = 10.0  # off the course, from which a compass is taken for turned i
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
 _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
+_OWN_CLOCK_S = 10.0  # no message takes as long
+_FEWEST_STAMPS = 10  # that tell of a clock
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _RTK_M = (
@@ -96,9 +98,9 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         instead = ": take the receiver's NavSatFix" if inspection.gnss and item.grid else ""
         yield [f"# {item.topic}: left out, {item.world}{instead}"]
     if inspection.lidars:
-        yield _aerial_block(inspection.lidars)
+        yield [*_aerial_block(inspection.lidars), *_recorded_lines(inspection, inspection.lidars)]
     if inspection.cameras:
-        yield _tags_block(inspection.cameras)
+        yield [*_tags_block(inspection.cameras), *_recorded_lines(inspection, inspection.cameras)]
     if inspection.gnss:
         yield ["height:", "  enabled: false  # guess: true for a vessel that floats"]
 
@@ -141,6 +143,23 @@ def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
                 f"      mount: {{xyz_m: [0.0, 0.0, 0.0]}}  # guess: where '{lidar.frame_id}' sits is not in the bag; measure it"
             )
     return lines
+
+
+def _recorded_lines(inspection: Inspection, mounted: tuple[MountedTopic, ...]) -> list[str]:
+    """Say that recording times stand for the stamps of scans or images, where these have none, or are of a clock of their own.
+
+    Recording times are on the clock of the IMU, or on that which its stamps are set by, unless all stamps are of another time.
+    """
+    usual = [t.latency_s[1] for t in inspection.topics if t.latency_s and t.count >= _FEWEST_STAMPS]
+    if all(abs(latency_s) > EPOCH_LIMIT_S for latency_s in usual):
+        return []
+    for item in mounted:
+        if item.latency_s is None or abs(item.latency_s) > _OWN_CLOCK_S:
+            clock = (
+                "have no stamps" if item.latency_s is None else f"are stamped {item.latency_s:+.0f} s before they come"
+            )
+            return [f"  stamps: recorded  # guess: messages of {item.topic} {clock}; late by as long as one takes"]
+    return []
 
 
 def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:

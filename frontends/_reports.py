@@ -204,6 +204,7 @@ class MountedTopic:
     Attributes:
         tf_frame: the same where /tf_static leads to it, else None. info_topic: a camera's CameraInfo where one lies beside
             it, else ''. listed: it holds what a detector found, not images.
+        latency_s: recording time minus header stamp of its first message, s; None where that has no stamp.
     """
 
     topic: str
@@ -211,6 +212,7 @@ class MountedTopic:
     tf_frame: str | None
     info_topic: str = ""
     listed: bool = False
+    latency_s: float | None = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

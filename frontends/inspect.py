@@ -74,12 +74,13 @@ from graphloc.frontends.decode import (
     QUATERNION,
     TWIST,
     VECTOR,
+    header_stamp_ns,
 )
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic
 from graphloc.frozen_receiver import frozen_fixes
 from graphloc.measurements import CompassHeading, ImuSeries
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, seconds_between
 
 __all__ = [
     "CompassReport",
@@ -104,6 +105,13 @@ _FEWEST = 20  # places of a track
 _COVERS = 0.8  # of the run, from which a receiver is there throughout
 
 
+class _First(NamedTuple):
+    """First readable message of a topic: its frame, and recording time minus stamp, s; None: it has no stamp."""
+
+    frame: str
+    latency_s: float | None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Contents:
     """What is read of a bag.
@@ -111,7 +119,7 @@ class _Contents:
     Attributes:
         source: its name, for messages. topics: by name, from its index.
         streams: by topic, as recorded. aligned: those with messages, on one clock.
-        tree: of /tf_static. lidars, cameras: frame of the first message, by topic.
+        tree: of /tf_static. lidars, cameras: by topic.
     """
 
     source: str
@@ -119,8 +127,8 @@ class _Contents:
     streams: Mapping[str, Stream]
     aligned: Mapping[str, Stream]
     tree: StaticTree
-    lidars: Mapping[str, str]
-    cameras: Mapping[str, str]
+    lidars: Mapping[str, _First]
+    cameras: Mapping[str, _First]
     warnings: tuple[str, ...]
 
     def of_type(self, *msgtypes: str) -> list[Stream]:
@@ -200,8 +208,8 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
         topics = bag.topics
         bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
         streams, tree = read_streams(bag)
-        lidars = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
-        cameras = _frames_of(bag, _pictures(bag))
+        lidars = _firsts_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
+        cameras = _firsts_of(bag, _pictures(bag))
         source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
     streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
     for stream in streams:
@@ -375,11 +383,16 @@ def _timed_fixes(
     return replace(gnss, late_s=known.get(by), late_by=by)
 
 
-def _mounted(bag: _Contents, frames: Mapping[str, str]) -> tuple[MountedTopic, ...]:
+def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic, ...]:
     body = bag.tree.body()
     return tuple(
-        MountedTopic(topic=topic, frame_id=frame, tf_frame=frame if bag.tree.resolve(body, frame) else None)
-        for topic, frame in sorted(frames.items())
+        MountedTopic(
+            topic=topic,
+            frame_id=first.frame,
+            tf_frame=first.frame if bag.tree.resolve(body, first.frame) else None,
+            latency_s=first.latency_s,
+        )
+        for topic, first in sorted(firsts.items())
     )
 
 
@@ -398,18 +411,20 @@ def _pictures(bag: Bag) -> list[str]:
     return [t for t in every if f"{t}/compressed" not in every and "depth" not in t.lower()]
 
 
-def _frames_of(bag: Bag, topics: Sequence[str]) -> dict[str, str]:
-    """Return the frame of the first readable message of each topic, if that is among the first 200.
+def _firsts_of(bag: Bag, topics: Sequence[str]) -> dict[str, _First]:
+    """Return what the header says of the first readable message of each topic, if that is among the first 200.
 
     Each topic is read separately: a topic without any readable message would otherwise cause all others to be unpacked
     to the end of the bag.
     """
-    found: dict[str, str] = {}
+    found: dict[str, _First] = {}
     for topic in topics:
         for raw in islice(bag.messages({topic}), _MOST_TRIED):
             try:
                 msg: Any = bag.decode(raw)
-                found[topic] = str(msg.header.frame_id)
+                stamp_ns = header_stamp_ns(msg)
+                latency_s = None if stamp_ns is None else seconds_between(stamp_ns, raw.log_ns)
+                found[topic] = _First(str(msg.header.frame_id), latency_s)
                 break
             except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; a later one will do
                 continue

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from graphloc.app import configured
 from graphloc.config import ImuConfig, VesselConfig
 from graphloc.frontends.bag import read_recording
+from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
 from graphloc.time import duration_ns
@@ -181,3 +183,33 @@ def test_stamps_that_come_in_bursts_are_said(together: int, tmp_path: Path) -> N
     _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), MAKE)
     lines = [w for w in read(tmp_path, config).warnings if "stamped in bursts, 1.0 s apart" in w]
     assert len(lines) == (together > 1)
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "others_ns", "recorded"),
+    [
+        (START_NS, 0, False),
+        (0, 0, True),
+        (900 * S, 0, True),
+        (900 * S, START_NS - 900 * S, False),  # all count from when the computer was switched on
+    ],
+)
+@pytest.mark.parametrize("kind", ["aerial", "apriltag"])
+def test_scans_and_images_without_usable_stamps_are_drafted_by_the_recording_times(
+    kind: str, stamp_ns: int, others_ns: int, recorded: bool, tmp_path: Path
+) -> None:
+    items = restamped(dict.fromkeys(WAY_NS, lambda ns: ns - others_ns))
+    seen = {
+        "aerial": MAKE.t["sensor_msgs/msg/PointCloud2"](
+            header=MAKE.header(stamp_ns, "lidar"), height=1, width=0, fields=[], is_bigendian=False, point_step=12,
+            row_step=0, data=np.zeros(0, np.uint8), is_dense=True,
+        ),
+        "apriltag": MAKE.t["sensor_msgs/msg/CompressedImage"](
+            header=MAKE.header(stamp_ns, "camera"), format="jpeg", data=np.zeros(0, np.uint8)
+        ),
+    }  # fmt: skip
+    items += [("/seen", START_NS + S // 10, seen[kind])]
+    path = write_bag(tmp_path / "run", MAKE, sorted(items, key=lambda item: item[1]), "mcap")
+    (tmp_path / "vessel.yaml").write_text(draft_config(inspect_bag(path)))
+    (sensor,) = (s for s in configured(tmp_path / "vessel.yaml").sensors.values() if s.kind == kind)
+    assert sensor.stamps == ("recorded" if recorded else "header")
