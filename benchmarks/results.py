@@ -25,6 +25,7 @@ import drawn
 import drills
 import fuzz
 import matcher
+import odd
 import online
 import simulator
 import smoothing
@@ -41,6 +42,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "A.5": smoothing.outages,
     "A.6": smoothing.speed,
     "A.dev": compass.figures,
+    "A.odd": odd.figures,
     "B.1": simulator.signals,
     "B.2": simulator.overlays,
     "B.3": simulator.tags,
@@ -135,7 +137,7 @@ def render(results: dict[str, Any]) -> str:
         "",
         "| items | about |",
         "|---|---|",
-        "| A | offline smoothing: real recordings, cases of BL, bad starts, outages, speed, compass deviation |",
+        "| A | offline smoothing: real recordings, cases of BL, bad starts, outages, speed, compass deviation, odd bags |",
         "| B | the simulator |",
         "| C | LiDAR scans matched to an aerial image ([aerial](aerial.md)) |",
         "| D | AprilTags: detector, docking ([tags](tags.md)) |",

@@ -30,6 +30,7 @@ _TURNS_DEG, _SAME_DEG = 5.0, 0.2
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
 _BLOCK_S = 30
 _SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
+_FEWEST_STAMPS = 100  # that tell of a clock
 _RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
 _STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
 _FOLLOWS_DEG, _FOLLOWS = 8.0, 3.0  # most RMS of what a heading and the gyroscope differ by; turns over that
@@ -95,6 +96,7 @@ def topic_report(stream: Stream, count: int) -> TopicReport:
         no_stamp=stream.no_stamp,
         recorded=stream.recorded,
         latency_s=vec(latency),
+        drift_ppm=stream.drift_ppm,
     )
 
 
@@ -102,6 +104,30 @@ def sane(stream: Stream) -> NDArray[np.intp]:
     """Return indices of messages in order of strictly increasing stamps, without clock jumps."""
     good = np.flatnonzero(~_clock.clock_jumps(stream.stamps_ns, stream.logs_ns))
     return good[_clock.longest_increasing(stream.stamps_ns[good])]
+
+
+def without_drift(streams: Sequence[Stream]) -> list[Stream]:
+    """Return streams whose clocks do not drift against each other, by the recording times: the steadiest clock is believed.
+
+    Clocks that gain as much as that one are left as they are: then it is the recorder's that drifts.
+    """
+    ppm = {s.topic: 0.0 if s.recorded or not len(s) else _clock.drift_ppm(s.stamps_ns, s.logs_ns) for s in streams}
+    clocks = [
+        ppm[s.topic] for s in streams if len(s) >= _FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED
+    ]
+    steadiest = min(clocks, key=abs, default=0.0)
+    found = []
+    for stream in streams:
+        span_s = float(np.ptp(stream.logs_ns)) / NS_PER_S if len(stream) else 0.0
+        apart_s = 1e-6 * (ppm[stream.topic] - steadiest) * span_s
+        drifts = ppm[stream.topic] and abs(apart_s) > _clock.GAIN_LIMIT_S
+        found.append(stream.without_drift(ppm[stream.topic] - steadiest) if drifts else stream)
+    return found
+
+
+def evenly(imu: Stream) -> Stream:
+    """Return an IMU's stream, samples that were stamped in bursts laid out evenly."""
+    return imu.stamped(_clock.evened(imu.stamps_ns, _clock.fresh(imu.rows[:, :6])))
 
 
 def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:
@@ -173,7 +199,7 @@ def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
     if len(fixes) < 20:
         return Courses(np.zeros(0, dtype=np.int64), np.zeros(0))
     p = world_from_fixes(fixes, Datum(fixes[0].position))[:, :2]
-    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(_scatter(p).max()))
+    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(white_noise_m(p).max()))
 
 
 def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> Motion | None:
@@ -198,7 +224,7 @@ def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> M
     return Motion(source, int(stamps_ns[0]), t, speed, p_m[:, 0] + 1j * p_m[:, 1], rests=fast)
 
 
-def _scatter(p_m: Array) -> Array:
+def white_noise_m(p_m: Array) -> Array:
     """Return the white noise of each axis of places (N, k), m."""
     # Third differences remove position, velocity and acceleration; those of white noise have 20 x its variance.
     return np.asarray(1.4826 * np.median(np.abs(np.diff(p_m, n=3, axis=0)), axis=0) / np.sqrt(20.0))
@@ -214,7 +240,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
     sigma = np.sqrt(np.median(rows[known, 5:8], axis=0)) if known.any() else None
     bad = frozen_fixes(stamps, rows[:, :2], p[:, :2])
     own = p[~bad]
-    scatter = _scatter(own) if len(own) > 10 else None
+    scatter = white_noise_m(own) if len(own) > 10 else None
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
     precise = sigma is not None and float(sigma[:2].max()) < 0.1 and float(np.median(rows[:, 3])) >= 2.0
     if precise:

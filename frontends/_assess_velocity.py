@@ -80,7 +80,8 @@ def odometry_report(
     rows = stream.rows[sane(stream)]
     speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
     name = stream.topic.lower()
-    if any(word in name for word in ("truth", "groundtruth", "/gt")):
+    truth = any(word in name for word in ("truth", "groundtruth", "/gt"))
+    if truth:
         role, why = "truth", "its name says so"
     elif stream.msgtype != ODOMETRY or speed <= 0.05:
         role, why = "pose", "it reports poses and no speed"
@@ -100,6 +101,7 @@ def odometry_report(
         why=why,
         origin=world.origin,
         world=world.why,
+        grid=world.grid and not truth,
     )
 
 

@@ -25,12 +25,26 @@ _APART_M, _APART = 5.0, 0.02  # largest distance that still fits: metres, share 
 class World(NamedTuple):
     """Frame of poses: its origin, None if it is not east-north-up or unknown; the evidence in words.
 
-    `pose`: whether they may be poses of the vessel about a datum, neither in a map grid nor of something else.
+    `pose`: whether they may be poses of the vessel about a datum, neither in a map grid nor of something else. `grid`: whether they are as
+    large as in a map grid.
     """
 
     origin: Vec | None
     why: str
     pose: bool = True
+    grid: bool = False
+
+
+def in_map_grid(poses: Stream) -> bool:
+    """Return whether positions are as large as in a map grid, such as UTM."""
+    middle_m = _middle_m(poses)
+    return float(np.linalg.norm(middle_m)) > _FAR_M and abs(float(middle_m[2])) <= _FAR_M
+
+
+def _middle_m(poses: Stream) -> Array:
+    places = poses.rows[:, :3] if len(poses) else np.zeros((0, 3))
+    places = places[np.isfinite(places).all(axis=1)]
+    return np.median(places, axis=0) if len(places) else np.zeros(3)
 
 
 def world_of(
@@ -44,12 +58,11 @@ def world_of(
     """
     keep = sane(poses)
     keep = keep[np.isfinite(poses.rows[keep, :3]).all(axis=1)] if len(keep) else keep
-    middle = np.median(poses.rows[keep, :3], axis=0) if len(keep) else np.zeros(3)
-    if float(np.linalg.norm(middle)) > _FAR_M:
-        kind = "earth-centred axes" if abs(middle[2]) > _FAR_M else "a map grid (UTM)"
-        away_km = np.linalg.norm(middle) / 1e3
-        why = f"it is {away_km:.0f} km from its origin: looks like {kind}, which is not read: take the receiver's NavSatFix"
-        return World(None, why, pose=False)
+    away_km = float(np.linalg.norm(_middle_m(poses))) / 1e3
+    if away_km > _FAR_M / 1e3:
+        grid = in_map_grid(poses)
+        kind = "a map grid (UTM)" if grid else "earth-centred axes, which are not read"
+        return World(None, f"it is {away_km:.0f} km from its origin: looks like {kind}", pose=False, grid=grid)
     if first_fix is None or len(keep) < 10 or len(stamps_ns) < 10:
         return World(None, "no GNSS track to check its frame against")
     at, q = poses.stamps_ns[keep], poses.rows[keep, :3]

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc.config import SensorConfig
 from graphloc.errors import InputError
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 
@@ -25,9 +26,15 @@ NO_DATE_NS = 946_684_800 * NS_PER_S
 GAIN_LIMIT_S = 0.1
 """A clock that gains more on another during a run is said to drift."""
 
-_FEWEST = 10  # messages that tell how soon they are recorded
+_TENTHS, _FEWEST = 10, 10  # of a run; messages that tell how soon they are recorded
+_EVEN = 0.15  # of the gain, that a clock may be off an even one
 _SET_BACK_S = 0.5
 _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
+_AT_ONCE, _BURSTS, _AFTER_GAP = (
+    0.1,
+    0.3,
+    1.3,
+)  # usual steps, within a burst; share of samples in bursts; usual steps, at a gap
 _HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing, as online
 _IN_ORDER = 0.8  # of those that follow, at the least: others come late
 
@@ -38,15 +45,44 @@ def usual_latency_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
 
 
 def gain_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
-    """Return by how much a clock gains on the recording times from the first tenth of its messages to the last, s.
+    """Return by how much a clock gains on the recording times from the first tenth of its messages to the last, s."""
+    ahead_s = _ahead_s(stamps_ns, logs_ns)
+    return float(ahead_s[-1] - ahead_s[0])
 
-    In each tenth the smallest latencies count, since other messages were delayed.
+
+def drift_ppm(stamps_ns: Stamps, logs_ns: Stamps) -> float:
+    """Return by how much a clock runs faster than that of the recording times, ppm; 0 where it gains unevenly, or nearly nothing.
+
+    A clock that is set, or messages that are delayed from some time on, gain in steps.
     """
-    tenth = len(stamps_ns) // 10
-    if tenth < _FEWEST:
+    ahead_s = _ahead_s(stamps_ns, logs_ns)
+    gained_s = float(ahead_s[-1] - ahead_s[0])
+    tenths = np.arange(_TENTHS)
+    slope, at_start = np.polyfit(tenths, ahead_s, 1)
+    uneven_s = float(np.abs(ahead_s - at_start - slope * tenths).max())
+    if abs(gained_s) <= GAIN_LIMIT_S or uneven_s > _EVEN * abs(gained_s):
         return 0.0
-    ahead_s = (stamps_ns - logs_ns) / NS_PER_S
-    return float(np.percentile(ahead_s[-tenth:], 95) - np.percentile(ahead_s[:tenth], 95))
+    return float(slope) / (float(logs_ns[-1] - logs_ns[0]) / NS_PER_S / _TENTHS) * 1e6
+
+
+def _ahead_s(stamps_ns: Stamps, logs_ns: Stamps) -> NDArray[np.float64]:
+    """Return by how much stamps are ahead of the recording times in each tenth of the messages (10,), s; 0 of few messages.
+
+    The smallest latencies count, since other messages were delayed.
+    """
+    if len(stamps_ns) < _TENTHS * _FEWEST:
+        return np.zeros(_TENTHS)
+    tenths = np.array_split((stamps_ns - logs_ns) / NS_PER_S, _TENTHS)
+    return np.array([np.percentile(tenth, 95) for tenth in tenths])
+
+
+def corrected_ns(stamp_ns: int, config: SensorConfig, elapsed_ns: int) -> int:
+    """Return a stamp with the sensor's `time_offset_s` added, and taken off what its clock has gained.
+
+    Args:
+        elapsed_ns: from the beginning of the bag until the message was recorded.
+    """
+    return stamp_ns + duration_ns(config.time_offset_s - 1e-6 * config.clock_drift_ppm * elapsed_ns / NS_PER_S)
 
 
 class Clock(NamedTuple):
@@ -109,6 +145,37 @@ def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
         keep[i] = True
         i = int(before[i])
     return keep
+
+
+def fresh(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return (N,) which samples (N, k) differ from the one before, as no copies do."""
+    return np.concatenate([[True], (values[1:] != values[:-1]).any(axis=1)])[: len(values)]
+
+
+def evened(stamps_ns: Stamps, fresh: NDArray[np.bool_]) -> Stamps:
+    """Return the stamps (N,) of IMU samples, those of bursts laid out evenly; as they are where few samples come in bursts.
+
+    A driver that reads a buffer stamps all that is in it at once. Of a burst, the last sample is as old as its stamp; the others precede
+    it in equal steps since the burst before, after a gap in usual ones.
+
+    Args:
+        stamps_ns: (N,) in order of arrival. fresh: (N,) whether a sample differs from the one before.
+    """
+    if len(stamps_ns) <= 2 * _FOLLOW:
+        return stamps_ns
+    usual_ns = float(np.median(stamps_ns[_FOLLOW:] - stamps_ns[:-_FOLLOW])) / _FOLLOW
+    steps_ns = np.diff(stamps_ns)
+    together = (steps_ns >= 0) & (steps_ns < _AT_ONCE * usual_ns) & fresh[1:]
+    if float(together.mean()) < _BURSTS:
+        return stamps_ns
+    burst = np.concatenate([[0], np.cumsum(~together)])
+    counts = np.bincount(burst)
+    last = np.cumsum(counts) - 1
+    since_ns = np.diff(stamps_ns[last], prepend=stamps_ns[last[0]] - round(usual_ns * counts[0]))
+    step_ns = np.maximum(since_ns / counts, 0.0)
+    step_ns[step_ns > _AFTER_GAP * usual_ns] = usual_ns
+    before = last[burst] - np.arange(len(stamps_ns))
+    return np.asarray(stamps_ns[last][burst] - np.rint(before * step_ns[burst]).astype(np.int64))
 
 
 def in_order_or_late(stamps_ns: Stamps) -> NDArray[np.bool_]:

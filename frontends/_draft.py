@@ -32,6 +32,8 @@ _TURNED_DEG = 10.0  # off the course, from which a compass is taken for turned i
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
 _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
+_OWN_CLOCK_S = 10.0  # no message takes as long
+_FEWEST_STAMPS = 10  # that tell of a clock
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _RTK_M = (
@@ -58,10 +60,10 @@ def draft_config(inspection: Inspection) -> str:
         f"vessel: {json.dumps(name)}",
         f"body_frame: {inspection.body_frame}"
         + ("" if inspection.body_frame == "base_link" else "  # guess: the body, by /tf_static"),
-        _datum_line(inspection.odometry),
+        _datum_line(inspection),
         "sensors:" if inspection.usable else "sensors: {}  # nothing in this bag can be used",
     ]
-    blocks = [_with_offset(block, inspection) for block in _blocks(inspection)]
+    blocks = [_with_clock(block, inspection) for block in _blocks(inspection)]
     lines += [f"  {line}" for block in blocks for line in block]
     lines += _beside(inspection.odometry)
     return "\n".join(lines) + "\n"
@@ -72,6 +74,8 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         yield _imu_block(_numbered("imu", k), imu, enabled=k == 0 and not imu.missing)
     for k, gnss in enumerate(inspection.gnss):
         yield _gnss_block(_numbered("gnss", k), gnss, enabled=k == 0)
+    for k, item in enumerate(_in_a_grid(inspection)):
+        yield _grid_block(_numbered("gnss", k), item, enabled=k == 0)
     compasses = sorted((c for c in inspection.compasses if c.usable), key=lambda c: c.topic.endswith(_MAGNETIC))
     seen: set[str] = set()
     for k, compass in enumerate(compasses):
@@ -89,14 +93,33 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
             f"  # its frame '{item.frame_id}': {item.world}",
             "  enabled: false  # guess: true if its frame is east-north-up at the datum and no fix went into it",
         ]
-    for item in (o for o in inspection.odometry if o.role == "other"):
-        yield [f"# {item.topic}: left out, {item.world}"]
+    in_a_grid = _in_a_grid(inspection)
+    for item in (o for o in inspection.odometry if o.role == "other" and o not in in_a_grid):
+        instead = ": take the receiver's NavSatFix" if inspection.gnss and item.grid else ""
+        yield [f"# {item.topic}: left out, {item.world}{instead}"]
     if inspection.lidars:
-        yield _aerial_block(inspection.lidars)
+        yield [*_aerial_block(inspection.lidars), *_recorded_lines(inspection, inspection.lidars)]
     if inspection.cameras:
-        yield _tags_block(inspection.cameras)
+        yield [*_tags_block(inspection.cameras), *_recorded_lines(inspection, inspection.cameras)]
     if inspection.gnss:
         yield ["height:", "  enabled: false  # guess: true for a vessel that floats"]
+
+
+def _in_a_grid(inspection: Inspection) -> list[OdometryReport]:
+    """Positions in a map grid, where nothing tells a latitude."""
+    return [] if inspection.gnss else [item for item in inspection.odometry if item.grid]
+
+
+def _grid_block(name: str, item: OdometryReport, *, enabled: bool) -> list[str]:
+    lines = [f"{name}:", "  kind: gnss", f"  topic: {item.topic}"]
+    lines += [] if enabled else ["  enabled: false  # guess: one receiver is used"]
+    zone = "EPSG:32632 for UTM zone 32 north, EPSG:32732 for zone 32 south"
+    return [
+        *lines,
+        f"  grid: ''  # set it, the zone is not in the bag: {zone}; {item.world}",
+        "  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: of base_link, if /tf_static was applied; else of the antenna",
+        "  slow_error: {}  # guess: where RTK is fixed throughout, {" + _RTK_SLOW_ERROR + "}",
+    ]
 
 
 def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
@@ -120,6 +143,23 @@ def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
                 f"      mount: {{xyz_m: [0.0, 0.0, 0.0]}}  # guess: where '{lidar.frame_id}' sits is not in the bag; measure it"
             )
     return lines
+
+
+def _recorded_lines(inspection: Inspection, mounted: tuple[MountedTopic, ...]) -> list[str]:
+    """Say that recording times stand for the stamps of scans or images, where these have none, or are of a clock of their own.
+
+    Recording times are on the clock of the IMU, or on that which its stamps are set by, unless all stamps are of another time.
+    """
+    usual = [t.latency_s[1] for t in inspection.topics if t.latency_s and t.count >= _FEWEST_STAMPS]
+    if all(abs(latency_s) > EPOCH_LIMIT_S for latency_s in usual):
+        return []
+    for item in mounted:
+        if item.latency_s is None or abs(item.latency_s) > _OWN_CLOCK_S:
+            clock = (
+                "have no stamps" if item.latency_s is None else f"are stamped {item.latency_s:+.0f} s before they come"
+            )
+            return [f"  stamps: recorded  # guess: messages of {item.topic} {clock}; late by as long as one takes"]
+    return []
 
 
 def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
@@ -151,7 +191,7 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
     return lines
 
 
-def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
+def _with_clock(block: list[str], inspection: Inspection) -> list[str]:
     """Say where recording times stand for stamps; where a clock is off by them, or stamps are late by the motion, add an offset.
 
     Poses may take their time.
@@ -165,6 +205,9 @@ def _with_offset(block: list[str], inspection: Inspection) -> list[str]:
         unknown = "" if kind == "gnss" else ", which no bound includes"
         said = f"guess: its headers hold no stamps; they are late by as long as a message takes{unknown}"
         block = [*block, f"  stamps: recorded  # {said}"]
+    if topic in topics and (ppm := topics[topic].drift_ppm):
+        said = f"it gains {1e-6 * ppm * (topics[topic].span_s or 0.0):+.2f} s on the steadiest clock, by the recording times"
+        block = [*block, f"  clock_drift_ppm: {ppm:.1f}  # guess: {said}"]
     if imu is None or kind not in _SET or topic not in clocks:
         return block
     own = (c for n, c in clocks.items() if not topics[n].recorded and topics[n].msgtype not in UNSTAMPED)
@@ -241,7 +284,9 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     lines = [f"{name}:", "  kind: gnss", *_topic_lines(gnss.topic)]
     if not enabled:
         why = (
-            _FILTERED if filtered(gnss.topic) else "one receiver is used: RTK throughout, or else that with most fixes"
+            _FILTERED
+            if filtered(gnss.topic)
+            else "one receiver is used: RTK throughout, else the most accurate by its claims, of equal ones that with most fixes"
         )
         lines.append(f"  enabled: false  # guess: {why}")
     else:
@@ -419,14 +464,18 @@ def _mount_lines(compass: CompassReport) -> list[str]:
     return lines
 
 
-def _datum_line(odometry: tuple[OdometryReport, ...]) -> str:
+def _datum_line(inspection: Inspection) -> str:
     """The datum is where the frame of true or measured poses has its origin; without them any place will do."""
     for role in ("truth", "pose"):
-        for item in odometry:
+        for item in inspection.odometry:
             if item.role == role and item.origin is not None:
                 lat, lon, height = item.origin
                 where = f"latitude_deg: {lat:.8f}, longitude_deg: {lon:.8f}, height_m: {height:.2f}"
                 return f"datum: {{{where}}}  # guess: the origin of {item.topic}; {item.world}"
+    frames = [item.frame_id for item in inspection.odometry if item.role == "pose"]
+    if frames and not (inspection.gnss or _in_a_grid(inspection)):
+        where = "latitude_deg: , longitude_deg: , height_m: 0"
+        return f"# datum: {{{where}}}  # set it where the origin of '{frames[0]}' lies: nothing in the bag tells"
     return "# datum: the median of the first five fixes"
 
 

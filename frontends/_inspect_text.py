@@ -27,7 +27,13 @@ def render(inspection: Inspection) -> str:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
         off = ", switched off" if item.role == "truth" and item.origin is None else ""
-        drafted = "left out" if item.role == "other" else f"drafted as {_DRAFTED[item.role]}{off}"
+        drafted = (
+            "in a map grid"
+            if item.grid
+            else "left out"
+            if item.role == "other"
+            else f"drafted as {_DRAFTED[item.role]}{off}"
+        )
         lines += ["", f"{item.topic}: {drafted}", f"  {item.why}; {item.world}"]
     counts = {t.topic: t.count for t in inspection.topics}
     for what, kind, mounted, need in (

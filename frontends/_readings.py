@@ -164,12 +164,15 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
     reach = next(r for r in sensors if r.sensor == reference)
     for r in sensors:
         gain_s = _clock.gain_s(r.stamps(), r.logs()) - _clock.gain_s(reach.stamps(), reach.logs())
-        if abs(gain_s) > _clock.GAIN_LIMIT_S:
-            lines.append(
-                f"{r.sensor}: its clock {'gains' if gain_s > 0 else 'loses'} {abs(gain_s):.2f} s on that of {reference} during the "
-                "run, by the recording times: no time_offset_s holds throughout, and no bound includes it; synchronise the clocks, "
-                "or smooth short parts (--start, --duration)"
-            )
+        if abs(gain_s) <= _clock.GAIN_LIMIT_S:
+            continue
+        ppm = _clock.drift_ppm(r.stamps(), r.logs()) - _clock.drift_ppm(reach.stamps(), reach.logs())
+        steady = f"set its clock_drift_ppm to {r.config.clock_drift_ppm + ppm:.1f}"
+        lines.append(
+            f"{r.sensor}: its clock {'gains' if gain_s > 0 else 'loses'} {abs(gain_s):.2f} s on that of {reference} during the "
+            "run, by the recording times: no time_offset_s holds throughout, and no bound includes it; "
+            + (steady if ppm else "synchronise the clocks, or smooth short parts (--start, --duration)")
+        )
     return lines
 
 
@@ -180,6 +183,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
         InputError: their rates cannot be rad/s, or accelerations or rates are missing.
     """
     assert isinstance(readings.config, ImuConfig)
+    _even_out(readings, warnings)
     bad = ~_clock.in_order_or_late(readings.stamps())
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
     readings.sort()
@@ -198,6 +202,21 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     _sanity.refuse_degrees(readings.sensor, series.stamps_ns, series.accel_mps2, series.gyro_radps, readings.config)
     warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     return series, rows
+
+
+def _even_out(readings: Readings, warnings: list[str]) -> None:
+    """Lay out samples that were stamped in bursts evenly."""
+    stamps = readings.stamps()
+    values = np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)]).reshape(
+        -1, 6
+    )
+    even = _clock.evened(stamps, _clock.fresh(values))
+    if even is not stamps:
+        readings.stamps_ns[:] = even.tolist()
+        said = "they are laid out evenly between them; `graphloc stream` cannot do that: fix the driver"
+        warnings.append(
+            f"{readings.sensor}: its samples are stamped in bursts, as when a driver reads a buffer: {said}"
+        )
 
 
 def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:

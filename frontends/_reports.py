@@ -41,7 +41,8 @@ class TopicReport:
         gaps: intervals longer than 5 usual ones (and 0.1 s); max_gap_s: the longest interval.
         repeated, backward: stamps equal to, or before, the one before; no_stamp: zero stamps.
         recorded: whether the headers hold no stamps, so that the recording times stand for them here.
-        latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points.
+        latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points; without what the clock gains.
+        drift_ppm: by how much the clock runs fast, where that is clear; else 0.
     """
 
     topic: str
@@ -59,6 +60,7 @@ class TopicReport:
     no_stamp: int | None = None
     recorded: bool = False
     latency_s: Vec | None = None
+    drift_ppm: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -181,7 +183,7 @@ class OdometryReport:
     """An odometry or pose topic: role is 'truth', 'check_speed', 'pose', or 'other' of what is no pose of the vessel.
 
     `origin`: latitude, longitude (deg) and height (m) of its frame's origin, where the frame is
-    east-north-up by the fixes; `world`: the evidence.
+    east-north-up by the fixes; `world`: the evidence. `grid`: whether its positions are as large as in a map grid.
     """
 
     topic: str
@@ -192,6 +194,7 @@ class OdometryReport:
     why: str
     origin: Vec | None
     world: str
+    grid: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,6 +204,7 @@ class MountedTopic:
     Attributes:
         tf_frame: the same where /tf_static leads to it, else None. info_topic: a camera's CameraInfo where one lies beside
             it, else ''. listed: it holds what a detector found, not images.
+        latency_s: recording time minus header stamp of its first message, s; None where that has no stamp.
     """
 
     topic: str
@@ -208,6 +212,7 @@ class MountedTopic:
     tf_frame: str | None
     info_topic: str = ""
     listed: bool = False
+    latency_s: float | None = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,7 +235,7 @@ class Inspection:
     @property
     def usable(self) -> bool:
         """Whether any of it can be a sensor."""
-        poses = any(o.role == "pose" for o in self.odometry)
+        poses = any(o.role == "pose" or o.grid for o in self.odometry)
         compasses = any(c.usable for c in self.compasses)
         return bool(self.imus or self.gnss or compasses or poses or self.velocities or self.lidars or self.cameras)
 

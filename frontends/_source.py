@@ -36,13 +36,14 @@ TF_STATIC = "/tf_static"
 
 
 class RawMessage(NamedTuple):
-    """A message as recorded, not decoded."""
+    """A message as recorded, not decoded; `elapsed_ns`: since the bag's first message was recorded."""
 
     topic: str
     msgtype: str
     file: str
     log_ns: int
     data: bytes
+    elapsed_ns: int = 0
 
 
 class TopicSummary(NamedTuple):
@@ -190,12 +191,13 @@ class Bag:
     def _until_damage(
         self, opened: Opened, wanted: list[Connection], within: tuple[int | None, int | None]
     ) -> Iterator[RawMessage]:
-        read = 0
+        read, began_ns = 0, min(max(o.reader.start_time, 0) for o in self._opened)
         try:
             for connection, log_ns, data in opened.messages(wanted, *within):
                 read += 1
                 at_ns = min(max(log_ns, 0), LATEST_NS)
-                yield RawMessage(connection.topic, connection.msgtype, opened.path.name, at_ns, data)
+                elapsed_ns = at_ns - began_ns
+                yield RawMessage(connection.topic, connection.msgtype, opened.path.name, at_ns, data, elapsed_ns)
         except Exception as error:  # noqa: BLE001 - as above
             self.warnings.append(
                 f"{opened.path}: damaged after {read} messages ({text_of(error)}): the rest was not read; "

@@ -123,6 +123,7 @@ class Stream:
     """Columns of one topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`).
 
     recorded: whether the stamps are recording times, because the headers hold none.
+    drift_ppm: by how much the clock ran fast; what it gained is taken off the stamps. elapsed: (N,) ns from the beginning of the bag.
     """
 
     topic: str
@@ -131,14 +132,17 @@ class Stream:
     undecodable: int = 0
     no_stamp: int = 0
     recorded: bool = False
+    drift_ppm: float = 0.0
     _stamps: list[int] = field(default_factory=list)
     _logs: list[int] = field(default_factory=list)
     tuples: list[tuple[float, ...]] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
+    elapsed: list[int] = field(default_factory=list)
 
-    def add(self, stamp_ns: int, log_ns: int, row: tuple[float, ...], file: str) -> None:
+    def add(self, stamp_ns: int, log_ns: int, row: tuple[float, ...], file: str, elapsed_ns: int = 0) -> None:
         """Append a message."""
         self.files.append(file)
+        self.elapsed.append(elapsed_ns)
         self._stamps.append(stamp_ns)
         self._logs.append(log_ns)
         self.tuples.append(row)
@@ -153,13 +157,22 @@ class Stream:
         self.no_stamp = there.count(False)
         if not self.no_stamp:
             return
-        columns: tuple[list[Any], ...] = (self._stamps, self._logs, self.tuples, self.files)
+        columns: tuple[list[Any], ...] = (self._stamps, self._logs, self.tuples, self.files, self.elapsed)
         for column in columns:
             column[:] = list(compress(column, there))
 
     def later(self, by_ns: int) -> Stream:
         """Return the stream with `by_ns` added to its stamps."""
         return replace(self, _stamps=[stamp_ns + by_ns for stamp_ns in self._stamps])
+
+    def stamped(self, stamps_ns: NDArray[np.int64]) -> Stream:
+        """Return the stream with other stamps (N,)."""
+        return replace(self, _stamps=stamps_ns.tolist())
+
+    def without_drift(self, ppm: float) -> Stream:
+        """Return the stream with what a clock that runs fast has gained taken off its stamps."""
+        gained = np.rint(1e-6 * ppm * np.array(self.elapsed, dtype=float)).astype(np.int64)
+        return replace(self, _stamps=(self.stamps_ns - gained).tolist(), drift_ppm=ppm)
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -211,7 +224,7 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
             stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns)
             if raw.msgtype not in UNSTAMPED:
                 stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
-            stream.add(stamp_ns or 0, raw.log_ns, row, raw.file)
+            stream.add(stamp_ns or 0, raw.log_ns, row, raw.file, raw.elapsed_ns)
     for stream in streams.values():
         stream.settle()
     return list(streams.values()), tree

@@ -18,6 +18,7 @@ from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import courses_of_fixes, motion_of_fixes
+from graphloc.frontends._clock import corrected_ns
 from graphloc.frontends._mount_yaw import yaw_in_craft
 from graphloc.frontends._part import Bags
 from graphloc.frontends._readings import (
@@ -53,7 +54,7 @@ from graphloc.frontends.decode import (
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Progress, Recording, Span
-from graphloc.time import duration_ns, utc_text
+from graphloc.time import utc_text
 
 _REPORT_EVERY = 2000  # messages between two calls of `progress`
 
@@ -238,7 +239,7 @@ class _Reader:
             text = f"{raw.file}: header stamp is zero or negative, recorded at {utc_text(raw.log_ns)}: {NO_STAMP}"
             self._rows.append(readings.row(seq, 0, malformed(text)))
             return
-        stamp_ns += duration_ns(readings.config.time_offset_s)
+        stamp_ns = corrected_ns(stamp_ns, readings.config, raw.elapsed_ns)
         if not 0 < stamp_ns <= LATEST_NS:
             text = f"{raw.file}: no time with time_offset_s on it, recorded at {utc_text(raw.log_ns)}"
             self._rows.append(readings.row(seq, 0, malformed(text)))

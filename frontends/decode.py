@@ -8,11 +8,14 @@ floors, scales and kernels belong to the factors.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from math import isfinite, pi
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pyproj import Transformer
+from pyproj.exceptions import CRSError
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import (
@@ -204,6 +207,30 @@ def _gnss_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfi
     dilution = max(fix.hdop, 1.0) if isfinite(fix.hdop) else 1.0
     cov = np.diag([horizontal, horizontal, vertical]) ** 2 * min(dilution, 100.0) ** 2
     return _placed((fix.latitude_deg, fix.longitude_deg, fix.height_m), cov, stamp_ns, seq, sensor, config)
+
+
+@lru_cache(maxsize=8)
+def _from_grid(grid: str) -> Transformer:
+    try:
+        return Transformer.from_crs(grid, 4326, always_xy=True)
+    except CRSError:
+        raise ValueError(f"grid {grid} is not known") from None
+
+
+def _gnss_grid(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:
+    """Position of a pose in a map grid; its orientation is not used. The grid's north is off by a few degrees, which a covariance ignores."""
+    if not config.grid:
+        return malformed("a position in a map grid: set grid to its name, e.g. EPSG:32632 for UTM zone 32 north")
+    (x, y, height), _ = pose_of(msg)
+    longitude, latitude = _from_grid(config.grid).transform(x, y)
+    if not np.isfinite([longitude, latitude]).all():
+        return malformed(f"its position is not in the grid {config.grid}")
+    cov = (
+        covariance_translation_first(msg.pose.covariance)[:3, :3]
+        if hasattr(msg.pose, "covariance")
+        else np.zeros((3, 3))
+    )
+    return _placed((latitude, longitude, height), cov, stamp_ns, seq, sensor, config)
 
 
 def _placed(
@@ -415,6 +442,7 @@ DECODERS: dict[tuple[str, str], Decoder] = {
     ("gnss", NAV_SAT_FIX): _gnss,
     **{("gnss", msgtype): _gnss for msgtype in GPS_FIXES},
     **{("gnss", msgtype): _gnss_nmea for msgtype in NMEA},
+    **{("gnss", msgtype): _gnss_grid for msgtype in (ODOMETRY, POSE, PLAIN_POSE)},
     ("compass", QUATERNION): _compass_quaternion,
     ("compass", IMU): _compass_imu,
     **{("compass", msgtype): _compass_nmea for msgtype in NMEA},

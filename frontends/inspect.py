@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.config import STANDARD_GRAVITY_MPS2
+from graphloc.config import STANDARD_GRAVITY_MPS2, GnssConfig
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import (
     Courses,
@@ -21,16 +22,21 @@ from graphloc.frontends._assess import (
     Turning,
     compass_report,
     courses_of,
+    evenly,
     gnss_report,
     headings,
+    motion_of_places,
     on_one_clock,
+    sane,
     says_the_same,
     topic_report,
     track,
+    white_noise_m,
+    without_drift,
 )
 from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
-from graphloc.frontends._assess_world import world_of
+from graphloc.frontends._assess_world import in_map_grid, world_of
 from graphloc.frontends._clock import refuse_woven, usual_latency_s
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
@@ -68,12 +74,13 @@ from graphloc.frontends.decode import (
     QUATERNION,
     TWIST,
     VECTOR,
+    header_stamp_ns,
 )
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic
 from graphloc.frozen_receiver import frozen_fixes
 from graphloc.measurements import CompassHeading, ImuSeries
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, seconds_between
 
 __all__ = [
     "CompassReport",
@@ -94,7 +101,15 @@ _MOST_TRIED = 200  # messages of a topic that cannot be decoded
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
 _MOST_NAMED = 6
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
+_FEWEST = 20  # places of a track
 _COVERS = 0.8  # of the run, from which a receiver is there throughout
+
+
+class _First(NamedTuple):
+    """First readable message of a topic: its frame, and recording time minus stamp, s; None: it has no stamp."""
+
+    frame: str
+    latency_s: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,7 +119,7 @@ class _Contents:
     Attributes:
         source: its name, for messages. topics: by name, from its index.
         streams: by topic, as recorded. aligned: those with messages, on one clock.
-        tree: of /tf_static. lidars, cameras: frame of the first message, by topic.
+        tree: of /tf_static. lidars, cameras: by topic.
     """
 
     source: str
@@ -112,8 +127,8 @@ class _Contents:
     streams: Mapping[str, Stream]
     aligned: Mapping[str, Stream]
     tree: StaticTree
-    lidars: Mapping[str, str]
-    cameras: Mapping[str, str]
+    lidars: Mapping[str, _First]
+    cameras: Mapping[str, _First]
     warnings: tuple[str, ...]
 
     def of_type(self, *msgtypes: str) -> list[Stream]:
@@ -157,7 +172,10 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     ]
     wheels = [s for s, report in odometry if report.role == "check_speed"]
     motions = motions_of(wheels, velocities, bag.of_type(*_FIXES))
-    courses = courses_of(reference.stamps_ns, reference.p_m, reference.scatter_m) if gnss else None
+    if not gnss and (motion := motion_of_places("the poses in a map grid", reference.stamps_ns, reference.p_m)):
+        motions.append(motion)
+    known = len(reference.stamps_ns) > 0
+    courses = courses_of(reference.stamps_ns, reference.p_m, reference.scatter_m) if known else None
     imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, motions, courses, tree, body))]
     imus.sort(key=lambda i: (bool(i.missing), i.gravity == "removed", i.gyro_noise_mdps))
     late = _late_s(bag, imus, motions)
@@ -190,9 +208,10 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
         topics = bag.topics
         bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
         streams, tree = read_streams(bag)
-        lidars = _frames_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
-        cameras = _frames_of(bag, _pictures(bag))
+        lidars = _firsts_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
+        cameras = _firsts_of(bag, _pictures(bag))
         source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
+    streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
     for stream in streams:
         if stream.msgtype == IMU:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
@@ -219,9 +238,22 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     found = [r for s in bag.of_type(*_FIXES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
     longest_s = max((r.spans_s for r in found), default=0.0)
     found.sort(
-        key=lambda r: (filtered(r.topic), r.slow_error or r.spans_s < _COVERS * longest_s, -r.fixes, r.without_height)
+        key=lambda r: (
+            filtered(r.topic),
+            r.spans_s < _COVERS * longest_s,
+            r.slow_error,
+            _octave(r),
+            -r.fixes,
+            r.without_height,
+        )
     )
     return found
+
+
+def _octave(gnss: GnssReport) -> int:
+    """Return how large the fixes' error is by what they claim, or scatter by, in powers of two: closer ones are taken for equal."""
+    claimed = gnss.reported_sigma_m[:2] if gnss.reported_sigma_m else (GnssConfig().default_horizontal_sigma_m,)
+    return round(math.log2(max(*claimed, *(gnss.scatter_m or ())[:2], 1e-3)))
 
 
 def _odometry_reports(
@@ -261,7 +293,7 @@ def _lacking(
     lines = []
     if not any(not imu.missing for imu in imus):
         lines.append("no whole IMU in it: smooth, replay and compare need one")
-    if not (gnss or bag.lidars or bag.cameras or any(report.role == "pose" for report in odometry)):
+    if not (gnss or bag.lidars or bag.cameras or any(report.role == "pose" or report.grid for report in odometry)):
         lines.append("nothing in it tells the place: no GNSS fix that can be used, no pose")
     others = [t for t in bag.topics.values() if t.topic not in bag.streams and not _KNOWN.match(t.msgtypes[0])]
     if lines and others:
@@ -351,11 +383,16 @@ def _timed_fixes(
     return replace(gnss, late_s=known.get(by), late_by=by)
 
 
-def _mounted(bag: _Contents, frames: Mapping[str, str]) -> tuple[MountedTopic, ...]:
+def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic, ...]:
     body = bag.tree.body()
     return tuple(
-        MountedTopic(topic=topic, frame_id=frame, tf_frame=frame if bag.tree.resolve(body, frame) else None)
-        for topic, frame in sorted(frames.items())
+        MountedTopic(
+            topic=topic,
+            frame_id=first.frame,
+            tf_frame=first.frame if bag.tree.resolve(body, first.frame) else None,
+            latency_s=first.latency_s,
+        )
+        for topic, first in sorted(firsts.items())
     )
 
 
@@ -374,18 +411,20 @@ def _pictures(bag: Bag) -> list[str]:
     return [t for t in every if f"{t}/compressed" not in every and "depth" not in t.lower()]
 
 
-def _frames_of(bag: Bag, topics: Sequence[str]) -> dict[str, str]:
-    """Return the frame of the first readable message of each topic, if that is among the first 200.
+def _firsts_of(bag: Bag, topics: Sequence[str]) -> dict[str, _First]:
+    """Return what the header says of the first readable message of each topic, if that is among the first 200.
 
     Each topic is read separately: a topic without any readable message would otherwise cause all others to be unpacked
     to the end of the bag.
     """
-    found: dict[str, str] = {}
+    found: dict[str, _First] = {}
     for topic in topics:
         for raw in islice(bag.messages({topic}), _MOST_TRIED):
             try:
                 msg: Any = bag.decode(raw)
-                found[topic] = str(msg.header.frame_id)
+                stamp_ns = header_stamp_ns(msg)
+                latency_s = None if stamp_ns is None else seconds_between(stamp_ns, raw.log_ns)
+                found[topic] = _First(str(msg.header.frame_id), latency_s)
                 break
             except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; a later one will do
                 continue
@@ -393,10 +432,22 @@ def _frames_of(bag: Bag, topics: Sequence[str]) -> dict[str, str]:
 
 
 def _best_track(bag: _Contents, gnss: Sequence[GnssReport]) -> _Track:
-    """Return the track of the first receiver, without frozen fixes; an empty one where there is no receiver."""
+    """Return the track of the first receiver, without frozen fixes; without one, that of poses in a map grid; else an empty one."""
     if not gnss:
-        return _Track(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None)
+        return _grid_track(bag)
     best = gnss[0]
     stamps_ns, p_m, rows = track(bag.aligned[best.topic])
     good = ~frozen_fixes(stamps_ns, rows[:, :2], p_m[:, :2])
     return _Track(stamps_ns[good], p_m[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first)
+
+
+def _grid_track(bag: _Contents) -> _Track:
+    """Return the first track in a map grid, about its first position; the grid's north is off by a few degrees."""
+    for stream in bag.of_type(ODOMETRY, POSE, PLAIN_POSE):
+        keep = sane(stream)
+        p_m = stream.rows[keep, :3]
+        good = np.isfinite(p_m).all(axis=1)
+        if in_map_grid(stream) and good.sum() > _FEWEST:
+            p_m = p_m[good] - p_m[good][0]
+            return _Track(stream.stamps_ns[keep][good], p_m, float(white_noise_m(p_m)[:2].max()), None)
+    return _Track(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None)

@@ -19,7 +19,7 @@ from graphloc.frontends._streams import Stream
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import TWIST
 from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
-from graphloc.measurements import CompassHeading, GnssVelocity
+from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.commands import called
 from tests.test_bag import HUSKY, KINDS
@@ -33,6 +33,7 @@ def rotation_z(degrees: float) -> Any:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+EASTING, NORTHING = 672816.3225, 6399009.0284  # of DATUM, by the series itself, not by PROJ
 ROLL_90 = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # takes the sensor's y to body z
 
 
@@ -395,17 +396,28 @@ def test_a_map_grid_is_no_world(tmp_path: Path) -> None:
     assert "looks like a map grid (UTM)" in text
 
 
-def test_places_on_a_map_grid_alone_are_said_to_tell_no_place(tmp_path: Path) -> None:
-    """A receiver's driver that publishes UTM and no fix: drafted as a pose, it went on to ask for a datum, which would not help."""
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0])
+def test_places_in_a_map_grid_alone_are_fixes_once_the_grid_is_named(yaw_deg: float, tmp_path: Path) -> None:
+    """A receiver's driver that publishes UTM and no fix. 57.7 N 11.9 E in zone 32, by Krueger's series to n^4."""
     make = Messages(2)
-    items = [item for item in drive(make) if item[0] in ("/imu", "/compass")]
-    for k in range(300):
-        stamp = START_NS + k * S // 5
-        items.append(("/gps/odom", stamp, make.odometry(stamp, (674_000.0 + 0.5 * k, 6_399_000.0, 40.0))))
+    driven = drive(make, R_body_sensor=rotation_z(yaw_deg))
+    items = [item for item in driven if item[0] in ("/imu", "/compass")]
+    for _, log_ns, fix in [item for item in driven if item[0] == "/fix"]:
+        enu = DATUM.enu_from_geodetic(*np.array([[fix.latitude], [fix.longitude], [fix.altitude]]))[0]
+        stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
+        items.append(("/gps/odom", log_ns, make.odometry(stamp, (enu[0] + EASTING, enu[1] + NORTHING, 40.0))))
     found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     assert not config.of_kind("pose")
-    assert "# /gps/odom: left out, it is 6434 km from its origin: looks like a map grid (UTM)" in text
-    assert any("nothing in it tells the place" in w for w in found.warnings)
+    assert not any("nothing in it tells the place" in w for w in found.warnings)
+    assert found.imus[0].mount.rpy_deg[2] == yaw_deg
+    nowhere = read_recording(tmp_path / "run", config)
+    assert any("gnss: none of the 300 messages" in w and "set grid to its name" in w for w in nowhere.warnings)
+    (tmp_path / "vessel.yaml").write_text(text.replace("grid: ''", "grid: EPSG:32632"))
+    placed = read_recording(tmp_path / "run", load_config(tmp_path / "vessel.yaml", KINDS))
+    first = next(m for m in placed.measurements if isinstance(m, GnssPosition))
+    assert first.position.latitude_deg == pytest.approx(57.7, abs=1e-8)
+    assert first.position.longitude_deg == pytest.approx(11.9, abs=1e-8)
+    assert first.position.height_m == 40.0
 
 
 def test_another_body_is_no_truth(tmp_path: Path) -> None:

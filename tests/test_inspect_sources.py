@@ -272,6 +272,20 @@ def test_rtk_is_taken_before_a_receiver_that_says_more(lasts_s: float, used: str
     assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == [used]
 
 
+@pytest.mark.parametrize(("claims_m", "used"), [(1.2, "/fix"), (0.4, "/second")])
+def test_a_receiver_that_claims_more_accuracy_is_taken_before_one_that_says_more(
+    claims_m: float, used: str, tmp_path: Path
+) -> None:
+    """Of equally accurate ones, within a factor of two, the one that says more."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=1.0)
+    for _, at, m in [item for item in items if item[0] == "/fix"][::2]:
+        cov = (claims_m**2 * np.eye(3)).ravel()
+        items.append(("/second", at, make.fix(at, m.latitude, m.longitude, m.altitude, 0, cov)))
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == [used]
+
+
 def test_what_no_run_can_do_without_is_reported(tmp_path: Path) -> None:
     """A draft of an IMU alone was all that came of a bag whose places are in messages of another kind."""
     make = Messages(2)

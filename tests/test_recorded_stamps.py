@@ -4,12 +4,16 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from graphloc.config import VesselConfig
+from graphloc.app import configured
+from graphloc.config import ImuConfig, VesselConfig
 from graphloc.frontends.bag import read_recording
+from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.time import duration_ns
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag_bad_input import accounted, vessel
 from tests.test_inspect import drive, look
@@ -108,12 +112,64 @@ def test_clocks_that_all_count_from_their_start_keep_the_time_of_the_imu(tmp_pat
 
 
 @pytest.mark.parametrize(("share", "said"), [(0.01, "gains 0.54 s"), (-0.01, "loses 0.54 s"), (0.001, "")])
-def test_a_clock_that_drifts_is_said(share: float, said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("topic", ["/fix", "/imu"])
+def test_a_clock_that_drifts_is_drafted_and_set_right(topic: str, share: float, said: str, tmp_path: Path) -> None:
     """By a hundredth over 60 s; nine tenths of that lie between the first tenth and the last."""
-    _, config, _ = look(tmp_path, restamped({"/fix": lambda ns: ns + round(share * (ns - START_NS))}), MAKE)
-    lines = [w for w in read(tmp_path, config).warnings if "during the run, by the recording times" in w]
-    assert len(lines) == bool(said)
-    assert all(line.startswith(f"gnss: its clock {said}") for line in lines)
+    _, config, _ = look(tmp_path, restamped({topic: lambda ns: ns + round(share * (ns - START_NS))}), MAKE)
+    name = topic.strip("/").replace("fix", "gnss")
+    drifts = {n: s.clock_drift_ppm for n, s in config.sensors.items() if s.clock_drift_ppm}
+    assert drifts == ({name: pytest.approx(1e6 * share, rel=0.02)} if said else {})
+    recording = read(tmp_path, config)
+    assert not any("during the run" in w for w in recording.warnings)
+    fixes = [m.stamp_ns for m in recording.measurements if isinstance(m, GnssPosition)]
+    last_ns = (
+        fixes[-1] - duration_ns(config.sensors["gnss"].time_offset_s)
+        if topic == "/fix"
+        else recording.imu.stamps_ns[-1]
+    )
+    true_ns = START_NS + (299 * S // 5 if topic == "/fix" else 2999 * S // 50)
+    assert abs(last_ns - true_ns) < (5_000_000 if said else 70_000_000)
+    plain = {n: sensor.model_copy(update={"clock_drift_ppm": 0.0}) for n, sensor in config.sensors.items()}
+    warnings = read(tmp_path, config.model_copy(update={"sensors": plain})).warnings
+    lines = [w for w in warnings if "during the run, by the recording times" in w]
+    assert bool(lines) == bool(said)
+    told = said if topic == "/fix" else ""  # else that the others' clocks do
+    assert all(told in line and "set its clock_drift_ppm to" in line for line in lines)
+
+
+def test_a_clock_that_is_set_during_the_run_does_not_drift(tmp_path: Path) -> None:
+    """A step is no drift: nothing is drafted, and the warning stays."""
+    _, config, _ = look(tmp_path, restamped({"/fix": lambda ns: ns + S // 2 * (ns > START_NS + 30 * S)}), MAKE)
+    assert config.sensors["gnss"].clock_drift_ppm == 0.0
+    (line,) = [w for w in read(tmp_path, config).warnings if "during the run, by the recording times" in w]
+    assert "synchronise the clocks" in line
+
+
+@pytest.mark.parametrize("apart_ns", [0, 20_000])
+def test_imu_samples_that_are_stamped_in_bursts_are_laid_out_evenly(apart_ns: int, tmp_path: Path) -> None:
+    """Five samples at 50 Hz are read, and stamped, when the last of them is there; a second of them is lost."""
+    tick_ns = S // 50
+
+    def burst(ns: int) -> int:
+        k = (ns - START_NS) // tick_ns
+        return START_NS + (k // 5 * 5 + 4) * tick_ns - (4 - k % 5) * apart_ns
+
+    items = [i for i in restamped({"/imu": burst}) if i[0] != "/imu" or not 20 * S <= i[1] - START_NS < 21 * S]
+    _, config, _ = look(tmp_path, items, MAKE)
+    recording = read(tmp_path, config)
+    true_ns = np.array([START_NS + k * tick_ns for k in range(3000) if not 1000 <= k < 1050])
+    assert len(recording.imu) == len(true_ns)
+    assert np.abs(recording.imu.stamps_ns - true_ns).max() < 1_000_000
+    assert any("imu: its samples are stamped in bursts" in w for w in recording.warnings)
+    assert config.sensors["imu"].gyro_noise_mdps_per_sqrt_hz == ImuConfig().gyro_noise_mdps_per_sqrt_hz
+
+
+def test_copies_of_imu_samples_are_no_burst(tmp_path: Path) -> None:
+    items = [i for item in restamped({}) for i in ([item, item] if item[0] == "/imu" else [item])]
+    _, config, _ = look(tmp_path, items, MAKE)
+    recording = read(tmp_path, config)
+    assert len(recording.imu) == 3000
+    assert not any("bursts" in w for w in recording.warnings)
 
 
 @pytest.mark.parametrize("together", [5, 1])
@@ -127,3 +183,33 @@ def test_stamps_that_come_in_bursts_are_said(together: int, tmp_path: Path) -> N
     _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), MAKE)
     lines = [w for w in read(tmp_path, config).warnings if "stamped in bursts, 1.0 s apart" in w]
     assert len(lines) == (together > 1)
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "others_ns", "recorded"),
+    [
+        (START_NS, 0, False),
+        (0, 0, True),
+        (900 * S, 0, True),
+        (900 * S, START_NS - 900 * S, False),  # all count from when the computer was switched on
+    ],
+)
+@pytest.mark.parametrize("kind", ["aerial", "apriltag"])
+def test_scans_and_images_without_usable_stamps_are_drafted_by_the_recording_times(
+    kind: str, stamp_ns: int, others_ns: int, recorded: bool, tmp_path: Path
+) -> None:
+    items = restamped(dict.fromkeys(WAY_NS, lambda ns: ns - others_ns))
+    seen = {
+        "aerial": MAKE.t["sensor_msgs/msg/PointCloud2"](
+            header=MAKE.header(stamp_ns, "lidar"), height=1, width=0, fields=[], is_bigendian=False, point_step=12,
+            row_step=0, data=np.zeros(0, np.uint8), is_dense=True,
+        ),
+        "apriltag": MAKE.t["sensor_msgs/msg/CompressedImage"](
+            header=MAKE.header(stamp_ns, "camera"), format="jpeg", data=np.zeros(0, np.uint8)
+        ),
+    }  # fmt: skip
+    items += [("/seen", START_NS + S // 10, seen[kind])]
+    path = write_bag(tmp_path / "run", MAKE, sorted(items, key=lambda item: item[1]), "mcap")
+    (tmp_path / "vessel.yaml").write_text(draft_config(inspect_bag(path)))
+    (sensor,) = (s for s in configured(tmp_path / "vessel.yaml").sensors.values() if s.kind == kind)
+    assert sensor.stamps == ("recorded" if recorded else "header")

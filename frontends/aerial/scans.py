@@ -12,13 +12,13 @@ from pathlib import Path
 from graphloc.config import AerialConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
+from graphloc.frontends._clock import corrected_ns
 from graphloc.frontends._mounts import mounts_of
 from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, decode_cloud
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn, outside
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
-from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -108,7 +108,6 @@ def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
     If one is missing, or is slower than that, the others form a turn without it.
     """
     names = {lidar.topic: name for name, lidar in config.lidars.items()}
-    offset_ns = duration_ns(config.time_offset_s)
     turn: dict[str, Cloud] = {}
     now_ns = 0
 
@@ -127,6 +126,7 @@ def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
             said = str(error) if isinstance(error, ValueError) else f"cannot be decoded ({type(error).__name__})"
             yield Turn(now_ns, now_ns, (), f"{raw.topic}: {said}")
             continue
+        offset_ns = corrected_ns(cloud.stamp_ns, config, raw.elapsed_ns) - cloud.stamp_ns
         cloud = replace(cloud, stamp_ns=cloud.stamp_ns + offset_ns, stamps_ns=cloud.stamps_ns + offset_ns)
         if any(abs(cloud.stamp_ns - c.stamp_ns) > _TURN_S * 1e9 for n, c in turn.items() if n != name):
             yield whole()

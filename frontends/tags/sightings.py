@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 from graphloc.config import AprilTagConfig, CameraConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array
+from graphloc.frontends._clock import corrected_ns
 from graphloc.frontends._mounts import mounts_of
 from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag, RawMessage
@@ -27,7 +28,6 @@ from graphloc.frontends.tags.images import grey_image
 from graphloc.frontends.tags.listed import LISTS, ListedTag, read_list
 from graphloc.measurements import TagSighting, TagView
 from graphloc.survey import TagConfig
-from graphloc.time import duration_ns
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -203,7 +203,7 @@ def _look(raw: RawMessage, msg: Any, eye: _Eye, sensor: str, config: AprilTagCon
         stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=config.stamps == "recorded")
         if stamp_ns is None:
             raise ValueError(f"its header has no stamp: {NO_STAMP}")
-        stamp_ns += duration_ns(config.time_offset_s)
+        stamp_ns = corrected_ns(stamp_ns, config, raw.elapsed_ns)
         shown = _listed(msg, raw.msgtype, eye, config) if eye.listed else _detected(msg, raw.msgtype, eye, detector)
     except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
         said = str(error) if isinstance(error, ValueError) else f"cannot be decoded ({type(error).__name__})"

@@ -64,5 +64,8 @@ class SensorConfig(Block):
     `gnss`); see `time_offset_s`."""
     time_offset_s: Annotated[float, Field(ge=-4e9, le=4e9)] = 0.0
     """Added to the sensor's stamps, s."""
+    clock_drift_ppm: Annotated[float, Field(ge=-1e5, le=1e5)] = 0.0
+    """By how much the sensor's clock runs fast, ppm: what it has gained since the bag began is taken off its stamps. Slow: negative. Not
+    used by `graphloc stream`."""
     kernel: KernelConfig = KernelConfig()
     """Robust loss."""

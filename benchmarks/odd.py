@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Odd bags through the user's path: inspect, its draft as it stands, smooth, replay; against the truth.
+
+`python benchmarks/odd.py bursts UTM` measures the bags whose names hold one of the words: is the draft right, RMSE and share of the
+time inside the 95 % bounds, offline and online.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _odd_bags import DATUM, START_NS, Change, Craft, Item, Odd, stamp, written
+from _rows import Row, row
+from pyproj import Transformer
+
+from graphloc import app
+from graphloc.errors import GraphlocError
+from graphloc.eval.metrics import TruthMetrics, compare_to_truth
+from graphloc.frontends.bag import read_recording
+from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.replay import replay
+from graphloc.solution import Solution
+from graphloc.trajectory import Trajectory
+
+_HONEST = 0.85  # share of the time inside the 95 % bounds, at the least
+
+
+def _restamped(topic: str, stamped: Callable[[int, int], int]) -> Change:
+    """Other header stamps; `stamped` takes the number of a message and its stamp, ns."""
+
+    def change(craft: Craft, items: list[Item]) -> list[Item]:
+        own = [m for name, _, m in items if name == topic]
+        for k, m in enumerate(own):
+            old_ns = m.header.stamp.sec * 10**9 + m.header.stamp.nanosec
+            m.header = craft.make.header(stamped(k, old_ns), m.header.frame_id)
+        return items
+
+    return change
+
+
+def _jump(size_m: float) -> Change:
+    """Fixes that are off for the middle third of the run."""
+
+    def change(craft: Craft, items: list[Item]) -> list[Item]:
+        third = craft.odd.seconds / 3.0
+        for name, log_ns, m in items:
+            if name == "/gnss/fix" and stamp(third) < log_ns < stamp(2.0 * third):
+                m.latitude += 0.6 * size_m / 111e3
+                m.longitude += 0.8 * size_m / 111e3 / np.cos(np.radians(m.latitude))
+        return items
+
+    return change
+
+
+def _no_covariance(_craft: Craft, items: list[Item]) -> list[Item]:
+    for name, _, m in items:
+        if name == "/gnss/fix":
+            m.position_covariance = np.full(9, np.nan)
+    return items
+
+
+def _second_receiver(craft: Craft, items: list[Item]) -> list[Item]:
+    """One that says more, drifts by metres, and claims nothing."""
+    t = craft.times(10.0, 0.03)
+    places = craft.fixes(t, 1.0, 3.0)
+    return items + [
+        ("/cheap/fix", log_ns, craft.make.fix(stamp(at), *place, 0, np.zeros(9), 0, frame="cheap"))
+        for log_ns, at, place in zip(craft.recorded(t), t, places, strict=True)
+    ]
+
+
+def _utm(craft: Craft, items: list[Item]) -> list[Item]:
+    """Odometry of a receiver in UTM, zone 32 north, instead of fixes."""
+    t = craft.times(5.0, 0.03)
+    lat, lon, height = craft.fixes(t, 0.02).T
+    east, north = Transformer.from_crs(4326, 32632, always_xy=True).transform(lon, lat)
+    return [item for item in items if item[0] != "/gnss/fix"] + [
+        ("/rtk/odom", log_ns, craft.make.odometry(stamp(at), place))
+        for log_ns, at, *place in zip(craft.recorded(t), t, east, north, height, strict=True)
+    ]
+
+
+def _nmea(craft: Craft, items: list[Item]) -> list[Item]:
+    """Sentences in strings, minutes to four decimals, instead of fixes."""
+    t = craft.times(1.0, 0.05)
+    places, v, yaw = craft.fixes(t, craft.odd.sigma_m), craft.motion.pose(t)[2], craft.yaw(t)
+    said = [item for item in items if item[0] != "/gnss/fix"]
+    for log_ns, at, (lat, lon, height), (east, north, _), angle in zip(
+        craft.recorded(t, 0.06), t, places, v, yaw, strict=True
+    ):
+        clock = f"12{int(at) // 60:02d}{at % 60:05.2f}"
+        place = f"{_minutes(lat, 2)},N,{_minutes(lon, 3)},E"
+        course, knots = np.degrees(np.arctan2(east, north)) % 360.0, np.hypot(east, north) / 0.514444
+        for k, body in enumerate((
+            f"GPGGA,{clock},{place},1,09,0.9,{height - 35.0:.1f},M,35.0,M,,",
+            f"GPRMC,{clock},A,{place},{knots:.2f},{course:.1f},230924,,,A",
+            f"HEHDT,{(90.0 - np.degrees(angle)) % 360.0:.1f},T",
+        )):  # fmt: skip
+            check = int(np.bitwise_xor.reduce(np.frombuffer(body.encode(), dtype=np.uint8)))
+            said.append(("/nmea", log_ns + k * 1_000_000, craft.make.text(f"${body}*{check:02X}")))
+    return said
+
+
+def _minutes(degrees: float, digits: int) -> str:
+    return f"{int(degrees):0{digits}d}{60.0 * (degrees % 1.0):07.4f}"
+
+
+_RTK: dict[str, Any] = {"sigma_m": 0.01, "claims": 0.014, "status": 2}
+CASES: dict[str, Odd] = {
+    "nothing odd": Odd(),
+    "NMEA strings alone, ROS 1": Odd(craft="robot", kind="ros1", change=_nmea, draft=(r"nmea: \[GPGGA\]", r"nmea: \[HEHDT\]")),
+    "gravity removed": Odd(craft="boat", accel=lambda a: a - [0.0, 0.0, 9.82], draft=("gravity: removed",)),
+    "g and deg/s, sqlite": Odd(
+        kind="sqlite3", accel=lambda a: a / 9.80665, gyro=np.degrees, draft=("accel_unit: g", "gyro_unit: deg/s")
+    ),
+    "IMU's z down, accelerations negated": Odd(
+        imu_rpy_deg=(180.0, 0.0, 0.0), accel=np.negative, draft=("gravity: inverted",)
+    ),
+    "IMU turned by 90 deg": Odd(imu_rpy_deg=(0.0, 0.0, 90.0), draft=(r"0.0, 0.0, 90.0\]",)),
+    "covariances NaN": Odd(change=_no_covariance),
+    "IMU stamps zero": Odd(change=_restamped("/imu/data", lambda k, ns: 0), draft=("stamps: recorded",)),
+    "IMU stamps from boot": Odd(
+        change=_restamped("/imu/data", lambda k, ns: ns - START_NS + 5 * 10**9), draft=("time_offset_s",)
+    ),
+    "IMU in bursts of ten": Odd(
+        change=_restamped("/imu/data", lambda k, ns: stamp(0.09 + k // 10 / 10.0 + 5e-5 * (k % 10))), **_RTK
+    ),
+    "IMU clock 800 ppm fast": Odd(seconds=300.0, imu_hz=50.0, gnss_hz=2.0, ppm=800.0, draft=("clock_drift_ppm: [78]",), **_RTK),
+    "second receiver, faster and worse": Odd(
+        change=_second_receiver, draft=(r"(?s)/gnss/fix\n    mount.*/cheap/fix\n    enabled: false",)
+    ),
+    "fixes 0.5 s late, car": Odd(late_s=0.5, draft=("time_offset_s: -0.[45]",), **_RTK),
+    "fixes 0.5 s late, boat": Odd(craft="boat", late_s=0.5),
+    "ferry sideways by up to 40 deg, compass": Odd(craft="ferry", crab_rad=0.7, compass=True, draft=("convention: enu",)),
+    "RTK jump of 0.5 m": Odd(change=_jump(0.5), **_RTK),
+    "RTK jump of 10 m": Odd(change=_jump(10.0), **_RTK),
+    "RTK jump of 100 m": Odd(change=_jump(100.0), **_RTK),
+    "positions in UTM alone": Odd(change=_utm, draft=("grid: ''",), edit=("grid: ''", "grid: EPSG:32632")),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """What came of a bag: whether its draft is right, errors against the truth, or why there is no track."""
+
+    name: str
+    drafted: bool = False
+    offline: TruthMetrics | None = None
+    online: TruthMetrics | None = None
+    trouble: str = ""
+    crashed: bool = False
+
+    def line(self) -> str:
+        cells = [f"{self.name:42}", "right" if self.drafted else "WRONG"]
+        for m in (self.offline, self.online):
+            cells.append("-" if m is None else f"{m.position_rmse_m:6.2f} m {100.0 * (m.coverage_95 or 0.0):4.0f} %")
+        return "  ".join([*cells, self.trouble])
+
+
+def measured(name: str) -> Found:
+    found = Found(name=name)
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return _walked(found, CASES[name], Path(folder))
+        except GraphlocError as error:
+            return replace(found, trouble=str(error)[:200])
+        except Exception:  # noqa: BLE001 - what no user may see
+            return replace(found, trouble=traceback.format_exc(), crashed=True)
+
+
+def _walked(found: Found, odd: Odd, folder: Path) -> Found:
+    bag, craft = written(odd, folder)
+    draft = draft_config(inspect_bag(bag))
+    found = replace(found, drafted=odd.drafted_well(draft))
+    (folder / "vessel.yaml").write_text(draft.replace(*odd.edit) if any(odd.edit) else draft)
+    config = app.configured(folder / "vessel.yaml")
+    recording = read_recording(bag, config)
+    run = app.smooth_recording(recording, config)
+    datum = app.choose_datum(run.recording, config)
+
+    def judged(solution: Solution) -> TruthMetrics:
+        t = np.arange(0.5, odd.seconds - 0.5, 0.05)
+        p, R, v = craft.motion.pose(t)
+        p = datum.enu_from_geodetic(*DATUM.geodetic_from_enu(p).T)
+        stamps_ns = np.array([stamp(at) for at in t])
+        truth = Trajectory(stamps_ns=stamps_ns, p_world_m=p, R_world_body=R, v_world_mps=v)
+        return compare_to_truth(solution.trajectory, truth)
+
+    found = replace(found, offline=judged(run.solution))
+    return replace(found, online=judged(replay(recording, config).solution))
+
+
+def figures(pool: ProcessPoolExecutor) -> list[Row]:
+    found = list(pool.map(measured, CASES))
+    print("\n".join(f.line() for f in found))
+    label = f"{len(found)} odd bags"
+    rows = [
+        row(
+            "A.odd", f"{label}: drafts with the right settings", sum(f.drafted for f in found), "bags", len(found), ">="
+        ),
+        row("A.odd", f"{label}: tracebacks", sum(f.crashed for f in found), "bags", 0, "<="),
+        row("A.odd", f"{label}: no track, offline or online", sum(f.online is None for f in found), "bags", 0, "<="),
+    ]
+    for way in ("offline", "online"):
+        tracks = {f.name: m for f in found if (m := getattr(f, way)) is not None}
+        narrow = sum((m.coverage_95 or 0.0) < _HONEST for m in tracks.values())
+        rows.append(row("A.odd", f"{label}, {way}: inside the 95 % bounds less than 85 % of the time", narrow, "bags", 0, "<="))  # fmt: skip
+        rows += [row("A.odd", f"{name}, {way}: position RMSE", m.position_rmse_m, "m") for name, m in tracks.items()]
+    return rows
+
+
+def main() -> None:
+    for name in (n for n in CASES if not sys.argv[1:] or any(word in n for word in sys.argv[1:])):
+        print(measured(name).line(), flush=True)
+
+
+if __name__ == "__main__":
+    main()
