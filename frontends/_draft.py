@@ -9,7 +9,7 @@ from pathlib import Path
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SlowErrorConfig
 from graphloc.frontends._clock import EPOCH_LIMIT_S, Clock, behind_s, reference_of
-from graphloc.frontends._fixes import NOTHING_M, SCATTERS
+from graphloc.frontends._fixes import NOTHING_M, RTK_SIGMA_M, SCATTERS
 from graphloc.frontends._reports import (
     BODY_AXES,
     EAST_AXES,
@@ -301,7 +301,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     if wanders:
         lines.append(f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m")
     if not gnss.slow_error:
-        lines.append(f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {gnss.why}")
+        lines.append(_rtk_slow_error(gnss))
     else:
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3) if wanders else None
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
@@ -326,6 +326,17 @@ def _scatter_lines(gnss: GnssReport) -> list[str]:
         return [f"  sigma_scale: {times:.1f}  # {scatter}, and claim {claimed:.2f} m"]
     vertical = f"  default_vertical_sigma_m: {times * default.default_vertical_sigma_m:.1f}  # guess: as many times"
     return [f"  default_horizontal_sigma_m: {gnss.white_m:.1f}  # {scatter}, and claim nothing", vertical]
+
+
+def _rtk_slow_error(gnss: GnssReport) -> str:
+    """That of RTK; where a part of the fixes is float, as large as those claim to be off: the error of a float is slow."""
+    floats_m = gnss.worst_sigma_m
+    if floats_m < RTK_SIGMA_M:
+        return f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {gnss.why}"
+    said = f"{gnss.why}, but more than 5 % claim {floats_m:.2g} m or worse (float?), and such an error is slow"
+    return (
+        f"  slow_error: {{horizontal_sigma_m: {floats_m:.2g}, vertical_sigma_m: {2.0 * floats_m:.2g}}}  # guess: {said}"
+    )
 
 
 def _rtk_lines(gnss: GnssReport) -> list[str]:

@@ -23,6 +23,8 @@ NOTHING_M = 100.0
 """1 sigma from which a fix is none."""
 SCATTERS = 2.0
 """Scatter over the claim from which the claim is not believed."""
+RTK_SIGMA_M = 0.1
+"""Horizontal, 1 sigma: fixed RTK claims less, float more."""
 
 
 def held(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:

@@ -272,6 +272,23 @@ def test_rtk_is_taken_before_a_receiver_that_says_more(lasts_s: float, used: str
     assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == [used]
 
 
+@pytest.mark.parametrize(("floats", "sigma_m"), [(0.03, 0.03), (0.3, 0.5)])
+def test_the_slow_error_of_rtk_that_is_float_at_times_is_that_of_a_float(
+    floats: float, sigma_m: float, tmp_path: Path
+) -> None:
+    """3 cm for such a receiver: floats that were 0.4 m off were in the bounds for 70 % of the time."""
+    make = Messages(2)
+    items: list[Item] = []
+    for n, (topic, at, m) in enumerate(drive(make, sigma_m=0.01, status=2)):
+        if topic == "/fix" and (n * 0.618) % 1.0 < floats:
+            m = make.fix(at, m.latitude, m.longitude, m.altitude, 2, (0.25 * np.eye(3)).ravel())
+        items.append((topic, at, m))
+    _, config, _ = look(tmp_path, items, make)
+    (gnss,) = config.of_kind("gnss").values()
+    assert isinstance(gnss, GnssConfig)
+    assert gnss.slow_error.horizontal_sigma_m == pytest.approx(sigma_m)
+
+
 @pytest.mark.parametrize(("claims_m", "used"), [(1.2, "/fix"), (0.4, "/second")])
 def test_a_receiver_that_claims_more_accuracy_is_taken_before_one_that_says_more(
     claims_m: float, used: str, tmp_path: Path
