@@ -107,7 +107,7 @@ class _Seen:
                 gtsam.Rot3.ExpmapDerivative(-self.moved[3:])
             )  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
         tags = np.array(m.points_m).reshape(-1, 4, 3)
-        self.within = tags - tags.mean(axis=1, keepdims=True)  # each corner from its tag's middle
+        self.within = tags - 0.25 * tags.sum(axis=1, keepdims=True)  # each corner from its tag's middle
         for k, constant in enumerate(self.constants):
             if constant is not None:
                 tags[k] += constant[1][:3] + self.within[k] @ skew(constant[1][3:]).T
@@ -149,10 +149,15 @@ def _turned(R: Array) -> Array:
     return turn
 
 
-def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode) -> Residual:
+def _off_mode(m: TagSighting, seen: _Seen, mode: TagMode) -> tuple[Array, Array]:
+    """Return the error (6,) of a mode, m and rad, and the tags' middle (3,) from the camera by that mode, in world's axes."""
     toward = seen.R @ _middle_in_camera(m, mode)
-    rotation = np.asarray(gtsam.Rot3.Logmap(gtsam.Rot3(seen.R @ (seen.turn @ mode.R_world_camera).T)))
-    raw = np.concatenate([seen.p + toward - seen.middle_m, rotation])
+    rotation = gtsam.Rot3.Logmap(gtsam.Rot3(seen.R @ (seen.turn @ mode.R_world_camera).T))
+    return np.concatenate([seen.p + toward - seen.middle_m, rotation]), toward
+
+
+def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode) -> Residual:
+    raw, toward = _off_mode(m, seen, mode)
 
     def jacobian() -> Array:
         turned = np.eye(6)
@@ -181,7 +186,7 @@ def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode)
         else None,  # edges are no matter where modes are chosen
         prior=mode.probability * (1.0 - config.false_fraction),
         size_m=float(np.hypot(raw[0], raw[1])),
-        size_deg=float(np.degrees(np.linalg.norm(rotation))),
+        size_deg=float(np.degrees(np.linalg.norm(raw[3:]))),
         expected_nis=m.rays.size,
     )
 
@@ -195,10 +200,10 @@ def residuals(m: TagSighting, config: AprilTagConfig, at: Attachment) -> tuple[R
 def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factors of a sighting: of its corners, or of the chosen mode where the estimate is far from it."""
     seen = _Seen(m, config, at)
-    by_mode = _by_mode(m, config, seen, m.modes[decision.mode])
+    mode = m.modes[decision.mode]
     toward = (seen.points_m - seen.p) @ seen.R
-    if not _near(m, decision.mode, by_mode, toward):
-        return linear_factor(by_mode, at, decision)
+    if not _near(m, decision.mode, _off_mode(m, seen, mode)[0], toward):
+        return linear_factor(_by_mode(m, config, seen, mode), at, decision)
     flat, projected = pinhole(toward)
     by_point = projected @ seen.R.T  # d flat / d place of the corner
     turning = _turning(by_point, seen.points_m - seen.p)
@@ -216,27 +221,26 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
         flat = flat + seen.edge_px * outwards
         by_own.append(outwards.reshape(-1, 1))
     by_slow = np.hstack(by_own) if by_own else np.zeros((m.rays.size, 0))
-    raw, by_body = (flat - m.rays).ravel(), camera @ seen.body
+    raw, by_body = (flat - m.rays).ravel(), pose_term(at, camera @ seen.body)
+    at_rest = by_point @ seen.turn  # d flat / d place of the corner, its dock at rest
+    by_tag = np.concatenate([at_rest, _turning(at_rest, seen.within.reshape(-1, 3))], axis=2).reshape(-1, 6)
     dock = config.surveyed.dock(m.frame) if seen.rides else None
     tie = None if dock is None else _tie(seen, dock, config, at)
     found: list[Any] = [] if tie is None else list(tie.factors)
+    points = gtsam.Values()
     for k, constant in enumerate(seen.constants):  # GTSAM's linear factors have at most three keys: one for each tag
         own = slice(8 * k, 8 * k + 8)
         corners = Residual(
             raw=raw[own], cov=m.cov[own, own], jacobian=lambda: np.zeros((8, 6)), prior=1.0, size_m=None, size_deg=None
         )
-        terms = [pose_term(at, by_body[own])]
+        terms = [by_body._replace(jacobian=by_body.jacobian[own])]
         if tie is not None:
             terms.append(Term(at.leaf_keys[0], seen.slow, by_slow[own]))
         elif seen.own and at.slow_key is not None:
             terms.append(Term(at.slow_key, np.array(at.slow_value), seen.placed(by_slow[own])))
         if constant is not None:
-            at_rest = by_point[4 * k : 4 * k + 4] @ seen.turn
-            turned = _turning(at_rest, seen.within[k])
-            terms.append(
-                Term(constant[0], np.array(constant[1]), np.concatenate([at_rest, turned], axis=2).reshape(8, 6))
-            )
-        found += linear_update(corners, terms, decision).factors
+            terms.append(Term(constant[0], np.array(constant[1]), by_tag[own]))
+        found += linear_update(corners, terms, decision, points).factors
     return GraphUpdate(factors=tuple(found), guesses=() if tie is None else tie.guesses)
 
 
@@ -284,25 +288,30 @@ def _tie(seen: _Seen, dock: DockConfig, config: AprilTagConfig, at: Attachment) 
 def _outwards(rays: Array) -> Array:
     """Return how corners (n, 2) move per unit by which the edges of their tags move outwards."""
     tags = rays.reshape(-1, 4, 2)
-    along = np.roll(tags, -1, axis=1) - tags
-    along /= np.maximum(np.linalg.norm(along, axis=2, keepdims=True), 1e-12)
+    along = tags[:, [1, 2, 3, 0]] - tags
+    along /= np.maximum(np.hypot(along[..., :1], along[..., 1:]), 1e-12)
     normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)  # clockwise in an image whose y looks down: outwards
-    before = np.roll(normal, 1, axis=1)
+    before = normal[:, [3, 0, 1, 2]]
     opened = 1.0 + (before * normal).sum(axis=-1, keepdims=True)  # -1 where an edge turns back on the one before
     return np.asarray(((before + normal) / np.maximum(opened, 0.1)).reshape(-1, 2))
 
 
-def _near(m: TagSighting, chosen: int, residual: Residual, toward: Array) -> bool:
-    """Return whether the corners, linearised at the estimate, lead to the chosen mode."""
+def _near(m: TagSighting, chosen: int, off: Array, toward: Array) -> bool:
+    """Return whether the corners, linearised at the estimate, lead to the chosen mode.
+
+    Args:
+        off: (6,) error of that mode. toward: (n, 3) corners in the camera.
+    """
     mode = m.modes[chosen]
     reach = _middle_in_camera(m, mode)[2]
-    if toward[:, 2].min() < _AHEAD * reach or np.linalg.norm(residual.raw[:3]) > (1.0 - _AHEAD) * reach:
+    turned = float(np.linalg.norm(off[3:]))
+    if toward[:, 2].min() < _AHEAD * reach or np.linalg.norm(off[:3]) > (1.0 - _AHEAD) * reach:
         return False
-    if float(np.linalg.norm(residual.raw[3:])) < _BY_A_MODE_RAD:
+    if turned < _BY_A_MODE_RAD:
         return True
     away = [Rotation.from_matrix(other.R_world_camera @ mode.R_world_camera.T).magnitude() for other in m.modes]
     nearest = min((float(a) for k, a in enumerate(away) if k != chosen), default=np.pi)
-    return float(np.linalg.norm(residual.raw[3:])) < 0.5 * nearest
+    return turned < 0.5 * nearest
 
 
 def false(m: TagSighting, config: AprilTagConfig) -> FalseModel:

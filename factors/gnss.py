@@ -13,6 +13,7 @@ anew at every pass. Not handled: correlation between axes of d; of tau what u ch
 
 from __future__ import annotations
 
+import math
 from weakref import WeakKeyDictionary
 
 import gtsam
@@ -35,9 +36,8 @@ def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
     return with_floors(m.cov_enu_m2 * config.sigma_scale**2, np.array([horizontal, horizontal, vertical]))
 
 
-def _covariance(m: GnssPosition, config: GnssConfig, at: Attachment) -> Array:
-    """Covariance (3, 3) of a fix about a slow error that is held between its nodes, m^2."""
-    white = white_covariance(m, config)
+def _covariance(white: Array, at: Attachment) -> Array:
+    """Covariance (3, 3) of a fix about a slow error that is held between its nodes, m^2; `white`: of its white part."""
     return white if at.slow_walk is None else white + np.diag(at.slow_walk)
 
 
@@ -70,8 +70,8 @@ def _predicted_m(at: Attachment) -> Array:
 def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual predicted - measured (3,) in m, world axes."""
     raw = _predicted_m(at) - _fix_world_m(m, at)
-    size = float(np.hypot(raw[0], raw[1]))
-    white, cov = white_covariance(m, config), _covariance(m, config, at)
+    white = white_covariance(m, config)
+    cov = _covariance(white, at)
     return (
         Residual(
             raw=raw,
@@ -79,7 +79,7 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
             jacobian=lambda: _antenna_jacobian(at),
             slow_jacobian=lambda: -np.eye(3),
             prior=1.0,
-            size_m=size,
+            size_m=math.hypot(raw[0], raw[1]),
             size_deg=None,
             expected_nis=float((np.diagonal(white) / np.diagonal(cov))[: 3 if m.has_height else 2].sum()),
         ),
@@ -93,7 +93,7 @@ def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decis
         return linear_factor(residuals(m, config, at)[0], at, decision, *delay)
     z = _fix_world_m(m, at)
     lever = np.asarray(at.T_state_sensor.translation())
-    model = noise_model(_covariance(m, config, at), decision)
+    model = noise_model(_covariance(white_covariance(m, config), at), decision)
     if at.slow_key is None:
         return GraphUpdate(factors=(gtsam.GPSFactorArm(at.pose_key, z, lever, model),))
     antenna_key, lever_key = at.leaf_keys

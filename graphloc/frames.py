@@ -88,7 +88,7 @@ class Datum:
 
 def skew(v: Array) -> Array:
     """Return the matrix (3, 3) that takes b to the cross product v x b."""
-    x, y, z = (float(c) for c in v)
+    x, y, z = np.asarray(v, dtype=float).tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.linalg.lapack import dposv
+from scipy.linalg.lapack import dposv, dpotrf, dtrtri
 
 from graphloc.frames import Array
 
@@ -22,6 +22,18 @@ def square(raw: Array, cov: Array) -> float:
         return float(raw[0]) ** 2 / float(cov[0, 0])
     _, solved, failed = dposv(cov, raw)
     return float(raw @ (np.linalg.solve(cov, raw) if failed else solved))
+
+
+def whitening(cov: Array) -> Array:
+    """Return the lower triangular W (k, k) with W'W = cov^-1, which makes residuals of covariance (k, k) white.
+
+    Raises:
+        numpy.linalg.LinAlgError: the covariance is not positive definite.
+    """
+    root, failed = dpotrf(cov, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("covariance not positive definite")
+    return np.asarray(dtrtri(root, lower=1)[0])
 
 
 def log_density(raw: Array, cov: Array) -> float:

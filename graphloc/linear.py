@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import gtsam
 import numpy as np
 
+from graphloc import gauss
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual
 
@@ -61,7 +62,9 @@ def linear_factor(residual: Residual, at: Attachment, decision: Decision, *more:
     return linear_update(residual, [*terms, *more], decision)
 
 
-def linear_update(residual: Residual, terms: Sequence[Term], decision: Decision) -> GraphUpdate:
+def linear_update(
+    residual: Residual, terms: Sequence[Term], decision: Decision, points: gtsam.Values | None = None
+) -> GraphUpdate:
     """Return the factor of a residual that is linearised in any states.
 
     A linear factor cannot carry a robust kernel, so the information is scaled by the weight that the kernel gives the residual.
@@ -70,20 +73,22 @@ def linear_update(residual: Residual, terms: Sequence[Term], decision: Decision)
         residual: raw (k,) and its covariance, at the estimate.
         terms: the states; of the pose, `pose_term`.
         decision: of this pass.
+        points: shared by factors with the same terms, and filled by them: GTSAM takes longer to store a pose than to make a factor.
     """
     weight = decision.weight
     if decision.kernel is not None:
         weight *= max(decision.kernel.weight(residual.nis()), 1e-6)
-    # Most residuals here are of one row (headings, heights), and at every pass: two calls into LAPACK for a root show.
+    # Most residuals here are of one row (headings, heights), and at every pass.
     cov, single = residual.cov, len(residual.cov) == 1
-    whiten = np.sqrt(weight) * (1.0 / np.sqrt(cov) if single else np.linalg.inv(np.linalg.cholesky(cov)))
-    point, raw = gtsam.Values(), residual.raw
+    whiten = np.sqrt(weight) * (1.0 / np.sqrt(cov) if single else gauss.whitening(cov))
+    points, raw = gtsam.Values() if points is None else points, residual.raw
     arguments: list[Any] = []
     for term in terms:
-        point.insert(term.key, term.point)
+        if not points.exists(term.key):
+            points.insert(term.key, term.point)
         arguments += [term.key, whiten * term.jacobian if single else whiten @ term.jacobian]
         if term.offset is not None:
             raw = raw - term.jacobian @ term.offset
     make: Any = gtsam.JacobianFactor  # the stubs know one overload per number of states
     linear = make(*arguments, -whiten @ raw, _unit(len(raw)))
-    return GraphUpdate(factors=(gtsam.LinearContainerFactor(linear, point),))
+    return GraphUpdate(factors=(gtsam.LinearContainerFactor(linear, points),))

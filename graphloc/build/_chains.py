@@ -80,6 +80,7 @@ def slow_end(slow: SlowProcess, key: int, *, jumps: bool = True) -> Iterator[Any
     yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps)
 
 
+@lru_cache(maxsize=256)  # many measurements are equally far apart
 def walk_between_nodes(slow: SlowProcess, period_s: float, apart_s: float) -> Array:
     """Return the variance (k,) to add to each measurement, because its slow error walks on between two nodes.
 
@@ -91,13 +92,10 @@ def walk_between_nodes(slow: SlowProcess, period_s: float, apart_s: float) -> Ar
         period_s: of the nodes. apart_s: h.
     """
     n = max(period_s / max(apart_s, 1e-3), 1.0)
-    return np.asarray(_walk_rate(slow) * (period_s / n * (n - 1.0) * (2.0 * n - 1.0) / 6.0))
-
-
-@lru_cache(maxsize=64)
-def _walk_rate(slow: SlowProcess) -> Array:
-    """Return the variance (k,) that a process gains per second: q."""
-    return np.where(np.isfinite(slow.time_constant_s), 2.0 * slow.sigma**2 / slow.time_constant_s, 0.0)
+    rate = np.where(np.isfinite(slow.time_constant_s), 2.0 * slow.sigma**2 / slow.time_constant_s, 0.0)
+    walk = rate * (period_s / n * (n - 1.0) * (2.0 * n - 1.0) / 6.0)
+    walk.setflags(write=False)
+    return walk
 
 
 def closing_variance(slow: SlowProcess, value: Array) -> Array:
