@@ -60,6 +60,28 @@ def test_gnss_alone_owns_up_to_its_slow_error() -> None:
     assert not any("slow error" in w for w in told.stats.warnings)
 
 
+def test_of_a_parked_vessel_no_heading_is_known() -> None:
+    """Fixes good to 2 cm and an IMU at rest: about the heading that was assumed, the solver is sure to 25 deg."""
+    run, rng = simulate(replace(BASE, duration_s=20.0), 0), np.random.default_rng(0)
+    imu, sensors = run.recording.imu, run.config.sensors
+    assert imu is not None
+    shape = (len(imu.stamps_ns), 3)
+    rest = replace(imu, accel_mps2=rng.normal([0.0, 0.0, 9.8], 0.02, shape), gyro_radps=rng.normal(0.0, 1e-3, shape))
+    first = next(m for m in run.recording.measurements if isinstance(m, GnssPosition)).position
+    fixes = tuple(
+        replace(
+            m, position=Geodetic(*(np.array(first) + rng.normal(0.0, [2e-7, 3e-7, 0.02]))), cov_enu_m2=4e-4 * np.eye(3)
+        )
+        for m in run.recording.measurements
+        if isinstance(m, GnssPosition)
+    )
+    config = with_sensors(run, compass=None, imu=sensors["imu"].model_copy(update={"mount": MountConfig()}))
+    solved = app.smooth_recording(replace(only(run.recording, fixes), imu=rest), config).solution
+    assert solved.trajectory.cov is not None
+    assert np.degrees(np.sqrt(solved.trajectory.cov[:, 5, 5])) == pytest.approx(103.9, abs=0.1)
+    assert any("no sensor tells it, nor does motion" in w for w in solved.stats.warnings)
+
+
 def test_the_sea_is_round() -> None:
     """A datum 10 km off: the waterline lies 7.8 m below its tangent plane."""
     run = simulate(BASE, 1)

@@ -53,7 +53,7 @@ class BatchResult:
     converged: bool
     noise_scale: float
     prior: StartPrior
-    headings: int  # number of candidates that explain the start about equally well
+    headings: int  # number of candidates that explain the start about equally well; 0: nothing tells the heading there
     levels_cov: Array  # (3, 3) of the position, m^2, by other levels that may be the usual ones (see `_levels`)
     notes: tuple[str, ...]
 
@@ -102,7 +102,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         converged=settled.converged,
         noise_scale=problem.noise_scale,
         prior=prior,
-        headings=headings,
+        headings=headings if start.yaw_sigma_rad < np.pi else 0,
         levels_cov=levels_cov,
         notes=start.notes,
     )

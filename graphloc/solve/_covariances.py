@@ -10,6 +10,9 @@ import numpy as np
 
 from graphloc.frames import Array, skew
 
+ANY_HEADING_RAD = float(np.pi / np.sqrt(3.0))
+"""1 sigma of a heading of which nothing is known."""
+
 
 def world_covariance(cov_body: Any, R: Array, lever_m: Array) -> Array:
     """Turn a body-tangent covariance (rotation first) into x, y, z, rotation, all about the world's axes.
@@ -27,6 +30,16 @@ def to_world(R: Array, lever_m: Array) -> Array:
     turn[:3, :3] = -R @ skew(lever_m)
     turn[:3, 3:], turn[3:, :3] = R, R
     return turn
+
+
+def limit_heading(cov: Array) -> None:
+    """Scale the heading in covariances (..., 6, 6), in axes of world, to at most that of one that may be any.
+
+    Linearised, what is hardly known is stated as many turns.
+    """
+    share = np.minimum(1.0, ANY_HEADING_RAD / np.sqrt(cov[..., 5, 5]))[..., None]
+    cov[..., 5, :] *= share
+    cov[..., :, 5] *= share
 
 
 def unmodelled_covariance(streams: Sequence[Any]) -> Array:

@@ -17,7 +17,13 @@ from graphloc.frames import Array
 from graphloc.recording import Recording
 from graphloc.solution import SlowEstimate, Solution
 from graphloc.solve._batch import BatchResult
-from graphloc.solve._covariances import to_world, unmodelled_covariance, world_covariance
+from graphloc.solve._covariances import (
+    ANY_HEADING_RAD,
+    limit_heading,
+    to_world,
+    unmodelled_covariance,
+    world_covariance,
+)
 from graphloc.solve._health import health_over_time, misfits, since_agreed
 from graphloc.solve._ledger import ledger_of
 from graphloc.solve._unmodelled import unmodelled
@@ -25,6 +31,7 @@ from graphloc.solve._warnings import stats_of
 from graphloc.trajectory import Trajectory
 
 _NEAR_BERTH_M = 60.0
+_SHOWN_RAD = np.radians(15.0)  # 1 sigma, somewhere in the run, from which the motion tells the heading
 
 
 def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
@@ -50,7 +57,8 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     assert trajectory.cov is not None
     trajectory.cov[:, :3, :3] += unmodelled_covariance(problem.streams) + result.levels_cov
     v_cov = np.array([tree.marginalCovariance(keys.velocity(k)) for k in range(n)])
-    unsaid = _add_unmodelled(result, trajectory.cov, v_cov)
+    unsaid = [*_add_unmodelled(result, trajectory.cov, v_cov), *_add_guess(result, trajectory.cov)]
+    limit_heading(trajectory.cov)
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = stats_of(problem, result)
     stats = replace(stats, warnings=(*stats.warnings, *unsaid))
@@ -93,6 +101,20 @@ def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
         cov[:, 3:, 3:] += more.rotation
         v_cov += more.velocity
     return []
+
+
+def _add_guess(result: BatchResult, cov: Array) -> list[str]:
+    """Where several headings explain the run, state none as known, and return a warning; nothing where the motion shows it.
+
+    About each of them the linearised run is as sure as its biases and waves allow: 25 deg for a craft that is parked.
+    """
+    if result.headings == 1 or float(cov[:, 5, 5].min()) < _SHOWN_RAD**2:
+        return []
+    cov[:, 5, 5] += ANY_HEADING_RAD**2
+    why = (
+        f"{result.headings} candidates explain the motion" if result.headings else "no sensor tells it, nor does motion"
+    )
+    return [f"the heading is a guess: {why}; turn, add a heading sensor or set start.heading_deg"]
 
 
 def _berth_tracks(problem: Problem, result: BatchResult, trajectory: Trajectory) -> Iterator[BerthTrack]:
