@@ -80,6 +80,27 @@ def test_online_too() -> None:
     assert 0.3 < velocity < 1.3
 
 
+def with_compass() -> tuple[SimulatedRun, VesselConfig]:
+    """A run of 30 s, of IMU, one receiver and a compass whose mount may be off by a degree."""
+    scenario = Scenario(
+        path="loops", duration_s=30.0, noise="clean", pose_hz=0.0, compass_hz=5.0, imu_hz=50.0, gnss_hz=2.0, gnss_sigma_m=0.05
+    )  # fmt: skip
+    run = simulate(scenario, 1)
+    sensors = {name: run.config.sensors[name] for name in ("imu", "gnss", "compass")}
+    return run, run.config.model_copy(update={"sensors": sensors})
+
+
+def test_a_compass_with_an_offset_does_not_hold_the_heading_online() -> None:
+    """At the end of a run both modes have used the same. A compass without offset would say 0.03 deg, not two."""
+    run, config = with_compass()
+    whole, live = (
+        made(run.recording, config).solution.trajectory.cov for made in (app.smooth_recording, app.replay_recording)
+    )
+    assert whole is not None
+    assert live is not None
+    assert np.sqrt(live[-1, 5, 5] / whole[-1, 5, 5]) == pytest.approx(1.0, abs=0.3)
+
+
 def test_a_receiver_whose_fixes_are_all_rejected_adds_nothing() -> None:
     """Then the heading comes from the matches alone; an empty table was indexed."""
     scenario = Scenario(path="loops", duration_s=20.0, noise="clean", pose_hz=1.0, imu_hz=50.0, gnss_hz=2.0)

@@ -247,11 +247,16 @@ class States:
                 P[6:, 6:] += np.diag(np.where(far_axes(stream.slow), jump_m**2, 0.0))
         return prediction_of(residual, at, P, newest.velocity_cov)
 
-    def covariance(self) -> Array:
-        """Return the joint covariance (15, 15) of the newest pose, velocity and bias, rotation and position in axes of world."""
+    def covariance(self, slow_of: Sequence[LiveStream]) -> Array:
+        """Return the joint covariance (15 + k, 15 + k) of the newest pose, velocity, bias, and slow errors of some streams.
+
+        Rotation and position in axes of world.
+        """
         k, window = self._newest.number, self._window
-        turn = in_world(self._newest.pose)
-        joint = window.covariance([keys.pose(k), keys.velocity(k), keys.bias(self._problem.timeline.slow_of[k])])
+        j = self._problem.timeline.slow_of[k]
+        slow = [keys.slow(stream.number, j) for stream in slow_of]
+        joint = window.covariance([keys.pose(k), keys.velocity(k), keys.bias(j), *slow])
+        turn = block_diag(in_world(self._newest.pose), np.eye(len(joint) - 15))
         return np.asarray(turn @ joint @ turn.T)
 
     def joint(self, attached: Sequence[Attachment], residuals: Sequence[Residual]) -> Array:
