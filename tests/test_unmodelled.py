@@ -9,13 +9,17 @@ import pytest
 from graphloc import app
 from graphloc.config import GnssConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.measurements import GnssPosition, Measurement
+from graphloc.online import OnlineSmoother
+from graphloc.online._unmodelled import UnmodelledError
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.solve import _solution
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._unmodelled import Unmodelled, unmodelled
+from tests.faults import arrivals_of, feed, finish
 
 CORRELATED_S = 200.0  # of the default configuration
 
@@ -99,6 +103,20 @@ def test_a_compass_with_an_offset_does_not_hold_the_heading_online() -> None:
     assert whole is not None
     assert live is not None
     assert np.sqrt(live[-1, 5, 5] / whole[-1, 5, 5]) == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_bound_that_cannot_be_computed_costs_no_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The window would be rebuilt, fail again, and restart without end."""
+    run, config = with_compass()
+
+    def fail(*_: object) -> None:
+        raise np.linalg.LinAlgError("singular matrix")
+
+    monkeypatch.setattr(UnmodelledError, "advance", fail)
+    smoother = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL)
+    fed = finish(smoother, feed(smoother, run, arrivals_of(run)))
+    assert not [event for event in fed.events if "restart" in event or "rebuilt" in event]
+    assert fed.worst_m() < 1.0
 
 
 def test_a_receiver_whose_fixes_are_all_rejected_adds_nothing() -> None:
