@@ -10,8 +10,8 @@ with F, Q from one state to the next, J the information of all measurements sinc
 The state has the slow errors of the other sensors with it: a compass whose mount offset is unknown holds a heading for a while,
 but does not tell it. P is computed here, not taken from the window: that is linearised anew now and then, and judges older
 measurements again, which its covariances of two states do not tell from what was measured between them. Offline:
-`graphloc.solve._unmodelled`. Not handled: what comes late counts as measured at the newest state; the motion model, without which
-the errors grow more than they should where nothing but the IMU tells a velocity.
+`graphloc.solve._unmodelled`. Not handled: what comes late counts as measured at the newest state; the motion model
+(of 100 s without fixes it would take a few percent off).
 """
 
 from __future__ import annotations
