@@ -9,6 +9,7 @@ import pytest
 
 from graphloc.app import configured
 from graphloc.config import ImuConfig, VesselConfig
+from graphloc.frontends._clock import drift_ppm
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
@@ -135,6 +136,15 @@ def test_a_clock_that_drifts_is_drafted_and_set_right(topic: str, share: float, 
     assert bool(lines) == bool(said)
     told = said if topic == "/fix" else ""  # else that the others' clocks do
     assert all(told in line and "set its clock_drift_ppm to" in line for line in lines)
+
+
+@pytest.mark.parametrize("silent_s", [0, 500, 2000])
+def test_a_silence_does_not_change_what_a_clock_gains(silent_s: int) -> None:
+    """A silence of 500 of 3000 s made it 109 ppm; one of 2000 s hid it."""
+    logs_ns = START_NS + np.arange(0, 3000 * S, S // 5)
+    logs_ns = logs_ns[np.abs(logs_ns - START_NS - 1650 * S) >= silent_s // 2 * S]
+    stamps_ns = logs_ns + (logs_ns - START_NS) // 10_000
+    assert drift_ppm(stamps_ns, logs_ns) == pytest.approx(100.0, rel=0.01)
 
 
 def test_a_clock_that_is_set_during_the_run_does_not_drift(tmp_path: Path) -> None:
