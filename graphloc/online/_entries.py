@@ -9,7 +9,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from graphloc.build import attach
 from graphloc.frames import Array
@@ -112,8 +111,8 @@ class Entries:
             entry = self._entries.get((stream.number, index))
             if entry is not None and entry.held is not None:
                 found, R = entry.verdict.residual, entry.verdict.at.T_world_body.rotation().matrix()
-                J = np.zeros((len(found.raw), width))
-                J[:, :6] = found.jacobian() @ block_diag(R.T, R.T)
+                J, by_pose = np.zeros((len(found.raw), width)), found.jacobian()
+                J[:, :3], J[:, 3:6] = by_pose[:, :3] @ R.T, by_pose[:, 3:] @ R.T
                 if found.velocity_jacobian is not None:
                     J[:, 6:9] = found.velocity_jacobian()
                 if width > 9 and found.slow_jacobian is not None:

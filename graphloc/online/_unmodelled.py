@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from graphloc import keys
 from graphloc.frames import Array
@@ -116,7 +115,8 @@ class UnmodelledError:
         P = sound(left @ predicted)
         # The errors move on first, and the state then follows them.
         decay, walk = _decay(self.left_out.values(), dt_s)
-        on = block_diag(left @ F, decay)
+        on = np.zeros_like(self.cov)
+        on[:n, :n], on[n:, n:] = left @ F, decay
         cov = on @ self.cov @ on.T
         cov[n:, n:] += walk
         follow = np.eye(len(cov))
