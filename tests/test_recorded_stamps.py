@@ -155,6 +155,16 @@ def test_a_clock_that_is_set_during_the_run_does_not_drift(tmp_path: Path) -> No
     assert "synchronise the clocks" in line
 
 
+def test_a_clock_that_is_set_is_not_said_to_drift_because_that_of_the_imu_does(tmp_path: Path) -> None:
+    """A drift that was that of the IMU with its sign turned was proposed."""
+    change = {"/fix": lambda ns: ns + S // 2 * (ns > START_NS + 30 * S), "/imu": lambda ns: ns + (ns - START_NS) // 50}
+    _, config, _ = look(tmp_path, restamped(change), MAKE)
+    plain = {n: sensor.model_copy(update={"clock_drift_ppm": 0.0}) for n, sensor in config.sensors.items()}
+    warnings = read(tmp_path, config.model_copy(update={"sensors": plain})).warnings
+    (line,) = [w for w in warnings if w.startswith("gnss: its clock") and "during the run" in w]
+    assert "synchronise the clocks" in line
+
+
 @pytest.mark.parametrize("apart_ns", [0, 20_000])
 def test_imu_samples_that_are_stamped_in_bursts_are_laid_out_evenly(apart_ns: int, tmp_path: Path) -> None:
     """Five samples at 50 Hz are read, and stamped, when the last of them is there; a second of them is lost."""
