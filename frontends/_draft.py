@@ -206,7 +206,9 @@ def _with_clock(block: list[str], inspection: Inspection) -> list[str]:
         said = f"guess: its headers hold no stamps; they are late by as long as a message takes{unknown}"
         block = [*block, f"  stamps: recorded  # {said}"]
     if topic in topics and (ppm := topics[topic].drift_ppm):
-        said = f"it gains {1e-6 * ppm * (topics[topic].span_s or 0.0):+.2f} s on the steadiest clock, by the recording times"
+        gained_s = 1e-6 * ppm * (topics[topic].span_s or 0.0)
+        said = f"it {'gains' if ppm > 0.0 else 'loses'} {abs(gained_s):.2f} s on the steadiest clock, by the recording times"
+        said += "" if ppm > 0.0 else "; 0 if its messages only took ever longer to come"
         block = [*block, f"  clock_drift_ppm: {ppm:.1f}  # guess: {said}"]
     if imu is None or kind not in _SET or topic not in clocks:
         return block

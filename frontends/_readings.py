@@ -166,12 +166,17 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
         gain_s = _clock.gain_s(r.stamps(), r.logs()) - _clock.gain_s(reach.stamps(), reach.logs())
         if abs(gain_s) <= _clock.GAIN_LIMIT_S:
             continue
-        ppm = _clock.drift_ppm(r.stamps(), r.logs()) - _clock.drift_ppm(reach.stamps(), reach.logs())
-        steady = f"set its clock_drift_ppm to {r.config.clock_drift_ppm + ppm:.1f}"
+        both = [(_clock.gain_s(s.stamps(), s.logs()), _clock.drift_ppm(s.stamps(), s.logs())) for s in (r, reach)]
+        even = all(ppm or abs(own_s) <= _clock.GAIN_LIMIT_S for own_s, ppm in both)
+        steady = f"set its clock_drift_ppm to {r.config.clock_drift_ppm + both[0][1] - both[1][1]:.1f}"
         lines.append(
             f"{r.sensor}: its clock {'gains' if gain_s > 0 else 'loses'} {abs(gain_s):.2f} s on that of {reference} during the "
             "run, by the recording times: no time_offset_s holds throughout, and no bound includes it; "
-            + (steady if ppm else "synchronise the clocks, or smooth short parts (--start, --duration)")
+            + (
+                steady
+                if even and both[0][1] != both[1][1]
+                else "synchronise the clocks, or smooth short parts (--start, --duration)"
+            )
         )
     return lines
 

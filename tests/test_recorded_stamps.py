@@ -9,6 +9,7 @@ import pytest
 
 from graphloc.app import configured
 from graphloc.config import ImuConfig, VesselConfig
+from graphloc.frontends._clock import drift_ppm
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
@@ -137,11 +138,30 @@ def test_a_clock_that_drifts_is_drafted_and_set_right(topic: str, share: float, 
     assert all(told in line and "set its clock_drift_ppm to" in line for line in lines)
 
 
+@pytest.mark.parametrize("silent_s", [0, 500, 2000])
+def test_a_silence_does_not_change_what_a_clock_gains(silent_s: int) -> None:
+    """A silence of 500 of 3000 s made it 109 ppm; one of 2000 s hid it."""
+    logs_ns = START_NS + np.arange(0, 3000 * S, S // 5)
+    logs_ns = logs_ns[np.abs(logs_ns - START_NS - 1650 * S) >= silent_s // 2 * S]
+    stamps_ns = logs_ns + (logs_ns - START_NS) // 10_000
+    assert drift_ppm(stamps_ns, logs_ns) == pytest.approx(100.0, rel=0.01)
+
+
 def test_a_clock_that_is_set_during_the_run_does_not_drift(tmp_path: Path) -> None:
     """A step is no drift: nothing is drafted, and the warning stays."""
     _, config, _ = look(tmp_path, restamped({"/fix": lambda ns: ns + S // 2 * (ns > START_NS + 30 * S)}), MAKE)
     assert config.sensors["gnss"].clock_drift_ppm == 0.0
     (line,) = [w for w in read(tmp_path, config).warnings if "during the run, by the recording times" in w]
+    assert "synchronise the clocks" in line
+
+
+def test_a_clock_that_is_set_is_not_said_to_drift_because_that_of_the_imu_does(tmp_path: Path) -> None:
+    """A drift that was that of the IMU with its sign turned was proposed."""
+    change = {"/fix": lambda ns: ns + S // 2 * (ns > START_NS + 30 * S), "/imu": lambda ns: ns + (ns - START_NS) // 50}
+    _, config, _ = look(tmp_path, restamped(change), MAKE)
+    plain = {n: sensor.model_copy(update={"clock_drift_ppm": 0.0}) for n, sensor in config.sensors.items()}
+    warnings = read(tmp_path, config.model_copy(update={"sensors": plain})).warnings
+    (line,) = [w for w in warnings if w.startswith("gnss: its clock") and "during the run" in w]
     assert "synchronise the clocks" in line
 
 

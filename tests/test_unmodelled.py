@@ -9,13 +9,17 @@ import pytest
 from graphloc import app
 from graphloc.config import GnssConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.measurements import GnssPosition, Measurement
+from graphloc.online import OnlineSmoother
+from graphloc.online._unmodelled import UnmodelledError
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.solve import _solution
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._unmodelled import Unmodelled, unmodelled
+from tests.faults import arrivals_of, feed, finish
 
 CORRELATED_S = 200.0  # of the default configuration
 
@@ -78,6 +82,41 @@ def test_online_too() -> None:
     heading, velocity = np.mean([h.mean() for h, _ in found]), np.mean([v.mean() for _, v in found])
     assert 0.3 < heading < 1.5
     assert 0.3 < velocity < 1.3
+
+
+def with_compass() -> tuple[SimulatedRun, VesselConfig]:
+    """A run of 30 s, of IMU, one receiver and a compass whose mount may be off by a degree."""
+    scenario = Scenario(
+        path="loops", duration_s=30.0, noise="clean", pose_hz=0.0, compass_hz=5.0, imu_hz=50.0, gnss_hz=2.0, gnss_sigma_m=0.05
+    )  # fmt: skip
+    run = simulate(scenario, 1)
+    sensors = {name: run.config.sensors[name] for name in ("imu", "gnss", "compass")}
+    return run, run.config.model_copy(update={"sensors": sensors})
+
+
+def test_a_compass_with_an_offset_does_not_hold_the_heading_online() -> None:
+    """At the end of a run both modes have used the same. A compass without offset would say 0.03 deg, not two."""
+    run, config = with_compass()
+    whole, live = (
+        made(run.recording, config).solution.trajectory.cov for made in (app.smooth_recording, app.replay_recording)
+    )
+    assert whole is not None
+    assert live is not None
+    assert np.sqrt(live[-1, 5, 5] / whole[-1, 5, 5]) == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_bound_that_cannot_be_computed_costs_no_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The window would be rebuilt, fail again, and restart without end."""
+    run, config = with_compass()
+
+    def fail(*_: object) -> None:
+        raise np.linalg.LinAlgError("singular matrix")
+
+    monkeypatch.setattr(UnmodelledError, "advance", fail)
+    smoother = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL)
+    fed = finish(smoother, feed(smoother, run, arrivals_of(run)))
+    assert not [event for event in fed.events if "restart" in event or "rebuilt" in event]
+    assert fed.worst_m() < 1.0
 
 
 def test_a_receiver_whose_fixes_are_all_rejected_adds_nothing() -> None:

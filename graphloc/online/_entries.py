@@ -9,7 +9,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from graphloc.build import attach
 from graphloc.frames import Array
@@ -103,17 +102,21 @@ class Entries:
     def information(self, stream: LiveStream, since: int) -> Array:
         """Return what the measurements of a stream from an index on tell of their states, as judged.
 
-        (9, 9), on rotation, position and velocity, in axes of world.
+        (9, 9), on rotation, position and velocity, in axes of world; with its slow error, if that is estimated: (9 + k, 9 + k). Of a receiver
+        whose slow error is left out but for its jumps, these are taken for known.
         """
-        total = np.zeros((9, 9))
+        width = 9 if stream.slow is None or stream.left_out is not None else 9 + len(stream.slow.sigma)
+        total = np.zeros((width, width))
         for index in range(max(since, stream.measurements.first), len(stream.measurements)):
             entry = self._entries.get((stream.number, index))
             if entry is not None and entry.held is not None:
                 found, R = entry.verdict.residual, entry.verdict.at.T_world_body.rotation().matrix()
-                by_velocity = (
-                    np.zeros((len(found.raw), 3)) if found.velocity_jacobian is None else found.velocity_jacobian()
-                )
-                J = np.hstack([found.jacobian() @ block_diag(R.T, R.T), by_velocity])
+                J, by_pose = np.zeros((len(found.raw), width)), found.jacobian()
+                J[:, :3], J[:, 3:6] = by_pose[:, :3] @ R.T, by_pose[:, 3:] @ R.T
+                if found.velocity_jacobian is not None:
+                    J[:, 6:9] = found.velocity_jacobian()
+                if width > 9 and found.slow_jacobian is not None:
+                    J[:, 9:] = found.slow_jacobian()
                 total += entry.verdict.weight * J.T @ np.linalg.solve(found.cov, J)
         return total
 

@@ -26,7 +26,7 @@ from graphloc.online._entries import Entries
 from graphloc.online._judge import Judge
 from graphloc.online._live import LiveProblem
 from graphloc.online._states import Newest, States
-from graphloc.online._unmodelled import UnmodelledError
+from graphloc.online._unmodelled import UnmodelledError, estimated_beside
 from graphloc.online._window import Window
 from graphloc.position_jumps import why_in_doubt
 
@@ -133,8 +133,8 @@ class Lag:
         unmodelled.advance(self.newest, self.problem.links, told)
 
     def covariance(self) -> Array:
-        """Return the joint covariance (15, 15) of the newest pose, velocity and bias, rotation and position in axes of world."""
-        return self._states.covariance()
+        """Return the joint covariance (15 + k, 15 + k) of the newest state, as `UnmodelledError.P`."""
+        return self._states.covariance([stream for stream, _ in estimated_beside(self.problem.streams)])
 
     def anchor(self) -> Anchor:
         """Return the anchor at the newest state, to rebuild or resume from."""

@@ -365,13 +365,13 @@ class OnlineSmoother:
         persistent = PersistentState.resumed(found, self._configured_noise(), self._setup.measuring)
         try:
             tracking = Tracking(self._setup, persistent, self._ledger, found.anchor, [found.imu, newest])
+            lag = tracking.lag
+            persistent.unmodelled = UnmodelledError.resumed(
+                lag.problem.streams, lag.newest, lag.covariance(), found.unmodelled
+            )
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             self._say(f"the snapshot cannot be used ({in_one_line(error)}): starts without it")
             return
-        lag = tracking.lag
-        persistent.unmodelled = UnmodelledError.resumed(
-            lag.problem.streams, lag.newest, lag.covariance(), found.unmodelled
-        )
         self._tracking, self._persistent = tracking, persistent
         waiting = [m for m in self._waiting.taken() if m is not newest]
         tracking.resume(found.anchor, found.imu, newest)

@@ -10,7 +10,6 @@ from typing import Any
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from graphloc import keys
 from graphloc.build import bias_step, closing_variance, far_axes, nav_state, slow_begin, slow_end, slow_step
@@ -48,8 +47,9 @@ class Newest:
 
 def in_world(pose: Any) -> Array:
     """Return the rotation (15, 15) of pose, velocity and bias from the tangent at a pose (body axes) to the axes of world."""
-    R = pose.rotation().matrix()
-    return np.asarray(block_diag(R, R, np.eye(9)))
+    turn = np.eye(15)
+    turn[:3, :3] = turn[3:6, 3:6] = pose.rotation().matrix()
+    return turn
 
 
 def propagated_covariance(cov: Array, newest: Newest, R: Array, dt_s: float, noise: Array) -> Array:
@@ -247,11 +247,17 @@ class States:
                 P[6:, 6:] += np.diag(np.where(far_axes(stream.slow), jump_m**2, 0.0))
         return prediction_of(residual, at, P, newest.velocity_cov)
 
-    def covariance(self) -> Array:
-        """Return the joint covariance (15, 15) of the newest pose, velocity and bias, rotation and position in axes of world."""
+    def covariance(self, slow_of: Sequence[LiveStream]) -> Array:
+        """Return the joint covariance (15 + k, 15 + k) of the newest pose, velocity, bias, and slow errors of some streams.
+
+        Rotation and position in axes of world.
+        """
         k, window = self._newest.number, self._window
-        turn = in_world(self._newest.pose)
-        joint = window.covariance([keys.pose(k), keys.velocity(k), keys.bias(self._problem.timeline.slow_of[k])])
+        j = self._problem.timeline.slow_of[k]
+        slow = [keys.slow(stream.number, j) for stream in slow_of]
+        joint = window.covariance([keys.pose(k), keys.velocity(k), keys.bias(j), *slow])
+        turn = np.eye(len(joint))
+        turn[:15, :15] = in_world(self._newest.pose)
         return np.asarray(turn @ joint @ turn.T)
 
     def joint(self, attached: Sequence[Attachment], residuals: Sequence[Residual]) -> Array:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from bisect import insort
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -27,9 +28,11 @@ from graphloc.online._propagate import advance_odometry, propagate, unpropagated
 from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
+from graphloc.online._unmodelled import UnmodelledError
 from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 
+log = logging.getLogger(__name__)
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _PENDING = 10_000
 
@@ -149,9 +152,24 @@ class Tracking:
             advance_odometry(self._odometry, lag.problem, lag.newest, reached_ns)
             lag.commit()
             lag.try_others()
-            if self._persistent.unmodelled is not None:
-                lag.follow(self._persistent.unmodelled)
+            self._follow_unmodelled()
         self._ledger.enter(lag.gone())
+
+    def _follow_unmodelled(self) -> None:
+        """Bring what left-out slow errors do to the newest state up to date; where that fails, they do what they did before.
+
+        It is only about bounds: a window that is right must not be given up for it.
+        """
+        lag, unmodelled = self.lag, self._persistent.unmodelled
+        if unmodelled is None:
+            return
+        try:
+            lag.follow(unmodelled)
+        except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
+            log.warning("online: what slow errors do to heading and velocity is not up to date: %s", in_one_line(error))
+            self._persistent.unmodelled = UnmodelledError.resumed(
+                lag.problem.streams, lag.newest, lag.covariance(), unmodelled.cov
+            )
 
     def _read_imu(self) -> None:
         """Hand the samples that have arrived to the window; where they came late, integrate anew."""

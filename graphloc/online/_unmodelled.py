@@ -7,19 +7,20 @@ with F, Q from one state to the next, J the information of all measurements sinc
 
     P+ = ((F P F' + Q)^-1 + J)^-1,    e+ = (1 - P+ J) F e + P+ J_p d
 
-P is computed here, not taken from the window: that is linearised anew now and then, and judges older measurements again, which
-its covariances of two states do not tell from what was measured between them. Offline: `graphloc.solve._unmodelled`. Not
-handled: what comes late counts as measured at the newest state.
+The state has the slow errors of the other sensors with it: a compass whose mount offset is unknown holds a heading for a while,
+but does not tell it. P is computed here, not taken from the window: that is linearised anew now and then, and judges older
+measurements again, which its covariances of two states do not tell from what was measured between them. Offline:
+`graphloc.solve._unmodelled`. Not handled: what comes late counts as measured at the newest state; the motion model
+(after 100 s without fixes the errors are up to 15 % larger for it).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from graphloc import keys
 from graphloc.frames import Array
@@ -30,6 +31,7 @@ from graphloc.online._states import Newest, in_world
 from graphloc.solve._unmodelled import Unmodelled
 
 _ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
+_CORE = 15  # rotation, position, velocity, bias
 
 
 @dataclass(slots=True, eq=False)
@@ -37,12 +39,14 @@ class UnmodelledError:
     """What the left-out errors of some receivers do to the newest state.
 
     Attributes:
-        slow: their processes, by receiver.
-        cov: (15 + 3 m, 15 + 3 m) of e (rotation, position, velocity in axes of world; bias) and of the m errors (east, north, up).
-        newest: the state that it is of. P: (15, 15), covariance of that state without the errors, axes as of e.
+        left_out: their processes, by receiver. estimated: those of the slow errors that the window estimates, by sensor.
+        cov: (n + 3 m, n + 3 m) of e (rotation, position, velocity in axes of world; bias; slow errors that are estimated) and of the m
+            errors (east, north, up).
+        newest: the state that it is of. P: (n, n), covariance of that state without the errors, axes as of e.
     """
 
-    slow: Mapping[str, SlowProcess]
+    left_out: Mapping[str, SlowProcess]
+    estimated: Mapping[str, SlowProcess]
     cov: Array
     newest: Newest
     P: Array
@@ -57,18 +61,21 @@ class UnmodelledError:
             newest, P: the first state of the window. attitude: what the errors have done to attitude and velocity before it;
                 None: nothing.
         """
-        slow = _left_out(streams)
-        if not slow:
+        left_out = {name: stream.left_out for name, stream in streams.items() if stream.left_out is not None}
+        if not left_out:
             return None
-        size = 3 * len(slow)
-        of_errors = np.vstack(
-            [np.zeros((3, size)), np.hstack([np.eye(3)] * len(slow)), np.zeros((9, size)), np.eye(size)]
-        )
-        cov = of_errors @ np.diag(np.concatenate([s.sigma**2 for s in slow.values()])) @ of_errors.T
+        estimated = {stream.name: slow for stream, slow in estimated_beside(streams)}
+        n, m = len(P), len(left_out)
+        of_errors = np.vstack([np.zeros((n, 3 * m)), np.eye(3 * m)])
+        of_errors[_POSITION] = np.hstack([np.eye(3)] * m)
+        cov = of_errors @ np.diag(np.concatenate([s.sigma**2 for s in left_out.values()])) @ of_errors.T
         if attitude is not None:
-            cov[_ROTATION, _ROTATION] += attitude.rotation
+            # Beside a heading that is off, the offset of a compass that agrees with it is off too.
+            turned = np.vstack([np.eye(3), np.linalg.solve(P[_ROTATION, _ROTATION], P[_ROTATION, _CORE:]).T])
+            rows = np.r_[_ROTATION, _CORE:n]
+            cov[np.ix_(rows, rows)] += turned @ attitude.rotation @ turned.T
             cov[_VELOCITY, _VELOCITY] += attitude.velocity
-        return cls(slow, cov, newest, P)
+        return cls(left_out, estimated, cov, newest, P)
 
     @classmethod
     def resumed(
@@ -76,7 +83,7 @@ class UnmodelledError:
     ) -> UnmodelledError | None:
         """Return that of a snapshot, where it is of the same receivers; else that of a start."""
         begun = cls.of_start(streams, newest, P, None)
-        if begun is not None and cov is not None and cov.shape == begun.cov.shape:
+        if begun is not None and cov is not None and cov.shape == begun.cov.shape and np.isfinite(cov).all():
             begun.cov = cov
         return begun
 
@@ -84,27 +91,40 @@ class UnmodelledError:
         """Follow the window to its newest state; nothing where that is not newer than the last (a window that was rebuilt).
 
         Args:
-            told: by sensor, information (9, 9) of what it measured since the last state: on rotation, position, velocity of the
-                state, in axes of world.
+            told: by sensor, information of what it measured since the last state: (9, 9) on rotation, position, velocity of the state,
+                in axes of world; where its slow error is estimated, (9 + k, 9 + k) with that.
+
+        Raises:
+            ArithmeticError: the result is not finite. numpy.linalg.LinAlgError, RuntimeError: there is none. Nothing has changed then.
         """
         if newest.stamp_ns <= self.newest.stamp_ns:
             return
-        dt_s = (newest.stamp_ns - self.newest.stamp_ns) * 1e-9
-        F, Q = _step(self.newest, newest, links)
-        predicted, J = sound(F @ self.P @ F.T + Q), np.zeros((15, 15))
-        J[:9, :9] = sum(told.values(), np.zeros((9, 9)))
-        left = np.linalg.inv(np.eye(15) + predicted @ J)  # 1 - P+ J
-        self.newest, self.P = newest, sound(left @ predicted)
-        followed = np.hstack([self.P[:, :9] @ told[name][:, _POSITION] for name in self.slow])
-        decay = np.exp(-dt_s / np.concatenate([s.time_constant_s for s in self.slow.values()]))
-        sigma = np.concatenate([s.sigma for s in self.slow.values()])
+        dt_s, n = (newest.stamp_ns - self.newest.stamp_ns) * 1e-9, len(self.P)
+        F, Q = np.eye(n), np.zeros((n, n))
+        F[:_CORE, :_CORE], Q[:_CORE, :_CORE] = _step(self.newest, newest, links)
+        F[_CORE:, _CORE:], Q[_CORE:, _CORE:] = _decay(self.estimated.values(), dt_s)
+        predicted, J = sound(F @ self.P @ F.T + Q), np.zeros((n, n))
+        first = dict(
+            zip(self.estimated, _CORE + np.cumsum([0, *(len(s.sigma) for s in self.estimated.values())]), strict=False)
+        )
+        for name, information in told.items():
+            begin = first.get(name, _CORE)
+            rows = np.r_[0:9, begin : begin + len(information) - 9]
+            J[np.ix_(rows, rows)] += information
+        left = np.linalg.inv(np.eye(n) + predicted @ J)  # 1 - P+ J
+        P = sound(left @ predicted)
         # The errors move on first, and the state then follows them.
-        on = block_diag(left @ F, np.diag(decay))
+        decay, walk = _decay(self.left_out.values(), dt_s)
+        on = np.zeros_like(self.cov)
+        on[:n, :n], on[n:, n:] = left @ F, decay
         cov = on @ self.cov @ on.T
-        cov[15:, 15:] += np.diag(sigma**2 * (1.0 - decay**2))
+        cov[n:, n:] += walk
         follow = np.eye(len(cov))
-        follow[:15, 15:] = followed
-        self.cov = follow @ cov @ follow.T
+        follow[:n, n:] = np.hstack([P[:, :9] @ told[name][:9, _POSITION] for name in self.left_out])
+        cov = follow @ cov @ follow.T
+        if not (np.isfinite(P).all() and np.isfinite(cov).all()):
+            raise ArithmeticError("what slow errors do to the newest state is not finite")
+        self.newest, self.P, self.cov = newest, P, 0.5 * (cov + cov.T)
 
     @property
     def rotation(self) -> Array:
@@ -122,8 +142,17 @@ class UnmodelledError:
         return self.cov[_VELOCITY, _VELOCITY]
 
 
-def _left_out(streams: Mapping[str, LiveStream]) -> dict[str, SlowProcess]:
-    return {name: stream.left_out for name, stream in streams.items() if stream.left_out is not None}
+def estimated_beside(streams: Mapping[str, LiveStream]) -> list[tuple[LiveStream, SlowProcess]]:
+    """Return the streams whose slow errors are estimated and not left out, and these."""
+    return [(s, s.slow) for s in streams.values() if s.slow is not None and s.left_out is None]
+
+
+def _decay(processes: Iterable[SlowProcess], dt_s: float) -> tuple[Array, Array]:
+    """Return what is left of slow errors after a time, and the covariance that comes to them."""
+    both = list(processes)
+    sigma = np.concatenate([np.zeros(0), *(s.sigma for s in both)])
+    kept = np.exp(-dt_s / np.concatenate([np.zeros(0), *(s.time_constant_s for s in both)]))
+    return np.diag(kept), np.diag(sigma**2 * (1.0 - kept**2))
 
 
 def _step(before: Newest, newest: Newest, links: InertialLink) -> tuple[Array, Array]:
