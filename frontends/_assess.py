@@ -267,7 +267,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         frozen="".join(frozen_fixes_warning(fixes.topic, stamps, bad)),
         slow_error=not precise,
         why=why,
-        worst_sigma_m=worst_m,
+        sigma_p95_m=worst_m,
         tf_frame=tf_frame,
     )
 

@@ -333,11 +333,11 @@ def _scatter_lines(gnss: GnssReport) -> list[str]:
 def _rtk_slow_error(gnss: GnssReport) -> str:
     """That of RTK; where a part of the fixes is float, as large as those claim to be off: the error of a float is slow."""
     floats_m = min(
-        gnss.worst_sigma_m, SlowErrorConfig().horizontal_sigma_m
+        gnss.sigma_p95_m, SlowErrorConfig().horizontal_sigma_m
     )  # a single fix claims more for its white noise
     if floats_m < RTK_SIGMA_M:
         return f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {gnss.why}"
-    said = f"{gnss.why}, but 5 % claim {gnss.worst_sigma_m:.2g} m or worse (float?), and such an error is slow"
+    said = f"{gnss.why}, but 5 % claim {gnss.sigma_p95_m:.2g} m or worse (float?), and such an error is slow"
     return (
         f"  slow_error: {{horizontal_sigma_m: {floats_m:.2g}, vertical_sigma_m: {2.0 * floats_m:.2g}}}  # guess: {said}"
     )

@@ -108,7 +108,7 @@ class GnssReport:
 
     Attributes:
         statuses: fixes by status name; known_covariance: share of fixes that report one.
-        reported_sigma_m: median sigma east, north, up; worst_sigma_m: horizontal, that only 5 % exceed; scatter_m: the white part seen in the data, the same.
+        reported_sigma_m: median sigma east, north, up; sigma_p95_m: horizontal sigma that 5 % of the fixes exceed; scatter_m: the white part seen in the data, the same.
         white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
         spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
             1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
@@ -128,7 +128,7 @@ class GnssReport:
     first: Vec
     slow_error: bool
     why: str
-    worst_sigma_m: float = 0.0
+    sigma_p95_m: float = 0.0
     tf_frame: str | None = None
     white_m: float | None = None
     frozen: str = ""

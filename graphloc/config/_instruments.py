@@ -127,11 +127,11 @@ class GnssConfig(SensorConfig):
     slow_error: SlowErrorConfig = SlowErrorConfig()
     """The modelled slow error."""
     stamp_sigma_s: NonNegative = 0.0
-    """Unknown delay of its stamps beyond `time_offset_s`, 1 sigma, s; it is estimated, to first order: of half a second only
-    roughly. Many drivers stamp a fix when it arrives, 0.05 to 0.5 s after it was measured; `inspect` drafts it. 0: stamps are right."""
+    """Unknown delay of its stamps beyond `time_offset_s`, 1 sigma, s; it is estimated with the run, one of half a
+    second only in part. Many drivers stamp a fix when it arrives, 0.05 to 0.5 s after it was measured; `inspect` drafts it. 0: stamps are right."""
     grid: Annotated[str, Field(pattern=r"^(EPSG:\d{4,6})?$")] = ""
     """Map grid of `nav_msgs/Odometry`, `geometry_msgs/PoseStamped` or `PoseWithCovarianceStamped`, e.g. `EPSG:32632` for UTM zone 32 north
-    (32732: south), x east and y north; z is taken for the height above the ellipsoid. Other messages have none."""
+    (32732: south), x east and y north; z is taken for the height above the ellipsoid. Leave it empty for other messages."""
     nmea: Places = ("GGA",)
     """NMEA sentences to read, from one talker (`GPGGA`) or any (`GGA`): GGA, GNS, RMC, GLL."""
 

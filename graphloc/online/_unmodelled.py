@@ -111,12 +111,12 @@ class UnmodelledError:
             begin = first.get(name, _CORE)
             rows = np.r_[0:9, begin : begin + len(information) - 9]
             J[np.ix_(rows, rows)] += information
-        left = np.linalg.inv(np.eye(n) + predicted @ J)  # 1 - P+ J
-        P = sound(left @ predicted)
+        kept = np.linalg.inv(np.eye(n) + predicted @ J)  # 1 - P+ J
+        P = sound(kept @ predicted)
         # The errors move on first, and the state then follows them.
         decay, walk = _decay(self.left_out.values(), dt_s)
         on = np.zeros_like(self.cov)
-        on[:n, :n], on[n:, n:] = left @ F, decay
+        on[:n, :n], on[n:, n:] = kept @ F, decay
         cov = on @ self.cov @ on.T
         cov[n:, n:] += walk
         follow = np.eye(len(cov))
@@ -130,11 +130,6 @@ class UnmodelledError:
     def rotation(self) -> Array:
         """Covariance (3, 3) that comes on top of the rotation's, rad^2, in axes of world."""
         return self.cov[_ROTATION, _ROTATION]
-
-    @property
-    def position(self) -> Array:
-        """Likewise of the position (3, 3), m^2."""
-        return self.cov[_POSITION, _POSITION]
 
     @property
     def velocity(self) -> Array:
@@ -151,8 +146,8 @@ def _decay(processes: Iterable[SlowProcess], dt_s: float) -> tuple[Array, Array]
     """Return what is left of slow errors after a time, and the covariance that comes to them."""
     both = list(processes)
     sigma = np.concatenate([np.zeros(0), *(s.sigma for s in both)])
-    kept = np.exp(-dt_s / np.concatenate([np.zeros(0), *(s.time_constant_s for s in both)]))
-    return np.diag(kept), np.diag(sigma**2 * (1.0 - kept**2))
+    decay = np.exp(-dt_s / np.concatenate([np.zeros(0), *(s.time_constant_s for s in both)]))
+    return np.diag(decay), np.diag(sigma**2 * (1.0 - decay**2))
 
 
 def _step(before: Newest, newest: Newest, links: InertialLink) -> tuple[Array, Array]:
