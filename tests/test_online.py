@@ -294,11 +294,11 @@ def test_starts_from_fix_and_compass() -> None:
 
 @pytest.fixture
 def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A start that waits is tried four times in half a minute, not thirteen times: each solves all that there is."""
-    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.6)
+    """A start that waits is tried every five seconds, not thirteen times in half a minute: each solves all that there is."""
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 5.1)
+    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
 
 
-@pytest.mark.usefixtures("few_tries")
 def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
     run = slowly(
         simulate(

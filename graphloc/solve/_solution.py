@@ -104,17 +104,16 @@ def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
 
 
 def _add_guess(result: BatchResult, cov: Array) -> list[str]:
-    """Where several headings explain the run, state none as known, and return a warning; nothing where the motion shows it.
+    """Where no heading is measured and the vessel stays in place, state it as unknown, and return a warning; nothing where waves show it.
 
-    About each of them the linearised run is as sure as its biases and waves allow: 25 deg for a craft that is parked.
+    About the heading that is assumed then, the linearised run is as sure as its biases allow: to 25 deg.
     """
-    if result.headings == 1 or float(cov[:, 5, 5].min()) < _SHOWN_RAD**2:
+    if result.headings or float(cov[:, 5, 5].min()) < _SHOWN_RAD**2:
         return []
     cov[:, 5, 5] += ANY_HEADING_RAD**2
-    why = (
-        f"{result.headings} candidates explain the motion" if result.headings else "no sensor tells it, nor does motion"
-    )
-    return [f"the heading is a guess: {why}; turn, add a heading sensor or set start.heading_deg"]
+    return [
+        "the heading is a guess: no sensor tells it, nor does motion; move, add a heading sensor or set start.heading_deg"
+    ]
 
 
 def _berth_tracks(problem: Problem, result: BatchResult, trajectory: Trajectory) -> Iterator[BerthTrack]:
