@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from _rows import ROOT
+from _vessels import gauss_markov
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -111,7 +112,7 @@ class Craft:
     ) -> Array:
         """Latitude, longitude, height (N, 3) of a receiver."""
         p, R, _ = self.motion.pose(t)
-        error = sigma_m * self.rng.normal(size=(len(t), 3)) + _wander(self.rng, t, slow_m)
+        error = sigma_m * self.rng.normal(size=(len(t), 3)) + gauss_markov(self.rng, t, slow_m, _SLOW_S, 3)
         return DATUM.geodetic_from_enu(p + R @ np.array(lever_m) + error * [1.0, 1.0, 2.0])
 
     def recorded(self, t: Array, latency_s: float = 0.01) -> list[int]:
@@ -205,13 +206,3 @@ def _motion(odd: Odd, rng: np.random.Generator) -> Motion:
     )
     ahead, sway = at(speed * np.cos(crab)), at(speed * np.sin(crab))
     return make_motion(odd.seconds, ahead, at(rate), rng.uniform(-3.0, 3.0), sway, waves, 0.0)
-
-
-def _wander(rng: np.random.Generator, t: Array, sigma_m: float) -> Array:
-    """A Gauss-Markov process (N, 3)."""
-    keep = np.exp(-float(t[1] - t[0]) / _SLOW_S)
-    out = np.zeros((len(t), 3))
-    out[0] = sigma_m * rng.normal(size=3)
-    for k in range(1, len(t)):
-        out[k] = keep * out[k - 1] + np.sqrt(1.0 - keep**2) * sigma_m * rng.normal(size=3)
-    return out

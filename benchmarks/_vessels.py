@@ -97,7 +97,7 @@ def _floats(values: Array) -> tuple[float, float, float]:
     return float(x), float(y), float(z)
 
 
-def _walk(rng: np.random.Generator, t: Array, sigma: float, tau_s: float, axes: int) -> Array:
+def gauss_markov(rng: np.random.Generator, t: Array, sigma: float, tau_s: float, axes: int) -> Array:
     """A first-order Gauss-Markov process (N, axes)."""
     x = np.zeros((len(t), axes))
     x[0] = rng.normal(0.0, sigma, axes)
@@ -157,7 +157,7 @@ def _gnss_error(yard: _Yard, t: Array, name: str) -> tuple[Array, float]:
     said: dict[str, Any] = {"kind": kind, "white": white}
     if "drift" in kind:
         said |= {"sigma": float(rng.uniform(0.4, 2.2)), "tau": float(rng.uniform(60.0, 400.0))}
-        error += _walk(rng, t, said["sigma"], said["tau"], 3) * [1.0, 1.0, 1.5]
+        error += gauss_markov(rng, t, said["sigma"], said["tau"], 3) * [1.0, 1.0, 1.5]
     if "jump" in kind:
         said["jumps"] = []
         for _ in range(rng.integers(1, 4)):
@@ -209,7 +209,7 @@ def _compass(yard: _Yard) -> None:
     heading = np.pi / 2.0 - yaw
     A, B, C = np.radians(rng.normal(0.0, [1.0, 1.2, 1.2]))
     yaw = yaw + A + B * np.sin(heading) + C * np.cos(heading)
-    yaw = yaw + _walk(rng, t, np.radians(0.4), 60.0, 1)[:, 0] + rng.normal(0.0, np.radians(sigma_deg), len(t))
+    yaw = yaw + gauss_markov(rng, t, np.radians(0.4), 60.0, 1)[:, 0] + rng.normal(0.0, np.radians(sigma_deg), len(t))
     keep = yard.heard(t, "compass", 0.2)
     yard.drawn |= {"compass_hz": rate_hz, "compass_sigma": sigma_deg, "deviation": list(np.degrees([A, B, C]))}
     yard.sensors["compass"] = CompassConfig(topic="/compass", sigma_deg=sigma_deg)

@@ -19,6 +19,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from graphloc import gauss
 from graphloc.config import AnyPoseConfig, PoseConfig
 from graphloc.factors._noise import robust, with_floors
 from graphloc.frames import Array, Datum
@@ -96,7 +97,7 @@ def factors(m: PoseFix, config: AnyPoseConfig, at: Attachment, decision: Decisio
     rows = _world_jacobian(Z.rotation().matrix(), at.T_state_sensor)
     root = np.diag([1.0 / _WIDE_M] * 3 + [1.0 / _WIDE_RAD] * 3)
     cov = _covariance(mode, m.axes, config) / decision.weight
-    root[np.ix_(picked, picked)] = np.linalg.inv(np.linalg.cholesky(cov))
+    root[np.ix_(picked, picked)] = gauss.whitening(cov)
     anchor = Z.compose(at.T_state_sensor.inverse())
     upper = np.linalg.qr(root @ rows)[1]
     upper *= np.sign(np.diagonal(upper))[:, None]  # GTSAM takes a diagonal one for sigmas, and these are positive

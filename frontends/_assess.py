@@ -30,7 +30,6 @@ _TURNS_DEG, _SAME_DEG = 5.0, 0.2
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
 _BLOCK_S = 30
 _SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
-_FEWEST_STAMPS = 100  # that tell of a clock
 _RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
 _STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
 _FOLLOWS_DEG, _FOLLOWS = 8.0, 3.0  # most RMS of what a heading and the gyroscope differ by; turns over that
@@ -111,10 +110,9 @@ def without_drift(streams: Sequence[Stream]) -> list[Stream]:
 
     Clocks that gain as much as that one are left as they are: then it is the recorder's that drifts.
     """
-    ppm = {s.topic: 0.0 if s.recorded or not len(s) else _clock.drift_ppm(s.stamps_ns, s.logs_ns) for s in streams}
-    clocks = [
-        ppm[s.topic] for s in streams if len(s) >= _FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED
-    ]
+    ppm = {s.topic: 0.0 if s.recorded else _clock.gain(s.stamps_ns, s.logs_ns).drift_ppm for s in streams}
+    told = [s for s in streams if len(s) >= _clock.FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED]
+    clocks = [ppm[s.topic] for s in told]
     steadiest = min(clocks, key=abs, default=0.0)
     found = []
     for stream in streams:
@@ -127,7 +125,7 @@ def without_drift(streams: Sequence[Stream]) -> list[Stream]:
 
 def evenly(imu: Stream) -> Stream:
     """Return an IMU's stream, samples that were stamped in bursts laid out evenly."""
-    return imu.stamped(_clock.evened(imu.stamps_ns, _clock.fresh(imu.rows[:, :6])))
+    return imu.stamped(_clock.evened(imu.stamps_ns, imu.rows[:, :6]))
 
 
 def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:

@@ -58,11 +58,11 @@ def world_of(
     """
     keep = sane(poses)
     keep = keep[np.isfinite(poses.rows[keep, :3]).all(axis=1)] if len(keep) else keep
-    away_km = float(np.linalg.norm(_middle_m(poses))) / 1e3
-    if away_km > _FAR_M / 1e3:
+    away_m = float(np.linalg.norm(_middle_m(poses)))
+    if away_m > _FAR_M:
         grid = in_map_grid(poses)
         kind = "a map grid (UTM)" if grid else "earth-centred axes, which are not read"
-        return World(None, f"it is {away_km:.0f} km from its origin: looks like {kind}", pose=False, grid=grid)
+        return World(None, f"it is {away_m / 1e3:.0f} km from its origin: looks like {kind}", pose=False, grid=grid)
     if first_fix is None or len(keep) < 10 or len(stamps_ns) < 10:
         return World(None, "no GNSS track to check its frame against")
     at, q = poses.stamps_ns[keep], poses.rows[keep, :3]

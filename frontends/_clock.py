@@ -26,15 +26,15 @@ NO_DATE_NS = 946_684_800 * NS_PER_S
 GAIN_LIMIT_S = 0.1
 """A clock that gains more on another during a run is said to drift."""
 
-_TENTHS, _FEWEST = 10, 10  # of a run; messages that tell how soon they are recorded
+FEWEST_STAMPS = 100
+"""Messages that tell what their clock gains."""
+
+_TENTHS = 10  # of a run
 _EVEN = 0.15  # of the gain, that a clock may be off an even one
 _SET_BACK_S = 0.5
 _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
-_AT_ONCE, _BURSTS, _AFTER_GAP = (
-    0.1,
-    0.3,
-    1.3,
-)  # usual steps, within a burst; share of samples in bursts; usual steps, at a gap
+_AT_ONCE, _AFTER_GAP = 0.1, 1.3  # usual steps: within a burst at most, at a gap at least
+_BURSTS = 0.3  # share of samples in bursts, from which they are laid out
 _HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing, as online
 _IN_ORDER = 0.8  # of those that follow, at the least: others come late
 
@@ -44,39 +44,43 @@ def usual_latency_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
     return float(np.median(logs_ns - stamps_ns)) / NS_PER_S
 
 
-def gain_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
-    """Return by how much a clock gains on the recording times from the first tenth of its messages to the last, s."""
-    _, ahead_s = _soonest(stamps_ns, logs_ns)
-    return float(ahead_s[-1] - ahead_s[0])
+class Gain(NamedTuple):
+    """What a clock gains on the recording times.
 
-
-def drift_ppm(stamps_ns: Stamps, logs_ns: Stamps) -> float:
-    """Return by how much a clock runs faster than that of the recording times, ppm; 0 where it gains unevenly, or nearly nothing.
-
-    A clock that is set, or messages that are delayed from some time on, gain in steps.
+    Attributes:
+        gained_s: from the first tenth of its messages to the last.
+        drift_ppm: by how much it runs faster; 0 where it gains unevenly, or nearly nothing. A clock that is set, or messages that are
+            delayed from some time on, gain in steps.
     """
-    t_s, ahead_s = _soonest(stamps_ns, logs_ns)
+
+    gained_s: float
+    drift_ppm: float
+
+    @property
+    def even(self) -> bool:
+        """Whether its drift tells all that it gains."""
+        return self.drift_ppm != 0.0 or abs(self.gained_s) <= GAIN_LIMIT_S
+
+
+def gain(stamps_ns: Stamps, logs_ns: Stamps) -> Gain:
+    """Return what a clock gains on the recording times, by messages of each tenth that were recorded soon: others were delayed.
+
+    The 95 % point, since a few stamps may be wrong; of messages and not of time, since a topic may be silent for long. Few messages
+    tell nothing.
+    """
+    if len(stamps_ns) < FEWEST_STAMPS:
+        return Gain(0.0, 0.0)
+    t_s, ahead_s = np.zeros(_TENTHS), np.zeros(_TENTHS)
+    for k, tenth in enumerate(np.array_split(np.arange(len(stamps_ns)), _TENTHS)):
+        ahead_ns = stamps_ns[tenth] - logs_ns[tenth]
+        soon = np.argsort(ahead_ns)[int(0.95 * (len(tenth) - 1))]
+        t_s[k], ahead_s[k] = (logs_ns[tenth[soon]] - logs_ns[0]) / NS_PER_S, ahead_ns[soon] / NS_PER_S
     gained_s = float(ahead_s[-1] - ahead_s[0])
     if abs(gained_s) <= GAIN_LIMIT_S:
-        return 0.0
+        return Gain(gained_s, 0.0)
     slope, at_start = np.polyfit(t_s, ahead_s, 1)
     uneven_s = float(np.abs(ahead_s - at_start - slope * t_s).max())
-    return 0.0 if uneven_s > _EVEN * abs(gained_s) else float(slope) * 1e6
-
-
-def _soonest(stamps_ns: Stamps, logs_ns: Stamps) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return when a soon recorded message of each tenth was recorded, s since the first, and by how much its stamp is ahead of that, s.
-
-    (10,) each, 0 of few messages. Other messages were delayed. The 95 % point, since a few stamps may be wrong; of messages and not
-    of time, since a topic may be silent for long.
-    """
-    found = np.zeros((2, _TENTHS))
-    if len(stamps_ns) >= _TENTHS * _FEWEST:
-        for k, tenth in enumerate(np.array_split(np.arange(len(stamps_ns)), _TENTHS)):
-            ahead_ns = stamps_ns[tenth] - logs_ns[tenth]
-            soon = np.argsort(ahead_ns)[int(0.95 * (len(tenth) - 1))]
-            found[:, k] = (logs_ns[tenth[soon]] - logs_ns[0]) / NS_PER_S, ahead_ns[soon] / NS_PER_S
-    return found[0], found[1]
+    return Gain(gained_s, 0.0 if uneven_s > _EVEN * abs(gained_s) else float(slope) * 1e6)
 
 
 def corrected_ns(stamp_ns: int, config: SensorConfig, elapsed_ns: int) -> int:
@@ -150,25 +154,20 @@ def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
     return keep
 
 
-def fresh(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (N,) which samples (N, k) differ from the one before, as no copies do."""
-    return np.concatenate([[True], (values[1:] != values[:-1]).any(axis=1)])[: len(values)]
-
-
-def evened(stamps_ns: Stamps, fresh: NDArray[np.bool_]) -> Stamps:
+def evened(stamps_ns: Stamps, values: NDArray[np.float64]) -> Stamps:
     """Return the stamps (N,) of IMU samples, those of bursts laid out evenly; as they are where few samples come in bursts.
 
     A driver that reads a buffer stamps all that is in it at once. Of a burst, the last sample is as old as its stamp; the others precede
-    it in equal steps since the burst before, after a gap in usual ones.
+    it in equal steps since the burst before, after a gap in usual ones. Copies of a sample are no burst.
 
     Args:
-        stamps_ns: (N,) in order of arrival. fresh: (N,) whether a sample differs from the one before.
+        stamps_ns: (N,) in order of arrival. values: (N, k).
     """
     if len(stamps_ns) <= 2 * _FOLLOW:
         return stamps_ns
     usual_ns = float(np.median(stamps_ns[_FOLLOW:] - stamps_ns[:-_FOLLOW])) / _FOLLOW
     steps_ns = np.diff(stamps_ns)
-    together = (steps_ns >= 0) & (steps_ns < _AT_ONCE * usual_ns) & fresh[1:]
+    together = (steps_ns >= 0) & (steps_ns < _AT_ONCE * usual_ns) & (values[1:] != values[:-1]).any(axis=1)
     if float(together.mean()) < _BURSTS:
         return stamps_ns
     burst = np.concatenate([[0], np.cumsum(~together)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, TopicReport
+from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, OdometryReport, TopicReport
 from graphloc.time import utc_text
 
 # How the draft names an odometry or pose topic, by its role.
@@ -26,15 +26,7 @@ def render(inspection: Inspection) -> str:
     for twist in inspection.velocities:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
-        off = ", switched off" if item.role == "truth" and item.origin is None else ""
-        drafted = (
-            "in a map grid"
-            if item.grid
-            else "left out"
-            if item.role == "other"
-            else f"drafted as {_DRAFTED[item.role]}{off}"
-        )
-        lines += ["", f"{item.topic}: {drafted}", f"  {item.why}; {item.world}"]
+        lines += ["", f"{item.topic}: {_fate(item)}", f"  {item.why}; {item.world}"]
     counts = {t.topic: t.count for t in inspection.topics}
     for what, kind, mounted, need in (
         ("scans", "aerial", inspection.lidars, "a map"),
@@ -47,6 +39,14 @@ def render(inspection: Inspection) -> str:
         lines += ["", f"frames in /tf_static: {', '.join(inspection.tf_frames)}"]
     lines += [f"warning: {w}" for w in inspection.warnings]
     return "\n".join(lines)
+
+
+def _fate(item: OdometryReport) -> str:
+    if item.grid:
+        return "in a map grid"
+    if item.role == "other":
+        return "left out"
+    return f"drafted as {_DRAFTED[item.role]}{', switched off' if item.role == 'truth' and item.origin is None else ''}"
 
 
 def _topic_table(topics: Sequence[TopicReport]) -> list[str]:

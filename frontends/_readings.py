@@ -20,6 +20,7 @@ from graphloc.config import (
     VelocityConfig,
     VesselConfig,
 )
+from graphloc.frames import Array
 from graphloc.frontends import _clock, _fixes, _sanity
 from graphloc.frontends._references import Reference
 from graphloc.frontends._rejections import Rejection, rejected
@@ -161,22 +162,19 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
                 f"{reference}, by the recording times; if that is right, add {behind:.3f} to its time_offset_s (how much longer its "
                 "messages take than those of the other is in it)"
             )
-    reach = next(r for r in sensors if r.sensor == reference)
+    gains = {r.sensor: _clock.gain(r.stamps(), r.logs()) for r in sensors}
+    usual = gains[reference]
     for r in sensors:
-        gain_s = _clock.gain_s(r.stamps(), r.logs()) - _clock.gain_s(reach.stamps(), reach.logs())
+        own = gains[r.sensor]
+        gain_s, drift_ppm = own.gained_s - usual.gained_s, own.drift_ppm - usual.drift_ppm
         if abs(gain_s) <= _clock.GAIN_LIMIT_S:
             continue
-        both = [(_clock.gain_s(s.stamps(), s.logs()), _clock.drift_ppm(s.stamps(), s.logs())) for s in (r, reach)]
-        even = all(ppm or abs(own_s) <= _clock.GAIN_LIMIT_S for own_s, ppm in both)
-        steady = f"set its clock_drift_ppm to {r.config.clock_drift_ppm + both[0][1] - both[1][1]:.1f}"
+        cure = "synchronise the clocks, or smooth short parts (--start, --duration)"
+        if own.even and usual.even and drift_ppm:
+            cure = f"set its clock_drift_ppm to {r.config.clock_drift_ppm + drift_ppm:.1f}"
         lines.append(
             f"{r.sensor}: its clock {'gains' if gain_s > 0 else 'loses'} {abs(gain_s):.2f} s on that of {reference} during the "
-            "run, by the recording times: no time_offset_s holds throughout, and no bound includes it; "
-            + (
-                steady
-                if even and both[0][1] != both[1][1]
-                else "synchronise the clocks, or smooth short parts (--start, --duration)"
-            )
+            f"run, by the recording times: no time_offset_s holds throughout, and no bound includes it; {cure}"
         )
     return lines
 
@@ -209,13 +207,17 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     return series, rows
 
 
+def _imu_values(readings: Readings) -> Array:
+    """Return accelerations and rates (N, 6); of none, (0, 6)."""
+    return np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)]).reshape(
+        -1, 6
+    )
+
+
 def _even_out(readings: Readings, warnings: list[str]) -> None:
     """Lay out samples that were stamped in bursts evenly."""
     stamps = readings.stamps()
-    values = np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)]).reshape(
-        -1, 6
-    )
-    even = _clock.evened(stamps, _clock.fresh(values))
+    even = _clock.evened(stamps, _imu_values(readings))
     if even is not stamps:
         readings.stamps_ns[:] = even.tolist()
         said = "they are laid out evenly between them; `graphloc stream` cannot do that: fix the driver"
@@ -227,8 +229,7 @@ def _even_out(readings: Readings, warnings: list[str]) -> None:
 def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     """Drop the repetitions of a frozen IMU: the solver bridges them like a gap."""
     stamps = readings.stamps()
-    samples = np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)])
-    bad = frozen_samples(stamps, samples.reshape(-1, 6))  # of none: (0,)
+    bad = frozen_samples(stamps, _imu_values(readings))
     warnings += frozen_imu_warning(readings.sensor, stamps, bad)
     return readings.drop(bad, rejected(WHY))
 

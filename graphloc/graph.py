@@ -164,6 +164,11 @@ class SlowProcess:
     far: tuple[str, ...] = ()
     needs_company: bool = False
 
+    def after(self, dt_s: float) -> tuple[Array, Array]:
+        """Return what share of the state is left after a time (k,), and the variance (k,) that has come to it."""
+        kept = np.exp(-dt_s / self.time_constant_s)
+        return kept, self.sigma**2 * (1.0 - kept**2)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Constant:

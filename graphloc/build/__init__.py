@@ -10,7 +10,7 @@ whose Euler term GTSAM's preintegration leaves out. Every other mount is taken f
 solution is moved to the body's origin at the end (`graphloc.solve`).
 """
 
-from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state, state_of
+from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state, solved_constants, state_of
 from graphloc.build._chains import (
     CONSTANT_TAILS,
     JUMP,
@@ -64,6 +64,7 @@ __all__ = [
     "slow_begin",
     "slow_end",
     "slow_step",
+    "solved_constants",
     "standing_cost",
     "state_keys",
     "state_of",

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
 import gtsam
@@ -210,6 +210,13 @@ def constants_of(stream: Attaching, values: gtsam.Values) -> tuple[tuple[int, Ar
         (key, np.atleast_1d(values.atVector(key)) if values.exists(key) else np.zeros(len(constant.sigma)))
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True)
     )
+
+
+def solved_constants(stream: Attaching, values: gtsam.Values) -> Iterator[tuple[Constant, Array]]:
+    """Yield the constants of a sensor that some factor has, and their values (k,)."""
+    for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
+        if values.exists(key):
+            yield constant, np.atleast_1d(values.atVector(key))
 
 
 def constant_keys(stream: Attaching) -> list[int]:

@@ -15,7 +15,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from graphloc import keys
+from graphloc import gauss, keys
 from graphloc.build import Level, Past, Problem, StartPrior, constant_keys
 from graphloc.frames import Array
 
@@ -150,7 +150,7 @@ class Anchor:
         """Return the prior factors of the state, by its keys; linear in world, as in `conditional_factor`."""
         turn = np.eye(_CORE)
         turn[:3, :3] = turn[3:6, 3:6] = self.pose.rotation().matrix()
-        whiten, mean = np.linalg.inv(np.linalg.cholesky(sound(turn @ self.cov @ turn.T))), turn @ self.step
+        whiten, mean = gauss.whitening(sound(turn @ self.cov @ turn.T)), turn @ self.step
 
         def error(this: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
             off, steps = self._off(this.keys(), values)
@@ -169,7 +169,7 @@ class Anchor:
         tangent of a heading that is later corrected by 20 deg the factor would state another sum, and both sums together would
         determine the position.
         """
-        whiten, turn = np.linalg.inv(np.linalg.cholesky(sound(known.cov))), np.eye(_CORE)
+        whiten, turn = gauss.whitening(sound(known.cov)), np.eye(_CORE)
         turn[:3, :3] = turn[3:6, 3:6] = self.pose.rotation().matrix()
         gain = whiten @ known.gain @ turn.T
 

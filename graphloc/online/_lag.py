@@ -29,6 +29,7 @@ from graphloc.online._states import Newest, States
 from graphloc.online._unmodelled import UnmodelledError, estimated_beside
 from graphloc.online._window import Window
 from graphloc.position_jumps import why_in_doubt
+from graphloc.solve._unmodelled import Unmodelled
 
 _STEP_COST = (
     1.0  # of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10
@@ -132,9 +133,11 @@ class Lag:
             self._followed[name] = len(stream.measurements)
         unmodelled.advance(self.newest, self.problem.links, told)
 
-    def covariance(self) -> Array:
-        """Return the joint covariance (15 + k, 15 + k) of the newest state, as `UnmodelledError.P`."""
-        return self._states.covariance([stream for stream, _ in estimated_beside(self.problem.streams)])
+    def unmodelled(self, attitude: Unmodelled | None = None, cov: Array | None = None) -> UnmodelledError | None:
+        """Return what left-out slow errors do to the newest state, as known from elsewhere (see `UnmodelledError.at`)."""
+        streams = self.problem.streams
+        P = self._states.covariance([stream for stream, _ in estimated_beside(streams)])
+        return UnmodelledError.at(streams, self.newest, P, attitude, cov)
 
     def anchor(self) -> Anchor:
         """Return the anchor at the newest state, to rebuild or resume from."""

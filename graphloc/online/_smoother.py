@@ -29,7 +29,6 @@ from graphloc.online._setup import Setup
 from graphloc.online._snapshot import SnapshotFile
 from graphloc.online._start import Started, try_start
 from graphloc.online._tracking import Tracking, failure_text
-from graphloc.online._unmodelled import UnmodelledError
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
 from graphloc.solve._warnings import slow_error_warning
@@ -317,10 +316,7 @@ class OnlineSmoother:
         solved = (started.pose, started.velocity, started.bias)
         self._tracking = tracking = Tracking(self._setup, persistent, self._ledger, started.anchor, samples, solved)
         self._ledger.enter(started.rows)
-        lag = tracking.lag
-        persistent.unmodelled = UnmodelledError.of_start(
-            lag.problem.streams, lag.newest, lag.covariance(), started.unmodelled
-        )
+        persistent.unmodelled = tracking.lag.unmodelled(started.unmodelled)
         tracking.catch_up(samples, others, until_ns)
         self._keep_anchor(tracking)
         newest_ns = tracking.lag.newest.stamp_ns
@@ -365,10 +361,7 @@ class OnlineSmoother:
         persistent = PersistentState.resumed(found, self._configured_noise(), self._setup.measuring)
         try:
             tracking = Tracking(self._setup, persistent, self._ledger, found.anchor, [found.imu, newest])
-            lag = tracking.lag
-            persistent.unmodelled = UnmodelledError.resumed(
-                lag.problem.streams, lag.newest, lag.covariance(), found.unmodelled
-            )
+            persistent.unmodelled = tracking.lag.unmodelled(cov=found.unmodelled)
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             self._say(f"the snapshot cannot be used ({in_one_line(error)}): starts without it")
             return

@@ -28,7 +28,6 @@ from graphloc.online._propagate import advance_odometry, propagate, unpropagated
 from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
-from graphloc.online._unmodelled import UnmodelledError
 from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 
@@ -167,9 +166,7 @@ class Tracking:
             lag.follow(unmodelled)
         except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
             log.warning("online: what slow errors do to heading and velocity is not up to date: %s", in_one_line(error))
-            self._persistent.unmodelled = UnmodelledError.resumed(
-                lag.problem.streams, lag.newest, lag.covariance(), unmodelled.cov
-            )
+            self._persistent.unmodelled = lag.unmodelled(cov=unmodelled.cov)
 
     def _read_imu(self) -> None:
         """Hand the samples that have arrived to the window; where they came late, integrate anew."""

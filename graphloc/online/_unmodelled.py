@@ -52,14 +52,14 @@ class UnmodelledError:
     P: Array
 
     @classmethod
-    def of_start(
-        cls, streams: Mapping[str, LiveStream], newest: Newest, P: Array, attitude: Unmodelled | None
+    def at(
+        cls, streams: Mapping[str, LiveStream], newest: Newest, P: Array, attitude: Unmodelled | None, cov: Array | None
     ) -> UnmodelledError | None:
-        """Return that of a start, where the position is off by all of the errors; None where no stream leaves any out.
+        """Return that of the first state of a window, where the position is off by all of the errors; None where no stream leaves any out.
 
         Args:
-            newest, P: the first state of the window. attitude: what the errors have done to attitude and velocity before it;
-                None: nothing.
+            newest, P: that state. attitude: what the errors have done to attitude and velocity before it; None: nothing.
+            cov: `cov` as it was last, taken where it has the size for these streams; None: not known.
         """
         left_out = {name: stream.left_out for name, stream in streams.items() if stream.left_out is not None}
         if not left_out:
@@ -68,24 +68,16 @@ class UnmodelledError:
         n, m = len(P), len(left_out)
         of_errors = np.vstack([np.zeros((n, 3 * m)), np.eye(3 * m)])
         of_errors[_POSITION] = np.hstack([np.eye(3)] * m)
-        cov = of_errors @ np.diag(np.concatenate([s.sigma**2 for s in left_out.values()])) @ of_errors.T
+        begun = of_errors @ np.diag(np.concatenate([s.sigma**2 for s in left_out.values()])) @ of_errors.T
         if attitude is not None:
             # Beside a heading that is off, the offset of a compass that agrees with it is off too.
             turned = np.vstack([np.eye(3), np.linalg.solve(P[_ROTATION, _ROTATION], P[_ROTATION, _CORE:]).T])
             rows = np.r_[_ROTATION, _CORE:n]
-            cov[np.ix_(rows, rows)] += turned @ attitude.rotation @ turned.T
-            cov[_VELOCITY, _VELOCITY] += attitude.velocity
+            begun[np.ix_(rows, rows)] += turned @ attitude.rotation @ turned.T
+            begun[_VELOCITY, _VELOCITY] += attitude.velocity
+        if cov is None or cov.shape != begun.shape or not np.isfinite(cov).all():
+            cov = begun
         return cls(left_out, estimated, cov, newest, P)
-
-    @classmethod
-    def resumed(
-        cls, streams: Mapping[str, LiveStream], newest: Newest, P: Array, cov: Array | None
-    ) -> UnmodelledError | None:
-        """Return that of a snapshot, where it is of the same receivers; else that of a start."""
-        begun = cls.of_start(streams, newest, P, None)
-        if begun is not None and cov is not None and cov.shape == begun.cov.shape and np.isfinite(cov).all():
-            begun.cov = cov
-        return begun
 
     def advance(self, newest: Newest, links: InertialLink, told: Mapping[str, Array]) -> None:
         """Follow the window to its newest state; nothing where that is not newer than the last (a window that was rebuilt).
@@ -102,7 +94,7 @@ class UnmodelledError:
         dt_s, n = (newest.stamp_ns - self.newest.stamp_ns) * 1e-9, len(self.P)
         F, Q = np.eye(n), np.zeros((n, n))
         F[:_CORE, :_CORE], Q[:_CORE, :_CORE] = _step(self.newest, newest, links)
-        F[_CORE:, _CORE:], Q[_CORE:, _CORE:] = _decay(self.estimated.values(), dt_s)
+        F[_CORE:, _CORE:], Q[_CORE:, _CORE:] = _walks(self.estimated.values(), dt_s)
         predicted, J = sound(F @ self.P @ F.T + Q), np.zeros((n, n))
         first = dict(
             zip(self.estimated, _CORE + np.cumsum([0, *(len(s.sigma) for s in self.estimated.values())]), strict=False)
@@ -114,7 +106,7 @@ class UnmodelledError:
         kept = np.linalg.inv(np.eye(n) + predicted @ J)  # 1 - P+ J
         P = sound(kept @ predicted)
         # The errors move on first, and the state then follows them.
-        decay, walk = _decay(self.left_out.values(), dt_s)
+        decay, walk = _walks(self.left_out.values(), dt_s)
         on = np.zeros_like(self.cov)
         on[:n, :n], on[n:, n:] = kept @ F, decay
         cov = on @ self.cov @ on.T
@@ -142,12 +134,11 @@ def estimated_beside(streams: Mapping[str, LiveStream]) -> list[tuple[LiveStream
     return [(s, s.slow) for s in streams.values() if s.slow is not None and s.left_out is None]
 
 
-def _decay(processes: Iterable[SlowProcess], dt_s: float) -> tuple[Array, Array]:
-    """Return what is left of slow errors after a time, and the covariance that comes to them."""
-    both = list(processes)
-    sigma = np.concatenate([np.zeros(0), *(s.sigma for s in both)])
-    decay = np.exp(-dt_s / np.concatenate([np.zeros(0), *(s.time_constant_s for s in both)]))
-    return np.diag(decay), np.diag(sigma**2 * (1.0 - decay**2))
+def _walks(processes: Iterable[SlowProcess], dt_s: float) -> tuple[Array, Array]:
+    """Return what is left of slow errors after a time, and the covariance that has come to them."""
+    steps = [process.after(dt_s) for process in processes]
+    kept, walk = (np.concatenate([np.zeros(0), *(step[n] for step in steps)]) for n in (0, 1))
+    return np.diag(kept), np.diag(walk)
 
 
 def _step(before: Newest, newest: Newest, links: InertialLink) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.berths import Berth, BerthTrack, rates, seen_from
-from graphloc.build import Problem, Stream, constant_keys
+from graphloc.build import Problem, Stream, solved_constants
 from graphloc.errors import in_one_line
 from graphloc.frames import Array
 from graphloc.recording import Recording
@@ -85,9 +85,9 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
 def _time_offsets_s(problem: Problem, result: BatchResult) -> Iterator[tuple[str, float]]:
     """Yield the sensors whose time offset is estimated, and its value, s."""
     for stream in problem.streams:
-        for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
-            if constant.corrects == "time_offset_s" and result.values.exists(key):
-                yield stream.name, float(result.values.atVector(key)[0])
+        for constant, value in solved_constants(stream, result.values):
+            if constant.corrects == "time_offset_s":
+                yield stream.name, float(value[0])
 
 
 def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:

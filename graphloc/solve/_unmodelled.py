@@ -72,8 +72,9 @@ def unmodelled(result: BatchResult) -> Unmodelled | None:
 def _drawn(slow: SlowProcess, stream: Stream, used: list[int], rng: np.random.Generator) -> Array:
     """Return draws (M, 3, draws) of a slow error, east, north and up in m, at M measurements of its receiver."""
     t = np.array([stream.measurements[i].stamp_ns for i in used]) / NS_PER_S
-    d = slow.sigma[:, None] * rng.standard_normal((len(used), len(slow.sigma), _AT_ONCE))
+    d = rng.standard_normal((len(used), len(slow.sigma), _AT_ONCE))
+    d[0] *= slow.sigma[:, None]
     for k, dt_s in enumerate(np.diff(t), 1):
-        kept = np.exp(-dt_s / slow.time_constant_s)[:, None]
-        d[k] = kept * d[k - 1] + np.sqrt(1.0 - kept**2) * d[k]
+        kept, walk = slow.after(dt_s)
+        d[k] = kept[:, None] * d[k - 1] + np.sqrt(walk)[:, None] * d[k]
     return d

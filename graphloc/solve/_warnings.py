@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import Problem, Stream, constant_keys
+from graphloc.build import Problem, Stream, solved_constants
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.position_jumps import jump_warnings, largest_sigma
@@ -112,19 +112,17 @@ def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
             warnings.append(
                 f"{stream.name}: {said} from zero: check its mount and the IMU's, or raise the configured sigma"
             )
-        for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
-            if result.values.exists(key):
-                value = np.atleast_1d(result.values.atVector(key))
-                off = float(np.abs(value / constant.sigma).max())
-                if off > _FAR_OFF and constant.corrects:
-                    warnings.append(
-                        f"{stream.name}: {constant.name} is {off:.1f} sigmas from zero: add {value[0]:+.3f} to its {constant.corrects}"
-                    )
-                elif off > _FAR_OFF:
-                    warnings.append(
-                        f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
-                        "its sigmas"
-                    )
+        for constant, value in solved_constants(stream, result.values):
+            off = float(np.abs(value / constant.sigma).max())
+            if off > _FAR_OFF and constant.corrects:
+                warnings.append(
+                    f"{stream.name}: {constant.name} is {off:.1f} sigmas from zero: add {value[0]:+.3f} to its {constant.corrects}"
+                )
+            elif off > _FAR_OFF:
+                warnings.append(
+                    f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
+                    "its sigmas"
+                )
         warnings += slow_error_warning(stream.name, stream.left_out)
         allowed = stream.left_out is not None
         warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
