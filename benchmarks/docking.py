@@ -37,7 +37,8 @@ from graphloc.recording import Recording
 from graphloc.solve import smooth
 from graphloc.solve._align import align
 from graphloc.solve._decide import Verdicts
-from graphloc.solve._grow import grow, solve_start
+from graphloc.solve._grow import grow
+from graphloc.solve._start import solve_start
 from graphloc.survey import Survey, TagConfig
 
 SEEDS = {"illuminated": range(2)}  # of a condition

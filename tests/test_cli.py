@@ -193,7 +193,7 @@ def test_ctrl_c_in_the_solver_ends_at_once(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "graphloc", "smooth", where, "-c", config, "-o", tmp_path / "run"]
     code = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a `nohup` runner ignores it
-        "from graphloc import cli; from graphloc.solve import _grow; grow = _grow.solve_start\n"
+        "from graphloc import cli; from graphloc.solve import _start; grow = _start.solve_start\n"
         "def told(*a): print('solving', flush=True); return grow(*a)\n"
         "import graphloc.solve._batch as b; b.solve_start = told\n"
         f"sys.argv = {['graphloc', *map(str, command[3:])]!r}; cli.main()"

@@ -26,7 +26,7 @@ from graphloc.online._setup import Setup
 from graphloc.recording import Recording
 from graphloc.solve._align import MOVED_M
 from graphloc.solve._batch import BatchResult, solve_batch
-from graphloc.solve._covariances import world_covariance
+from graphloc.solve._covariances import ANY_HEADING_RAD, world_covariance
 from graphloc.solve._decide import AGREES, decisions
 from graphloc.solve._ledger import row_of
 from graphloc.solve._stretch import StretchStep, past_at
@@ -139,7 +139,8 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
                 return f"{_AGREEING} measurements of {stream.name} that agree with each other ({agreeing} of {len(weights)} do)"
     last = keys.pose(len(problem.timeline) - 1)
     R = result.values.atPose3(last).rotation().matrix()
-    sigma = float(np.sqrt(world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]))
+    linear_var = world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]
+    sigma = min(float(np.sqrt(max(linear_var, result.heading_var[-1]))), ANY_HEADING_RAD)
     doubt = ""
     if result.headings > 1 or sigma > _HEADING_RAD:
         doubt = f"the heading is a guess: {result.headings} candidates explain the motion so far, 1 sigma {np.degrees(sigma):.0f} deg"
@@ -174,12 +175,19 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
 
 
 def _unmodelled(result: BatchResult, k: int) -> Unmodelled | None:
-    """Return what left-out slow errors did to state `k`, the first of the window; at the first data nothing has done anything yet."""
+    """Return what the window does not know of state `k`, its first; None: nothing.
+
+    That is what left-out slow errors did to it (at the first data nothing yet), and how far off other headings are that explain
+    the motion: about the one that it is linearised at, the window knows none of them.
+    """
     try:
         found = unmodelled(result) if k else None
     except RuntimeError:  # not determined; the window that follows says what it can
-        return None
-    return None if found is None else Unmodelled(found.rotation[k], found.velocity[k])
+        found = None
+    rotation, velocity = np.diag([0.0, 0.0, result.heading_var[k]]), np.zeros((3, 3))
+    if found is not None:
+        rotation, velocity = rotation + found.rotation[k], found.velocity[k]
+    return Unmodelled(rotation, velocity) if rotation.any() or velocity.any() else None
 
 
 def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The offline solver: align, grow, then decide over the whole run.
 
-1. Align over a window; try each candidate heading on it and keep the cheapest (`_align`, `_grow`).
+1. Align over a window; try each candidate heading on it and keep the cheapest (`_align`, `_start`).
 2. Grow by some seconds at a time, each window solved with a prior from earlier data. Hypotheses that are
    new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
    thinned run (`graphloc.build.thinned`).
@@ -27,10 +27,11 @@ from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
 from graphloc.solve._choices import other_choices, take_more_probable
 from graphloc.solve._decide import Verdicts, weigh
-from graphloc.solve._grow import grow, solve_start
+from graphloc.solve._grow import grow
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import Settled, expected_cost, open_passes, outliers_cost, settle
+from graphloc.solve._start import solve_start
 
 _MAX_NOISE_ROUNDS = 5
 # Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
@@ -54,6 +55,7 @@ class BatchResult:
     noise_scale: float
     prior: StartPrior
     headings: int  # number of candidates that explain the start about equally well; 0: nothing tells the heading there
+    heading_var: Array  # (N,) rad^2 of each state, by headings that the motion does not exclude (see `_start`)
     levels_cov: Array  # (3, 3) of the position, m^2, by other levels that may be the usual ones (see `_levels`)
     notes: tuple[str, ...]
 
@@ -69,7 +71,8 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         SolveError: it could not be started, or the linear algebra failed.
     """
     start, few = align(problem), thinned(problem)
-    grown, prior, known, iterations, headings = solve_start(few.problem, start, progress)
+    grown, prior, known, iterations, headings, few_var = solve_start(few.problem, start, progress)
+    heading_var = np.interp(problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1], few_var)
     iterations += grow(few.problem, grown, prior, known, progress)
     passes, estimate, ratio = 0, few.filled(problem, grown), 1.0
     if problem.links.gaps():
@@ -102,6 +105,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         converged=settled.converged,
         noise_scale=problem.noise_scale,
         prior=prior,
+        heading_var=heading_var,
         headings=headings if start.yaw_sigma_rad < np.pi else 0,
         levels_cov=levels_cov,
         notes=start.notes,

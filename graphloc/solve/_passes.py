@@ -140,9 +140,10 @@ def outliers_cost(verdicts: Verdicts) -> float:
     )
 
 
-def expected_cost(problem: Problem, verdicts: Verdicts) -> float:
-    """Return the degrees of freedom of the weighted problem: the expectation of 2 x its cost."""
-    n, m = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
+def expected_cost(problem: Problem, verdicts: Verdicts, last: int = -1) -> float:
+    """Return the degrees of freedom of the weighted problem up to state `last`: the expectation of 2 x its cost."""
+    slow_of = problem.timeline.slow_of
+    n, m = len(slow_of[:last]) + 1, int(slow_of[last]) + 1
     expected = sum((v.residual.expected_nis or len(v.residual.raw)) * v.weight for v in verdicts.values())
     expected += 9.0 * (n - 1) + 6.0 * (m - 1) + 15.0 - 9.0 * n - 6.0 * m
     for stream in problem.streams:

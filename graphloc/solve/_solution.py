@@ -57,7 +57,8 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     assert trajectory.cov is not None
     trajectory.cov[:, :3, :3] += unmodelled_covariance(problem.streams) + result.levels_cov
     v_cov = np.array([tree.marginalCovariance(keys.velocity(k)) for k in range(n)])
-    unsaid = [*_add_unmodelled(result, trajectory.cov, v_cov), *_add_guess(result, trajectory.cov)]
+    guess = _add_others(result, trajectory.cov)
+    unsaid = [*_add_unmodelled(result, trajectory.cov, v_cov), *(guess or _add_guess(result, trajectory.cov))]
     limit_heading(trajectory.cov)
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = stats_of(problem, result)
@@ -101,6 +102,18 @@ def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
         cov[:, 3:, 3:] += more.rotation
         v_cov += more.velocity
     return []
+
+
+def _add_others(result: BatchResult, cov: Array) -> list[str]:
+    """State the heading as uncertain as other headings that explain the motion make it; return a warning where it is a guess."""
+    cov[:, 5, 5] = np.maximum(cov[:, 5, 5], result.heading_var)
+    sure = np.sqrt(result.heading_var.min())
+    if sure < _SHOWN_RAD:
+        return []
+    return [
+        f"the heading is a guess: no sensor tells it, and the motion only to {np.degrees(sure):.0f} deg (1 sigma) at best; "
+        "turn or accelerate more, add a heading sensor or set start.heading_deg"
+    ]
 
 
 def _add_guess(result: BatchResult, cov: Array) -> list[str]:

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The start of a run: candidates for the heading are tried on its first window, which grows while they cannot be told apart.
+
+Where no sensor tells the heading, the accelerations do, turned by it into the motion that the positions show. The linearised run
+is too sure of such a heading: it takes the noise of the accelerometer, and a bias that explains the motion as well, for
+accelerations that turn with the heading. On a robot that drove straight for 120 s with a noisy IMU it stated 20 deg, 1 sigma, and
+was 95 deg off, at a cost that differed by 1.3 from that of the true heading. So the window grows until headings beside the best
+one cost clearly more; where none ever do, the heading is as uncertain as the costs of all headings say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from graphloc import keys
+from graphloc.build import Problem, StartPrior
+from graphloc.errors import SolveError
+from graphloc.frames import Array, wrap_angle
+from graphloc.recording import Progress
+from graphloc.solve._align import Start, start_pose
+from graphloc.solve._decide import decisions, weigh
+from graphloc.solve._passes import expected_cost
+from graphloc.solve._stretch import copy_states, dead_reckon, fill_slow, solve_stretch
+
+# Starts that cost this much more (log-likelihood) are dropped; while several remain, the window grows.
+_COST_APART, _LONGEST_S, _LONGEST_UNTOLD_S = 8.0, 60.0, 600.0
+_PLACE_S, _LATE_PLACE_S = 5.0, 90.0  # of positions in the first window; latest time of the first one
+# Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
+_STAGES = (("far", 8, 0.5, False), ("open", 2, 0.5, False), ("final", 2, 0.5, True))
+_BESIDE_RAD, _HELD_RAD = np.radians(30.0), np.radians(3.0)  # headings that are compared, and 1 sigma that holds them there
+
+
+class Begun(NamedTuple):
+    """The start of a run: values, prior, the last state solved, iterations, and how many headings explain it.
+
+    `heading_var`: (last + 1,), rad^2, of each state: mean square distance to the headings that the motion does not exclude; 0 where it
+    excludes those beside the solved one, or a sensor tells it.
+    """
+
+    values: gtsam.Values
+    prior: StartPrior
+    last: int
+    iterations: int
+    headings: int
+    heading_var: Array
+
+
+def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
+    """Try each candidate on the first window; look further while several explain it; keep the cheapest."""
+    seconds, iterations, until = max(start.window_s, _placed_s(problem)), 0, 0
+    longest_s = _LONGEST_UNTOLD_S if start.by_motion else _LONGEST_S
+    candidates = [_candidate(problem, start, yaw) for yaw in start.yaws_rad]
+    failure: SolveError | None = None
+    while True:
+        known, until = until, _index_after(problem, seconds)
+        alive = []
+        for n, candidate in enumerate(candidates):
+            progress("start", n, len(candidates))
+            try:
+                dead_reckon(problem, candidate.values, known, until)
+                iterations += _solve_candidate(problem, candidate, until)
+            except SolveError as caught:
+                failure = caught
+                continue
+            alive.append(candidate)
+        if not alive:
+            raise failure or SolveError("the start alignment found no heading to try")
+        alive.sort(key=lambda c: c.cost)
+        candidates = _different(alive)
+        best, last_window = candidates[0], seconds >= longest_s or until == len(problem.timeline) - 1
+        heading_var = np.zeros(until + 1)
+        told_apart = len(candidates) == 1
+        if start.by_motion:
+            for candidate in candidates:
+                # A prior about a heading that was only tried is no information: the candidates may go where the motion takes them.
+                candidate.prior = _start_prior(problem, start, _yaw(candidate.values, 0))
+            told_apart = told_apart and _told(problem, start, best, until)
+            if last_window and not told_apart:
+                heading_var = _heading_var(problem, start, best, until)
+        if told_apart or last_window:
+            return Begun(best.values, best.prior, until, iterations, len(candidates), heading_var)
+        seconds *= 1.6
+
+
+def _placed_s(problem: Problem) -> float:
+    """Return how long (s) the first window must be to contain a position measurement; 0 where none comes soon.
+
+    Without one the next window would be dead reckoning with poorly known biases: after 15 s it may be 300 m off, and tags cannot be
+    judged by such a prediction.
+    """
+    stamps = problem.timeline.stamps_ns
+    first_ns = [s.measurements[0].stamp_ns for s in problem.streams if s.row.absolute and s.measurements]
+    soon_s = float(min(first_ns) - stamps[0]) * 1e-9 + _PLACE_S if first_ns else 0.0
+    return soon_s if soon_s <= _LATE_PLACE_S else 0.0
+
+
+@dataclass(slots=True)
+class _Candidate:
+    """One start: its estimate, prior and cost so far; `excess`: cost over what is expected, at least 1."""
+
+    values: gtsam.Values
+    prior: StartPrior
+    cost: float = 0.0
+    excess: float = 1.0
+
+
+def _candidate(problem: Problem, start: Start, yaw: float) -> _Candidate:
+    prior, values = _start_prior(problem, start, yaw), gtsam.Values()
+    values.insert(keys.pose(0), prior.pose)
+    values.insert(keys.velocity(0), prior.velocity)
+    fill_slow(problem, values, 0, prior.bias, {})
+    return _Candidate(values, prior)
+
+
+def _start_prior(problem: Problem, start: Start, yaw: float) -> StartPrior:
+    pose = start_pose(start, yaw)
+    R = pose.rotation().matrix()
+    world_rotation = np.diag([start.tilt_sigma_rad, start.tilt_sigma_rad, start.yaw_sigma_rad]) ** 2
+    cov = np.zeros((6, 6))
+    cov[:3, :3] = R.T @ world_rotation @ R
+    cov[3:, 3:] = R.T @ np.diag(start.p_sigma_m**2) @ R
+    sigmas = problem.links.bias_sigmas()
+    bias_cov = np.diag(np.concatenate([sigmas[:3], start.gyro_bias_sigma_radps]) ** 2)
+    return StartPrior(
+        pose=pose,
+        pose_cov=cov,
+        velocity=start.v_world_mps,
+        velocity_cov=np.diag(start.v_sigma_mps**2),
+        bias=gtsam.imuBias.ConstantBias(np.zeros(3), start.gyro_bias_radps),
+        bias_cov=bias_cov,
+        level=start.level,
+    )
+
+
+def _different(ranked: list[_Candidate]) -> list[_Candidate]:
+    """Drop candidates that cost clearly more than the cheapest, or have converged to the heading of a cheaper one."""
+    kept: list[_Candidate] = []
+    for candidate in ranked:
+        yaw = _yaw(candidate.values, 0)
+        apart = all(abs(wrap_angle(yaw - _yaw(other.values, 0))) > np.radians(15.0) for other in kept)
+        if apart and candidate.cost < ranked[0].cost + _COST_APART + 0.2 * ranked[0].cost:
+            kept.append(candidate)
+    return kept
+
+
+def _yaw(values: gtsam.Values, k: int) -> float:
+    return float(values.atPose3(keys.pose(k)).rotation().yaw())
+
+
+def _told(problem: Problem, start: Start, best: _Candidate, last: int) -> bool:
+    """Whether the motion excludes the headings beside the best one."""
+    return all(
+        _held_at(problem, start, best, by_rad, last).cost > best.cost + _COST_APART * best.excess
+        for by_rad in (-_BESIDE_RAD, _BESIDE_RAD)
+    )
+
+
+def _heading_var(problem: Problem, start: Start, best: _Candidate, last: int) -> Array:
+    """Return the mean square distance, rad^2, of the heading of each state to those of runs held at other headings, by their likelihood."""
+    turns = np.arange(-np.pi, np.pi, _BESIDE_RAD)
+    held = [_held_at(problem, start, best, by_rad, last) for by_rad in turns if abs(by_rad) > 0.5 * _BESIDE_RAD]
+    runs = [best, *held]
+    cost = np.array([run.cost for run in runs])
+    likelihood = np.exp(-(cost - cost.min()) / best.excess)
+    yaw = np.array([[_yaw(run.values, k) for k in range(last + 1)] for run in runs])
+    return np.asarray(likelihood @ wrap_angle(yaw - yaw[0]) ** 2 / likelihood.sum())
+
+
+def _held_at(problem: Problem, start: Start, best: _Candidate, by_rad: float, last: int) -> _Candidate:
+    """Return the run solved with the heading at its start held at that of `best` turned by an angle."""
+    turn, values = gtsam.Rot3.Yaw(by_rad), copy_states(problem, best.values, 0, last)
+    for k in range(last + 1):
+        pose = values.atPose3(keys.pose(k))
+        values.update(keys.pose(k), gtsam.Pose3(turn.compose(pose.rotation()), pose.translation()))
+    held = replace(start, yaw_sigma_rad=_HELD_RAD)
+    candidate = _Candidate(values, _start_prior(problem, held, _yaw(values, 0)), excess=best.excess)
+    try:
+        _solve_candidate(problem, candidate, last)
+    except SolveError:
+        candidate.cost = np.inf
+    return candidate
+
+
+def _solve_candidate(problem: Problem, candidate: _Candidate, last: int) -> int:
+    """Solve the first window in place, gently first; return the iterations."""
+    iterations = 0
+    for stage, limit, settled_m, hypotheses in _STAGES:
+        for _ in range(limit):
+            verdicts = weigh(problem, candidate.values, first=0, last=last, stage=stage, hypotheses=hypotheses)
+            decided, jumps = decisions(verdicts), stage != "far"
+            step = solve_stretch(problem, candidate.values, 0, last, candidate.prior, decided, jumps=jumps, tol=1e-4)
+            iterations += step.iterations
+            if step.moved_m < settled_m:
+                break
+    candidate.cost = step.error
+    candidate.excess = max(1.0, 2.0 * step.error / max(expected_cost(problem, verdicts, last), 1.0))
+    return iterations
+
+
+def _index_after(problem: Problem, seconds: float) -> int:
+    stamps = problem.timeline.stamps_ns
+    return int(min(np.searchsorted(stamps, stamps[0] + int(seconds * 1e9)), len(stamps) - 1))
