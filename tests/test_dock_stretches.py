@@ -13,8 +13,8 @@ from graphloc.frames import Array
 from graphloc.solve._align import align
 from graphloc.solve._decide import decisions, weigh
 from graphloc.solve._grow import grow
-from graphloc.solve._start import solve_start
 from graphloc.solve._optimize import bayes_tree
+from graphloc.solve._start import solve_start
 from graphloc.solve._stretch import past_at, solve_stretch, weak_prior
 from tests import tagfactory
 

@@ -16,6 +16,8 @@ from graphloc.online._unmodelled import UnmodelledError
 from graphloc.solve._covariances import limit_heading, unmodelled_covariance, world_covariance
 from graphloc.solve._health import health_of
 
+_TOLD_RAD = np.radians(10.0)  # 1 sigma that only motion gives that does tell the heading
+
 
 def estimate_of(
     now: Propagated,
@@ -26,6 +28,7 @@ def estimate_of(
     absolute: Sequence[str],
     doubt: str,
     heading_off_rad: float,
+    guess_rad: float,
     unmodelled: UnmodelledError | None,
 ) -> Estimate:
     """Return the estimate at a state of the window, or propagated beyond it.
@@ -35,6 +38,7 @@ def estimate_of(
         doubt: why the health cannot be good, or empty.
         unmodelled: what slow errors that are left out do to the newest state; the covariances then include it.
         heading_off_rad: by how much the motion shows the heading to be off; the covariance then includes it.
+        guess_rad: 1 sigma of a heading that is a guess: of more than `_TOLD_RAD`, the window's own is too sure (see `solve._start`).
     """
     newest, problem = lag.newest, lag.problem
     at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
@@ -49,6 +53,8 @@ def estimate_of(
     others_m, others_cov = lag.others
     cov[:3, :3] += others_cov
     cov[5, 5] += heading_off_rad**2
+    if cov[5, 5] > _TOLD_RAD**2:
+        cov[5, 5] = max(cov[5, 5], guess_rad**2)
     limit_heading(cov)
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
     health, reason = health_of(cov, since, doubt)

@@ -65,6 +65,15 @@ class HeadingCheck:
         self._sensor = ""
         self._looked_ns, self._wrong, self._right = 0, 0, 0
 
+    def begin(self) -> None:
+        """Forget what earlier checks found right: the estimate starts anew."""
+        self._right = 0
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the last checks found the heading right."""
+        return self._right >= _IN_A_ROW
+
     def note(self, m: Measurement, lag: Lag) -> None:
         """Take in a position of the first GNSS receiver (any absolute sensor without hypotheses)."""
         stream = lag.problem.streams.get(m.sensor)

@@ -13,8 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from graphloc.config import VesselConfig
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate
@@ -40,7 +38,6 @@ from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 _AGAIN_S = 6.0  # of data, with which a lost estimate starts anew
-_TOLD_RAD = np.radians(10.0)  # 1 sigma from which on a heading is no guess
 _AHEAD_S = 60.0  # of the IMU: a stamp of another clock
 _NOT_REACHED = "the estimate restarted before IMU data reached its stamp"
 _NOT_ASKED = "its sensor is switched off or not in the configuration"
@@ -246,18 +243,10 @@ class OnlineSmoother:
             if contradiction := self._persistent.noise.contradicted(tracking.lag):
                 self._rebuild(contradiction)
                 return self._estimate()
-            estimate = tracking.estimate()
-            self._end_doubt(float(np.sqrt(estimate.cov[5, 5])))
-            return estimate
+            return tracking.estimate()
         except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
             self._rebuild(failure_text(error))
         return self._estimate()
-
-    def _end_doubt(self, heading_sigma_rad: float) -> None:
-        """No longer call the heading of the start a guess once the motion has told it."""
-        if self._persistent.doubt and heading_sigma_rad < _TOLD_RAD:
-            self._persistent.doubt = ""
-            self._say(f"the motion tells the heading to {np.degrees(heading_sigma_rad):.0f} deg (1 sigma): no guess any more")
 
     def _keep_anchor(self, tracking: Tracking) -> None:
         """Remember the newest state now and then, in memory and in the snapshot."""
@@ -319,8 +308,10 @@ class OnlineSmoother:
         """Build the window where the start says, and bring it to now."""
         persistent = self._persistent
         self._setup = self._setup.without_start_heading()
-        persistent.datum, persistent.heights_m, persistent.doubt = started.datum, started.heights_m, started.doubt
+        persistent.datum, persistent.heights_m = started.datum, started.heights_m
+        persistent.doubt, persistent.doubt_rad = started.doubt, started.doubt_rad
         persistent.noise.scale = max(persistent.noise.scale, started.noise_scale)
+        persistent.heading_check.begin()
         for sample in samples:
             self._ledger.used(sample)
         self._waiting.taken()

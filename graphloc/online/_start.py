@@ -57,7 +57,7 @@ class Started:
         pose, velocity, bias: of that state, as solved: at the IMU with the body's axes, in world: gtsam.Pose3, (3,), m/s,
             (6,), accelerometer first.
         heights_m: configured heights (m, up in world), by sensor.
-        doubt: why the health cannot be good, or empty. noise_scale: factor on the IMU noise.
+        doubt: why the health cannot be good, or empty. doubt_rad: 1 sigma of the heading then, else 0. noise_scale: factor on the IMU noise.
         unmodelled: what slow errors that are left out did to that state; None: nothing that is known.
         notes: what the alignment was based on. rows: ledger rows of what was measured before the first state.
     """
@@ -69,6 +69,7 @@ class Started:
     bias: Array
     heights_m: Mapping[str, float]
     doubt: str
+    doubt_rad: float
     noise_scale: float
     unmodelled: Unmodelled | None
     notes: tuple[str, ...]
@@ -167,6 +168,7 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         bias=result.values.atConstantBias(keys.bias(int(result.problem.timeline.slow_of[k]))).vector(),
         heights_m=heights,
         doubt=doubt,
+        doubt_rad=sigma if doubt else 0.0,
         noise_scale=result.noise_scale,
         unmodelled=_unmodelled(result, k),
         notes=result.notes,
@@ -175,19 +177,12 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
 
 
 def _unmodelled(result: BatchResult, k: int) -> Unmodelled | None:
-    """Return what the window does not know of state `k`, its first; None: nothing.
-
-    That is what left-out slow errors did to it (at the first data nothing yet), and how far off other headings are that explain
-    the motion: about the one that it is linearised at, the window knows none of them.
-    """
+    """Return what left-out slow errors did to state `k`, the first of the window; at the first data nothing has done anything yet."""
     try:
         found = unmodelled(result) if k else None
     except RuntimeError:  # not determined; the window that follows says what it can
-        found = None
-    rotation, velocity = np.diag([0.0, 0.0, result.heading_var[k]]), np.zeros((3, 3))
-    if found is not None:
-        rotation, velocity = rotation + found.rotation[k], found.velocity[k]
-    return Unmodelled(rotation, velocity) if rotation.any() or velocity.any() else None
+        return None
+    return None if found is None else Unmodelled(found.rotation[k], found.velocity[k])
 
 
 def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:

@@ -243,6 +243,7 @@ class Tracking:
             absolute=self._setup.absolute,
             doubt="; ".join(doubt for doubt in doubts if doubt),
             heading_off_rad=persistent.heading_check.off_rad,
+            guess_rad=persistent.doubt_rad,
             unmodelled=persistent.unmodelled,
         )
 
@@ -258,11 +259,14 @@ class Tracking:
     def news(self) -> list[str]:
         """Return a line on what the newest state newly shows: a wrong heading, frozen receivers, position jumps."""
         check = self._persistent.heading_check
-        wrong_heading = [check.said] if check.look(self.lag) else []
+        heading = [check.said] if check.look(self.lag) else []
+        if self._persistent.doubt and check.confirmed:
+            self._persistent.doubt, self._persistent.doubt_rad = "", 0.0
+            heading.append("the motion confirms the heading: it is no guess any more")
         was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now
         frozen = [f"{name}: {_FROZEN if name in now else _NO_LONGER_FROZEN}" for name in sorted(now ^ was)]
-        return [*wrong_heading, *frozen, *self.lag.jump_warnings()]
+        return [*heading, *frozen, *self.lag.jump_warnings()]
 
     def snapshot(self, newest: ImuSample) -> Snapshot:
         """Return the last anchor and all that is needed to go on from it; `newest`: sample of the IMU."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the slow errors that are left out of the window (`LiveStream.left_out`), and a heading that is a guess, do to its newest state.
+"""What the slow errors that are left out of the window (`LiveStream.left_out`) do to its newest state.
 
 Nothing tells such an error d from motion, so the estimate follows it: in position by all of it, in heading and velocity by as
 much as the IMU lets it. Its covariance is that of a consider parameter (Schmidt 1966) of the filter that the newest state is:
@@ -55,20 +55,20 @@ class UnmodelledError:
     def at(
         cls, streams: Mapping[str, LiveStream], newest: Newest, P: Array, attitude: Unmodelled | None, cov: Array | None
     ) -> UnmodelledError | None:
-        """Return that of the first state of a window, where the position is off by all of the errors; None where nothing is known to be off.
+        """Return that of the first state of a window, where the position is off by all of the errors; None where no stream leaves any out.
 
         Args:
             newest, P: that state. attitude: what the errors have done to attitude and velocity before it; None: nothing.
             cov: `cov` as it was last, taken where it has the size for these streams; None: not known.
         """
         left_out = {name: stream.left_out for name, stream in streams.items() if stream.left_out is not None}
-        if not left_out and attitude is None and cov is None:
+        if not left_out:
             return None
         estimated = {stream.name: slow for stream, slow in estimated_beside(streams)}
         n, m = len(P), len(left_out)
         of_errors = np.vstack([np.zeros((n, 3 * m)), np.eye(3 * m)])
-        of_errors[_POSITION] = np.tile(np.eye(3), m)
-        begun = of_errors @ np.diag(np.concatenate([np.zeros(0), *(s.sigma**2 for s in left_out.values())])) @ of_errors.T
+        of_errors[_POSITION] = np.hstack([np.eye(3)] * m)
+        begun = of_errors @ np.diag(np.concatenate([s.sigma**2 for s in left_out.values()])) @ of_errors.T
         if attitude is not None:
             # Beside a heading that is off, the offset of a compass that agrees with it is off too.
             turned = np.vstack([np.eye(3), np.linalg.solve(P[_ROTATION, _ROTATION], P[_ROTATION, _CORE:]).T])
@@ -112,7 +112,7 @@ class UnmodelledError:
         cov = on @ self.cov @ on.T
         cov[n:, n:] += walk
         follow = np.eye(len(cov))
-        follow[:n, n:] = np.hstack([np.zeros((n, 0)), *(P[:, :9] @ told[name][:9, _POSITION] for name in self.left_out)])
+        follow[:n, n:] = np.hstack([P[:, :9] @ told[name][:9, _POSITION] for name in self.left_out])
         cov = follow @ cov @ follow.T
         if not (np.isfinite(P).all() and np.isfinite(cov).all()):
             raise ArithmeticError("what slow errors do to the newest state is not finite")

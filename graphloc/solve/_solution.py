@@ -110,10 +110,8 @@ def _add_others(result: BatchResult, cov: Array) -> list[str]:
     sure = np.sqrt(result.heading_var.min())
     if sure < _SHOWN_RAD:
         return []
-    return [
-        f"the heading is a guess: no sensor tells it, and the motion only to {np.degrees(sure):.0f} deg (1 sigma) at best; "
-        "turn or accelerate more, add a heading sensor or set start.heading_deg"
-    ]
+    said = f"the heading is a guess: no sensor tells it, and the motion only to {np.degrees(sure):.0f} deg (1 sigma) at best"
+    return [f"{said}; turn or accelerate more, add a heading sensor or set start.heading_deg"]
 
 
 def _add_guess(result: BatchResult, cov: Array) -> list[str]:

@@ -31,14 +31,18 @@ _COST_APART, _LONGEST_S, _LONGEST_UNTOLD_S = 8.0, 60.0, 600.0
 _PLACE_S, _LATE_PLACE_S = 5.0, 90.0  # of positions in the first window; latest time of the first one
 # Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
 _STAGES = (("far", 8, 0.5, False), ("open", 2, 0.5, False), ("final", 2, 0.5, True))
-_BESIDE_RAD, _HELD_RAD = np.radians(30.0), np.radians(3.0)  # headings that are compared, and 1 sigma that holds them there
+# What stands for all headings: turned from the best one by angles, and how much of the circle each stands for; the best: 30 deg.
+_OTHERS_RAD = np.radians([-30.0, 30.0, -60.0, 60.0, -120.0, 120.0, 180.0])
+_WIDTHS_RAD = np.radians([30.0, 30.0, 45.0, 45.0, 60.0, 60.0, 60.0])
+_HELD_RAD = np.radians(3.0)  # 1 sigma that holds them there
+_FREE = 1e4  # 1 sigma, m or rad, of what is not held
 
 
 class Begun(NamedTuple):
     """The start of a run: values, prior, the last state solved, iterations, and how many headings explain it.
 
-    `heading_var`: (last + 1,), rad^2, of each state: mean square distance to the headings that the motion does not exclude; 0 where it
-    excludes those beside the solved one, or a sensor tells it.
+    `heading_var`: (last + 1,), rad^2, of each state, from how much other headings cost (at both ends, linear in between); 0 where the
+    motion excludes those beside the solved one, or a sensor tells it.
     """
 
     values: gtsam.Values
@@ -71,17 +75,17 @@ def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
             raise failure or SolveError("the start alignment found no heading to try")
         alive.sort(key=lambda c: c.cost)
         candidates = _different(alive)
-        best, last_window = candidates[0], seconds >= longest_s or until == len(problem.timeline) - 1
-        heading_var = np.zeros(until + 1)
-        told_apart = len(candidates) == 1
+        told_apart, heading_var = len(candidates) == 1, np.zeros(until + 1)
+        last_window = seconds >= longest_s or until == len(problem.timeline) - 1
         if start.by_motion:
             for candidate in candidates:
                 # A prior about a heading that was only tried is no information: the candidates may go where the motion takes them.
                 candidate.prior = _start_prior(problem, start, _yaw(candidate.values, 0))
-            told_apart = told_apart and _told(problem, start, best, until)
-            if last_window and not told_apart:
-                heading_var = _heading_var(problem, start, best, until)
+            if told_apart or last_window:
+                heading_var = _heading_var(problem, start, candidates[0], until)
+                told_apart = told_apart and heading_var[-1] == 0.0
         if told_apart or last_window:
+            best = candidates[0]
             return Begun(best.values, best.prior, until, iterations, len(candidates), heading_var)
         seconds *= 1.6
 
@@ -151,48 +155,59 @@ def _yaw(values: gtsam.Values, k: int) -> float:
     return float(values.atPose3(keys.pose(k)).rotation().yaw())
 
 
-def _told(problem: Problem, start: Start, best: _Candidate, last: int) -> bool:
-    """Whether the motion excludes the headings beside the best one."""
-    return all(
-        _held_at(problem, start, best, by_rad, last).cost > best.cost + _COST_APART * best.excess
-        for by_rad in (-_BESIDE_RAD, _BESIDE_RAD)
-    )
-
-
 def _heading_var(problem: Problem, start: Start, best: _Candidate, last: int) -> Array:
-    """Return the mean square distance, rad^2, of the heading of each state to those of runs held at other headings, by their likelihood."""
-    turns = np.arange(-np.pi, np.pi, _BESIDE_RAD)
-    held = [_held_at(problem, start, best, by_rad, last) for by_rad in turns if abs(by_rad) > 0.5 * _BESIDE_RAD]
-    runs = [best, *held]
-    cost = np.array([run.cost for run in runs])
-    likelihood = np.exp(-(cost - cost.min()) / best.excess)
-    yaw = np.array([[_yaw(run.values, k) for k in range(last + 1)] for run in runs])
-    return np.asarray(likelihood @ wrap_angle(yaw - yaw[0]) ** 2 / likelihood.sum())
+    """Return the variance (last + 1,), rad^2, of the heading of each state: at both ends from how much others cost, linear in between."""
+    ends = [_var_at(problem, start, best, last, at) for at in (0, last)]
+    stamps = problem.timeline.stamps_ns[: last + 1]
+    return np.interp(stamps, stamps[[0, -1]], ends)
 
 
-def _held_at(problem: Problem, start: Start, best: _Candidate, by_rad: float, last: int) -> _Candidate:
-    """Return the run solved with the heading at its start held at that of `best` turned by an angle."""
+def _var_at(problem: Problem, start: Start, best: _Candidate, last: int, at: int) -> float:
+    """Return the variance, rad^2, of the heading of a state, from how much other headings cost; 0 where the motion excludes those beside it."""
+
+    def weight(turns_rad: Array) -> Array:
+        cost = np.array([_held(problem, start, best, last, at, by_rad).cost for by_rad in turns_rad.tolist()])
+        return np.asarray(np.exp(-np.maximum(cost - best.cost, 0.0) / best.excess))
+
+    beside = weight(_OTHERS_RAD[:2])
+    if beside.max() < np.exp(-_COST_APART):
+        return 0.0
+    weights = _WIDTHS_RAD * np.concatenate([beside, weight(_OTHERS_RAD[2:])])
+    return float(weights @ _OTHERS_RAD**2 / (_WIDTHS_RAD[0] + weights.sum()))
+
+
+def _held(problem: Problem, start: Start, best: _Candidate, last: int, at: int, by_rad: float) -> _Candidate:
+    """Return the run solved with the heading of state `at` held at that of `best` turned by an angle."""
     turn, values = gtsam.Rot3.Yaw(by_rad), copy_states(problem, best.values, 0, last)
     for k in range(last + 1):
         pose = values.atPose3(keys.pose(k))
         values.update(keys.pose(k), gtsam.Pose3(turn.compose(pose.rotation()), pose.translation()))
-    held = replace(start, yaw_sigma_rad=_HELD_RAD)
-    candidate = _Candidate(values, _start_prior(problem, held, _yaw(values, 0)), excess=best.excess)
+    middle = values.atPose3(keys.pose(at))
+    R = middle.rotation().matrix()
+    cov = np.eye(6) * _FREE**2
+    cov[:3, :3] = R.T @ np.diag([_FREE, _FREE, _HELD_RAD]) ** 2 @ R
+    held = gtsam.PriorFactorPose3(keys.pose(at), middle, gtsam.noiseModel.Gaussian.Covariance(cov))
+    prior = _start_prior(problem, replace(start, yaw_sigma_rad=_FREE), _yaw(values, 0))
+    candidate = _Candidate(values, prior, excess=best.excess)
     try:
-        _solve_candidate(problem, candidate, last)
+        _solve_candidate(problem, candidate, last, held)
     except SolveError:
         candidate.cost = np.inf
     return candidate
 
 
-def _solve_candidate(problem: Problem, candidate: _Candidate, last: int) -> int:
-    """Solve the first window in place, gently first; return the iterations."""
+def _solve_candidate(
+    problem: Problem, candidate: _Candidate, last: int, held: gtsam.NonlinearFactor | None = None
+) -> int:
+    """Solve the first window in place; return the iterations. `held`: a factor that holds it near an estimate; else gently first."""
     iterations = 0
-    for stage, limit, settled_m, hypotheses in _STAGES:
+    for stage, limit, settled_m, hypotheses in _STAGES[0 if held is None else 1 :]:
         for _ in range(limit):
             verdicts = weigh(problem, candidate.values, first=0, last=last, stage=stage, hypotheses=hypotheses)
             decided, jumps = decisions(verdicts), stage != "far"
-            step = solve_stretch(problem, candidate.values, 0, last, candidate.prior, decided, jumps=jumps, tol=1e-4)
+            step = solve_stretch(
+                problem, candidate.values, 0, last, candidate.prior, decided, jumps=jumps, tol=1e-4, beside=held
+            )
             iterations += step.iterations
             if step.moved_m < settled_m:
                 break

@@ -50,10 +50,16 @@ def solve_stretch(
     *,
     jumps: bool = True,
     tol: float = 3e-3,
+    beside: Any = None,
 ) -> StretchStep:
-    """Optimise states first..last in place, roughly: the passes over the whole run do the rest."""
+    """Optimise states first..last in place, roughly: the passes over the whole run do the rest.
+
+    `beside`: a factor (gtsam.NonlinearFactor) that is no part of the run.
+    """
     made: dict[tuple[int, int], range] = {}
     graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps, made=made)
+    if beside is not None:
+        graph.add(beside)
     solved = optimize(graph, guess, 15, tol)
     moved_m = moved(guess, solved.values)
     update_states(problem, values, solved.values, first, last)

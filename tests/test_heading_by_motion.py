@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A vehicle without a heading sensor: as sure of its heading as its motion tells it, and no surer."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphloc import app
+from graphloc.config import GnssConfig, ImuConfig, VesselConfig
+from graphloc.eval.simulate import Scenario, simulate
+from graphloc.frames import Array, Geodetic, wrap_angle
+from graphloc.measurements import GnssPosition
+from graphloc.recording import Recording
+from graphloc.solution import Solution
+
+IMU_HZ, ACCEL_NOISE, GYRO_NOISE, FIX_M = 25.0, 0.05, 0.003, 0.3  # noise densities: m/s^2, rad/s per sqrt(Hz)
+
+
+def robot(
+    seed: int, duration_s: float, *turns_at_s: float, speed_mps: float = 1.0
+) -> tuple[Recording, VesselConfig, Array, Array]:
+    """Drive straight, by default at a walking pace, and turn by 90 deg within 3 s at some moments.
+
+    Returns:
+        The recording, its configuration, and the true yaw (N,), rad, at times (N,), s, since the first sample.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, duration_s, 1.0 / IMU_HZ)
+    rate = np.zeros(len(t))
+    for begin_s in turns_at_s:
+        rate[(t > begin_s) & (t < begin_s + 3.0)] = np.pi / 6.0
+    yaw = rng.uniform(-np.pi, np.pi) + np.cumsum(rate) / IMU_HZ
+    v = speed_mps * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))])
+    p = np.cumsum(v, axis=0) / IMU_HZ
+    force = np.column_stack([np.zeros(len(t)), speed_mps * rate, np.full(len(t), 9.80665)])
+    gyro = np.column_stack([np.zeros((len(t), 2)), rate])
+    template = simulate(Scenario(path="still", duration_s=6.0, imu_hz=20.0, gnss_hz=2.0, pose_hz=0.0), 0)
+    first_ns = int(template.truth.stamps_ns[0])
+    stamps_ns = first_ns + np.round(t * 1e9).astype(np.int64)
+    assert template.recording.imu is not None
+    imu = replace(
+        template.recording.imu,
+        seqs=np.arange(len(t)),
+        stamps_ns=stamps_ns,
+        accel_mps2=force + ACCEL_NOISE * np.sqrt(IMU_HZ) * rng.standard_normal(force.shape),
+        gyro_radps=gyro + GYRO_NOISE * np.sqrt(IMU_HZ) * rng.standard_normal(gyro.shape),
+    )
+    fix = next(m for m in template.recording.measurements if isinstance(m, GnssPosition))
+    datum = app.choose_datum(template.recording, template.config)
+    fixes = tuple(
+        replace(
+            fix, seq=10**6 + k, stamp_ns=int(stamps_ns[k]), cov_enu_m2=FIX_M**2 * np.eye(3),
+            position=Geodetic(*datum.geodetic_from_enu(p[k] + FIX_M * rng.standard_normal(3))[0]),
+        )
+        for k in range(0, len(t), int(IMU_HZ / 2.0))
+    )  # fmt: skip
+    sensors = {
+        "imu": ImuConfig.model_validate({
+            "topic": "/imu", "accel_noise_ug_per_sqrt_hz": ACCEL_NOISE / 9.80665e-6,
+            "gyro_noise_mdps_per_sqrt_hz": np.degrees(GYRO_NOISE) * 1e3,
+        }),
+        "gnss": GnssConfig.model_validate({"topic": "/fix", "slow_error": {"enabled": False}}),
+    }  # fmt: skip
+    config = template.config.model_copy(update={"sensors": sensors})
+    recording = replace(template.recording, imu=imu, measurements=fixes, truth=None, mounts={})
+    return recording, config, t, yaw
+
+
+def errors(solved: Solution, recording: Recording, t: Array, yaw: Array) -> tuple[Array, Array]:
+    """Errors of the heading (N,), deg, and their stated sigmas (N,), deg."""
+    track = solved.trajectory
+    assert track.cov is not None
+    assert recording.imu is not None
+    at = np.interp((track.stamps_ns - recording.imu.stamps_ns[0]) * 1e-9, t, yaw)
+    return np.degrees(wrap_angle(track.yaw_rad - at)), np.degrees(np.sqrt(track.cov[:, 5, 5]))
+
+
+def test_straight_on_the_heading_is_a_guess() -> None:
+    """Any heading explains it, and the gyroscope's bias is not known: the squared errors over their variance average 1.
+
+    Linearised about the heading that explains the noise best, they are 14.
+    """
+    found = []
+    for seed in range(4):
+        recording, config, t, yaw = robot(seed, 50.0)
+        solved = app.smooth_recording(recording, config).solution
+        error, sigma = errors(solved, recording, t, yaw)
+        found.append(np.mean((error / sigma) ** 2))
+        assert any("the heading is a guess" in w for w in solved.stats.warnings)
+    assert 0.3 < np.mean(found) < 2.5
+
+
+def test_turns_tell_the_heading() -> None:
+    """A quick vehicle that turns twice: the motion excludes all other headings, and nothing is added to the linearised bounds."""
+    recording, config, t, yaw = robot(0, 50.0, 15.0, 35.0, speed_mps=8.0)
+    solved = app.smooth_recording(recording, config).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert sigma.max() < 5.0
+    assert np.abs(error / sigma).max() < 3.0
+    assert not any("the heading is a guess" in w for w in solved.stats.warnings)
+
+
+def test_online_a_guess_ends_once_the_motion_tells_the_heading() -> None:
+    """Straight on for 40 s, then turns: at first the bounds hold any heading, in the end the heading is right, and no guess."""
+    recording, config, t, yaw = robot(1, 100.0, 45.0, 55.0, 65.0, 75.0, 85.0, speed_mps=8.0)
+    solved = app.replay_recording(recording, config).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert (np.abs(error) < 2.5 * sigma).all()
+    assert np.abs(error[-1]) < 10.0
+    assert "the heading is a guess" in solved.health_reason[0]
+    assert "the heading is a guess" not in solved.health_reason[-1]
