@@ -22,9 +22,16 @@ from graphloc.eval import ekf
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import compare_to_held_out, compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
+from graphloc.frames import wrap_angle
+from graphloc.frontends._part import BagPart
 from graphloc.measurements import GnssPosition
+from graphloc.trajectory import Trajectory, bounds_95
 
 HUSKY = ROOT.parent / "shared/data/husky/husky_car_park.bag"
+_PARTS_S = (
+    (0, 30), (0, 45), (0, 75), (0, 120), (0, 160), (0, 200), (60, 120),
+    (120, 45), (120, 90), (180, 60), (180, 120), (240, 60), (240, 120), (300, 60),
+)  # begin and length; it drives straight on until 140 s  # fmt: skip
 
 
 def husky(_pool: ProcessPoolExecutor) -> list[Row]:
@@ -43,6 +50,28 @@ def husky(_pool: ProcessPoolExecutor) -> list[Row]:
         ),
         row("A.1", "Husky: forward speed less wheels, mean (absolute)", abs(speed["mean_mps"]), "m/s", 0.10, "<="),
         row("A.1", "Husky: forward speed less wheels, std", speed["std_mps"], "m/s", 0.25, "<="),
+        *_headings_of_parts(),
+    ]
+
+
+def _headings_of_parts() -> list[Row]:
+    """No sensor tells the heading: in parts of the run it should differ from that of the whole run by no more than they say."""
+
+    def track(bags: Path | BagPart) -> Trajectory:
+        recording, config = app.load(bags, ROOT / "examples/husky/vessel.yaml")
+        return app.smooth_recording(recording, config).solution.trajectory
+
+    whole, largest, inside = track(HUSKY), 0.0, []
+    for begin_s, length_s in _PARTS_S:
+        part = track(BagPart((HUSKY,), float(begin_s), float(length_s)))
+        assert part.cov is not None
+        apart = wrap_angle(part.yaw_rad - np.interp(part.stamps_ns, whole.stamps_ns, np.unwrap(whole.yaw_rad)))
+        largest = max(largest, float(np.abs(apart / np.sqrt(part.cov[:, 5, 5])).max()))
+        inside.append(np.mean(np.degrees(np.abs(apart)) < bounds_95(part.cov)[:, 2]))
+    of = f"Husky, {len(_PARTS_S)} parts of 30 to 200 s, heading from that of the whole run"
+    return [
+        row("A.1", f"{of}: largest difference / sigma", largest, "", 3.0, "<="),
+        row("A.1", f"{of}: inside the 95 % bounds", float(np.mean(inside)), "", 0.9, ">="),
     ]
 
 

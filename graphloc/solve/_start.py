@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The start of a run: candidates for the heading are tried on its first window, which grows while they cannot be told apart.
 
-Where no sensor tells the heading, the accelerations do, turned by it into the motion that the positions show. The linearised run
-is too sure of such a heading: it takes the noise of the accelerometer, and a bias that explains the motion as well, for
-accelerations that turn with the heading. On a robot that drove straight for 120 s with a noisy IMU it stated 20 deg, 1 sigma, and
-was 95 deg off, at a cost that differed by 1.3 from that of the true heading. So the window grows until headings beside the best
-one cost clearly more; where none ever do, the heading is as uncertain as the costs of all headings say.
+Where no sensor tells the heading, the accelerations do, turned by it into the motion that the positions show. Linearised about
+the heading that explains their noise best, and with a prior there, a run is too sure of it: on a robot that drove straight for
+120 s with a noisy IMU it stated 20 deg, 1 sigma, and was 95 deg off, at a cost that differed by 1.3 from that of the true heading.
+So the window grows until headings beside the best one cost clearly more; where none ever do, the heading is as uncertain as the
+costs of all headings say.
 """
 
 from __future__ import annotations
