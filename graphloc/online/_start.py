@@ -144,9 +144,12 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
     sigma = min(float(np.sqrt(max(linear_var, result.heading_var[-1]))), ANY_HEADING_RAD)
     doubt = ""
     if result.headings > 1 or sigma > _HEADING_RAD:
-        doubt = f"the heading is a guess: {result.headings} candidates explain the motion so far, 1 sigma {np.degrees(sigma):.0f} deg"
+        found = f"the motion so far tells it to {np.degrees(sigma):.0f} deg (1 sigma)"
+        if result.headings > 1:
+            found += f", {result.headings} candidates explain it"
         if span_s < _HEADING_WAIT_S:
-            return f"a heading: {result.headings} candidates explain the motion so far; turn, add a heading sensor or set `start.heading_deg`"
+            return f"a heading: {found}; turn, add a heading sensor or set `start.heading_deg`"
+        doubt = f"the heading is a guess: {found}"
     heights = {
         name: origin.height_m(recording, config, sensor.height_m, datum)
         for row in rows
