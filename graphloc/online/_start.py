@@ -2,7 +2,7 @@
 """The start: wait until position and heading are observable, then solve the data so far with the batch solver.
 
 The window then begins at the first data, with the prior of the start, linearised at the solution: the choice of modes
-among matches stays open for as long as these are in the window. Where the start had to wait for longer than the window (for
+among matches stays open for as long as these are in the window. Where the start had to wait for much longer than the window (for
 a heading from travel alone), the window begins its own length ago, with the prior that all earlier data give for that state.
 """
 
@@ -44,6 +44,7 @@ _AGREEING, _SHARE, _CHOICE_WAIT_S = (
     0.4,
     15.0,
 )  # number and share that must agree: two false matches of five may agree with each other
+_WHOLE = 1.5  # windows of data up to which it begins at the first data: a start that came a little later is then no other one
 _FIXES = 3  # needed to set a datum
 
 
@@ -196,11 +197,12 @@ def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:
     """
     problem, values = result.problem, result.values
     timeline, last = problem.timeline, len(problem.timeline) - 1
-    back = timeline.floor(int(timeline.stamps_ns[last]) - duration_ns(lag_s))
+    first_ns, last_ns = int(timeline.stamps_ns[0]), int(timeline.stamps_ns[last])
+    back = timeline.floor(last_ns - duration_ns(lag_s))
     # Not at the last node: the prior that closes the slow chains there would be part of the anchor, and count twice.
     k = int(np.searchsorted(timeline.slow_of, min(timeline.slow_of[back], timeline.slow_of[last] - 1)))
-    if k == 0:
-        return 0, Anchor.of_start(int(timeline.stamps_ns[0]), result.prior)
+    if k == 0 or last_ns - first_ns <= duration_ns(_WHOLE * lag_s):
+        return 0, Anchor.of_start(first_ns, result.prior)
     made: dict[tuple[int, int], range] = {}
     graph, guess = build_graph(problem, values, decisions(result.verdicts), 0, last, result.prior, made=made)
     # Earlier measurements may be attached to this state; the window takes only those from its stamp on.
