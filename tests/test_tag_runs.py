@@ -125,7 +125,7 @@ def dock(
     cameras = {name: c.model_copy(update={"mount_sigma_deg": mount_sigma_deg}) for name, c in tags.cameras.items()}
     sensors = seen.config.sensors | {"tags": tags.model_copy(update={"cameras": cameras})}
     config = seen.config.model_copy(
-        update={"timeline": TimelineConfig(rate_hz=5.0), "sensors": sensors}
+        update={"timeline": TimelineConfig(rate_hz=2.5), "sensors": sensors}
     )  # half the time
     run = app.simulated(replace(seen, recording=recording, config=config), compare=compare)
     return Docked(true, run, {m.seq: right for m, right in numbered})
