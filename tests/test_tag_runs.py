@@ -316,7 +316,7 @@ def test_tags_that_are_first_seen_near_the_berth_are_believed(kind: str) -> None
 
 def test_single_tags_without_a_compass() -> None:
     """Their modes are the only heading there is: it is right from the beginning to the end."""
-    docked = dock(change=without(CompassHeading), alone=True)
+    docked = dock(change=without(CompassHeading), alone=True, rate_hz=1.0)
     assert np.abs(docked.heading_error_deg()).max() < 2.0
     assert wrong_modes(docked) <= 0.005
     assert docked.number("berth_p95_m") < 0.15
