@@ -17,6 +17,6 @@ def slowly(run: SimulatedRun, rate_hz: float = 5.0) -> SimulatedRun:
     return replace(run, config=with_few_states(run.config, rate_hz))
 
 
-def simulate_slowly(scenario: Scenario, seed: int) -> SimulatedRun:
-    """Simulate, for five states a second."""
-    return slowly(simulate(scenario, seed))
+def simulate_slowly(scenario: Scenario, seed: int, rate_hz: float = 5.0) -> SimulatedRun:
+    """Simulate a run `with_few_states`."""
+    return slowly(simulate(scenario, seed), rate_hz)

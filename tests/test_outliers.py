@@ -226,7 +226,7 @@ def believed(off_m: float, last_s: float) -> tuple[Recording, Recording, VesselC
 def test_a_run_with_a_jump_that_the_bounds_do_not_cover_is_not_good() -> None:
     """Its bound was 2 cm, and its health good, where it was 0.6 m off."""
     right, wrong, config = believed(0.6, last_s=35.0)
-    config = with_few_states(config)
+    config = with_few_states(config, rate_hz=2.5)
     usual, jumped = (app.smooth_recording(of, config).solution for of in (right, wrong))
     assert not any("position jump" in line for line in usual.stats.warnings)
     assert "position jump of gnss, and no other sensor measures position" not in usual.health_reason
@@ -380,7 +380,7 @@ def jumping_alone(
         return replace(m, position=Geodetic(m.position[0] + off_m / 111_300.0, *m.position[1:]))
 
     recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
-    return run, recording, with_few_states(run.config.model_copy(update={"sensors": sensors}))
+    return run, recording, with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz=2.5)
 
 
 def test_a_sensor_that_lies_by_more_than_numbers_hold_is_an_outlier() -> None:

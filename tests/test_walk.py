@@ -47,7 +47,7 @@ def test_bounds_hold_beside_fixes_good_to_centimetres_that_walk() -> None:
     scenario: Scenario = replace(
         bl_scenario(1, "clean"), duration_s=80.0, imu_hz=50.0, gnss_hz=5.0, gnss_sigma_m=0.03, false_fraction=0.0
     )
-    run = simulate_slowly(scenario, 4)
+    run = simulate_slowly(scenario, 4, rate_hz=2.5)
     rng, walked, fixes = np.random.default_rng(6), np.zeros(3), []
     datum = Datum(next(m.position for m in run.recording.measurements if isinstance(m, GnssPosition)))
     for m in run.recording.measurements:
