@@ -29,6 +29,7 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import BodyVelocity, GnssPosition
 from graphloc.replay import replay
 from tests.bagfactory import START_NS, Messages
+from tests.slowly import simulate_slowly
 
 MAKE = Messages(2)
 KNOT_MPS = 1852.0 / 3600.0
@@ -123,9 +124,12 @@ def test_a_residual_by_hand() -> None:
 
 
 def silent(seed: int, log_hz: float) -> SimulatedRun:
-    """A minute of loops, then 40 s without fixes and matches."""
-    scenario = Scenario(path="loops", noise="drift", duration_s=105.0, outage_s=(60.0, 100.0), log_hz=log_hz)
-    return simulate(scenario, seed)
+    """A minute of loops, then 40 s without fixes and matches. Sensors and states at low rates: a quarter of the time."""
+    scenario = Scenario(
+        path="loops", noise="drift", duration_s=101.0, outage_s=(60.0, 100.0), log_hz=log_hz,
+        imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0,
+    )  # fmt: skip
+    return simulate_slowly(scenario, seed, rate_hz=2.5)
 
 
 def test_a_log_holds_the_track_while_gnss_is_silent() -> None:

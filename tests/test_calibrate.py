@@ -25,6 +25,7 @@ from graphloc.solve import smooth
 from graphloc.solve._linearised import Rows, normal_solver
 from graphloc.solve._offsets import _imu_misfit
 from tests.bagfactory import Messages
+from tests.slowly import simulate_slowly
 from tests.test_inspect import drive, look
 from tests.test_odd_vessels import antenna_velocity
 
@@ -119,7 +120,7 @@ def calibration_of(recording: Any, config: VesselConfig) -> Calibration:
 
 @pytest.fixture(scope="module")
 def simulated() -> SimulatedRun:
-    run = simulate(
+    run = simulate_slowly(
         Scenario(
             path="loops",
             duration_s=80.0,

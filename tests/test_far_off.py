@@ -21,6 +21,7 @@ from graphloc.graph import SlowProcess
 from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, PoseFix
 from graphloc.recording import Recording
 from graphloc.replay import replay
+from tests.slowly import with_few_states
 
 PLACE, FIRST = 10_000, 0
 
@@ -136,7 +137,7 @@ def jumped(
     velocity = VelocityConfig(topic="/velocity", mount=run.config.sensors["gnss"].mount)
     sensors = {n: s for n, s in run.config.sensors.items() if n != "matcher"} | {"velocity": velocity}
     recording = replace(run.recording, measurements=measurements, message_count=len(imu) + len(measurements))
-    return run, recording, run.config.model_copy(update={"sensors": sensors})
+    return run, recording, with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz=2.5)
 
 
 @pytest.mark.parametrize(("begin_s", "end_s"), [(44.0, 60.0), (20.0, 34.0)])

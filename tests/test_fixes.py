@@ -23,6 +23,7 @@ from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.slowly import simulate_slowly
 from tests.test_bag import KINDS
 from tests.test_bag_bad_input import accounted, rows_of, vessel
 
@@ -202,7 +203,7 @@ def test_a_fix_without_a_height_is_a_horizontal_one(every: int, tmp_path: Path) 
 
 def test_horizontal_fixes_tell_the_same_track() -> None:
     """Planar fixes beside the height prior: the horizontal track is that of fixes with their heights, batch and online."""
-    run = simulate(Scenario(path="loops", duration_s=30.0, noise="drift"), 2)
+    run = simulate_slowly(Scenario(path="loops", duration_s=30.0, noise="drift", imu_hz=50.0), 2, rate_hz=2.5)
     flat = tuple(_flattened(m) if isinstance(m, GnssPosition) else m for m in run.recording.measurements)
     planar = replace(run.recording, measurements=flat)
     for solve in (smooth_recording, replay):

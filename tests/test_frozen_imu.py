@@ -10,7 +10,7 @@ import pytest
 from graphloc import app
 from graphloc.config import DatumConfig
 from graphloc.errors import SolveError
-from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
@@ -22,6 +22,7 @@ from graphloc.online import OnlineSmoother
 from graphloc.replay import replay
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.faults import Arrival, Arrivals, arrivals_of, complaints, feed, finish
+from tests.slowly import simulate_slowly
 from tests.test_bag_bad_input import accounted, rows_of, vessel
 
 MAKE = Messages(2)
@@ -122,7 +123,7 @@ def test_a_bag_whose_imu_is_frozen_throughout_is_refused_with_the_cause(tmp_path
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
-    return simulate(Scenario(path="loops", duration_s=40.0, noise="clean", false_fraction=0.0), 12)
+    return simulate_slowly(Scenario(path="loops", duration_s=40.0, noise="clean", false_fraction=0.0), 12)
 
 
 def struck(run: SimulatedRun, begin_s: float, end_s: float) -> Arrivals:

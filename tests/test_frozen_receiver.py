@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.eval.simulate import Scenario, simulate
+from graphloc.eval.simulate import Scenario
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.inspect import inspect_bag, render
 from graphloc.frozen_receiver import frozen_fixes
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, PoseFix
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.slowly import simulate_slowly
 
 DATUM = Datum(Geodetic(57.7, 11.9, 40.0))
 Way = Callable[[Array], Array]
@@ -147,7 +148,7 @@ def test_what_comes_after_a_silence_tells_little_of_a_rest(
 
 def test_a_frozen_receiver_is_as_good_as_a_silent_one() -> None:
     """Followed, the track is 26 to 36 m off there; nothing but IMU and compass is beside it."""
-    run = simulate(Scenario(path="loops", duration_s=60.0, noise="drift"), 1)
+    run = simulate_slowly(Scenario(path="loops", duration_s=60.0, noise="drift"), 1)
     fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
     begin_ns, end_ns = fixes[0].stamp_ns + 25 * S, fixes[0].stamp_ns + 40 * S
     held = next(m for m in fixes if m.stamp_ns >= begin_ns)

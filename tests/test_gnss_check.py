@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.config import TimelineConfig
 from graphloc.eval.gnss_check import _mean_variance, gnss_offset_warnings
-from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition, Measurement, PoseFix
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import S
+from tests.slowly import simulate_slowly
 
 SIGMA_M, LASTING_S = 2.0, 200.0
 DATUM = Datum(Geodetic(57.7, 11.7, 36.0))
@@ -25,8 +25,7 @@ def run() -> SimulatedRun:
     scenario = Scenario(
         path="loops", duration_s=60.0, noise="clean", false_fraction=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0
     )
-    run = simulate(scenario, 21)
-    return replace(run, config=run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)}))
+    return simulate_slowly(scenario, 21, rate_hz=2.5)
 
 
 def said(run: SimulatedRun, east_north_m: Array, every_s: int = 1, up_m: float = 0.0) -> list[str]:

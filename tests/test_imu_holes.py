@@ -13,13 +13,14 @@ import pytest
 from graphloc import app, keys
 from graphloc.build import Problem, bridged, make_problem
 from graphloc.config import ImuConfig
-from graphloc.eval.simulate import Scenario, simulate
+from graphloc.eval.simulate import Scenario
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
 from graphloc.graph import Going
 from graphloc.measurements import ImuSeries, Measurement
 from tests.faults import arrivals_of, feed, numbered
+from tests.slowly import simulate_slowly
 from tests.test_online_faults import smoother
 
 G = 9.81
@@ -142,7 +143,7 @@ def test_who_turns_goes_round(rpy: tuple[float, float, float], from_s: float) ->
 
 def test_once_a_run_is_solved_its_links_lead_on_as_it_went() -> None:
     """They are laid before anything is known: a bias of 0.3 m/s^2 is taken off twice then, and a turn leaves the velocity behind."""
-    run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=45.0), seed=2)
+    run = simulate_slowly(replace(Scenario(path="loops", noise="clean"), duration_s=45.0), seed=2)
     imu, truth = run.recording.imu, run.truth
     assert imu is not None
     t_s = (imu.stamps_ns - imu.stamps_ns[0]) / S
@@ -223,7 +224,7 @@ def test_one_silence_tilts_by_one_bound(calls: int, begun_s: float) -> None:
 
 def test_online_it_is_back_at_once_after_a_silence_of_everything() -> None:
     """As where a cable or a switch goes: no sensor for 13 s. Tried with the hole interpolated across, it was 60 m off for 16 s."""
-    run = simulate(replace(Scenario(path="loops", noise="drift"), duration_s=50.0), seed=1)
+    run = simulate_slowly(replace(Scenario(path="loops", noise="drift"), duration_s=50.0), seed=1)
     begin_ns = int(run.truth.stamps_ns[0]) + 26 * S
     over_ns = begin_ns + 13 * S
     left = [a for a in arrivals_of(run) if not (begin_ns <= a.true_ns < over_ns and isinstance(a.m, Measurement))]

@@ -44,7 +44,7 @@ def drive(
     gyro_scale: float = 1.0,
     status: int = 2,
     sigma_m: float = 0.02,
-    seconds: int = 60,
+    seconds: int = 40,
     noise_m: float = 0.0,
 ) -> list[Item]:
     """Speed 3 + 1.5 sin(0.4 t) m/s, yaw rate 0.15 sin(0.13 t) + 0.05 rad/s, first 10 s at rest; analytic IMU."""
@@ -96,7 +96,7 @@ def look(tmp_path: Path, items: list[Item], make: Messages) -> tuple[Inspection,
 def test_mount_from_gravity_and_motion(tmp_path: Path, yaw_deg: float, upright: bool) -> None:
     make = Messages(2)
     R = rotation_z(yaw_deg) @ (np.eye(3) if upright else ROLL_90)
-    found, config, _ = look(tmp_path, drive(make, R, seconds=60), make)
+    found, config, _ = look(tmp_path, drive(make, R), make)
     np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, R, atol=1e-6)
     axis = 2 if upright else 1
     assert found.imus[0].gravity_axis[axis] == pytest.approx(1.0, abs=0.01)
@@ -104,7 +104,7 @@ def test_mount_from_gravity_and_motion(tmp_path: Path, yaw_deg: float, upright: 
 
 def test_a_whole_draft(tmp_path: Path) -> None:
     make = Messages(2)
-    found, config, text = look(tmp_path, drive(make), make)
+    found, config, text = look(tmp_path, drive(make, seconds=60), make)
     imu, gnss, compass = found.imus[0], found.gnss[0], found.compasses[0]
     assert imu.gyro_bias_radps == pytest.approx((0.0, 0.0, 0.004), abs=2e-4)
     assert imu.still_s == pytest.approx(10.0, abs=1.5)
@@ -209,7 +209,7 @@ def test_without_gravity_the_motion_tells_the_yaw(yaw_deg: float, upright: bool,
 
 def test_standard_receiver_gets_a_slow_error(tmp_path: Path) -> None:
     make = Messages(2)
-    found, config, _ = look(tmp_path, drive(make, status=1, sigma_m=1.2, seconds=60), make)
+    found, config, _ = look(tmp_path, drive(make, status=1, sigma_m=1.2), make)
     assert config.sensors["gnss"].slow_error.enabled is None  # on where a second absolute sensor is
     assert found.gnss[0].reported_sigma_m == pytest.approx((1.2, 1.2, 1.2))
     assert max(found.gnss[0].scatter_m or (1.0,)) < 0.02  # the data are smooth, whatever they claim
@@ -411,7 +411,7 @@ def test_places_in_a_map_grid_alone_are_fixes_once_the_grid_is_named(yaw_deg: fl
     assert not any("nothing in it tells the place" in w for w in found.warnings)
     assert found.imus[0].mount.rpy_deg[2] == yaw_deg
     nowhere = read_recording(tmp_path / "run", config)
-    assert any("gnss: none of the 300 messages" in w and "set grid to its name" in w for w in nowhere.warnings)
+    assert any("gnss: none of the 200 messages" in w and "set grid to its name" in w for w in nowhere.warnings)
     (tmp_path / "vessel.yaml").write_text(text.replace("grid: ''", "grid: EPSG:32632"))
     placed = read_recording(tmp_path / "run", load_config(tmp_path / "vessel.yaml", KINDS))
     first = next(m for m in placed.measurements if isinstance(m, GnssPosition))

@@ -16,6 +16,7 @@ from graphloc.factors.gnss import ROW
 from graphloc.graph import Decision
 from graphloc.measurements import GnssPosition
 from graphloc.replay import replay
+from tests.slowly import with_few_states
 from tests.test_factors import attachment, values_of
 
 LATE_S = 0.1
@@ -43,7 +44,8 @@ def late(
         "slow_error": gnss.slow_error.model_copy(update={"enabled": slow, "horizontal_sigma_m": 0.05}),
     }
     sensors = {**run.config.sensors, "gnss": gnss.model_copy(update=settings)}
-    return replace(run, recording=recording, config=run.config.model_copy(update={"sensors": sensors}))
+    config = with_few_states(run.config.model_copy(update={"sensors": sensors}))
+    return replace(run, recording=recording, config=config)
 
 
 def offline(run: SimulatedRun) -> TruthMetrics:

@@ -22,11 +22,13 @@ from graphloc.solve._legs import overlap_ns, seams
 
 S = 10**9
 LEG_S = 60.0
-LOOPS = Scenario(path="loops", duration_s=130.0, noise="drift", gnss_hz=2.0, compass_hz=2.0)
+RATE_HZ = 5.0  # of states: half the time
+LOOPS = Scenario(path="loops", duration_s=130.0, noise="drift", imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0)
 
 
 def in_legs(config: VesselConfig, leg_s: float = LEG_S) -> VesselConfig:
-    return config.model_copy(update={"timeline": config.timeline.model_copy(update={"leg_s": leg_s})})
+    timeline = config.timeline.model_copy(update={"rate_hz": RATE_HZ, "leg_s": leg_s})
+    return config.model_copy(update={"timeline": timeline})
 
 
 def solved(run: SimulatedRun, leg_s: float = LEG_S, measurements: tuple[Measurement, ...] | None = None) -> Solution:
@@ -90,7 +92,7 @@ def test_every_message_has_one_row_and_every_state_its_values(whole: Solution, l
         legs.health_reason,
     ]
     assert {len(c) for c in (*columns, *legs.since_agreed_s.values())} == {n}
-    assert np.diff(legs.trajectory.stamps_ns).max() < 0.25 * S
+    assert np.diff(legs.trajectory.stamps_ns).max() < 1.5 * S / RATE_HZ  # none is missing
     assert legs.slow.keys() == whole.slow.keys()
     for name, slow in legs.slow.items():
         assert (np.diff(slow.stamps_ns) > 0).all()
@@ -129,14 +131,15 @@ def test_a_heading_that_no_sensor_tells_is_handed_on(run: SimulatedRun, monkeypa
         assert heading_deg == pytest.approx(float(heading_deg_from_yaw(true.yaw_rad)[0]), abs=6.0)
 
 
-def test_a_leg_without_a_place_is_no_reason_to_fail(run: SimulatedRun) -> None:
+def test_a_leg_without_a_place_is_no_reason_to_fail() -> None:
+    run = simulate(replace(LOOPS, duration_s=60.0), 3)
     first = begin_ns(run)
     early = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < first + 20 * S)
-    found = solved(run, measurements=early)
+    found = solved(run, 30.0, early)
     (said,) = found.stats.events
     assert "solved in one piece, not in legs: a leg failed" in said
     assert "no position" in said
-    assert found.trajectory.stamps_ns[-1] > first + 125 * S
+    assert found.trajectory.stamps_ns[-1] > first + 55 * S
 
 
 def test_a_sensor_that_fell_silent_was_heard_in_the_leg_before(run: SimulatedRun) -> None:

@@ -25,8 +25,9 @@ from graphloc.solution import Solution
 from graphloc.solve._align import _level, _turns, align
 from graphloc.solve._parts import _join_stats
 from graphloc.trajectory import Trajectory, bounds_95
+from tests.slowly import simulate_slowly
 
-BASE = Scenario(path="loops", duration_s=40.0, noise="clean", pose_hz=0.0)
+BASE = Scenario(path="loops", duration_s=40.0, noise="clean", pose_hz=0.0, imu_hz=50.0)
 
 
 def only(recording: Recording, keep: tuple[Measurement, ...]) -> Recording:
@@ -42,14 +43,14 @@ def with_sensors(run: SimulatedRun, **sensors: object) -> VesselConfig:
 
 def test_gnss_alone_owns_up_to_its_slow_error() -> None:
     """Fixes that drift by a metre, and nothing beside them: the estimate drifts along, and its bound says so."""
-    run = simulate(replace(BASE, noise="drift", duration_s=40.0), 2)
+    run = simulate_slowly(replace(BASE, noise="drift", duration_s=40.0), 2)
     solved = app.simulated(run).solution
     ours = compare_to_truth(solved.trajectory, run.truth)
     assert ours.position_rmse_m > 0.7
     assert ours.coverage_95 is not None
     assert ours.coverage_95 > 0.95
     assert any("slow error" in w for w in solved.stats.warnings)
-    begin = simulate(replace(BASE, noise="drift", duration_s=15.0), 2)
+    begin = simulate_slowly(replace(BASE, noise="drift", duration_s=15.0), 2)
     told = app.smooth_recording(
         begin.recording, with_sensors(begin, gnss=GnssConfig.model_validate({
             "topic": "/gnss/fix", "mount": {"xyz_m": (-1.5, 0.3, 2.2789)}, "slow_error": {"enabled": False},
@@ -62,7 +63,7 @@ def test_gnss_alone_owns_up_to_its_slow_error() -> None:
 
 def test_of_a_parked_vessel_no_heading_is_known() -> None:
     """Fixes good to 2 cm and an IMU at rest: about the heading that was assumed, the solver is sure to 25 deg."""
-    run, rng = simulate(replace(BASE, duration_s=20.0), 0), np.random.default_rng(0)
+    run, rng = simulate_slowly(replace(BASE, duration_s=20.0), 0), np.random.default_rng(0)
     imu, sensors = run.recording.imu, run.config.sensors
     assert imu is not None
     shape = (len(imu.stamps_ns), 3)
@@ -84,7 +85,7 @@ def test_of_a_parked_vessel_no_heading_is_known() -> None:
 
 def test_the_sea_is_round() -> None:
     """A datum 10 km off: the waterline lies 7.8 m below its tangent plane."""
-    run = simulate(BASE, 1)
+    run = simulate_slowly(BASE, 1)
     away = Geodetic(57.7 + 10.0 / 111.4, 11.7, 36.0)
     config = run.config.model_copy(
         update={"datum": DatumConfig(latitude_deg=away.latitude_deg, longitude_deg=11.7, height_m=36.0)}
@@ -100,7 +101,7 @@ def test_the_sea_is_round() -> None:
 
 
 def test_a_late_first_position_is_no_confident_prior() -> None:
-    run = simulate(replace(BASE, duration_s=40.0, imu_hz=50.0, gnss_hz=5.0), 4)
+    run = simulate_slowly(replace(BASE, duration_s=40.0, imu_hz=50.0, gnss_hz=5.0), 4)
     start = run.recording.measurements[0].stamp_ns
     late = tuple(
         m for m in run.recording.measurements if not isinstance(m, GnssPosition) or m.stamp_ns > start + 20 * 10**9
@@ -114,7 +115,7 @@ def test_a_late_first_position_is_no_confident_prior() -> None:
 
 def test_a_recorder_pause_cuts_the_run() -> None:
     """Nothing at all for 60 s: each side is as good as a run of its own, and every message has its row."""
-    run = simulate(replace(BASE, duration_s=100.0), 1)
+    run = simulate_slowly(replace(BASE, duration_s=100.0), 1)
     imu = run.recording.imu
     assert imu is not None
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
@@ -136,7 +137,7 @@ def test_a_recorder_pause_cuts_the_run() -> None:
 
 def test_a_part_that_cannot_be_solved_is_left_out() -> None:
     """No position after the pause: the first part stands, the second one's messages are rejected with the reason."""
-    run = simulate(replace(BASE, duration_s=50.0), 1)
+    run = simulate_slowly(replace(BASE, duration_s=50.0), 1)
     imu = run.recording.imu
     assert imu is not None
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
@@ -149,7 +150,7 @@ def test_a_part_that_cannot_be_solved_is_left_out() -> None:
 
 
 def test_an_imu_that_ends_early_is_reported() -> None:
-    run = simulate(BASE, 1)
+    run = simulate_slowly(BASE, 1)
     imu = run.recording.imu
     assert imu is not None
     early = replace(run.recording, imu=imu.where(imu.stamps_ns < imu.stamps_ns[0] + 10 * 10**9))
@@ -158,7 +159,7 @@ def test_an_imu_that_ends_early_is_reported() -> None:
 
 
 def test_a_sensor_that_is_switched_off_keeps_its_rows() -> None:
-    run = simulate(replace(BASE, duration_s=8.0, pose_hz=1.0), 1)
+    run = simulate_slowly(replace(BASE, duration_s=8.0, pose_hz=1.0), 1)
     matches = sum(m.sensor == "matcher" for m in run.recording.measurements)
     assert matches >= 7
     off = run.config.sensors["matcher"].model_copy(update={"enabled": False})
@@ -172,7 +173,7 @@ def test_a_sensor_that_is_switched_off_keeps_its_rows() -> None:
 
 def test_held_out_fixes_of_two_receivers_keep_their_antennas() -> None:
     """Receivers 7.5 m apart, held out in turn: each fix is predicted at its own antenna."""
-    run = simulate(replace(BASE, gnss_hz=5.0), 1)
+    run = simulate_slowly(replace(BASE, gnss_hz=5.0), 1)
     second = MountConfig(xyz_m=(6.0, -1.0, 2.0))
     datum, rng = app.choose_datum(run.recording, run.config), np.random.default_rng(1)
     imu = run.recording.imu
@@ -194,7 +195,7 @@ def test_held_out_fixes_of_two_receivers_keep_their_antennas() -> None:
 
 
 def test_places_in_world_need_a_datum() -> None:
-    run = simulate(replace(BASE, duration_s=10.0, pose_hz=1.0), 1)
+    run = simulate_slowly(replace(BASE, duration_s=10.0, pose_hz=1.0), 1)
     with pytest.raises(InputError, match=r"sensors\.matcher, truth_topic.*set datum"):
         app.smooth_recording(run.recording, run.config.model_copy(update={"datum": None}))
 
@@ -245,7 +246,7 @@ def test_fixes_without_a_stamp_are_counted_by_their_reason() -> None:
 
 
 def test_truth_on_another_clock_is_reported_and_left_out() -> None:
-    run = simulate(replace(BASE, duration_s=8.0), 1)
+    run = simulate_slowly(replace(BASE, duration_s=8.0), 1)
     truth = run.truth
     shifted = Trajectory(stamps_ns=truth.stamps_ns + 10**12, p_world_m=truth.p_world_m, R_world_body=truth.R_world_body)
     solved = app.smooth_recording(replace(run.recording, truth=shifted), run.config, compare=True)
@@ -256,7 +257,7 @@ def test_truth_on_another_clock_is_reported_and_left_out() -> None:
 
 def test_health_follows_what_agrees() -> None:
     """Position sensors silent from 15 to 30 s: dead reckoning from 5 s after, and good again at once."""
-    run = simulate(replace(BASE, duration_s=45.0, pose_hz=1.0, false_fraction=0.0, outage_s=(15.0, 30.0)), 3)
+    run = simulate_slowly(replace(BASE, duration_s=45.0, pose_hz=1.0, false_fraction=0.0, outage_s=(15.0, 30.0)), 3)
     solved = app.simulated(run).solution
     t = (solved.trajectory.stamps_ns - solved.trajectory.stamps_ns[0]) * 1e-9
     health = np.array([h.value for h in solved.health])
@@ -270,7 +271,7 @@ def test_health_follows_what_agrees() -> None:
 
 def test_antenna_height_is_taken_off_the_waterline() -> None:
     """Without a configured height the body is at the median fix less the antenna's 2.28 m."""
-    run = simulate(replace(BASE, duration_s=10.0, wave_roll_deg=0.1, wave_pitch_deg=0.1), 1)
+    run = simulate_slowly(replace(BASE, duration_s=10.0, wave_roll_deg=0.1, wave_pitch_deg=0.1), 1)
     config = with_sensors(run, height=HeightConfig(topic=""))
     made = app.with_synthetic(run.recording, config, app.choose_datum(run.recording, config))
     heights = {m.height_m for m in made.measurements if isinstance(m, HeightPrior)}
@@ -280,7 +281,7 @@ def test_antenna_height_is_taken_off_the_waterline() -> None:
 
 def test_output_velocity_is_that_of_the_body_origin() -> None:
     """The states stand 5 m ahead of the origin, at the IMU: in a turn its velocity differs by w x l."""
-    run = simulate(replace(BASE, duration_s=20.0, pose_hz=2.0, false_fraction=0.0), 6)
+    run = simulate_slowly(replace(BASE, duration_s=20.0, pose_hz=2.0, false_fraction=0.0), 6)
     track = app.simulated(run).solution.trajectory
     inner = track.stamps_ns[20:-20]
     true = run.truth.at(inner)
@@ -292,7 +293,7 @@ def test_output_velocity_is_that_of_the_body_origin() -> None:
 
 def test_a_height_from_biased_fixes_is_not_known() -> None:
     """Fixes 7 m too high, and a waterline taken from them: the bound on the height has to hold 7 m."""
-    run = simulate(replace(BASE, duration_s=20.0), 2)
+    run = simulate_slowly(replace(BASE, duration_s=20.0), 2)
     high = tuple(
         replace(m, position=m.position._replace(height_m=m.position.height_m + 7.0))
         if isinstance(m, GnssPosition)
@@ -312,7 +313,7 @@ def test_a_compass_far_off_its_mount_is_reported() -> None:
     """And one that is not is not: of as long a run, with fixes as good, so that it could be told."""
     scenario = replace(BASE, gnss_sigma_m=0.02, duration_s=50.0)
     off, right = (
-        app.simulated(simulate(replace(scenario, compass_offset_deg=deg), 2)).solution.stats.warnings
+        app.simulated(simulate_slowly(replace(scenario, compass_offset_deg=deg), 2)).solution.stats.warnings
         for deg in (8.0, 0.0)
     )
     assert any(w.startswith("compass: its compass offset is estimated") for w in off)
@@ -321,7 +322,7 @@ def test_a_compass_far_off_its_mount_is_reported() -> None:
 
 def test_the_deviation_of_a_compass_is_told_by_the_motion() -> None:
     """B = 4 deg, C = -2 deg, fixes and turns beside it: found, as sure as is said; held at nothing, the heading is 2 deg off."""
-    run = simulate(replace(BASE, gnss_sigma_m=0.05, duration_s=40.0), 2)
+    run = simulate_slowly(replace(BASE, gnss_sigma_m=0.05, duration_s=40.0), 2)
 
     def deviated(m: Measurement) -> Measurement:
         if not isinstance(m, CompassHeading):
@@ -350,7 +351,7 @@ def test_the_deviation_of_a_compass_is_told_by_the_motion() -> None:
 
 def test_a_compass_that_wanders_is_held_by_the_map_and_in_its_bounds() -> None:
     """Off by up to 3 deg, three of its sigmas, now to one side, now to the other, in 40 s. Taken for noise it bends the heading."""
-    run = simulate(replace(BASE, duration_s=40.0, pose_hz=1.0, false_fraction=0.2), 3)
+    run = simulate(replace(BASE, duration_s=40.0, pose_hz=1.0, imu_hz=100.0, false_fraction=0.2), 3)
 
     def wandered(m: Measurement) -> Measurement:
         if not isinstance(m, CompassHeading):
@@ -374,7 +375,7 @@ def test_a_compass_that_wanders_is_held_by_the_map_and_in_its_bounds() -> None:
 
 def test_an_imu_noisier_than_configured_is_scaled_up() -> None:
     """Noise of 20 times what vessel.yaml says: scaled up and said; with `adapt_noise: false` left alone."""
-    run = simulate(
+    run = simulate_slowly(
         replace(
             BASE,
             duration_s=10.0,
@@ -398,7 +399,7 @@ def test_an_imu_noisier_than_configured_is_scaled_up() -> None:
 
 def test_parts_that_lack_a_sensor_and_do_not_converge() -> None:
     """Joined: never since a part's missing sensor agreed; converged only where every part is."""
-    run = simulate(replace(BASE, duration_s=50.0, pose_hz=1.0, false_fraction=0.0), 1)
+    run = simulate_slowly(replace(BASE, duration_s=50.0, pose_hz=1.0, false_fraction=0.0), 1)
     imu = run.recording.imu
     assert imu is not None
     t0 = int(imu.stamps_ns[0])
@@ -420,7 +421,7 @@ def test_parts_that_lack_a_sensor_and_do_not_converge() -> None:
 
 def test_level_and_bias_at_a_tilted_start() -> None:
     """At rest, rolled 5 and pitched 8 deg, with an IMU turned by 90 deg: attitude and gyro bias come out in its axes."""
-    run = simulate(
+    run = simulate_slowly(
         replace(BASE, duration_s=30.0, path="still", wave_roll_deg=0.01, wave_pitch_deg=0.01, wave_heave_m=0.001), 5
     )
     imu = run.recording.imu
@@ -444,7 +445,7 @@ def test_level_and_bias_at_a_tilted_start() -> None:
 
 def test_a_levelling_is_that_of_its_biases() -> None:
     """Which way is up changes with either bias as it says, on a vessel that turns and an IMU that is mounted turned."""
-    run = simulate(replace(BASE, duration_s=10.0, path="loops", imu_hz=50.0), 1)
+    run = simulate_slowly(replace(BASE, duration_s=10.0, path="loops", imu_hz=50.0), 1)
     recording = run.recording
     problem = make_problem(recording, run.config, app.choose_datum(recording, run.config), SENSORS, INERTIAL)
     at = np.array([0.0, 0.0, 0.0, 0.004, -0.003, 0.002])
@@ -466,7 +467,7 @@ def test_a_levelling_is_that_of_its_biases() -> None:
 
 def test_a_heading_that_comes_late_is_not_the_starts() -> None:
     """Fixes from the start, and matches with a heading after 50 s of turns, no compass: carried back, they say anything."""
-    run = simulate(replace(BASE, duration_s=75.0, pose_hz=1.0, false_fraction=0.0, imu_hz=50.0, gnss_hz=2.0), 1)
+    run = simulate_slowly(replace(BASE, duration_s=75.0, pose_hz=1.0, false_fraction=0.0, imu_hz=50.0, gnss_hz=2.0), 1)
     begin_ns = run.truth.stamps_ns[0]
     late = tuple(
         m
@@ -485,7 +486,7 @@ def test_a_heading_that_comes_late_is_not_the_starts() -> None:
 
 def test_a_late_heading_is_the_starts_where_no_place_was_told_before() -> None:
     """Poses from 50 s on, and nothing else: eight starts would be tried, on a way that tells nothing before the heading comes."""
-    run = simulate(replace(BASE, duration_s=75.0, pose_hz=1.0, false_fraction=0.0, imu_hz=50.0), 1)
+    run = simulate_slowly(replace(BASE, duration_s=75.0, pose_hz=1.0, false_fraction=0.0, imu_hz=50.0), 1)
     begin_ns = run.truth.stamps_ns[0]
     late = tuple(m for m in run.recording.measurements if isinstance(m, PoseFix) and m.stamp_ns - begin_ns > 50e9)
     recording = only(run.recording, late)
@@ -515,7 +516,7 @@ def test_roll_or_pitch_alone_is_refused(axes: tuple[str, ...]) -> None:
 )
 def test_a_run_without_a_place_says_why(cause: str, words: str) -> None:
     """A datum is configured and a compass is heard, so nothing but the start misses the fixes."""
-    run = simulate(replace(BASE, duration_s=20.0, gnss_hz=10.0), 3)
+    run = simulate_slowly(replace(BASE, duration_s=20.0, gnss_hz=10.0), 3)
     fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
     others = tuple(m for m in run.recording.measurements if not isinstance(m, GnssPosition))
     assert len(fixes) == 200

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from graphloc import app
-from graphloc.config import TimelineConfig
 from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
@@ -20,6 +19,7 @@ from graphloc.online._lag import Lag
 from graphloc.replay import arrivals, replay
 from graphloc.trajectory import Trajectory
 from tests import tagfactory
+from tests.slowly import with_few_states
 
 
 @cache
@@ -29,7 +29,7 @@ def docking(compass_hz: str = "4") -> SimulatedRun:
     true = simulate(find_scenario("dock-floating-optimal", {**less, "duration_s": "45", "route_s": "45"}), 1)
     run, _ = tagfactory.sighted(true, rate_hz=4.0)
     kept = tuple(m for m in run.recording.measurements if m.sensor != "gnss")
-    config = run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)})  # half the time
+    config = with_few_states(run.config)
     return replace(run, recording=replace(run.recording, measurements=kept), config=config)
 
 
@@ -92,7 +92,7 @@ def test_a_step_uphill_is_no_noise_of_the_imu() -> None:
     true = simulate(find_scenario("dock-fixed-optimal", {**less, "duration_s": "45", "route_s": "45"}), 2)
     run, _ = tagfactory.sighted(true, rate_hz=4.0, hidden_s=(31.0, 45.0))
     kept = tuple(m for m in run.recording.measurements if m.sensor != "gnss")
-    imu, config = run.recording.imu, run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)})
+    imu, config = run.recording.imu, with_few_states(run.config)
     assert imu is not None
     since_s = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
     heard = imu.where((since_s < 27.0) | (since_s >= 32.0))
@@ -155,7 +155,7 @@ def test_what_cannot_be_followed_is_taken_back() -> None:
         replace(m, R_body_camera=m.R_body_camera @ turn) if isinstance(m, TagSighting) else m
         for m in run.recording.measurements
     )
-    config = run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)})
+    config = with_few_states(run.config)
     replayed = app.replay_recording(replace(run.recording, measurements=measurements), config)
     track = replayed.solution.trajectory
     off_m = np.linalg.norm(track.p_world_m - run.truth.at(track.stamps_ns).p_world_m, axis=1)

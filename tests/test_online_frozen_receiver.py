@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from graphloc.config import SlowErrorConfig
-from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.online._frozen_receiver import WINDOW_S, FrozenReceiverDetector
 from graphloc.recording import Recording
 from graphloc.replay import replay
+from tests.slowly import simulate_slowly
 
 Off = Callable[[float, Array], Array]
 
@@ -119,7 +120,7 @@ def test_online_a_frozen_receiver_and_compass_do_not_pull_the_estimate() -> None
         path="loops", duration_s=50.0, noise="clean", gnss_hz=5.0, gnss_sigma_m=0.5, accel_bias_mps2=0.3, gyro_bias_radps=0.03,
         wave_roll_deg=5.0, wave_heave_m=0.3,
     )  # fmt: skip
-    run = simulate(scenario, 1)
+    run = simulate_slowly(scenario, 1)
     sensors = {name: run.config.sensors[name] for name in ("imu", "gnss", "compass")}
     sensors["gnss"] = sensors["gnss"].model_copy(update={"slow_error": SlowErrorConfig()})
     assert run.recording.imu is not None
@@ -134,7 +135,7 @@ def test_online_a_frozen_receiver_and_compass_do_not_pull_the_estimate() -> None
 
 def test_online_frozen_sensors_are_not_followed() -> None:
     """ConditionalGaussian matches, 40 % of them false. Followed, it would be off by 30 m and more, and call that good."""
-    run = simulate(Scenario(path="loops", duration_s=45.0, noise="drift"), 1)
+    run = simulate_slowly(Scenario(path="loops", duration_s=45.0, noise="drift"), 1)
     begin_ns = next(m.stamp_ns for m in run.recording.measurements if isinstance(m, GnssPosition)) + 18 * 10**9
     end_ns = begin_ns + 15 * 10**9
     said = frozen(run, begin_ns, end_ns, {m.sensor for m in run.recording.measurements})

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphloc.config import TimelineConfig, VesselConfig
+from graphloc.config import VesselConfig
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
 from graphloc.frames import rpy_from_rotation, wrap_angle
 from graphloc.measurements import CompassHeading
 from graphloc.recording import Recording
 from graphloc.replay import Replayed, replay
 from graphloc.solution import Health
+from tests.slowly import with_few_states
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,7 @@ def run() -> SimulatedRun:
 
 
 def replayed(recording: Recording, config: VesselConfig) -> Replayed:
-    return replay(recording, config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0)}))
+    return replay(recording, with_few_states(config, rate_hz=2.5))
 
 
 def read_as(recording: Recording, sense: float, off_deg: float) -> Recording:

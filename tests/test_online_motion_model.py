@@ -8,13 +8,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from graphloc.config import TimelineConfig
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array
 from graphloc.measurements import CompassHeading
 from graphloc.online._motion_model import MotionModel, Moving
 from graphloc.replay import replay
 from graphloc.trajectory import bounds_95
+from tests.slowly import with_few_states
 
 SECOND = 1_000_000_000
 
@@ -95,8 +95,8 @@ def test_without_a_place_it_drifts_as_far_as_a_vessel_can_and_no_farther() -> No
 
     For six of them the IMU is silent, too: along which axes it moved there nobody knows.
     """
-    run = simulate(replace(Scenario(path="loops", noise="drift"), duration_s=115.0), 3)
-    config = run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=2.5)})
+    run = simulate(replace(Scenario(path="loops", noise="drift"), duration_s=115.0, imu_hz=50.0), 3)
+    config = with_few_states(run.config, rate_hz=2.5)
     lost_ns = int(run.truth.stamps_ns[0]) + 25 * SECOND
     kept = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < lost_ns)
     imu = run.recording.imu

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphloc.config import TimelineConfig
 from graphloc.eval.simulate import bl_scenario, simulate
 from graphloc.frames import wrap_angle
 from graphloc.measurements import CompassHeading
 from graphloc.online._live import Scatter
 from graphloc.replay import replay
+from tests.slowly import with_few_states
 
 SECOND = 1_000_000_000
 
@@ -63,7 +63,7 @@ def test_a_compass_that_is_off_beside_a_crane_is_not_followed() -> None:
     # Without wander, which takes some of it up: here it is the kernel that has to tell.
     compass = run.config.sensors["compass"].model_copy(update={"wander_sigma_deg": 0.0})
     sensors = {**run.config.sensors, "compass": compass}
-    config = run.config.model_copy(update={"timeline": TimelineConfig(rate_hz=5.0), "sensors": sensors})
+    config = with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz=2.5)
     begin_ns = int(run.truth.stamps_ns[0]) + 20 * SECOND
     bent = tuple(
         replace(m, yaw_rad=m.yaw_rad + np.radians(15.0))

@@ -25,16 +25,15 @@ from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
 from graphloc.solution import Health
 from graphloc.solve._decide import _by_kernel
+from tests.slowly import slowly, with_few_states
 
 
 def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
     """Three seconds of twenty, 30 m to the north, of 10 Hz fixes good to 0.5 m."""
-    run = simulate(
-        Scenario(
-            path="loops", duration_s=80.0, noise="clean", pose_hz=0.0, gnss_sigma_m=0.5, gnss_reported_sigma_m=0.5
-        ),
-        901,
-    )
+    scenario = Scenario(
+        path="loops", duration_s=80.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_sigma_m=0.5, gnss_reported_sigma_m=0.5
+    )  # fmt: skip
+    run = slowly(simulate(scenario, 901))
 
     def struck(m: Measurement) -> Measurement:
         t_s = (m.stamp_ns - run.recording.imu.stamps_ns[0]) / 1e9 if run.recording.imu is not None else 0.0
@@ -51,12 +50,10 @@ def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
 
 def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one() -> None:
     """90 deg off for 35 s of 70: taken for scatter, it turned the run by up to 180 deg, and 69 of 70 matches were refused."""
-    run = simulate(
-        Scenario(
-            path="turn", duration_s=70.0, gnss_hz=5.0, compass_hz=5.0, gnss_sigma_m=0.05, gnss_reported_sigma_m=0.21
-        ),
-        1,
-    )
+    scenario = Scenario(
+        path="turn", duration_s=70.0, gnss_hz=5.0, compass_hz=5.0, gnss_sigma_m=0.05, gnss_reported_sigma_m=0.21
+    )  # fmt: skip
+    run = simulate(scenario, 1)
     begin_ns = int(run.truth.stamps_ns[0])
 
     def struck(m: Measurement) -> Measurement:
@@ -229,6 +226,7 @@ def believed(off_m: float, last_s: float) -> tuple[Recording, Recording, VesselC
 def test_a_run_with_a_jump_that_the_bounds_do_not_cover_is_not_good() -> None:
     """Its bound was 2 cm, and its health good, where it was 0.6 m off."""
     right, wrong, config = believed(0.6, last_s=35.0)
+    config = with_few_states(config, rate_hz=2.5)
     usual, jumped = (app.smooth_recording(of, config).solution for of in (right, wrong))
     assert not any("position jump" in line for line in usual.stats.warnings)
     assert "position jump of gnss, and no other sensor measures position" not in usual.health_reason
@@ -259,7 +257,9 @@ def test_a_jump_is_remembered_through_a_restart_online(off_m: float, restarts: b
 
 
 def test_a_jump_of_the_only_receiver_is_reported_in_the_run() -> None:
-    run = simulate(Scenario(path="loops", duration_s=50.0, noise="drift", pose_hz=0.0, compass_hz=5.0), 1)
+    run = slowly(
+        simulate(Scenario(path="loops", duration_s=50.0, noise="drift", pose_hz=0.0, imu_hz=50.0, compass_hz=5.0), 1)
+    )
     begin_ns = int(run.truth.stamps_ns[0])
     config = run.config.model_copy(
         update={"sensors": {k: v for k, v in run.config.sensors.items() if k in ("imu", "gnss", "compass")}}
@@ -380,7 +380,7 @@ def jumping_alone(
         return replace(m, position=Geodetic(m.position[0] + off_m / 111_300.0, *m.position[1:]))
 
     recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
-    return run, recording, run.config.model_copy(update={"sensors": sensors})
+    return run, recording, with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz=2.5)
 
 
 def test_a_sensor_that_lies_by_more_than_numbers_hold_is_an_outlier() -> None:

@@ -27,7 +27,7 @@ STARTED_NS = START_NS - 900 * S  # of a clock that counts from then
 def restamped(topics: dict[str, Any]) -> list[Item]:
     """The drive, each message recorded after its way; `topics`: what becomes of their stamps, ns."""
     items = []
-    for topic, at_ns, msg in drive(MAKE):
+    for topic, at_ns, msg in drive(MAKE, seconds=60):
         if topic in WAY_NS:
             stamp_ns = topics.get(topic, lambda ns: ns)(at_ns)
             msg.header = MAKE.header(stamp_ns, msg.header.frame_id)

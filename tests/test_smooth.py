@@ -13,16 +13,17 @@ from graphloc.config import VesselConfig
 from graphloc.errors import InputError, SolveError
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import compare_to_truth
-from graphloc.eval.simulate import Scenario, bl_scenario, simulate
+from graphloc.eval.simulate import Scenario, bl_scenario
 from graphloc.measurements import GnssPosition, PoseFix
 from graphloc.recording import Recording
+from tests.slowly import simulate_slowly
 
 SHORT = Scenario(duration_s=40.0, noise="drift", imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
 
 
 @pytest.fixture(scope="module")
 def short() -> app.Run:
-    return app.simulated(simulate(SHORT, 5), compare=True)
+    return app.simulated(simulate_slowly(SHORT, 5), compare=True)
 
 
 def test_smoother_beats_the_filter_and_its_covariance_holds(short: app.Run) -> None:
@@ -84,7 +85,7 @@ def test_the_gnss_error_is_found_with_its_sign(short: app.Run) -> None:
 
 def test_modes_are_chosen() -> None:
     """Three modes a match, one right: the ledger's choice is the right one."""
-    run = simulate(replace(SHORT, pose_modes=3, false_fraction=0.0, noise="clean"), 2)
+    run = simulate_slowly(replace(SHORT, pose_modes=3, false_fraction=0.0, noise="clean"), 2)
     solved = app.simulated(run)
     rows = {row.seq: row for row in solved.solution.ledger}
     chosen = []
@@ -99,7 +100,7 @@ def test_modes_are_chosen() -> None:
 def test_bad_start_is_not_lost() -> None:
     """Gyro bias of 0.05 rad/s and a start heading 15 deg off."""
     scenario = replace(SHORT, noise="clean", gyro_bias_radps=0.05, start_heading_error_deg=15.0)
-    run = simulate(scenario, 1)
+    run = simulate_slowly(scenario, 1)
     ours = compare_to_truth(app.simulated(run).solution.trajectory, run.truth)
     assert ours.heading_max_deg < 1.5
     assert ours.position_rmse_m < 0.5
@@ -107,7 +108,7 @@ def test_bad_start_is_not_lost() -> None:
 
 def test_comes_back_after_an_outage() -> None:
     scenario = replace(bl_scenario(1, "clean"), duration_s=80.0, outage_s=(25.0, 55.0))
-    run = simulate(scenario, 3)
+    run = simulate_slowly(scenario, 3)
     track = app.simulated(run).solution.trajectory
     at = np.array([run.truth.stamps_ns[6500]])
     error = np.hypot(*(track.at(at).p_world_m - run.truth.at(at).p_world_m)[0, :2])
@@ -116,7 +117,7 @@ def test_comes_back_after_an_outage() -> None:
 
 def test_rotated_world_gives_the_rotated_estimate() -> None:
     """Turning every measurement about the datum by 90 deg turns the estimate: no axis is special."""
-    run = simulate(replace(SHORT, duration_s=20.0, gnss_hz=0.0, compass_hz=0.0, false_fraction=0.0), 4)
+    run = simulate_slowly(replace(SHORT, duration_s=20.0, gnss_hz=0.0, compass_hz=0.0, false_fraction=0.0), 4)
     plain = app.simulated(run).solution.trajectory
 
     def turned(m: PoseFix) -> PoseFix:
@@ -131,7 +132,7 @@ def test_rotated_world_gives_the_rotated_estimate() -> None:
 
 
 def test_imu_gap_is_bridged_and_said() -> None:
-    run = simulate(replace(SHORT, noise="clean"), 6)
+    run = simulate_slowly(replace(SHORT, noise="clean"), 6)
     imu = run.recording.imu
     assert imu is not None
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
@@ -142,7 +143,7 @@ def test_imu_gap_is_bridged_and_said() -> None:
 
 
 def test_no_imu_and_no_position_are_one_clear_line() -> None:
-    run = simulate(replace(SHORT, duration_s=10.0), 0)
+    run = simulate_slowly(replace(SHORT, duration_s=10.0), 0)
     with pytest.raises(SolveError, match="no IMU data"):
         app.smooth_recording(replace(run.recording, imu=None), run.config)
     with pytest.raises(SolveError, match="no position"):
@@ -152,7 +153,7 @@ def test_no_imu_and_no_position_are_one_clear_line() -> None:
 
 
 def test_held_out_fixes_are_counted_and_predicted() -> None:
-    run = simulate(replace(SHORT, noise="clean", duration_s=30.0), 8)
+    run = simulate_slowly(replace(SHORT, noise="clean", duration_s=30.0), 8)
     solved = app.smooth_recording(run.recording, run.config, hold_out=HoldOut.parse("every:3"))
     counts = solved.solution.ledger.counts()["gnss"]
     assert counts["held_out"] == len(solved.held) == 150 // 3

@@ -19,7 +19,6 @@ from scipy.stats import chi2
 
 from graphloc import app
 from graphloc.berths import seen_from
-from graphloc.config import TimelineConfig
 from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
 from graphloc.eval.simulate._light import tag_in_world
 from graphloc.eval.simulate.scene import scene_of
@@ -27,6 +26,7 @@ from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement, TagSighting, TagView
 from graphloc.survey import Survey, TagConfig, load_survey
 from tests import tagfactory
+from tests.slowly import with_few_states
 
 S = 1_000_000_000
 QUAY = (226, 227, 228)
@@ -124,9 +124,7 @@ def dock(
     tags = seen.config.sensors["tags"]
     cameras = {name: c.model_copy(update={"mount_sigma_deg": mount_sigma_deg}) for name, c in tags.cameras.items()}
     sensors = seen.config.sensors | {"tags": tags.model_copy(update={"cameras": cameras})}
-    config = seen.config.model_copy(
-        update={"timeline": TimelineConfig(rate_hz=5.0), "sensors": sensors}
-    )  # half the time
+    config = with_few_states(seen.config.model_copy(update={"sensors": sensors}), rate_hz=2.5)
     run = app.simulated(replace(seen, recording=recording, config=config), compare=compare)
     return Docked(true, run, {m.seq: right for m, right in numbered})
 
@@ -316,7 +314,7 @@ def test_tags_that_are_first_seen_near_the_berth_are_believed(kind: str) -> None
 
 def test_single_tags_without_a_compass() -> None:
     """Their modes are the only heading there is: it is right from the beginning to the end."""
-    docked = dock(change=without(CompassHeading), alone=True)
+    docked = dock(change=without(CompassHeading), alone=True, rate_hz=1.0)
     assert np.abs(docked.heading_error_deg()).max() < 2.0
     assert wrong_modes(docked) <= 0.005
     assert docked.number("berth_p95_m") < 0.15

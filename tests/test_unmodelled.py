@@ -20,6 +20,7 @@ from graphloc.solve import _solution
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._unmodelled import Unmodelled, unmodelled
 from tests.faults import arrivals_of, feed, finish
+from tests.slowly import with_few_states
 
 CORRELATED_S = 200.0  # of the default configuration
 
@@ -67,6 +68,7 @@ def test_a_drifting_receiver_is_in_the_bounds_of_heading_and_velocity() -> None:
     found = []
     for seed in range(3):
         run, recording, config = drifting(seed, 1.0)
+        config = with_few_states(config)
         found.append(squares(app.smooth_recording(recording, config).solution, run))
     heading, velocity = np.mean([h.mean() for h, _ in found]), np.mean([v.mean() for _, v in found])
     assert 0.3 < heading < 2.2  # of some six degrees of freedom
@@ -91,7 +93,7 @@ def with_compass() -> tuple[SimulatedRun, VesselConfig]:
     )  # fmt: skip
     run = simulate(scenario, 1)
     sensors = {name: run.config.sensors[name] for name in ("imu", "gnss", "compass")}
-    return run, run.config.model_copy(update={"sensors": sensors})
+    return run, with_few_states(run.config.model_copy(update={"sensors": sensors}))
 
 
 def test_a_compass_with_an_offset_does_not_hold_the_heading_online() -> None:
