@@ -75,17 +75,16 @@ def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
             raise failure or SolveError("the start alignment found no heading to try")
         alive.sort(key=lambda c: c.cost)
         candidates = _different(alive)
-        told_apart, heading_var = len(candidates) == 1, np.zeros(until + 1)
-        last_window = seconds >= longest_s or until == len(problem.timeline) - 1
+        told_apart, last_window = len(candidates) == 1, seconds >= longest_s or until == len(problem.timeline) - 1
         if start.by_motion:
             for candidate in candidates:
                 # A prior about a heading that was only tried is no information: the candidates may go where the motion takes them.
                 candidate.prior = _start_prior(problem, start, _yaw(candidate.values, 0))
-            if told_apart or last_window:
-                heading_var = _heading_var(problem, start, candidates[0], until)
-                told_apart = told_apart and heading_var[-1] == 0.0
+            told_apart = told_apart and _told(problem, start, candidates[0], until)
         if told_apart or last_window:
-            best = candidates[0]
+            best, heading_var = candidates[0], np.zeros(until + 1)
+            if start.by_motion:
+                heading_var = _heading_var(problem, start, best, until, told=told_apart)
             return Begun(best.values, best.prior, until, iterations, len(candidates), heading_var)
         seconds *= 1.6
 
@@ -155,25 +154,28 @@ def _yaw(values: gtsam.Values, k: int) -> float:
     return float(values.atPose3(keys.pose(k)).rotation().yaw())
 
 
-def _heading_var(problem: Problem, start: Start, best: _Candidate, last: int) -> Array:
-    """Return the variance (last + 1,), rad^2, of the heading of each state: at both ends from how much others cost, linear in between."""
-    ends = [_var_at(problem, start, best, last, at) for at in (0, last)]
+def _told(problem: Problem, start: Start, best: _Candidate, last: int) -> bool:
+    """Whether the motion excludes, at state `last`, the headings beside the best one."""
+    most = best.cost + _COST_APART * best.excess
+    return all(_held(problem, start, best, last, last, by_rad).cost > most for by_rad in _OTHERS_RAD[:2].tolist())
+
+
+def _heading_var(problem: Problem, start: Start, best: _Candidate, last: int, *, told: bool) -> Array:
+    """Return the variance (last + 1,), rad^2, of the heading of each state: at both ends by `_var_at`, linear in between.
+
+    Args:
+        told: at the last state others are excluded (`_told`).
+    """
+    ends = [_var_at(problem, start, best, last, 0), 0.0 if told else _var_at(problem, start, best, last, last)]
     stamps = problem.timeline.stamps_ns[: last + 1]
     return np.interp(stamps, stamps[[0, -1]], ends)
 
 
 def _var_at(problem: Problem, start: Start, best: _Candidate, last: int, at: int) -> float:
-    """Return the variance, rad^2, of the heading of a state, from how much other headings cost; 0 where the motion excludes those beside it."""
-
-    def weight(turns_rad: Array) -> Array:
-        cost = np.array([_held(problem, start, best, last, at, by_rad).cost for by_rad in turns_rad.tolist()])
-        return np.asarray(np.exp(-np.maximum(cost - best.cost, 0.0) / best.excess))
-
-    beside = weight(_OTHERS_RAD[:2])
-    if beside.max() < np.exp(-_COST_APART):
-        return 0.0
-    weights = _WIDTHS_RAD * np.concatenate([beside, weight(_OTHERS_RAD[2:])])
-    return float(weights @ _OTHERS_RAD**2 / (_WIDTHS_RAD[0] + weights.sum()))
+    """Return the variance, rad^2, of the heading of a state, from how much others cost: about 0 where these cost much more."""
+    cost = np.array([_held(problem, start, best, last, at, by_rad).cost for by_rad in _OTHERS_RAD.tolist()])
+    weight = _WIDTHS_RAD * np.exp(-np.maximum(cost - best.cost, 0.0) / best.excess)
+    return float(weight @ _OTHERS_RAD**2 / (_WIDTHS_RAD[0] + weight.sum()))
 
 
 def _held(problem: Problem, start: Start, best: _Candidate, last: int, at: int, by_rad: float) -> _Candidate:
