@@ -30,7 +30,7 @@ from graphloc.solve._decide import Verdicts, weigh
 from graphloc.solve._grow import grow, solve_start
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
-from graphloc.solve._passes import Settled, expected_cost, open_passes, outliers_cost, settle
+from graphloc.solve._passes import Settled, cost_without_outliers, expected_cost, open_passes, settle
 
 _MAX_NOISE_ROUNDS = 5
 # Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
@@ -50,6 +50,7 @@ class BatchResult:
     graph: gtsam.NonlinearFactorGraph
     passes: int
     iterations: int
+    cost: float  # 2 x that of the graph, without outliers
     converged: bool
     noise_scale: float
     prior: StartPrior
@@ -84,8 +85,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
             passes, iterations = passes + passed, iterations + used
         settled = _final_passes(problem, few, estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
-        cost = 2.0 * float(settled.graph.error(estimate)) - outliers_cost(settled.verdicts)
-        ratio = cost / max(expected_cost(problem, settled.verdicts), 1.0)
+        ratio = cost_without_outliers(settled) / max(expected_cost(problem, settled.verdicts), 1.0)
         if ratio < CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
     settled, levels_cov = at_usual_level(problem, settled, prior, progress, _LAST_PASSES)
@@ -99,6 +99,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         graph=settled.graph,
         passes=passes,
         iterations=iterations,
+        cost=cost_without_outliers(settled),
         converged=settled.converged,
         noise_scale=problem.noise_scale,
         prior=prior,
