@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -15,7 +16,7 @@ from graphloc.solve._optimize import full_step, optimize
 from graphloc.solve._stretch import moved
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
-_MAX_OPEN_PASSES, _OPEN_SETTLED_M = 4, 0.5
+_ROUGHLY_SETTLED_M = 0.5
 _UPHILL = 1.1  # times the cost before: above it a single step has failed
 _OUTLIER = 0.1  # weight under its own kernel below which a measurement is an outlier
 
@@ -115,20 +116,29 @@ def changed(before: Verdicts, after: Verdicts) -> float:
     return max((abs(v.weight - before[key].weight) for key, v in after.items()), default=0.0)
 
 
-def open_passes(
-    problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress
+def rough_passes(
+    problem: Problem,
+    estimate: gtsam.Values,
+    prior: StartPrior,
+    progress: Progress,
+    stages: Sequence[str],
+    most: int,
 ) -> tuple[gtsam.Values, int, int]:
-    """Solve the whole run with gentle losses; rebuild the graph until the estimate no longer moves, as attachments depend on it."""
+    """Solve the whole run with the losses of each stage; rebuild the graph until the estimate hardly moves, as attachments depend on it.
+
+    Returns:
+        The values, iterations, and passes, at most `most` for each stage.
+    """
     last = len(problem.timeline) - 1
     passes = iterations = 0
-    for stage in ("far", "open"):
-        for n in range(_MAX_OPEN_PASSES):
+    for stage in stages:
+        for n in range(most):
             verdicts = weigh(problem, estimate, first=0, last=last, stage=stage)
             done = optimise_run(problem, estimate, verdicts, prior, jumps=stage != "far")
             estimate = done.values
             passes, iterations = passes + 1, iterations + done.iterations
-            progress(f"{stage} passes", n + 1, _MAX_OPEN_PASSES)
-            if done.moved_m < _OPEN_SETTLED_M:
+            progress(f"{stage} passes", n + 1, most)
+            if done.moved_m < _ROUGHLY_SETTLED_M:
                 break
     return estimate, iterations, passes
 
