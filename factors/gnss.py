@@ -7,9 +7,11 @@ z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachme
 much later than stamped the fix was measured (negative: it is stamped late), a constant of the run; C: the reported
 covariance; W: what d walks between its nodes (`Attachment.slow_walk`). The slow state holds n = -d.
 
-Without a slow state and tau: `GPSFactorArm`. With them: one linear factor (`graphloc.linear`), since GTSAM has none of a pose and a
-point; native factors would need two leaves for each fix, 40 % of the variables where each state has one. Not handled: correlation
-between axes of d; of tau what u changes by in that time.
+Without a slow state and tau: `GPSFactorArm`. With them: one linear factor, written anew at every pass. A solver that goes on from
+older linearisations (online) would need it written anew whenever the pose turns; there, without tau, native factors turn along:
+`A = p + R l` is a leaf (`ReferenceFrameFactor`, tied within 5 mm), and `A - N = z` is a `BetweenFactor` under the kernel. These
+leaves are 45 % of the variables where each state has a fix. Not handled: correlation between axes of d; of tau what u changes by
+in that time.
 """
 
 from __future__ import annotations
@@ -26,6 +28,9 @@ from graphloc.frames import Array, Datum, Geodetic, skew
 from graphloc.graph import Attachment, Constant, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.linear import Term, linear_factor
 from graphloc.measurements import GnssPosition, world_from_fixes
+
+_TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
+_TIE = gtsam.noiseModel.Isotropic.Sigma(3, _TIE_M)
 
 
 def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
@@ -86,12 +91,23 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
 
 def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factors of one fix."""
-    if at.constants or at.slow_key is not None:
+    if at.constants or (at.slow_key is not None and at.T_solver is None):
         delay = [Term(key, np.array(late), at.sensor_velocity_mps()[:, None]) for key, late in at.constants]
         return linear_factor(residuals(m, config, at)[0], at, decision, *delay)
-    model = noise_model(_covariance(white_covariance(m, config), at), decision)
+    z = _fix_world_m(m, at)
     lever = np.asarray(at.T_state_sensor.translation())
-    return GraphUpdate(factors=(gtsam.GPSFactorArm(at.pose_key, _fix_world_m(m, at), lever, model),))
+    model = noise_model(_covariance(white_covariance(m, config), at), decision)
+    if at.slow_key is None:
+        return GraphUpdate(factors=(gtsam.GPSFactorArm(at.pose_key, z, lever, model),))
+    antenna_key, lever_key = at.leaf_keys
+    return GraphUpdate(
+        factors=(
+            gtsam.PriorFactorPoint3(lever_key, lever, _TIE),
+            gtsam.ReferenceFrameFactorPoint3Pose3(lever_key, at.pose_key, antenna_key, _TIE),
+            gtsam.BetweenFactorPoint3(at.slow_key, antenna_key, z, model),
+        ),
+        guesses=((antenna_key, at.T_world_body.transformFrom(lever)), (lever_key, lever)),
+    )
 
 
 def slow(config: GnssConfig) -> SlowProcess | None:

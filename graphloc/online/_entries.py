@@ -40,11 +40,6 @@ class Entry:
     judged: bool = False  # among hypotheses, at least once
 
     @property
-    def bends(self) -> bool:
-        """Whether more than the attitude shows where it is linearised: a fix is linear in position and slow error."""
-        return self.stream.row.false is not None or bool(self.stream.constants)
-
-    @property
     def measurement(self) -> Measurement:
         return self.stream.measurements[self.index]
 
@@ -212,16 +207,14 @@ class Entries:
         self.change(entry, replace(entry.verdict, at=at))
 
     def _left_behind(self, entry: Entry) -> bool:
-        at, pose = entry.verdict.at, self._window.linearised_at(entry.verdict.at.pose_key)
-        if not entry.bends:
-            return _turned(entry.written, pose)
+        at = entry.verdict.at
         loose = at.slow_key is not None and at.slow_next is None
         # See `graphloc.linear.pose_term` for the tangents.
-        return loose or not pose.equals(entry.written, _SAME)
+        return loose or not self._window.linearised_at(at.pose_key).equals(entry.written, _SAME)
 
     def _elsewhere(self, entry: Entry) -> bool:
-        at, pose = entry.verdict.at, self._window.values.atPose3(entry.verdict.at.pose_key)
-        return (_moved if entry.bends else _turned)(at.T_world_body, pose)
+        at = entry.verdict.at
+        return _moved(at.T_world_body, self._window.values.atPose3(at.pose_key))
 
     def expected_cost(self) -> float:
         """Return the expected sum of weighted squares of what is in the graph: one per axis, times its weight."""
@@ -258,9 +251,5 @@ def _row(entry: Entry) -> LedgerRow:
 
 def _moved(a: Any, b: Any) -> bool:
     """Whether two poses differ so much that a factor linearised at one is wrong at the other."""
-    return float(np.linalg.norm(b.translation() - a.translation())) > _MOVED_M or _turned(a, b)
-
-
-def _turned(a: Any, b: Any) -> bool:
-    """Whether two attitudes differ so much."""
-    return float(np.linalg.norm(gtsam.Rot3.Logmap(a.rotation().between(b.rotation())))) > _TURNED_RAD
+    step = a.localCoordinates(b)
+    return float(np.linalg.norm(step[3:])) > _MOVED_M or float(np.linalg.norm(step[:3])) > _TURNED_RAD

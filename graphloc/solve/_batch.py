@@ -76,8 +76,9 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     start, few = align(problem), thinned(problem)
     grown, prior, known, iterations, headings = solve_start(few.problem, start, progress)
     iterations += grow(few.problem, grown, prior, known, progress)
-    grown, used, passes = rough_passes(few.problem, grown, prior, progress, ("final",), _SEAM_PASSES)
-    iterations, estimate, ratio = iterations + used, few.filled(problem, grown), 1.0
+    grown, used, _ = rough_passes(few.problem, grown, prior, progress, ("final",), _SEAM_PASSES)
+    iterations += used
+    passes, estimate, ratio = 0, few.filled(problem, grown), 1.0
     if problem.links.gaps():
         problem = bridged(problem, estimate)
         few = thinned(problem)
