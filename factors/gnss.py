@@ -5,10 +5,13 @@
 
 z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachment`); u: velocity of the antenna; tau: how
 much later than stamped the fix was measured (negative: it is stamped late), a constant of the run; C: the reported
-covariance; W: what d walks between its nodes (`Attachment.slow_walk`). The slow state holds n = -d, so that only native
-factors are needed where tau is known to be 0: `A = p + R l` is a leaf (`ReferenceFrameFactor`, tied within 5 mm), and
-`A - N = z` is a `BetweenFactor` under the kernel; without a slow state: `GPSFactorArm`. With tau: one factor that is linearised
-anew at every pass. Not handled: correlation between axes of d; of tau what u changes by in that time.
+covariance; W: what d walks between its nodes (`Attachment.slow_walk`). The slow state holds n = -d.
+
+Without a slow state and tau: `GPSFactorArm`. With them: one linear factor, written anew at every pass. A solver that goes on from
+older linearisations (online) would need it written anew whenever the pose turns; there, without tau, native factors turn along:
+`A = p + R l` is a leaf (`ReferenceFrameFactor`, tied within 5 mm), and `A - N = z` is a `BetweenFactor` under the kernel. These
+leaves are 45 % of the variables where each state has a fix. Not handled: correlation between axes of d; of tau what u changes by
+in that time.
 """
 
 from __future__ import annotations
@@ -88,7 +91,7 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
 
 def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decision) -> GraphUpdate:
     """Return the factors of one fix."""
-    if at.constants:
+    if at.constants or (at.slow_key is not None and at.T_solver is None):
         delay = [Term(key, np.array(late), at.sensor_velocity_mps()[:, None]) for key, late in at.constants]
         return linear_factor(residuals(m, config, at)[0], at, decision, *delay)
     z = _fix_world_m(m, at)

@@ -44,7 +44,8 @@ class Attachment:
         slow_key: key of the sensor's slow state, or None.
         leaf_keys: two keys that belong to this measurement alone.
         T_world_body: estimate at the state: body axes, origin at the IMU (see `graphloc.build`). v_world_mps: of its velocity (3,).
-        T_solver: where the solver linearises the pose, if that is not the estimate (see `graphloc.linear`).
+        T_solver: where a solver that goes on from older linearisations linearises the pose (see `graphloc.linear`); None: at the
+            estimate, as all factors are written anew at every pass.
         T_state_sensor: see above (gtsam.Pose3).
         dv_world_mps: (3,) what velocity gains from the state to the measurement.
         gyro_radps: (3,) body rate at the measurement, body axes, bias removed.

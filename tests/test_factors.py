@@ -1,7 +1,7 @@
 """Conformance of every row of the sensor table, from the table (style rule 27)."""
 
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import gtsam
 import numpy as np
@@ -255,6 +255,30 @@ def test_pose_leaves_unmeasured_axes_free() -> None:
     turned = at.T_world_body.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(0.05, 0.05, 0.0), np.array([0.0, 0.0, 1.0])))
     values.insert(1, turned)
     assert factor.error(values) < 1e-2
+
+
+@pytest.mark.parametrize("kind", ["none", "cauchy"])
+def test_a_fix_tells_a_solver_that_goes_on_the_same(kind: Literal["none", "cauchy"]) -> None:
+    """Its leaves eliminated, the native factors of a fix are the linear one, to the looseness of their ties (5 mm of 0.5 m)."""
+    row = next(r for r in SENSORS if r.kind == "gnss")
+    config = row.config(kind="gnss")
+    at = attachment(row, config)
+    m = row.ideal(at, config)
+    assert at.slow_value is not None
+    at = replace(at, slow_value=at.slow_value + np.array([0.4, -0.3, 0.2]))  # a residual
+    told = []
+    for solver in (None, at.T_world_body):
+        update = row.factors(m, config, replace(at, T_solver=solver), Decision(kernel=KernelConfig(kind=kind)))
+        assert bool(update.guesses) == (solver is not None)
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in update.factors:
+            graph.add(factor)
+        linear = graph.linearize(values_of(at, update.guesses)).marginal([1, 3], gtsam.EliminateQR)
+        order = gtsam.Ordering()
+        for key in (1, 3):
+            order.push_back(key)
+        told.append(linear.augmentedHessian(order))
+    assert np.linalg.norm(told[0] - told[1]) < 1e-3 * np.linalg.norm(told[0])
 
 
 def test_kernel_bounds_the_error_of_an_outlier() -> None:

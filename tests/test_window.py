@@ -209,3 +209,41 @@ def test_errors_connected_to_nothing_else_are_relinearised() -> None:
     assert window.relinearise()
     window.commit()
     np.testing.assert_allclose([window.values.atVector(key) for key in slow], 0.0, atol=1e-9)
+
+
+def _underway(window: Window, k: int, pim: gtsam.PreintegratedImuMeasurements) -> None:
+    """Stage state k of a vessel at rest, which has a bias each second."""
+    t_s, j = float(np.ceil(k / HZ)), k // HZ
+    window.guess(keys.pose(k), gtsam.Pose3(), t_s)
+    window.guess(keys.velocity(k), np.zeros(3), t_s)
+    if k % HZ == 0:
+        window.guess(keys.bias(j), gtsam.imuBias.ConstantBias(), t_s)
+        tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
+        window.add([gtsam.PriorFactorConstantBias(keys.bias(j), gtsam.imuBias.ConstantBias(), tight)])
+    window.touch(keys.bias(j), t_s)
+    if k == 0:
+        window.add([gtsam.PriorFactorPose3(keys.pose(0), gtsam.Pose3(), FIRST),
+                    gtsam.PriorFactorVector(keys.velocity(0), np.zeros(3), PLACE)])  # fmt: skip
+    else:
+        before = keys.pose(k - 1), keys.velocity(k - 1)
+        window.add([gtsam.ImuFactor(*before, keys.pose(k), keys.velocity(k), keys.bias((k - 1) // HZ), pim)])
+
+
+def test_where_all_fixes_are_written_anew_the_tree_stays_as_sparse() -> None:
+    """Left to iSAM2, all that the new factors have would be eliminated last, after the velocities and biases between."""
+    pim = gtsam.PreintegratedImuMeasurements(gtsam.PreintegrationParams.MakeSharedU(9.81))
+    for _ in range(4):
+        pim.integrateMeasurement(np.array([0.0, 0.0, 9.81]), np.zeros(3), 0.25 / HZ)
+    window, held = Window(10.0), []
+    fix = [gtsam.GPSFactorArm(keys.pose(k), LEVER, LEVER, PLACE) for k in range(6 * HZ)]
+    for k in range(len(fix)):
+        _underway(window, k, pim)
+        held.append(window.add([fix[k]]))
+        window.commit()
+    tree = window._solver  # noqa: SLF001 - how full it is shows in time alone
+    sparse = tree.treeNnz()
+    for k, fixes in enumerate(held):
+        assert window.remove(fixes)
+        window.add([fix[k]])
+    window.commit()
+    assert tree.treeNnz() < 1.5 * sparse

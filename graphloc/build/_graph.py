@@ -182,6 +182,8 @@ def _step(slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool,
 def _jumps_m(problem: Problem, stream: Stream) -> dict[int, float]:
     """Return by slow node the size (m) of the position jump before the next node, from the last fix before it to the first after."""
     found: dict[int, float] = {}
+    if not len(stream.position_jumps[0]):
+        return found
     nodes_ns = problem.timeline.slow_stamps_ns
     stamps_ns = [m.stamp_ns for m in stream.measurements]
     for at_ns, off_m in zip(*stream.position_jumps, strict=True):

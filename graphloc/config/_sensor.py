@@ -32,20 +32,6 @@ class KernelConfig(Block):
             return 1.0 / (1.0 + u2) ** 2
         return (1.0 - u2) ** 2 if u2 < 1.0 else 0.0
 
-    def cost(self, nis: float) -> float:
-        """Return what a residual costs under the loss: `nis` where that is small, less beyond the bend."""
-        c2 = self.scale**2
-        u2 = nis / c2
-        if self.kind == "none":
-            return nis
-        if self.kind == "huber":
-            return nis if u2 <= 1.0 else c2 * (2.0 * math.sqrt(u2) - 1.0)
-        if self.kind == "cauchy":
-            return c2 * math.log1p(u2)
-        if self.kind == "geman_mcclure":
-            return c2 * u2 / (1.0 + u2)
-        return c2 / 3.0 * (1.0 - (1.0 - u2) ** 3 if u2 < 1.0 else 1.0)
-
 
 class SensorConfig(Block):
     """What every sensor has."""

@@ -92,7 +92,8 @@ class Entries:
 
     def of(self, stream: LiveStream) -> list[Entry]:
         """Return the entries of a stream that can still be judged, by stamp."""
-        own = [e for e in self._all_reachable() if e.stream is stream]
+        first = self._problem.timeline.first
+        own = [e for e in self._entries.values() if e.stream is stream and e.reaches(first)]
         return sorted(own, key=lambda e: (e.measurement.stamp_ns, e.index))
 
     def _all_reachable(self) -> Iterator[Entry]:

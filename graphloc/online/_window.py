@@ -152,7 +152,7 @@ class Window:
         params = gtsam.ISAM2UpdateParams()
         params.removeFactorIndices = self._remove
         params.force_relinearize = self._to_relinearise
-        if gone or self._to_relinearise:
+        if gone or self._to_relinearise or self._remove:  # else little is eliminated again
             params.constrainedKeys = _groups(alive, gone, self._newest)
         if gone:  # marginalised keys must be leaves of the tree
             params.extraReelimKeys = _listed(self._alive.keys() & alive)

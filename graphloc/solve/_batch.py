@@ -4,7 +4,7 @@
 1. Align over a window; try each candidate heading on it and keep the cheapest (`_align`, `_start`).
 2. Grow by some seconds at a time, each window solved with a prior from earlier data. Hypotheses that are
    new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
-   thinned run (`graphloc.build.thinned`).
+   thinned run (`graphloc.build.thinned`). Passes over all of it remove the seams: there they cost a fifth.
 3. Passes over the whole run: modes and weights re-chosen until they no longer change (`_passes`).
 4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any.
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
@@ -30,12 +30,16 @@ from graphloc.solve._decide import Verdicts, weigh
 from graphloc.solve._grow import grow
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
-from graphloc.solve._passes import Settled, expected_cost, open_passes, outliers_cost, settle
+from graphloc.solve._passes import Settled, cost_without_outliers, expected_cost, rough_passes, settle
 from graphloc.solve._start import solve_start
 
 _MAX_NOISE_ROUNDS = 5
 # Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
 _FIRST_PASSES, _LAST_PASSES = 6, 15
+_SEAM_PASSES, _OPEN_PASSES = (
+    2,
+    4,
+)  # at most: of the thinned run after growing; of each gentle loss, with other IMU noise
 CONTRADICTION = 2.5  # cost over its expectation, from which the configured IMU noise is not believed
 LARGEST_NOISE_SCALE = 10.0  # no IMU is so many times noisier than configured
 
@@ -51,6 +55,7 @@ class BatchResult:
     graph: gtsam.NonlinearFactorGraph
     passes: int
     iterations: int
+    cost: float  # 2 x that of the graph, without outliers
     converged: bool
     noise_scale: float
     prior: StartPrior
@@ -74,6 +79,8 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     grown, prior, known, iterations, headings, few_var = solve_start(few.problem, start, progress)
     heading_var = np.interp(problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1], few_var)
     iterations += grow(few.problem, grown, prior, known, progress)
+    grown, used, _ = rough_passes(few.problem, grown, prior, progress, ("final",), _SEAM_PASSES)
+    iterations += used
     passes, estimate, ratio = 0, few.filled(problem, grown), 1.0
     if problem.links.gaps():
         problem = bridged(problem, estimate)
@@ -83,12 +90,11 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
             scale = problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0))
             problem = bridged(with_noise_scale(problem, scale), estimate)
             few = thinned(problem)
-            estimate, used, passed = open_passes(problem, estimate, prior, progress)
+            estimate, used, passed = rough_passes(problem, estimate, prior, progress, ("far", "open"), _OPEN_PASSES)
             passes, iterations = passes + passed, iterations + used
         settled = _final_passes(problem, few, estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
-        cost = 2.0 * float(settled.graph.error(estimate)) - outliers_cost(settled.verdicts)
-        ratio = cost / max(expected_cost(problem, settled.verdicts), 1.0)
+        ratio = cost_without_outliers(settled) / max(expected_cost(problem, settled.verdicts), 1.0)
         if ratio < CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
     settled, levels_cov = at_usual_level(problem, settled, prior, progress, _LAST_PASSES)
@@ -102,6 +108,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         graph=settled.graph,
         passes=passes,
         iterations=iterations,
+        cost=cost_without_outliers(settled),
         converged=settled.converged,
         noise_scale=problem.noise_scale,
         prior=prior,

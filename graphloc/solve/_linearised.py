@@ -108,12 +108,11 @@ def linearised(problem: Problem, values: gtsam.Values, result: BatchResult) -> R
 
 def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: gtsam.Values) -> Attachment:
     """Return an attachment of the solution, with the slow states and constants that the stream has here."""
-    if not stream.constants:
-        at = replace(at, constants=())
+    constants = at.constants if stream.constants else ()
     if stream.slow is None:
-        return replace(at, slow_key=None, slow_value=None, slow_next=None)
+        return replace(at, constants=constants, slow_key=None, slow_value=None, slow_next=None)
     key = keys.slow(stream.number, int(problem.timeline.slow_of[stream.state[i]]))
-    return replace(at, slow_key=key, slow_value=np.atleast_1d(values.atVector(key)))
+    return replace(at, constants=constants, slow_key=key, slow_value=np.atleast_1d(values.atVector(key)))
 
 
 def _jumps(problem: Problem, held: list[Any]) -> list[int]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -15,17 +16,21 @@ from graphloc.solve._optimize import full_step, optimize
 from graphloc.solve._stretch import moved
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
-_MAX_OPEN_PASSES, _OPEN_SETTLED_M = 4, 0.5
+_ROUGHLY_SETTLED_M = 0.5
 _UPHILL = 1.1  # times the cost before: above it a single step has failed
 _OUTLIER = 0.1  # weight under its own kernel below which a measurement is an outlier
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One optimisation of the whole run: values, the graph they come from, and how far any pose moved."""
+    """One optimisation of the whole run: values, the graph they come from, and how far any pose moved.
+
+    `made`: where the factors of each measurement stand in the graph.
+    """
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
+    made: dict[tuple[int, int], range]
     iterations: int
     moved_m: float
 
@@ -34,29 +39,30 @@ def optimise_run(
     problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior, *, jumps: bool = True
 ) -> Step:
     """Optimise the whole run with the given decisions."""
-    last = len(problem.timeline) - 1
-    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps)
+    last, made = len(problem.timeline) - 1, dict[tuple[int, int], range]()
+    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps, made=made)
     solved = optimize(graph, guess, 12, 1e-3)
-    return Step(solved.values, graph, solved.iterations, moved(guess, solved.values))
+    return Step(solved.values, graph, made, solved.iterations, moved(guess, solved.values))
 
 
 def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Step:
     """Take one step over the whole run, and iterate only where the cost rises by more than a nonlinear step near the minimum does."""
-    last = len(problem.timeline) - 1
-    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior)
+    last, made = len(problem.timeline) - 1, dict[tuple[int, int], range]()
+    graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, made=made)
     values, iterations = full_step(graph, guess), 1
     before = float(graph.error(guess))
     if not float(graph.error(values)) < _UPHILL * before + 1.0:
         values, iterations, _ = optimize(graph, guess, 12, 1e-3)
-    return Step(values, graph, iterations, moved(guess, values))
+    return Step(values, graph, made, iterations, moved(guess, values))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settled:
-    """A solution of the whole run, and the graph of its last step."""
+    """A solution of the whole run, and the graph of its last step (`made` as in `Step`)."""
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
+    made: dict[tuple[int, int], range]
     verdicts: Verdicts
     passes: int
     iterations: int
@@ -88,6 +94,7 @@ def settle(
     return Settled(
         values=estimate,
         graph=done.graph,
+        made=done.made,
         verdicts=verdicts,
         passes=n + 1,
         iterations=iterations,
@@ -109,35 +116,46 @@ def changed(before: Verdicts, after: Verdicts) -> float:
     return max((abs(v.weight - before[key].weight) for key, v in after.items()), default=0.0)
 
 
-def open_passes(
-    problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress
+def rough_passes(
+    problem: Problem,
+    estimate: gtsam.Values,
+    prior: StartPrior,
+    progress: Progress,
+    stages: Sequence[str],
+    most: int,
 ) -> tuple[gtsam.Values, int, int]:
-    """Solve the whole run with gentle losses; rebuild the graph until the estimate no longer moves, as attachments depend on it."""
+    """Solve the whole run with the losses of each stage; rebuild the graph until the estimate hardly moves, as attachments depend on it.
+
+    Returns:
+        The values, iterations, and passes, at most `most` for each stage.
+    """
     last = len(problem.timeline) - 1
     passes = iterations = 0
-    for stage in ("far", "open"):
-        for n in range(_MAX_OPEN_PASSES):
+    for stage in stages:
+        for n in range(most):
             verdicts = weigh(problem, estimate, first=0, last=last, stage=stage)
             done = optimise_run(problem, estimate, verdicts, prior, jumps=stage != "far")
             estimate = done.values
             passes, iterations = passes + 1, iterations + done.iterations
-            progress(f"{stage} passes", n + 1, _MAX_OPEN_PASSES)
-            if done.moved_m < _OPEN_SETTLED_M:
+            progress(f"{stage} passes", n + 1, most)
+            if done.moved_m < _ROUGHLY_SETTLED_M:
                 break
     return estimate, iterations, passes
 
 
-def outliers_cost(verdicts: Verdicts) -> float:
-    """Return the share of outliers (by the sensor's own kernel) in 2 x the cost.
+def cost_without_outliers(settled: Settled) -> float:
+    """Return 2 x the cost, without the share of outliers (by the sensor's own kernel).
 
     The kernel width follows the median of the sensor's residuals, so outliers are few and far off: no noise of another sensor
     explains them.
     """
-    return sum(
-        v.decision.kernel.cost(v.residual.nis())
-        for v in verdicts.values()
+    outliers = [
+        settled.graph.at(factor).error(settled.values)
+        for key, v in settled.verdicts.items()
         if v.weight < _OUTLIER and v.decision is not None and v.decision.kernel is not None
-    )
+        for factor in settled.made[key]
+    ]
+    return 2.0 * (float(settled.graph.error(settled.values)) - float(sum(outliers)))
 
 
 def expected_cost(problem: Problem, verdicts: Verdicts, last: int = -1) -> float:

@@ -12,10 +12,10 @@ from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.position_jumps import jump_warnings, largest_sigma
 from graphloc.solution import SolveStats
-from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult, expected_cost
+from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
 from graphloc.solve._decide import AGREES
 from graphloc.solve._health import CONTRADICTING_COST
-from graphloc.solve._passes import outliers_cost
+from graphloc.solve._passes import expected_cost
 from graphloc.time import utc_text
 
 _FAR_OFF = 3.0
@@ -95,10 +95,9 @@ def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
             if any(not constant.corrects for stream in problem.streams for constant in stream.constants):
                 cure += ", or for tags on a floating dock that the survey has as fixed"
         warnings.append(f"{said}; {cure}")
-    cost = 2.0 * float(result.graph.error(result.values)) - outliers_cost(result.verdicts)
-    if expected > 0 and cost > CONTRADICTING_COST * expected:
+    if expected > 0 and result.cost > CONTRADICTING_COST * expected:
         warnings.append(
-            f"the cost is {cost / expected:.1f} times its expectation: noise is configured too small, or a "
+            f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
             "mount, a unit or a time offset is wrong"
         )
     if (beside_m := largest_sigma(result.levels_cov)) > _LEVELS_M:
@@ -137,7 +136,7 @@ def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
         iterations=result.iterations,
         states=len(problem.timeline),
         factors=int(result.graph.size()),
-        cost=cost,
+        cost=result.cost,
         expected_cost=expected,
         converged=result.converged,
         warnings=tuple(warnings),
