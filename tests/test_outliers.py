@@ -379,7 +379,7 @@ def jumping_alone(
         return replace(m, position=Geodetic(m.position[0] + off_m / 111_300.0, *m.position[1:]))
 
     recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
-    return run, recording, with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz=2.5)
+    return run, recording, with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz=5.0)
 
 
 def test_a_sensor_that_lies_by_more_than_numbers_hold_is_an_outlier() -> None:
