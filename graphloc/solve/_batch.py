@@ -36,10 +36,8 @@ from graphloc.solve._start import solve_start
 _MAX_NOISE_ROUNDS = 5
 # Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
 _FIRST_PASSES, _LAST_PASSES = 6, 15
-_SEAM_PASSES, _OPEN_PASSES = (
-    2,
-    4,
-)  # at most: of the thinned run after growing; of each gentle loss, with other IMU noise
+# At most: over the thinned run after growing; with each gentle loss, where the IMU's noise has changed.
+_SEAM_PASSES, _OPEN_PASSES = 2, 4
 CONTRADICTION = 2.5  # cost over its expectation, from which the configured IMU noise is not believed
 LARGEST_NOISE_SCALE = 10.0  # no IMU is so many times noisier than configured
 
