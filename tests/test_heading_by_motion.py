@@ -4,12 +4,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from graphloc import app
 from graphloc.config import GnssConfig, ImuConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.measurements import GnssPosition
+from graphloc.online._heading_check import HeadingCheck
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 
@@ -109,3 +111,12 @@ def test_online_a_guess_ends_once_the_motion_tells_the_heading() -> None:
     assert np.abs(error[-1]) < 10.0
     assert "the heading is a guess" in solved.health_reason[0]
     assert "the heading is a guess" not in solved.health_reason[-1]
+
+
+def test_online_a_guess_goes_on_where_the_motion_contradicts_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A heading that is hardly known is not called wrong, as its bounds say so; but nor is it confirmed."""
+    monkeypatch.setattr(HeadingCheck, "_off_rad", lambda *_: np.radians(90.0))
+    recording, config, _, _ = robot(1, 60.0)
+    solved = app.replay_recording(recording, config).solution
+    assert not any("the motion confirms the heading" in line for line in solved.stats.events)
+    assert "the heading is a guess" in solved.health_reason[-1]
