@@ -120,3 +120,13 @@ def test_online_a_guess_goes_on_where_the_motion_contradicts_it(monkeypatch: pyt
     solved = app.replay_recording(recording, config).solution
     assert not any("the motion confirms the heading" in line for line in solved.stats.events)
     assert "the heading is a guess" in solved.health_reason[-1]
+
+
+def test_a_leg_takes_no_guess_as_known() -> None:
+    """What the leg before could not tell is no heading to start the next one with."""
+    recording, config, _, _ = robot(0, 130.0)
+    in_legs = config.model_copy(update={"timeline": config.timeline.model_copy(update={"leg_s": 60.0})})
+    solved = app.smooth_recording(recording, in_legs).solution
+    assert any("solved in 3 overlapping legs" in line for line in (*solved.stats.events, *solved.stats.warnings))
+    assert solved.trajectory.cov is not None
+    assert np.degrees(np.sqrt(solved.trajectory.cov[:, 5, 5])).min() > 15.0
