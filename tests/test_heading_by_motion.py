@@ -92,6 +92,26 @@ def test_straight_on_the_heading_is_a_guess() -> None:
     assert 0.3 < np.mean(found) < 3.0
 
 
+def test_a_guess_leaves_the_place_of_the_body_open() -> None:
+    """The antenna is 4 m ahead: where the body is depends on the heading; by the antenna's bounds alone, it was outside for most of the run."""
+    ahead_m, inside = 4.0, []
+    for seed in range(3):
+        recording, config, _, yaw = robot(seed, 60.0)
+        gnss = config.sensors["gnss"]
+        mount = gnss.mount.model_copy(update={"xyz_m": (ahead_m, 0.0, 0.0)})
+        sensors = {**config.sensors, "gnss": gnss.model_copy(update={"mount": mount})}
+        solved = app.smooth_recording(recording, config.model_copy(update={"sensors": sensors})).solution
+        track = solved.trajectory
+        assert track.cov is not None
+        assert recording.imu is not None
+        at_s = (track.stamps_ns - recording.imu.stamps_ns[0]) * 1e-9
+        true = (at_s[:, None] - ahead_m) * np.array([np.cos(yaw[0]), np.sin(yaw[0])])  # at 1 m/s
+        off = track.p_world_m[:, :2] - true
+        nis = np.einsum("ni,nij,nj->n", off, np.linalg.inv(track.cov[:, :2, :2]), off)
+        inside.append(np.mean(nis < 6.0))  # 95 % of a plane
+    assert np.mean(inside) > 0.9
+
+
 def test_turns_tell_the_heading() -> None:
     """A quick vehicle that turns twice: the motion excludes all other headings, and nothing is added to the linearised bounds."""
     recording, config, t, yaw = robot(0, 50.0, 15.0, 35.0, speed_mps=8.0)

@@ -22,6 +22,7 @@ from graphloc.solve._covariances import (
     limit_heading,
     to_world,
     unmodelled_covariance,
+    widen_heading,
     world_covariance,
 )
 from graphloc.solve._health import health_over_time, misfits, since_agreed
@@ -106,7 +107,7 @@ def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
 
 def _add_others(result: BatchResult, cov: Array) -> list[str]:
     """State the heading as uncertain as other headings that explain the motion make it; return a warning where it is a guess."""
-    cov[:, 5, 5] = np.maximum(cov[:, 5, 5], result.heading_var)
+    widen_heading(cov, result.heading_var)
     sure = np.sqrt(result.heading_var.min())
     if sure < _SHOWN_RAD:
         return []
@@ -121,7 +122,7 @@ def _add_guess(result: BatchResult, cov: Array) -> list[str]:
     """
     if result.headings or float(cov[:, 5, 5].min()) < _SHOWN_RAD**2:
         return []
-    cov[:, 5, 5] += ANY_HEADING_RAD**2
+    widen_heading(cov, cov[:, 5, 5] + ANY_HEADING_RAD**2)
     return [
         "the heading is a guess: no sensor tells it, nor does motion; move, add a heading sensor or set start.heading_deg"
     ]
