@@ -14,6 +14,7 @@ from graphloc.measurements import GnssPosition
 from graphloc.online._heading_check import HeadingCheck
 from graphloc.recording import Recording
 from graphloc.solution import Solution
+from graphloc.solve import _start
 
 IMU_HZ, ACCEL_NOISE, GYRO_NOISE, FIX_M = 25.0, 0.05, 0.003, 0.3  # noise densities: m/s^2, rad/s per sqrt(Hz)
 
@@ -118,6 +119,18 @@ def test_turns_tell_the_heading() -> None:
     solved = app.smooth_recording(recording, config).solution
     error, sigma = errors(solved, recording, t, yaw)
     assert sigma.max() < 5.0
+    assert np.abs(error / sigma).max() < 3.0
+    assert not any("the heading is a guess" in w for w in solved.stats.warnings)
+
+
+def test_what_comes_after_the_first_window_tells_the_heading(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Straight on for longer than headings are compared, here 50 s instead of 600: no guess any more once it has turned."""
+    monkeypatch.setattr(_start, "_LONGEST_UNTOLD_S", 50.0)
+    recording, config, t, yaw = robot(0, 120.0, 80.0, 95.0, 105.0, speed_mps=8.0)
+    solved = app.smooth_recording(recording, config).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert sigma[0] > 30.0
+    assert sigma[-1] < 5.0
     assert np.abs(error / sigma).max() < 3.0
     assert not any("the heading is a guess" in w for w in solved.stats.warnings)
 

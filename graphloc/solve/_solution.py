@@ -33,6 +33,7 @@ from graphloc.trajectory import Trajectory
 
 _NEAR_BERTH_M = 60.0
 _SHOWN_RAD = np.radians(15.0)  # 1 sigma, somewhere in the run, from which the motion tells the heading
+_TOLD_RAD = np.radians(7.0)  # 1 sigma of a heading of which those 30 deg beside it cost 8 more, as in `_start`
 
 
 def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
@@ -107,8 +108,12 @@ def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
 
 def _add_others(result: BatchResult, cov: Array) -> list[str]:
     """State the heading as uncertain as other headings that explain the motion make it; return a warning where it is a guess."""
-    widen_heading(cov, result.heading_var)
-    sure = np.sqrt(result.heading_var.min())
+    told = (np.arange(len(cov)) > result.begun) & (
+        cov[:, 5, 5] < _TOLD_RAD**2
+    )  # turns or a sensor after the first window
+    var = np.where(told, 0.0, result.heading_var)
+    widen_heading(cov, var)
+    sure = np.sqrt(var.min())
     if sure < _SHOWN_RAD:
         return []
     said = f"the heading is a guess: no sensor tells it, and the motion only to {np.degrees(sure):.0f} deg (1 sigma) at best"
