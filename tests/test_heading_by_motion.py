@@ -4,14 +4,17 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from graphloc import app
 from graphloc.config import GnssConfig, ImuConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.measurements import GnssPosition
+from graphloc.online._heading_check import HeadingCheck
 from graphloc.recording import Recording
 from graphloc.solution import Solution
+from graphloc.solve import _start
 
 IMU_HZ, ACCEL_NOISE, GYRO_NOISE, FIX_M = 25.0, 0.05, 0.003, 0.3  # noise densities: m/s^2, rad/s per sqrt(Hz)
 
@@ -90,12 +93,44 @@ def test_straight_on_the_heading_is_a_guess() -> None:
     assert 0.3 < np.mean(found) < 3.0
 
 
+def test_a_guess_leaves_the_place_of_the_body_open() -> None:
+    """The antenna is 4 m ahead: where the body is depends on the heading; by the antenna's bounds alone, it was outside for most of the run."""
+    ahead_m, inside = 4.0, []
+    for seed in range(3):
+        recording, config, _, yaw = robot(seed, 60.0)
+        gnss = config.sensors["gnss"]
+        mount = gnss.mount.model_copy(update={"xyz_m": (ahead_m, 0.0, 0.0)})
+        sensors = {**config.sensors, "gnss": gnss.model_copy(update={"mount": mount})}
+        solved = app.smooth_recording(recording, config.model_copy(update={"sensors": sensors})).solution
+        track = solved.trajectory
+        assert track.cov is not None
+        assert recording.imu is not None
+        at_s = (track.stamps_ns - recording.imu.stamps_ns[0]) * 1e-9
+        true = (at_s[:, None] - ahead_m) * np.array([np.cos(yaw[0]), np.sin(yaw[0])])  # at 1 m/s
+        off = track.p_world_m[:, :2] - true
+        nis = np.einsum("ni,nij,nj->n", off, np.linalg.inv(track.cov[:, :2, :2]), off)
+        inside.append(np.mean(nis < 6.0))  # 95 % of a plane
+    assert np.mean(inside) > 0.9
+
+
 def test_turns_tell_the_heading() -> None:
     """A quick vehicle that turns twice: the motion excludes all other headings, and nothing is added to the linearised bounds."""
     recording, config, t, yaw = robot(0, 50.0, 15.0, 35.0, speed_mps=8.0)
     solved = app.smooth_recording(recording, config).solution
     error, sigma = errors(solved, recording, t, yaw)
     assert sigma.max() < 5.0
+    assert np.abs(error / sigma).max() < 3.0
+    assert not any("the heading is a guess" in w for w in solved.stats.warnings)
+
+
+def test_what_comes_after_the_first_window_tells_the_heading(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Straight on for longer than headings are compared, here 50 s instead of 600: no guess any more once it has turned."""
+    monkeypatch.setattr(_start, "_LONGEST_UNTOLD_S", 50.0)
+    recording, config, t, yaw = robot(0, 120.0, 80.0, 95.0, 105.0, speed_mps=8.0)
+    solved = app.smooth_recording(recording, config).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert sigma[0] > 30.0
+    assert sigma[-1] < 5.0
     assert np.abs(error / sigma).max() < 3.0
     assert not any("the heading is a guess" in w for w in solved.stats.warnings)
 
@@ -109,3 +144,22 @@ def test_online_a_guess_ends_once_the_motion_tells_the_heading() -> None:
     assert np.abs(error[-1]) < 10.0
     assert "the heading is a guess" in solved.health_reason[0]
     assert "the heading is a guess" not in solved.health_reason[-1]
+
+
+def test_online_a_guess_goes_on_where_the_motion_contradicts_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A heading that is hardly known is not called wrong, as its bounds say so; but nor is it confirmed."""
+    monkeypatch.setattr(HeadingCheck, "_off_rad", lambda *_: np.radians(90.0))
+    recording, config, _, _ = robot(1, 60.0)
+    solved = app.replay_recording(recording, config).solution
+    assert not any("the motion confirms the heading" in line for line in solved.stats.events)
+    assert "the heading is a guess" in solved.health_reason[-1]
+
+
+def test_a_leg_takes_no_guess_as_known() -> None:
+    """What the leg before could not tell is no heading to start the next one with."""
+    recording, config, _, _ = robot(0, 130.0)
+    in_legs = config.model_copy(update={"timeline": config.timeline.model_copy(update={"leg_s": 60.0})})
+    solved = app.smooth_recording(recording, in_legs).solution
+    assert any("solved in 3 overlapping legs" in line for line in (*solved.stats.events, *solved.stats.warnings))
+    assert solved.trajectory.cov is not None
+    assert np.degrees(np.sqrt(solved.trajectory.cov[:, 5, 5])).min() > 15.0

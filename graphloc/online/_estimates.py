@@ -13,7 +13,7 @@ from graphloc.online._lag import Lag
 from graphloc.online._odometry import Odometry
 from graphloc.online._propagate import Propagated
 from graphloc.online._unmodelled import UnmodelledError
-from graphloc.solve._covariances import limit_heading, unmodelled_covariance, world_covariance
+from graphloc.solve._covariances import limit_heading, unmodelled_covariance, widen_heading, world_covariance
 from graphloc.solve._health import health_of
 
 _TOLD_RAD = np.radians(10.0)  # 1 sigma that only motion gives that does tell the heading
@@ -54,7 +54,7 @@ def estimate_of(
     cov[:3, :3] += others_cov
     cov[5, 5] += heading_off_rad**2
     if cov[5, 5] > _TOLD_RAD**2:
-        cov[5, 5] = max(cov[5, 5], guess_rad**2)
+        widen_heading(cov, guess_rad**2)
     limit_heading(cov)
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
     health, reason = health_of(cov, since, doubt)

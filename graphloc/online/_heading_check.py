@@ -63,16 +63,16 @@ class HeadingCheck:
         self._steps: deque[_Step] = deque()
         self._fixes: deque[tuple[int, complex]] = deque()
         self._sensor = ""
-        self._looked_ns, self._wrong, self._right = 0, 0, 0
+        self._looked_ns, self._wrong, self._right, self._fits = 0, 0, 0, 0
 
     def begin(self) -> None:
         """Forget what earlier checks found right: the estimate starts anew."""
-        self._right = 0
+        self._right = self._fits = 0
 
     @property
     def confirmed(self) -> bool:
         """Whether the last checks found the heading right."""
-        return self._right >= _IN_A_ROW
+        return self._fits >= _IN_A_ROW
 
     def note(self, m: Measurement, lag: Lag) -> None:
         """Take in a position of the first GNSS receiver (any absolute sensor without hypotheses)."""
@@ -111,7 +111,9 @@ class HeadingCheck:
             )
             < _KNOWN_DEG
         )
-        if known and abs(off_rad) > _TURNED_RAD:
+        turned = abs(off_rad) > _TURNED_RAD
+        self._fits = 0 if turned else self._fits + 1
+        if known and turned:
             self._wrong, self._right = self._wrong + 1, 0
         else:
             self._wrong, self._right = 0, self._right + 1

@@ -59,6 +59,7 @@ class BatchResult:
     prior: StartPrior
     headings: int  # number of candidates that explain the start about equally well; 0: nothing tells the heading there
     heading_var: Array  # (N,) rad^2 of each state, by headings that the motion does not exclude (see `_start`)
+    begun: int  # last state of the first window: what comes later is not in `heading_var`
     levels_cov: Array  # (3, 3) of the position, m^2, by other levels that may be the usual ones (see `_levels`)
     notes: tuple[str, ...]
 
@@ -76,6 +77,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     start, few = align(problem), thinned(problem)
     grown, prior, known, iterations, headings, few_var = solve_start(few.problem, start, progress)
     heading_var = np.interp(problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1], few_var)
+    begun = int(few.states[known])
     iterations += grow(few.problem, grown, prior, known, progress)
     grown, used, _ = rough_passes(few.problem, grown, prior, progress, ("final",), _SEAM_PASSES)
     iterations += used
@@ -111,6 +113,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         noise_scale=problem.noise_scale,
         prior=prior,
         heading_var=heading_var,
+        begun=begun,
         headings=headings if start.yaw_sigma_rad < np.pi else 0,
         levels_cov=levels_cov,
         notes=start.notes,

@@ -42,6 +42,21 @@ def limit_heading(cov: Array) -> None:
     cov[..., :, 5] *= share
 
 
+def widen_heading(cov: Array, heading_var: Array | float) -> None:
+    """Raise the variance of the heading in covariances (..., 6, 6), in axes of world, to at least `heading_var` (...), rad^2.
+
+    What measures position (an antenna) stays where it is, and the body turns about it. The arm between them is what the covariance
+    says of position and heading together; turned by tens of degrees, the body moves along it as well as across.
+    """
+    more = np.maximum(heading_var - cov[..., 5, 5], 0.0)
+    across = cov[..., :2, 5] / cov[..., 5, 5, None]  # d position / d heading, m
+    along = np.stack([-across[..., 1], across[..., 0]], axis=-1)
+    shares = (0.5 * (1.0 - np.exp(-2.0 * more)), 1.5 - 2.0 * np.exp(-0.5 * more) + 0.5 * np.exp(-2.0 * more))
+    for arm, share in zip((across, along), shares, strict=True):  # means of sin^2 and (1 - cos)^2
+        cov[..., :2, :2] += share[..., None, None] * arm[..., :, None] * arm[..., None, :]
+    cov[..., 5, 5] += more
+
+
 def unmodelled_covariance(streams: Sequence[Any]) -> Array:
     """Return the covariance (3, 3) of slow errors that nothing can tell from motion: the position is off by as much."""
     total = np.zeros((3, 3))

@@ -2,7 +2,7 @@
 """A run of hours is solved in overlapping legs, so that memory does not grow with its length.
 
 The estimate at the end of an overlap hardly depends on data before it: biases and slow errors are known again after some tens of
-seconds. Only a heading that no sensor measures is handed on to the next leg.
+seconds. Only a heading is handed on to the next leg, which takes it where no sensor measures one; not where it is a guess.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from graphloc.trajectory import bounds_95
 
 _OVERLAP_S, _SHARE = 60.0, 0.2  # overlap on each side of a seam, s, and at most this share of a leg
 _LOOK = 0.1  # share of a leg to each side within which a seam is placed
+_HANDED_ON_RAD = np.radians(15.0)  # largest 1 sigma of a heading that is: the next leg takes it as known
 _ENOUGH = 0.9  # share of the largest number of positions near a candidate
 
 Solve = Callable[[Recording, float | None], Solution]
@@ -83,13 +84,21 @@ def solve_legs(
         whole = solve(_between(recording, begin - over, end + over), heading_deg)
         if before is not None:
             apart = _farther(apart, before, whole, begin)
-        at = np.array([end - over])
-        known = whole.trajectory.covers(at)[0]
-        heading_deg = float(heading_deg_from_yaw(whole.trajectory.at(at).yaw_rad)[0]) if known else None
+        heading_deg = _known_heading_deg(whole, np.array([end - over]))
         legs.append(_own(whole, begin, end, legs[-1] if legs else None))
         before = whole
         give_back_memory()
     return legs, apart
+
+
+def _known_heading_deg(leg: Solution, at_ns: NDArray[np.int64]) -> float | None:
+    """Return the compass heading (deg) at a stamp (1,); None where the leg has no state there, or it is hardly known."""
+    if not leg.trajectory.covers(at_ns)[0]:
+        return None
+    there = leg.trajectory.at(at_ns)
+    if there.cov is None or there.cov[0, 5, 5] > _HANDED_ON_RAD**2:
+        return None
+    return float(heading_deg_from_yaw(there.yaw_rad)[0])
 
 
 def _between(recording: Recording, begin_ns: int, end_ns: int) -> Recording:

@@ -22,6 +22,7 @@ from graphloc.solve._covariances import (
     limit_heading,
     to_world,
     unmodelled_covariance,
+    widen_heading,
     world_covariance,
 )
 from graphloc.solve._health import health_over_time, misfits, since_agreed
@@ -32,6 +33,7 @@ from graphloc.trajectory import Trajectory
 
 _NEAR_BERTH_M = 60.0
 _SHOWN_RAD = np.radians(15.0)  # 1 sigma, somewhere in the run, from which the motion tells the heading
+_TOLD_RAD = np.radians(7.0)  # 1 sigma of a heading of which those 30 deg beside it cost 8 more, as in `_start`
 
 
 def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
@@ -106,8 +108,12 @@ def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
 
 def _add_others(result: BatchResult, cov: Array) -> list[str]:
     """State the heading as uncertain as other headings that explain the motion make it; return a warning where it is a guess."""
-    cov[:, 5, 5] = np.maximum(cov[:, 5, 5], result.heading_var)
-    sure = np.sqrt(result.heading_var.min())
+    told = (np.arange(len(cov)) > result.begun) & (
+        cov[:, 5, 5] < _TOLD_RAD**2
+    )  # turns or a sensor after the first window
+    var = np.where(told, 0.0, result.heading_var)
+    widen_heading(cov, var)
+    sure = np.sqrt(var.min())
     if sure < _SHOWN_RAD:
         return []
     said = f"the heading is a guess: no sensor tells it, and the motion only to {np.degrees(sure):.0f} deg (1 sigma) at best"
@@ -121,7 +127,7 @@ def _add_guess(result: BatchResult, cov: Array) -> list[str]:
     """
     if result.headings or float(cov[:, 5, 5].min()) < _SHOWN_RAD**2:
         return []
-    cov[:, 5, 5] += ANY_HEADING_RAD**2
+    widen_heading(cov, cov[:, 5, 5] + ANY_HEADING_RAD**2)
     return [
         "the heading is a guess: no sensor tells it, nor does motion; move, add a heading sensor or set start.heading_deg"
     ]

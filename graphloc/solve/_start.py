@@ -190,7 +190,7 @@ def _held(problem: Problem, start: Start, best: _Candidate, last: int, at: int, 
     cov[:3, :3] = R.T @ np.diag([_FREE, _FREE, _HELD_RAD]) ** 2 @ R
     held = gtsam.PriorFactorPose3(keys.pose(at), middle, gtsam.noiseModel.Gaussian.Covariance(cov))
     prior = _start_prior(problem, replace(start, yaw_sigma_rad=_FREE), _yaw(values, 0))
-    candidate = _Candidate(values, prior, excess=best.excess)
+    candidate = _Candidate(values, prior)
     try:
         _solve_candidate(problem, candidate, last, held)
     except SolveError:
