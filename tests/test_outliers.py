@@ -24,7 +24,7 @@ from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
 from graphloc.solution import Health
 from graphloc.solve._decide import _by_kernel
-from tests.slowly import slowly, with_few_states
+from tests.slowly import simulate_slowly, with_few_states
 
 
 def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
@@ -32,7 +32,7 @@ def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
     scenario = Scenario(
         path="loops", duration_s=80.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_sigma_m=0.5, gnss_reported_sigma_m=0.5
     )  # fmt: skip
-    run = slowly(simulate(scenario, 901))
+    run = simulate_slowly(scenario, 901)
 
     def struck(m: Measurement) -> Measurement:
         t_s = (m.stamp_ns - run.recording.imu.stamps_ns[0]) / 1e9 if run.recording.imu is not None else 0.0
@@ -256,8 +256,8 @@ def test_a_jump_is_remembered_through_a_restart_online(off_m: float, restarts: b
 
 
 def test_a_jump_of_the_only_receiver_is_reported_in_the_run() -> None:
-    run = slowly(
-        simulate(Scenario(path="loops", duration_s=50.0, noise="drift", pose_hz=0.0, imu_hz=50.0, compass_hz=5.0), 1)
+    run = simulate_slowly(
+        Scenario(path="loops", duration_s=50.0, noise="drift", pose_hz=0.0, imu_hz=50.0, compass_hz=5.0), 1
     )
     begin_ns = int(run.truth.stamps_ns[0])
     config = run.config.model_copy(
