@@ -132,7 +132,7 @@ class Decision:
     Attributes:
         mode: index of the hypothesis that enters the graph.
         weight: factor on its information, in (0, 1].
-        kernel: robust loss on top, or None.
+        kernel: robust loss of what is weighted so, or None.
     """
 
     mode: int = 0

@@ -77,7 +77,7 @@ def linear_update(
     """
     weight = decision.weight
     if decision.kernel is not None:
-        weight *= max(decision.kernel.weight(residual.nis()), 1e-6)
+        weight *= max(decision.kernel.weight(weight * residual.nis()), 1e-6)
     # Most residuals here are of one row (headings, heights), and at every pass.
     cov, single = residual.cov, len(residual.cov) == 1
     whiten = np.sqrt(weight) * (1.0 / np.sqrt(cov) if single else gauss.whitening(cov))

@@ -59,8 +59,10 @@ class Entry:
         return self.state >= first and (carry is None or carry[0] >= first)
 
     def weighs_other(self, verdict: Verdict) -> bool:
-        """Whether weight or covariance differ so much that the factors must be replaced."""
-        new, old = (float(np.trace(v.residual.cov)) for v in (verdict, self.verdict))
+        """Whether weight or variance differ so much that the factors must be replaced."""
+        new, old = (
+            float(np.trace(v.residual.cov)) / (v.decision.weight if v.decision else 1.0) for v in (verdict, self.verdict)
+        )
         return abs(verdict.weight - self.verdict.weight) > _CHANGED or abs(new - old) > _CHANGED * old
 
     def differs(self, verdict: Verdict) -> bool:

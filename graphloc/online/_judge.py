@@ -132,18 +132,19 @@ class Judge:
             The verdict, and whether the prediction widened the kernel.
         """
         own, dof = stream.config.kernel, len(residual.raw)
-        scale = own.scale * stream.scatter.times * float(np.sqrt(dof))
-        plain = nis = residual.nis()
+        noisier = 1.0 if stream.row.absolute else stream.scatter.noisier
+        scale = own.scale * stream.scatter.times / noisier * float(np.sqrt(dof))
+        plain = nis = residual.nis() / noisier**2
         widened, inflation = False, None
         if fresh and own.kind != "none" and nis > scale**2:
             inflation = self._states.prediction(stream, at, stream.state[i], residual).cov
-            nis = residual.nis(inflation)
+            nis = residual.nis(inflation) / noisier**2
             widened = plain > 1.5 * nis
             scale *= float(np.sqrt(plain / max(nis, 1e-9))) if widened else 1.0
         if fresh:
             stream.scatter.note(stream.measurements[i].stamp_ns, residual.normalised(inflation))
         kernel = KernelConfig(kind=own.kind, scale=scale)
-        return Verdict(Decision(kernel=kernel), kernel.weight(plain), 1.0, residual, 0, at), widened
+        return Verdict(Decision(weight=noisier**-2, kernel=kernel), kernel.weight(plain), 1.0, residual, 0, at), widened
 
     def _schedule(self, due_s: float, entry: Entry) -> None:
         heapq.heappush(self._scheduled, (due_s, next(self._turn), entry))

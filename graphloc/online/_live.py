@@ -25,7 +25,8 @@ from graphloc.online._frozen_receiver import FrozenReceiverDetector
 from graphloc.online._motion_model import MotionModel
 from graphloc.online._setup import Setup
 from graphloc.position_jumps import JumpDetector, PositionJump
-from graphloc.time import duration_ns
+from graphloc.solve._decide import STEP_S, noisier_than_stated
+from graphloc.time import NS_PER_S, duration_ns
 
 T = TypeVar("T")
 _LAST = 15  # measurements up to one, by stamp, from which a sensor's rate at it is taken
@@ -146,16 +147,17 @@ class Scatter:
         jumps: the shared error is modelled as a state that may jump, and has not yet: then only about 0.
 
     Attributes:
-        times: the factor, at least 1.
+        times: the factor, at least 1. noisier: factor on the stated sigma (see `noisier_than_stated`), at most as large.
     """
 
     def __init__(self, *, jumps: bool = False) -> None:
-        self.times = 1.0
+        self.times = self.noisier = 1.0
         self._jumps = jumps
         self._recent: deque[tuple[int, Array]] = deque()
         self._noted = 0
         self._squares: deque[float] = deque(maxlen=_REMEMBERED)
         self._pairs: deque[float] = deque(maxlen=_REMEMBERED)
+        self._steps: deque[float] = deque(maxlen=_REMEMBERED)
 
     def note(self, stamp_ns: int, residual: Array) -> None:
         """Take in a residual (k,), normalised to unit covariance."""
@@ -168,13 +170,21 @@ class Scatter:
             before = other
         while len(self._recent) > 1 and stamp_ns - self._recent[1][0] >= _LAGS_S[1] * 1e9:
             self._recent.popleft()
+        if self._recent and 0 <= stamp_ns - self._recent[-1][0] <= STEP_S * NS_PER_S:
+            self._steps.append(_half_square(residual - self._recent[-1][1]))
         self._recent.append((stamp_ns, residual))
         if before is not None:
-            self._pairs.append(0.5 * float((residual - before) @ (residual - before)))
+            self._pairs.append(_half_square(residual - before))
         if len(self._pairs) >= len(residual) + 4:
-            about = np.median(self._squares)
+            about, usual = np.median(self._squares), chi2_median(len(residual))
             least = about if self._jumps else min(about, np.median(self._pairs))
-            self.times = max(1.0, float(np.sqrt(least / chi2_median(len(residual)))))
+            self.times = max(1.0, float(np.sqrt(least / usual)))
+            white = float(np.sqrt(np.median(self._steps) / usual)) if self._steps else 1.0
+            self.noisier = noisier_than_stated(min(self.times, white))
+
+
+def _half_square(difference: Array) -> float:
+    return 0.5 * float(difference @ difference)
 
 
 @dataclass(slots=True, eq=False)

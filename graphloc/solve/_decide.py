@@ -9,7 +9,7 @@ reject the right measurements.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -17,6 +17,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from graphloc import keys
@@ -28,6 +29,7 @@ from graphloc.graph import Attachment, Decision, Residual
 from graphloc.solve._best_chain import best_chain
 from graphloc.solve._hypotheses import log_evidence_of, sequence_of
 from graphloc.solve._prediction import Prediction, predict_residuals, prediction_of
+from graphloc.time import NS_PER_S
 
 # By stage, for every sensor that has a kernel at all: Huber is convex, so a start that is tens of metres
 # off still pulls in; Cauchy forgets outliers better and still lets the truth back in.
@@ -35,6 +37,8 @@ _STAGE_KERNEL = {"far": KernelConfig(kind="huber", scale=1.5), "open": KernelCon
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
 # How far apart pairs of residuals are; multiples of the latter, whole turns taken off, spread them evenly.
 _LAGS_S, _GOLDEN = (2.0, 4.0), 0.618
+STEP_S = 1.0  # within which two measurements follow each other
+_LEFT = 1.5
 _WIDEST = 1e9  # sigmas: larger residuals (0.1 mm stated, 100 km off) count the same
 AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
@@ -145,15 +149,17 @@ def _by_kernel(
     gentle = _CONVEXITY.index(own.kind) <= _CONVEXITY.index(limit.kind)
     # The norm of k whitened residuals is about sqrt(k): the threshold is larger by that.
     dof = len(residuals[0][0].raw)
-    spread = _spread(best, dof)
+    spread, noisier = _spread(best, dof), 1.0
     if spread > 1.0 and not stream.row.absolute:  # of positions, a shared error may be that of the estimate
-        pairs = _pairs(stream, indices, [found[m] for m, found in zip(mode, residuals, strict=True)])
-        spread = min(spread, _spread(pairs, dof)) if len(pairs) >= dof + 4 else spread
-    scale = min(own.scale * spread * float(np.sqrt(dof)), _WIDEST)
+        stamps_ns = np.array([stream.measurements[i].stamp_ns for i in indices])
+        normal = np.array([found[m].normalised() for m, found in zip(mode, residuals, strict=True)])
+        spread = min(spread, _spread_of_pairs(normal, *_pairs(stamps_ns), too_few=spread))
+        noisier = noisier_than_stated(min(spread, _spread_of_pairs(normal, *_steps(stamps_ns), too_few=1.0)))
+    scale = min(own.scale * spread / noisier * float(np.sqrt(dof)), _WIDEST)
     kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=scale)
-    decided = {m: Decision(mode=m, kernel=kernel) for m in set(mode)}
+    decided = {m: Decision(mode=m, weight=noisier**-2, kernel=kernel) for m in set(mode)}
     return [
-        Verdict(decided[m], kernel.weight(n), 1.0, found[m], m, at)
+        Verdict(decided[m], kernel.weight(n / noisier**2), 1.0, found[m], m, at)
         for m, n, found, at in zip(mode, best, residuals, attached, strict=True)
     ]
 
@@ -166,28 +172,49 @@ def _nis(residuals: list[Residual]) -> Array:
     return np.asarray(np.einsum("ni,ni->n", raw, np.linalg.solve([r.cov for r in residuals], raw[:, :, None])[:, :, 0]))
 
 
-def _spread(nis: list[float], dof: int) -> float:
-    """Return by what factor the residuals of a sensor scatter more than configured, at least 1: its kernel is widened by it.
+def _spread(squares: Sequence[float], dof: int) -> float:
+    """Return by what factor the residuals of a sensor scatter more than stated, at least 1: its kernel is widened by it.
 
     Around an estimate that is 100 sigmas off, a loss with a threshold of 1.5 sigmas sees only outliers, and re-weighting converges
     slowly; and where the noise is configured too small, it rejects a good sensor (measured on KITTI: 97 % of the fixes lost,
     23 m off). So the threshold follows the median of the residuals.
     """
-    return max(1.0, float(np.sqrt(np.median(nis) / chi2_median(dof)))) if nis else 1.0
+    return max(1.0, float(np.sqrt(np.median(squares) / chi2_median(dof)))) if len(squares) else 1.0
 
 
-def _pairs(stream: Stream, indices: list[int], residuals: list[Residual]) -> list[float]:
-    """Return half the squared differences of normalised residuals 2 to 4 s apart: an error that they share is no scatter.
+def _spread_of_pairs(normal: Array, now: NDArray[np.intp], before: NDArray[np.intp], too_few: float) -> float:
+    """Return the same of the differences of normalised residuals (N, k), which have no part of an error that both share."""
+    dof = normal.shape[1]
+    squares = 0.5 * ((normal[now] - normal[before]) ** 2).sum(axis=1)
+    return _spread(squares, dof) if len(squares) >= dof + 4 else too_few
 
-    If it were counted, a compass that is 90 deg off for more than half of a window would widen its kernel to 90 deg and turn the run
-    (measured).
+
+def _pairs(stamps_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return pairs of measurements 2 to 4 s apart.
+
+    If the error that they share were counted as scatter, a compass that is 90 deg off for more than half of a window would widen its
+    kernel to 90 deg and turn the run (measured).
     """
-    stamps_ns = np.array([stream.measurements[i].stamp_ns for i in indices])
-    lags_s = np.interp(np.arange(len(indices)) * _GOLDEN % 1.0, (0.0, 1.0), _LAGS_S)
+    lags_s = np.interp(np.arange(len(stamps_ns)) * _GOLDEN % 1.0, (0.0, 1.0), _LAGS_S)
     before = np.searchsorted(stamps_ns, stamps_ns - np.rint(1e9 * lags_s).astype(np.int64), side="right") - 1
     (now,) = np.nonzero((before >= 0) & (stamps_ns - stamps_ns[before] < 2e9 * _LAGS_S[1]))
-    normal = [r.normalised() for r in residuals]
-    return [0.5 * float(np.sum((normal[n] - normal[before[n]]) ** 2)) for n in now]
+    return now, before[now]
+
+
+def _steps(stamps_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return pairs of measurements that follow each other within a second: only white noise makes these differ."""
+    (before,) = np.nonzero(np.diff(stamps_ns) <= STEP_S * NS_PER_S)
+    return before + 1, before
+
+
+def noisier_than_stated(white: float) -> float:
+    """Return the factor on the stated sigma of a sensor whose residuals scatter `white` times as much from one to the next.
+
+    Otherwise what is noise of this sensor counts against the IMU, whose noise is then scaled up (measured: headings that claim
+    0.2 deg and scatter by 2: 81 times, and a heading 42 deg off). Up to half as much again is left: so much does a median of few
+    residuals scatter.
+    """
+    return max(1.0, white / _LEFT)
 
 
 def by_hypotheses(
