@@ -540,7 +540,7 @@ def test_memory_does_not_grow() -> None:
                 largest = early if t < 30.0 else late
                 for name, size in sizes(online).items():
                     largest[name] = max(size, largest.get(name, 0))
-    full = ("scatter._pairs", "scatter._squares", "heading_check._steps", "heading_check._fixes")
+    full = ("scatter._pairs", "scatter._squares", "scatter._bent", "heading_check._steps", "heading_check._fixes")
     remembered = {name for name in early if name.endswith(full)}  # fill up to their limit
     # 40 s: at the 10 Hz of states, at the 2 Hz of fixes
     assert late["online._persistent.heading_check._steps"] <= 401

@@ -25,7 +25,7 @@ from graphloc.online._frozen_receiver import FrozenReceiverDetector
 from graphloc.online._motion_model import MotionModel
 from graphloc.online._setup import Setup
 from graphloc.position_jumps import JumpDetector, PositionJump
-from graphloc.solve._decide import STEP_S, noisier_than_stated
+from graphloc.solve._decide import WHITE_S, noisier_than_stated
 from graphloc.time import NS_PER_S, duration_ns
 
 T = TypeVar("T")
@@ -157,7 +157,7 @@ class Scatter:
         self._noted = 0
         self._squares: deque[float] = deque(maxlen=_REMEMBERED)
         self._pairs: deque[float] = deque(maxlen=_REMEMBERED)
-        self._steps: deque[float] = deque(maxlen=_REMEMBERED)
+        self._bent: deque[float] = deque(maxlen=_REMEMBERED)
 
     def note(self, stamp_ns: int, residual: Array) -> None:
         """Take in a residual (k,), normalised to unit covariance."""
@@ -170,21 +170,18 @@ class Scatter:
             before = other
         while len(self._recent) > 1 and stamp_ns - self._recent[1][0] >= _LAGS_S[1] * 1e9:
             self._recent.popleft()
-        if self._recent and 0 <= stamp_ns - self._recent[-1][0] <= STEP_S * NS_PER_S:
-            self._steps.append(_half_square(residual - self._recent[-1][1]))
         self._recent.append((stamp_ns, residual))
+        if len(self._recent) > 2 and stamp_ns - self._recent[-3][0] <= WHITE_S * NS_PER_S:
+            bent = residual - 2.0 * self._recent[-2][1] + self._recent[-3][1]
+            self._bent.append(float(bent @ bent) / 6.0)
         if before is not None:
-            self._pairs.append(_half_square(residual - before))
+            self._pairs.append(0.5 * float((residual - before) @ (residual - before)))
         if len(self._pairs) >= len(residual) + 4:
             about, usual = np.median(self._squares), chi2_median(len(residual))
             least = about if self._jumps else min(about, np.median(self._pairs))
             self.times = max(1.0, float(np.sqrt(least / usual)))
-            white = float(np.sqrt(np.median(self._steps) / usual)) if self._steps else 1.0
+            white = float(np.sqrt(np.median(self._bent) / usual)) if self._bent else 1.0
             self.noisier = noisier_than_stated(min(self.times, white))
-
-
-def _half_square(difference: Array) -> float:
-    return 0.5 * float(difference @ difference)
 
 
 @dataclass(slots=True, eq=False)

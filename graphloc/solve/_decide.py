@@ -37,8 +37,8 @@ _STAGE_KERNEL = {"far": KernelConfig(kind="huber", scale=1.5), "open": KernelCon
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
 # How far apart pairs of residuals are; multiples of the latter, whole turns taken off, spread them evenly.
 _LAGS_S, _GOLDEN = (2.0, 4.0), 0.618
-STEP_S = 1.0  # within which two measurements follow each other
-_LEFT = 1.5
+WHITE_S = 2.0  # within which three measurements show what is white in them
+_LEFT = 1.5  # times the stated sigma: so much more may be by chance
 _WIDEST = 1e9  # sigmas: larger residuals (0.1 mm stated, 100 km off) count the same
 AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
@@ -153,8 +153,12 @@ def _by_kernel(
     if spread > 1.0 and not stream.row.absolute:  # of positions, a shared error may be that of the estimate
         stamps_ns = np.array([stream.measurements[i].stamp_ns for i in indices])
         normal = np.array([found[m].normalised() for m, found in zip(mode, residuals, strict=True)])
-        spread = min(spread, _spread_of_pairs(normal, *_pairs(stamps_ns), too_few=spread))
-        noisier = noisier_than_stated(min(spread, _spread_of_pairs(normal, *_steps(stamps_ns), too_few=1.0)))
+        spread = min(spread, _spread_of_pairs(stamps_ns, normal))
+        noisier = noisier_than_stated(min(spread, white_spread(stamps_ns, normal)))
+    if stage == "far":
+        # Around an estimate that is metres off, right measurements are many sigmas away. At full weight they, and false ones, bend
+        # the motion until the solver diverges; at the weight of what they are off by, the IMU holds it together.
+        noisier = spread
     scale = min(own.scale * spread / noisier * float(np.sqrt(dof)), _WIDEST)
     kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=scale)
     decided = {m: Decision(mode=m, weight=noisier**-2, kernel=kernel) for m in set(mode)}
@@ -182,39 +186,45 @@ def _spread(squares: Sequence[float], dof: int) -> float:
     return max(1.0, float(np.sqrt(np.median(squares) / chi2_median(dof)))) if len(squares) else 1.0
 
 
-def _spread_of_pairs(normal: Array, now: NDArray[np.intp], before: NDArray[np.intp], too_few: float) -> float:
-    """Return the same of the differences of normalised residuals (N, k), which have no part of an error that both share."""
-    dof = normal.shape[1]
-    squares = 0.5 * ((normal[now] - normal[before]) ** 2).sum(axis=1)
-    return _spread(squares, dof) if len(squares) >= dof + 4 else too_few
+def _spread_of_pairs(stamps_ns: NDArray[np.int64], normal: Array) -> float:
+    """Return the same of the differences of normalised residuals (N, k) 2 to 4 s apart: an error that they share is no scatter.
 
-
-def _pairs(stamps_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return pairs of measurements 2 to 4 s apart.
-
-    If the error that they share were counted as scatter, a compass that is 90 deg off for more than half of a window would widen its
-    kernel to 90 deg and turn the run (measured).
+    If it were counted, a compass that is 90 deg off for more than half of a window would widen its kernel to 90 deg and turn the run
+    (measured). Infinite where there are too few.
     """
     lags_s = np.interp(np.arange(len(stamps_ns)) * _GOLDEN % 1.0, (0.0, 1.0), _LAGS_S)
     before = np.searchsorted(stamps_ns, stamps_ns - np.rint(1e9 * lags_s).astype(np.int64), side="right") - 1
     (now,) = np.nonzero((before >= 0) & (stamps_ns - stamps_ns[before] < 2e9 * _LAGS_S[1]))
-    return now, before[now]
+    if len(now) < normal.shape[1] + 4:
+        return np.inf
+    return _spread(0.5 * ((normal[now] - normal[before[now]]) ** 2).sum(axis=1), normal.shape[1])
 
 
-def _steps(stamps_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return pairs of measurements that follow each other within a second: only white noise makes these differ."""
-    (before,) = np.nonzero(np.diff(stamps_ns) <= STEP_S * NS_PER_S)
-    return before + 1, before
+def white_spread(stamps_ns: NDArray[np.int64], normal: Array) -> float:
+    """Return the same of what is white in normalised residuals (N, k), by three at a time that follow each other within seconds.
+
+    In their second difference, an error of the estimate that grows evenly has no part. 1 where there are too few.
+    """
+    (first,) = np.nonzero(stamps_ns[2:] - stamps_ns[:-2] <= WHITE_S * NS_PER_S)
+    if len(first) < normal.shape[1] + 4:
+        return 1.0
+    bent = normal[first] - 2.0 * normal[first + 1] + normal[first + 2]
+    return _spread((bent**2).sum(axis=1) / 6.0, normal.shape[1])
 
 
 def noisier_than_stated(white: float) -> float:
     """Return the factor on the stated sigma of a sensor whose residuals scatter `white` times as much from one to the next.
 
     Otherwise what is noise of this sensor counts against the IMU, whose noise is then scaled up (measured: headings that claim
-    0.2 deg and scatter by 2: 81 times, and a heading 42 deg off). Up to half as much again is left: so much does a median of few
-    residuals scatter.
+    0.2 deg and scatter by 2: 81 times, and a heading 42 deg off).
     """
     return max(1.0, white / _LEFT)
+
+
+def cost_of_noise(verdicts: Verdicts) -> float:
+    """Return what larger noise than stated costs, -log of its density: without it, noise would explain any heading."""
+    found = [(v.decision.weight, len(v.residual.raw)) for v in verdicts.values() if v.decision and v.decision.kernel]
+    return float(sum(-0.5 * dof * np.log(weight) for weight, dof in found))
 
 
 def by_hypotheses(

@@ -22,7 +22,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array, wrap_angle
 from graphloc.recording import Progress
 from graphloc.solve._align import Start, start_pose
-from graphloc.solve._decide import decisions, weigh
+from graphloc.solve._decide import cost_of_noise, decisions, weigh
 from graphloc.solve._passes import expected_cost
 from graphloc.solve._stretch import copy_states, dead_reckon, fill_slow, solve_stretch
 
@@ -213,7 +213,7 @@ def _solve_candidate(
             iterations += step.iterations
             if step.moved_m < settled_m:
                 break
-    candidate.cost = step.error
+    candidate.cost = step.error + cost_of_noise(verdicts)
     candidate.excess = max(1.0, 2.0 * step.error / max(expected_cost(problem, verdicts, last), 1.0))
     return iterations
 
