@@ -47,6 +47,7 @@ _WARNS = (
     "the heading is off",
     "frozen receiver",
     ": position jump of ",
+    "scatter more than they state",
     _GUESS,
 )  # of events, that a reader must see
 _BUSY = "not tried: the previous scan was still being matched"

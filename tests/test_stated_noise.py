@@ -42,7 +42,9 @@ def noisy_headings(seed: int) -> SimulatedRun:
     def told(m: Measurement) -> Measurement:
         if not isinstance(m, CompassHeading):
             return m
-        return replace(m, yaw_rad=float(wrap_angle(m.yaw_rad + rng.normal(0.0, np.radians(2.0)))), sigma_rad=np.radians(0.2))
+        return replace(
+            m, yaw_rad=float(wrap_angle(m.yaw_rad + rng.normal(0.0, np.radians(2.0)))), sigma_rad=np.radians(0.2)
+        )
 
     recording = replace(run.recording, measurements=tuple(told(m) for m in run.recording.measurements))
     return slowly(replace(run, recording=recording))
@@ -56,6 +58,8 @@ def test_headings_that_state_a_tenth_of_their_noise_do_not_make_the_imu_noisy(on
     found = compare_to_truth(solution.trajectory, run.truth)
     said = (*solution.stats.warnings, *solution.stats.events)
     assert not [line for line in said if "IMU" in line]
+    (noisy,) = (line for line in solution.stats.warnings if "scatter more than they state" in line)
+    assert "compass: " in noisy
     assert found.heading_rmse_deg < (1.0 if online else 0.5)
     assert found.coverage_95 > 0.85
 

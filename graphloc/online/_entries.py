@@ -61,7 +61,8 @@ class Entry:
     def weighs_other(self, verdict: Verdict) -> bool:
         """Whether weight or variance differ so much that the factors must be replaced."""
         new, old = (
-            float(np.trace(v.residual.cov)) / (v.decision.weight if v.decision else 1.0) for v in (verdict, self.verdict)
+            float(np.trace(v.residual.cov)) / (v.decision.weight if v.decision else 1.0)
+            for v in (verdict, self.verdict)
         )
         return abs(verdict.weight - self.verdict.weight) > _CHANGED or abs(new - old) > _CHANGED * old
 

@@ -30,6 +30,7 @@ from graphloc.online._unmodelled import UnmodelledError, estimated_beside
 from graphloc.online._window import Window
 from graphloc.position_jumps import why_in_doubt
 from graphloc.solve._unmodelled import Unmodelled
+from graphloc.solve._warnings import noisier_warning
 
 _STEP_COST = (
     1.0  # of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10
@@ -203,6 +204,15 @@ class Lag:
     def jump_warnings(self) -> list[str]:
         """Return a warning on each position jump since this was last called (see `position_jumps.py`)."""
         return self._judge.receivers.jump_warnings()
+
+    def noisier_warnings(self) -> list[str]:
+        """Return a warning on each sensor that newly scatters by far more than it states."""
+        lines = []
+        for name, stream in self.problem.streams.items():
+            scatter = stream.scatter
+            if not (stream.row.absolute or scatter.said) and (line := noisier_warning(name, scatter.noisier)):
+                scatter.said, lines = True, lines + line
+        return lines
 
     @property
     def unmodelled_jumps(self) -> list[str]:

@@ -35,6 +35,7 @@ _LAGS_S, _GOLDEN = (
     (2.0, 4.0),
     0.618,
 )  # time between the residuals of a pair; golden ratio: its multiples modulo 1 are spread evenly
+_FEWEST_BENT = 20  # second differences of residuals, from which white noise is judged
 _PAGE_S = 1.0  # states are marginalised in pages of this length
 
 
@@ -148,10 +149,12 @@ class Scatter:
 
     Attributes:
         times: the factor, at least 1. noisier: factor on the stated sigma (see `noisier_than_stated`), at most as large.
+        said: whether that has been reported.
     """
 
     def __init__(self, *, jumps: bool = False) -> None:
         self.times = self.noisier = 1.0
+        self.said = False
         self._jumps = jumps
         self._recent: deque[tuple[int, Array]] = deque()
         self._noted = 0
@@ -180,8 +183,9 @@ class Scatter:
             about, usual = np.median(self._squares), chi2_median(len(residual))
             least = about if self._jumps else min(about, np.median(self._pairs))
             self.times = max(1.0, float(np.sqrt(least / usual)))
-            white = float(np.sqrt(np.median(self._bent) / usual)) if self._bent else 1.0
-            self.noisier = noisier_than_stated(min(self.times, white))
+            if len(self._bent) >= _FEWEST_BENT:
+                white = float(np.sqrt(np.median(self._bent) / usual))
+                self.noisier = noisier_than_stated(min(self.times, white))
 
 
 @dataclass(slots=True, eq=False)

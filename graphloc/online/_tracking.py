@@ -257,7 +257,7 @@ class Tracking:
         return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v, cov=cov)
 
     def news(self) -> list[str]:
-        """Return a line on what the newest state newly shows: a wrong heading, frozen receivers, position jumps."""
+        """Return a line on what the newest state newly shows: a wrong heading, frozen receivers, position jumps, noise."""
         check = self._persistent.heading_check
         heading = [check.said] if check.look(self.lag) else []
         if self._persistent.doubt and check.confirmed:
@@ -266,7 +266,7 @@ class Tracking:
         was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now
         frozen = [f"{name}: {_FROZEN if name in now else _NO_LONGER_FROZEN}" for name in sorted(now ^ was)]
-        return [*heading, *frozen, *self.lag.jump_warnings()]
+        return [*heading, *frozen, *self.lag.jump_warnings(), *self.lag.noisier_warnings()]
 
     def snapshot(self, newest: ImuSample) -> Snapshot:
         """Return the last anchor and all that is needed to go on from it; `newest`: sample of the IMU."""

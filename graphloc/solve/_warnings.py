@@ -19,6 +19,7 @@ from graphloc.solve._passes import expected_cost
 from graphloc.time import utc_text
 
 _FAR_OFF = 3.0
+_MUCH_NOISIER = 1.5
 _SMALL_M = 0.1  # a slow error below it is that of RTK
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3
@@ -41,6 +42,16 @@ def disagreement_warning(sensor: str, weights: Array) -> list[str]:
     if share <= 0.5 or len(weights) <= 10:
         return []
     return [f"{sensor}: {100 * share:.0f} % of its measurements disagree with the rest"]
+
+
+def noisier_warning(sensor: str, noisier: float) -> list[str]:
+    """Say where a sensor is taken to be `noisier` times as noisy as it states: a line, or none."""
+    if noisier < _MUCH_NOISIER:
+        return []
+    cure = "set its sigma or the floor of it accordingly (a compass also use_reported_sigma: false)"
+    return [
+        f"{sensor}: its measurements scatter more than they state, and are taken with {noisier:.1f} times their sigma: {cure}"
+    ]
 
 
 def joint_rejection_warning(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, false: Array) -> list[str]:
@@ -75,6 +86,14 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     k = int(np.argmax(far))
     where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
     return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where})"
+
+
+def _noisier(stream: Stream, result: BatchResult) -> float:
+    """How many times the stated noise a sensor with a kernel is taken to have."""
+    if stream.row.false is not None:
+        return 1.0
+    found = [result.verdicts[stream.number, i].decision for i in range(len(stream.measurements))]
+    return max((decision.weight**-0.5 for decision in found if decision is not None), default=1.0)
 
 
 def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
@@ -127,6 +146,7 @@ def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
         warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
         weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
         warnings += disagreement_warning(stream.name, weights)
+        warnings += noisier_warning(stream.name, _noisier(stream, result))
         if stream.row.false is not None:
             stamps_ns = np.array([m.stamp_ns for m in stream.measurements])
             false = np.array([stream.row.false(m, stream.config).probability for m in stream.measurements])
