@@ -207,7 +207,7 @@ class Lag:
 
     def noisier_warnings(self) -> list[str]:
         """Return a warning on each sensor that newly scatters by far more than it states."""
-        lines = []
+        lines = list[str]()
         for name, stream in self.problem.streams.items():
             scatter = stream.scatter
             if not (stream.row.absolute or scatter.said) and (line := noisier_warning(name, scatter.noisier)):
