@@ -61,7 +61,8 @@ def test_headings_that_state_a_tenth_of_their_noise_do_not_make_the_imu_noisy(on
     (noisy,) = (line for line in solution.stats.warnings if "scatter more than they state" in line)
     assert "compass: " in noisy
     assert found.heading_rmse_deg < (1.0 if online else 0.5)
-    assert found.coverage_95 is not None and found.coverage_95 > 0.85
+    assert found.coverage_95 is not None
+    assert found.coverage_95 > 0.85
 
 
 def test_matches_that_state_a_tenth_of_their_noise_do_not_throw_the_start() -> None:
