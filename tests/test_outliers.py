@@ -307,6 +307,17 @@ def test_a_jump_of_the_only_receiver_is_not_followed_online(gnss_hz: float) -> N
     assert Health.GOOD not in [h for h, k in zip(live.health, far_off, strict=True) if k]
 
 
+def test_a_jump_of_the_only_receiver_is_no_noise_of_the_imu_at_the_start() -> None:
+    """12 m for 2 s of the first 5: the start followed, by noise of the IMU 81 times larger than configured."""
+    run, recording, config = jumping_alone(5.0, (1.5, 3.5), 12.0)
+    online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL)
+    estimates = [e for e in map(online.feed, arrivals(recording)) if e is not None]
+    assert online._persistent.noise.scale == 1.0  # noqa: SLF001
+    off_m = [np.linalg.norm((e.p_world_m - run.truth.at(np.array([e.stamp_ns])).p_world_m[0])[:2]) for e in estimates]
+    assert max(off_m) < 4.0
+    assert max(off_m[5:]) < 2.0  # 1 s later
+
+
 def test_where_a_jump_of_the_only_receiver_may_be_its_end_the_bounds_hold_both_levels() -> None:
     """Off by 12 m for the first 15 s: the level before the jump is the wrong one, and held until a restart."""
     run, recording, config = jumping_alone(5.0, (0.0, 15.0), 90.0)
