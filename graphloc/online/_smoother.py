@@ -84,7 +84,7 @@ class OnlineSmoother:
         self._say(trouble)
         self._waiting = Waiting(self._ledger)
         self._tracking: Tracking | None = None
-        self._tried_ns = 0  # to start with a measured heading, instead of one that was a guess
+        self._tried_ns = 0  # to start over with a measured heading
         self._wait(
             "the first IMU sample" if imu else f"an IMU: no enabled sensor of kind {inertial.kind} is configured"
         )
@@ -275,7 +275,7 @@ class OnlineSmoother:
 
     def _wait(self, why: str) -> None:
         """Give up the estimate, and wait for a start."""
-        self._tracking = None
+        self._tracking, self._tried_ns = None, 0
         self._persistent.forget_jumps()
         self._waiting.begin(why)
         self._ledger.close()
