@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.config import GnssConfig, ImuConfig, VesselConfig
+from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, Geodetic, wrap_angle
-from graphloc.measurements import GnssPosition
+from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.online import _start as online_start
 from graphloc.online._heading_check import HeadingCheck
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.solve import _start
+from tests.slowly import with_few_states
 
 IMU_HZ, ACCEL_NOISE, GYRO_NOISE, FIX_M = 25.0, 0.05, 0.003, 0.3  # noise densities: m/s^2, rad/s per sqrt(Hz)
 
@@ -147,12 +149,53 @@ def test_online_a_guess_ends_once_the_motion_tells_the_heading() -> None:
 
 
 def test_online_a_guess_goes_on_where_the_motion_contradicts_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A heading that is hardly known is not called wrong, as its bounds say so; but nor is it confirmed."""
-    monkeypatch.setattr(HeadingCheck, "_off_rad", lambda *_: np.radians(90.0))
+    """A heading that is hardly known is not called wrong, as its bounds say so; but nor is it confirmed.
+
+    Nor by the gyroscope's bias as estimated, with which any heading fits: it followed the guess.
+    """
+    monkeypatch.setattr(HeadingCheck, "_off", lambda *of: (np.radians(90.0) * (not of[-1].any()), 0.05))
     recording, config, _, _ = robot(1, 60.0)
     solved = app.replay_recording(recording, config).solution
     assert not any("the motion confirms the heading" in line for line in solved.stats.events)
     assert "the heading is a guess" in solved.health_reason[-1]
+
+
+def with_compass(
+    recording: Recording, config: VesselConfig, t: Array, yaw: Array, since_s: float
+) -> tuple[Recording, VesselConfig]:
+    """The robot with a compass once a second from some time on, 5 deg (1 sigma)."""
+    assert recording.imu is not None
+    rng, sigma_rad = np.random.default_rng(0), np.radians(5.0)
+    compass = [
+        CompassHeading(
+            stamp_ns=int(recording.imu.stamps_ns[k]), sensor="compass", seq=2 * 10**6 + int(k),
+            yaw_rad=float(wrap_angle(yaw[k] + rng.normal(0.0, sigma_rad))), sigma_rad=sigma_rad,
+        )
+        for k in range(int(since_s * IMU_HZ), len(t), int(IMU_HZ))
+    ]  # fmt: skip
+    sensors = {**config.sensors, "compass": CompassConfig.model_validate({"topic": "/compass"})}
+    measurements = tuple(sorted([*recording.measurements, *compass], key=lambda m: m.stamp_ns))
+    return replace(recording, measurements=measurements), config.model_copy(update={"sensors": sensors})
+
+
+def test_online_a_compass_that_comes_later_ends_a_guess(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A guess that is wrong by 130 deg: in its bounds until the compass has been there for 5 s, then right.
+
+    Straight on at 8 m/s the window's own sigma falls to 6 deg, whatever the heading; it rejected the compass.
+    """
+    monkeypatch.setattr(online_start, "_LONGEST_WAIT_S", 10.0)
+    recording, config, t, yaw = robot(3, 34.0, speed_mps=8.0)
+    recording, config = with_compass(recording, with_few_states(config, 2.5), t, yaw, 20.0)
+    solved = app.replay_recording(recording, config).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert np.abs(error).max() > 90.0  # or there is nothing to mend
+    assert (np.abs(error) < 2.5 * sigma).all()
+    assert recording.imu is not None
+    late = (solved.trajectory.stamps_ns - recording.imu.stamps_ns[0]) * 1e-9 > 26.0
+    assert np.abs(error[late]).max() < 10.0
+    assert sigma[late].max() < 15.0
+    assert "the heading is a guess" in solved.health_reason[0]
+    assert "the heading is a guess" not in solved.health_reason[-1]
 
 
 def test_a_leg_takes_no_guess_as_known() -> None:

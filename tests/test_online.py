@@ -22,7 +22,7 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix, PoseMode
 from graphloc.online import OnlineSmoother, _waiting
 from graphloc.thinning import THINNED
-from graphloc.trajectory import Trajectory, bounds_95
+from graphloc.trajectory import Trajectory
 from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, delayed, feed, finish
 from tests.slowly import slowly
 from tests.tagfactory import sighted
@@ -349,9 +349,9 @@ def test_a_start_that_waited_longer_than_the_lag_keeps_what_it_found() -> None:
         ),
         run.config.model_copy(update={"sensors": {"imu": run.config.sensors["imu"], "gnss": told}}),
     ).solution.trajectory  # fmt: skip
-    assert whole.cov is not None
     assert np.degrees(abs(wrap_angle(begun.yaw_rad - yaw_of(whole, end_ns)))) < 5.0
-    assert np.degrees(begun.heading_bound_95_rad) == pytest.approx(bounds_95(whole.cov)[-1, 2], rel=0.25)
+    assert "the heading is a guess" in begun.reason
+    assert begun.heading_bound_95_rad > np.pi  # so any heading is in its bounds
 
 
 @pytest.mark.usefixtures("few_tries")

@@ -285,9 +285,8 @@ def test_a_lost_estimate_restarts() -> None:
     anchor = recent.anchors[-1]
     pose = type(anchor.pose)(anchor.pose.rotation(), anchor.pose.translation() + np.array([300.0, 0.0, 0.0]))
     known = {name: replace(b, cov=b.cov * 1e-4) for name, b in anchor.slow.items()}
-    recent.anchors.clear()
-    recent.anchors.append(replace(anchor, pose=pose, cov=anchor.cov * 1e-4, slow=known))
-    recent.begin([m for m in recent if m.stamp_ns >= anchor.stamp_ns])
+    since = [m for m in recent if m.stamp_ns >= anchor.stamp_ns]
+    recent.begin(replace(anchor, pose=pose, cov=anchor.cov * 1e-4, slow=known), since)
     online._rebuild("planted")  # noqa: SLF001
     feed(online, run, base[n:], fed)
     assert complaints(base, finish(online, fed)) == []

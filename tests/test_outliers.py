@@ -19,6 +19,7 @@ from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.graph import Residual
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
 from graphloc.online import OnlineSmoother
+from graphloc.online import _start as online_start
 from graphloc.position_jumps import JumpDetector, jump_warnings, position_jumps
 from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
@@ -305,6 +306,32 @@ def test_a_jump_of_the_only_receiver_is_not_followed_online(gnss_hz: float) -> N
     assert sum("the window was rebuilt" in w for w in live.stats.warnings) == 2
     far_off = live.trajectory.stamps_ns > run.truth.stamps_ns[0] + 45_000_000_000
     assert Health.GOOD not in [h for h, k in zip(live.health, far_off, strict=True) if k]
+
+
+def test_a_jump_of_the_only_receiver_is_no_noise_of_the_imu_at_the_start() -> None:
+    """12 m for 2 s of the first 5: the start followed, by noise of the IMU 81 times larger than configured."""
+    run, recording, config = jumping_alone(5.0, (1.5, 3.5), 12.0)
+    online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL)
+    estimates = [e for e in map(online.feed, arrivals(recording)) if e is not None]
+    assert online._persistent.noise.scale == 1.0  # noqa: SLF001
+    off_m = [np.linalg.norm((e.p_world_m - run.truth.at(np.array([e.stamp_ns])).p_world_m[0])[:2]) for e in estimates]
+    assert max(off_m) < 4.0
+    assert max(off_m[5:]) < 2.0  # 1 s later
+
+
+def test_a_start_that_makes_the_imu_far_noisier_than_configured_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here every one does; in the end a position is better than none."""
+    monkeypatch.setattr(online_start, "LARGEST_NOISE_SCALE", 0.5)
+    monkeypatch.setattr(online_start, "_LONGEST_WAIT_S", 7.0)
+    _, recording, config = jumping_alone(5.0, (99.0, 99.0), 8.5)
+    online, said, first_s = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL), set(), 0.0
+    for m in arrivals(recording):
+        said.add(online.waiting_for)
+        if online.feed(m) is not None and not first_s:
+            assert recording.imu is not None
+            first_s = float(m.stamp_ns - recording.imu.stamps_ns[0]) * 1e-9
+    assert "data in which the IMU and the other sensors agree" in said
+    assert 7.0 <= first_s < 8.0
 
 
 def test_where_a_jump_of_the_only_receiver_may_be_its_end_the_bounds_hold_both_levels() -> None:

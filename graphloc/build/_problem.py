@@ -152,7 +152,6 @@ def make_problem(
     by_sensor: dict[str, list[Measurement]] = {}
     for m in inside:
         by_sensor.setdefault(m.sensor, []).append(m)
-    starts = company is not None
     if company is None:
         company = company_of(config, rows, by_sensor)
     streams = []
@@ -168,7 +167,7 @@ def make_problem(
             position_jumps = _NO_JUMPS
             if one_place and slow is None and row.absolute and row.false is None:
                 position_jumps = _position_jumps(row, by_sensor[name], datum, allowed_jump_m(left_out))
-            if left_out is not None and len(position_jumps[0]) and not starts:
+            if left_out is not None and len(position_jumps[0]):
                 slow, left_out = without_drift(left_out), None
             streams.append(
                 _stream(

@@ -13,10 +13,14 @@ from graphloc.online._lag import Lag
 from graphloc.online._odometry import Odometry
 from graphloc.online._propagate import Propagated
 from graphloc.online._unmodelled import UnmodelledError
-from graphloc.solve._covariances import limit_heading, unmodelled_covariance, widen_heading, world_covariance
+from graphloc.solve._covariances import (
+    ANY_HEADING_RAD,
+    limit_heading,
+    unmodelled_covariance,
+    widen_heading,
+    world_covariance,
+)
 from graphloc.solve._health import health_of
-
-_TOLD_RAD = np.radians(10.0)  # 1 sigma that only motion gives that does tell the heading
 
 
 def estimate_of(
@@ -28,7 +32,7 @@ def estimate_of(
     absolute: Sequence[str],
     doubt: str,
     heading_off_rad: float,
-    guess_rad: float,
+    guess: bool,
     unmodelled: UnmodelledError | None,
 ) -> Estimate:
     """Return the estimate at a state of the window, or propagated beyond it.
@@ -38,7 +42,7 @@ def estimate_of(
         doubt: why the health cannot be good, or empty.
         unmodelled: what slow errors that are left out do to the newest state; the covariances then include it.
         heading_off_rad: by how much the motion shows the heading to be off; the covariance then includes it.
-        guess_rad: 1 sigma of a heading that is a guess: of more than `_TOLD_RAD`, the window's own is too sure (see `solve._start`).
+        guess: whether the heading is a guess: the window's own covariance is then too sure (see `solve._start`), and it may be any.
     """
     newest, problem = lag.newest, lag.problem
     at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
@@ -53,8 +57,8 @@ def estimate_of(
     others_m, others_cov = lag.others
     cov[:3, :3] += others_cov
     cov[5, 5] += heading_off_rad**2
-    if cov[5, 5] > _TOLD_RAD**2:
-        widen_heading(cov, guess_rad**2)
+    if guess:
+        widen_heading(cov, ANY_HEADING_RAD**2)
     limit_heading(cov)
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
     health, reason = health_of(cov, since, doubt)

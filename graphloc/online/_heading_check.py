@@ -98,30 +98,30 @@ class HeadingCheck:
         self._looked_ns = newest.stamp_ns
         if self._sensor not in lag.problem.streams:
             return False
-        off_rad = self._off_rad(lag, newest, np.zeros(3))
-        if off_rad is None:
+        found = self._off(lag, newest, np.zeros(3))
+        if found is None:
             return False
-        if abs(off_rad) > _TURNED_RAD:
+        # Not with the estimated bias, which a guess has bent until it fits.
+        self._fits = self._fits + 1 if abs(found[0]) <= _TURNED_RAD else 0
+        if _turned(*found):
             up = newest.pose.rotation().matrix()[2]
-            told = self._off_rad(lag, newest, up * float(up @ lag.problem.R_body_imu @ newest.bias.gyroscope()))
-            off_rad = told if told is not None and abs(told) <= _TURNED_RAD else off_rad
+            told = self._off(lag, newest, up * float(up @ lag.problem.R_body_imu @ newest.bias.gyroscope()))
+            found = told if told is not None and not _turned(*told) else found
         known = (
             float(
                 bounds_95(world_covariance(newest.pose_cov, newest.pose.rotation().matrix(), np.zeros(3))[None])[0, 2]
             )
             < _KNOWN_DEG
         )
-        turned = abs(off_rad) > _TURNED_RAD
-        self._fits = 0 if turned else self._fits + 1
-        if known and turned:
+        if known and _turned(*found):
             self._wrong, self._right = self._wrong + 1, 0
         else:
             self._wrong, self._right = 0, self._right + 1
         was = self.said
         if self._wrong >= _IN_A_ROW:
-            self.off_rad = off_rad
+            self.off_rad = found[0]
             self.said = was or (
-                f"the heading is off by about {np.degrees(off_rad):.0f} deg, by the IMU's accelerations and the fixes of {self._sensor}: "
+                f"the heading is off by about {np.degrees(self.off_rad):.0f} deg, by the IMU's accelerations and the fixes of {self._sensor}: "
                 "check the compass (convention, mount) and the IMU's axes"
             )
         elif self._right >= _IN_A_ROW:
@@ -150,8 +150,8 @@ class HeadingCheck:
         while self._fixes and self._fixes[0][0] < begin_ns:
             self._fixes.popleft()
 
-    def _off_rad(self, lag: Lag, newest: Newest, drift_radps: Array) -> float | None:
-        """Return the error of the heading (rad) by the motion; 0 where it may be noise, None where the motion does not show it.
+    def _off(self, lag: Lag, newest: Newest, drift_radps: Array) -> tuple[float, float] | None:
+        """Return the error of the heading by the motion and its sigma (rad); None where the motion does not show it.
 
         Args:
             drift_radps: (3,) gyroscope bias to take off, body axes.
@@ -174,8 +174,7 @@ class HeadingCheck:
         sigma = float(np.sqrt(np.linalg.inv(information)[0, 0].real))
         if not _SIZE[0] < abs(rho) < _SIZE[1] or sigma > _SURE:
             return None
-        off_rad = -float(np.angle(rho))
-        return off_rad if abs(off_rad) > _SIGMAS * sigma else 0.0
+        return -float(np.angle(rho)), sigma
 
     def _felt(self, lag: Lag, newest: Newest, drift_radps: Array) -> tuple[Array, Array]:
         """Return times (N,), s, relative to the newest state, and s, x2 and x3 (3, N), complex, in world."""
@@ -194,3 +193,8 @@ class HeadingCheck:
         twice = np.cumsum(np.cumsum(x) * dt)
         at_s = (np.array([step.until_ns for step in self._steps]) - newest.stamp_ns) * 1e-9
         return at_s, np.array([place, twice, np.cumsum(twice * dt)])
+
+
+def _turned(off_rad: float, sigma_rad: float) -> bool:
+    """Whether an error of the heading is too large, and no noise."""
+    return bool(abs(off_rad) > max(_TURNED_RAD, _SIGMAS * sigma_rad))

@@ -26,7 +26,7 @@ class PersistentState:
         datum: origin of world; None before it is known.
         noise: by how much the IMU noise is scaled up.
         heights_m: configured heights (m, up in world), by the name of the sensor that measures them.
-        doubt: why the pose of this start cannot be called good; empty where it can. doubt_rad: 1 sigma of its heading then, else 0.
+        doubt: why the heading is a guess; empty where it is none.
         agreed_ns: stamp at which each absolute sensor last agreed, as known when the last window ended.
         odometry: the `odom` frame; None before the first start.
         motion_model: motion model. heading_check: whether the heading fits the motion.
@@ -39,7 +39,6 @@ class PersistentState:
     noise: ImuNoise
     heights_m: Mapping[str, float] = field(default_factory=dict)
     doubt: str = ""
-    doubt_rad: float = 0.0
     agreed_ns: dict[str, int] = field(default_factory=dict)
     odometry: Odometry | None = None
     motion_model: MotionModel = field(default_factory=MotionModel)
@@ -61,7 +60,6 @@ class PersistentState:
             noise=noise,
             heights_m={name: height_m for name, height_m in found.heights_m.items() if name in sensors},
             doubt=found.doubt,
-            doubt_rad=found.doubt_rad,
             agreed_ns=dict(found.agreed_ns),
             odometry=Odometry(found.anchor.stamp_ns, found.p_odom_m, found.R_odom_body),
         )
@@ -83,7 +81,6 @@ class PersistentState:
             agreed_ns={**self.agreed_ns, **agreed_ns},
             noise_scale=self.noise.scale,
             doubt=self.doubt,
-            doubt_rad=self.doubt_rad,
             p_odom_m=self.odometry.p_m,
             R_odom_body=self.odometry.R,
             unmodelled=None if self.unmodelled is None else self.unmodelled.cov,

@@ -24,19 +24,14 @@ class Recent:
         self._came: list[Measurement] = []
         self._before: ImuSample | None = None  # the last sample before the oldest anchor
 
-    def clear(self) -> None:
-        """Forget everything."""
-        self.anchors.clear()
-        self._came, self._before = [], None
+    def begin(self, anchor: Anchor, came: Iterable[Measurement], before: ImuSample | None = None) -> None:
+        """A window has begun at an anchor with these measurements.
 
-    def begin(self, came: Iterable[Measurement]) -> None:
-        """A window has begun with these measurements."""
-        self._came = list(came)
-
-    def resume(self, anchor: Anchor, before: ImuSample, came: ImuSample) -> None:
-        """A window has begun at an anchor of a snapshot, with the IMU sample at it or before, and the first since."""
+        Args:
+            before: the last IMU sample at the anchor or before it, where it is not among them.
+        """
         self.anchors = deque([anchor])
-        self._before, self._came = before, [came]
+        self._before, self._came = before, list(came)
 
     def keep(self, m: Measurement) -> None:
         """Keep a measurement, whatever its stamp."""

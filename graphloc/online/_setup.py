@@ -7,9 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
+
+from graphloc.build import mount_of
 from graphloc.config import ImuConfig, VesselConfig
-from graphloc.frames import Array
-from graphloc.graph import InertialRow, Sensor
+from graphloc.frames import Array, Datum
+from graphloc.graph import Hint, InertialRow, Sensor
+from graphloc.measurements import Measurement
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,6 +69,13 @@ class Setup:
     def absolute(self) -> tuple[str, ...]:
         """Names of the enabled sensors that measure position in world."""
         return tuple(n for row in self.rows if row.absolute for n in self.config.of_kind(row.kind))
+
+    def hint(self, m: Measurement, datum: Datum) -> Hint:
+        """Return what a measurement says by itself."""
+        sensor = self.config.sensors[m.sensor]
+        R = mount_of(m.sensor, sensor, self.mounts)[1]
+        row = next(row for row in self.rows if row.kind == sensor.kind)
+        return row.hint(m, float(np.arctan2(R[1, 0], R[0, 0])), datum)
 
     def without_start_heading(self) -> Setup:
         """Return the same for a later start: the configured heading is that of the first start alone."""

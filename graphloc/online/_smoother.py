@@ -27,7 +27,7 @@ from graphloc.online._noise import ImuNoise
 from graphloc.online._persistent import PersistentState
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import SnapshotFile
-from graphloc.online._start import Started, try_start
+from graphloc.online._start import LEAST_S, Started, try_start
 from graphloc.online._tracking import Tracking, failure_text
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
@@ -84,6 +84,7 @@ class OnlineSmoother:
         self._say(trouble)
         self._waiting = Waiting(self._ledger)
         self._tracking: Tracking | None = None
+        self._tried_ns = 0  # to start over with a measured heading
         self._wait(
             "the first IMU sample" if imu else f"an IMU: no enabled sensor of kind {inertial.kind} is configured"
         )
@@ -235,8 +236,11 @@ class OnlineSmoother:
             tracking.advance(until_ns)
             self._keep_anchor(tracking)
             self._events += tracking.news()
-            if tracking.lag.lost_s:
-                return self._start_over(tracking, until_ns)
+            if lost_s := tracking.lag.lost_s:
+                why = f"for {lost_s:.0f} s no absolute sensor agreed, unless its error had jumped"
+                return self._start_over(tracking, until_ns, why)
+            if self._persistent.doubt and self._starts_with_heading(tracking, until_ns):
+                return self._start_over(tracking, until_ns, "sensors measure the heading, which was a guess")
             if jumped := tracking.lag.unmodelled_jumps:
                 self._rebuild(f"position jump of {', '.join(jumped)}")
                 return self._estimate()
@@ -271,7 +275,7 @@ class OnlineSmoother:
 
     def _wait(self, why: str) -> None:
         """Give up the estimate, and wait for a start."""
-        self._tracking = None
+        self._tracking, self._tried_ns = None, 0
         self._persistent.forget_jumps()
         self._waiting.begin(why)
         self._ledger.close()
@@ -309,7 +313,7 @@ class OnlineSmoother:
         persistent = self._persistent
         self._setup = self._setup.without_start_heading()
         persistent.datum, persistent.heights_m = started.datum, started.heights_m
-        persistent.doubt, persistent.doubt_rad = started.doubt, started.doubt_rad
+        persistent.doubt = started.doubt
         persistent.noise.scale = max(persistent.noise.scale, started.noise_scale)
         persistent.heading_check.begin()
         for sample in samples:
@@ -319,7 +323,7 @@ class OnlineSmoother:
         self._tracking = tracking = Tracking(self._setup, persistent, self._ledger, started.anchor, samples, solved)
         self._ledger.enter(started.rows)
         persistent.unmodelled = tracking.lag.unmodelled(started.unmodelled)
-        tracking.catch_up(samples, others, until_ns)
+        tracking.catch_up(started.anchor, samples, others, until_ns)
         self._keep_anchor(tracking)
         newest_ns = tracking.lag.newest.stamp_ns
         persistent.noise.begin(newest_ns)
@@ -338,12 +342,26 @@ class OnlineSmoother:
         self._waiting.refuse(f"the estimate restarted while waiting for {self._waiting.why}")
         self._wait("the next IMU sample")
 
-    def _start_over(self, tracking: Tracking, now_ns: int) -> Estimate | None:
-        """Start anew with the last seconds: absolute sensors agree with each other or not, but not with the estimate."""
-        lost_s = tracking.lag.lost_s
+    def _starts_with_heading(self, tracking: Tracking, now_ns: int) -> bool:
+        """Return whether sensors measure the heading by now, and the last seconds are enough for a start that is no guess.
+
+        Corrected in the window, a wrong guess leaves wrong biases and velocities behind, and with them a wrong heading.
+        """
+        since_ns = now_ns - duration_ns(_AGAIN_S)
+        if now_ns - self._tried_ns < duration_ns(LEAST_S) or not tracking.heading_measured(since_ns):
+            return False
+        self._tried_ns = now_ns
+        came = tracking.since(since_ns)
+        imu = series_of([m for m in came if isinstance(m, ImuSample)])
+        reached = [m for m in came if not isinstance(m, ImuSample) and m.stamp_ns <= now_ns]
+        started = try_start(self._setup, imu, reached, self.datum)
+        return not isinstance(started, str) and not started.doubt
+
+    def _start_over(self, tracking: Tracking, now_ns: int, why: str) -> Estimate | None:
+        """Start anew with the last seconds."""
         again = tracking.end_but(now_ns - duration_ns(_AGAIN_S))
         self._persistent.agreed_ns.update(tracking.lag.agreed_ns)
-        self._say(f"for {lost_s:.0f} s no absolute sensor agreed, unless its error had jumped: restarts")
+        self._say(f"{why}: restarts")
         self._wait("the next IMU sample")
         # Samples have their rows already.
         for m in again:

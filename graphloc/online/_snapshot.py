@@ -28,7 +28,7 @@ class Snapshot:
         vessel: its name. anchor: the newest state. imu: the sample at it or before.
         datum: origin of world. heights_m: configured heights (m, up in world), by sensor.
         agreed_ns: stamp at which each absolute sensor last agreed. noise_scale: factor on the IMU noise.
-        doubt: why the health cannot be good, or empty. doubt_rad: 1 sigma of the heading of the start then, else 0.
+        doubt: why the heading is a guess, or empty.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
         unmodelled: covariance of `UnmodelledError`; None where no slow error is left out.
     """
@@ -41,7 +41,6 @@ class Snapshot:
     agreed_ns: Mapping[str, int]
     noise_scale: float
     doubt: str
-    doubt_rad: float
     p_odom_m: Array
     R_odom_body: Array
     unmodelled: Array | None
@@ -61,7 +60,6 @@ class Snapshot:
             "heights_m": dict(self.heights_m),
             "noise_scale": self.noise_scale,
             "doubt": self.doubt,
-            "doubt_rad": self.doubt_rad,
             "agreed_ns": dict(self.agreed_ns),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
             "unmodelled": None if self.unmodelled is None else self.unmodelled.tolist(),
@@ -86,7 +84,7 @@ class Snapshot:
         stamp, *six = raw["imu"]
         p, R = (np.array(raw["odom"][n], dtype=np.float64).reshape(shape) for n, shape in ((0, 3), (1, (3, 3))))
         heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
-        scale, doubt_rad = float(raw["noise_scale"]), float(raw["doubt_rad"])
+        scale = float(raw["noise_scale"])
         datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
         unmodelled = None if raw["unmodelled"] is None else np.array(raw["unmodelled"], dtype=np.float64)
         numbers = np.concatenate(
@@ -95,7 +93,7 @@ class Snapshot:
                 R.ravel(),
                 datum.origin,
                 list(heights_m.values()),
-                [scale, doubt_rad],
+                [scale],
                 [] if unmodelled is None else unmodelled.ravel(),
             ]
         )
@@ -110,7 +108,6 @@ class Snapshot:
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
             noise_scale=float(np.clip(scale, 1.0, LARGEST_NOISE_SCALE)),
             doubt=str(raw["doubt"]),
-            doubt_rad=doubt_rad,
             p_odom_m=p,
             R_odom_body=R,
             unmodelled=unmodelled,

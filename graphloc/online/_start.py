@@ -15,17 +15,16 @@ import gtsam
 import numpy as np
 
 from graphloc import keys, origin
-from graphloc.build import build_graph, company_of, make_problem, mount_of
+from graphloc.build import build_graph, company_of, make_problem
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
-from graphloc.graph import Hint
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._setup import Setup
 from graphloc.recording import Recording
 from graphloc.solve._align import MOVED_M
-from graphloc.solve._batch import BatchResult, solve_batch
+from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult, solve_batch
 from graphloc.solve._covariances import ANY_HEADING_RAD, world_covariance
 from graphloc.solve._decide import AGREES, decisions
 from graphloc.solve._ledger import row_of
@@ -35,9 +34,7 @@ from graphloc.time import duration_ns
 
 LEAST_S = 5.0  # of IMU data: gives gyro bias, roll and pitch of a vessel in waves
 _HEADING_RAD = np.radians(15.0)  # 1 sigma: from a larger error the window does not recover soon
-_HEADING_WAIT_S = (
-    30.0  # wait for a heading from travel alone; then a position with a doubtful heading is better than none
-)
+_LONGEST_WAIT_S = 30.0  # for a heading from travel alone, or an IMU that fits; then a position with a doubtful heading is better than none
 _DOUBTFUL = 0.1  # probability of being false, above which several must agree; tags and poses lie below
 _AGREEING, _SHARE, _CHOICE_WAIT_S = (
     3,
@@ -58,7 +55,7 @@ class Started:
         pose, velocity, bias: of that state, as solved: at the IMU with the body's axes, in world: gtsam.Pose3, (3,), m/s,
             (6,), accelerometer first.
         heights_m: configured heights (m, up in world), by sensor.
-        doubt: why the health cannot be good, or empty. doubt_rad: 1 sigma of the heading then, else 0. noise_scale: factor on the IMU noise.
+        doubt: why the heading is a guess, or empty. noise_scale: factor on the IMU noise.
         unmodelled: what slow errors that are left out did to that state; None: nothing that is known.
         notes: what the alignment was based on. rows: ledger rows of what was measured before the first state.
     """
@@ -70,7 +67,6 @@ class Started:
     bias: Array
     heights_m: Mapping[str, float]
     doubt: str
-    doubt_rad: float
     noise_scale: float
     unmodelled: Unmodelled | None
     notes: tuple[str, ...]
@@ -106,16 +102,11 @@ def try_start(setup: Setup, imu: ImuSeries, measurements: Sequence[Measurement],
 
 def _missing(setup: Setup, recording: Recording, datum: Datum) -> str:
     """Return what position or heading still needs; empty where both are observable."""
-    config, by_kind = setup.config, {row.kind: row for row in setup.rows}
-    hints: list[Hint] = []
-    for m in recording.measurements:
-        sensor = config.sensors[m.sensor]
-        R = mount_of(m.sensor, sensor, recording.mounts)[1]
-        hints.append(by_kind[sensor.kind].hint(m, float(np.arctan2(R[1, 0], R[0, 0])), datum))
+    hints = [setup.hint(m, datum) for m in recording.measurements]
     places = [h for h in hints if np.isfinite(h.p_world_m[:2]).all()]
     if not places:
         return "a position: a fix, a match, a tag or a pose"
-    if config.start.heading_deg is not None or any(np.isfinite(h.yaw_rad) for h in hints):
+    if setup.config.start.heading_deg is not None or any(np.isfinite(h.yaw_rad) for h in hints):
         return ""
     p = np.array([h.p_world_m[:2] for h in places])
     noise_m = 5.0 * float(np.nanmedian([h.p_sigma_m[:2] for h in places]))
@@ -131,6 +122,8 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
     problem = make_problem(whole, config, datum, rows, setup.inertial, company_of(config, rows))
     result = solve_batch(problem)
     span_s = (problem.timeline.stamps_ns[-1] - problem.timeline.stamps_ns[0]) * 1e-9
+    if result.noise_scale > LARGEST_NOISE_SCALE and span_s < _LONGEST_WAIT_S:
+        return "data in which the IMU and the other sensors agree"
     if span_s < _CHOICE_WAIT_S:
         for stream in problem.streams:
             weights = [result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))]
@@ -148,7 +141,7 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         found = f"the motion so far tells it to {np.degrees(sigma):.0f} deg (1 sigma)"
         if result.headings > 1:
             found += f", {result.headings} candidates explain it"
-        if span_s < _HEADING_WAIT_S:
+        if span_s < _LONGEST_WAIT_S:
             return f"a heading: {found}; turn, add a heading sensor or set `start.heading_deg`"
         doubt = f"the heading is a guess: {found}"
     heights = {
@@ -172,7 +165,6 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         bias=result.values.atConstantBias(keys.bias(int(result.problem.timeline.slow_of[k]))).vector(),
         heights_m=heights,
         doubt=doubt,
-        doubt_rad=sigma if doubt else 0.0,
         noise_scale=result.noise_scale,
         unmodelled=_unmodelled(result, k),
         notes=result.notes,

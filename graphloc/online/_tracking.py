@@ -28,12 +28,14 @@ from graphloc.online._propagate import advance_odometry, propagate, unpropagated
 from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
+from graphloc.online._start import LEAST_S
 from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _PENDING = 10_000
+_HEADINGS = 3  # measurements of the heading that end a guess
 
 
 class Tracking:
@@ -122,17 +124,19 @@ class Tracking:
         """Whether the next state lies at or before a stamp."""
         return self.lag.problem.timeline.due_ns <= until_ns
 
-    def catch_up(self, samples: Sequence[ImuSample], others: Sequence[Measurement], until_ns: int) -> None:
-        """Bring a window that has just begun to a stamp, with the measurements that the start was made of."""
+    def catch_up(
+        self, anchor: Anchor, samples: Sequence[ImuSample], others: Sequence[Measurement], until_ns: int
+    ) -> None:
+        """Bring a window that has just begun at an anchor to a stamp, with the measurements that the start was made of."""
         self._pending = [m for m in others if not self._ledger.has(m)]
         while self._pending and self._pending[0].stamp_ns < self.lag.first_ns:
             self._ledger.drop(self._pending.pop(0), Outcome.REJECTED, "no IMU data at this stamp")
-        self._recent.begin([*samples, *self._pending])
+        self._recent.begin(anchor, [*samples, *self._pending])
         self._extend(until_ns)
 
     def resume(self, anchor: Anchor, before: ImuSample, newest: ImuSample) -> None:
         """Go on from a snapshot: its anchor, the sample at it or before, and the first sample since."""
-        self._recent.resume(anchor, before, newest)
+        self._recent.begin(anchor, [newest], before)
         self._ledger.used(newest)
 
     def advance(self, until_ns: int) -> None:
@@ -243,9 +247,23 @@ class Tracking:
             absolute=self._setup.absolute,
             doubt="; ".join(doubt for doubt in doubts if doubt),
             heading_off_rad=persistent.heading_check.off_rad,
-            guess_rad=persistent.doubt_rad,
+            guess=bool(persistent.doubt),
             unmodelled=persistent.unmodelled,
         )
+
+    def heading_measured(self, since_ns: int) -> bool:
+        """Return whether sensors have measured the heading since a stamp (ns), for as long as a start takes."""
+        datum = self.lag.problem.datum
+        told_ns = [
+            m.stamp_ns
+            for m in self._recent.others()
+            if m.stamp_ns >= since_ns and np.isfinite(self._setup.hint(m, datum).yaw_rad)
+        ]
+        return len(told_ns) >= _HEADINGS and self.lag.newest.stamp_ns - min(told_ns) >= duration_ns(LEAST_S)
+
+    def since(self, stamp_ns: int) -> list[Measurement]:
+        """Return what has come with stamps from `stamp_ns` on."""
+        return [m for m in self._recent if m.stamp_ns >= stamp_ns]
 
     def trajectory(self, now: Estimate) -> Trajectory:
         """Return the states of the window, and `now` where it is newer; the covariance at all of them is that of `now`."""
@@ -261,7 +279,7 @@ class Tracking:
         check = self._persistent.heading_check
         heading = [check.said] if check.look(self.lag) else []
         if self._persistent.doubt and check.confirmed:
-            self._persistent.doubt, self._persistent.doubt_rad = "", 0.0
+            self._persistent.doubt = ""
             heading.append("the motion confirms the heading: it is no guess any more")
         was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now
@@ -327,7 +345,7 @@ class Tracking:
     def end_but(self, since_ns: int) -> list[Measurement]:
         """Give every measurement its row, but those since a stamp (ns), which are returned to start anew with."""
         self._ledger.enter(self.lag.gone())
-        again = [m for m in self._recent if m.stamp_ns >= since_ns and not self._ledger.has(m)]
+        again = [m for m in self.since(since_ns) if not self._ledger.has(m)]
         self._settle_rows(self.lag, again)
         return again
 
