@@ -211,8 +211,14 @@ def _gyro_bias(
     prior = problem.links.bias_sigmas()[3:]
     if still is not None:
         t, _, w = _samples(problem, *still)
-        sigma = w.std(axis=0) / np.sqrt(len(w)) + 3e-4 + _swell(t, w)
-        return w.mean(axis=0), np.minimum(sigma, prior), (f"gyro bias from {still[1] - still[0]:.0f} s of standstill",)
+        bias = w.mean(axis=0)
+        sigma = np.minimum(w.std(axis=0) / np.sqrt(len(w)) + 3e-4 + _swell(t, w), prior)
+        if not yaws:
+            # It may as well turn on the spot: any part of its rate is bias, as far as the prior has it.
+            half = bias[2] / 2.0
+            share = prior[2] ** 2 / (prior[2] ** 2 + half**2)
+            bias[2], sigma[2] = share * half, np.hypot(sigma[2], np.sqrt(share) * half)
+        return bias, sigma, (f"gyro bias from {still[1] - still[0]:.0f} s of standstill",)
     t, _, w = _samples(problem, 0.0, window)
     span = float(np.ptp(t))
     mean = w.mean(axis=0)
