@@ -65,10 +65,10 @@ def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
         return []
     step_s = float(np.median(np.diff(moments))) / NS_PER_S
     said = f"{sensor}: {len(stamps_ns)} measurements have {len(moments)} stamps, {step_s:g} s apart: the driver truncates them"
-    return [
-        f"{said}; times are off by up to that, positions by that times the speed, which no bound includes: fix the driver, or "
-        "set `stamps: recorded`, as `inspect` drafts it for whole seconds"
-    ]
+    said += (
+        "; times are off by up to that, positions by that times the speed, which no bound includes: fix the driver, or "
+    )
+    return [f"{said}set `stamps: recorded`, as `inspect` drafts it for whole seconds"]
 
 
 def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:

@@ -54,7 +54,10 @@ def test_headers_without_stamps_are_read_by_the_recording_times(tmp_path: Path, 
         "gnss": "recorded",
         "compass": "recorded",
     }
-    assert "stamps: recorded  # guess: its headers hold no stamps, or whole seconds only; recording times are late by" in text
+    assert (
+        "stamps: recorded  # guess: its headers hold no stamps, or whole seconds only; recording times are late by"
+        in text
+    )
     late_s, _ = found.gnss[0].late_s or (0.0, 0.0)
     assert late_s == pytest.approx(-0.12, abs=0.02)  # the accelerometer tells how long a fix is on its way
     assert config.sensors["gnss"].time_offset_s == pytest.approx(late_s, abs=1e-3)
