@@ -72,7 +72,10 @@ def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
 
 
 def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:
-    """Return a line if fixes have no height."""
+    """Return a line if fixes have no height, or 0 in its place."""
+    if len(fixes) >= _FEWEST and all(m.has_height and m.position.height_m == 0.0 for m in fixes):
+        said = f"{sensor}: all {len(fixes)} fixes have a height of 0, as of a receiver that gives none"
+        return [f"{said}: the track's height is off by what no bound includes; NaN would say so"]
     flat = sum(not m.has_height for m in fixes)
     if not flat:
         return []

@@ -175,6 +175,14 @@ def test_fixes_that_claim_to_tell_nothing_are_reported(hz: int, sigma_m: float, 
     assert all("gnss: its fixes claim a sigma of 10000 m" in line for line in lines)
 
 
+def test_heights_of_zero_throughout_are_said_to_be_none(tmp_path: Path) -> None:
+    items = fixes(10)
+    for _, _, fix in items:
+        fix.altitude = 0.0
+    (line,) = read(tmp_path, items).warnings
+    assert line.startswith("gnss: all 400 fixes have a height of 0, as of a receiver that gives none")
+
+
 @pytest.mark.parametrize("every", [1, 3])
 def test_a_fix_without_a_height_is_a_horizontal_one(every: int, tmp_path: Path) -> None:
     """NavSatFix says NaN where there is no altitude; a fix without a latitude or longitude stays refused."""
