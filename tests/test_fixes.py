@@ -102,6 +102,7 @@ def test_stamps_cut_to_seconds_are_reported(step_ns: int, said: int, tmp_path: P
         (10, 0.5, 0.05, 1.0, 10.0),
         (10, 0.5, 0.05, 4.0, 10.0),  # of the scale that is configured already
         (10, 0.5, 0.05, 9.0, None),
+        (10, 0.5, 0.5, 0.01, 1.0),  # the floor of the sigma is not what is scaled
         (10, 0.05, 0.05, 1.0, None),
         (10, 0.0, 0.05, 1.0, None),
         (1, 0.5, 0.05, 1.0, None),  # motion could be in it
