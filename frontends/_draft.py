@@ -203,7 +203,7 @@ def _with_clock(block: list[str], inspection: Inspection) -> list[str]:
     topic = next((line.split()[1] for line in block if line.startswith("  topic:")), "")
     if topic in topics and topics[topic].recorded:
         unknown = "" if kind == "gnss" else ", which no bound includes"
-        said = f"guess: its headers hold no stamps; they are late by as long as a message takes{unknown}"
+        said = f"guess: its headers hold no stamps, or whole seconds only; recording times are late by as long as a message takes{unknown}"
         block = [*block, f"  stamps: recorded  # {said}"]
     if topic in topics and (ppm := topics[topic].drift_ppm):
         gained_s = 1e-6 * ppm * (topics[topic].span_s or 0.0)

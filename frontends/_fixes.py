@@ -65,13 +65,17 @@ def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
         return []
     step_s = float(np.median(np.diff(moments))) / NS_PER_S
     said = f"{sensor}: {len(stamps_ns)} measurements have {len(moments)} stamps, {step_s:g} s apart: the driver truncates them"
-    return [
-        f"{said}; times are off by up to that, positions by that times the speed, which no bound includes: fix the driver"
-    ]
+    said += (
+        "; times are off by up to that, positions by that times the speed, which no bound includes: fix the driver, or "
+    )
+    return [f"{said}set `stamps: recorded`, as `inspect` drafts it for whole seconds"]
 
 
 def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:
-    """Return a line if fixes have no height."""
+    """Return a line if fixes have no height, or 0 in its place."""
+    if len(fixes) >= _FEWEST and all(m.has_height and m.position.height_m == 0.0 for m in fixes):
+        said = f"{sensor}: all {len(fixes)} fixes have a height of 0, as of a receiver that gives none"
+        return [f"{said}: the track's height is off by what no bound includes; NaN would say so"]
     flat = sum(not m.has_height for m in fixes)
     if not flat:
         return []
@@ -90,9 +94,8 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
     places = Datum(ordered[0].position).enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])[:, :2]
     found = scatter_m(np.array([m.stamp_ns for m in ordered], dtype=np.int64), places)
     variances = np.array([np.diagonal(m.cov_enu_m2)[:2] for m in ordered])
-    claimed = max(
-        config.sigma_scale * float(np.sqrt(np.median(variances, axis=0).max())), config.min_horizontal_sigma_m
-    )
+    reported = float(np.sqrt(np.median(variances, axis=0).max()))
+    claimed = max(config.sigma_scale * reported, config.min_horizontal_sigma_m)
     if claimed > NOTHING_M:
         scatter = "" if found is None else f", though consecutive fixes scatter by {found:.2f} m"
         said = f"{sensor}: its fixes claim a sigma of {claimed:.0f} m, so they have almost no weight{scatter}"
@@ -100,7 +103,7 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
     if found is None or found < SCATTERS * claimed:
         return []
     said = f"{sensor}: consecutive fixes scatter by {found:.2f} m but claim a sigma of {claimed:.2f} m"
-    return [f"{said}: set sigma_scale: {config.sigma_scale * found / claimed:.1f}"]
+    return [f"{said}: set sigma_scale: {found / reported:.1f}"]
 
 
 def scatter_m(stamps_ns: NDArray[np.int64], p_m: Array) -> float | None:

@@ -75,7 +75,9 @@ def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
         lines.append(f"starts {utc_text(min(starts))}")
     for t in topics:
         if t.recorded:
-            lines.append(f"{t.topic}: its headers hold no stamps (all zero, or all the same): recording times are used")
+            lines.append(
+                f"{t.topic}: its headers hold no stamps (all zero, all the same, or whole seconds): recording times are used"
+            )
         if t.undecodable or t.no_stamp:
             lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded, {t.no_stamp or 0} have no stamp")
     return lines

@@ -40,7 +40,7 @@ class TopicReport:
     Attributes:
         gaps: intervals longer than 5 usual ones (and 0.1 s); max_gap_s: the longest interval.
         repeated, backward: stamps equal to, or before, the one before; no_stamp: zero stamps.
-        recorded: whether the headers hold no stamps, so that the recording times stand for them here.
+        recorded: whether the headers hold no stamps, or whole seconds only, so that the recording times stand for them here.
         latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points; without what the clock gains.
         drift_ppm: by how much the clock runs fast, where that is clear; else 0.
     """

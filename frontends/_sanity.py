@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.config import ImuConfig, VesselConfig
+from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition, PoseFix
@@ -39,11 +39,7 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
     lines = []
     said = f"{sensor}: median acceleration is {g:.2f} m/s^2"
     if config.gravity != "removed" and not 8.5 < g < 11.5:
-        if config.accel_unit == "m/s^2" and 0.9 < g < 1.1 and not without_gravity(accel_mps2):
-            lines.append(f"{said}: looks like g; set accel_unit: g")
-        elif config.accel_unit == "g" and 85.0 < g < 115.0:
-            lines.append(f"{said}: looks like m/s^2 already; set accel_unit: m/s^2")
-        elif g < 2.0:
+        if g < 2.0:
             lines.append(f"{said}: looks like gravity was removed by the driver; set gravity: removed")
         else:
             lines.append(f"{said}, not about 9.8: check accel_unit, and the sensor itself")
@@ -75,6 +71,24 @@ def refuse_half(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuCo
     missing = missing_half(accel_mps2, gyro_radps)
     if missing:
         raise InputError(f"{sensor}: all {missing} of {config.topic} are 0: {HALF}; name a topic that holds both")
+
+
+def refuse_accel_unit(sensor: str, accel_mps2: Array, config: ImuConfig) -> None:
+    """Refuse accelerations (N, 3) that, converted as configured, are g for m/s^2 or the reverse.
+
+    The solver would run for minutes, and lay the vessel on its side.
+
+    Raises:
+        InputError: they are.
+    """
+    g = float(np.median(np.linalg.norm(accel_mps2, axis=1))) if len(accel_mps2) >= 10 else STANDARD_GRAVITY_MPS2
+    in_g = config.accel_unit == "m/s^2" and 0.9 < g < 1.1 and not without_gravity(accel_mps2)
+    in_mps2 = config.accel_unit == "g" and 85.0 < g < 115.0
+    if config.gravity != "removed" and (in_g or in_mps2):
+        raise InputError(
+            f"{sensor}: median acceleration is {g:.2f} m/s^2 with accel_unit: {config.accel_unit}: linear_acceleration of "
+            f"{config.topic} looks like {'g' if in_g else 'm/s^2'}; set accel_unit: {'g' if in_g else 'm/s^2'} of sensors.{sensor}"
+        )
 
 
 def refuse_degrees(

@@ -35,6 +35,7 @@ from graphloc.frontends.decode import (
     nav_sat_status,
     stamp_ns_of,
 )
+from graphloc.time import NS_PER_S
 
 Row = tuple[float, ...]
 
@@ -122,7 +123,7 @@ _MOST = 1e12
 class Stream:
     """Columns of one topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`).
 
-    recorded: whether the stamps are recording times, because the headers hold none.
+    recorded: whether the stamps are recording times, because the headers hold none, or whole seconds only.
     drift_ppm: by how much the clock ran fast; what it gained is taken off the stamps. elapsed: (N,) ns from the beginning of the bag.
     """
 
@@ -148,9 +149,9 @@ class Stream:
         self.tuples.append(row)
 
     def settle(self) -> None:
-        """Drop messages without a stamp; if no message has one, use the recording times."""
+        """Drop messages without a stamp; if no message has one that tells when it was measured, use the recording times."""
         stamps = self.stamps_ns
-        if len(stamps) > 1 and bool((stamps == stamps[0]).all()):
+        if len(stamps) > 1 and (bool((stamps == stamps[0]).all()) or self._in_whole_seconds()):
             self.recorded, self._stamps = True, list(self._logs)
             return
         there = (stamps != 0).tolist()
@@ -160,6 +161,11 @@ class Stream:
         columns: tuple[list[Any], ...] = (self._stamps, self._logs, self.tuples, self.files, self.elapsed)
         for column in columns:
             column[:] = list(compress(column, there))
+
+    def _in_whole_seconds(self) -> bool:
+        """Whether several messages a second are stamped in whole seconds, and are recorded one after another."""
+        stamps, moments = self.stamps_ns, len(set(self._stamps))
+        return bool((stamps % NS_PER_S == 0).all()) and 4 * moments < 3 * min(len(stamps), len(set(self._logs)))
 
     def later(self, by_ns: int) -> Stream:
         """Return the stream with `by_ns` added to its stamps."""

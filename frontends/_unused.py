@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""IMU and GNSS topics of a bag that are not used, with reasons."""
+"""Topics of IMUs, receivers and magnetometers in a bag that are not used, with reasons."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container, Iterable, Sequence
 
 import numpy as np
 
 from graphloc.frontends._assess import sane
 from graphloc.frontends._assess_imu import samples_of
+from graphloc.frontends._source import TopicSummary
 from graphloc.frontends._streams import Stream
 from graphloc.frontends.decode import GPS_FIXES, IMU, NAV_SAT_FIX
 
 _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
+_MAGNETIC = "sensor_msgs/msg/MagneticField"
 
 
 def unused_topics(streams: Sequence[Stream], used: Container[str]) -> list[str]:
@@ -33,6 +35,16 @@ def unused_topics(streams: Sequence[Stream], used: Container[str]) -> list[str]:
             else f"{stream.topic}: not a message on it"
         )
     return lines
+
+
+def unused_magnetometers(topics: Iterable[TopicSummary]) -> list[str]:
+    """Return a line for each magnetometer of a bag without a compass: what makes one of it."""
+    return [
+        f"{t.topic}: a magnetic field is not read, and nothing else tells the heading but the motion; a filter such as "
+        "imu_filter_madgwick makes an orientation of it, which is read as a compass"
+        for t in topics
+        if _MAGNETIC in t.msgtypes and t.messages
+    ]
 
 
 def _why_unused(stream: Stream) -> str:

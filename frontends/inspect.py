@@ -60,7 +60,7 @@ from graphloc.frontends._streams import Stream, read_streams
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._time_offsets import heading_time_offset, motion_time_offset
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
-from graphloc.frontends._unused import unused_topics
+from graphloc.frontends._unused import unused_magnetometers, unused_topics
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import (
     GPS_FIXES,
@@ -199,6 +199,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             *(report.frozen for report in gnss if report.frozen),
             *unused_topics(list(bag.streams.values()), used),
             *_lacking(bag, imus, gnss, reports),
+            *([] if any(c.usable for c in compasses) else unused_magnetometers(bag.topics.values())),
         ),
     )
 

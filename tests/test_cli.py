@@ -76,6 +76,7 @@ def test_a_draft_from_inspect_gives_a_track(
         ("kind: gnss", "knid: gnss", "did you mean 'kind'"),
         ("kind: gnss", "kind: gnsss", "did you mean 'gnss'"),
         ("sensors:", "sensros:", "did you mean 'sensors'"),
+        ("sensors:", "sensors:\n  b: {kind: gnss, topic: /gnss/fix}", "both read /gnss/fix, which would count twice"),
         ("topic: /gnss/fix", "topic: /gnss/fxi", "/gnss/fix"),
         ("kind: imu", "kind: imu\n    accel_unit: furlong", "accel_unit"),
         ("kind: imu", "kind: imu\n    accel_noise_ug_per_sqrt_hz: -3", "accel_noise_ug_per_sqrt_hz"),

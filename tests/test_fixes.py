@@ -102,6 +102,7 @@ def test_stamps_cut_to_seconds_are_reported(step_ns: int, said: int, tmp_path: P
         (10, 0.5, 0.05, 1.0, 10.0),
         (10, 0.5, 0.05, 4.0, 10.0),  # of the scale that is configured already
         (10, 0.5, 0.05, 9.0, None),
+        (10, 0.5, 0.5, 0.01, 1.0),  # the floor of the sigma is not what is scaled
         (10, 0.05, 0.05, 1.0, None),
         (10, 0.0, 0.05, 1.0, None),
         (1, 0.5, 0.05, 1.0, None),  # motion could be in it
@@ -173,6 +174,14 @@ def test_fixes_that_claim_to_tell_nothing_are_reported(hz: int, sigma_m: float, 
     lines = read(tmp_path, fixes(hz, noise_m=0.2, sigma_m=sigma_m, seconds=60)).warnings
     assert len(lines) == said
     assert all("gnss: its fixes claim a sigma of 10000 m" in line for line in lines)
+
+
+def test_heights_of_zero_throughout_are_said_to_be_none(tmp_path: Path) -> None:
+    items = fixes(10)
+    for _, _, fix in items:
+        fix.altitude = 0.0
+    (line,) = read(tmp_path, items).warnings
+    assert line.startswith("gnss: all 400 fixes have a height of 0, as of a receiver that gives none")
 
 
 @pytest.mark.parametrize("every", [1, 3])

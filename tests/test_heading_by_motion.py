@@ -22,9 +22,11 @@ IMU_HZ, ACCEL_NOISE, GYRO_NOISE, FIX_M = 25.0, 0.05, 0.003, 0.3  # noise densiti
 
 
 def robot(
-    seed: int, duration_s: float, *turns_at_s: float, speed_mps: float = 1.0
+    seed: int, duration_s: float, *turns_at_s: float, speed_mps: float = 1.0, spins_s: float = 0.0
 ) -> tuple[Recording, VesselConfig, Array, Array]:
     """Drive straight, by default at a walking pace, and turn by 90 deg within 3 s at some moments.
+
+    `spins_s`: so long it first turns on the spot, at 0.06 rad/s, then it gathers speed for 4 s.
 
     Returns:
         The recording, its configuration, and the true yaw (N,), rad, at times (N,), s, since the first sample.
@@ -34,10 +36,12 @@ def robot(
     rate = np.zeros(len(t))
     for begin_s in turns_at_s:
         rate[(t > begin_s) & (t < begin_s + 3.0)] = np.pi / 6.0
+    rate[t < spins_s] = 0.06
+    speed = speed_mps * (np.clip((t - spins_s) / 4.0, 0.0, 1.0) if spins_s else np.ones(len(t)))
     yaw = rng.uniform(-np.pi, np.pi) + np.cumsum(rate) / IMU_HZ
-    v = speed_mps * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))])
+    v = speed[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))])
     p = np.cumsum(v, axis=0) / IMU_HZ
-    force = np.column_stack([np.zeros(len(t)), speed_mps * rate, np.full(len(t), 9.80665)])
+    force = np.column_stack([np.gradient(speed, t), speed * rate, np.full(len(t), 9.80665)])
     gyro = np.column_stack([np.zeros((len(t), 2)), rate])
     template = simulate(Scenario(path="still", duration_s=6.0, imu_hz=20.0, gnss_hz=2.0, pose_hz=0.0), 0)
     first_ns = int(template.truth.stamps_ns[0])
@@ -123,6 +127,15 @@ def test_turns_tell_the_heading() -> None:
     assert sigma.max() < 5.0
     assert np.abs(error / sigma).max() < 3.0
     assert not any("the heading is a guess" in w for w in solved.stats.warnings)
+
+
+def test_a_turn_on_the_spot_is_no_gyro_bias() -> None:
+    """A vessel swings at the quay: taken for standstill, that gave a bias of 0.06 rad/s, and headings that were off by 112 deg, stated to 15."""
+    recording, config, t, yaw = robot(0, 90.0, 50.0, 55.0, speed_mps=2.0, spins_s=25.0)
+    solved = app.smooth_recording(recording, config).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert np.abs(error / sigma).max() < 3.0
+    assert np.abs(error).max() < 10.0
 
 
 def test_what_comes_after_the_first_window_tells_the_heading(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -316,6 +316,16 @@ def test_what_no_run_can_do_without_is_reported(tmp_path: Path) -> None:
     assert "IMU" not in said
 
 
+@pytest.mark.parametrize("compass", [True, False])
+def test_a_magnetometer_alone_is_said_to_be_no_compass(compass: bool, tmp_path: Path) -> None:
+    make = Messages(2)
+    items = [item for item in drive(make, seconds=30) if compass or item[0] != "/compass"]
+    magnetic = make.t["sensor_msgs/msg/MagneticField"]
+    field = magnetic(make.header(START_NS), make.vector((0.0, 15e-6, -48e-6)), np.zeros(9))
+    found, _, _ = look(tmp_path, [*items, ("/mag", items[-1][1], field)], make)
+    assert any(w.startswith("/mag: a magnetic field is not read") for w in found.warnings) != compass
+
+
 @pytest.mark.parametrize("leeway_deg", [0.0, 6.0])
 def test_a_course_that_wanders_about_the_heading_tells_no_compass_to_a_degree(
     leeway_deg: float, tmp_path: Path

@@ -443,6 +443,21 @@ def test_level_and_bias_at_a_tilted_start() -> None:
     np.testing.assert_allclose(start.R_level_body[2], tilt[2], atol=0.01)
 
 
+def test_a_lull_between_waves_is_not_believed_more_than_all_of_them() -> None:
+    """Four seconds of slow roll look like standstill; twenty of quick roll tell its bias better, and were left out."""
+    run = simulate_slowly(replace(BASE, duration_s=30.0, path="still"), 5)
+    imu = run.recording.imu
+    assert imu is not None
+    t, rng = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9, np.random.default_rng(1)
+    roll = np.where((t >= 8.0) & (t < 12.0), 0.03 * np.sin(np.pi * t / 4.0), 0.2 * np.sin(2.0 * np.pi * t))
+    gyro = np.column_stack([0.0 * t, -roll, 0.0 * t]) + rng.normal(0.0, 0.001, (len(imu), 3))  # body x is IMU -y
+    lull = replace(imu, accel_mps2=rng.normal([0.0, 0.0, 9.82], 0.02, (len(imu), 3)), gyro_radps=gyro)
+    recording = replace(run.recording, imu=lull)
+    start = align(make_problem(recording, run.config, app.choose_datum(recording, run.config), SENSORS, INERTIAL))
+    assert any("4 s of standstill" in note for note in start.notes)
+    assert start.gyro_bias_sigma_radps[:2].max() < 0.006
+
+
 def test_a_levelling_is_that_of_its_biases() -> None:
     """Which way is up changes with either bias as it says, on a vessel that turns and an IMU that is mounted turned."""
     run = simulate_slowly(replace(BASE, duration_s=10.0, path="loops", imu_hz=50.0), 1)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Headers without stamps, and clocks that count from their start: recording times take their place, or set them."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +42,11 @@ def read(tmp_path: Path, config: VesselConfig) -> Any:
     return recording
 
 
-@pytest.mark.parametrize("said_ns", [0, START_NS], ids=["zero", "one stamp"])
-def test_headers_without_stamps_are_read_by_the_recording_times(tmp_path: Path, said_ns: int) -> None:
-    never = {"/fix": lambda _ns: said_ns, "/compass": lambda _ns: said_ns}
+@pytest.mark.parametrize(
+    "stamped", [lambda _ns: 0, lambda _ns: START_NS, lambda ns: ns - ns % S], ids=["zero", "one stamp", "whole seconds"]
+)
+def test_headers_without_stamps_are_read_by_the_recording_times(tmp_path: Path, stamped: Callable[[int], int]) -> None:
+    never = {"/fix": stamped, "/compass": stamped}
     found, config, text = look(tmp_path, restamped(never), MAKE)
     assert {t.topic: t.recorded for t in found.topics} == {"/imu": False, "/fix": True, "/compass": True}
     assert {n: config.sensors[n].stamps for n in ("imu", "gnss", "compass")} == {
@@ -51,7 +54,10 @@ def test_headers_without_stamps_are_read_by_the_recording_times(tmp_path: Path, 
         "gnss": "recorded",
         "compass": "recorded",
     }
-    assert "stamps: recorded  # guess: its headers hold no stamps; they are late by as long as a message takes" in text
+    assert (
+        "stamps: recorded  # guess: its headers hold no stamps, or whole seconds only; recording times are late by"
+        in text
+    )
     late_s, _ = found.gnss[0].late_s or (0.0, 0.0)
     assert late_s == pytest.approx(-0.12, abs=0.02)  # the accelerometer tells how long a fix is on its way
     assert config.sensors["gnss"].time_offset_s == pytest.approx(late_s, abs=1e-3)

@@ -89,6 +89,20 @@ class VesselConfig(Block):
             raise ValueError(f"sensors: only one imu can be enabled, found {', '.join(self.of_kind('imu'))}")
         return self
 
+    @model_validator(mode="after")
+    def _each_source_once(self) -> VesselConfig:
+        """What two sensors read of the same messages would count as two measurements with errors of their own."""
+        readers: dict[tuple[object, ...], str] = {}
+        for name, sensor in self.sensors.items():
+            if not (sensor.enabled and sensor.topic):
+                continue
+            source = (sensor.kind, sensor.topic, *(getattr(sensor, key, None) for key in ("nmea", "axes")))
+            if (other := readers.setdefault(source, name)) != name:
+                raise ValueError(
+                    f"sensors: {other} and {name} both read {sensor.topic}, which would count twice: delete one"
+                )
+        return self
+
     def of_kind(self, kind: str) -> dict[str, Any]:
         """Return the enabled sensors of a kind, by name."""
         return {n: s for n, s in self.sensors.items() if getattr(s, "kind", None) == kind and s.enabled}

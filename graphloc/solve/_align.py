@@ -207,12 +207,8 @@ def _slope(t: Array, y: Array) -> float:
 def _gyro_bias(
     problem: Problem, origin: int, window: float, still: tuple[float, float] | None, yaws: dict[str, Array]
 ) -> tuple[Array, Array, tuple[str, ...]]:
-    """Bias (3,) in body axes and its sigma (3,), rad/s."""
+    """Bias (3,) in body axes and its sigma (3,), rad/s: of each axis from standstill or from motion, whichever tells it better."""
     prior = problem.links.bias_sigmas()[3:]
-    if still is not None:
-        t, _, w = _samples(problem, *still)
-        sigma = w.std(axis=0) / np.sqrt(len(w)) + 3e-4 + _swell(t, w)
-        return w.mean(axis=0), np.minimum(sigma, prior), (f"gyro bias from {still[1] - still[0]:.0f} s of standstill",)
     t, _, w = _samples(problem, 0.0, window)
     span = float(np.ptp(t))
     mean = w.mean(axis=0)
@@ -231,9 +227,29 @@ def _gyro_bias(
     around = np.hypot(0.1 / span, 0.1 * turn)
     bias[:2] = np.where(around < prior[:2], mean[:2], 0.0)
     sigma[:2] = np.minimum(prior[:2], around)
+    if still is not None:
+        at_rest, its_sigma = _bias_at_rest(*_samples(problem, *still)[::2], prior, turns=not yaws)
+        better = its_sigma < sigma
+        found = np.where(better, at_rest, bias), np.where(better, its_sigma, sigma)
+        return *found, (f"gyro bias from {still[1] - still[0]:.0f} s of standstill",)
     if rate is None:
         return bias, sigma, ("gyro bias about the vertical unknown at the start",)
     return bias, sigma, (f"gyro bias from {span:.0f} s of motion and heading",)
+
+
+def _bias_at_rest(t: Array, w: Array, prior: Array, *, turns: bool) -> tuple[Array, Array]:
+    """Return the bias (3,) and its sigma (3,), rad/s, by the rates (M, 3) of a standstill.
+
+    Args:
+        prior: (3,) sigma of the bias, rad/s. turns: whether the vessel may turn on the spot, as no heading tells that it does not.
+    """
+    bias = w.mean(axis=0)
+    sigma = np.minimum(w.std(axis=0) / np.sqrt(len(w)) + 3e-4 + _swell(t, w), prior)
+    if turns:  # any part of the mean rate is bias, as far as the prior has it
+        half = bias[2] / 2.0
+        share = prior[2] ** 2 / (prior[2] ** 2 + half**2)
+        bias[2], sigma[2] = share * half, np.hypot(sigma[2], np.sqrt(share) * half)
+    return bias, sigma
 
 
 def _swell(t: Array, w: Array) -> Array:
