@@ -1,20 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """A heading that the motion contradicts is said under way; a craft that goes astern is not."""
 
+from collections import deque
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 
+from graphloc import app
 from graphloc.config import VesselConfig
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
-from graphloc.frames import rpy_from_rotation, wrap_angle
-from graphloc.measurements import CompassHeading
+from graphloc.factors import gnss, imu
+from graphloc.frames import Geodetic, rpy_from_rotation, wrap_angle
+from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.online._heading_check import HeadingCheck
 from graphloc.recording import Recording
 from graphloc.replay import Replayed, replay
 from graphloc.solution import Health
 from tests.slowly import with_few_states
+
+SECOND = 1_000_000_000
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +104,53 @@ def test_nothing_is_reported_of_a_gyroscope_with_a_bias(overturned: bool) -> Non
     track = found.solution.trajectory
     off = np.degrees(np.abs(wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad)))
     assert np.quantile(off, 0.95) < 5.0
+
+
+@pytest.fixture(scope="module")
+def at_two_hertz() -> SimulatedRun:
+    scenario = replace(bl_scenario(1, "clean"), duration_s=70.0, pose_hz=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=0.0)
+    return simulate(scenario, 4)
+
+
+def said_of(run: SimulatedRun, jump_s: tuple[float, float], turned_rad: float) -> list[str]:
+    """What is said of an estimate that is right but for its heading, where the fixes are 8 m further east for a while."""
+    datum, of_imu = app.choose_datum(run.recording, run.config), run.config.sensors["imu"].mount
+    assert run.recording.imu is not None
+    links = imu.ROW.link(
+        run.recording.imu,
+        run.config.sensors["imu"],
+        of_imu.R_body_sensor,
+        datum.gravity_mps2,
+    )
+    lever = run.config.sensors["gnss"].mount.t_body_sensor_m - of_imu.t_body_sensor_m
+    stream = SimpleNamespace(row=gnss.ROW, mount=gtsam.Pose3(gtsam.Rot3(), lever))
+    problem = SimpleNamespace(
+        streams={"gnss": stream}, datum=datum, links=links, R_body_imu=of_imu.R_body_sensor, t_body_imu_m=of_imu.t_body_sensor_m
+    )  # fmt: skip
+    begin_ns = int(run.truth.stamps_ns[0])
+    waiting = deque(m for m in run.recording.measurements if isinstance(m, GnssPosition))
+    check, said = HeadingCheck(), list[str]()
+    for stamp_ns in range(begin_ns + SECOND // 5, begin_ns + 69 * SECOND, SECOND // 5):
+        at = run.truth.at(np.array([stamp_ns]))
+        pose = gtsam.Pose3(gtsam.Rot3.Yaw(turned_rad).compose(gtsam.Rot3(at.R_world_body[0])), at.p_world_m[0])
+        newest = SimpleNamespace(
+            stamp_ns=stamp_ns, pose=pose, pose_cov=1e-4 * np.eye(6), bias=gtsam.imuBias.ConstantBias()
+        )
+        lag: Any = SimpleNamespace(first_ns=begin_ns, problem=problem, newest=newest)
+        while waiting and waiting[0].stamp_ns <= stamp_ns:
+            m = waiting.popleft()
+            if jump_s[0] <= (m.stamp_ns - begin_ns) / SECOND < jump_s[1]:
+                lat, lon, height = m.position
+                m = replace(m, position=Geodetic(lat, lon + 8.0 / (111_320.0 * np.cos(np.radians(lat))), height))
+            check.note(m, lag)
+        if check.look(lag):
+            said.append(check.said)
+    return said
+
+
+@pytest.mark.parametrize("jump_s", [(0.0, 0.0), (46.0, 70.0), (54.0, 70.0)], ids=["none", "amid", "later"])
+def test_fixes_that_jump_neither_hide_a_wrong_heading_nor_make_one(
+    jump_s: tuple[float, float], at_two_hertz: SimulatedRun
+) -> None:
+    assert len(said_of(at_two_hertz, jump_s, np.radians(70.0))) == 1
+    assert said_of(at_two_hertz, jump_s, 0.0) == []

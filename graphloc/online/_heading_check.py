@@ -11,7 +11,7 @@ accelerometer and the gyroscope, about 0 and not about the estimated ones, which
 right heading rho = 1; a heading that is off by e gives rho = exp(-i e). A gyroscope bias of 0.02 rad/s about the vertical turns
 s by 0.8 rad in 40 s: where the heading fits with the estimated bias taken off, nothing is reported. So a compass with a wrong
 mount or convention is told from a vessel that moves astern, sideways or with a current: there the accelerations fit the motion.
-The course over ground cannot tell these apart.
+The course over ground cannot tell these apart. Where the fixes jump, z has a step.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from graphloc.frames import Array
 from graphloc.measurements import Measurement
 from graphloc.online._lag import Lag
 from graphloc.online._states import Newest
+from graphloc.position_jumps import position_jumps
 from graphloc.solve._covariances import world_covariance
 from graphloc.trajectory import bounds_95
 
@@ -36,6 +37,7 @@ _SIGMAS = 3.0  # and from so many sigmas of the check itself on
 _SIZE, _SURE = (0.7, 1.4), 0.2  # |rho| is near 1 unless fixes jump; largest sigma of rho
 _APART_S = 1.0  # correlation time of the errors of fixes, at least
 _FEWEST = 15  # fixes
+_ENDS = slice(2, -2)  # fixes at which a jump would show
 _IN_A_ROW = 2  # checks that must agree before the heading is called wrong, or right again
 _BIASES = np.array([0.1, 9.8 * 0.005])  # 1 sigma: m/s^2, and of the rate that tilts gravity, m/s^3
 
@@ -50,6 +52,14 @@ class _Step(NamedTuple):
     dR: Array
 
 
+class _Fix(NamedTuple):
+    """A fix: place (2,) in world and its sigma, m."""
+
+    stamp_ns: int
+    p_world_m: Array
+    sigma_m: float
+
+
 class HeadingCheck:
     """Compares the fixes of one receiver with the steps of the IMU.
 
@@ -61,7 +71,7 @@ class HeadingCheck:
     def __init__(self) -> None:
         self.said, self.off_rad = "", 0.0
         self._steps: deque[_Step] = deque()
-        self._fixes: deque[tuple[int, complex]] = deque()
+        self._fixes: deque[_Fix] = deque()
         self._sensor = ""
         self._looked_ns, self._wrong, self._right, self._fits = 0, 0, 0, 0
 
@@ -84,10 +94,10 @@ class HeadingCheck:
             or self._sensor not in ("", m.sensor)
         ):
             return
-        p = stream.row.hint(m, 0.0, lag.problem.datum).p_world_m
-        if p is not None and np.isfinite(p[:2]).all():
+        hint = stream.row.hint(m, 0.0, lag.problem.datum)
+        if np.isfinite(hint.p_world_m[:2]).all():
             self._sensor = m.sensor
-            self._fixes.append((m.stamp_ns, complex(p[0], p[1])))
+            self._fixes.append(_Fix(m.stamp_ns, hint.p_world_m[:2], float(hint.p_sigma_m[:2].max())))
 
     def look(self, lag: Lag) -> bool:
         """Integrate the IMU to the newest state and check the heading; return whether it is newly found to be wrong."""
@@ -100,6 +110,7 @@ class HeadingCheck:
             return False
         found = self._off(lag, newest, np.zeros(3))
         if found is None:
+            self._wrong = 0
             return False
         # Not with the estimated bias, which a guess has bent until it fits.
         self._fits = self._fits + 1 if abs(found[0]) <= _TURNED_RAD else 0
@@ -147,7 +158,7 @@ class HeadingCheck:
         begin_ns = until_ns - round(_WINDOW_S * 1e9)
         while self._steps[0].from_ns < begin_ns:
             self._steps.popleft()
-        while self._fixes and self._fixes[0][0] < begin_ns:
+        while self._fixes and self._fixes[0].stamp_ns < begin_ns:
             self._fixes.popleft()
 
     def _off(self, lag: Lag, newest: Newest, drift_radps: Array) -> tuple[float, float] | None:
@@ -157,18 +168,23 @@ class HeadingCheck:
             drift_radps: (3,) gyroscope bias to take off, body axes.
         """
         at_s, felt = self._felt(lag, newest, drift_radps)
-        fixes = [(stamp, z) for stamp, z in self._fixes if self._steps[0].until_ns <= stamp <= newest.stamp_ns]
+        fixes = [fix for fix in self._fixes if self._steps[0].until_ns <= fix.stamp_ns <= newest.stamp_ns]
         if at_s[-1] - at_s[0] < 0.9 * _WINDOW_S or len(fixes) < _FEWEST:
             return None
-        t = (np.array([stamp for stamp, _ in fixes]) - newest.stamp_ns) * 1e-9
-        z = np.array([place for _, place in fixes])
+        stamps_ns = np.array([fix.stamp_ns for fix in fixes])
+        places = np.array([fix.p_world_m for fix in fixes])
+        t, z = (stamps_ns - newest.stamp_ns) * 1e-9, places @ np.array([1.0, 1j])
         rows = [np.interp(t, at_s, row.real) + 1j * np.interp(t, at_s, row.imag) for row in felt]
-        basis, _ = np.linalg.qr(np.vander(1.0 + 2.0 * t / _WINDOW_S, 4))
+        jumped_ns, _ = position_jumps(stamps_ns, places, np.array([fix.sigma_m for fix in fixes]), allowed_m=0.0)
+        since = (stamps_ns[:, None] >= jumped_ns).astype(float)
+        model = np.hstack([np.vander(1.0 + 2.0 * t / _WINDOW_S, 4), since])
+        rows, z, model = [row[_ENDS] for row in rows], z[_ENDS], model[_ENDS]
+        basis, _ = np.linalg.qr(model)
         free = np.column_stack([z, *rows])
         free = free - basis @ (basis.T @ free)
         moved, terms = free[:, 0], free[:, 1:]
         left = moved - terms @ np.linalg.lstsq(terms, moved, rcond=None)[0]
-        variance = float(np.mean(np.abs(left) ** 2)) * len(t) / (_WINDOW_S / _APART_S)  # of a fix, as all go together
+        variance = float(np.mean(np.abs(left) ** 2)) * len(z) / (_WINDOW_S / _APART_S)  # of a fix, as all go together
         information = terms.conj().T @ terms / variance + np.diag([0.0, *(1.0 / _BIASES**2)])
         rho = complex(np.linalg.solve(information, terms.conj().T @ moved / variance)[0])
         sigma = float(np.sqrt(np.linalg.inv(information)[0, 0].real))
