@@ -5,12 +5,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from graphloc.frames import Array
 from graphloc.solution import Health
 from graphloc.trajectory import bounds_95
+
+
+class Event(NamedTuple):
+    """What happened under way, in a line. `warns`: it makes the track, or a sensor, doubtful, so that a reader must see it."""
+
+    text: str
+    warns: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

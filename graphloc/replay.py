@@ -18,7 +18,7 @@ import numpy as np
 
 from graphloc.config import VesselConfig
 from graphloc.errors import SolveError
-from graphloc.estimate import Estimate
+from graphloc.estimate import Estimate, Event
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum
 from graphloc.frontends._source import Bag
@@ -38,18 +38,6 @@ Status = Callable[[float, float, Estimate | None, str], None]
 
 
 _GUESS = "the heading is a guess"
-_WARNS = (
-    "restarts",
-    "starts without it",
-    "rebuilt",
-    "interrupted",
-    "no second sensor",
-    "the heading is off",
-    "frozen receiver",
-    ": position jump of ",
-    "scatter more than they state",
-    _GUESS,
-)  # of events, that a reader must see
 _BUSY = "not tried: the previous scan was still being matched"
 
 
@@ -182,7 +170,7 @@ class _Session:
 
     Attributes:
         estimates: in order. update_s: the time that each took. rows: of its ledger.
-        events: IMU stamp (ns) and text. first_ns, last_ns: of the IMU.
+        events: with the IMU stamp (ns). first_ns, last_ns: of the IMU.
     """
 
     def __init__(self, smoother: OnlineSmoother, recording: Recording, status: Status) -> None:
@@ -190,7 +178,7 @@ class _Session:
         self.estimates: list[Estimate] = []
         self.update_s: list[float] = []
         self.rows: list[LedgerRow] = []
-        self.events: list[tuple[int, str]] = []
+        self.events: list[tuple[int, Event]] = []
         imu = recording.imu
         self.first_ns, self.last_ns = (
             (int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])) if imu is not None and len(imu) else (0, 0)
@@ -313,14 +301,13 @@ def _result(session: _Session, recording: Recording, config: VesselConfig, *, in
     events = _timed(session.events, estimates)
     if len(update_s) > 1:
         p50, p99, most = (1e3 * float(np.quantile(update_s[1:], q)) for q in (0.5, 0.99, 1.0))
-        events.append(
-            f"time per update: {p50:.1f} ms (median), {p99:.0f} ms (99 %), {most:.0f} ms (largest); start {1e3 * update_s[0]:.0f} ms"
-        )
+        took = f"{p50:.1f} ms (median), {p99:.0f} ms (99 %), {most:.0f} ms (largest); start {1e3 * update_s[0]:.0f} ms"
+        events.append(Event(f"time per update: {took}", warns=False))
     fed = {row.seq for row in session.rows}
     rows = session.rows + [row for row in recording.rows if row.seq not in fed or row.seq < 0]
     if interrupted:
         end_s = (estimates[-1].stamp_ns - session.first_ns) / 1e9
-        events.append(f"interrupted at {end_s:.1f} s: the track ends there, the run does not")
+        events.append(Event(f"interrupted at {end_s:.1f} s: the track ends there, the run does not"))
         rows += [
             LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=recording.topics.get(m.sensor, ""),
                       outcome=Outcome.IGNORED, reason="the replay was interrupted before it")
@@ -330,14 +317,14 @@ def _result(session: _Session, recording: Recording, config: VesselConfig, *, in
     return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=update_s)
 
 
-def _timed(said: Sequence[tuple[int, str]], estimates: Sequence[Estimate]) -> list[str]:
+def _timed(happened: Sequence[tuple[int, Event]], estimates: Sequence[Estimate]) -> list[Event]:
     """Return events with their times, s since the first pose; of a guessed heading also until when, and what would end that."""
     begin_ns = estimates[0].stamp_ns
-    lines = []
-    for stamp_ns, event in said:
-        line = f"at {max(stamp_ns - begin_ns, 0) / 1e9:.0f} s: {event}"
-        if _GUESS in event:
-            held = [e.stamp_ns for e in estimates if e.stamp_ns >= stamp_ns and event in e.reason]
+    timed = []
+    for stamp_ns, event in happened:
+        line = f"at {max(stamp_ns - begin_ns, 0) / 1e9:.0f} s: {event.text}"
+        if _GUESS in event.text:
+            held = [e.stamp_ns for e in estimates if e.stamp_ns >= stamp_ns and event.text in e.reason]
             last_ns = max(held, default=stamp_ns)
             until = (
                 "to the end of the run"
@@ -348,8 +335,8 @@ def _timed(said: Sequence[tuple[int, str]], estimates: Sequence[Estimate]) -> li
                 f"; it stays so {until} ({(last_ns - max(stamp_ns, begin_ns)) / 1e9:.0f} s) and is not rated good; use a "
                 "compass, a dual antenna or start.heading_deg"
             )
-        lines.append(line)
-    return lines
+        timed.append(event._replace(text=line))
+    return timed
 
 
 def _false_of(recording: Recording, config: VesselConfig) -> dict[int, float]:
@@ -367,7 +354,7 @@ def _solution(
     estimates: Sequence[Estimate],
     ledger: Ledger,
     smoother: OnlineSmoother,
-    said: Sequence[str],
+    events: Sequence[Event],
     config: VesselConfig,
     false_of: Mapping[int, float],
 ) -> Solution:
@@ -384,7 +371,7 @@ def _solution(
     for row in ledger:
         if row.weight is not None:
             judged.setdefault(row.sensor, []).append(row)
-    warnings = [line for line in said if any(word in line for word in _WARNS)]
+    warnings = [event.text for event in events if event.warns]
     for name, rows in judged.items():
         rows.sort(key=lambda row: row.stamp_ns)
         weights = np.array([row.weight for row in rows])
@@ -413,6 +400,6 @@ def _solution(
         ledger=ledger,
         stats=SolveStats(
             passes=0, iterations=len(estimates), states=len(kept), factors=0, cost=0.0, expected_cost=0.0, converged=True,
-            warnings=tuple(warnings), events=tuple(said), online=True,
+            warnings=tuple(warnings), events=tuple(event.text for event in events), online=True,
         ),
     )  # fmt: skip

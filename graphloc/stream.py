@@ -24,7 +24,7 @@ from graphloc.config import (
     load_config,
 )
 from graphloc.errors import ConfigError
-from graphloc.estimate import Estimate
+from graphloc.estimate import Estimate, Event
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Array, Datum, heading_deg_from_yaw, rpy_from_rotation
 from graphloc.frontends.lines import MAX_LINE, Request, Trouble, parse
@@ -86,7 +86,7 @@ class Smoother(Protocol):
     def predict(self, stamp_ns: int | None = None) -> Estimate | None: ...  # noqa: D102
     def rows(self) -> list[LedgerRow]: ...  # noqa: D102
     def finish(self) -> list[LedgerRow]: ...  # noqa: D102
-    def events(self) -> list[str]: ...  # noqa: D102
+    def events(self) -> list[Event]: ...  # noqa: D102
 
 
 class _Session:
@@ -118,8 +118,8 @@ class _Session:
 
     def events(self) -> None:
         """Write what happened."""
-        for text in self._smoother.events():
-            self.say("event", {"text": text})
+        for event in self._smoother.events():
+            self.say("event", event._asdict())
 
     def news(self) -> None:
         """Write what happened, and what the start waits for where that changed."""

@@ -101,7 +101,7 @@ def feed(smoother: OnlineSmoother, run: SimulatedRun, arrivals: Sequence[Arrival
     for a in arrivals:
         estimate = smoother.feed(a.m)
         fed.rows += smoother.rows()
-        fed.events += smoother.events()
+        fed.events += [event.text for event in smoother.events()]
         if estimate is not None:
             fed.estimates.append(estimate)
             true_ns = estimate.stamp_ns - (a.m.stamp_ns - a.true_ns)
@@ -114,7 +114,7 @@ def feed(smoother: OnlineSmoother, run: SimulatedRun, arrivals: Sequence[Arrival
 def finish(smoother: OnlineSmoother, fed: Fed) -> Fed:
     """End the stream."""
     fed.rows += smoother.finish()
-    fed.events += smoother.events()
+    fed.events += [event.text for event in smoother.events()]
     return fed
 
 

@@ -123,7 +123,7 @@ def test_a_rebuild_does_not_make_it_surer(monkeypatch: pytest.MonkeyPatch) -> No
             if estimate is not None and since_s > 40.0:
                 ends.append(np.sqrt(np.diagonal(estimate.cov)[:3]))
                 break
-        said = online.events()
+        said = [event.text for event in online.events()]
     assert any("rebuilt" in line for line in said)
     assert ends[1] == pytest.approx(ends[0], rel=0.1)
 

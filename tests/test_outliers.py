@@ -356,7 +356,7 @@ def test_a_snapshot_knows_the_jump_of_the_only_receiver(tmp_path: Path) -> None:
         online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, snapshot=tmp_path / "online.json")
         fed = [online.feed(m) for m in measurements if first_s <= (m.stamp_ns - begin_ns) * 1e-9 < last_s]
         found.append([estimate for estimate in fed if estimate is not None])
-    assert any("resumed from a snapshot" in said for said in online.events())
+    assert any("resumed from a snapshot" in event.text for event in online.events())
     resumed = found[1][-1]
     off_m = np.linalg.norm((resumed.p_world_m - run.truth.at(np.array([resumed.stamp_ns])).p_world_m[0])[:2])
     assert off_m < 2.0

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from graphloc import app
 from graphloc.cli import app as cli
 from graphloc.errors import SolveError
+from graphloc.estimate import Event
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
@@ -150,9 +151,16 @@ def test_a_guessed_heading_is_reported_with_its_times(whole: Replayed) -> None:
     doubt = "the heading is a guess: 2 candidates explain the motion so far"
     first_ns = estimates[0].stamp_ns
     some = [replace(e, reason=f"95 % bound 3 m; {doubt}" if k <= 50 else "") for k, e in enumerate(estimates)]
-    (line,) = _timed([(first_ns, doubt)], some)
+    ((line, _),) = _timed([(first_ns, Event(doubt))], some)
     assert line.startswith(f"at 0 s: {doubt}; it stays so until 5 s (5 s) and is not rated good")
     assert "start.heading_deg" in line
     every = [replace(e, reason=doubt) for e in estimates]
-    assert "to the end of the run" in _timed([(first_ns, doubt)], every)[0]
-    assert _timed([(first_ns + 2_000_000_000, "rebuilt")], some) == ["at 2 s: rebuilt"]
+    assert "to the end of the run" in _timed([(first_ns, Event(doubt))], every)[0].text
+    assert _timed([(first_ns + 2_000_000_000, Event("rebuilt"))], some) == [Event("at 2 s: rebuilt")]
+
+
+def test_the_start_is_told_but_no_warning(whole: Replayed) -> None:
+    stats = whole.solution.stats
+    for routine in ("started at", "time per update"):
+        assert any(routine in line for line in stats.events)
+        assert not any(routine in line for line in stats.warnings)

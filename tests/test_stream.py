@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from graphloc.config import VesselConfig, parse_config
 from graphloc.errors import GraphlocError
-from graphloc.estimate import Estimate
+from graphloc.estimate import Estimate, Event
 from graphloc.factors import KINDS
 from graphloc.frames import Datum, Geodetic
 from graphloc.frontends.bag import read_recording
@@ -367,9 +367,9 @@ class Fake:
         self.fixes = 0  # the real one waits for a start again
         return self._rows
 
-    def events(self) -> list[str]:
+    def events(self) -> list[Event]:
         found, self._said = self._said, []
-        return found
+        return [Event(text, warns=False) for text in found]
 
 
 def answers(*lines: dict[str, Any] | bytes, **options: Any) -> tuple[list[dict[str, Any]], Fake]:
@@ -423,7 +423,7 @@ def test_a_session() -> None:
     assert [line["for"] for line in found[:2]] == ["measurements", "a fix"]
     assert found[2]["line"] == 3
     assert "not JSON" in found[2]["reason"]
-    assert found[3] == {"type": "event", "text": "started"}
+    assert found[3] == {"type": "event", "text": "started", "warns": False}
     assert found[4]["stamp_ns"] == 6_000_000_000
     assert "line" not in found[4]
     counts = {"imu": {"used": 2}, "gnss": {"used": 2}, "(stream)": {"malformed": 1}, "second": {"ignored": 1}}

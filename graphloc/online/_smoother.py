@@ -15,7 +15,7 @@ from pathlib import Path
 
 from graphloc.config import VesselConfig
 from graphloc.errors import SolveError, in_one_line
-from graphloc.estimate import Estimate
+from graphloc.estimate import Estimate, Event
 from graphloc.frames import Array, Datum
 from graphloc.frozen_imu import WHY
 from graphloc.graph import InertialRow, Sensor
@@ -76,7 +76,7 @@ class OnlineSmoother:
             datum=datum or (Datum(config.datum.geodetic) if config.datum else None), noise=self._configured_noise()
         )
         self._ledger = OnlineLedger(config)
-        self._events: list[str] = []
+        self._events: list[Event] = []
         self._thinnings = {n: Thinning(apart_ns) for n, apart_ns in setup.apart_ns.items()}
         self._intake = ImuIntake(setup.gap_s, imu is not None and imu.gravity != "removed")
         self._snapshot = SnapshotFile(snapshot)
@@ -140,15 +140,15 @@ class OnlineSmoother:
             self._ledger.enter(self._tracking.lag.gone())
         return self._ledger.taken()
 
-    def events(self) -> list[str]:
-        """Return what happened since this was last asked, a line each: started, restarted, rebuilt, resumed."""
+    def events(self) -> list[Event]:
+        """Return what happened since this was last asked: started, restarted, rebuilt, resumed, what is wrong with a sensor."""
         events, self._events = self._events, []
         return events
 
-    def _say(self, what: str) -> None:
+    def _say(self, text: str, *, warns: bool = True) -> None:
         """Add an event, if there is anything to say."""
-        if what:
-            self._events.append(what)
+        if text:
+            self._events.append(Event(text, warns))
 
     def _estimate(self, stamp_ns: int | None = None) -> Estimate | None:
         """Return the newest state, or its propagation to a later stamp; None where there is none, or it fails."""
@@ -327,7 +327,7 @@ class OnlineSmoother:
         self._keep_anchor(tracking)
         newest_ns = tracking.lag.newest.stamp_ns
         persistent.noise.begin(newest_ns)
-        self._say(f"started at {utc_text(newest_ns)}: {'; '.join(started.notes)}")
+        self._say(f"started at {utc_text(newest_ns)}: {'; '.join(started.notes)}", warns=False)
         self._say(started.doubt)
         for stream in tracking.lag.problem.streams.values():
             for said in slow_error_warning(stream.name, stream.left_out):
@@ -388,7 +388,7 @@ class OnlineSmoother:
         self._tracking, self._persistent = tracking, persistent
         waiting = [m for m in self._waiting.taken() if m is not newest]
         tracking.resume(found.anchor, found.imu, newest)
-        self._say(f"resumed from a snapshot {age_s:.1f} s old")
+        self._say(f"resumed from a snapshot {age_s:.1f} s old", warns=False)
         for m in waiting:
             self.feed(m)
 

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from graphloc.errors import SolveError, in_one_line
-from graphloc.estimate import Estimate
+from graphloc.estimate import Estimate, Event
 from graphloc.frames import Array
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample, Measurement
@@ -274,17 +274,18 @@ class Tracking:
         cov = np.broadcast_to(now.cov, (len(stamps), 6, 6))
         return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v, cov=cov)
 
-    def news(self) -> list[str]:
-        """Return a line on what the newest state newly shows: a wrong heading, frozen receivers, position jumps, noise."""
+    def news(self) -> list[Event]:
+        """Return what the newest state newly shows: a wrong heading, frozen receivers, position jumps, noise."""
         check = self._persistent.heading_check
-        heading = [check.said] if check.look(self.lag) else []
+        heading = [Event(check.said)] if check.look(self.lag) else []
         if self._persistent.doubt and check.confirmed:
             self._persistent.doubt = ""
-            heading.append("the motion confirms the heading: it is no guess any more")
+            heading.append(Event("the motion confirms the heading: it is no guess any more", warns=False))
         was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now
-        frozen = [f"{name}: {_FROZEN if name in now else _NO_LONGER_FROZEN}" for name in sorted(now ^ was)]
-        return [*heading, *frozen, *self.lag.jump_warnings(), *self.lag.noisier_warnings()]
+        frozen = [Event(f"{name}: {_FROZEN}") for name in sorted(now - was)]
+        thawed = [Event(f"{name}: {_NO_LONGER_FROZEN}", warns=False) for name in sorted(was - now)]
+        return [*heading, *frozen, *thawed, *map(Event, [*self.lag.jump_warnings(), *self.lag.noisier_warnings()])]
 
     def snapshot(self, newest: ImuSample) -> Snapshot:
         """Return the last anchor and all that is needed to go on from it; `newest`: sample of the IMU."""
