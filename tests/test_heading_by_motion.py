@@ -10,10 +10,13 @@ from graphloc import app
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, Geodetic, wrap_angle
-from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.factors import INERTIAL, SENSORS
+from graphloc.measurements import CompassHeading, GnssPosition, ImuSample
+from graphloc.online import OnlineSmoother, _smoother
 from graphloc.online import _start as online_start
 from graphloc.online._heading_check import HeadingCheck
 from graphloc.recording import Recording
+from graphloc.replay import arrivals
 from graphloc.solution import Solution
 from graphloc.solve import _start
 from tests.slowly import with_few_states
@@ -209,6 +212,30 @@ def test_online_a_compass_that_comes_later_ends_a_guess(monkeypatch: pytest.Monk
     assert sigma[late].max() < 15.0
     assert "the heading is a guess" in solved.health_reason[0]
     assert "the heading is a guess" not in solved.health_reason[-1]
+
+
+@pytest.mark.parametrize("fails", [False, True], ids=["late samples", "failing"])
+def test_online_tries_with_a_measured_heading_disturb_no_estimate(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples of the IMU that change places on their way belong into a start by their stamps; one that fails is no failed estimate."""
+    monkeypatch.setattr(online_start, "_LONGEST_WAIT_S", 10.0)
+    recording, config, t, yaw = robot(3, 28.0, speed_mps=8.0)
+    recording, config = with_compass(recording, with_few_states(config, 2.5), t, yaw, 20.0)
+    came = list(arrivals(recording))
+    samples = [n for n, m in enumerate(came) if isinstance(m, ImuSample)]
+    for n in samples[21 * int(IMU_HZ) :: 20]:
+        came.insert(n, came.pop(n + 1))
+    online, said = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL), list[str]()
+    for m in came:
+        online.feed(m)
+        said += online.events()
+        if fails and said:  # it has started
+            monkeypatch.setattr(_smoother, "try_start", failing)
+    assert not any("rebuilt" in line for line in said)
+    assert any("sensors measure the heading" in line for line in said) != fails
+
+
+def failing(*_: object) -> None:
+    raise RuntimeError("the system is indeterminate")
 
 
 def test_a_leg_takes_no_guess_as_known() -> None:

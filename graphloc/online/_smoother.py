@@ -290,11 +290,7 @@ class OnlineSmoother:
             return None
         samples, others = self._waiting.samples(), self._waiting.others()
         self._intake.restart([m.stamp_ns for m in samples])
-        reached = [m for m in others if m.stamp_ns <= newest.stamp_ns]
-        try:
-            started = try_start(self._setup, series_of(samples), reached, self.datum)
-        except Exception as error:  # noqa: BLE001 - as in `_advance`
-            started = f"data from which the start can be solved: {in_one_line(error)}"
+        started = self._start_from(samples, others, newest.stamp_ns)
         if isinstance(started, str):
             self._waiting.why = started
             return None
@@ -307,6 +303,16 @@ class OnlineSmoother:
             self._restart(f"the start failed ({in_one_line(error)})")
             return None
         return self._estimate()
+
+    def _start_from(
+        self, samples: Sequence[ImuSample], others: Sequence[Measurement], until_ns: int
+    ) -> Started | str:
+        """Return the start, or what it waits for; what lies ahead of `until_ns`, the newest sample's stamp, is left out."""
+        reached = [m for m in others if m.stamp_ns <= until_ns]
+        try:
+            return try_start(self._setup, series_of(samples), reached, self.datum)
+        except Exception as error:  # noqa: BLE001 - as in `_advance`
+            return f"data from which the start can be solved: {in_one_line(error)}"
 
     def _take_over(self, started: Started, samples: list[ImuSample], others: list[Measurement], until_ns: int) -> None:
         """Build the window where the start says, and bring it to now."""
@@ -352,9 +358,8 @@ class OnlineSmoother:
             return False
         self._tried_ns = now_ns
         came = tracking.since(since_ns)
-        imu = series_of([m for m in came if isinstance(m, ImuSample)])
-        reached = [m for m in came if not isinstance(m, ImuSample) and m.stamp_ns <= now_ns]
-        started = try_start(self._setup, imu, reached, self.datum)
+        samples = [m for m in came if isinstance(m, ImuSample)]
+        started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns)
         return not isinstance(started, str) and not started.doubt
 
     def _start_over(self, tracking: Tracking, now_ns: int, why: str) -> Estimate | None:

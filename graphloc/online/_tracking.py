@@ -262,8 +262,8 @@ class Tracking:
         return len(told_ns) >= _HEADINGS and self.lag.newest.stamp_ns - min(told_ns) >= duration_ns(LEAST_S)
 
     def since(self, stamp_ns: int) -> list[Measurement]:
-        """Return what has come with stamps from `stamp_ns` on."""
-        return [m for m in self._recent if m.stamp_ns >= stamp_ns]
+        """Return what has come with stamps from `stamp_ns` on, by stamp: what came late is among it."""
+        return sorted((m for m in self._recent if m.stamp_ns >= stamp_ns), key=lambda m: m.stamp_ns)
 
     def trajectory(self, now: Estimate) -> Trajectory:
         """Return the states of the window, and `now` where it is newer; the covariance at all of them is that of `now`."""
