@@ -238,9 +238,10 @@ class OnlineSmoother:
             self._events += tracking.news()
             if lost_s := tracking.lag.lost_s:
                 why = f"for {lost_s:.0f} s no absolute sensor agreed, unless its error had jumped"
-                return self._start_over(tracking, until_ns, why)
+                return self._start_over(tracking, until_ns - duration_ns(_AGAIN_S), why)
             if self._persistent.doubt and self._starts_with_heading(tracking, until_ns):
-                return self._start_over(tracking, until_ns, "sensors measure the heading, which was a guess")
+                why = "sensors measure the heading, which was a guess"
+                return self._start_over(tracking, tracking.lag.first_ns, why)
             if jumped := tracking.lag.unmodelled_jumps:
                 self._rebuild(f"position jump of {', '.join(jumped)}")
                 return self._estimate()
@@ -349,22 +350,21 @@ class OnlineSmoother:
         self._wait("the next IMU sample")
 
     def _starts_with_heading(self, tracking: Tracking, now_ns: int) -> bool:
-        """Return whether sensors measure the heading by now, and the last seconds are enough for a start that is no guess.
+        """Return whether sensors measure the heading by now, and the window's data are enough for a start that is no guess.
 
         Corrected in the window, a wrong guess leaves wrong biases and velocities behind, and with them a wrong heading.
         """
-        since_ns = now_ns - duration_ns(_AGAIN_S)
-        if now_ns - self._tried_ns < duration_ns(LEAST_S) or not tracking.heading_measured(since_ns):
+        if now_ns - self._tried_ns < duration_ns(LEAST_S) or not tracking.heading_measured():
             return False
         self._tried_ns = now_ns
-        came = tracking.since(since_ns)
+        came = tracking.since(tracking.lag.first_ns)
         samples = [m for m in came if isinstance(m, ImuSample)]
         started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns)
         return not isinstance(started, str) and not started.doubt
 
-    def _start_over(self, tracking: Tracking, now_ns: int, why: str) -> Estimate | None:
-        """Start anew with the last seconds."""
-        again = tracking.end_but(now_ns - duration_ns(_AGAIN_S))
+    def _start_over(self, tracking: Tracking, since_ns: int, why: str) -> Estimate | None:
+        """Start anew with what was measured since a stamp (ns)."""
+        again = tracking.end_but(since_ns)
         self._persistent.agreed_ns.update(tracking.lag.agreed_ns)
         self._say(f"{why}: restarts")
         self._wait("the next IMU sample")
