@@ -9,8 +9,8 @@ import pytest
 from graphloc import app
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, simulate
-from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.factors import INERTIAL, SENSORS
+from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample
 from graphloc.online import OnlineSmoother, _smoother
 from graphloc.online import _start as online_start

@@ -305,9 +305,7 @@ class OnlineSmoother:
             return None
         return self._estimate()
 
-    def _start_from(
-        self, samples: Sequence[ImuSample], others: Sequence[Measurement], until_ns: int
-    ) -> Started | str:
+    def _start_from(self, samples: Sequence[ImuSample], others: Sequence[Measurement], until_ns: int) -> Started | str:
         """Return the start, or what it waits for; what lies ahead of `until_ns`, the newest sample's stamp, is left out."""
         reached = [m for m in others if m.stamp_ns <= until_ns]
         try:
