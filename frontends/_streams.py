@@ -163,9 +163,14 @@ class Stream:
             column[:] = list(compress(column, there))
 
     def _in_whole_seconds(self) -> bool:
-        """Whether several messages a second are stamped in whole seconds, and are recorded one after another."""
-        stamps, moments = self.stamps_ns, len(set(self._stamps))
-        return bool((stamps % NS_PER_S == 0).all()) and 4 * moments < 3 * min(len(stamps), len(set(self._logs)))
+        """Whether several measurements a second are stamped in whole seconds, and are recorded one after another.
+
+        Not those of a receiver that measures once a second, whose driver repeats each with its stamp.
+        """
+        if (self.stamps_ns % NS_PER_S).any():
+            return False
+        told = {(stamp_ns, repr(row)) for stamp_ns, row in zip(self._stamps, self.tuples, strict=True)}
+        return 4 * len(set(self._stamps)) < 3 * min(len(told), len(set(self._logs)))
 
     def later(self, by_ns: int) -> Stream:
         """Return the stream with `by_ns` added to its stamps."""

@@ -9,11 +9,14 @@ import pytest
 from graphloc import app
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
-from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.measurements import CompassHeading, GnssPosition, ImuSample
+from graphloc.online import OnlineSmoother, _smoother
 from graphloc.online import _start as online_start
 from graphloc.online._heading_check import HeadingCheck
 from graphloc.recording import Recording
+from graphloc.replay import arrivals
 from graphloc.solution import Solution
 from graphloc.solve import _start
 from tests.slowly import with_few_states
@@ -75,6 +78,24 @@ def robot(
     return recording, config, t, yaw
 
 
+def with_compass(
+    recording: Recording, config: VesselConfig, t: Array, yaw: Array, since_s: float, every_s: float = 1.0
+) -> tuple[Recording, VesselConfig]:
+    """The robot with a compass from some time on, 5 deg (1 sigma)."""
+    assert recording.imu is not None
+    rng, sigma_rad = np.random.default_rng(0), np.radians(5.0)
+    compass = [
+        CompassHeading(
+            stamp_ns=int(recording.imu.stamps_ns[k]), sensor="compass", seq=2 * 10**6 + int(k),
+            yaw_rad=float(wrap_angle(yaw[k] + rng.normal(0.0, sigma_rad))), sigma_rad=sigma_rad,
+        )
+        for k in range(int(since_s * IMU_HZ), len(t), int(every_s * IMU_HZ))
+    ]  # fmt: skip
+    sensors = {**config.sensors, "compass": CompassConfig.model_validate({"topic": "/compass"})}
+    measurements = tuple(sorted([*recording.measurements, *compass], key=lambda m: m.stamp_ns))
+    return replace(recording, measurements=measurements), config.model_copy(update={"sensors": sensors})
+
+
 def errors(solved: Solution, recording: Recording, t: Array, yaw: Array) -> tuple[Array, Array]:
     """Errors of the heading (N,), deg, and their stated sigmas (N,), deg."""
     track = solved.trajectory
@@ -129,9 +150,15 @@ def test_turns_tell_the_heading() -> None:
     assert not any("the heading is a guess" in w for w in solved.stats.warnings)
 
 
-def test_a_turn_on_the_spot_is_no_gyro_bias() -> None:
-    """A vessel swings at the quay: taken for standstill, that gave a bias of 0.06 rad/s, and headings that were off by 112 deg, stated to 15."""
+@pytest.mark.parametrize("compass_s", [None, 60.0])
+def test_a_turn_on_the_spot_is_no_gyro_bias(compass_s: float | None) -> None:
+    """A vessel swings at the quay: taken for standstill, that gave a bias of 0.06 rad/s, and headings that were off by 112 deg, stated to 15.
+
+    A compass that comes later tells nothing of that turn: with it they were off by 59 deg, stated to 7.
+    """
     recording, config, t, yaw = robot(0, 90.0, 50.0, 55.0, speed_mps=2.0, spins_s=25.0)
+    if compass_s is not None:
+        recording, config = with_compass(recording, config, t, yaw, compass_s)
     solved = app.smooth_recording(recording, config).solution
     error, sigma = errors(solved, recording, t, yaw)
     assert np.abs(error / sigma).max() < 3.0
@@ -173,42 +200,51 @@ def test_online_a_guess_goes_on_where_the_motion_contradicts_it(monkeypatch: pyt
     assert "the heading is a guess" in solved.health_reason[-1]
 
 
-def with_compass(
-    recording: Recording, config: VesselConfig, t: Array, yaw: Array, since_s: float
-) -> tuple[Recording, VesselConfig]:
-    """The robot with a compass once a second from some time on, 5 deg (1 sigma)."""
-    assert recording.imu is not None
-    rng, sigma_rad = np.random.default_rng(0), np.radians(5.0)
-    compass = [
-        CompassHeading(
-            stamp_ns=int(recording.imu.stamps_ns[k]), sensor="compass", seq=2 * 10**6 + int(k),
-            yaw_rad=float(wrap_angle(yaw[k] + rng.normal(0.0, sigma_rad))), sigma_rad=sigma_rad,
-        )
-        for k in range(int(since_s * IMU_HZ), len(t), int(IMU_HZ))
-    ]  # fmt: skip
-    sensors = {**config.sensors, "compass": CompassConfig.model_validate({"topic": "/compass"})}
-    measurements = tuple(sorted([*recording.measurements, *compass], key=lambda m: m.stamp_ns))
-    return replace(recording, measurements=measurements), config.model_copy(update={"sensors": sensors})
-
-
-def test_online_a_compass_that_comes_later_ends_a_guess(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A guess that is wrong by 130 deg: in its bounds until the compass has been there for 5 s, then right.
+@pytest.mark.parametrize(("since_s", "every_s", "most_deg"), [(20.0, 1.0, 10.0), (17.0, 4.0, 20.0)])
+def test_online_a_compass_that_comes_later_ends_a_guess(
+    since_s: float, every_s: float, most_deg: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A guess that is wrong by 130 deg: in its bounds until the compass has been there for 5 s and three headings, then right.
 
     Straight on at 8 m/s the window's own sigma falls to 6 deg, whatever the heading; it rejected the compass.
     """
     monkeypatch.setattr(online_start, "_LONGEST_WAIT_S", 10.0)
     recording, config, t, yaw = robot(3, 34.0, speed_mps=8.0)
-    recording, config = with_compass(recording, with_few_states(config, 2.5), t, yaw, 20.0)
+    recording, config = with_compass(recording, with_few_states(config, 2.5), t, yaw, since_s, every_s)
     solved = app.replay_recording(recording, config).solution
     error, sigma = errors(solved, recording, t, yaw)
     assert np.abs(error).max() > 90.0  # or there is nothing to mend
     assert (np.abs(error) < 2.5 * sigma).all()
     assert recording.imu is not None
     late = (solved.trajectory.stamps_ns - recording.imu.stamps_ns[0]) * 1e-9 > 26.0
-    assert np.abs(error[late]).max() < 10.0
+    assert np.abs(error[late]).max() < most_deg
     assert sigma[late].max() < 15.0
     assert "the heading is a guess" in solved.health_reason[0]
     assert "the heading is a guess" not in solved.health_reason[-1]
+
+
+@pytest.mark.parametrize("fails", [False, True], ids=["late samples", "failing"])
+def test_online_tries_with_a_measured_heading_disturb_no_estimate(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples of the IMU that change places on their way belong into a start by their stamps; one that fails is no failed estimate."""
+    monkeypatch.setattr(online_start, "_LONGEST_WAIT_S", 10.0)
+    recording, config, t, yaw = robot(3, 28.0, speed_mps=8.0)
+    recording, config = with_compass(recording, with_few_states(config, 2.5), t, yaw, 20.0)
+    came = list(arrivals(recording))
+    samples = [n for n, m in enumerate(came) if isinstance(m, ImuSample)]
+    for n in samples[21 * int(IMU_HZ) :: 20]:
+        came.insert(n, came.pop(n + 1))
+    online, said = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL), list[str]()
+    for m in came:
+        online.feed(m)
+        said += online.events()
+        if fails and said:  # it has started
+            monkeypatch.setattr(_smoother, "try_start", failing)
+    assert not any("rebuilt" in line for line in said)
+    assert any("sensors measure the heading" in line for line in said) != fails
+
+
+def failing(*_: object) -> None:
+    raise RuntimeError("the system is indeterminate")
 
 
 def test_a_leg_takes_no_guess_as_known() -> None:

@@ -74,6 +74,20 @@ def test_headers_without_stamps_are_read_by_the_recording_times(tmp_path: Path, 
     assert not any(w.startswith("gnss: stamps: recorded") for w in said)
 
 
+def test_fixes_of_whole_seconds_that_are_published_again_keep_their_stamps(tmp_path: Path) -> None:
+    """A receiver of 1 Hz stamps its fixes when it measures them; its driver publishes each five times."""
+    items, fix = [], None
+    for topic, at_ns, msg in restamped({}):
+        if topic == "/fix" and msg.header.stamp.nanosec == 0:
+            fix = msg
+        items.append((topic, at_ns, fix if topic == "/fix" else msg))
+    found, config, _ = look(tmp_path, items, MAKE)
+    assert not any(t.recorded for t in found.topics)
+    fixes = [m for m in read(tmp_path, config).measurements if isinstance(m, GnssPosition)]
+    late_ns = duration_ns(config.sensors["gnss"].time_offset_s)
+    assert [m.stamp_ns - late_ns for m in fixes] == [START_NS + k * S for k in range(60)]
+
+
 def test_a_truth_without_stamps_is_compared_by_the_recording_times(tmp_path: Path) -> None:
     items = restamped({})
     for k in range(200):

@@ -238,9 +238,10 @@ class OnlineSmoother:
             self._events += tracking.news()
             if lost_s := tracking.lag.lost_s:
                 why = f"for {lost_s:.0f} s no absolute sensor agreed, unless its error had jumped"
-                return self._start_over(tracking, until_ns, why)
+                return self._start_over(tracking, until_ns - duration_ns(_AGAIN_S), why)
             if self._persistent.doubt and self._starts_with_heading(tracking, until_ns):
-                return self._start_over(tracking, until_ns, "sensors measure the heading, which was a guess")
+                why = "sensors measure the heading, which was a guess"
+                return self._start_over(tracking, tracking.lag.first_ns, why)
             if jumped := tracking.lag.unmodelled_jumps:
                 self._rebuild(f"position jump of {', '.join(jumped)}")
                 return self._estimate()
@@ -290,11 +291,7 @@ class OnlineSmoother:
             return None
         samples, others = self._waiting.samples(), self._waiting.others()
         self._intake.restart([m.stamp_ns for m in samples])
-        reached = [m for m in others if m.stamp_ns <= newest.stamp_ns]
-        try:
-            started = try_start(self._setup, series_of(samples), reached, self.datum)
-        except Exception as error:  # noqa: BLE001 - as in `_advance`
-            started = f"data from which the start can be solved: {in_one_line(error)}"
+        started = self._start_from(samples, others, newest.stamp_ns)
         if isinstance(started, str):
             self._waiting.why = started
             return None
@@ -307,6 +304,14 @@ class OnlineSmoother:
             self._restart(f"the start failed ({in_one_line(error)})")
             return None
         return self._estimate()
+
+    def _start_from(self, samples: Sequence[ImuSample], others: Sequence[Measurement], until_ns: int) -> Started | str:
+        """Return the start, or what it waits for; what lies ahead of `until_ns`, the newest sample's stamp, is left out."""
+        reached = [m for m in others if m.stamp_ns <= until_ns]
+        try:
+            return try_start(self._setup, series_of(samples), reached, self.datum)
+        except Exception as error:  # noqa: BLE001 - as in `_advance`
+            return f"data from which the start can be solved: {in_one_line(error)}"
 
     def _take_over(self, started: Started, samples: list[ImuSample], others: list[Measurement], until_ns: int) -> None:
         """Build the window where the start says, and bring it to now."""
@@ -343,23 +348,21 @@ class OnlineSmoother:
         self._wait("the next IMU sample")
 
     def _starts_with_heading(self, tracking: Tracking, now_ns: int) -> bool:
-        """Return whether sensors measure the heading by now, and the last seconds are enough for a start that is no guess.
+        """Return whether sensors measure the heading by now, and the window's data are enough for a start that is no guess.
 
         Corrected in the window, a wrong guess leaves wrong biases and velocities behind, and with them a wrong heading.
         """
-        since_ns = now_ns - duration_ns(_AGAIN_S)
-        if now_ns - self._tried_ns < duration_ns(LEAST_S) or not tracking.heading_measured(since_ns):
+        if now_ns - self._tried_ns < duration_ns(LEAST_S) or not tracking.heading_measured():
             return False
         self._tried_ns = now_ns
-        came = tracking.since(since_ns)
-        imu = series_of([m for m in came if isinstance(m, ImuSample)])
-        reached = [m for m in came if not isinstance(m, ImuSample) and m.stamp_ns <= now_ns]
-        started = try_start(self._setup, imu, reached, self.datum)
+        came = tracking.since(tracking.lag.first_ns)
+        samples = [m for m in came if isinstance(m, ImuSample)]
+        started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns)
         return not isinstance(started, str) and not started.doubt
 
-    def _start_over(self, tracking: Tracking, now_ns: int, why: str) -> Estimate | None:
-        """Start anew with the last seconds."""
-        again = tracking.end_but(now_ns - duration_ns(_AGAIN_S))
+    def _start_over(self, tracking: Tracking, since_ns: int, why: str) -> Estimate | None:
+        """Start anew with what was measured since a stamp (ns)."""
+        again = tracking.end_but(since_ns)
         self._persistent.agreed_ns.update(tracking.lag.agreed_ns)
         self._say(f"{why}: restarts")
         self._wait("the next IMU sample")

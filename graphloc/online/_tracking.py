@@ -251,19 +251,15 @@ class Tracking:
             unmodelled=persistent.unmodelled,
         )
 
-    def heading_measured(self, since_ns: int) -> bool:
-        """Return whether sensors have measured the heading since a stamp (ns), for as long as a start takes."""
+    def heading_measured(self) -> bool:
+        """Return whether sensors have measured the heading in the window, for as long as a start takes."""
         datum = self.lag.problem.datum
-        told_ns = [
-            m.stamp_ns
-            for m in self._recent.others()
-            if m.stamp_ns >= since_ns and np.isfinite(self._setup.hint(m, datum).yaw_rad)
-        ]
+        told_ns = [m.stamp_ns for m in self._recent.others() if np.isfinite(self._setup.hint(m, datum).yaw_rad)]
         return len(told_ns) >= _HEADINGS and self.lag.newest.stamp_ns - min(told_ns) >= duration_ns(LEAST_S)
 
     def since(self, stamp_ns: int) -> list[Measurement]:
-        """Return what has come with stamps from `stamp_ns` on."""
-        return [m for m in self._recent if m.stamp_ns >= stamp_ns]
+        """Return what has come with stamps from `stamp_ns` on, by stamp: what came late is among it."""
+        return sorted((m for m in self._recent if m.stamp_ns >= stamp_ns), key=lambda m: m.stamp_ns)
 
     def trajectory(self, now: Estimate) -> Trajectory:
         """Return the states of the window, and `now` where it is newer; the covariance at all of them is that of `now`."""

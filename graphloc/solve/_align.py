@@ -26,6 +26,7 @@ from graphloc.time import duration_ns, utc_text
 
 _STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
 _STILL_SPEED_MPS = 0.15
+_FEWEST_HEADINGS = 4  # of a standstill, that show a turn
 _USUAL_SPEED_MPS = 10.0  # 1 sigma, where the speed is unknown
 _BLOCK_S, _SWELL_S = 0.5, 10.0
 _CARRIED_RAD = np.radians(20.0)  # error by gyro bias, 1 sigma: from later on, a heading is no longer one of the start
@@ -186,12 +187,23 @@ def _rests(track: _Track, yaws: dict[str, Array], first: float, last: float) -> 
     if np.hypot(slope[0], slope[1]) > _STILL_SPEED_MPS + min(noise, 0.3):
         return False
     for rows in yaws.values():
-        near = rows[(rows[:, 0] >= first) & (rows[:, 0] <= last)]
-        if len(near) >= 4:
+        near = _within(rows, first, last)
+        if len(near) >= _FEWEST_HEADINGS:
             noise = 3.0 * float(near[:, 2].mean()) / float(np.ptp(near[:, 0])) / np.sqrt(len(near))
             if abs(_slope(near[:, 0], np.unwrap(near[:, 1]))) > 0.01 + noise:
                 return False
     return True
+
+
+def _within(rows: Array, first: float, last: float) -> Array:
+    """Return the headings (M, 3) of a sensor from `first` to `last`, s."""
+    return rows[(rows[:, 0] >= first) & (rows[:, 0] <= last)]
+
+
+def _headed(yaws: dict[str, Array], first: float, last: float) -> bool:
+    """Whether a sensor tells the heading through a stretch, and with it any turn."""
+    found = (_within(rows, first, last) for rows in yaws.values())
+    return any(len(rows) >= _FEWEST_HEADINGS and np.ptp(rows[:, 0]) > 0.5 * (last - first) for rows in found)
 
 
 def _slope(t: Array, y: Array) -> float:
@@ -228,7 +240,7 @@ def _gyro_bias(
     bias[:2] = np.where(around < prior[:2], mean[:2], 0.0)
     sigma[:2] = np.minimum(prior[:2], around)
     if still is not None:
-        at_rest, its_sigma = _bias_at_rest(*_samples(problem, *still)[::2], prior, turns=not yaws)
+        at_rest, its_sigma = _bias_at_rest(*_samples(problem, *still)[::2], prior, turns=not _headed(yaws, *still))
         better = its_sigma < sigma
         found = np.where(better, at_rest, bias), np.where(better, its_sigma, sigma)
         return *found, (f"gyro bias from {still[1] - still[0]:.0f} s of standstill",)
