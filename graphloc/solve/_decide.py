@@ -155,10 +155,10 @@ def _by_kernel(
         normal = np.array([found[m].normalised() for m, found in zip(mode, residuals, strict=True)])
         spread = min(spread, _spread_of_pairs(stamps_ns, normal))
         noisier = noisier_than_stated(min(spread, white_spread(stamps_ns, normal)))
-    if stage == "far" and not stream.constants:
-        # Around an estimate that is metres off, right measurements are many sigmas away. At full weight they, and false ones, bend
-        # the motion until the solver diverges; at the weight of what they are off by, the IMU holds it together. But where they
-        # share an error (a mount), it is that which has to give way.
+    if stage == "far" and stream.row.false is not None and not stream.constants:
+        # Around an estimate that is metres off, right matches are many sigmas away. At full weight they, and false ones, bend the
+        # motion until the solver diverges; at the weight of what they are off by, the rest holds it together. Not so of fixes, which
+        # are what leads back; nor where they share an error (a mount), which has to give way.
         noisier = spread
     scale = min(own.scale * spread / noisier * float(np.sqrt(dof)), _WIDEST)
     kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=scale)
