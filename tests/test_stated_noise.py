@@ -12,7 +12,7 @@ from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
 from graphloc.frames import wrap_angle
 from graphloc.measurements import CompassHeading, Measurement, PoseFix
 from graphloc.replay import replay
-from graphloc.solve._decide import noisier_than_stated, white_spread
+from graphloc.solve._scatter import noisier_than_stated, white_scatter
 from tests.slowly import slowly
 
 SECOND = 1_000_000_000
@@ -20,7 +20,7 @@ SECOND = 1_000_000_000
 
 def white_of(residuals: np.ndarray, rate_hz: float = 10.0) -> float:
     """Of normalised residuals (N, k)."""
-    return white_spread(np.rint(np.arange(len(residuals)) * SECOND / rate_hz).astype(np.int64), residuals)
+    return white_scatter(np.rint(np.arange(len(residuals)) * SECOND / rate_hz).astype(np.int64), residuals)
 
 
 @pytest.mark.parametrize("k", [1, 3])

@@ -209,9 +209,8 @@ class Lag:
         """Return a warning on each sensor that newly scatters by far more than it states."""
         lines = list[str]()
         for name, stream in self.problem.streams.items():
-            scatter = stream.scatter
-            if not (stream.row.absolute or scatter.said) and (line := noisier_warning(name, scatter.noisier)):
-                scatter.said, lines = True, lines + line
+            if not stream.scatter.said and (line := noisier_warning(name, stream.noisier)):
+                stream.scatter.said, lines = True, lines + line
         return lines
 
     @property
