@@ -132,5 +132,5 @@ def _jumped(stream: LiveStream, at: Attachment) -> float:
     """Return how many sigmas the jumping slow error of a sensor is; 0 where it has none."""
     if stream.slow is None or at.slow_value is None:
         return 0.0
-    far = [axis in stream.slow.far for axis in stream.slow.axes]
+    far = stream.slow.far_axes
     return float(np.linalg.norm(at.slow_value[far] / stream.slow.sigma[far]))

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import far_axes
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
@@ -178,7 +177,7 @@ class Lag:
         for stream in self.problem.streams.values():
             if share and stream.left_out is not None and stream.slow is not None:
                 off_m = self._window.values.atVector(keys.slow(stream.number, timeline.slow_of[timeline.last]))
-                off_m = np.where(far_axes(stream.slow), off_m, 0.0)
+                off_m = np.where(stream.slow.far_axes, off_m, 0.0)
                 cov = cov + share * np.outer(off_m, off_m)
         return mean, cov
 
@@ -246,5 +245,5 @@ class Lag:
         nodes = len(timeline.slow_stamps_ns) - timeline.slow_stamps_ns.first
         for stream in self.problem.streams.values():
             if stream.slow is not None:
-                expected += nodes * int(np.isfinite(stream.slow.time_constant_s).sum())
+                expected += nodes * int((~stream.slow.constant).sum())
         return 2.0 * self._window.error() / max(expected, 1.0)

@@ -61,6 +61,12 @@ class Verdict:
     at: Attachment
     settled: int = 0
 
+    @property
+    def expected_cost(self) -> float:
+        """Expectation of its weighted square."""
+        expected = self.residual.expected_nis
+        return (len(self.residual.raw) if expected is None else expected) * self.weight
+
 
 # By (stream number, measurement index).
 Verdicts = dict[tuple[int, int], Verdict]
