@@ -8,6 +8,7 @@ import pytest
 
 from graphloc import app
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
+from graphloc.estimate import Event
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
@@ -233,14 +234,15 @@ def test_online_tries_with_a_measured_heading_disturb_no_estimate(fails: bool, m
     samples = [n for n, m in enumerate(came) if isinstance(m, ImuSample)]
     for n in samples[21 * int(IMU_HZ) :: 20]:
         came.insert(n, came.pop(n + 1))
-    online, said = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL), list[str]()
+    online, told = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL), list[Event]()
     for m in came:
         online.feed(m)
-        said += [event.text for event in online.events()]
-        if fails and said:  # it has started
+        told += online.events()
+        if fails and told:  # it has started
             monkeypatch.setattr(_smoother, "try_start", failing)
-    assert not any("rebuilt" in line for line in said)
-    assert any("sensors measure the heading" in line for line in said) != fails
+    assert [event.heading_guessed for event in told[:2]] == [False, True]  # started, and what of
+    assert not any("rebuilt" in event.text for event in told)
+    assert any("sensors measure the heading" in event.text for event in told) != fails
 
 
 def failing(*_: object) -> None:

@@ -333,7 +333,8 @@ class OnlineSmoother:
         newest_ns = tracking.lag.newest.stamp_ns
         persistent.noise.begin(newest_ns)
         self._say(f"started at {utc_text(newest_ns)}: {'; '.join(started.notes)}", warns=False)
-        self._say(started.doubt)
+        if started.doubt:
+            self._events.append(Event(started.doubt, heading_guessed=True))
         for stream in tracking.lag.problem.streams.values():
             for said in slow_error_warning(stream.name, stream.left_out):
                 self._say(said)
