@@ -258,8 +258,9 @@ class Tracking:
         return len(told_ns) >= _HEADINGS and self.lag.newest.stamp_ns - min(told_ns) >= duration_ns(LEAST_S)
 
     def since(self, stamp_ns: int) -> list[Measurement]:
-        """Return what has come with stamps from `stamp_ns` on, by stamp: what came late is among it."""
-        return sorted((m for m in self._recent if m.stamp_ns >= stamp_ns), key=lambda m: m.stamp_ns)
+        """Return what has come with stamps from `stamp_ns` on and can be used again, by stamp: what came late is among it."""
+        again = (m for m in self._recent if m.stamp_ns >= stamp_ns and not self._ledger.has(m))
+        return sorted(again, key=lambda m: m.stamp_ns)
 
     def trajectory(self, now: Estimate) -> Trajectory:
         """Return the states of the window, and `now` where it is newer; the covariance at all of them is that of `now`."""
@@ -342,7 +343,7 @@ class Tracking:
     def end_but(self, since_ns: int) -> list[Measurement]:
         """Give every measurement its row, but those since a stamp (ns), which are returned to start anew with."""
         self._ledger.enter(self.lag.gone())
-        again = [m for m in self.since(since_ns) if not self._ledger.has(m)]
+        again = self.since(since_ns)
         self._settle_rows(self.lag, again)
         return again
 
