@@ -31,9 +31,8 @@ from graphloc.position_jumps import why_in_doubt
 from graphloc.solve._unmodelled import Unmodelled
 from graphloc.solve._warnings import noisier_warning
 
-_STEP_COST = (
-    1.0  # of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10
-)
+# Of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10.
+_STEP_COST = 1.0
 _STEP_M = 0.3  # a commit that moves the newest state by more is followed by further iterations
 _MOST_STEPS, _STANDS = 10, 0.1  # largest number of iterations; relative change of the cost at which they end
 

@@ -34,8 +34,10 @@ from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
-_PENDING = 10_000
+_PENDING = 10_000  # measurements that may wait for the IMU
 _HEADINGS = 3  # measurements of the heading that end a guess
+_FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
+_NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
 
 
 class Tracking:
@@ -354,10 +356,6 @@ class Tracking:
         for m in self._recent.others():
             if not self._ledger.has(m) and m.seq not in used_again:
                 self._ledger.drop(m, Outcome.LATE, "older than the oldest state of the rebuilt window")
-
-
-_FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
-_NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
 
 
 def failure_text(error: Exception) -> str:
