@@ -51,9 +51,8 @@ class HoldOut:
                 f"{recording.source}: --hold-out gaps:{self.gaps}x{self.gap_s:g}: the gaps do not fit into the "
                 f"{span:.1f} s from the first fix to the last; ask for fewer or shorter ones"
             )
-        number: defaultdict[str, count[int]] = defaultdict(
-            count
-        )  # counted for each receiver: every 2nd of two in turn would be all of one
+        # Counted for each receiver: every 2nd of two in turn would be all of one.
+        number: defaultdict[str, count[int]] = defaultdict(count)
         held = tuple(m for m in fixes if self._holds(next(number[m.sensor]), m, fixes))
         if not held:
             raise ConfigError(f"{recording.source}: --hold-out every:{self.every} holds nothing of {len(fixes)} fixes")

@@ -103,9 +103,8 @@ class _Seen:
         self.turn = self.by_turn = np.eye(3)
         if self.rides:
             self.turn = gtsam.Rot3.Expmap(self.moved[3:]).matrix()
-            self.by_turn = np.asarray(
-                gtsam.Rot3.ExpmapDerivative(-self.moved[3:])
-            )  # Exp(w + dw) = Exp(by_turn dw) Exp(w)
+            # Exp(w + dw) = Exp(by_turn dw) Exp(w)
+            self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-self.moved[3:]))
         tags = np.array(m.points_m).reshape(-1, 4, 3)
         self.within = tags - 0.25 * tags.sum(axis=1, keepdims=True)  # each corner from its tag's middle
         for k, constant in enumerate(self.constants):
@@ -181,9 +180,8 @@ def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode)
         raw=raw,
         cov=_turned(seen.R) @ mode.cov @ _turned(seen.R).T + np.diag(_TO_DECIDE**2),
         jacobian=jacobian,
-        slow_jacobian=slow_jacobian
-        if seen.rides or seen.mounted
-        else None,  # edges are no matter where modes are chosen
+        # Edges are no matter where modes are chosen.
+        slow_jacobian=slow_jacobian if seen.rides or seen.mounted else None,
         prior=mode.probability * (1.0 - config.false_fraction),
         size_m=float(np.hypot(raw[0], raw[1])),
         size_deg=float(np.degrees(np.linalg.norm(raw[3:]))),

@@ -36,10 +36,8 @@ _OWN_CLOCK_S = 10.0  # no message takes as long
 _FEWEST_STAMPS = 10  # that tell of a clock
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
-_RTK_M = (
-    0.05,
-    0.1,
-)  # horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error
+# Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
+_RTK_M = (0.05, 0.1)
 _RTK_SCATTER_M = 0.1
 _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
 _FILTERED = (
@@ -332,9 +330,8 @@ def _scatter_lines(gnss: GnssReport) -> list[str]:
 
 def _rtk_slow_error(gnss: GnssReport) -> str:
     """That of RTK; where a part of the fixes is float, as large as those claim to be off: the error of a float is slow."""
-    floats_m = min(
-        gnss.sigma_p95_m, SlowErrorConfig().horizontal_sigma_m
-    )  # a single fix claims more for its white noise
+    # A single fix claims more for its white noise.
+    floats_m = min(gnss.sigma_p95_m, SlowErrorConfig().horizontal_sigma_m)
     if floats_m < RTK_SIGMA_M:
         return f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {gnss.why}"
     said = f"{gnss.why}, but 5 % claim {gnss.sigma_p95_m:.2g} m or worse (float?), and such an error is slow"

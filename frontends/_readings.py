@@ -25,7 +25,7 @@ from graphloc.frontends import _clock, _fixes, _sanity
 from graphloc.frontends._references import Reference
 from graphloc.frontends._rejections import Rejection, rejected
 from graphloc.frontends._turns import SCATTERED, scattered
-from graphloc.frontends.decode import Decoded, ImuSample
+from graphloc.frontends.decode import Decoded, ImuReading
 from graphloc.frozen_imu import WHY, frozen_imu_warning, frozen_samples
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
@@ -191,7 +191,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
     readings.sort()
     rows += _drop_hanging(readings, warnings)
-    samples = [v for v in readings.values if isinstance(v, ImuSample)]
+    samples = [v for v in readings.values if isinstance(v, ImuReading)]
     if not samples:
         return None, rows
     series = ImuSeries(
@@ -210,7 +210,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
 
 def _imu_values(readings: Readings) -> Array:
     """Return accelerations and rates (N, 6); of none, (0, 6)."""
-    return np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuSample)]).reshape(
+    return np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuReading)]).reshape(
         -1, 6
     )
 

@@ -75,14 +75,14 @@ MOST_SPEED_MPS, MOST_DISTANCE_M, _MOST_HEIGHT_M = 1e4, 1e7, 1e5
 _VARIANCES = (1e-18, 1e12)  # m^2 and the like: 1 nm to 1000 km
 
 
-class ImuSample(NamedTuple):
-    """One inertial sample in the sensor's axes, SI units."""
+class ImuReading(NamedTuple):
+    """One inertial sample as decoded: axes of the sensor, SI units; `Readings` has its stamp and number."""
 
     accel_mps2: tuple[float, float, float]
     gyro_radps: tuple[float, float, float]
 
 
-Decoded = Measurement | ImuSample | Rejection
+Decoded = Measurement | ImuReading | Rejection
 # The message and the configuration are whatever this row of the table asks for, hence Any.
 Decoder = Callable[[Any, int, int, str, Any], Decoded]
 
@@ -175,7 +175,7 @@ def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -
     k = STANDARD_GRAVITY_MPS2 if config.accel_unit == "g" else 1.0
     k = -k if config.gravity == "inverted" else k
     r = pi / 180.0 if config.gyro_unit == "deg/s" else 1.0
-    return ImuSample((k * accel[0], k * accel[1], k * accel[2]), (r * gyro[0], r * gyro[1], r * gyro[2]))
+    return ImuReading((k * accel[0], k * accel[1], k * accel[2]), (r * gyro[0], r * gyro[1], r * gyro[2]))
 
 
 def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:

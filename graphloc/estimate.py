@@ -15,10 +15,16 @@ from graphloc.trajectory import bounds_95
 
 
 class Event(NamedTuple):
-    """What happened under way, in a line. `warns`: it makes the track, or a sensor, doubtful, so that a reader must see it."""
+    """What happened under way.
+
+    Attributes:
+        text: a line. warns: it makes the track, or a sensor, doubtful, so that a reader must see it.
+        heading_guessed: from here on the heading is a guess, for as long as estimates say so in their reason.
+    """
 
     text: str
     warns: bool = True
+    heading_guessed: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -23,10 +23,8 @@ from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
 
 WHY = "frozen receiver or driver: it repeats one position while the vessel moves"
-_HELD_S, _FEWEST = (
-    2.5,
-    3,
-)  # a stretch of one position; a driver that repeats fixes does so for less (`frontends/_fixes.py`)
+# A stretch of one position; a driver that repeats fixes does so for less (`frontends/_fixes.py`).
+_HELD_S, _FEWEST = 2.5, 3
 _NOISE_M = 0.5  # how far the fixes of one position may scatter
 _BEFORE_S = 3.0  # before the stretch: the fixes in it give the speed
 _SIGMAS = 3.0

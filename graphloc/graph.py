@@ -93,7 +93,7 @@ class Residual:
         jacobian: gives (k, 6) d raw / d (body tangent of the state's pose), for the predicted covariance.
         slow_jacobian: gives (k, n) d raw / d (slow state), for the same; None: it has no part in that.
         velocity_jacobian: gives (k, 3) d raw / d (velocity in world), for the same; None: it has no part in that.
-        expected_nis: expected square of the factor, where that is another than the length of `raw`; 0: it is that.
+        expected_nis: expected square of the factor; None: that of its length, one per axis.
         prior: prior probability of this hypothesis.
         size_m, size_deg: physical size, for the ledger.
     """
@@ -106,7 +106,7 @@ class Residual:
     size_deg: float | None
     slow_jacobian: Callable[[], Array] | None = None
     velocity_jacobian: Callable[[], Array] | None = None
-    expected_nis: float = 0.0
+    expected_nis: float | None = None
 
     def nis(self, inflation: Array | None = None) -> float:
         """Squared residual normalised by `cov` (+ `inflation`)."""
@@ -145,7 +145,8 @@ class SlowProcess:
     """A slow state: per axis a first-order Gauss-Markov process.
 
     Attributes:
-        name: for outputs. offset: what its constants are together, where it has others beside them. axes: k names. units: k of them. scale: (k,) from the state's units to these.
+        name: for outputs. offset: what its constants are together, where it has others beside them.
+        axes: k names. units: k of them. scale: (k,) from the state's units to these.
         sigma: (k,) standing size. time_constant_s: (k,) correlation time; inf for a constant.
         no_tails: axes of constants that are never far from zero; a mount may be turned by any angle.
         jumps: put a robust loss on its steps. far: axes that together may stand much farther off than sigma; tails of their prior.
@@ -164,6 +165,16 @@ class SlowProcess:
     jumps: bool = False
     far: tuple[str, ...] = ()
     needs_company: bool = False
+
+    @property
+    def constant(self) -> NDArray[np.bool_]:
+        """Which axes (k,) do not change."""
+        return ~np.isfinite(self.time_constant_s)
+
+    @property
+    def far_axes(self) -> NDArray[np.bool_]:
+        """Which axes (k,) may stand far off, and jump."""
+        return np.array([axis in self.far for axis in self.axes])
 
     def after(self, dt_s: float) -> tuple[Array, Array]:
         """Return what share of the state is left after a time (k,), and the variance (k,) that has come to it."""

@@ -37,7 +37,6 @@ Status = Callable[[float, float, Estimate | None, str], None]
 """Called with s of the run, its whole length, the newest estimate, and what the start waits for."""
 
 
-_GUESS = "the heading is a guess"
 _BUSY = "not tried: the previous scan was still being matched"
 
 
@@ -323,7 +322,7 @@ def _timed(happened: Sequence[tuple[int, Event]], estimates: Sequence[Estimate])
     timed = []
     for stamp_ns, event in happened:
         line = f"at {max(stamp_ns - begin_ns, 0) / 1e9:.0f} s: {event.text}"
-        if _GUESS in event.text:
+        if event.heading_guessed:
             held = [e.stamp_ns for e in estimates if e.stamp_ns >= stamp_ns and event.text in e.reason]
             last_ns = max(held, default=stamp_ns)
             until = (

@@ -119,7 +119,7 @@ class _Session:
     def events(self) -> None:
         """Write what happened."""
         for event in self._smoother.events():
-            self.say("event", event._asdict())
+            self.say("event", {"text": event.text, "warns": event.warns})
 
     def news(self) -> None:
         """Write what happened, and what the start waits for where that changed."""

@@ -8,7 +8,7 @@ import pytest
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, PoseConfig, VelocityConfig
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends.decode import DECODERS, ImuSample, covariance_translation_first, usable_covariance
+from graphloc.frontends.decode import DECODERS, ImuReading, covariance_translation_first, usable_covariance
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
 from tests.bagfactory import START_NS, Messages
@@ -35,7 +35,7 @@ def yaw_quaternion(degrees: float) -> tuple[float, float, float, float]:
 
 def test_imu_units() -> None:
     sample = decode(MAKE.imu(T, accel=(0, 0.5, 1), gyro=(90, 0, 0)), ImuConfig(accel_unit="g", gyro_unit="deg/s"))
-    assert isinstance(sample, ImuSample)
+    assert isinstance(sample, ImuReading)
     np.testing.assert_allclose(sample.accel_mps2, [0, 4.903325, 9.80665])
     np.testing.assert_allclose(sample.gyro_radps, [1.5707963267948966, 0, 0])
 

@@ -2,12 +2,14 @@
 """A vehicle without a heading sensor: as sure of its heading as its motion tells it, and no surer."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from graphloc import app
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
+from graphloc.estimate import Event
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
@@ -233,14 +235,24 @@ def test_online_tries_with_a_measured_heading_disturb_no_estimate(fails: bool, m
     samples = [n for n, m in enumerate(came) if isinstance(m, ImuSample)]
     for n in samples[21 * int(IMU_HZ) :: 20]:
         came.insert(n, came.pop(n + 1))
-    online, said = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL), list[str]()
+    solved = []
+
+    def counted(*given: Any) -> online_start.Started | str:
+        found = online_start.try_start(*given)
+        solved.append(not isinstance(found, str))
+        return found
+
+    monkeypatch.setattr(_smoother, "try_start", counted)
+    online, told = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL), list[Event]()
     for m in came:
         online.feed(m)
-        said += [event.text for event in online.events()]
-        if fails and said:  # it has started
+        told += online.events()
+        if fails and told:  # it has started
             monkeypatch.setattr(_smoother, "try_start", failing)
-    assert not any("rebuilt" in line for line in said)
-    assert any("sensors measure the heading" in line for line in said) != fails
+    assert [event.heading_guessed for event in told[:2]] == [False, True]  # started, and what of
+    assert not any("rebuilt" in event.text for event in told)
+    assert any("sensors measure the heading" in event.text for event in told) != fails
+    assert sum(solved) == (1 if fails else 2)  # it starts anew with the start that showed that it can
 
 
 def failing(*_: object) -> None:

@@ -27,7 +27,7 @@ from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import (
     DECODERS,
     IMU,
-    ImuSample,
+    ImuReading,
     covariance_translation_first,
     usable_covariance,
     yaw_of_x_axis,
@@ -339,7 +339,7 @@ def test_units_of_an_imu_do_not_change_what_it_says(
     a, w = np.array(said), np.array(said[::-1]) / 60.0
     force, rate = a / (9.80665 if accel_unit == "g" else 1.0), w * (180.0 / np.pi if gyro_unit == "deg/s" else 1.0)
     sample = DECODERS["imu", IMU](MAKE.imu(1, force.tolist(), rate.tolist()), 1, 0, "imu", config)
-    assert isinstance(sample, ImuSample)
+    assert isinstance(sample, ImuReading)
     np.testing.assert_allclose(sample.accel_mps2, a, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(sample.gyro_radps, w, rtol=1e-12, atol=1e-12)
 

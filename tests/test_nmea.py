@@ -2,6 +2,7 @@
 """Sentences of NMEA 0183 as a source of places, headings and velocities; messages of other packages that say the same."""
 
 import operator
+from contextlib import nullcontext
 from functools import reduce
 from math import isnan
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from graphloc.app import smooth_recording
-from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, load_config
+from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, VesselConfig, load_config, parse_config
 from graphloc.errors import ConfigError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
@@ -286,3 +287,22 @@ def test_sentences_that_do_not_say_it_are_refused_with_the_key(kind: str, asked:
     path.write_text(f"sensors:\n  it: {{kind: {kind}, topic: /line, nmea: {asked}}}\n")
     with pytest.raises(ConfigError, match=r"sensors\.it\.nmea"):
         load_config(path, KINDS)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "twice"),
+    [("GGA", "GPGGA", True), ("GNGGA, RMC", "RMC", True), ("GPGGA", "GNGGA", False), ("GGA", "RMC", False)],
+)
+def test_a_sentence_is_read_once(one: str, other: str, twice: bool) -> None:
+    """`GGA` is that of any talker, so that of one talker is among it."""
+    blocks = {
+        name: {"kind": "gnss", "topic": "/line", "nmea": asked.split(", ")}
+        for name, asked in zip("ab", (one, other), strict=True)
+    }
+    with pytest.raises(ConfigError, match="a and b both read /line") if twice else nullcontext():
+        parse_config({"sensors": blocks}, KINDS, "vessel.yaml")
+
+
+def test_blocks_that_are_not_parsed_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="gnss: no SensorConfig"):
+        VesselConfig.model_validate({"sensors": {"gnss": {"kind": "gnss", "topic": "/fix"}}})

@@ -9,7 +9,7 @@ import pytest
 from graphloc.eval.simulate import bl_scenario, simulate
 from graphloc.frames import wrap_angle
 from graphloc.measurements import CompassHeading
-from graphloc.online._live import Scatter
+from graphloc.online._scatter import Scatter
 from graphloc.replay import replay
 from tests.slowly import with_few_states
 

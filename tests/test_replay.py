@@ -151,11 +151,11 @@ def test_a_guessed_heading_is_reported_with_its_times(whole: Replayed) -> None:
     doubt = "the heading is a guess: 2 candidates explain the motion so far"
     first_ns = estimates[0].stamp_ns
     some = [replace(e, reason=f"95 % bound 3 m; {doubt}" if k <= 50 else "") for k, e in enumerate(estimates)]
-    ((line, _),) = _timed([(first_ns, Event(doubt))], some)
-    assert line.startswith(f"at 0 s: {doubt}; it stays so until 5 s (5 s) and is not rated good")
-    assert "start.heading_deg" in line
+    (said,) = _timed([(first_ns, Event(doubt, heading_guessed=True))], some)
+    assert said.text.startswith(f"at 0 s: {doubt}; it stays so until 5 s (5 s) and is not rated good")
+    assert "start.heading_deg" in said.text
     every = [replace(e, reason=doubt) for e in estimates]
-    assert "to the end of the run" in _timed([(first_ns, Event(doubt))], every)[0].text
+    assert "to the end of the run" in _timed([(first_ns, Event(doubt, heading_guessed=True))], every)[0].text
     assert _timed([(first_ns + 2_000_000_000, Event("rebuilt"))], some) == [Event("at 2 s: rebuilt")]
 
 

@@ -3,16 +3,22 @@
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 
-from graphloc import app
+from graphloc import app, keys
+from graphloc.build import make_problem
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import wrap_angle
 from graphloc.measurements import CompassHeading, Measurement, PoseFix
 from graphloc.replay import replay
-from graphloc.solve._decide import noisier_than_stated, white_spread
+from graphloc.solve._align import align
+from graphloc.solve._decide import weigh
+from graphloc.solve._scatter import noisier_than_stated, white_scatter
+from graphloc.solve._start import solve_start
 from tests.slowly import slowly
 
 SECOND = 1_000_000_000
@@ -20,7 +26,7 @@ SECOND = 1_000_000_000
 
 def white_of(residuals: np.ndarray, rate_hz: float = 10.0) -> float:
     """Of normalised residuals (N, k)."""
-    return white_spread(np.rint(np.arange(len(residuals)) * SECOND / rate_hz).astype(np.int64), residuals)
+    return white_scatter(np.rint(np.arange(len(residuals)) * SECOND / rate_hz).astype(np.int64), residuals)
 
 
 @pytest.mark.parametrize("k", [1, 3])
@@ -79,3 +85,23 @@ def test_matches_that_state_a_tenth_of_their_noise_do_not_throw_the_start() -> N
     solution = app.smooth_recording(run.recording, run.config).solution
     assert compare_to_truth(solution.trajectory, run.truth).position_rmse_m < 0.6
     assert solution.stats.iterations < 200
+
+
+def test_while_far_off_fixes_keep_their_weight_and_matches_weigh_as_they_scatter() -> None:
+    """At the weight of what they are off by, fixes did not lead back from dead reckoning (drawn vessel 409: 1110 m off)."""
+    run = slowly(simulate(replace(bl_scenario(1, "drift"), duration_s=20.0), 1))
+    datum = app.choose_datum(run.recording, run.config)
+    whole = app.with_synthetic(run.recording, run.config, datum)
+    problem = make_problem(whole, app.seen_frames(run.config, whole), datum, SENSORS, INERTIAL)
+    values, _, last, *_ = solve_start(problem, align(problem), lambda *_: None)
+    for k in range(last + 1):
+        pose = values.atPose3(keys.pose(k))
+        values.update(keys.pose(k), gtsam.Pose3(pose.rotation(), pose.translation() + [300.0, 0.0, 0.0]))
+    verdicts = weigh(problem, values, first=0, last=last, stage="far", hypotheses=False)
+    weights = {
+        s.name: [v.decision.weight for (n, _), v in verdicts.items() if n == s.number and v.decision is not None]
+        for s in problem.streams
+    }
+    assert set(weights["gnss"]) == {1.0}
+    assert weights["matcher"]
+    assert max(weights["matcher"]) < 1e-3

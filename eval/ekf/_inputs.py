@@ -39,8 +39,8 @@ class Interval:
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
-    """A measurement with its mount."""
+class MountedMeasurement:
+    """A measurement with the mount of its sensor in body: lever arm (3,), m, and yaw, rad."""
 
     m: Measurement
     lever: Array
@@ -71,8 +71,8 @@ def intervals_of(recording: Recording, config: VesselConfig, rate_hz: float) -> 
     ]
 
 
-def events_of(recording: Recording, config: VesselConfig) -> list[Event]:
-    events = []
+def measurements_of(recording: Recording, config: VesselConfig) -> list[MountedMeasurement]:
+    measured = []
     for m in recording.measurements:
         sensor = config.sensors.get(m.sensor)
         if isinstance(m, TagSighting) and sensor:
@@ -82,8 +82,8 @@ def events_of(recording: Recording, config: VesselConfig) -> list[Event]:
         planar = GnssPosition | GnssVelocity | BodyVelocity | CompassHeading | PoseFix
         if isinstance(m, planar) and sensor and sensor.enabled:
             t, R = mount_of(m.sensor, sensor, recording.mounts)
-            events.append(Event(m, t, float(np.arctan2(R[1, 0], R[0, 0]))))
-    return events
+            measured.append(MountedMeasurement(m, t, float(np.arctan2(R[1, 0], R[0, 0]))))
+    return measured
 
 
 def as_pose(m: TagSighting, survey: Survey) -> PoseFix:
@@ -108,16 +108,16 @@ def as_pose(m: TagSighting, survey: Survey) -> PoseFix:
     return PoseFix(stamp_ns=m.stamp_ns, sensor=m.sensor, seq=m.seq, axes=("x", "y", "yaw"), modes=tuple(modes))
 
 
-def start_of(events: list[Event], recording: Recording, datum: Datum) -> Array:
+def start_of(measured: list[MountedMeasurement], recording: Recording, datum: Datum) -> Array:
     """Start as BL does: at the true pose if there is truth, else by the first fixes and heading."""
     truth, imu = recording.truth, recording.imu
     if truth is not None and imu is not None and truth.covers(imu.stamps_ns[:1]).all():
         there = truth.at(imu.stamps_ns[:1])
         v = there.R_world_body[0].T @ there.v_world_mps[0] if there.v_world_mps is not None else np.zeros(3)
         return np.array([*there.p_world_m[0, :2], v[0], v[1], there.yaw_rad[0]])
-    fixes = [e.m for e in events if isinstance(e.m, GnssPosition)]
-    poses = [e.m for e in events if isinstance(e.m, PoseFix) and e.m.axes[:2] == ("x", "y")]
-    heading = next((e for e in events if isinstance(e.m, CompassHeading)), None)
+    fixes = [e.m for e in measured if isinstance(e.m, GnssPosition)]
+    poses = [e.m for e in measured if isinstance(e.m, PoseFix) and e.m.axes[:2] == ("x", "y")]
+    heading = next((e for e in measured if isinstance(e.m, CompassHeading)), None)
     track = world_from_fixes(fixes, datum)[:, :2] if fixes else np.zeros((1, 2))
     p = track[0] if fixes or not poses else poses[0].modes[0].value[:2]
     psi = 0.0

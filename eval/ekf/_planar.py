@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.config import VesselConfig
-from graphloc.eval.ekf._inputs import Event, Interval, events_of, intervals_of, start_of
+from graphloc.eval.ekf._inputs import Interval, MountedMeasurement, intervals_of, measurements_of, start_of
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import (
@@ -42,14 +42,14 @@ class FilterResult:
     why: str = ""
 
 
-def _measurement(event: Event, x: Array, rate: float, datum: Datum) -> tuple[Array, Array, Array]:
+def _measurement(mounted: MountedMeasurement, x: Array, rate: float, datum: Datum) -> tuple[Array, Array, Array]:
     """Return innovation (k,), H (k, 5) and R of a measurement, corrected for its lever arm with psi."""
-    m, lever = event.m, event.lever
+    m, lever = mounted.m, mounted.lever
     c, s = np.cos(x[4]), np.sin(x[4])
     turn = np.array([[c, -s], [s, c]])
     swing = rate * np.array([-lever[1], lever[0]])
     if isinstance(m, BodyVelocity):
-        c, s = np.cos(event.mount_yaw), np.sin(event.mount_yaw)
+        c, s = np.cos(mounted.mount_yaw), np.sin(mounted.mount_yaw)
         level = [n for n, axis in enumerate(m.axes) if axis != "z"]
         H = np.zeros((len(level), 5))
         H[:, 2:4] = np.array([[c, s], [-s, c]])[["xy".index(m.axes[n]) for n in level]]
@@ -71,7 +71,7 @@ def _measurement(event: Event, x: Array, rate: float, datum: Datum) -> tuple[Arr
         index = [states[m.axes[i]] for i in picked]
         values = dict(zip(index, best.value[picked], strict=True))
         cov = best.cov[np.ix_(picked, picked)]
-    off = {0: (turn @ lever[:2])[0], 1: (turn @ lever[:2])[1], 4: event.mount_yaw}
+    off = {0: (turn @ lever[:2])[0], 1: (turn @ lever[:2])[1], 4: mounted.mount_yaw}
     r = np.array([values[i] - off[i] - x[i] for i in index])
     r = np.where(np.array(index) == 4, wrap_angle(r), r)
     return r, np.eye(5)[index], np.array(cov)
@@ -126,22 +126,22 @@ class PlanarEkf(Protocol):
 
 def run_filter(ekf: PlanarEkf, recording: Recording, config: VesselConfig, datum: Datum) -> FilterResult:
     """Predict step by step, and apply each measurement at the first step after it."""
-    intervals, events = intervals_of(recording, config, ekf.rate_hz), events_of(recording, config)
-    x, P = ekf.start(start_of(events, recording, datum))
+    intervals, measured = intervals_of(recording, config, ekf.rate_hz), measurements_of(recording, config)
+    x, P = ekf.start(start_of(measured, recording, datum))
     first = intervals[0].stop_ns - round(NS_PER_S / ekf.rate_hz) if intervals else 0
     ledger, out, k = Ledger(), [(first, x.copy(), P.copy())], 0
     for step in intervals:
         x, P = ekf.predict(x, P, step)
-        while k < len(events) and events[k].m.stamp_ns <= step.stop_ns:
-            event, k = events[k], k + 1
-            r, planar, R = _measurement(event, x[:5], step.rate - (x[5] if len(x) > 5 else 0.0), datum)
+        while k < len(measured) and measured[k].m.stamp_ns <= step.stop_ns:
+            mounted, k = measured[k], k + 1
+            r, planar, R = _measurement(mounted, x[:5], step.rate - (x[5] if len(x) > 5 else 0.0), datum)
             H = np.hstack([planar, np.zeros((len(r), len(x) - 5))])
-            taken = ekf.gate(event.m, r, H, P, R)
+            taken = ekf.gate(mounted.m, r, H, P, R)
             nis = float(r @ np.linalg.solve(H @ P @ H.T + R, r))
             if not isinstance(taken, str):
                 x, P = _update(x, P, r, H, taken)
-            if event.m.seq >= 0:
-                ledger.add(filter_row(event.m, recording, nis, taken if isinstance(taken, str) else ""))
+            if mounted.m.seq >= 0:
+                ledger.add(filter_row(mounted.m, recording, nis, taken if isinstance(taken, str) else ""))
         out.append((step.stop_ns, x.copy(), P.copy()))
     return FilterResult(name=ekf.name, trajectory=_planar(out), ledger=ledger)
 

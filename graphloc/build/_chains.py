@@ -17,7 +17,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.config import KernelConfig
@@ -41,7 +40,7 @@ def bias_step(links: InertialLink, j: int, dt_s: float) -> Any:
 
 def slow_begin(slow: SlowProcess, key: int, known: Array, *, jumps: bool = True) -> Iterator[Any]:
     """Yield the priors of the first node of a chain; `known` (k,): its estimate, which sets the tails of constant components."""
-    constant = ~np.isfinite(slow.time_constant_s)
+    constant = slow.constant
     if constant.any():
         # Why tails: see `_add_constants` in `_graph.py`.
         tails = np.sqrt(1.0 + (known / slow.sigma) ** 2 / CONSTANT_TAILS)
@@ -58,11 +57,11 @@ def slow_step(
     Args:
         jumps: whether steps have a robust loss. jump_m: size of a position jump seen in this step: it, or the vessel, has moved so far.
     """
-    constant = ~np.isfinite(slow.time_constant_s)
+    constant = slow.constant
     # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
     step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt_s / slow.time_constant_s))
     if jump_m > 0.0:
-        step = np.where(far_axes(slow), jump_m, step)
+        step = np.where(slow.far_axes, jump_m, step)
     model: Any = gtsam.noiseModel.Diagonal.Sigmas(step)
     if slow.jumps and jumps and jump_m == 0.0:
         model = _with_tails(model, JUMP.scale)
@@ -92,7 +91,7 @@ def walk_between_nodes(slow: SlowProcess, period_s: float, apart_s: float) -> Ar
         period_s: of the nodes. apart_s: h.
     """
     n = max(period_s / max(apart_s, 1e-3), 1.0)
-    rate = np.where(np.isfinite(slow.time_constant_s), 2.0 * slow.sigma**2 / slow.time_constant_s, 0.0)
+    rate = np.where(slow.constant, 0.0, 2.0 * slow.sigma**2 / slow.time_constant_s)
     walk = rate * (period_s / n * (n - 1.0) * (2.0 * n - 1.0) / 6.0)
     walk.setflags(write=False)
     return walk
@@ -100,10 +99,10 @@ def walk_between_nodes(slow: SlowProcess, period_s: float, apart_s: float) -> Ar
 
 def closing_variance(slow: SlowProcess, value: Array) -> Array:
     """Return the variance (k,) of the prior that closes a chain, re-weighted at `value` (k,), its last node; inf for constants."""
-    far = far_axes(slow)
+    far = slow.far_axes
     square = float(((value[far] / slow.sigma[far]) ** 2).sum())
     tails = np.where(far, 1.0 + square / _FAR**2, 1.0)
-    return np.where(np.isfinite(slow.time_constant_s), _CHAIN_END * slow.sigma**2 * tails, np.inf)
+    return np.where(slow.constant, np.inf, _CHAIN_END * slow.sigma**2 * tails)
 
 
 def standing_cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
@@ -112,7 +111,7 @@ def standing_cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
     Args:
         path: (N, k) nodes. dt_s: (N - 1,) between them.
     """
-    far = far_axes(slow)
+    far = slow.far_axes
     square = ((path[:, far] / slow.sigma[far]) ** 2).sum(axis=1)
     held = np.concatenate([[1.0 / _CHAIN_END], dt_s / (2.0 * float(slow.time_constant_s[far].max()))])
     held[-1] += 1.0 / _CHAIN_END
@@ -124,16 +123,11 @@ def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool) -> Iter
 
     Components that may stay far off have a prior of their own: a height above another zero must not loosen the horizontal ones.
     """
-    held, far = np.isfinite(slow.time_constant_s), far_axes(slow) & jumps
+    held, far = ~slow.constant, slow.far_axes & jumps
     for part in (held & ~far, held & far):
         if part.any():
             tails = _FAR / float(np.sqrt(times[part].max())) if far[part].all() else None
             yield _prior(key, slow.sigma * np.where(part, np.sqrt(times), _NOTHING), tails)
-
-
-def far_axes(slow: SlowProcess) -> NDArray[np.bool_]:
-    """Return which axes (k,) may stand far off, and jump."""
-    return np.array([axis in slow.far for axis in slow.axes])
 
 
 def _prior(key: int, sigmas: Array, tails: float | None = None) -> Any:

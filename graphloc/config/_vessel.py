@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from itertools import combinations, product
 from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from graphloc.blocks import Block, Finite, Positive
+from graphloc.config._sensor import SensorConfig
 from graphloc.frames import Geodetic
 
 
@@ -61,6 +63,14 @@ class OutputConfig(Block):
     """Georeferenced image under the report's map, path as for an aerial sensor; empty: that of the first such sensor."""
 
 
+def _read_the_same(a: Any, b: Any) -> bool:
+    """Whether two sensors of a kind and topic take the same axes, and a sentence in common (`GGA` is that of any talker, also `GPGGA`)."""
+    if getattr(a, "axes", None) != getattr(b, "axes", None):
+        return False
+    pairs = list(product(getattr(a, "nmea", ()), getattr(b, "nmea", ())))
+    return not pairs or any(one.endswith(other) or other.endswith(one) for one, other in pairs)
+
+
 class VesselConfig(Block):
     """A whole `vessel.yaml`."""
 
@@ -83,6 +93,14 @@ class VesselConfig(Block):
     output: OutputConfig = OutputConfig()
     """What is written."""
 
+    @field_validator("sensors")
+    @classmethod
+    def _parsed(cls, sensors: dict[str, Any]) -> dict[str, Any]:
+        raw = [name for name, sensor in sensors.items() if not isinstance(sensor, SensorConfig)]
+        if raw:
+            raise ValueError(f"{', '.join(raw)}: no SensorConfig: read mappings with `parse_config`")
+        return sensors
+
     @model_validator(mode="after")
     def _one_imu(self) -> VesselConfig:
         if len(self.of_kind("imu")) > 1:
@@ -92,15 +110,10 @@ class VesselConfig(Block):
     @model_validator(mode="after")
     def _each_source_once(self) -> VesselConfig:
         """What two sensors read of the same messages would count as two measurements with errors of their own."""
-        readers: dict[tuple[object, ...], str] = {}
-        for name, sensor in self.sensors.items():
-            if not (sensor.enabled and sensor.topic):
-                continue
-            source = (sensor.kind, sensor.topic, *(getattr(sensor, key, None) for key in ("nmea", "axes")))
-            if (other := readers.setdefault(source, name)) != name:
-                raise ValueError(
-                    f"sensors: {other} and {name} both read {sensor.topic}, which would count twice: delete one"
-                )
+        readers = [(name, sensor) for name, sensor in self.sensors.items() if sensor.enabled and sensor.topic]
+        for (one, a), (other, b) in combinations(readers, 2):
+            if (a.kind, a.topic) == (b.kind, b.topic) and _read_the_same(a, b):
+                raise ValueError(f"sensors: {one} and {other} both read {a.topic}, which would count twice: delete one")
         return self
 
     def of_kind(self, kind: str) -> dict[str, Any]:

@@ -15,10 +15,8 @@ from graphloc.solve._decide import AGREES, Verdict
 _CREDIBLE = 6.0  # sigmas of a slow error: a sensor that agrees only by a larger one does not really agree
 _USUAL = 3.0  # sigmas of a jumping slow error: beyond them the level that it jumped from may be the wrong one
 _FEW = 8  # absolute measurements in a row must disagree; fewer are no sign
-_LOST_S, _DENIES = (
-    15.0,
-    3,
-)  # of disagreement, until the estimate is lost; measurements of one sensor in a row that must disagree
+# Of disagreement, until the estimate is lost; measurements of one sensor in a row that must disagree.
+_LOST_S, _DENIES = 15.0, 3
 _JUMPED_S = (60.0, 200.0)  # the longest a jump lasts: after a short, and after a long time at the level before it
 
 
@@ -32,9 +30,8 @@ class Agreement:
     def __init__(self, timeline: LiveTimeline) -> None:
         self._timeline = timeline
         self.agreed_ns: dict[str, int] = {}
-        self._refused: list[
-            int
-        ] = []  # stamps of the first few absolute measurements that disagreed since the last that agreed
+        # Stamps of the first few absolute measurements that disagreed since the last that agreed.
+        self._refused: list[int] = []
         self._denied: dict[str, int] = {}  # by sensor: how many in a row disagreed, whatever slow error is allowed
         self._usual_ns: tuple[int, int] | None = None  # first and last stamp at the usual level
         self._jumped_ns: int | None = None  # since when sensors agree only by a jump
@@ -132,5 +129,5 @@ def _jumped(stream: LiveStream, at: Attachment) -> float:
     """Return how many sigmas the jumping slow error of a sensor is; 0 where it has none."""
     if stream.slow is None or at.slow_value is None:
         return 0.0
-    far = [axis in stream.slow.far for axis in stream.slow.axes]
+    far = stream.slow.far_axes
     return float(np.linalg.norm(at.slow_value[far] / stream.slow.sigma[far]))

@@ -221,8 +221,7 @@ class Entries:
 
     def expected_cost(self) -> float:
         """Return the expected sum of weighted squares of what is in the graph: one per axis, times its weight."""
-        held = [e.verdict for e in self._entries.values() if e.held is not None]
-        return sum((v.residual.expected_nis or len(v.residual.raw)) * v.weight for v in held)
+        return sum(e.verdict.expected_cost for e in self._entries.values() if e.held is not None)
 
     # In the ledger
 

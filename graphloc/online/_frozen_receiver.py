@@ -18,10 +18,8 @@ WINDOW_S, _FEWEST = 4.0, 4  # seconds and fixes that a decision is made from
 _LEAST_MPS = 0.7  # no multipath drifts so fast
 _SHARE = 0.5  # of the vessel's speed: with late stamps the error also grows in a turn, but by less
 _SIGMAS = 4.0
-_STANDS_MPS, _STANDS_M = (
-    0.3,
-    0.5,
-)  # measured by the receiver: if it moves in another way, it may be right and the estimate wrong
+# Measured by the receiver: if it moves in another way, it may be right and the estimate wrong.
+_STANDS_MPS, _STANDS_M = 0.3, 0.5
 _LONGEST_S = 15.0  # for which its disagreement does not count against the estimate
 _ALONG_S = 10.0  # that it must have moved with the vessel before: else a bad start of the estimate may be the cause
 _LINE = 0.15  # of the growth of the error: residuals of a straight line; fixes that jump have larger ones

@@ -62,9 +62,8 @@ class ImuIntake:
     def __init__(self, gap_s: float, floats: bool) -> None:
         self._gap_ns, self._floats = gap_s * 1e9, floats
         self.newest: ImuSample | None = None
-        self.jumped: ImuSample | None = (
-            None  # held back until others follow it, so that one bad stamp does not cut the run
-        )
+        # Held back until others follow it, so that one bad stamp does not cut the run.
+        self.jumped: ImuSample | None = None
         self._jumped_age = self._behind = 0
         self._frozen = FrozenImuDetector()
         self._stamps: list[int] = []  # in order, as far back as a late one may lie
@@ -129,9 +128,8 @@ class ImuIntake:
             hole = (stamps[n - 1], stamps[n]) if n > 0 else None
             stamps.insert(n, m.stamp_ns)
             return Taken(late=m, hole=hole)
-        self._behind += (
-            newest.stamp_ns - m.stamp_ns > self._gap_ns
-        )  # a smaller step back is caught up with, and bridged
+        # A smaller step back is caught up with, and bridged.
+        self._behind += newest.stamp_ns - m.stamp_ns > self._gap_ns
         if self._behind < _BACK:
             return Taken(dropped=((m, "its stamp does not increase"),))
         self.newest = None

@@ -132,7 +132,7 @@ class Judge:
             The verdict, and whether the prediction widened the kernel.
         """
         own, dof = stream.config.kernel, len(residual.raw)
-        noisier = 1.0 if stream.row.absolute else stream.scatter.noisier
+        noisier = stream.noisier
         scale = own.scale * stream.scatter.times / noisier * float(np.sqrt(dof))
         plain = nis = residual.nis() / noisier**2
         widened, inflation = False, None

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import far_axes
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
@@ -32,9 +31,8 @@ from graphloc.position_jumps import why_in_doubt
 from graphloc.solve._unmodelled import Unmodelled
 from graphloc.solve._warnings import noisier_warning
 
-_STEP_COST = (
-    1.0  # of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10
-)
+# Of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10.
+_STEP_COST = 1.0
 _STEP_M = 0.3  # a commit that moves the newest state by more is followed by further iterations
 _MOST_STEPS, _STANDS = 10, 0.1  # largest number of iterations; relative change of the cost at which they end
 
@@ -178,7 +176,7 @@ class Lag:
         for stream in self.problem.streams.values():
             if share and stream.left_out is not None and stream.slow is not None:
                 off_m = self._window.values.atVector(keys.slow(stream.number, timeline.slow_of[timeline.last]))
-                off_m = np.where(far_axes(stream.slow), off_m, 0.0)
+                off_m = np.where(stream.slow.far_axes, off_m, 0.0)
                 cov = cov + share * np.outer(off_m, off_m)
         return mean, cov
 
@@ -209,9 +207,8 @@ class Lag:
         """Return a warning on each sensor that newly scatters by far more than it states."""
         lines = list[str]()
         for name, stream in self.problem.streams.items():
-            scatter = stream.scatter
-            if not (stream.row.absolute or scatter.said) and (line := noisier_warning(name, scatter.noisier)):
-                scatter.said, lines = True, lines + line
+            if not stream.scatter.said and (line := noisier_warning(name, stream.noisier)):
+                stream.scatter.said, lines = True, lines + line
         return lines
 
     @property
@@ -247,5 +244,5 @@ class Lag:
         nodes = len(timeline.slow_stamps_ns) - timeline.slow_stamps_ns.first
         for stream in self.problem.streams.values():
             if stream.slow is not None:
-                expected += nodes * int(np.isfinite(stream.slow.time_constant_s).sum())
+                expected += nodes * int((~stream.slow.constant).sum())
         return 2.0 * self._window.error() / max(expected, 1.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections import deque
 from collections.abc import Collection, MutableMapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -16,26 +15,19 @@ import gtsam
 import numpy as np
 
 from graphloc.build import Carry, company_of, mount_of, state_of, without_drift
-from graphloc.chi2 import chi2_median
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, Sensor, SlowProcess
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._frozen_receiver import FrozenReceiverDetector
 from graphloc.online._motion_model import MotionModel
+from graphloc.online._scatter import Scatter
 from graphloc.online._setup import Setup
 from graphloc.position_jumps import JumpDetector, PositionJump
-from graphloc.solve._decide import WHITE_S, noisier_than_stated
-from graphloc.time import NS_PER_S, duration_ns
+from graphloc.time import duration_ns
 
 T = TypeVar("T")
 _LAST = 15  # measurements up to one, by stamp, from which a sensor's rate at it is taken
-_REMEMBERED = 300  # residuals, and pairs of them, from which the scatter of a sensor is taken
-_LAGS_S, _GOLDEN = (
-    (2.0, 4.0),
-    0.618,
-)  # time between the residuals of a pair; golden ratio: its multiples modulo 1 are spread evenly
-_FEWEST_BENT = 20  # second differences of residuals, from which white noise is judged
 _PAGE_S = 1.0  # states are marginalised in pages of this length
 
 
@@ -136,58 +128,6 @@ class LiveTimeline:
         return self.first + max(bisect_right(self.stamps_ns.kept, stamp_ns) - 1, 0)
 
 
-class Scatter:
-    """By what factor a sensor's residuals scatter more than configured: about 0, or about each other if that is less.
-
-    An error that residuals share is no noise. With the scatter about 0 alone, a compass that was 15 deg off beside a crane was
-    believed after 15 s, because half of the remembered residuals were that large. With the scatter about each other alone, one
-    third of outliers would make half of all pairs wide. The two residuals of a pair are 2 to 4 s apart, evenly distributed:
-    with one fixed distance, swell of that period would not show.
-
-    Args:
-        jumps: the shared error is modelled as a state that may jump, and has not yet: then only about 0.
-
-    Attributes:
-        times: the factor, at least 1. noisier: factor on the stated sigma (see `noisier_than_stated`), at most as large.
-        said: whether that has been reported.
-    """
-
-    def __init__(self, *, jumps: bool = False) -> None:
-        self.times = self.noisier = 1.0
-        self.said = False
-        self._jumps = jumps
-        self._recent: deque[tuple[int, Array]] = deque()
-        self._noted = 0
-        self._squares: deque[float] = deque(maxlen=_REMEMBERED)
-        self._pairs: deque[float] = deque(maxlen=_REMEMBERED)
-        self._bent: deque[float] = deque(maxlen=_REMEMBERED)
-
-    def note(self, stamp_ns: int, residual: Array) -> None:
-        """Take in a residual (k,), normalised to unit covariance."""
-        self._squares.append(float(residual @ residual))
-        self._noted += 1
-        before, lag_ns = None, float(np.interp(self._noted * _GOLDEN % 1.0, (0.0, 1.0), _LAGS_S)) * 1e9
-        for stamp, other in self._recent:
-            if stamp_ns - stamp < lag_ns:
-                break
-            before = other
-        while len(self._recent) > 1 and stamp_ns - self._recent[1][0] >= _LAGS_S[1] * 1e9:
-            self._recent.popleft()
-        self._recent.append((stamp_ns, residual))
-        if len(self._recent) > 2 and stamp_ns - self._recent[-3][0] <= WHITE_S * NS_PER_S:
-            bent = residual - 2.0 * self._recent[-2][1] + self._recent[-3][1]
-            self._bent.append(float(bent @ bent) / 6.0)
-        if before is not None:
-            self._pairs.append(0.5 * float((residual - before) @ (residual - before)))
-        if len(self._pairs) >= len(residual) + 4:
-            about, usual = np.median(self._squares), chi2_median(len(residual))
-            least = about if self._jumps else min(about, np.median(self._pairs))
-            self.times = max(1.0, float(np.sqrt(least / usual)))
-            if len(self._bent) >= _FEWEST_BENT:
-                white = float(np.sqrt(np.median(self._bent) / usual))
-                self.noisier = noisier_than_stated(min(self.times, white))
-
-
 @dataclass(slots=True, eq=False)
 class LiveStream:
     """The measurements of one sensor in order of arrival (offline: `graphloc.build.Stream`), and its detectors.
@@ -217,6 +157,11 @@ class LiveStream:
     frozen_detector: FrozenReceiverDetector = field(default_factory=FrozenReceiverDetector)
     jump_detector: JumpDetector = field(default_factory=JumpDetector)
     jumps: tuple[PositionJump, ...] = ()
+
+    @property
+    def noisier(self) -> float:
+        """Factor on its stated sigma; 1 for positions, whose scatter may be that of the estimate."""
+        return 1.0 if self.row.absolute else self.scatter.noisier
 
     def space(self) -> None:
         """Note how far apart measurements are at the one taken last, and anew at those after it, if it came late.

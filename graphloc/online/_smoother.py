@@ -239,9 +239,9 @@ class OnlineSmoother:
             if lost_s := tracking.lag.lost_s:
                 why = f"for {lost_s:.0f} s no absolute sensor agreed, unless its error had jumped"
                 return self._start_over(tracking, until_ns - duration_ns(_AGAIN_S), why)
-            if self._persistent.doubt and self._starts_with_heading(tracking, until_ns):
+            if self._persistent.doubt and (started := self._start_with_heading(tracking, until_ns)):
                 why = "sensors measure the heading, which was a guess"
-                return self._start_over(tracking, tracking.lag.first_ns, why)
+                return self._start_over(tracking, tracking.lag.first_ns, why, started)
             if jumped := tracking.lag.unmodelled_jumps:
                 self._rebuild(f"position jump of {', '.join(jumped)}")
                 return self._estimate()
@@ -289,14 +289,19 @@ class OnlineSmoother:
             return None
         if not self._waiting.due(newest.stamp_ns):
             return None
-        samples, others = self._waiting.samples(), self._waiting.others()
+        samples = self._waiting.samples()
         self._intake.restart([m.stamp_ns for m in samples])
-        started = self._start_from(samples, others, newest.stamp_ns)
+        started = self._start_from(samples, self._waiting.others(), newest.stamp_ns)
         if isinstance(started, str):
             self._waiting.why = started
             return None
+        return self._begin(started, newest.stamp_ns)
+
+    def _begin(self, started: Started, until_ns: int) -> Estimate | None:
+        """Begin with a start that was solved with what is held; where that fails, restart."""
+        samples, others = self._waiting.samples(), self._waiting.others()
         try:
-            self._take_over(started, samples, others, newest.stamp_ns)
+            self._take_over(started, samples, others, until_ns)
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             if self._tracking is None:
                 for m in others:
@@ -333,7 +338,8 @@ class OnlineSmoother:
         newest_ns = tracking.lag.newest.stamp_ns
         persistent.noise.begin(newest_ns)
         self._say(f"started at {utc_text(newest_ns)}: {'; '.join(started.notes)}", warns=False)
-        self._say(started.doubt)
+        if started.doubt:
+            self._events.append(Event(started.doubt, heading_guessed=True))
         for stream in tracking.lag.problem.streams.values():
             for said in slow_error_warning(stream.name, stream.left_out):
                 self._say(said)
@@ -347,21 +353,23 @@ class OnlineSmoother:
         self._waiting.refuse(f"the estimate restarted while waiting for {self._waiting.why}")
         self._wait("the next IMU sample")
 
-    def _starts_with_heading(self, tracking: Tracking, now_ns: int) -> bool:
-        """Return whether sensors measure the heading by now, and the window's data are enough for a start that is no guess.
+    def _start_with_heading(self, tracking: Tracking, now_ns: int) -> Started | None:
+        """Return a start from the window's data, if sensors measure the heading by now, and it is no guess.
 
         Corrected in the window, a wrong guess leaves wrong biases and velocities behind, and with them a wrong heading.
         """
         if now_ns - self._tried_ns < duration_ns(LEAST_S) or not tracking.heading_measured():
-            return False
+            return None
         self._tried_ns = now_ns
         came = tracking.since(tracking.lag.first_ns)
         samples = [m for m in came if isinstance(m, ImuSample)]
         started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns)
-        return not isinstance(started, str) and not started.doubt
+        return None if isinstance(started, str) or started.doubt else started
 
-    def _start_over(self, tracking: Tracking, since_ns: int, why: str) -> Estimate | None:
-        """Start anew with what was measured since a stamp (ns)."""
+    def _start_over(
+        self, tracking: Tracking, since_ns: int, why: str, started: Started | None = None
+    ) -> Estimate | None:
+        """Start anew with what was measured since a stamp (ns); `started`: from that, where it has been solved."""
         again = tracking.end_but(since_ns)
         self._persistent.agreed_ns.update(tracking.lag.agreed_ns)
         self._say(f"{why}: restarts")
@@ -369,8 +377,12 @@ class OnlineSmoother:
         # Samples have their rows already.
         for m in again:
             self._waiting.hold(replace(m, seq=-1) if isinstance(m, ImuSample) else m)
-        assert self._intake.newest is not None
-        return self._try_to_start(self._intake.newest)
+        newest = self._intake.newest
+        assert newest is not None
+        if started is None:
+            return self._try_to_start(newest)
+        self._intake.restart([m.stamp_ns for m in self._waiting.samples()])
+        return self._begin(started, newest.stamp_ns)
 
     def _resume(self, newest: ImuSample) -> None:
         """Go on from the snapshot, if the first sample is not too far from it."""

@@ -66,9 +66,8 @@ class Snapshot:
         }
         part = path.with_name(path.name + ".part")
         with part.open("w", encoding="utf-8") as stream:
-            json.dump(
-                raw, stream
-            )  # no fsync: a killed process loses nothing, and a memory card may take a second for it
+            # No fsync: a killed process loses nothing, and a memory card may take a second for it.
+            json.dump(raw, stream)
         part.replace(path)
 
     @classmethod

@@ -36,11 +36,8 @@ LEAST_S = 5.0  # of IMU data: gives gyro bias, roll and pitch of a vessel in wav
 _HEADING_RAD = np.radians(15.0)  # 1 sigma: from a larger error the window does not recover soon
 _LONGEST_WAIT_S = 30.0  # for a heading from travel alone, or an IMU that fits; then a position with a doubtful heading is better than none
 _DOUBTFUL = 0.1  # probability of being false, above which several must agree; tags and poses lie below
-_AGREEING, _SHARE, _CHOICE_WAIT_S = (
-    3,
-    0.4,
-    15.0,
-)  # number and share that must agree: two false matches of five may agree with each other
+# Number and share that must agree, and for how long that is waited for: two false matches of five may agree with each other.
+_AGREEING, _SHARE, _CHOICE_WAIT_S = 3, 0.4, 15.0
 _WHOLE = 1.5  # windows of data up to which it begins at the first data: a start that came a little later is then no other one
 _FIXES = 3  # needed to set a datum
 

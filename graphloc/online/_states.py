@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import bias_step, closing_variance, far_axes, nav_state, slow_begin, slow_end, slow_step
+from graphloc.build import bias_step, closing_variance, nav_state, slow_begin, slow_end, slow_step
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Going, Residual
@@ -244,7 +244,7 @@ class States:
                 P, newest, at.T_world_body.rotation().matrix(), (to_ns - from_ns) * 1e-9, pim.preintMeasCov()
             )
             if stream.slow is not None and size > 6 and (jump_m := stream.jump_m(from_ns, to_ns)):
-                P[6:, 6:] += np.diag(np.where(far_axes(stream.slow), jump_m**2, 0.0))
+                P[6:, 6:] += np.diag(np.where(stream.slow.far_axes, jump_m**2, 0.0))
         return prediction_of(residual, at, P, newest.velocity_cov)
 
     def covariance(self, slow_of: Sequence[LiveStream]) -> Array:

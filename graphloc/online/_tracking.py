@@ -34,8 +34,10 @@ from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
-_PENDING = 10_000
+_PENDING = 10_000  # measurements that may wait for the IMU
 _HEADINGS = 3  # measurements of the heading that end a guess
+_FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
+_NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
 
 
 class Tracking:
@@ -258,8 +260,9 @@ class Tracking:
         return len(told_ns) >= _HEADINGS and self.lag.newest.stamp_ns - min(told_ns) >= duration_ns(LEAST_S)
 
     def since(self, stamp_ns: int) -> list[Measurement]:
-        """Return what has come with stamps from `stamp_ns` on, by stamp: what came late is among it."""
-        return sorted((m for m in self._recent if m.stamp_ns >= stamp_ns), key=lambda m: m.stamp_ns)
+        """Return what has come with stamps from `stamp_ns` on and can be used again, by stamp: what came late is among it."""
+        again = (m for m in self._recent if m.stamp_ns >= stamp_ns and not self._ledger.has(m))
+        return sorted(again, key=lambda m: m.stamp_ns)
 
     def trajectory(self, now: Estimate) -> Trajectory:
         """Return the states of the window, and `now` where it is newer; the covariance at all of them is that of `now`."""
@@ -342,7 +345,7 @@ class Tracking:
     def end_but(self, since_ns: int) -> list[Measurement]:
         """Give every measurement its row, but those since a stamp (ns), which are returned to start anew with."""
         self._ledger.enter(self.lag.gone())
-        again = [m for m in self.since(since_ns) if not self._ledger.has(m)]
+        again = self.since(since_ns)
         self._settle_rows(self.lag, again)
         return again
 
@@ -353,10 +356,6 @@ class Tracking:
         for m in self._recent.others():
             if not self._ledger.has(m) and m.seq not in used_again:
                 self._ledger.drop(m, Outcome.LATE, "older than the oldest state of the rebuilt window")
-
-
-_FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
-_NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
 
 
 def failure_text(error: Exception) -> str:

@@ -9,7 +9,7 @@ reject the right measurements.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -17,28 +17,22 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from graphloc import keys
 from graphloc.build import Decisions, Judged, Problem, Stream, attach
-from graphloc.chi2 import chi2_median
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
 from graphloc.solve._best_chain import best_chain
 from graphloc.solve._hypotheses import log_evidence_of, sequence_of
 from graphloc.solve._prediction import Prediction, predict_residuals, prediction_of
-from graphloc.time import NS_PER_S
+from graphloc.solve._scatter import noisier_than_stated, scatter_of, scatter_of_pairs, white_scatter
 
 # By stage, for every sensor that has a kernel at all: Huber is convex, so a start that is tens of metres
 # off still pulls in; Cauchy forgets outliers better and still lets the truth back in.
 _STAGE_KERNEL = {"far": KernelConfig(kind="huber", scale=1.5), "open": KernelConfig(kind="cauchy", scale=1.5)}
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
-# How far apart pairs of residuals are; multiples of the latter, whole turns taken off, spread them evenly.
-_LAGS_S, _GOLDEN = (2.0, 4.0), 0.618
-WHITE_S = 2.0  # within which three measurements show what is white in them
-_LEFT = 1.5  # times the stated sigma: so much more may be by chance
 _WIDEST = 1e9  # sigmas: larger residuals (0.1 mm stated, 100 km off) count the same
 AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
@@ -66,6 +60,12 @@ class Verdict:
     mode: int
     at: Attachment
     settled: int = 0
+
+    @property
+    def expected_cost(self) -> float:
+        """Expectation of its weighted square."""
+        expected = self.residual.expected_nis
+        return (len(self.residual.raw) if expected is None else expected) * self.weight
 
 
 # By (stream number, measurement index).
@@ -149,18 +149,19 @@ def _by_kernel(
     gentle = _CONVEXITY.index(own.kind) <= _CONVEXITY.index(limit.kind)
     # The norm of k whitened residuals is about sqrt(k): the threshold is larger by that.
     dof = len(residuals[0][0].raw)
-    spread, noisier = _spread(best, dof), 1.0
-    if spread > 1.0 and not stream.row.absolute:  # of positions, a shared error may be that of the estimate
+    times, noisier = scatter_of(best, dof), 1.0
+    # Around an estimate that is metres off, right matches are many sigmas away. At full weight they, and false ones, bend the motion
+    # until the solver diverges; at the weight of what they are off by, the rest holds it together. Not so of fixes, which lead
+    # back; nor of what shares an error (a mount), which has to give way.
+    by_scatter = stage == "far" and stream.row.false is not None and not stream.constants
+    if times > 1.0 and not stream.row.absolute:  # of positions, a shared error may be that of the estimate
         stamps_ns = np.array([stream.measurements[i].stamp_ns for i in indices])
         normal = np.array([found[m].normalised() for m, found in zip(mode, residuals, strict=True)])
-        spread = min(spread, _spread_of_pairs(stamps_ns, normal))
-        noisier = noisier_than_stated(min(spread, white_spread(stamps_ns, normal)))
-    if stage == "far" and stream.row.false is not None and not stream.constants:
-        # Around an estimate that is metres off, right matches are many sigmas away. At full weight they, and false ones, bend the
-        # motion until the solver diverges; at the weight of what they are off by, the rest holds it together. Not so of fixes, which
-        # are what leads back; nor where they share an error (a mount), which has to give way.
-        noisier = spread
-    scale = min(own.scale * spread / noisier * float(np.sqrt(dof)), _WIDEST)
+        times = min(times, scatter_of_pairs(stamps_ns, normal))
+        noisier = 1.0 if by_scatter else noisier_than_stated(min(times, white_scatter(stamps_ns, normal)))
+    if by_scatter:
+        noisier = times
+    scale = min(own.scale * times / noisier * float(np.sqrt(dof)), _WIDEST)
     kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=scale)
     decided = {m: Decision(mode=m, weight=noisier**-2, kernel=kernel) for m in set(mode)}
     return [
@@ -175,51 +176,6 @@ def _nis(residuals: list[Residual]) -> Array:
         return np.array([r.nis() for r in residuals])
     raw = np.array([r.raw for r in residuals])
     return np.asarray(np.einsum("ni,ni->n", raw, np.linalg.solve([r.cov for r in residuals], raw[:, :, None])[:, :, 0]))
-
-
-def _spread(squares: Sequence[float], dof: int) -> float:
-    """Return by what factor the residuals of a sensor scatter more than stated, at least 1: its kernel is widened by it.
-
-    Around an estimate that is 100 sigmas off, a loss with a threshold of 1.5 sigmas sees only outliers, and re-weighting converges
-    slowly; and where the noise is configured too small, it rejects a good sensor (measured on KITTI: 97 % of the fixes lost,
-    23 m off). So the threshold follows the median of the residuals.
-    """
-    return max(1.0, float(np.sqrt(np.median(squares) / chi2_median(dof)))) if len(squares) else 1.0
-
-
-def _spread_of_pairs(stamps_ns: NDArray[np.int64], normal: Array) -> float:
-    """Return the same of the differences of normalised residuals (N, k) 2 to 4 s apart: an error that they share is no scatter.
-
-    If it were counted, a compass that is 90 deg off for more than half of a window would widen its kernel to 90 deg and turn the run
-    (measured). Infinite where there are too few.
-    """
-    lags_s = np.interp(np.arange(len(stamps_ns)) * _GOLDEN % 1.0, (0.0, 1.0), _LAGS_S)
-    before = np.searchsorted(stamps_ns, stamps_ns - np.rint(1e9 * lags_s).astype(np.int64), side="right") - 1
-    (now,) = np.nonzero((before >= 0) & (stamps_ns - stamps_ns[before] < 2e9 * _LAGS_S[1]))
-    if len(now) < normal.shape[1] + 4:
-        return np.inf
-    return _spread(0.5 * ((normal[now] - normal[before[now]]) ** 2).sum(axis=1), normal.shape[1])
-
-
-def white_spread(stamps_ns: NDArray[np.int64], normal: Array) -> float:
-    """Return the same of what is white in normalised residuals (N, k), by three at a time that follow each other within seconds.
-
-    In their second difference, an error of the estimate that grows evenly has no part. 1 where there are too few.
-    """
-    (first,) = np.nonzero(stamps_ns[2:] - stamps_ns[:-2] <= WHITE_S * NS_PER_S)
-    if len(first) < normal.shape[1] + 4:
-        return 1.0
-    bent = normal[first] - 2.0 * normal[first + 1] + normal[first + 2]
-    return _spread((bent**2).sum(axis=1) / 6.0, normal.shape[1])
-
-
-def noisier_than_stated(white: float) -> float:
-    """Return the factor on the stated sigma of a sensor whose residuals scatter `white` times as much from one to the next.
-
-    Otherwise what is noise of this sensor counts against the IMU, whose noise is then scaled up (measured: headings that claim
-    0.2 deg and scatter by 2: 81 times, and a heading 42 deg off).
-    """
-    return max(1.0, white / _LEFT)
 
 
 def cost_of_noise(verdicts: Verdicts) -> float:

@@ -76,7 +76,7 @@ def _path(problem: Problem, values: gtsam.Values, stream: Stream) -> Array:
 def _levels(slow: SlowProcess | None, path: Array) -> list[Array]:
     """Return the levels (3,), m, of an error (N, 3) between its jumps: each once, without the usual one."""
     assert slow is not None
-    held = path * [axis in slow.far for axis in slow.axes]
+    held = path * slow.far_axes
     jumps = 1 + np.flatnonzero(np.linalg.norm(np.diff(held / slow.sigma, axis=0), axis=1) > _JUMP)
     found: list[Array] = []
     for part in np.split(held, jumps) if len(jumps) else []:
@@ -89,7 +89,7 @@ def _levels(slow: SlowProcess | None, path: Array) -> list[Array]:
 def _cost(slow: SlowProcess | None, path: Array, dt_s: Array) -> float:
     """Return the cost (nats) of an error (N, 3): of its size, and of the time that it is far off."""
     assert slow is not None
-    far = [axis in slow.far for axis in slow.axes]
+    far = slow.far_axes
     away = np.linalg.norm(path[:, far] / slow.sigma[far], axis=1) > _FAR
     return standing_cost(slow, path, dt_s) + float(dt_s @ away[1:]) / MEAN_S
 

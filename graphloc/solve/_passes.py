@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
-import numpy as np
 
 from graphloc.build import Problem, StartPrior, build_graph
 from graphloc.recording import Progress
@@ -162,11 +161,9 @@ def expected_cost(problem: Problem, verdicts: Verdicts, last: int = -1) -> float
     """Return the degrees of freedom of the weighted problem up to state `last`: the expectation of 2 x its cost."""
     slow_of = problem.timeline.slow_of
     n, m = len(slow_of[:last]) + 1, int(slow_of[last]) + 1
-    expected = sum((v.residual.expected_nis or len(v.residual.raw)) * v.weight for v in verdicts.values())
+    expected = sum(v.expected_cost for v in verdicts.values())
     expected += 9.0 * (n - 1) + 6.0 * (m - 1) + 15.0 - 9.0 * n - 6.0 * m
     for stream in problem.streams:
         if stream.slow is not None:
-            expected += m * int(
-                np.isfinite(stream.slow.time_constant_s).sum()
-            )  # a constant's steps are as many as its nodes
+            expected += m * int((~stream.slow.constant).sum())  # a constant's steps are as many as its nodes
     return expected

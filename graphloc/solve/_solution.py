@@ -108,9 +108,8 @@ def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
 
 def _add_others(result: BatchResult, cov: Array) -> list[str]:
     """State the heading as uncertain as other headings that explain the motion make it; return a warning where it is a guess."""
-    told = (np.arange(len(cov)) > result.begun) & (
-        cov[:, 5, 5] < _TOLD_RAD**2
-    )  # turns or a sensor after the first window
+    # Turns or a sensor after the first window.
+    told = (np.arange(len(cov)) > result.begun) & (cov[:, 5, 5] < _TOLD_RAD**2)
     var = np.where(told, 0.0, result.heading_var)
     widen_heading(cov, var)
     sure = np.sqrt(var.min())
