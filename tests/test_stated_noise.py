@@ -96,7 +96,7 @@ def test_while_far_off_fixes_keep_their_weight_and_matches_weigh_as_they_scatter
     values, _, last, *_ = solve_start(problem, align(problem), lambda *_: None)
     for k in range(last + 1):
         pose = values.atPose3(keys.pose(k))
-        values.update(keys.pose(k), gtsam.Pose3(pose.rotation(), pose.translation() + [300.0, 0.0, 0.0]))
+        values.update(keys.pose(k), gtsam.Pose3(pose.rotation(), pose.translation() + np.array([300.0, 0.0, 0.0])))
     verdicts = weigh(problem, values, first=0, last=last, stage="far", hypotheses=False)
     weights = {
         s.name: [v.decision.weight for (n, _), v in verdicts.items() if n == s.number and v.decision is not None]

@@ -158,7 +158,8 @@ def _by_kernel(
         stamps_ns = np.array([stream.measurements[i].stamp_ns for i in indices])
         normal = np.array([found[m].normalised() for m, found in zip(mode, residuals, strict=True)])
         times = min(times, scatter_of_pairs(stamps_ns, normal))
-        noisier = 1.0 if by_scatter else noisier_than_stated(min(times, white_scatter(stamps_ns, normal)))
+        if not by_scatter:
+            noisier = noisier_than_stated(min(times, white_scatter(stamps_ns, normal)))
     if by_scatter:
         noisier = times
     scale = min(own.scale * times / noisier * float(np.sqrt(dof)), _WIDEST)
