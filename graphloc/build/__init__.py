@@ -10,7 +10,7 @@ whose Euler term GTSAM's preintegration leaves out. Every other mount is taken f
 solution is moved to the body's origin at the end (`graphloc.solve`).
 """
 
-from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state, solved_constants, state_of
+from graphloc.build._attach import Carry, Judged, Sited, attach, constant_keys, nav_state, solved_constants, state_of
 from graphloc.build._chains import (
     CONSTANT_TAILS,
     JUMP,
@@ -46,6 +46,7 @@ __all__ = [
     "Mounts",
     "Past",
     "Problem",
+    "Sited",
     "StartPrior",
     "Stream",
     "Thinned",
