@@ -48,7 +48,7 @@ def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
             raise ConfigError(f"sensors.{name}.survey: name the tags.yaml that says where the tags are (docs/tags.md)")
         if isinstance(sensor.survey, str):
             read[name] = sensor.model_copy(update={"survey": load_survey(folder / sensor.survey)})
-    return config.model_copy(update={"sensors": {**config.sensors, **read}}) if read else config
+    return config.with_sensors(read)
 
 
 class Gathering:
