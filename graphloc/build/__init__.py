@@ -32,6 +32,7 @@ from graphloc.build._problem import (
     company_of,
     make_problem,
     mount_of,
+    slow_or_left_out,
     with_noise_scale,
 )
 from graphloc.build._thinned import Thinned, thinned
@@ -62,6 +63,7 @@ __all__ = [
     "nav_state",
     "slow_begin",
     "slow_end",
+    "slow_or_left_out",
     "slow_step",
     "solved_constants",
     "standing_cost",
