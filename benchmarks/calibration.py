@@ -48,7 +48,7 @@ PLANTED: dict[str, dict[str, float]] = {
 
 def changed(config: VesselConfig, sensor: str, **fields: Any) -> VesselConfig:
     block = config.sensors[sensor].model_copy(update=fields)
-    return config.model_copy(update={"sensors": {**config.sensors, sensor: block}})
+    return config.with_sensors({sensor: block})
 
 
 def moved(config: VesselConfig, sensor: str, lever_m: tuple[float, float], yaw_deg: float = 0.0) -> VesselConfig:

@@ -105,7 +105,7 @@ def _solve(
 def _smoothed(job: _Job) -> Solution | str:
     """Solve a run without some sensors; whatever that raises is a row that says why."""
     off = {name: job.config.sensors[name].model_copy(update={"enabled": False}) for name in job.without}
-    config = job.config.model_copy(update={"sensors": {**job.config.sensors, **off}})
+    config = job.config.with_sensors(off)
     try:
         return app.solve(job.recording, config, job.datum)
     except Exception as error:  # noqa: BLE001 - what is left may be anything; the other runs go on

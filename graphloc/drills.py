@@ -179,7 +179,7 @@ def _started_there(config: VesselConfig, recording: Recording, part: Window, tra
     if part.whole or told or not track.covers(at)[0]:
         return config
     heading_deg = float(heading_deg_from_yaw(track.at(at).yaw_rad)[0])
-    return config.model_copy(update={"start": config.start.model_copy(update={"heading_deg": heading_deg})})
+    return config.with_start_heading(heading_deg)
 
 
 def _tracks(job: _Job) -> Tracks:

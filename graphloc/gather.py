@@ -1,29 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
 """What takes more than a message to measure: sightings of tags (images and a survey), matches of scans (an image and a track).
 
-Each gives measurements that a recording gains, and a row of the ledger for whatever gave none.
+Matches are made around the track of a solved run, or scan by scan around the prediction of a smoother under way. Each gives measurements that a recording gains, and a row of the ledger for whatever gave none.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from graphloc.config import VesselConfig
 from graphloc.errors import ConfigError
 from graphloc.eval.match_picture import Gallery
 from graphloc.frames import Datum
 from graphloc.frontends._part import Bags
+from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial import match_bag
+from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn
+from graphloc.frontends.aerial.scans import ScanFeed
 from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_bag
 from graphloc.frontends.tags.sizes import size_factors
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import Measurement, TagSighting
+from graphloc.online import OnlineSmoother
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 from graphloc.survey import Survey, load_survey
+
+_BUSY = "not tried: the previous scan was still being matched"
+_REASONS = 8  # that are said, of those why something was refused
+_DOUBTFUL = 0.5  # share of the images with tags, above which those that a limit refuses are said
 
 
 def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
@@ -38,11 +48,7 @@ def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
             raise ConfigError(f"sensors.{name}.survey: name the tags.yaml that says where the tags are (docs/tags.md)")
         if isinstance(sensor.survey, str):
             read[name] = sensor.model_copy(update={"survey": load_survey(folder / sensor.survey)})
-    return config.model_copy(update={"sensors": {**config.sensors, **read}}) if read else config
-
-
-_REASONS = 8  # that are said, of those why something was refused
-_DOUBTFUL = 0.5  # share of the images with tags, above which those that a limit refuses are said
+    return config.with_sensors(read)
 
 
 class Gathering:
@@ -206,3 +212,84 @@ def _few_matches(sensor: str, reasons: Counter[str]) -> list[str]:
         return []
     ((most, count),) = reasons.most_common(1)
     return [f"{sensor}: {reasons.total()} scans gave no match, {count} of them: {most}; `graphloc match` shows one"]
+
+
+class LiveMatching:
+    """Scans of one aerial sensor, each matched as soon as the smoother has reached it.
+
+    With a `pool` the replay does not wait for a match: it comes when it is done, and scans that arrived meanwhile are not matched.
+    """
+
+    def __init__(
+        self, name: str, config: VesselConfig, scans: Scans, bag: Bag, gathering: Gathering, pool: Executor | None
+    ) -> None:
+        self._name, self._sensor, self._scans, self._pool = name, config.sensors[name], scans, pool
+        self._feed = ScanFeed(bag, self._sensor, config.body_frame)
+        self._turns = iter(self._feed)
+        self._matcher: LiveMatcher | None = None
+        self._gathering = gathering
+        self._next: Turn | None = next(self._turns, None)
+        self._underway: Future[Matched | Literal["wait"] | None] | None = None
+        gathering.sensor(
+            name, dict.fromkeys((lidar.topic for lidar in self._sensor.lidars.values()), f"read by {name}")
+        )
+
+    def due(self, smoother: OnlineSmoother, now_ns: int) -> Iterator[Measurement]:
+        """Yield the matches that are ready."""
+        if self._underway is not None and self._underway.done():
+            found, self._underway = self._underway.result(), None
+            if found == "wait":  # offered too early, and too late to be offered again
+                self._gathering.refuse(self._name, now_ns, "the scan ended after the newest pose")
+            elif found is not None:
+                yield from self._taken(found)
+        while self._next is not None and self._next.last_ns <= now_ns:
+            turn, window, datum = self._next, smoother.window(), smoother.datum
+            if window is None or datum is None or len(window) < 2:
+                self._refuse(turn, "there was no estimate to match around")
+                continue
+            if self._underway is not None:
+                self._refuse(turn, _BUSY)
+                continue
+            if self._matcher is None:
+                self._matcher = LiveMatcher(self._sensor, self._scans.folder, datum, self._feed.mounts)
+            if self._pool is not None:
+                self._underway, self._next = (
+                    self._pool.submit(self._matcher.offer, turn, window),
+                    next(self._turns, None),
+                )
+                return
+            found = self._matcher.offer(turn, window)
+            if found == "wait":
+                return
+            self._next = next(self._turns, None)
+            if found is not None:
+                yield from self._taken(found)
+
+    def end(self) -> Iterator[Measurement]:
+        """Yield the match in progress; the remaining scans are refused."""
+        if self._underway is not None:
+            found = self._underway.result()
+            if found is not None and found != "wait":
+                yield from self._taken(found)
+        while self._next is not None:
+            self._refuse(self._next, "the run ended before it could be matched")
+
+    def _refuse(self, turn: Turn, why: str) -> None:
+        self._gathering.refuse(self._name, turn.stamp_ns, turn.why_not or why)
+        self._next = next(self._turns, None)
+
+    def _taken(self, found: Matched) -> Iterator[Measurement]:
+        if found.match is not None and found.match.modes:
+            yield self._gathering.take(found.match.fix(found.stamp_ns, self._name, found.news, self._sensor.axes))
+        else:
+            self._gathering.refuse(self._name, found.stamp_ns, found.why_not)
+
+
+def with_busy_warning(recording: Recording, config: VesselConfig) -> Recording:
+    """Add a warning if many scans were skipped because the matcher was busy."""
+    busy = sum(row.reason == _BUSY for row in recording.rows)
+    scans = sum(row.reason == _BUSY or row.sensor in config.of_kind("aerial") for row in recording.rows)
+    if busy <= 0.2 * scans:
+        return recording
+    warning = f"the matcher did not keep up: {busy} scans were never tried"
+    return replace(recording, warnings=(*recording.warnings, warning))

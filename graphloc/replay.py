@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -22,9 +21,7 @@ from graphloc.estimate import Estimate, Event
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum
 from graphloc.frontends._source import Bag
-from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn
-from graphloc.frontends.aerial.scans import ScanFeed
-from graphloc.gather import Gathering, Scans
+from graphloc.gather import Gathering, LiveMatching, Scans, with_busy_warning
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement, TagSighting
 from graphloc.online import OnlineSmoother
@@ -35,9 +32,6 @@ from graphloc.trajectory import Trajectory
 
 Status = Callable[[float, float, Estimate | None, str], None]
 """Called with s of the run, its whole length, the newest estimate, and what the start waits for."""
-
-
-_BUSY = "not tried: the previous scan was still being matched"
 
 
 def silent(_at_s: float, _whole_s: float, _estimate: Estimate | None, _waiting: str) -> None:
@@ -93,77 +87,6 @@ def arrivals(recording: Recording, late_ns: Mapping[int, int] | None = None) -> 
     yield from reversed(made)
 
 
-class _Matching:
-    """Scans of one aerial sensor, each matched as soon as the smoother has reached it.
-
-    With a `pool` the replay does not wait for a match: it comes when it is done, and scans that arrived meanwhile are not matched.
-    """
-
-    def __init__(
-        self, name: str, config: VesselConfig, scans: Scans, bag: Bag, gathering: Gathering, pool: Executor | None
-    ) -> None:
-        self._name, self._sensor, self._scans, self._pool = name, config.sensors[name], scans, pool
-        self._feed = ScanFeed(bag, self._sensor, config.body_frame)
-        self._turns = iter(self._feed)
-        self._matcher: LiveMatcher | None = None
-        self._gathering = gathering
-        self._next: Turn | None = next(self._turns, None)
-        self._underway: Future[Matched | Literal["wait"] | None] | None = None
-        gathering.sensor(
-            name, dict.fromkeys((lidar.topic for lidar in self._sensor.lidars.values()), f"read by {name}")
-        )
-
-    def due(self, smoother: OnlineSmoother, now_ns: int) -> Iterator[Measurement]:
-        """Yield the matches that are ready."""
-        if self._underway is not None and self._underway.done():
-            found, self._underway = self._underway.result(), None
-            if found == "wait":  # offered too early, and too late to be offered again
-                self._gathering.refuse(self._name, now_ns, "the scan ended after the newest pose")
-            elif found is not None:
-                yield from self._taken(found)
-        while self._next is not None and self._next.last_ns <= now_ns:
-            turn, window, datum = self._next, smoother.window(), smoother.datum
-            if window is None or datum is None or len(window) < 2:
-                self._refuse(turn, "there was no estimate to match around")
-                continue
-            if self._underway is not None:
-                self._refuse(turn, _BUSY)
-                continue
-            if self._matcher is None:
-                self._matcher = LiveMatcher(self._sensor, self._scans.folder, datum, self._feed.mounts)
-            if self._pool is not None:
-                self._underway, self._next = (
-                    self._pool.submit(self._matcher.offer, turn, window),
-                    next(self._turns, None),
-                )
-                return
-            found = self._matcher.offer(turn, window)
-            if found == "wait":
-                return
-            self._next = next(self._turns, None)
-            if found is not None:
-                yield from self._taken(found)
-
-    def end(self) -> Iterator[Measurement]:
-        """Yield the match in progress; the remaining scans are refused."""
-        if self._underway is not None:
-            found = self._underway.result()
-            if found is not None and found != "wait":
-                yield from self._taken(found)
-        while self._next is not None:
-            self._refuse(self._next, "the run ended before it could be matched")
-
-    def _refuse(self, turn: Turn, why: str) -> None:
-        self._gathering.refuse(self._name, turn.stamp_ns, turn.why_not or why)
-        self._next = next(self._turns, None)
-
-    def _taken(self, found: Matched) -> Iterator[Measurement]:
-        if found.match is not None and found.match.modes:
-            yield self._gathering.take(found.match.fix(found.stamp_ns, self._name, found.news, self._sensor.axes))
-        else:
-            self._gathering.refuse(self._name, found.stamp_ns, found.why_not)
-
-
 class _Session:
     """A smoother that is fed a recording, and all that it returned.
 
@@ -184,7 +107,7 @@ class _Session:
         )
         self._length_s, self._begun_s, self._shown_s = (self.last_ns - self.first_ns) / 1e9, time.monotonic(), -1
 
-    def play(self, arriving: Iterator[Measurement], matchings: Sequence[_Matching], speed: float | None) -> None:
+    def play(self, arriving: Iterator[Measurement], matchings: Sequence[LiveMatching], speed: float | None) -> None:
         """Feed measurements, and matches of the scans as the IMU reaches them."""
         for m in arriving:
             if not isinstance(m, ImuSample):
@@ -263,7 +186,7 @@ def replay(
     with ExitStack() as stack:
         pool = None if speed is None else stack.enter_context(ThreadPoolExecutor(1))
         matchings = [
-            _Matching(name, config, scans, stack.enter_context(Bag(scans.bags)), gathering, pool)
+            LiveMatching(name, config, scans, stack.enter_context(Bag(scans.bags)), gathering, pool)
             for name in (config.of_kind("aerial") if scans is not None else ())
             if scans is not None
         ]
@@ -281,18 +204,8 @@ def replay(
     if not session.estimates:
         lost = recording.lost(config.of_kind("imu"))
         raise SolveError(f"{recording.source}: never started: still waiting for {waiting or 'IMU data'}{lost}")
-    recording = _with_busy_warning(gathering.recording(), config)
+    recording = with_busy_warning(gathering.recording(), config)
     return _result(session, recording, config, interrupted=interrupted)
-
-
-def _with_busy_warning(recording: Recording, config: VesselConfig) -> Recording:
-    """Add a warning if many scans were skipped because the matcher was busy."""
-    busy = sum(row.reason == _BUSY for row in recording.rows)
-    scans = sum(row.reason == _BUSY or row.sensor in config.of_kind("aerial") for row in recording.rows)
-    if busy <= 0.2 * scans:
-        return recording
-    warning = f"the matcher did not keep up: {busy} scans were never tried"
-    return replace(recording, warnings=(*recording.warnings, warning))
 
 
 def _result(session: _Session, recording: Recording, config: VesselConfig, *, interrupted: bool) -> Replayed:

@@ -199,7 +199,7 @@ def seen_frames(config: VesselConfig, recording: Recording) -> VesselConfig:
         name: sensor.model_copy(update={"survey": sensor.surveyed.of({f for s, f in seen if s == name})})
         for name, sensor in config.of_kind("apriltag").items()
     }
-    return config.model_copy(update={"sensors": {**config.sensors, **cut}})
+    return config.with_sensors(cut)
 
 
 def match_at(

@@ -10,7 +10,7 @@ whose Euler term GTSAM's preintegration leaves out. Every other mount is taken f
 solution is moved to the body's origin at the end (`graphloc.solve`).
 """
 
-from graphloc.build._attach import Carry, Judged, attach, constant_keys, nav_state, solved_constants, state_of
+from graphloc.build._attach import Carry, Judged, Sited, attach, constant_keys, nav_state, solved_constants, state_of
 from graphloc.build._chains import (
     CONSTANT_TAILS,
     JUMP,
@@ -32,6 +32,7 @@ from graphloc.build._problem import (
     company_of,
     make_problem,
     mount_of,
+    slow_or_left_out,
     with_noise_scale,
 )
 from graphloc.build._thinned import Thinned, thinned
@@ -46,6 +47,7 @@ __all__ = [
     "Mounts",
     "Past",
     "Problem",
+    "Sited",
     "StartPrior",
     "Stream",
     "Thinned",
@@ -61,6 +63,7 @@ __all__ = [
     "nav_state",
     "slow_begin",
     "slow_end",
+    "slow_or_left_out",
     "slow_step",
     "solved_constants",
     "standing_cost",

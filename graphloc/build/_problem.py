@@ -112,6 +112,16 @@ def company_of(config: VesselConfig, rows: Sequence[Sensor], seen: Container[str
     return sum(seen is None or name in seen for name in able)
 
 
+def slow_or_left_out(row: Sensor, config: SensorConfig, company: int) -> tuple[SlowProcess | None, SlowProcess | None]:
+    """Return a sensor's slow state, and the one that is left out instead, as nothing could tell it from motion: one of them, or none.
+
+    Args:
+        company: how many sensors can separate each other's slow errors from motion.
+    """
+    slow = row.slow(config)
+    return (None, slow) if slow is not None and slow.needs_company and company < 2 else (slow, None)
+
+
 def make_problem(
     recording: Recording,
     config: VesselConfig,
@@ -161,9 +171,7 @@ def make_problem(
             row = by_kind[sensor.kind]
             t, R_mount = mount_of(name, sensor, recording.mounts)
             mount = (t - t_body_imu, R_mount)
-            slow = row.slow(sensor)
-            left_out = slow if slow is not None and slow.needs_company and company < 2 else None
-            slow = slow if left_out is None else None
+            slow, left_out = slow_or_left_out(row, sensor, company)
             position_jumps = _NO_JUMPS
             if one_place and slow is None and row.absolute and row.false is None:
                 position_jumps = _position_jumps(row, by_sensor[name], datum, allowed_jump_m(left_out))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import combinations, product
 from typing import Annotated, Any
 
@@ -115,6 +116,14 @@ class VesselConfig(Block):
             if (a.kind, a.topic) == (b.kind, b.topic) and _read_the_same(a, b):
                 raise ValueError(f"sensors: {one} and {other} both read {a.topic}, which would count twice: delete one")
         return self
+
+    def with_sensors(self, changed: Mapping[str, Any]) -> VesselConfig:
+        """Return the configuration with some of its sensors replaced."""
+        return self.model_copy(update={"sensors": {**self.sensors, **changed}})
+
+    def with_start_heading(self, heading_deg: float | None) -> VesselConfig:
+        """Return the configuration of a run that starts with this heading, deg; None: with none that is configured."""
+        return self.model_copy(update={"start": self.start.model_copy(update={"heading_deg": heading_deg})})
 
     def of_kind(self, kind: str) -> dict[str, Any]:
         """Return the enabled sensors of a kind, by name."""

@@ -18,7 +18,7 @@ from graphloc.measurements import Measurement
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window, keys_of
-from graphloc.solve._decide import NEGLIGIBLE, Verdict
+from graphloc.solve._decide import NEGLIGIBLE, Verdict, residuals_at
 from graphloc.solve._ledger import row_of
 
 _CHANGED = 0.1  # change of a weight from which its factors are replaced
@@ -126,8 +126,7 @@ class Entries:
 
     def residuals_at(self, stream: LiveStream, index: int) -> tuple[Attachment, tuple[Residual, ...]]:
         """Return the attachment of a measurement at the present estimate, and its residuals there, one per mode."""
-        at = attach(self._problem, stream, index, self._window.values)
-        return at, stream.row.residuals(stream.measurements[index], stream.config, at)
+        return residuals_at(self._problem, stream, index, self._window.values)
 
     # In the graph
 

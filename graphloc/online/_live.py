@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 import gtsam
 import numpy as np
 
-from graphloc.build import Carry, company_of, mount_of, state_of, without_drift
+from graphloc.build import Carry, company_of, mount_of, slow_or_left_out, state_of, without_drift
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, Sensor, SlowProcess
@@ -255,17 +255,15 @@ def live_problem(
         if name not in asked:
             continue
         row = by_kind[block.kind]
-        slow = row.slow(block)
-        left_out = slow if slow is not None and slow.needs_company and company < 2 else None
+        slow, left_out = slow_or_left_out(row, block, company)
         t_sensor, R_sensor = mount_of(name, block, mounts)
         mount = gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t)
         detector = jump_detectors.setdefault(name, JumpDetector())
-        kept = slow if left_out is None else None
         if left_out is not None and (detector.jumps or name in slow_known):
-            kept = without_drift(left_out)
-        scatter = Scatter(jumps=kept is not None and kept.jumps)
+            slow = without_drift(left_out)
+        scatter = Scatter(jumps=slow is not None and slow.jumps)
         streams[name] = LiveStream(
-            number, name, row, block, kept, left_out, row.constants(block), mount, scatter=scatter,
+            number, name, row, block, slow, left_out, row.constants(block), mount, scatter=scatter,
             jump_detector=detector, jumps=detector.jumps,
         )  # fmt: skip
     return LiveProblem(

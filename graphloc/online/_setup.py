@@ -79,5 +79,4 @@ class Setup:
 
     def without_start_heading(self) -> Setup:
         """Return the same for a later start: the configured heading is that of the first start alone."""
-        start = self.config.start.model_copy(update={"heading_deg": None})
-        return replace(self, config=self.config.model_copy(update={"start": start}))
+        return replace(self, config=self.config.with_start_heading(None))

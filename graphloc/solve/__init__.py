@@ -52,9 +52,7 @@ def smooth(
     """
 
     def solve(part: Recording, heading_deg: float | None) -> Solution:
-        begun = config
-        if heading_deg is not None:
-            begun = config.model_copy(update={"start": config.start.model_copy(update={"heading_deg": heading_deg})})
+        begun = config if heading_deg is None else config.with_start_heading(heading_deg)
         problem = make_problem(part, begun, datum, rows, inertial)
         result = solve_batch(problem, progress)
         solution = make_solution(problem, part, result)

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from graphloc import keys
-from graphloc.build import Decisions, Judged, Problem, Stream, attach
+from graphloc.build import Decisions, Judged, Problem, Sited, Stream, attach
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
@@ -113,11 +113,8 @@ def weigh(
         indices = [i for i in stream.between(first, last) if only is None or (stream.number, i) in only]
         if not indices:
             continue
-        attached = [attach(problem, stream, i, values) for i in indices]
-        residuals = [
-            stream.row.residuals(stream.measurements[i], stream.config, at)
-            for i, at in zip(indices, attached, strict=True)
-        ]
+        met = [residuals_at(problem, stream, i, values) for i in indices]
+        attached, residuals = [at for at, _ in met], [found for _, found in met]
         if several and hypotheses:
             predictions = [
                 _predicted(r, at, int(stream.state[i]), covariance)
@@ -130,9 +127,10 @@ def weigh(
     return verdicts
 
 
-def _residuals_at(
-    problem: Problem, stream: Stream, i: int, values: gtsam.Values
+def residuals_at(
+    problem: Sited, stream: Judged, i: int, values: gtsam.Values
 ) -> tuple[Attachment, tuple[Residual, ...]]:
+    """Return the attachment of a measurement at the present estimate, and its residuals there, one per mode."""
     at = attach(problem, stream, i, values)
     return at, stream.row.residuals(stream.measurements[i], stream.config, at)
 
@@ -223,7 +221,7 @@ def log_evidence(problem: Problem, values: gtsam.Values, first: int, last: int) 
     for stream in problem.streams:
         if stream.row.false is not None:
             indices = stream.between(first, last)
-            residuals = [_residuals_at(problem, stream, i, values)[1] for i in indices]
+            residuals = [residuals_at(problem, stream, i, values)[1] for i in indices]
             total += log_evidence_of(stream, indices, residuals)
     return total
 
@@ -234,7 +232,7 @@ def along_best_chains(problem: Problem, values: gtsam.Values, verdicts: Verdicts
     for stream in problem.streams:
         if stream.row.false is None:
             continue
-        met = [_residuals_at(problem, stream, i, values) for i in range(len(stream.measurements))]
+        met = [residuals_at(problem, stream, i, values) for i in range(len(stream.measurements))]
         for i, mode in enumerate(best_chain(stream, range(len(met)), [residuals for _, residuals in met])):
             at, residuals = met[i]
             chosen = 0 if mode is None else mode
