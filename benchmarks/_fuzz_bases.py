@@ -28,7 +28,7 @@ _LATEST_NS = {"mcap": 2**64 - 1, "sqlite3": 2**63 - 1, "ros1": 2**32 * 10**9 - 1
 COMPRESSIONS = {"mcap": ("", "storage"), "sqlite3": ("", "message", "file"), "ros1": ("", "bz2", "lz4")}
 _FEW = {"imu_hz": "25", "gnss_hz": "2", "compass_hz": "2"}
 _LIDAR, _POINTS = "/lidar_1/points", 3000
-_CLOUD, _TF = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
+_CLOUD = "sensor_msgs/msg/PointCloud2"
 
 
 @dataclass(frozen=True, slots=True)

@@ -179,7 +179,7 @@ def solve(run: SimulatedRun, recording: Recording, config: VesselConfig, job: Jo
     then = _at_the_time(recording, config)
     near_ns = _seen_as_far_as_he(run, config, seen, job[1])
     his = tuple(m for m in whole.measurements if not isinstance(m, TagSighting) or m.stamp_ns >= near_ns)
-    kf = digerud.run_digerud(replace(whole, measurements=his), config, datum)
+    kf = digerud.run_digerud(replace(whole, measurements=his), config)
     honest = ekf.run_honest(whole, config, datum).trajectory
     at_end = track.stamps_ns[picked] > track.stamps_ns[-1] - 5_000_000_000
     there_ekf = honest.at(np.clip(track.stamps_ns[picked], honest.stamps_ns[0], honest.stamps_ns[-1]))

@@ -34,7 +34,7 @@ from graphloc.config import VesselConfig
 from graphloc.eval.docking import END_S, LOST_M
 from graphloc.eval.ekf import FilterResult, filter_row
 from graphloc.eval.metrics import errors
-from graphloc.frames import Array, Datum
+from graphloc.frames import Array
 from graphloc.ledger import Ledger, Outcome
 from graphloc.measurements import TagSighting
 from graphloc.recording import Recording
@@ -65,7 +65,7 @@ class DigerudConfig:
 
 
 def run_digerud(
-    recording: Recording, config: VesselConfig, datum: Datum, options: DigerudConfig | None = None
+    recording: Recording, config: VesselConfig, options: DigerudConfig | None = None
 ) -> FilterResult | None:
     """Run the filter; None if its tag was sighted less than twice, which does not make a track.
 
@@ -76,7 +76,6 @@ def run_digerud(
     Args:
         recording: sightings of enabled sensors are used; those of other tags get rows in the ledger.
         config: which sensors are enabled.
-        datum: not used, since tags are surveyed in world; for the same signature as other filters.
         options: None: as printed.
     """
     o = options or DigerudConfig()

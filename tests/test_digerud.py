@@ -13,13 +13,12 @@ from graphloc.config import AprilTagConfig, VesselConfig
 from graphloc.eval import digerud
 from graphloc.eval.digerud import DigerudConfig, losses, run_digerud, single_tag_pose
 from graphloc.eval.ekf import FilterResult
-from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frames import Array
 from graphloc.ledger import Ledger, Outcome
 from graphloc.measurements import TagMode, TagSighting
 from graphloc.recording import Recording
 from graphloc.trajectory import Trajectory
 
-DATUM = Datum(Geodetic(63.4, 10.4, 0.0))
 HALF_M = 0.206
 SQUARE = HALF_M * np.array([(-1.0, 0.0, 1.0), (1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (-1.0, 0.0, -1.0)])  # faces south
 HIS = ("36h11", 227)
@@ -68,7 +67,7 @@ def run(
 ) -> FilterResult | None:
     config = VesselConfig(sensors={"tags": AprilTagConfig(enabled=enabled)})
     recording = Recording(source="(test)", imu=None, measurements=tuple(sightings), truth=truth)
-    return run_digerud(recording, config, DATUM, options)
+    return run_digerud(recording, config, options)
 
 
 def ran(

@@ -117,10 +117,10 @@ def _measured(recording: Recording, solution: Solution) -> Iterator[Points]:
             name=f"{sensor} by weight", x=p[:, 0], y=p[:, 1], weight=weight[some], text=[hover(items[k].row) for k in some],
             shape=_SHAPES[kind], size={GnssPosition: 4.0, TagSighting: 5.0}.get(kind, 7.0),
         )  # fmt: skip
-    yield from _tags(solution, recording)
+    yield from _tags(recording)
 
 
-def _tags(solution: Solution, recording: Recording) -> Iterator[Points]:
+def _tags(recording: Recording) -> Iterator[Points]:
     """Return the positions of the tags that were seen, docks at rest."""
     seen: dict[tuple[str, int], tuple[Array, str]] = {}
     for m in recording.measurements:

@@ -129,7 +129,6 @@ class Way:
     length_m: float
     heading: CubicSpline
     start_m: tuple[float, float]
-    track_m: Array
 
     @staticmethod
     def through(waypoints_m: Array) -> Way:
@@ -141,7 +140,7 @@ class Way:
         length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(track, axis=0).T))])
         tangent = curve(along, 1)
         heading = CubicSpline(length, np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])))
-        return Way(float(length[-1]), heading, (float(track[0, 0]), float(track[0, 1])), track)
+        return Way(float(length[-1]), heading, (float(track[0, 0]), float(track[0, 1])))
 
 
 def make_way_motion(

@@ -83,7 +83,7 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
         shore_m=shore,
         to_land_rad=to_land,
         shore_share=_lines(shore, 2.0 * _NEAR_M)[1],
-        water_m=_free_water(shore, to_land, p[~dry]),
+        water_m=_free_water(shore, p[~dry]),
     )
 
 
@@ -143,7 +143,7 @@ def _first_returns(p: Array, origin: Array, low_limit: float) -> tuple[Array, Ar
     return d[first], np.arctan2(ray[:, 1], ray[:, 0])
 
 
-def _free_water(shore: Array, to_land: Array, wet: Array) -> Array:
+def _free_water(shore: Array, wet: Array) -> Array:
     """Return points of water: returns from it, and points between the vessel and the first object."""
     between = [shore * s for s in (0.3, 0.5, 0.7)]
     return np.vstack([wet[:, :2], *[b[np.hypot(*b.T) > 8.0] for b in between]])

@@ -129,7 +129,7 @@ def _filters(
 ) -> tuple[ekf.FilterResult, ...]:
     progress("filters", 0, 1)
     filters = ekf.run_all(recording, config, datum)
-    his = run_digerud(recording, config, datum)
+    his = run_digerud(recording, config)
     filters += (his,) if his is not None else ()
     progress("filters", 1, 1)
     return filters

@@ -176,7 +176,7 @@ def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> A
         dv_world_mps=dv,
         gyro_radps=stream.gyro_radps[i] - problem.R_body_imu @ bias.gyroscope(),
         lever_m=np.asarray(stream.mount.translation()),
-        slow_value=None if slow_key is None else np.atleast_1d(values.atVector(slow_key)),
+        slow_value=None if slow_key is None else values.atVector(slow_key),
         datum=problem.datum,
         slow_next=None if slow_key is None else _next_slow(problem, stream, j, stream.measurements[i].stamp_ns, values),
         slow_age_s=max(int(stream.measurements[i].stamp_ns) - int(problem.timeline.slow_stamps_ns[j]), 0) * 1e-9,
@@ -199,7 +199,7 @@ def _next_slow(
         return None
     apart = int(stamps[j + 1] - stamps[j])
     share = min(max((stamp_ns - int(stamps[j])) / apart, 0.0), 1.0)
-    return key, np.atleast_1d(values.atVector(key)), share, apart * 1e-9
+    return key, values.atVector(key), share, apart * 1e-9
 
 
 def constants_of(stream: Attaching, values: gtsam.Values) -> tuple[tuple[int, Array], ...]:
@@ -207,7 +207,7 @@ def constants_of(stream: Attaching, values: gtsam.Values) -> tuple[tuple[int, Ar
     if not stream.constants:
         return ()
     return tuple(
-        (key, np.atleast_1d(values.atVector(key)) if values.exists(key) else np.zeros(len(constant.sigma)))
+        (key, values.atVector(key) if values.exists(key) else np.zeros(len(constant.sigma)))
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True)
     )
 
@@ -216,7 +216,7 @@ def solved_constants(stream: Attaching, values: gtsam.Values) -> Iterator[tuple[
     """Yield the constants of a sensor that some factor has, and their values (k,)."""
     for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
         if values.exists(key):
-            yield constant, np.atleast_1d(values.atVector(key))
+            yield constant, values.atVector(key)
 
 
 def constant_keys(stream: Attaching) -> list[int]:

@@ -233,7 +233,7 @@ def _add_slow_chain(
         if (given := prior.slow.get(stream.number)) is not None:
             graph.add(gtsam.PriorFactorVector(key[0], given[0], gtsam.noiseModel.Gaussian.Covariance(given[1])))
         else:
-            for factor in slow_begin(slow, key[0], np.atleast_1d(values.atVector(key[0])), jumps=jumps):
+            for factor in slow_begin(slow, key[0], values.atVector(key[0]), jumps=jumps):
                 graph.add(factor)
     leaps_m = _jumps_m(problem, stream)
     for n, j in enumerate(nodes[:-1]):

@@ -135,7 +135,7 @@ class Anchor:
         A, b = past.factors.linearize(values).jacobian(order)
         Q, R = np.linalg.qr(A)
         root = np.linalg.solve(R, np.eye(len(R)))
-        vectors = {name: np.atleast_1d(values.atVector(key)) for name, key in [*slow.items(), *constants.items()]}
+        vectors = {name: values.atVector(key) for name, key in [*slow.items(), *constants.items()]}
         bias = values.atConstantBias(keys.bias(j))
         return cls.of_joint(
             int(problem.timeline.stamps_ns[k]),
@@ -180,7 +180,7 @@ class Anchor:
                 for n, (part, step) in enumerate(zip(_PARTS, steps, strict=True)):
                     H[n] = np.asfortranarray(-gain[:, part] @ step)
                 H[len(_PARTS)] = np.asfortranarray(whiten)
-            return np.asarray(whiten @ (np.atleast_1d(values.atVector(other)) - known.value) - gain @ off)
+            return np.asarray(whiten @ (values.atVector(other) - known.value) - gain @ off)
 
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(known.value)), [*state, key], error)
 

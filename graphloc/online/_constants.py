@@ -66,7 +66,7 @@ class Constants:
     def remember(self, now_s: float) -> None:
         """Remember the constants that the next commit marginalises."""
         for key in self._window.leaving([key for _, key in self._keys()], now_s):
-            value = np.atleast_1d(self._window.values.atVector(key))
+            value = self._window.values.atVector(key)
             self._known[key] = ConditionalGaussian.independent(value, self._window.covariance([key]))
 
     def seen(self) -> dict[Number, int]:

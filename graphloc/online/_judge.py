@@ -9,7 +9,6 @@ judged as a sequence, as the batch solver does, and new ones against the predict
 from __future__ import annotations
 
 import heapq
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count
 
@@ -28,7 +27,7 @@ from graphloc.online._receiver_checks import ReceiverChecks
 from graphloc.online._states import States
 from graphloc.online._window import Window
 from graphloc.solve._best_chain import best_chain
-from graphloc.solve._decide import AGREES, Verdict, by_hypotheses
+from graphloc.solve._decide import AGREES, Verdict, believing, by_hypotheses
 from graphloc.solve._hypotheses import log_evidence_of
 
 _REJUDGE_AGES_S = (1.0, 4.0)  # ages at which a measurement with a kernel is judged again
@@ -88,7 +87,7 @@ class Judge:
             self._agreement.note(stream, m, None)
             raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
         if self.receivers.frozen(stream, m, at, residuals[0]):
-            self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
+            self._entries.add(Entry(stream, i, Verdict.false(residuals[0], at)))
         elif stream.row.false is None:
             verdict, widened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
             # Behind a widened kernel it is used, but whether it agrees shows only when it is judged again.
@@ -98,7 +97,7 @@ class Judge:
             self._entries.add(entry)
             self._schedule(self._problem.timeline.seconds(m.stamp_ns) + _REJUDGE_AGES_S[0], entry)
         else:
-            self._entries.add(Entry(stream, i, Verdict(None, 0.0, 1.0, residuals[0], 0, at)))
+            self._entries.add(Entry(stream, i, Verdict.false(residuals[0], at)))
             self._rounds[stream.name] = _ROUNDS
 
     def judge(self) -> None:
@@ -240,7 +239,7 @@ class Judge:
                 continue
             self._tried[name] = tried
             moved = True
-            self._try(stream, own, _believing(chain, found, attached))
+            self._try(stream, own, believing(chain, found, attached))
         unsure, self._unsure = self._unsure, set()
         for name in sorted(unsure):
             moved |= self._weigh_choices(self._problem.streams[name])
@@ -276,7 +275,7 @@ class Judge:
                 return tried > 0
             self._chosen[stream.name] = chosen
             self._others.pop(stream.name, None)  # it belonged to the estimate before the trial
-            self._try(stream, own, _believing(best, found, attached))
+            self._try(stream, own, believing(best, found, attached))
         return True
 
     def _try(self, stream: LiveStream, own: list[Entry], others: list[Verdict]) -> None:
@@ -305,15 +304,3 @@ class Judge:
         """Return minus the log probability of the window, marginalised over all hypotheses of a stream."""
         evidence = log_evidence_of(stream, [e.index for e in own], self._attach(own)[1])
         return self._window.error([e.held for e in own if e.held is not None]) - evidence
-
-
-def _believing(
-    modes: Sequence[int | None], found: list[tuple[Residual, ...]], attached: list[Attachment]
-) -> list[Verdict]:
-    """Return the verdicts that believe exactly these modes."""
-    return [
-        Verdict(
-            None if mode is None else Decision(mode=mode), float(mode is not None), 1.0, r[mode or 0], mode or 0, at
-        )
-        for mode, r, at in zip(modes, found, attached, strict=True)
-    ]

@@ -189,7 +189,7 @@ class States:
             if stream.slow is None:
                 continue
             key, following = (keys.slow(stream.number, n) for n in (j, j + 1))
-            window.guess(following, np.atleast_1d(window.values.atVector(key)), t)
+            window.guess(following, window.values.atVector(key), t)
             stamps_ns = self._problem.timeline.slow_stamps_ns
             jump_m = stream.jump_m(stamps_ns[j], stamps_ns[j + 1])
             window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m))
@@ -265,7 +265,7 @@ class States:
         newest, window = keys.pose(self._problem.timeline.last), self._window
         poses = list(dict.fromkeys([newest, *(at.pose_key for at in attached)]))
         slow = list(dict.fromkeys(at.slow_key for at in attached if at.slow_key is not None))
-        width = len(np.atleast_1d(window.values.atVector(slow[0]))) if slow else 0
+        width = len(window.values.atVector(slow[0])) if slow else 0
         first = {key: 6 * n for n, key in enumerate(poses)}
         first |= {key: 6 * len(poses) + width * n for n, key in enumerate(slow)}
         ends = np.cumsum([3, *(len(r.raw) for r in residuals)])
@@ -293,7 +293,7 @@ class States:
         constants = self._constants.seen()
         every = [*core, *slow.values(), *constants.values()]
         joint = window.covariance(every)
-        vectors = [np.atleast_1d(window.values.atVector(key)) for key in every[3:]]
+        vectors = [window.values.atVector(key) for key in every[3:]]
         mean = np.concatenate([np.zeros(15), *vectors])
         ends = np.cumsum([15, *map(len, vectors)])
         for name, value, first in zip(slow, vectors, ends, strict=False):

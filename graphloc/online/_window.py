@@ -223,7 +223,7 @@ class Window:
         """
         try:
             if len(keys) == 1:
-                cov = np.atleast_2d(self._solver.marginalCovariance(keys[0]))
+                cov = self._solver.marginalCovariance(keys[0])
             else:
                 cov = np.asarray(self._solver.jointMarginalCovariance(list(keys)).fullMatrix())
         except (RuntimeError, IndexError, ValueError) as error:

@@ -88,7 +88,7 @@ def align(problem: Problem) -> Start:
             f"check the topics, the status and the stamps with `graphloc inspect`{problem.silent}"
         )
     still = _standstill(problem, track, yaws)
-    bias, bias_sigma, notes = _gyro_bias(problem, origin, window, still, yaws)
+    bias, bias_sigma, notes = _gyro_bias(problem, window, still, yaws)
     early = {name: rows for name, rows in yaws.items() if rows[0, 0] * bias_sigma[2] < _CARRIED_RAD}
     moved_s = _moved_at(track)
     if early or (moved_s is not None and moved_s < min((rows[0, 0] for rows in yaws.values()), default=np.inf)):
@@ -217,7 +217,7 @@ def _slope(t: Array, y: Array) -> float:
 
 
 def _gyro_bias(
-    problem: Problem, origin: int, window: float, still: tuple[float, float] | None, yaws: dict[str, Array]
+    problem: Problem, window: float, still: tuple[float, float] | None, yaws: dict[str, Array]
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Bias (3,) in body axes and its sigma (3,), rad/s: of each axis from standstill or from motion, whichever tells it better."""
     prior = problem.links.bias_sigmas()[3:]

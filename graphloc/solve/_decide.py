@@ -9,7 +9,7 @@ reject the right measurements.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -60,6 +60,11 @@ class Verdict:
     mode: int
     at: Attachment
     settled: int = 0
+
+    @classmethod
+    def false(cls, residual: Residual, at: Attachment) -> Verdict:
+        """Return the verdict that a measurement is false, or not judged yet: it is left out."""
+        return cls(None, 0.0, 1.0, residual, 0, at)
 
     @property
     def expected_cost(self) -> float:
@@ -233,12 +238,20 @@ def along_best_chains(problem: Problem, values: gtsam.Values, verdicts: Verdicts
         if stream.row.false is None:
             continue
         met = [residuals_at(problem, stream, i, values) for i in range(len(stream.measurements))]
-        for i, mode in enumerate(best_chain(stream, range(len(met)), [residuals for _, residuals in met])):
-            at, residuals = met[i]
-            chosen = 0 if mode is None else mode
-            kept = None if mode is None else Decision(mode=mode)
-            changed[(stream.number, i)] = Verdict(kept, float(mode is not None), 1.0, residuals[chosen], chosen, at)
+        attached, residuals = [at for at, _ in met], [found for _, found in met]
+        chain = best_chain(stream, range(len(met)), residuals)
+        changed |= {(stream.number, i): v for i, v in enumerate(believing(chain, residuals, attached))}
     return changed
+
+
+def believing(
+    modes: Sequence[int | None], residuals: Sequence[tuple[Residual, ...]], attached: Sequence[Attachment]
+) -> list[Verdict]:
+    """Return the verdicts on N measurements that believe exactly these modes; None: the measurement is false."""
+    return [
+        Verdict.false(found[0], at) if mode is None else Verdict(Decision(mode=mode), 1.0, 1.0, found[mode], mode, at)
+        for mode, found, at in zip(modes, residuals, attached, strict=True)
+    ]
 
 
 def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> Decisions:
@@ -248,5 +261,5 @@ def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> D
 
 def predicted_covariance(tree: Any) -> PredictedCovariance:
     """Return (state, key) -> covariance of the key's value, from a Bayes tree."""
-    of_key = cache(lambda key: np.atleast_2d(tree.marginalCovariance(key)))
+    of_key = cache(lambda key: tree.marginalCovariance(key))
     return lambda _state, key: of_key(key)

@@ -70,7 +70,7 @@ def _told_otherwise(problem: Problem, verdicts: Verdicts) -> bool:
 def _path(problem: Problem, values: gtsam.Values, stream: Stream) -> Array:
     """Return the slow error (N, 3) at the nodes, m."""
     nodes = range(len(problem.timeline.slow_stamps_ns))
-    return np.array([np.atleast_1d(values.atVector(keys.slow(stream.number, j))) for j in nodes])
+    return np.array([values.atVector(keys.slow(stream.number, j)) for j in nodes])
 
 
 def _levels(slow: SlowProcess | None, path: Array) -> list[Array]:
@@ -103,5 +103,5 @@ def _moved(problem: Problem, values: gtsam.Values, streams: list[Stream], by_m: 
     for stream in streams:
         for j in range(len(problem.timeline.slow_stamps_ns)):
             key = keys.slow(stream.number, j)
-            moved.update(key, np.atleast_1d(values.atVector(key)) + by_m)
+            moved.update(key, values.atVector(key) + by_m)
     return moved

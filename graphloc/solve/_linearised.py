@@ -112,7 +112,7 @@ def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: 
     if stream.slow is None:
         return replace(at, constants=constants, slow_key=None, slow_value=None, slow_next=None)
     key = keys.slow(stream.number, int(problem.timeline.slow_of[stream.state[i]]))
-    return replace(at, constants=constants, slow_key=key, slow_value=np.atleast_1d(values.atVector(key)))
+    return replace(at, constants=constants, slow_key=key, slow_value=values.atVector(key))
 
 
 def _jumps(problem: Problem, held: list[Any]) -> list[int]:

@@ -159,7 +159,7 @@ def _moved(problem: Problem, result: BatchResult, stream: Stream, berth: Berth, 
         return np.zeros((len(stamps), 4))
     at = problem.timeline.slow_stamps_ns
     nodes = [keys.slow(stream.number, j) for j in range(len(at))]
-    held = np.array([np.atleast_1d(result.values.atVector(key))[berth.moves + _IN_PLANE] for key in nodes])
+    held = np.array([result.values.atVector(key)[berth.moves + _IN_PLANE] for key in nodes])
     return np.column_stack([np.interp(stamps, at, column) for column in held.T])
 
 
@@ -181,8 +181,8 @@ def _slow(problem: Problem, stream: Stream, result: BatchResult) -> SlowEstimate
     process = stream.slow
     assert process is not None
     name = [keys.slow(stream.number, j) for j in range(len(problem.timeline.slow_stamps_ns))]
-    value = np.array([np.atleast_1d(result.values.atVector(key)) for key in name])
-    sigma = np.array([np.sqrt(np.diagonal(np.atleast_2d(result.tree.marginalCovariance(key)))) for key in name])
+    value = np.array([result.values.atVector(key) for key in name])
+    sigma = np.array([np.sqrt(np.diagonal(result.tree.marginalCovariance(key))) for key in name])
     return SlowEstimate(
         name=process.name,
         axes=process.axes,

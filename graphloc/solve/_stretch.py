@@ -117,7 +117,7 @@ def update_states(problem: Problem, values: gtsam.Values, new: gtsam.Values, fir
     values.update(new.extract(state_keys(problem, first, last)))
     for key in _constants(problem):
         if new.exists(key):
-            values.insert_or_assign(key, np.atleast_1d(new.atVector(key)))
+            values.insert_or_assign(key, new.atVector(key))
 
 
 def copy_states(problem: Problem, values: gtsam.Values, first: int, last: int) -> gtsam.Values:
@@ -131,9 +131,7 @@ def _constants(problem: Problem) -> list[int]:
 
 
 def slow_at(problem: Problem, values: gtsam.Values, j: int) -> dict[int, Array]:
-    return {
-        s.number: np.atleast_1d(values.atVector(keys.slow(s.number, j))) for s in problem.streams if s.slow is not None
-    }
+    return {s.number: values.atVector(keys.slow(s.number, j)) for s in problem.streams if s.slow is not None}
 
 
 def fill_slow(problem: Problem, values: gtsam.Values, j: int, bias: Any, slow: dict[int, Array]) -> None:

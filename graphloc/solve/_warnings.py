@@ -81,7 +81,7 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     slow = stream.slow
     if slow is None:
         return 0.0, ""
-    value = np.atleast_1d(result.values.atVector(keys.slow(stream.number, 0)))
+    value = result.values.atVector(keys.slow(stream.number, 0))
     far = np.where(slow.constant, np.abs(value) / slow.sigma, 0.0)
     k = int(np.argmax(far))
     where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
