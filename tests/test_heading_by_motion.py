@@ -7,20 +7,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphloc import app
-from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
+from graphloc import app, keys
+from graphloc.build import make_problem
+from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig
 from graphloc.estimate import Event
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
-from graphloc.measurements import CompassHeading, GnssPosition, ImuSample
+from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, ImuSample
 from graphloc.online import OnlineSmoother, _smoother
 from graphloc.online import _start as online_start
 from graphloc.online._heading_check import HeadingCheck
-from graphloc.recording import Recording
+from graphloc.recording import Recording, quiet
 from graphloc.replay import arrivals
 from graphloc.solution import Solution
 from graphloc.solve import _start
+from graphloc.solve._align import align
+from graphloc.solve._start import solve_start
 from tests.slowly import with_few_states
 
 IMU_HZ, ACCEL_NOISE, GYRO_NOISE, FIX_M = 25.0, 0.05, 0.003, 0.3  # noise densities: m/s^2, rad/s per sqrt(Hz)
@@ -267,3 +270,32 @@ def test_a_leg_takes_no_guess_as_known() -> None:
     assert any("solved in 3 overlapping legs" in line for line in (*solved.stats.events, *solved.stats.warnings))
     assert solved.trajectory.cov is not None
     assert np.degrees(np.sqrt(solved.trajectory.cov[:, 5, 5])).min() > 15.0
+
+
+def test_a_long_first_window_is_not_dead_reckoned_at_once() -> None:
+    """Ninety seconds of dead reckoning are kilometres off, and velocities five times a second keep it there (drawn vessel 436)."""
+    run = simulate(
+        Scenario(path="entry", duration_s=95.0, imu_hz=50.0, gnss_hz=0.5, compass_hz=0.0, pose_hz=0.0, noise="clean"), 1
+    )
+    truth, rng, step_ns = run.truth, np.random.default_rng(1), 200_000_000
+    at_ns = np.arange(truth.stamps_ns[0] + step_ns, truth.stamps_ns[-1] - step_ns, step_ns)
+    moved = truth.at(at_ns + step_ns // 2).p_world_m - truth.at(at_ns - step_ns // 2).p_world_m
+    v_world_mps = moved / 0.2 + rng.normal(0.0, 0.1, moved.shape)
+    velocities = [
+        GnssVelocity(stamp_ns=int(ns), sensor="velocity", seq=-1, v_world_mps=v, cov_m2ps2=np.eye(3) * 0.01)
+        for ns, v in zip(at_ns, v_world_mps, strict=True)
+    ]
+    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    measurements = tuple(sorted([*fixes, *velocities], key=lambda m: m.stamp_ns))
+    velocity = VelocityConfig(topic="/velocity", mount=run.config.sensors["gnss"].mount)
+    sensors = {n: run.config.sensors[n] for n in ("imu", "gnss", "height")} | {"velocity": velocity}
+    config = with_few_states(run.config.model_copy(update={"sensors": sensors}))
+    datum = app.choose_datum(run.recording, config)
+    recording = app.with_synthetic(replace(run.recording, measurements=measurements), config, datum)
+    problem = make_problem(recording, config, datum, SENSORS, INERTIAL)
+    begun = solve_start(problem, replace(align(problem), window_s=90.0, yaws_rad=(0.0,), by_motion=False), quiet)
+    stamps_ns = problem.timeline.stamps_ns[: begun.last + 1]
+    assert (stamps_ns[-1] - stamps_ns[0]) * 1e-9 > 85.0
+    found = np.array([begun.values.atPose3(keys.pose(k)).translation() for k in range(begun.last + 1)])
+    off_m = np.hypot(*(found - truth.at(stamps_ns).p_world_m)[:, :2].T)
+    assert off_m.max() < 4.0

@@ -28,6 +28,7 @@ from graphloc.solve._stretch import copy_states, dead_reckon, fill_slow, solve_s
 
 # Starts that cost this much more (log-likelihood) are dropped; while several remain, the window grows.
 _COST_APART, _LONGEST_S, _LONGEST_UNTOLD_S = 8.0, 60.0, 600.0
+_STEP_NS = 15_000_000_000  # most that a candidate is dead-reckoned before it is solved again
 _PLACE_S, _LATE_PLACE_S = 5.0, 90.0  # of positions in the first window; latest time of the first one
 # Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
 _STAGES = (("far", 8, 0.5, False), ("open", 2, 0.5, False), ("final", 2, 0.5, True))
@@ -65,8 +66,7 @@ def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
         for n, candidate in enumerate(candidates):
             progress("start", n, len(candidates))
             try:
-                dead_reckon(problem, candidate.values, known, until)
-                iterations += _solve_candidate(problem, candidate, until)
+                iterations += _extend(problem, candidate, known, until)
             except SolveError as caught:
                 failure = caught
                 continue
@@ -196,6 +196,19 @@ def _held(problem: Problem, start: Start, best: _Candidate, last: int, at: int, 
     except SolveError:
         candidate.cost = np.inf
     return candidate
+
+
+def _extend(problem: Problem, candidate: _Candidate, known: int, until: int) -> int:
+    """Take a candidate from state `known` to `until`, in place, a step at a time; return the iterations.
+
+    Dead-reckoned at once over a minute, with biases not known yet, it would be kilometres off, where nothing leads back.
+    """
+    stamps, iterations = problem.timeline.stamps_ns, 0
+    while known < until:
+        start, known = known, min(max(problem.timeline.floor(int(stamps[known]) + _STEP_NS), known + 1), until)
+        dead_reckon(problem, candidate.values, start, known)
+        iterations += _solve_candidate(problem, candidate, known)
+    return iterations
 
 
 def _solve_candidate(
