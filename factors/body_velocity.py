@@ -120,4 +120,5 @@ ROW = Sensor(
     hint=hint,
     slow=slow,
     company=True,
+    along_body=True,
 )

@@ -254,6 +254,7 @@ class Sensor:
         absolute: whether it says something about position (for health).
         company: whether it can tell another sensor's slow error from motion.
         in_world: whether it is given in world coordinates, so that the datum must be known.
+        along_body: whether it measures motion along the body's axes: with positions, that tells the heading.
         apart_ns: measurements of a sensor that follow the one before within less tell nothing new, and are left out.
     """
 
@@ -274,6 +275,7 @@ class Sensor:
     absolute: bool = False
     company: bool = False
     in_world: bool = False
+    along_body: bool = False
     apart_ns: int = 0
 
 

@@ -9,15 +9,16 @@ import pytest
 
 from graphloc import app, keys
 from graphloc.build import make_problem
-from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig
+from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig
 from graphloc.estimate import Event
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
-from graphloc.frames import Array, Geodetic, wrap_angle
-from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, ImuSample
+from graphloc.frames import Array, Geodetic, heading_deg_from_yaw, wrap_angle
+from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSample
 from graphloc.online import OnlineSmoother, _smoother
 from graphloc.online import _start as online_start
-from graphloc.online._heading_check import HeadingCheck
+from graphloc.online._heading_check import Fit, HeadingCheck
+from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.recording import Recording, quiet
 from graphloc.replay import arrivals
 from graphloc.solution import Solution
@@ -198,7 +199,7 @@ def test_online_a_guess_goes_on_where_the_motion_contradicts_it(monkeypatch: pyt
 
     Nor by the gyroscope's bias as estimated, with which any heading fits: it followed the guess.
     """
-    monkeypatch.setattr(HeadingCheck, "_off", lambda *of: (np.radians(90.0) * (not of[-1].any()), 0.05))
+    monkeypatch.setattr(HeadingCheck, "_fit", lambda *of: Fit(np.exp(-0.5j * np.pi * (not of[-1].any())), 0.05))
     recording, config, _, _ = robot(1, 60.0)
     solved = app.replay_recording(recording, config).solution
     assert not any("the motion confirms the heading" in line for line in solved.stats.events)
@@ -260,6 +261,55 @@ def test_online_tries_with_a_measured_heading_disturb_no_estimate(fails: bool, m
 
 def failing(*_: object) -> None:
     raise RuntimeError("the system is indeterminate")
+
+
+def with_start_heading(config: VesselConfig, yaw: Array) -> VesselConfig:
+    """`start.heading_deg`, 8 deg off, with few states."""
+    return with_few_states(config.with_start_heading(float(heading_deg_from_yaw(yaw[0] + np.radians(8.0)))))
+
+
+@pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
+def test_a_configured_heading_is_carried_by_a_gyroscope_of_unknown_bias(online: bool) -> None:
+    """Straight on for a minute: stated to 25 deg, it was 90 deg off."""
+    recording, config, t, yaw = robot(3, 60.0)
+    solve = app.replay_recording if online else app.smooth_recording
+    solved = solve(recording, with_start_heading(config, yaw)).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert np.abs(error).max() > 60.0  # or there is nothing to state
+    assert (np.abs(error) < 2.5 * sigma).all()
+    assert np.abs(error[0]) < 2.5 * sigma[0] < 60.0
+
+
+def test_online_speed_along_the_body_measures_the_heading() -> None:
+    """With positions: a car that drives straight on knows it, whatever its gyroscope does."""
+    recording, config, t, yaw = robot(3, 60.0)
+    assert recording.imu is not None
+    speeds = [
+        BodyVelocity(
+            stamp_ns=int(recording.imu.stamps_ns[k]), sensor="wheel", seq=3 * 10**6 + k, axes=("x", "y"),
+            value=np.array([1.0, 0.0]), cov=np.eye(2) * 0.05**2,
+        )
+        for k in range(0, len(t), 5)
+    ]  # fmt: skip
+    wheel = BodyVelocityConfig.model_validate({"topic": "/wheel", "axes": ["x", "y"]})
+    config = config.model_copy(update={"sensors": {**config.sensors, "wheel": wheel}})
+    measurements = tuple(sorted([*recording.measurements, *speeds], key=lambda m: m.stamp_ns))
+    recording = replace(recording, measurements=measurements)
+    solved = app.replay_recording(recording, with_start_heading(config, yaw)).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert (np.abs(error) < 3.0 * sigma).all()
+    assert sigma[-1] < 10.0
+    assert not any("guess" in line for line in (*solved.stats.events, *solved.health_reason))
+
+
+def test_an_unmeasured_heading_goes_off_by_the_gyroscope_until_the_motion_tells_it() -> None:
+    told = UnmeasuredHeading(why="only told", since_ns=0, sigma_rad=0.1, drift_radps=0.02)
+    assert np.sqrt(told.var(5 * 10**9)) == pytest.approx(np.hypot(0.1, 0.1))
+    assert np.sqrt(told.var(10**12)) == pytest.approx(np.pi / np.sqrt(3.0))
+    assert [told.doubt(s * 10**9) for s in (5, 30)] == ["", "only told"]
+    moved = told.narrowed(30 * 10**9, 0.2)
+    assert np.sqrt(moved.var(40 * 10**9)) == pytest.approx(np.hypot(0.2, 0.2))
+    assert told.narrowed(5 * 10**9, np.inf) is told.narrowed(5 * 10**9, 0.2) is told  # it was known better
 
 
 def test_a_leg_takes_no_guess_as_known() -> None:

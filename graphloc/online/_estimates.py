@@ -14,7 +14,6 @@ from graphloc.online._odometry import Odometry
 from graphloc.online._propagate import Propagated
 from graphloc.online._unmodelled import UnmodelledError
 from graphloc.solve._covariances import (
-    ANY_HEADING_RAD,
     limit_heading,
     unmodelled_covariance,
     widen_heading,
@@ -32,7 +31,7 @@ def estimate_of(
     absolute: Sequence[str],
     doubt: str,
     heading_off_rad: float,
-    guess: bool,
+    heading_var: float,
     unmodelled: UnmodelledError | None,
 ) -> Estimate:
     """Return the estimate at a state of the window, or propagated beyond it.
@@ -42,7 +41,7 @@ def estimate_of(
         doubt: why the health cannot be good, or empty.
         unmodelled: what slow errors that are left out do to the newest state; the covariances then include it.
         heading_off_rad: by how much the motion shows the heading to be off; the covariance then includes it.
-        guess: whether the heading is a guess: the window's own covariance is then too sure (see `solve._start`), and it may be any.
+        heading_var: of the heading, rad^2, where no sensor measures it and the window's own covariance is too sure; else 0.
     """
     newest, problem = lag.newest, lag.problem
     at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
@@ -57,8 +56,7 @@ def estimate_of(
     others_m, others_cov = lag.others
     cov[:3, :3] += others_cov
     cov[5, 5] += heading_off_rad**2
-    if guess:
-        widen_heading(cov, ANY_HEADING_RAD**2)
+    widen_heading(cov, heading_var)
     limit_heading(cov)
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
     health, reason = health_of(cov, since, doubt)

@@ -35,6 +35,7 @@ _LONGEST_STEP_S = 1.0  # of the IMU; in a longer gap the accelerations are unkno
 _TURNED_RAD, _KNOWN_DEG = np.radians(20.0), 20.0  # reported from this error on, where the 95 % bound is smaller
 _SIGMAS = 3.0  # and from so many sigmas of the check itself on
 _SIZE, _SURE = (0.7, 1.4), 0.2  # |rho| is near 1 unless fixes jump; largest sigma of rho
+_LIKELY = 2.5  # sigmas of rho: so far from 0, and no farther from 1, it says something of the heading
 _APART_S = 1.0  # correlation time of the errors of fixes, at least
 _FEWEST = 15  # fixes
 _ENDS = slice(2, -2)  # fixes at which a jump would show
@@ -52,6 +53,13 @@ class _Step(NamedTuple):
     dR: Array
 
 
+class Fit(NamedTuple):
+    """rho and its sigma."""
+
+    rho: complex
+    sigma: float
+
+
 class _Fix(NamedTuple):
     """A fix: place (2,) in world and its sigma, m."""
 
@@ -66,10 +74,11 @@ class HeadingCheck:
     Attributes:
         said: what is wrong with the heading, in plain words; empty where nothing is known to be.
         off_rad: by how much it is off, as far as that is known; 0 while nothing is said.
+        within_rad: 1 sigma of the heading by the last check alone, its error included; infinite where that told nothing.
     """
 
     def __init__(self) -> None:
-        self.said, self.off_rad = "", 0.0
+        self.said, self.off_rad, self.within_rad = "", 0.0, np.inf
         self._steps: deque[_Step] = deque()
         self._fixes: deque[_Fix] = deque()
         self._sensor = ""
@@ -78,6 +87,7 @@ class HeadingCheck:
     def begin(self) -> None:
         """Forget what earlier checks found right: the estimate starts anew."""
         self._right = self._fits = 0
+        self.within_rad = np.inf
 
     @property
     def confirmed(self) -> bool:
@@ -105,18 +115,20 @@ class HeadingCheck:
         self._carry_on(lag, newest)
         if not self._steps or newest.stamp_ns - self._looked_ns < _EVERY_S * 1e9:
             return False
-        self._looked_ns = newest.stamp_ns
+        self._looked_ns, self.within_rad = newest.stamp_ns, np.inf
         if self._sensor not in lag.problem.streams:
             return False
-        found = self._off(lag, newest, np.zeros(3))
+        # Not with the estimated bias, which a guess has bent until it fits.
+        fit = self._fit(lag, newest, np.zeros(3))
+        self.within_rad = _within_rad(fit)
+        found = _off(fit)
         if found is None:
             self._wrong = 0
             return False
-        # Not with the estimated bias, which a guess has bent until it fits.
         self._fits = self._fits + 1 if abs(found[0]) <= _TURNED_RAD else 0
         if _turned(*found):
             up = newest.pose.rotation().matrix()[2]
-            told = self._off(lag, newest, up * float(up @ lag.problem.R_body_imu @ newest.bias.gyroscope()))
+            told = _off(self._fit(lag, newest, up * float(up @ lag.problem.R_body_imu @ newest.bias.gyroscope())))
             found = told if told is not None and not _turned(*told) else found
         known = (
             float(
@@ -161,8 +173,8 @@ class HeadingCheck:
         while self._fixes and self._fixes[0].stamp_ns < begin_ns:
             self._fixes.popleft()
 
-    def _off(self, lag: Lag, newest: Newest, drift_radps: Array) -> tuple[float, float] | None:
-        """Return the error of the heading by the motion and its sigma (rad); None where the motion does not show it.
+    def _fit(self, lag: Lag, newest: Newest, drift_radps: Array) -> Fit | None:
+        """Return how the fixes follow the accelerations; None where there are too few.
 
         Args:
             drift_radps: (3,) gyroscope bias to take off, body axes.
@@ -188,9 +200,7 @@ class HeadingCheck:
         information = terms.conj().T @ terms / variance + np.diag([0.0, *(1.0 / _BIASES**2)])
         rho = complex(np.linalg.solve(information, terms.conj().T @ moved / variance)[0])
         sigma = float(np.sqrt(np.linalg.inv(information)[0, 0].real))
-        if not _SIZE[0] < abs(rho) < _SIZE[1] or sigma > _SURE:
-            return None
-        return -float(np.angle(rho)), sigma
+        return Fit(rho, sigma)
 
     def _felt(self, lag: Lag, newest: Newest, drift_radps: Array) -> tuple[Array, Array]:
         """Return times (N,), s, relative to the newest state, and s, x2 and x3 (3, N), complex, in world."""
@@ -209,6 +219,20 @@ class HeadingCheck:
         twice = np.cumsum(np.cumsum(x) * dt)
         at_s = (np.array([step.until_ns for step in self._steps]) - newest.stamp_ns) * 1e-9
         return at_s, np.array([place, twice, np.cumsum(twice * dt)])
+
+
+def _off(fit: Fit | None) -> tuple[float, float] | None:
+    """Return the error of the heading and its sigma (rad); None where the motion does not show it well."""
+    if fit is None or not _SIZE[0] < abs(fit.rho) < _SIZE[1] or fit.sigma > _SURE:
+        return None
+    return -float(np.angle(fit.rho)), fit.sigma
+
+
+def _within_rad(fit: Fit | None) -> float:
+    """Return 1 sigma of the heading by a fit alone, its error included; infinite where it tells nothing."""
+    if fit is None or not _LIKELY * fit.sigma < abs(fit.rho) < 1.0 + max(_SIZE[1] - 1.0, _LIKELY * fit.sigma):
+        return np.inf
+    return float(np.hypot(np.angle(fit.rho), fit.sigma / abs(fit.rho)))
 
 
 def _turned(off_rad: float, sigma_rad: float) -> bool:

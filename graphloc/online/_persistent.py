@@ -14,6 +14,7 @@ from graphloc.online._motion_model import MotionModel
 from graphloc.online._noise import ImuNoise
 from graphloc.online._odometry import Odometry
 from graphloc.online._snapshot import Snapshot
+from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import UnmodelledError
 from graphloc.position_jumps import JumpDetector
 
@@ -26,7 +27,7 @@ class PersistentState:
         datum: origin of world; None before it is known.
         noise: by how much the IMU noise is scaled up.
         heights_m: configured heights (m, up in world), by the name of the sensor that measures them.
-        doubt: why the heading is a guess; empty where it is none.
+        heading: where no sensor measures it, how far it may be off; None: one does, or the motion has confirmed it.
         agreed_ns: stamp at which each absolute sensor last agreed, as known when the last window ended.
         odometry: the `odom` frame; None before the first start.
         motion_model: motion model. heading_check: whether the heading fits the motion.
@@ -38,7 +39,7 @@ class PersistentState:
     datum: Datum | None
     noise: ImuNoise
     heights_m: Mapping[str, float] = field(default_factory=dict)
-    doubt: str = ""
+    heading: UnmeasuredHeading | None = None
     agreed_ns: dict[str, int] = field(default_factory=dict)
     odometry: Odometry | None = None
     motion_model: MotionModel = field(default_factory=MotionModel)
@@ -59,7 +60,7 @@ class PersistentState:
             datum=found.datum,
             noise=noise,
             heights_m={name: height_m for name, height_m in found.heights_m.items() if name in sensors},
-            doubt=found.doubt,
+            heading=found.heading,
             agreed_ns=dict(found.agreed_ns),
             odometry=Odometry(found.anchor.stamp_ns, found.p_odom_m, found.R_odom_body),
         )
@@ -80,7 +81,7 @@ class PersistentState:
             heights_m=self.heights_m,
             agreed_ns={**self.agreed_ns, **agreed_ns},
             noise_scale=self.noise.scale,
-            doubt=self.doubt,
+            heading=self.heading,
             p_odom_m=self.odometry.p_m,
             R_odom_body=self.odometry.R,
             unmodelled=None if self.unmodelled is None else self.unmodelled.cov,

@@ -239,7 +239,7 @@ class OnlineSmoother:
             if lost_s := tracking.lag.lost_s:
                 why = f"for {lost_s:.0f} s no absolute sensor agreed, unless its error had jumped"
                 return self._start_over(tracking, until_ns - duration_ns(_AGAIN_S), why)
-            if self._persistent.doubt and (started := self._start_with_heading(tracking, until_ns)):
+            if (started := self._start_with_heading(tracking, until_ns)) is not None:
                 why = "sensors measure the heading, which was a guess"
                 return self._start_over(tracking, tracking.lag.first_ns, why, started)
             if jumped := tracking.lag.unmodelled_jumps:
@@ -323,7 +323,7 @@ class OnlineSmoother:
         persistent = self._persistent
         self._setup = self._setup.without_start_heading()
         persistent.datum, persistent.heights_m = started.datum, started.heights_m
-        persistent.doubt = started.doubt
+        persistent.heading = started.heading
         persistent.noise.scale = max(persistent.noise.scale, started.noise_scale)
         persistent.heading_check.begin()
         for sample in samples:
@@ -338,8 +338,6 @@ class OnlineSmoother:
         newest_ns = tracking.lag.newest.stamp_ns
         persistent.noise.begin(newest_ns)
         self._say(f"started at {utc_text(newest_ns)}: {'; '.join(started.notes)}", warns=False)
-        if started.doubt:
-            self._events.append(Event(started.doubt, heading_guessed=True))
         for stream in tracking.lag.problem.streams.values():
             for said in slow_error_warning(stream.name, stream.left_out):
                 self._say(said)
@@ -358,13 +356,14 @@ class OnlineSmoother:
 
         Corrected in the window, a wrong guess leaves wrong biases and velocities behind, and with them a wrong heading.
         """
-        if now_ns - self._tried_ns < duration_ns(LEAST_S) or not tracking.heading_measured():
+        guessed = self._persistent.heading is not None and self._persistent.heading.doubt(now_ns)
+        if not guessed or now_ns - self._tried_ns < duration_ns(LEAST_S) or not tracking.heading_measured():
             return None
         self._tried_ns = now_ns
         came = tracking.since(tracking.lag.first_ns)
         samples = [m for m in came if isinstance(m, ImuSample)]
         started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns)
-        return None if isinstance(started, str) or started.doubt else started
+        return None if isinstance(started, str) or started.heading else started
 
     def _start_over(
         self, tracking: Tracking, since_ns: int, why: str, started: Started | None = None

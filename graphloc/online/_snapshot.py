@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,10 @@ from graphloc.errors import in_one_line
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
+from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.solve._batch import LARGEST_NOISE_SCALE
 
-_VERSION = 4
+_VERSION = 5
 _EVERY_S = 2.0
 
 
@@ -28,7 +29,7 @@ class Snapshot:
         vessel: its name. anchor: the newest state. imu: the sample at it or before.
         datum: origin of world. heights_m: configured heights (m, up in world), by sensor.
         agreed_ns: stamp at which each absolute sensor last agreed. noise_scale: factor on the IMU noise.
-        doubt: why the heading is a guess, or empty.
+        heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
         unmodelled: covariance of `UnmodelledError`; None where no slow error is left out.
     """
@@ -40,7 +41,7 @@ class Snapshot:
     heights_m: Mapping[str, float]
     agreed_ns: Mapping[str, int]
     noise_scale: float
-    doubt: str
+    heading: UnmeasuredHeading | None
     p_odom_m: Array
     R_odom_body: Array
     unmodelled: Array | None
@@ -59,7 +60,7 @@ class Snapshot:
             "imu": [self.imu.stamp_ns, *self.imu.accel_mps2.tolist(), *self.imu.gyro_radps.tolist()],
             "heights_m": dict(self.heights_m),
             "noise_scale": self.noise_scale,
-            "doubt": self.doubt,
+            "heading": None if self.heading is None else asdict(self.heading),
             "agreed_ns": dict(self.agreed_ns),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
             "unmodelled": None if self.unmodelled is None else self.unmodelled.tolist(),
@@ -86,6 +87,7 @@ class Snapshot:
         scale = float(raw["noise_scale"])
         datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
         unmodelled = None if raw["unmodelled"] is None else np.array(raw["unmodelled"], dtype=np.float64)
+        heading = None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"])
         numbers = np.concatenate(
             [
                 p,
@@ -106,7 +108,7 @@ class Snapshot:
             heights_m=heights_m,
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
             noise_scale=float(np.clip(scale, 1.0, LARGEST_NOISE_SCALE)),
-            doubt=str(raw["doubt"]),
+            heading=heading,
             p_odom_m=p,
             R_odom_body=R,
             unmodelled=unmodelled,

@@ -22,6 +22,7 @@ from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._setup import Setup
+from graphloc.online._unmeasured_heading import DOUBTFUL_RAD, UnmeasuredHeading
 from graphloc.recording import Recording
 from graphloc.solve._align import MOVED_M
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult, solve_batch
@@ -33,7 +34,6 @@ from graphloc.solve._unmodelled import Unmodelled, unmodelled
 from graphloc.time import duration_ns
 
 LEAST_S = 5.0  # of IMU data: gives gyro bias, roll and pitch of a vessel in waves
-_HEADING_RAD = np.radians(15.0)  # 1 sigma: from a larger error the window does not recover soon
 _LONGEST_WAIT_S = 30.0  # for a heading from travel alone, or an IMU that fits; then a position with a doubtful heading is better than none
 _DOUBTFUL = 0.1  # probability of being false, above which several must agree; tags and poses lie below
 # Number and share that must agree, and for how long that is waited for: two false matches of five may agree with each other.
@@ -52,7 +52,8 @@ class Started:
         pose, velocity, bias: of that state, as solved: at the IMU with the body's axes, in world: gtsam.Pose3, (3,), m/s,
             (6,), accelerometer first.
         heights_m: configured heights (m, up in world), by sensor.
-        doubt: why the heading is a guess, or empty. noise_scale: factor on the IMU noise.
+        heading: where no sensor measures it, how far it may be off; None: one does, or the motion told it.
+        noise_scale: factor on the IMU noise.
         unmodelled: what slow errors that are left out did to that state; None: nothing that is known.
         notes: what the alignment was based on. rows: ledger rows of what was measured before the first state.
     """
@@ -63,7 +64,7 @@ class Started:
     velocity: Array
     bias: Array
     heights_m: Mapping[str, float]
-    doubt: str
+    heading: UnmeasuredHeading | None
     noise_scale: float
     unmodelled: Unmodelled | None
     notes: tuple[str, ...]
@@ -133,14 +134,19 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
     R = result.values.atPose3(last).rotation().matrix()
     linear_var = world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]
     sigma = min(float(np.sqrt(max(linear_var, result.heading_var[-1]))), ANY_HEADING_RAD)
-    doubt = ""
-    if result.headings > 1 or sigma > _HEADING_RAD:
+    heading, last_ns = None, int(problem.timeline.stamps_ns[-1])
+    drift_radps = _vertical_bias_sigma(problem.R_body_imu, result)
+    if config.start.heading_deg is not None and not _measured(setup, recording, datum):
+        why = "the heading is a guess: only `start.heading_deg` told it, and the gyroscope has carried it since"
+        heading = UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=sigma, drift_radps=drift_radps)
+    elif result.headings > 1 or sigma > DOUBTFUL_RAD:
         found = f"the motion so far tells it to {np.degrees(sigma):.0f} deg (1 sigma)"
         if result.headings > 1:
             found += f", {result.headings} candidates explain it"
         if span_s < _LONGEST_WAIT_S:
             return f"a heading: {found}; turn, add a heading sensor or set `start.heading_deg`"
-        doubt = f"the heading is a guess: {found}"
+        why = f"the heading is a guess: {found}"
+        heading = UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=ANY_HEADING_RAD, drift_radps=drift_radps)
     heights = {
         name: origin.height_m(recording, config, sensor.height_m, datum)
         for row in rows
@@ -161,12 +167,24 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         velocity=np.asarray(result.values.atVector(keys.velocity(k))),
         bias=result.values.atConstantBias(keys.bias(int(result.problem.timeline.slow_of[k]))).vector(),
         heights_m=heights,
-        doubt=doubt,
+        heading=heading,
         noise_scale=result.noise_scale,
         unmodelled=_unmodelled(result, k),
         notes=result.notes,
         rows=tuple(before),
     )
+
+
+def _measured(setup: Setup, recording: Recording, datum: Datum) -> bool:
+    """Whether sensors measure the heading: by themselves, or along the body's axes, beside positions."""
+    along_body = any(setup.config.of_kind(row.kind) for row in setup.rows if row.along_body)
+    return along_body or any(np.isfinite(setup.hint(m, datum).yaw_rad) for m in recording.measurements)
+
+
+def _vertical_bias_sigma(R_body_imu: Array, result: BatchResult) -> float:
+    """Return what is known of the gyroscope's bias about the vertical before the motion, 1 sigma, rad/s."""
+    up = R_body_imu[2]
+    return float(np.sqrt(up @ result.prior.bias_cov[3:, 3:] @ up))
 
 
 def _unmodelled(result: BatchResult, k: int) -> Unmodelled | None:

@@ -35,7 +35,7 @@ from graphloc.trajectory import Trajectory
 log = logging.getLogger(__name__)
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _PENDING = 10_000  # measurements that may wait for the IMU
-_HEADINGS = 3  # measurements of the heading that end a guess
+_HEADINGS, _KEPT_HEADINGS = 3, 1000  # measurements of the heading that end a guess; that are remembered
 _FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
 _NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
 
@@ -76,6 +76,8 @@ class Tracking:
             place = np.asarray(pose.transformFrom(-self.lag.problem.t_body_imu_m))
             persistent.odometry = Odometry(anchor.stamp_ns, place, pose.rotation().matrix())
         self._odometry = persistent.odometry
+        self._guessed = False  # whether an event said that the heading is a guess
+        self._headed_ns: deque[int] = deque(maxlen=_KEPT_HEADINGS)  # stamps of measurements of it, while none was known
 
     def _built(
         self,
@@ -109,6 +111,8 @@ class Tracking:
         """Keep a measurement of the window until the IMU has reached its stamp."""
         insort(self._pending, m, key=lambda p: p.stamp_ns)
         self._recent.keep(m)
+        if self._persistent.heading is not None and np.isfinite(self._setup.hint(m, self.lag.problem.datum).yaw_rad):
+            self._headed_ns.append(m.stamp_ns)
         if len(self._pending) > _PENDING:
             self._ledger.drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
 
@@ -240,7 +244,9 @@ class Tracking:
         if stamp_ns is not None and stamp_ns > newest.stamp_ns:
             self._read_imu()
             now = propagate(lag.problem, newest, self._odometry, stamp_ns)
-        doubts = (persistent.heading_check.said, persistent.doubt, lag.in_doubt(now.stamp_ns))
+        heading = persistent.heading
+        guess, heading_var = (heading.doubt(now.stamp_ns), heading.var(now.stamp_ns)) if heading else ("", 0.0)
+        doubts = (persistent.heading_check.said, guess, lag.in_doubt(now.stamp_ns))
         return estimate_of(
             now,
             lag,
@@ -249,14 +255,13 @@ class Tracking:
             absolute=self._setup.absolute,
             doubt="; ".join(doubt for doubt in doubts if doubt),
             heading_off_rad=persistent.heading_check.off_rad,
-            guess=bool(persistent.doubt),
+            heading_var=heading_var,
             unmodelled=persistent.unmodelled,
         )
 
     def heading_measured(self) -> bool:
         """Return whether sensors have measured the heading in the window, for as long as a start takes."""
-        datum = self.lag.problem.datum
-        told_ns = [m.stamp_ns for m in self._recent.others() if np.isfinite(self._setup.hint(m, datum).yaw_rad)]
+        told_ns = [at_ns for at_ns in self._headed_ns if at_ns >= self.lag.first_ns]
         return len(told_ns) >= _HEADINGS and self.lag.newest.stamp_ns - min(told_ns) >= duration_ns(LEAST_S)
 
     def since(self, stamp_ns: int) -> list[Measurement]:
@@ -277,14 +282,26 @@ class Tracking:
         """Return what the newest state newly shows: a wrong heading, frozen receivers, position jumps, noise."""
         check = self._persistent.heading_check
         heading = [Event(check.said)] if check.look(self.lag) else []
-        if self._persistent.doubt and check.confirmed:
-            self._persistent.doubt = ""
-            heading.append(Event("the motion confirms the heading: it is no guess any more", warns=False))
+        heading += self._heading_news()
         was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now
         frozen = [Event(f"{name}: {_FROZEN}") for name in sorted(now - was)]
         thawed = [Event(f"{name}: {_NO_LONGER_FROZEN}", warns=False) for name in sorted(was - now)]
         return [*heading, *frozen, *thawed, *map(Event, [*self.lag.jump_warnings(), *self.lag.noisier_warnings()])]
+
+    def _heading_news(self) -> list[Event]:
+        """Follow a heading that no sensor measures; return that it is a guess by now, or is none any more."""
+        known, at_ns, check = self._persistent.heading, self.lag.newest.stamp_ns, self._persistent.heading_check
+        if known is None:
+            return []
+        self._persistent.heading = known = known.narrowed(at_ns, check.within_rad)
+        why, said = known.doubt(at_ns), self._guessed
+        if check.confirmed or (not why and self.heading_measured()):
+            self._persistent.heading, self._guessed = None, False
+            confirmed = Event("the motion confirms the heading: it is no guess any more", warns=False)
+            return [confirmed] if said and check.confirmed else []
+        self._guessed = said or bool(why)
+        return [Event(why, heading_guessed=True)] if why and not said else []
 
     def snapshot(self, newest: ImuSample) -> Snapshot:
         """Return the last anchor and all that is needed to go on from it; `newest`: sample of the IMU."""

@@ -41,6 +41,7 @@ class Start:
     Attributes:
         R_level_body: (3, 3) attitude with yaw 0. tilt_sigma_rad: of roll and pitch, where there is no `level`.
         yaws_rad: candidates. yaw_sigma_rad: of each (wide where it is a guess). by_motion: no sensor tells the heading, the motion may.
+        tried: the candidates are only tried, and no information.
         p_world_m, p_sigma_m, v_world_mps, v_sigma_mps: (3,) each.
         gyro_bias_radps, gyro_bias_sigma_radps: (3,) in IMU axes.
         window_s: span over which the candidates must be distinguished.
@@ -53,6 +54,7 @@ class Start:
     yaws_rad: tuple[float, ...]
     yaw_sigma_rad: float
     by_motion: bool
+    tried: bool
     p_world_m: Array
     p_sigma_m: Array
     v_world_mps: Array
@@ -104,7 +106,8 @@ def align(problem: Problem) -> Start:
         level=level,
         yaws_rad=heading[0],
         yaw_sigma_rad=heading[1],
-        by_motion=problem.config.start.heading_deg is None and not yaws and moved_s is not None,
+        by_motion=not yaws and moved_s is not None,
+        tried=not yaws and problem.config.start.heading_deg is None,
         p_world_m=p0,
         p_sigma_m=p_sigma,
         v_world_mps=v0,

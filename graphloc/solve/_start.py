@@ -77,7 +77,7 @@ def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
         candidates = _different(alive)
         told_apart, last_window = len(candidates) == 1, seconds >= longest_s or until == len(problem.timeline) - 1
         if start.by_motion:
-            for candidate in candidates:
+            for candidate in candidates if start.tried else ():
                 # A prior about a heading that was only tried is no information: the candidates may go where the motion takes them.
                 candidate.prior = _start_prior(problem, start, _yaw(candidate.values, 0))
             told_apart = told_apart and _told(problem, start, candidates[0], until)
@@ -189,8 +189,8 @@ def _held(problem: Problem, start: Start, best: _Candidate, last: int, at: int, 
     cov = np.eye(6) * _FREE**2
     cov[:3, :3] = R.T @ np.diag([_FREE, _FREE, _HELD_RAD]) ** 2 @ R
     held = gtsam.PriorFactorPose3(keys.pose(at), middle, gtsam.noiseModel.Gaussian.Covariance(cov))
-    prior = _start_prior(problem, replace(start, yaw_sigma_rad=_FREE), _yaw(values, 0))
-    candidate = _Candidate(values, prior)
+    free = _start_prior(problem, replace(start, yaw_sigma_rad=_FREE), _yaw(values, 0))
+    candidate = _Candidate(values, free if start.tried else best.prior)
     try:
         _solve_candidate(problem, candidate, last, held)
     except SolveError:
