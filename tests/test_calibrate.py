@@ -13,17 +13,18 @@ from graphloc import app
 from graphloc.config import BodyVelocityConfig, ImuConfig, VelocityConfig, VesselConfig
 from graphloc.eval.calibrate import PROBE, Calibration, Check, Suggestion, _check
 from graphloc.eval.calibrate._evidence import Estimate, Evidence
-from graphloc.eval.calibrate._imu import density, imu_noise
+from graphloc.eval.calibrate._imu import imu_noise
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frontends._assess import Turning
 from graphloc.frontends._time_offsets import heading_time_offset
 from graphloc.frontends.bag import read_recording
+from graphloc.imu_scatter import noise_density
 from graphloc.measurements import GnssVelocity, ImuSeries
 from graphloc.offsets import Misfit, Offset, Offsets, joined
 from graphloc.solve import smooth
+from graphloc.solve._imu_noise import imu_misfit
 from graphloc.solve._linearised import Rows, normal_solver
-from graphloc.solve._offsets import _imu_misfit
 from tests.bagfactory import Messages
 from tests.slowly import simulate_slowly
 from tests.test_inspect import drive, look
@@ -243,7 +244,7 @@ def test_imu_noise_that_is_configured_too_large_is_seen(times: float, needed: fl
         J=J, b=b, states=n + 1, starts=np.arange(2), stamps_ns=np.zeros(len(b), dtype=np.int64), made={}, kernels=[]
     )  # fmt: skip
     solve = normal_solver(J)
-    found = _imu_misfit(rows, np.ones(len(b)), b, (J, b - J @ solve(J.T @ b), solve))
+    found = imu_misfit(rows, np.ones(len(b)), b, (J, b - J @ solve(J.T @ b), solve))
     for misfit, share in zip(found, (3, 6), strict=True):
         assert misfit.freedom == pytest.approx(share * n, rel=0.01)
         assert misfit.needed == pytest.approx(needed, rel=0.2 if times > 1.0 else 1e-9)
@@ -288,11 +289,11 @@ def white(sigma: float, n: int = 20_000, step: float = 0.0) -> ImuSeries:
 
 def test_density_of_samples() -> None:
     imu = white(0.05)
-    value, sigma = density(imu.stamps_ns, imu.accel_mps2)
+    value, sigma = noise_density(imu.stamps_ns, imu.accel_mps2)
     assert value == pytest.approx(0.005, rel=0.05)
     assert abs(value - 0.005) < 4.0 * sigma
     coarse = white(1e-6, step=0.1)  # what rounding scatters: step / sqrt(12)
-    value, _ = density(coarse.stamps_ns, coarse.accel_mps2)
+    value, _ = noise_density(coarse.stamps_ns, coarse.accel_mps2)
     assert value >= 0.1 / np.sqrt(12.0) / 10.0 * 0.99
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors that are noisier than they state: that is not the IMU's fault."""
+"""Sensors that are noisier than they state: that is not the IMU's fault, unless they are its own samples."""
 
+import re
 from dataclasses import replace
 
 import gtsam
@@ -9,10 +10,12 @@ import pytest
 
 from graphloc import app, keys
 from graphloc.build import make_problem
+from graphloc.config import VesselConfig
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import wrap_angle
+from graphloc.imu_scatter import noise_density
 from graphloc.measurements import CompassHeading, Measurement, PoseFix
 from graphloc.replay import replay
 from graphloc.solve._align import align
@@ -105,3 +108,52 @@ def test_while_far_off_fixes_keep_their_weight_and_matches_weigh_as_they_scatter
     assert set(weights["gnss"]) == {1.0}
     assert weights["matcher"]
     assert max(weights["matcher"]) < 1e-3
+
+
+def shaken(seed: int) -> SimulatedRun:
+    """Half a minute of BL's case 1 with good matches and a noisy IMU."""
+    scenario = replace(
+        bl_scenario(1, "drift", false_fraction=0.0), duration_s=30.0, pose_hz=4.0, pose_sigma_m=0.05,
+        accel_noise_ug_per_sqrt_hz=2000.0, gyro_noise_mdps_per_sqrt_hz=40.0,
+    )  # fmt: skip
+    return slowly(simulate(scenario, seed))
+
+
+def by_data_sheet(run: SimulatedRun, **changed: object) -> VesselConfig:
+    """The noise of the IMU's data sheet, which knows no engine."""
+    quiet = {"accel_noise_ug_per_sqrt_hz": 60.0, "gyro_noise_mdps_per_sqrt_hz": 4.0}
+    imu = run.config.sensors["imu"].model_copy(update={**quiet, **changed})
+    return run.config.with_sensors({"imu": imu})
+
+
+def test_an_imu_that_is_noisier_than_its_data_sheet_is_believed_less() -> None:
+    """As good as with the right noise; or, where it must not adapt, off by many of the stated sigmas."""
+    run = shaken(1)
+    as_told = app.smooth_recording(run.recording, by_data_sheet(run, adapt_noise=False)).solution
+    adapted = app.smooth_recording(run.recording, by_data_sheet(run)).solution
+    right = app.smooth_recording(run.recording, run.config).solution
+    told, found, best = (compare_to_truth(s.trajectory, run.truth) for s in (as_told, adapted, right))
+    assert told.nees is not None
+    assert found.nees is not None
+    assert told.nees > 10.0  # or there is nothing to mend
+    assert found.nees < 4.0
+    assert found.position_rmse_m < 1.2 * best.position_rmse_m
+    (said,) = (w for w in adapted.stats.warnings if "its noise is configured too small" in w)
+    taken = re.findall(r"([0-9.e+]+) is taken", said)
+    assert 600.0 < float(taken[0]) < 2300.0
+    assert 25.0 < float(taken[1]) < 46.0
+    assert not [w for s in (as_told, right) for w in s.stats.warnings if "too small" in w]
+
+
+def test_vibration_that_does_not_go_on_into_the_motion_is_no_noise() -> None:
+    """Its samples scatter by 60 times what is configured."""
+    run = slowly(simulate(replace(bl_scenario(1, "drift", false_fraction=0.0), duration_s=30.0), 1))
+    imu = run.recording.imu
+    assert imu is not None
+    t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    shake = 2.0 * np.sin(2.0 * np.pi * 23.0 * t[:, None] + np.array([0.0, 1.0, 2.0]))
+    recording = replace(run.recording, imu=replace(imu, accel_mps2=imu.accel_mps2 + shake))
+    solution = app.smooth_recording(recording, run.config).solution
+    assert noise_density(imu.stamps_ns, shake)[0] > 30.0 * run.config.sensors["imu"].accel_noise_mps2
+    assert not [w for w in solution.stats.warnings if "too small" in w or "IMU" in w]
+    assert compare_to_truth(solution.trajectory, run.truth).position_rmse_m < 0.3

@@ -11,37 +11,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
 from graphloc.eval.calibrate._findings import Check, Suggestion
 from graphloc.eval.formatting import significant
-from graphloc.frames import Array
+from graphloc.imu_scatter import FEWEST, noise_density
 from graphloc.measurements import ImuSeries
 from graphloc.offsets import Misfit, Offsets
 
-_BLOCK = 1000  # samples
 _TOO_SMALL, _TOO_LARGE = 1.5, 0.5  # scatter by configured noise
 _LESS = 0.7  # of the configured noise: what the run needs, from which that is too large
 _UG, _MDPS = 1e-6 * STANDARD_GRAVITY_MPS2, float(np.radians(1e-3))
-
-
-def density(stamps_ns: NDArray[np.int64], columns: Array) -> tuple[float, float]:
-    """Return the white-noise density of the worst axis, and its sigma, from its variation along the run.
-
-    Args:
-        stamps_ns: (N,). columns: (N, 3) in some unit; the density is in that unit per sqrt(Hz).
-    """
-    root_dt = float(np.sqrt(np.median(np.diff(stamps_ns)) * 1e-9))
-    step = np.abs(np.diff(columns, n=3, axis=0))
-    blocks = np.array_split(step, max(len(step) // _BLOCK, 2))
-    scatter = np.array([1.4826 * np.median(b, axis=0) for b in blocks]) / np.sqrt(20.0) * root_dt
-    axis = int(np.argmax(np.median(scatter, axis=0)))
-    found = float(np.median(scatter[:, axis]))
-    spread = 1.4826 * float(np.median(np.abs(scatter[:, axis] - found)))
-    steps = np.diff(np.unique(columns[:, axis]))
-    floor = float(steps.min()) / np.sqrt(12.0) * root_dt if len(steps) else 0.0  # what rounding alone scatters
-    return max(found, floor), max(1.25 * spread / float(np.sqrt(len(blocks))), 0.02 * found)
 
 
 def imu_noise(imu: ImuSeries, config: ImuConfig, offsets: Offsets | None) -> Iterator[Suggestion | Check]:
@@ -60,11 +40,13 @@ def imu_noise(imu: ImuSeries, config: ImuConfig, offsets: Offsets | None) -> Ite
             None if offsets is None else offsets.gyroscope,
         ),
     )
-    if len(imu) < 2 * _BLOCK:
+    if len(imu) < FEWEST:
         return
     scale = 1.0 if offsets is None else offsets.noise_scale
     for key, unit, columns, misfit in samples:
-        yield _judge(imu.sensor, key, unit, float(getattr(config, key)), density(imu.stamps_ns, columns), misfit, scale)
+        yield _judge(
+            imu.sensor, key, unit, float(getattr(config, key)), noise_density(imu.stamps_ns, columns), misfit, scale
+        )
 
 
 def _judge(

@@ -33,6 +33,7 @@ from graphloc.build._problem import (
     make_problem,
     mount_of,
     slow_or_left_out,
+    with_imu_noise,
     with_noise_scale,
 )
 from graphloc.build._thinned import Thinned, thinned
@@ -71,6 +72,7 @@ __all__ = [
     "state_of",
     "thinned",
     "walk_between_nodes",
+    "with_imu_noise",
     "with_noise_scale",
     "without_drift",
 ]

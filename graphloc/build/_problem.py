@@ -74,7 +74,7 @@ class Problem:
 
     Attributes:
         t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body.
-        relink: makes the inertial links for a noise scale. links: those of `noise_scale`.
+        relink: makes the inertial links for a configuration of the IMU and a noise scale. links: those of `noise_scale`.
         preintegrated, inertial: motion from each state to the next, and its factor; neither depends on the estimate, so all graphs
             share them.
         rejected: ledger rows of measurements that the graph cannot take.
@@ -87,7 +87,7 @@ class Problem:
     imu: ImuSeries
     t_body_imu_m: Array
     R_body_imu: Array
-    relink: Callable[[float], InertialLink]
+    relink: Callable[[Any, float], InertialLink]
     links: InertialLink
     noise_scale: float
     preintegrated: tuple[Any, ...]
@@ -151,10 +151,10 @@ def make_problem(
     imu_config = config.sensors[imu.sensor]
     t_body_imu, R = mount_of(imu.sensor, imu_config, recording.mounts)
 
-    def relink(noise_scale: float) -> InertialLink:
+    def relink(imu_config: Any, noise_scale: float) -> InertialLink:
         return inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale)
 
-    links = relink(1.0)
+    links = relink(imu_config, 1.0)
     by_kind = {row.kind: row for row in rows}
     inside, rejected, warnings = _sorted_out(recording, config, set(by_kind), imu)
     start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
@@ -270,8 +270,26 @@ def _inertial(timeline: Timeline, links: InertialLink, preintegrated: Sequence[A
 
 def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
     """Return the problem with the IMU's noise densities scaled."""
-    links = problem.relink(noise_scale)
-    return with_links(replace(problem, links=links, noise_scale=noise_scale), _preintegrate(problem.timeline, links))
+    return _relinked(problem, problem.config, noise_scale)
+
+
+def with_imu_noise(problem: Problem, gyro: float, accel: float) -> Problem:
+    """Return the problem with the configured noise densities of gyroscope and accelerometer so many times as large."""
+    name = problem.imu.sensor
+    sensor = problem.config.sensors[name]
+    noisier = sensor.model_copy(
+        update={
+            "gyro_noise_mdps_per_sqrt_hz": sensor.gyro_noise_mdps_per_sqrt_hz * gyro,
+            "accel_noise_ug_per_sqrt_hz": sensor.accel_noise_ug_per_sqrt_hz * accel,
+        }
+    )
+    return _relinked(problem, problem.config.with_sensors({name: noisier}), problem.noise_scale)
+
+
+def _relinked(problem: Problem, config: VesselConfig, noise_scale: float) -> Problem:
+    links = problem.relink(config.sensors[problem.imu.sensor], noise_scale)
+    relinked = replace(problem, config=config, links=links, noise_scale=noise_scale)
+    return with_links(relinked, _preintegrate(problem.timeline, links))
 
 
 def with_links(problem: Problem, preintegrated: tuple[Any, ...]) -> Problem:

@@ -44,7 +44,7 @@ class ImuConfig(SensorConfig):
     gyro_bias_sigma_dps: Positive = 2.0
     """Turn-on gyroscope bias, 1 sigma, deg/s, before the start alignment has measured it."""
     adapt_noise: bool = True
-    """Scale the noise up (never down, and with a warning) if the run contradicts the configured noise several times over."""
+    """Raise the noise (never lower it, and with a warning) if the run contradicts it, or the IMU's own residuals do."""
     max_gap_s: Positive = 0.5
     """A longer interval between samples is an IMU gap: bridged with noise large enough for any motion of a vessel, s."""
     max_bridge_s: Positive = 20.0

@@ -28,6 +28,7 @@ from graphloc.solve._align import align
 from graphloc.solve._choices import other_choices, take_more_probable
 from graphloc.solve._decide import Verdicts, weigh
 from graphloc.solve._grow import grow
+from graphloc.solve._imu_noise import with_needed_noise
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import Settled, cost_without_outliers, expected_cost, rough_passes, settle
@@ -81,22 +82,28 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     iterations += grow(few.problem, grown, prior, known, progress)
     grown, used, _ = rough_passes(few.problem, grown, prior, progress, ("final",), _SEAM_PASSES)
     iterations += used
-    passes, estimate, ratio = 0, few.filled(problem, grown), 1.0
+    passes, estimate = 0, few.filled(problem, grown)
     if problem.links.gaps():
         problem = bridged(problem, estimate)
         few = thinned(problem)
     for attempt in range(_MAX_NOISE_ROUNDS):
-        if attempt > 0:
-            scale = problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0))
-            problem = bridged(with_noise_scale(problem, scale), estimate)
-            few = thinned(problem)
-            estimate, used, passed = rough_passes(problem, estimate, prior, progress, ("far", "open"), _OPEN_PASSES)
-            passes, iterations = passes + passed, iterations + used
         settled = _final_passes(problem, few, estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
         ratio = cost_without_outliers(settled) / max(expected_cost(problem, settled.verdicts), 1.0)
-        if ratio < CONTRADICTION or not problem.config.sensors[problem.imu.sensor].adapt_noise:
+        if attempt == _MAX_NOISE_ROUNDS - 1 or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
+        if ratio < CONTRADICTION:
+            noisier = with_needed_noise(problem, estimate, settled.verdicts, prior)
+        else:
+            scale = problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0))
+            noisier = with_noise_scale(problem, scale)
+        if noisier is None:
+            break
+        problem = bridged(noisier, estimate)
+        few = thinned(problem)
+        if ratio >= CONTRADICTION:
+            estimate, used, passed = rough_passes(problem, estimate, prior, progress, ("far", "open"), _OPEN_PASSES)
+            passes, iterations = passes + passed, iterations + used
     settled, levels_cov = at_usual_level(problem, settled, prior, progress, _LAST_PASSES)
     if settled.values is not estimate:
         passes, iterations = passes + settled.passes, iterations + settled.iterations

@@ -14,11 +14,11 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from graphloc import keys
-from graphloc.build import JUMP, Problem, Stream, build_graph
+from graphloc.build import JUMP, Problem, StartPrior, Stream, build_graph
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision
-from graphloc.solve._batch import BatchResult
+from graphloc.solve._decide import Verdicts
 
 _LEAST_WEIGHT = 1e-6
 
@@ -74,23 +74,24 @@ class Rows:
         return self.first_pose - 3 * self.states
 
 
-def linearised(problem: Problem, values: gtsam.Values, result: BatchResult) -> Rows:
+def linearised(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Rows:
     """Return a solved run, linearised at `values`.
 
     Args:
-        problem: that of the result, or one with other slow states, which `values` then has.
+        problem: that of the solution, or one with other slow states, which `values` then has.
+        verdicts, prior: of the solution.
     """
     last, made, decided = len(problem.timeline) - 1, dict[tuple[int, int], range](), {}
     streams = {s.number: s for s in problem.streams}
-    for key, verdict in result.verdicts.items():
+    for key, verdict in verdicts.items():
         if verdict.decision is not None:
             plain = Decision(mode=verdict.decision.mode, weight=verdict.decision.weight)
             decided[key] = (plain, _attached(problem, streams[key[0]], key[1], verdict.at, values))
-    graph, guess = build_graph(problem, values, decided, 0, last, result.prior, jumps=False, made=made)
+    graph, guess = build_graph(problem, values, decided, 0, last, prior, jumps=False, made=made)
     kernels = [
         (factors, kernel)
         for key, factors in made.items()
-        if (decision := result.verdicts[key].decision) and (kernel := decision.kernel) and kernel.kind != "none"
+        if (decision := verdicts[key].decision) and (kernel := decision.kernel) and kernel.kind != "none"
     ]
     held = [graph.at(f).keys() for f in range(graph.size())]
     kernels += [(range(f, f + 1), JUMP) for f in _jumps(problem, held)]

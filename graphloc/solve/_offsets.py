@@ -17,23 +17,20 @@ the GNSS error.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import diags_array
-from scipy.stats import chi2
 
 from graphloc import keys
 from graphloc.build import Problem, Stream
 from graphloc.frames import Array
 from graphloc.graph import Constant, SlowProcess
-from graphloc.offsets import Misfit, Offset, Offsets, Probe
+from graphloc.offsets import Offset, Offsets, Probe
 from graphloc.solve._batch import BatchResult
+from graphloc.solve._imu_noise import imu_misfit
 from graphloc.solve._linearised import Rows, linearised, normal_solver, root_weights
 
 BLOCK_S = 2.0
@@ -42,12 +39,6 @@ _ROUNDS, _SAME_WEIGHT, _SAME = 6, 0.2, 0.1
 # How far an offset may be off while weights are chosen, 1 sigma: m, rad, s.
 _FREE: dict[Offset, float] = {"x": 3.0, "y": 3.0, "yaw": 0.5, "time": 1.0}
 _HELD_RAD = 1e-6  # sigma of a mount that is held
-_DRAWS = 16  # random vectors for the estimate of a trace
-_NOISE_ROUNDS, _LEAST_FREEDOM, _UNLIKELY = 5, 3.0, 1e-4
-
-
-_Solved = tuple[Any, Array, Callable[[Array], Array]]
-"""J, weighted; residuals (rows,); and the solution of J'J x = y."""
 
 
 def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
@@ -57,7 +48,7 @@ def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
         RuntimeError, numpy.linalg.LinAlgError: a state or offset is not determined.
     """
     problem, values = _with_offsets_free(result)
-    rows = linearised(problem, values, result)
+    rows = linearised(problem, values, result.verdicts, result.prior)
     columns: dict[tuple[str, Offset], Array] = {}
     for stream in problem.streams:
         wanted = tuple(probe.get(stream.config.kind, ()))
@@ -85,7 +76,7 @@ def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
         if moved < _SAME if n else np.abs(fresh**2 - root**2).max() < _SAME_WEIGHT:
             break
     gradient, curvature = _in_blocks(rows, left, r)
-    gyroscope, accelerometer = _imu_misfit(rows, root, rows.b - B @ theta, (J, r_free, solve))
+    gyroscope, accelerometer = imu_misfit(rows, root, rows.b - B @ theta, (J, r_free, solve))
     return Offsets(
         names=tuple(names),
         block_s=BLOCK_S,
@@ -183,42 +174,3 @@ def _columns(
             shift[:, 3:6, c] = along
             shift[:, 6:, c] = np.einsum("nij,nj->ni", R, np.cross(w, along))
     return rows.moved(stream, used, shift)
-
-
-def _imu_misfit(rows: Rows, root: Array, b: Array, solved: _Solved) -> tuple[Misfit, Misfit]:
-    """Return the misfit of gyroscope and accelerometer, and by what factor smaller noise would explain it.
-
-    The IMU factors come first, nine rows each: attitude (gyroscope), position, velocity. With smaller noise the share of the other
-    sensors changes, so the factor is found in some rounds (variance components, Helmert).
-
-    Args:
-        root: (rows,) of the weights. b: (rows,) of `rows`, the offsets taken out. solved: the run with these.
-    """
-    links = np.arange(9 * (rows.states - 1)).reshape(-1, 9)
-    own, needed = (links[:, :3].ravel(), links[:, 3:].ravel()), np.ones(2)
-    squares, freedom = first = _squares_and_freedom(solved, own)
-    low = [f > _LEAST_FREEDOM and chi2.cdf(s, f) < _UNLIKELY for s, f in zip(squares, freedom, strict=True)]
-    for _ in range(_NOISE_ROUNDS if any(low) else 0):
-        needed[low] *= np.clip(np.sqrt(squares / np.maximum(freedom, 1e-9)), 0.3, 1.2)[low]
-        scaled = root.copy()
-        for part, times in zip(own, needed, strict=True):
-            scaled[part] /= times
-        J = diags_array(scaled) @ rows.J
-        solve = normal_solver(J)
-        squares, freedom = _squares_and_freedom((J, scaled * b - J @ solve(J.T @ (scaled * b)), solve), own)
-    sigma = needed / np.sqrt(2.0 * np.maximum(freedom, 1.0))
-    gyroscope, accelerometer = (
-        Misfit(squares=float(first[0][k]), freedom=float(first[1][k]), needed=float(needed[k]), sigma=float(sigma[k]))
-        for k in range(2)
-    )
-    return gyroscope, accelerometer
-
-
-def _squares_and_freedom(solved: _Solved, parts: tuple[NDArray[np.intp], ...]) -> tuple[Array, Array]:
-    """Squared residuals of parts of the rows, and the trace of 1 - J (J'J)^-1 J' over each (Hutchinson, random signs)."""
-    rng, (J, r, solve) = np.random.default_rng(0), solved
-    signs = [rng.choice(np.array([-1.0, 1.0]), (len(part), _DRAWS)) for part in parts]
-    back = np.hstack([J[part].T @ s for part, s in zip(parts, signs, strict=True)])
-    explained = (back * solve(back)).sum(axis=0).reshape(len(parts), _DRAWS).mean(axis=1)
-    squares = np.array([(r[part] ** 2).sum() for part in parts])
-    return squares, np.maximum(np.array([len(part) for part in parts]) - explained, 0.0)

@@ -43,7 +43,7 @@ def unmodelled(result: BatchResult) -> Unmodelled | None:
     problem, values = result.problem, result.values
     if all(stream.left_out is None for stream in problem.streams):
         return None
-    rows = linearised(problem, values, result)
+    rows = linearised(problem, values, result.verdicts, result.prior)
     followed = [
         (stream.left_out, stream, used) for stream in problem.streams
         if stream.left_out is not None and (used := rows.used(stream))  # else all its fixes were rejected

@@ -96,6 +96,22 @@ def _noisier(stream: Stream, result: BatchResult) -> float:
     return max((decision.weight**-0.5 for decision in found if decision is not None), default=1.0)
 
 
+def _too_quiet(problem: Problem, result: BatchResult) -> list[str]:
+    """Say that the IMU's noise is configured too small, and what was taken instead."""
+    name = problem.imu.sensor
+    stated, taken = problem.config.sensors[name], result.problem.config.sensors[name]
+    changed = [
+        f"{key} is {getattr(stated, key):.3g}, {getattr(taken, key):.3g} is taken"
+        for key in ("accel_noise_ug_per_sqrt_hz", "gyro_noise_mdps_per_sqrt_hz")
+        if getattr(taken, key) > getattr(stated, key)
+    ]
+    if not changed:
+        return []
+    return [
+        f"{name}: its noise is configured too small for how its samples scatter and for its residuals: {'; '.join(changed)}"
+    ]
+
+
 def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
     expected = expected_cost(problem, result.verdicts)
     warnings = list(problem.warnings)
@@ -114,6 +130,7 @@ def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
             if any(not constant.corrects for stream in problem.streams for constant in stream.constants):
                 cure += ", or for tags on a floating dock that the survey has as fixed"
         warnings.append(f"{said}; {cure}")
+    warnings += _too_quiet(problem, result)
     if expected > 0 and result.cost > CONTRADICTING_COST * expected:
         warnings.append(
             f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much the samples of an IMU scatter: its white noise, with the vibration of engine and hull."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+
+_BLOCK = 1000  # samples
+FEWEST = 2 * _BLOCK
+"""Samples that tell it."""
+
+
+def noise_density(stamps_ns: NDArray[np.int64], columns: Array) -> tuple[float, float]:
+    """Return the white-noise density of the worst axis, and its sigma, from its variation along the run.
+
+    Third differences remove motion; those of white noise have 20 times its variance.
+
+    Args:
+        stamps_ns: (N,). columns: (N, 3) in some unit; the density is in that unit per sqrt(Hz).
+    """
+    root_dt = float(np.sqrt(np.median(np.diff(stamps_ns)) * 1e-9))
+    step = np.abs(np.diff(columns, n=3, axis=0))
+    blocks = np.array_split(step, max(len(step) // _BLOCK, 2))
+    scatter = np.array([1.4826 * np.median(b, axis=0) for b in blocks]) / np.sqrt(20.0) * root_dt
+    axis = int(np.argmax(np.median(scatter, axis=0)))
+    found = float(np.median(scatter[:, axis]))
+    spread = 1.4826 * float(np.median(np.abs(scatter[:, axis] - found)))
+    steps = np.diff(np.unique(columns[:, axis]))
+    floor = float(steps.min()) / np.sqrt(12.0) * root_dt if len(steps) else 0.0  # what rounding alone scatters
+    return max(found, floor), max(1.25 * spread / float(np.sqrt(len(blocks))), 0.02 * found)

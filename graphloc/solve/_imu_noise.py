@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise of the IMU by the residuals of a solved run: how many times the configured one explains them.
+
+Values of a data sheet, where engine and hull shake it: the solution then follows the IMU's noise, and is too sure. The cost of the
+whole run hardly shows it, as most of it is of the other sensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import diags_array
+from scipy.stats import chi2
+
+from graphloc.build import Problem, StartPrior, with_imu_noise
+from graphloc.frames import Array
+from graphloc.imu_scatter import FEWEST, noise_density
+from graphloc.offsets import Misfit
+from graphloc.solve._decide import Verdicts
+from graphloc.solve._linearised import Rows, linearised, normal_solver, root_weights
+
+Solved = tuple[Any, Array, Callable[[Array], Array]]
+"""J, weighted; residuals (rows,); and the solution of J'J x = y."""
+
+_DRAWS = 16  # random vectors for the estimate of a trace
+_NOISE_ROUNDS, _LEAST_FREEDOM, _UNLIKELY = 5, 3.0, 1e-4
+_UNLIKELY_IF_SCATTERED = 1e-2  # where the samples themselves say that the noise is larger
+_LEAST_TIMES, _MOST_STEP = 1.5, 3.0  # noise that is this much larger is taken; most that a round changes it by
+
+
+class ImuMisfit(NamedTuple):
+    """Of the gyroscope, and of the accelerometer."""
+
+    gyroscope: Misfit
+    accelerometer: Misfit
+
+
+def imu_misfit(rows: Rows, root: Array, b: Array, solved: Solved, most: tuple[float, float] = (1.0, 1.0)) -> ImuMisfit:
+    """Return the misfit of gyroscope and accelerometer, and by what factor other noise would explain it.
+
+    The IMU factors come first, nine rows each: attitude (gyroscope), position, velocity. With other noise the share of the other
+    sensors changes, so the factor is found in some rounds (variance components, Helmert).
+
+    Args:
+        root: (rows,) of the weights. b: (rows,) of `rows`, the offsets taken out. solved: the run with these.
+        most: largest factors that are looked for; 1: only whether the noise is smaller.
+    """
+    links = np.arange(9 * (rows.states - 1)).reshape(-1, 9)
+    own, needed = (links[:, :3].ravel(), links[:, 3:].ravel()), np.ones(2)
+    squares, freedom = first = _squares_and_freedom(solved, own)
+    low = np.array([f > _LEAST_FREEDOM and chi2.cdf(s, f) < _UNLIKELY for s, f in zip(squares, freedom, strict=True)])
+    high = np.array([chi2.sf(s, max(f, 0.1)) < _UNLIKELY_IF_SCATTERED for s, f in zip(squares, freedom, strict=True)])
+    high &= np.array(most) > 1.0
+    follow = low | high
+    for _ in range(_NOISE_ROUNDS if follow.any() else 0):
+        step = np.sqrt(squares / np.maximum(freedom, 1e-9))
+        needed[low] *= np.clip(step, 0.3, 1.2)[low]
+        needed[high] *= np.clip(step, 0.3, _MOST_STEP)[high]
+        needed = np.minimum(needed, np.maximum(most, 1.0))
+        scaled = root.copy()
+        for part, times in zip(own, needed, strict=True):
+            scaled[part] /= times
+        J = diags_array(scaled) @ rows.J
+        solve = normal_solver(J)
+        squares, freedom = _squares_and_freedom((J, scaled * b - J @ solve(J.T @ (scaled * b)), solve), own)
+    sigma = needed / np.sqrt(2.0 * np.maximum(freedom, 1.0))
+    return ImuMisfit(
+        *(
+            Misfit(
+                squares=float(first[0][k]), freedom=float(first[1][k]), needed=float(needed[k]), sigma=float(sigma[k])
+            )
+            for k in range(2)
+        )
+    )
+
+
+def _squares_and_freedom(solved: Solved, parts: tuple[NDArray[np.intp], ...]) -> tuple[Array, Array]:
+    """Squared residuals of parts of the rows, and the trace of 1 - J (J'J)^-1 J' over each (Hutchinson, random signs)."""
+    rng, (J, r, solve) = np.random.default_rng(0), solved
+    signs = [rng.choice(np.array([-1.0, 1.0]), (len(part), _DRAWS)) for part in parts]
+    back = np.hstack([J[part].T @ s for part, s in zip(parts, signs, strict=True)])
+    explained = (back * solve(back)).sum(axis=0).reshape(len(parts), _DRAWS).mean(axis=1)
+    squares = np.array([(r[part] ** 2).sum() for part in parts])
+    return squares, np.maximum(np.array([len(part) for part in parts]) - explained, 0.0)
+
+
+def with_needed_noise(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Problem | None:
+    """Return the problem with as much IMU noise as its residuals need, where that is clearly more than it has; else None.
+
+    Only where the samples themselves scatter more, and no more than they do: other causes of a misfit have other cures. That they
+    scatter is not enough: vibration does not go on into the motion.
+    """
+    imu, config = problem.imu, problem.config.sensors[problem.imu.sensor]
+    if len(imu) < FEWEST:
+        return None
+    stated = np.array([config.gyro_noise_radps, config.accel_noise_mps2]) * problem.noise_scale
+    scatter = np.array([noise_density(imu.stamps_ns, columns)[0] for columns in (imu.gyro_radps, imu.accel_mps2)])
+    most = scatter / stated
+    if (most < _LEAST_TIMES).all():
+        return None
+    rows = linearised(problem, values, verdicts, prior)
+    root = root_weights(rows, -rows.b)
+    J = diags_array(root) @ rows.J
+    solve = normal_solver(J)
+    solved = J, root * rows.b - J @ solve(J.T @ (root * rows.b)), solve
+    found = imu_misfit(rows, root, rows.b, solved, (float(most[0]), float(most[1])))
+    gyro, accel = (max(misfit.needed, 1.0) for misfit in found)
+    return with_imu_noise(problem, gyro, accel) if max(gyro, accel) > _LEAST_TIMES else None
