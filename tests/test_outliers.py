@@ -24,7 +24,7 @@ from graphloc.position_jumps import JumpDetector, jump_warnings, position_jumps
 from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
 from graphloc.solution import Health
-from graphloc.solve._decide import _by_kernel
+from graphloc.solve._decide import Stage, _by_kernel
 from tests.slowly import simulate_slowly, with_few_states
 
 
@@ -423,5 +423,5 @@ def test_a_sensor_that_lies_by_more_than_numbers_hold_is_an_outlier() -> None:
         row=SimpleNamespace(absolute=True), config=SimpleNamespace(kernel=KernelConfig(kind="cauchy"))
     )
     at: Any = None
-    verdicts = _by_kernel(stream, [0, 1, 2], [at] * 3, [(off,)] * 3, "final")
+    verdicts = _by_kernel(stream, [0, 1, 2], [at] * 3, [(off,)] * 3, Stage.FINAL)
     assert max(v.weight for v in verdicts) < 1e-6

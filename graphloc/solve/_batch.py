@@ -26,7 +26,7 @@ from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
 from graphloc.solve._choices import other_choices, take_more_probable
-from graphloc.solve._decide import Verdicts, weigh
+from graphloc.solve._decide import Stage, Verdicts, weigh
 from graphloc.solve._grow import grow
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
@@ -79,7 +79,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     heading_var = np.interp(problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1], few_var)
     begun = int(few.states[known])
     iterations += grow(few.problem, grown, prior, known, progress)
-    grown, used, _ = rough_passes(few.problem, grown, prior, progress, ("final",), _SEAM_PASSES)
+    grown, used, _ = rough_passes(few.problem, grown, prior, progress, (Stage.FINAL,), _SEAM_PASSES)
     iterations += used
     passes, estimate, ratio = 0, few.filled(problem, grown), 1.0
     if problem.links.gaps():
@@ -90,7 +90,9 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
             scale = problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0))
             problem = bridged(with_noise_scale(problem, scale), estimate)
             few = thinned(problem)
-            estimate, used, passed = rough_passes(problem, estimate, prior, progress, ("far", "open"), _OPEN_PASSES)
+            estimate, used, passed = rough_passes(
+                problem, estimate, prior, progress, (Stage.FAR, Stage.OPEN), _OPEN_PASSES
+            )
             passes, iterations = passes + passed, iterations + used
         settled = _final_passes(problem, few, estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
@@ -128,9 +130,8 @@ def _final_passes(
     A choice confirms itself, because the estimate follows it; another one that is more probable replaces it.
     """
     last = len(problem.timeline) - 1
-    settled = settle(
-        problem, estimate, weigh(problem, estimate, first=0, last=last, stage="final"), prior, progress, _FIRST_PASSES
-    )
+    verdicts = weigh(problem, estimate, first=0, last=last, stage=Stage.FINAL)
+    settled = settle(problem, estimate, verdicts, prior, progress, _FIRST_PASSES)
     changed, iterations = False, settled.iterations
     for others, used in other_choices(problem, few, settled, prior):
         changed = take_more_probable(problem, settled, others, prior) or changed
