@@ -69,7 +69,7 @@ def as_json(estimate: Estimate, datum: Datum) -> dict[str, object]:
         "bound_95_m": estimate.bound_95_m,
         "heading_bound_95_deg": float(np.degrees(estimate.heading_bound_95_rad)),
         "health": estimate.health.value,
-        "reason": estimate.reason,
+        "reason": estimate.reason.text,
         "since_agreed_s": {name: round(s, 3) for name, s in estimate.since_agreed_s.items()},
     }
     return {key: plain(value) for key, value in told.items()}
