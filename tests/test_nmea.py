@@ -303,6 +303,23 @@ def test_a_sentence_is_read_once(one: str, other: str, twice: bool) -> None:
         parse_config({"sensors": blocks}, KINDS, "vessel.yaml")
 
 
+@pytest.mark.parametrize(
+    ("kind", "one", "other", "what"),
+    [
+        ("pose", ["x", "y"], ["y", "yaw"], "y of /pose"),
+        ("pose", ["x", "y", "yaw"], ["y", "x"], "x, y of /pose"),
+        ("pose", ["x", "y"], ["y", "x"], "/pose"),
+        ("pose", ["x", "y"], ["z", "yaw"], ""),
+        ("body_velocity", ["x"], ["x", "y"], "x of /pose"),
+    ],
+)
+def test_an_axis_is_read_once(kind: str, one: list[str], other: list[str], what: str) -> None:
+    blocks = {name: {"kind": kind, "topic": "/pose", "axes": axes} for name, axes in (("a", one), ("b", other))}
+    refused = f"^vessel.yaml: .*sensors: a and b both read {what}, which would count twice: delete .*$"
+    with pytest.raises(ConfigError, match=refused) if what else nullcontext():
+        parse_config({"sensors": blocks}, KINDS, "vessel.yaml")
+
+
 def test_blocks_that_are_not_parsed_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="gnss: no SensorConfig"):
         VesselConfig.model_validate({"sensors": {"gnss": {"kind": "gnss", "topic": "/fix"}}})
