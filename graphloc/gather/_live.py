@@ -94,9 +94,9 @@ class LiveMatching:
 
 def with_busy_warning(recording: Recording, config: VesselConfig) -> Recording:
     """Add a warning if many scans were skipped because the matcher was busy."""
-    busy = sum(row.reason == _BUSY for row in recording.rows)
-    scans = sum(row.reason == _BUSY or row.sensor in config.of_kind("aerial") for row in recording.rows)
-    if busy <= 0.2 * scans:
+    refused = [row.reason for row in recording.rows if row.sensor in config.of_kind("aerial")]
+    busy = refused.count(_BUSY)
+    if busy <= 0.2 * len(refused):
         return recording
     warning = f"the matcher did not keep up: {busy} scans were never tried"
     return replace(recording, warnings=(*recording.warnings, warning))
