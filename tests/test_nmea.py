@@ -20,7 +20,7 @@ from graphloc.factors import KINDS
 from graphloc.frontends import nmea
 from graphloc.frontends._assess_velocity import motions_of, velocity_report
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends._streams import Stream
+from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import OTHER_TYPES
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import TWIST
@@ -134,7 +134,7 @@ def test_a_message_may_hold_a_burst() -> None:
 
 
 def test_a_velocity_that_begins_without_a_fix_still_tells_the_motion() -> None:
-    stream = Stream("/nmea GPVTG", TWIST)
+    stream = TopicData("/nmea GPVTG", TWIST)
     for k in range(60):
         speed = (np.nan, np.nan, np.nan) if k < 20 else (0.1 * k, 1.0, 0.0)
         stream.add((1 + k) * S, (1 + k) * S, speed, "run.db3")
