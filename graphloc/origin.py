@@ -81,7 +81,7 @@ def _why_no_fix(recording: Recording, config: VesselConfig) -> str:
 def _why_no_receiver(recording: Recording, config: VesselConfig) -> str:
     if not config.sensors:
         return "; vessel.yaml names no sensor at all: `graphloc inspect` writes a first one"
-    off = [name for name, sensor in config.sensors.items() if getattr(sensor, "kind", None) == "gnss"]
+    off = [name for name, sensor in config.sensors.items() if sensor.kind == "gnss"]
     if off:
         return f": {', '.join(off)} is switched off (enabled: false); switch it on, or set datum: in vessel.yaml"
     unread = sorted({row.topic for row in recording.rows if not row.sensor and any(f in row.reason for f in _FIXES)})

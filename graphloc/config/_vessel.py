@@ -135,4 +135,4 @@ class VesselConfig(Block):
 
     def of_kind(self, kind: str) -> dict[str, Any]:
         """Return the enabled sensors of a kind, by name."""
-        return {n: s for n, s in self.sensors.items() if getattr(s, "kind", None) == kind and s.enabled}
+        return {n: s for n, s in self.sensors.items() if s.kind == kind and s.enabled}

@@ -60,10 +60,8 @@ class LiveMatching:
             if self._matcher is None:
                 self._matcher = LiveMatcher(self._sensor, self._scans.folder, datum, self._feed.mounts)
             if self._pool is not None:
-                self._underway, self._next = (
-                    self._pool.submit(self._matcher.offer, turn, window),
-                    next(self._turns, None),
-                )
+                self._underway = self._pool.submit(self._matcher.offer, turn, window)
+                self._next = next(self._turns, None)
                 return
             found = self._matcher.offer(turn, window)
             if found == "wait":

@@ -300,7 +300,7 @@ def _level(
     Args:
         turn: t -> R_body0_body(t), by the gyroscope less its bias (3,), in body axes.
     """
-    if getattr(problem.config.sensors[problem.imu.sensor], "gravity", "included") == "removed":
+    if problem.config.sensors[problem.imu.sensor].gravity == "removed":
         return np.eye(3), 0.1, None, "roll and pitch unknown (gravity removed by the driver): taken level"
     t, f, _ = _samples(problem, 0.0, still[1] if still else min(window, 10.0))
     span = float(np.ptp(t))  # online, a start comes before ten seconds have

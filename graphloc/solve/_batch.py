@@ -68,6 +68,14 @@ class BatchResult:
         return replace(self, tree=gtsam.ISAM2(), graph=gtsam.NonlinearFactorGraph())
 
 
+def noise_step(ratio: float) -> float:
+    """Return the factor by which the IMU's noise is scaled up at once where the cost is `ratio` times its expectation.
+
+    At most by 3: modes and weights are chosen anew before it is looked at again.
+    """
+    return float(np.clip(np.sqrt(ratio), 1.5, 3.0))
+
+
 def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     """Solve a whole run.
 
@@ -87,8 +95,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         few = thinned(problem)
     for attempt in range(_MAX_NOISE_ROUNDS):
         if attempt > 0:
-            scale = problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0))
-            problem = bridged(with_noise_scale(problem, scale), estimate)
+            problem = bridged(with_noise_scale(problem, problem.noise_scale * noise_step(ratio)), estimate)
             few = thinned(problem)
             estimate, used, passed = rough_passes(
                 problem, estimate, prior, progress, (Stage.FAR, Stage.OPEN), _OPEN_PASSES
