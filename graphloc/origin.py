@@ -70,8 +70,8 @@ def _why_no_fix(recording: Recording, config: VesselConfig) -> str:
         return f"no GNSS sensor to take a datum from{_why_no_receiver(recording, config)}"
     reasons: Counter[str] = Counter()
     for row in recording.rows:
-        if row.sensor in receivers:  # when each was recorded is no reason of its own
-            reasons[f"{row.sensor}: {row.reason.partition(', recorded at ')[0]}"] += row.count
+        if row.sensor in receivers:
+            reasons[f"{row.sensor}: {row.common_reason}"] += row.count
     if not reasons:
         return f"no GNSS fix from {', '.join(receivers)}: the topic holds no message"
     (reason, count), *_ = reasons.most_common(1)
