@@ -96,14 +96,14 @@ def align(problem: Problem) -> Start:
     turn = _turns(problem, max([window, *(rows[0, 0] for rows in yaws.values())]) + 10.0 if yaws else 180.0, bias)
     at_start = still if still is not None and still[0] == 0.0 else None
     R_level, tilt_sigma, level, tilt_note = _level(problem, window, at_start, turn, bias)
-    heading = _headings(problem, track, yaws, turn)
+    yaws_rad, yaw_sigma_rad, window_s, heading_note = _headings(problem, track, yaws, turn)
     p0, p_sigma, v0, v_sigma = _position_and_velocity(hints, track, at_start)
     return Start(
         R_level_body=R_level,
         tilt_sigma_rad=tilt_sigma,
         level=level,
-        yaws_rad=heading[0],
-        yaw_sigma_rad=heading[1],
+        yaws_rad=yaws_rad,
+        yaw_sigma_rad=yaw_sigma_rad,
         by_motion=problem.config.start.heading_deg is None and not yaws and moved_s is not None,
         p_world_m=p0,
         p_sigma_m=p_sigma,
@@ -111,8 +111,8 @@ def align(problem: Problem) -> Start:
         v_sigma_mps=v_sigma,
         gyro_bias_radps=problem.R_body_imu.T @ bias,
         gyro_bias_sigma_radps=bias_sigma,
-        window_s=heading[2],
-        notes=(*notes, tilt_note, heading[3]),
+        window_s=window_s,
+        notes=(*notes, tilt_note, heading_note),
     )
 
 
