@@ -41,7 +41,7 @@ class Found(Exception):
 
 
 @dataclass(slots=True)
-class Verdict:
+class CaseResult:
     """How a case ended: 'ok', 'refused', or what was found; `where` is the same for one bug's many cases."""
 
     outcome: str
@@ -89,10 +89,10 @@ _NEVER = {
 
 
 @contextmanager
-def judged(watch: Watch, room: Path, inputs: Iterable[Path]) -> Iterator[list[Verdict]]:
+def judged(watch: Watch, room: Path, inputs: Iterable[Path]) -> Iterator[list[CaseResult]]:
     """Run a case in here; the list gets its verdict. Warnings count, memory counts, inputs must stay as they are."""
     before = _digest(inputs)
-    verdicts: list[Verdict] = []
+    verdicts: list[CaseResult] = []
     _forget_peak()
     at_start = _mib("VmRSS")
     said: list[tuple[str, str]] = []
@@ -105,37 +105,37 @@ def judged(watch: Watch, room: Path, inputs: Iterable[Path]) -> Iterator[list[Ve
             )
             try:
                 yield verdicts
-                verdicts.append(Verdict("ok"))
+                verdicts.append(CaseResult("ok"))
             except GraphlocError as error:
                 verdicts.append(_refusal(error, room))
             except Found as error:
-                verdicts.append(Verdict(error.kind, str(error)[:300], f"{error.kind}: {str(error)[:60]}"))
+                verdicts.append(CaseResult(error.kind, str(error)[:300], f"{error.kind}: {str(error)[:60]}"))
             except MemoryError as error:
-                verdicts.append(Verdict("memory", _trace(), _place(error)))
+                verdicts.append(CaseResult("memory", _trace(), _place(error)))
             except Exception as error:  # noqa: BLE001 - that is what is looked for
-                verdicts.append(Verdict("crash", _trace(), _place(error)))
+                verdicts.append(CaseResult("crash", _trace(), _place(error)))
     finally:
         watch.room = ""
     grown = _mib("VmHWM") - at_start
     if watch.seen:
-        verdicts.append(Verdict("escape", "; ".join(watch.seen[:3]), f"escape: {watch.seen[0][:50]}"))
+        verdicts.append(CaseResult("escape", "; ".join(watch.seen[:3]), f"escape: {watch.seen[0][:50]}"))
     elif _digest(inputs) != before:
-        verdicts.append(Verdict("escape", "an input was changed", "escape: input"))
+        verdicts.append(CaseResult("escape", "an input was changed", "escape: input"))
     elif grown > MOST_MIB:
-        verdicts.append(Verdict("memory", f"{grown:.0f} MiB", "memory: resident"))
+        verdicts.append(CaseResult("memory", f"{grown:.0f} MiB", "memory: resident"))
     elif said and verdicts[-1].outcome in ("ok", "refused"):
         text, place = said[0]
-        verdicts.append(Verdict("warning", f"{place}: {text}", f"warning: {place}"))
+        verdicts.append(CaseResult("warning", f"{place}: {text}", f"warning: {place}"))
 
 
-def _refusal(error: GraphlocError, room: Path) -> Verdict:
+def _refusal(error: GraphlocError, room: Path) -> CaseResult:
     text = str(error)
     if "\n" in text or not text.strip() or len(text) > _LONGEST_LINE:
-        return Verdict("message", text[:300], f"message: {_place(error)}")
+        return CaseResult("message", text[:300], f"message: {_place(error)}")
     known = (str(room), "sensors.", "/", ".yaml", ": ")
     if not any(part in text for part in known):
-        return Verdict("message", f"names nothing: {text[:300]}", f"message: {_place(error)}")
-    return Verdict("refused", text[:200].replace(str(room), ""), _place(error))
+        return CaseResult("message", f"names nothing: {text[:300]}", f"message: {_place(error)}")
+    return CaseResult("refused", text[:200].replace(str(room), ""), _place(error))
 
 
 def _place(error: BaseException) -> str:

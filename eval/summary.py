@@ -49,7 +49,7 @@ class FinishedRun:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Block:
+class MetricTable:
     """One number of all runs: a row per run, a column per estimate; then mean and worst."""
 
     title: str
@@ -107,7 +107,7 @@ def _number(value: object) -> float | None:
     return value if value is None or type(value) is int else float(value)  # type: ignore[arg-type]
 
 
-def blocks(runs: Sequence[FinishedRun], *, shown_only: bool = True) -> list[Block]:
+def metric_tables(runs: Sequence[FinishedRun], *, shown_only: bool = True) -> list[MetricTable]:
     """Return each number of each table that a run has; `shown_only`: only the main ones."""
     found = []
     for title in dict.fromkeys(t for run in runs for t in run.tables):
@@ -120,7 +120,7 @@ def blocks(runs: Sequence[FinishedRun], *, shown_only: bool = True) -> list[Bloc
             )
             columns = [[v for v in column if v is not None] for column in zip(*(v for _, v in rows), strict=True)]
             found.append(
-                Block(
+                MetricTable(
                     title=title, metric=metric, estimates=estimates, rows=rows,
                     mean=tuple(sum(c) / len(c) if c else None for c in columns),
                     worst=tuple(_worst(metric, c) for c in columns),
@@ -145,7 +145,7 @@ def write_summary(folder: Path, runs: Sequence[FinishedRun], *, overwrite: bool)
     Raises:
         OutputError: the folder exists and may not be replaced, or cannot be written.
     """
-    found = blocks(runs)
+    found = metric_tables(runs)
     with fresh_folder(folder, overwrite=overwrite, mark=SUMMARY) as fresh:
         with (fresh / SUMMARY).open("w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
@@ -158,23 +158,23 @@ def write_summary(folder: Path, runs: Sequence[FinishedRun], *, overwrite: bool)
 
 def _csv_rows(runs: Sequence[FinishedRun]) -> Iterator[tuple[str, ...]]:
     """Return every number of every run; mean and worst as two more runs, with names that no folder has."""
-    for block in blocks(runs, shown_only=False):
-        for run, values in (*block.rows, ("(mean)", block.mean), ("(worst)", block.worst)):
-            for estimate, value in zip(block.estimates, values, strict=True):
+    for table in metric_tables(runs, shown_only=False):
+        for run, values in (*table.rows, ("(mean)", table.mean), ("(worst)", table.worst)):
+            for estimate, value in zip(table.estimates, values, strict=True):
                 if value is not None:
-                    yield run, block.title, block.metric, estimate, f"{value:.6g}"
+                    yield run, table.title, table.metric, estimate, f"{value:.6g}"
 
 
-def _lines(block: Block) -> list[tuple[str, ...]]:
-    """Return the rows of a block as text; the last one has the ratio of each estimate to the first."""
-    rows = [*block.rows, ("mean of the runs", block.mean), ("worst of the runs", block.worst)]
-    whole = all(v is None or isinstance(v, int) for _, values in block.rows for v in values)
+def _lines(table: MetricTable) -> list[tuple[str, ...]]:
+    """Return the rows of a table as text; the last one has the ratio of each estimate to the first."""
+    rows = [*table.rows, ("mean of the runs", table.mean), ("worst of the runs", table.worst)]
+    whole = all(v is None or isinstance(v, int) for _, values in table.rows for v in values)
     digits = 1 if whole else 3  # a mean of counts
     lines = [(name, *(number(v, digits) for v in values)) for name, values in rows]
-    if len(block.estimates) > 1 and block.metric.endswith(("_m", "_deg", "std_mps")):
-        over = (_over_first([values for _, values in block.rows], k) for k in range(1, len(block.estimates)))
+    if len(table.estimates) > 1 and table.metric.endswith(("_m", "_deg", "std_mps")):
+        over = (_over_first([values for _, values in table.rows], k) for k in range(1, len(table.estimates)))
         ratios = ("-" if ratio is None else f"{ratio:.1f} x" for ratio in over)
-        lines.append((f"times the mean of {block.estimates[0]}", "", *ratios))
+        lines.append((f"times the mean of {table.estimates[0]}", "", *ratios))
     return lines
 
 
@@ -189,14 +189,14 @@ def _over_first(rows: Sequence[Sequence[float | None]], k: int) -> float | None:
     return sum(b for _, b in both) / mine if mine else None
 
 
-def as_markdown(runs: Sequence[FinishedRun], found: Sequence[Block]) -> str:
+def as_markdown(runs: Sequence[FinishedRun], found: Sequence[MetricTable]) -> str:
     """Return the summary as Markdown."""
     text = [f"# {_title(runs)}", "", *_remarks(runs), ""]
-    for block in found:
-        head = ["", *block.estimates]
-        text += [f"## {block.title}: {_words(block.metric)}", ""]
-        text += [markdown.row(head), "|---|" + "---:|" * len(block.estimates)]
-        text += [markdown.row(line) for line in _lines(block)]
+    for table in found:
+        head = ["", *table.estimates]
+        text += [f"## {table.title}: {_words(table.metric)}", ""]
+        text += [markdown.row(head), "|---|" + "---:|" * len(table.estimates)]
+        text += [markdown.row(line) for line in _lines(table)]
         text.append("")
     return "\n".join(text)
 
@@ -213,7 +213,7 @@ def _remarks(runs: Sequence[FinishedRun]) -> list[str]:
     return said
 
 
-def _page(runs: Sequence[FinishedRun], found: Sequence[Block], folder: Path) -> str:
+def _page(runs: Sequence[FinishedRun], found: Sequence[MetricTable], folder: Path) -> str:
     links = " ".join(
         f'<a href="{quote(Path(os.path.relpath(run.folder / "report.html", folder)).as_posix())}">{escape(run.name)}</a>'
         for run in runs
@@ -222,11 +222,11 @@ def _page(runs: Sequence[FinishedRun], found: Sequence[Block], folder: Path) -> 
     body = [f'<ul class="warnings">{remarks}</ul>'] if remarks else []
     for title, group in groupby(found, key=lambda b: b.title):
         body.append(f"<h2>{escape(title)}</h2>")
-        for block in group:
-            lines = _lines(block)
-            classes = [""] * len(block.rows) + ["part ours", "ours"]
-            head = ("", *block.estimates)
-            body.append(f"<h3>{escape(_words(block.metric))}</h3>{html.table(head, lines, classes)}")
+        for table in group:
+            lines = _lines(table)
+            classes = [""] * len(table.rows) + ["part ours", "ours"]
+            head = ("", *table.estimates)
+            body.append(f"<h3>{escape(_words(table.metric))}</h3>{html.table(head, lines, classes)}")
     note = html.note(
         "Mean and worst are over the runs that have the number; summary.csv has every number of every run."
     )

@@ -19,7 +19,7 @@ from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec, two_antennas
 from graphloc.frontends._sanity import far_fixes_of
-from graphloc.frontends._streams import Stream
+from graphloc.frontends._streams import TopicData
 from graphloc.frontends._turns import without_line
 from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE, QUATERNION, UNSTAMPED, yaw_of_x_axis
 from graphloc.frozen_receiver import frozen_fixes, frozen_fixes_warning
@@ -37,7 +37,7 @@ STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class MeasuredMotion:
     """How the craft moved: times (N,) s since `origin_ns`, speed (N,) m/s (signed where the source knows).
 
     `way_m`: (N,) its places, m, east + i north, about any origin; None where the source tells the speed only.
@@ -71,7 +71,7 @@ def summed(t_s: Array, values: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(t_s))])
 
 
-def topic_report(stream: Stream, count: int) -> TopicReport:
+def topic_report(stream: TopicData, count: int) -> TopicReport:
     """Return rates, gaps, stamps and latency of a topic."""
     base = {"topic": stream.topic, "msgtype": stream.msgtype, "count": count}
     stamps, logs = stream.stamps_ns, stream.logs_ns
@@ -99,13 +99,13 @@ def topic_report(stream: Stream, count: int) -> TopicReport:
     )
 
 
-def sane(stream: Stream) -> NDArray[np.intp]:
+def sane(stream: TopicData) -> NDArray[np.intp]:
     """Return indices of messages in order of strictly increasing stamps, without clock jumps."""
     good = np.flatnonzero(~_clock.clock_jumps(stream.stamps_ns, stream.logs_ns))
     return good[_clock.longest_increasing(stream.stamps_ns[good])]
 
 
-def without_drift(streams: Sequence[Stream]) -> list[Stream]:
+def without_drift(streams: Sequence[TopicData]) -> list[TopicData]:
     """Return streams whose clocks do not drift against each other, by the recording times: the steadiest clock is believed.
 
     Clocks that gain as much as that one are left as they are: then it is the recorder's that drifts.
@@ -123,12 +123,12 @@ def without_drift(streams: Sequence[Stream]) -> list[Stream]:
     return found
 
 
-def evenly(imu: Stream) -> Stream:
+def evenly(imu: TopicData) -> TopicData:
     """Return an IMU's stream, samples that were stamped in bursts laid out evenly."""
     return imu.stamped(_clock.evened(imu.stamps_ns, imu.rows[:, :6]))
 
 
-def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:
+def on_one_clock(streams: Sequence[TopicData]) -> list[TopicData]:
     """Return streams with messages, each on the clock of the first IMU where its own is another one, by the recording times.
 
     Where that tells no date, on the first clock that does.
@@ -151,7 +151,7 @@ def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:
     return found
 
 
-def track(fixes: Stream) -> tuple[NDArray[np.int64], Array, Array]:
+def track(fixes: TopicData) -> tuple[NDArray[np.int64], Array, Array]:
     """Return stamps (N,), positions (N, 3) m about the first good fix, and the good fixes' rows.
 
     Fixes without a height lie as high as most of the others, or at 0.
@@ -200,7 +200,7 @@ def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
     return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(white_noise_m(p).max()))
 
 
-def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> Motion | None:
+def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> MeasuredMotion | None:
     """Return the motion of one receiver's fixes, in any order; None of fewer than twenty."""
     if len(fixes) < 20:
         return None
@@ -210,7 +210,7 @@ def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> Motion | None
     return motion_of_places(source, np.array([m.stamp_ns for m in ordered], dtype=np.int64), p)
 
 
-def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> Motion | None:
+def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> MeasuredMotion | None:
     """Return the motion that places (N, 3), m, tell: of a slow craft, their noise hides whether it stands; None of few."""
     t = (stamps_ns - stamps_ns[0]) / NS_PER_S if len(stamps_ns) else np.zeros(0)
     step = max(1, round(_WINDOW_S / float(np.median(np.diff(t))))) if len(t) > 1 else 1
@@ -219,7 +219,7 @@ def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> M
     v = (p_m[step:, :2] - p_m[:-step, :2]) / (t[step:] - t[:-step])[:, None]
     speed = np.interp(t, (t[step:] + t[:-step]) / 2.0, np.hypot(v[:, 0], v[:, 1]))
     fast = float(np.percentile(speed, 90)) > _FAST_MPS
-    return Motion(source, int(stamps_ns[0]), t, speed, p_m[:, 0] + 1j * p_m[:, 1], rests=fast)
+    return MeasuredMotion(source, int(stamps_ns[0]), t, speed, p_m[:, 0] + 1j * p_m[:, 1], rests=fast)
 
 
 def white_noise_m(p_m: Array) -> Array:
@@ -228,7 +228,7 @@ def white_noise_m(p_m: Array) -> Array:
     return np.asarray(1.4826 * np.median(np.abs(np.diff(p_m, n=3, axis=0)), axis=0) / np.sqrt(20.0))
 
 
-def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
+def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
     """Return status, spread and a guess on slow errors; None where there is no fix at all."""
     stamps, p, rows = track(fixes)
     if len(stamps) == 0:
@@ -328,7 +328,7 @@ def _beside(turning: Turning | None, at_ns: NDArray[np.int64], angle: Array) -> 
     return at[inside], angle[inside], np.interp(at[inside], turning.t_s, turning.turned_rad)
 
 
-def unit_of(stream: Stream) -> str | None:
+def unit_of(stream: TopicData) -> str | None:
     """Return the unit of a stream of bare numbers, if they are headings; None where it is none."""
     if stream.msgtype not in NUMBERS:
         return None
@@ -337,7 +337,7 @@ def unit_of(stream: Stream) -> str | None:
     return "rad" if len(known) and float(np.percentile(known, 95)) < 2.0 * np.pi + 0.1 else "deg"
 
 
-def _quaternions(stream: Stream, rows: Array) -> Array:
+def _quaternions(stream: TopicData, rows: Array) -> Array:
     if unit := unit_of(stream):
         angle = np.radians(rows[:, 0]) if unit == "deg" else rows[:, 0]
         half = np.where(np.abs(angle) <= MOST_TURNS * 2.0 * np.pi, angle, np.nan) / 2.0
@@ -345,7 +345,7 @@ def _quaternions(stream: Stream, rows: Array) -> Array:
     return rows[:, 6:10] if stream.msgtype == IMU else rows[:, :4]
 
 
-def headings(stream: Stream) -> tuple[NDArray[np.int64], Array]:
+def headings(stream: TopicData) -> tuple[NDArray[np.int64], Array]:
     """Return stamps (N,) and unwrapped yaw (N,), rad, as the messages say it, of those that say one."""
     keep = sane(stream)
     yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in _quaternions(stream, stream.rows[keep])]
@@ -353,7 +353,7 @@ def headings(stream: Stream) -> tuple[NDArray[np.int64], Array]:
     return stream.stamps_ns[keep][good], np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
 
 
-def says_the_same(first: Stream, second: Stream, *, mirrored: bool) -> bool:
+def says_the_same(first: TopicData, second: TopicData, *, mirrored: bool) -> bool:
     """Return whether two headings are one, but for an offset: two devices never agree so closely while the craft turns.
 
     Args:
@@ -389,7 +389,7 @@ def _wanders_deg(stamps_ns: NDArray[np.int64], angle: Array) -> float | None:
     return float(np.degrees(np.std(wrap_angle(middles - middles[0]), ddof=1)))
 
 
-def compass_report(stream: Stream, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
+def compass_report(stream: TopicData, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
     """Return whether an orientation is a heading, and in which convention; None where there is none."""
     keep = sane(stream)
     if len(keep) < 10:

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
-from graphloc.frontends._assess import Courses, Motion, Turning, against_turning, sane, summed, vec
+from graphloc.frontends._assess import Courses, MeasuredMotion, Turning, against_turning, sane, summed, vec
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
 from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, without_gravity
-from graphloc.frontends._streams import Stream
+from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
 from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
 from graphloc.time import NS_PER_S
@@ -29,7 +29,7 @@ _QUIET_S = 2
 _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, or an antenna far ahead, make less
 
 
-def samples_of(imu: Stream) -> tuple[NDArray[np.intp], list[str]]:
+def samples_of(imu: TopicData) -> tuple[NDArray[np.intp], list[str]]:
     """Return the indices of usable samples, sorted by stamp, and warnings on frozen ones, which are dropped."""
     keep = sane(imu)
     bad = frozen_samples(imu.stamps_ns[keep], imu.rows[keep, :6] if len(keep) else np.zeros((0, 6)))
@@ -37,7 +37,7 @@ def samples_of(imu: Stream) -> tuple[NDArray[np.intp], list[str]]:
 
 
 def mount_guess(
-    imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion], tree: StaticTree, body: str
+    imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion], tree: StaticTree, body: str
 ) -> MountGuess:
     """Return the IMU's mount in body: from /tf_static, else levelled by gravity and aligned with the motion.
 
@@ -71,7 +71,9 @@ def mount_guess(
     return _turned(imu, accel, gyro, motions, level, said)
 
 
-def _turned(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion], level: Array, said: str) -> MountGuess:
+def _turned(
+    imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion], level: Array, said: str
+) -> MountGuess:
     """Return the mount of a sensor that `level` (3, 3) levels, aligned with the motion; `said`: why it is known."""
     yaw, evidence = _mount_yaw(imu, accel @ level.T, gyro @ level.T, motions)
     turn = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
@@ -90,7 +92,7 @@ def _level(axis: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(angle * cross / sine).as_matrix())
 
 
-def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion]) -> tuple[float, str]:
+def _mount_yaw(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion]) -> tuple[float, str]:
     """Return the yaw (deg) that fits the motion, with the evidence; `accel`, `gyro` are levelled.
 
     It is a multiple of 90 deg unless the motion clearly contradicts that.
@@ -109,7 +111,7 @@ def _mount_yaw(imu: Stream, accel: Array, gyro: Array, motions: Sequence[Motion]
     return yaw, f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
 
 
-def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Turning | None:
+def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning | None:
     """Return the integrated rate of an IMU whose mount is known or guessed, with its gyro bias removed if known."""
     said = _in_body(imu, report, tree, body)
     if said is None:
@@ -119,14 +121,14 @@ def turning_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> T
     return Turning(int(stamps[0]), t, summed(t, gyro[:, 2]))
 
 
-def felt_of(imu: Stream, report: ImuReport, tree: StaticTree, body: str) -> Felt | None:
+def felt_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Felt | None:
     """Return the motion by an IMU whose mount is known or guessed, in the axes of the vessel."""
     said = _in_body(imu, report, tree, body)
     return None if said is None else Felt.of(*said)
 
 
 def _in_body(
-    imu: Stream, report: ImuReport, tree: StaticTree, body: str
+    imu: TopicData, report: ImuReport, tree: StaticTree, body: str
 ) -> tuple[NDArray[np.int64], Array, Array] | None:
     """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel; None of few samples."""
     keep, _ = samples_of(imu)
@@ -141,7 +143,7 @@ def _in_body(
     return imu.stamps_ns[keep], accel @ R.T, (gyro - (report.gyro_bias_radps or (0.0, 0.0, 0.0))) @ R.T
 
 
-def _against_courses(imu: Stream, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str) -> int:
+def _against_courses(imu: TopicData, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str) -> int:
     """Return +1 if the gyro turns like the course of the fixes, -1 if opposite, 0 if unclear."""
     if courses is None or len(courses.stamps_ns) < 20:
         return 0
@@ -151,9 +153,9 @@ def _against_courses(imu: Stream, report: ImuReport, courses: Courses | None, tr
 
 def _righted(
     report: ImuReport,
-    imu: Stream,
+    imu: TopicData,
     samples: tuple[Array, Array],
-    motions: Sequence[Motion],
+    motions: Sequence[MeasuredMotion],
     courses: Courses | None,
     tree: StaticTree,
     body: str,
@@ -196,7 +198,7 @@ def _righted(
 
 
 def imu_report(
-    imu: Stream, motions: Sequence[Motion], courses: Courses | None, tree: StaticTree, body: str
+    imu: TopicData, motions: Sequence[MeasuredMotion], courses: Courses | None, tree: StaticTree, body: str
 ) -> ImuReport | None:
     """Return units, gravity, standstill, noise and mount of an IMU; None if it has less than 20 samples."""
     keep, frozen = samples_of(imu)
@@ -278,7 +280,9 @@ def _scatter(columns: Array) -> float:
     return float(1.4826 * usual.max() / np.sqrt(20.0))
 
 
-def _standstill(stamps: NDArray[np.int64], accel: Array, gyro: Array, motion: Motion | None) -> NDArray[np.bool_]:
+def _standstill(
+    stamps: NDArray[np.int64], accel: Array, gyro: Array, motion: MeasuredMotion | None
+) -> NDArray[np.bool_]:
     """Return (N,) whether a sample is in several quiet seconds in a row, at a speed of zero if that is known.
 
     A rolling vessel is quiet for a second at each end of its motion, and its rate then is not a bias.

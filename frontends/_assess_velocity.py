@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import Motion, motion_of_places, sane, summed, track
+from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane, summed, track
 from graphloc.frontends._assess_world import World
 from graphloc.frontends._reports import BODY_AXES, EAST_AXES, NORTH_AXES, OdometryReport, VelocityReport, through_water
-from graphloc.frontends._streams import Stream
+from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import ODOMETRY, VECTOR
 from graphloc.time import NS_PER_S
 
@@ -22,7 +22,9 @@ _AXES = (EAST_AXES, NORTH_AXES, BODY_AXES)
 _FEWEST = 20
 
 
-def axes_of(stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float = 0.0) -> tuple[str | None, str]:
+def axes_of(
+    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float = 0.0
+) -> tuple[str | None, str]:
     """Return the axes in which the velocities of a stream fit chords of a track, and the evidence in words.
 
     The axes are None if the data do not show them, 'unknown' if none fits.
@@ -60,7 +62,7 @@ def _less(rms: float, noise: float) -> float:
 
 
 def velocity_report(
-    stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, tf_frame: str | None, scatter_m: float = 0.0
+    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, tf_frame: str | None, scatter_m: float = 0.0
 ) -> VelocityReport:
     """Return the axes of a twist or vector: of `tf_frame`, if /tf_static has its frame; else as `axes_of`."""
     axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
@@ -70,7 +72,7 @@ def velocity_report(
 
 
 def odometry_report(
-    stream: Stream, stamps_ns: NDArray[np.int64], p_m: Array, world: World, scatter_m: float = 0.0
+    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, world: World, scatter_m: float = 0.0
 ) -> OdometryReport:
     """Return the likely role of an odometry or pose topic, by its name and whether it reports the speed of the vessel.
 
@@ -106,8 +108,8 @@ def odometry_report(
 
 
 def motions_of(
-    wheels: Sequence[Stream], twists: Sequence[tuple[Stream, VelocityReport]], fixes: Sequence[Stream]
-) -> list[Motion]:
+    wheels: Sequence[TopicData], twists: Sequence[tuple[TopicData, VelocityReport]], fixes: Sequence[TopicData]
+) -> list[MeasuredMotion]:
     """Return the motion of the vessel by wheels, velocities and fixes, the most accurate source of speed first.
 
     Args:
@@ -129,7 +131,7 @@ def motions_of(
     return found + [m for s, at, p in ways if (m := motion_of_places(s.topic, at, p))]
 
 
-def _told(stream: Stream, axes: str) -> Motion | None:
+def _told(stream: TopicData, axes: str) -> MeasuredMotion | None:
     """Return the motion by a stream of velocities; NaN before the first fix."""
     keep = sane(stream)
     keep = keep[np.isfinite(stream.rows[keep, -3:-1]).all(axis=1)] if len(keep) else keep
@@ -139,9 +141,9 @@ def _told(stream: Stream, axes: str) -> Motion | None:
     origin = int(stream.stamps_ns[keep[0]])
     t = (stream.stamps_ns[keep] - origin) / NS_PER_S
     if axes == BODY_AXES:
-        return Motion(stream.topic, origin, t, v[:, 0])
+        return MeasuredMotion(stream.topic, origin, t, v[:, 0])
     east, north = (v[:, 1], v[:, 0]) if axes == NORTH_AXES else (v[:, 0], v[:, 1])
-    return Motion(stream.topic, origin, t, np.hypot(east, north), summed(t, east + 1j * north))
+    return MeasuredMotion(stream.topic, origin, t, np.hypot(east, north), summed(t, east + 1j * north))
 
 
 def _pairs(stamps_ns: NDArray[np.int64], v: Array, track_ns: NDArray[np.int64], p_m: Array) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._assess import sane, vec
 from graphloc.frontends._reports import Vec
-from graphloc.frontends._streams import Stream
+from graphloc.frontends._streams import TopicData
 from graphloc.time import NS_PER_S
 
 _EXTENT_M = 20.0  # a shorter way does not tell directions
@@ -35,20 +35,20 @@ class World(NamedTuple):
     grid: bool = False
 
 
-def in_map_grid(poses: Stream) -> bool:
+def in_map_grid(poses: TopicData) -> bool:
     """Return whether positions are as large as in a map grid, such as UTM."""
     middle_m = _middle_m(poses)
     return float(np.linalg.norm(middle_m)) > _FAR_M and abs(float(middle_m[2])) <= _FAR_M
 
 
-def _middle_m(poses: Stream) -> Array:
+def _middle_m(poses: TopicData) -> Array:
     places = poses.rows[:, :3] if len(poses) else np.zeros((0, 3))
     places = places[np.isfinite(places).all(axis=1)]
     return np.median(places, axis=0) if len(places) else np.zeros(3)
 
 
 def world_of(
-    poses: Stream, stamps_ns: NDArray[np.int64], p_m: Array, first_fix: Vec | None, antenna_m: Array | None
+    poses: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, first_fix: Vec | None, antenna_m: Array | None
 ) -> World:
     """Return the origin of the poses' frame: latitude, longitude, deg, and height, m.
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import Motion, summed
+from graphloc.frontends._assess import MeasuredMotion, summed
 from graphloc.time import NS_PER_S
 
 # Half the time over which an acceleration is asked: short, a car's fits best; longer, waves and the noise of fixes are less.
@@ -79,13 +79,13 @@ class Felt:
         a = a - np.median(a.real) - 1j * np.median(a.imag)
         return cls(int(stamps_ns[0]), t, turned, summed(t, summed(t, a * np.exp(1j * turned))))
 
-    def times_of(self, motion: Motion) -> Array:
+    def times_of(self, motion: MeasuredMotion) -> Array:
         """A motion's times (M,) as these are counted, s."""
         return np.asarray(motion.t_s + (motion.origin_ns - self.origin_ns) / NS_PER_S)
 
 
 def yaw_in_craft(
-    stamps_ns: NDArray[np.int64], accel: Array, gyro: Array, motions: Sequence[Motion]
+    stamps_ns: NDArray[np.int64], accel: Array, gyro: Array, motions: Sequence[MeasuredMotion]
 ) -> YawInCraft | None:
     """Return the clearest estimate over all motions and window lengths; None if no motion is long enough.
 
@@ -97,7 +97,7 @@ def yaw_in_craft(
     return max(tried, key=lambda found: found.coherence / found.chance, default=None)
 
 
-def _yaw_by(felt: Felt, motion: Motion, half_s: float) -> YawInCraft | None:
+def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | None:
     """Return the estimate by one motion and one window length.
 
     Of positions p, p(t + h) - 2 p(t) + p(t - h) gives the mean acceleration about t, and p(t + h) - p(t - h) the course; the

@@ -120,7 +120,7 @@ _MOST = 1e12
 
 
 @dataclass(slots=True)
-class Stream:
+class TopicData:
     """Columns of one topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`).
 
     recorded: whether the stamps are recording times, because the headers hold none, or whole seconds only.
@@ -172,15 +172,15 @@ class Stream:
         told = {(stamp_ns, repr(row)) for stamp_ns, row in zip(self._stamps, self.tuples, strict=True)}
         return 4 * len(set(self._stamps)) < 3 * min(len(told), len(set(self._logs)))
 
-    def later(self, by_ns: int) -> Stream:
+    def later(self, by_ns: int) -> TopicData:
         """Return the stream with `by_ns` added to its stamps."""
         return replace(self, _stamps=[stamp_ns + by_ns for stamp_ns in self._stamps])
 
-    def stamped(self, stamps_ns: NDArray[np.int64]) -> Stream:
+    def stamped(self, stamps_ns: NDArray[np.int64]) -> TopicData:
         """Return the stream with other stamps (N,)."""
         return replace(self, _stamps=stamps_ns.tolist())
 
-    def without_drift(self, ppm: float) -> Stream:
+    def without_drift(self, ppm: float) -> TopicData:
         """Return the stream with what a clock that runs fast has gained taken off its stamps."""
         gained = np.rint(1e-6 * ppm * np.array(self.elapsed, dtype=float)).astype(np.int64)
         return replace(self, _stamps=(self.stamps_ns - gained).tolist(), drift_ppm=ppm)
@@ -206,13 +206,13 @@ class Stream:
         return len(self._stamps)
 
 
-def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
+def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
     """Read all topics of the types in `ROWS`, and the static transforms.
 
     An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type.
     """
     streams = {
-        t.topic: Stream(t.topic, t.msgtypes[0])
+        t.topic: TopicData(t.topic, t.msgtypes[0])
         for t in bag.topics.values()
         if len(t.msgtypes) == 1 and t.msgtypes[0] in ROWS and (t.msgtypes[0] not in NUMBERS or _HEADING.search(t.topic))
     }
@@ -241,17 +241,17 @@ def read_streams(bag: Bag) -> tuple[list[Stream], StaticTree]:
     return list(streams.values()), tree
 
 
-def _plain(raw: RawMessage, msg: Any, streams: dict[str, Stream]) -> list[tuple[Stream, Row | None]]:
+def _plain(raw: RawMessage, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:
     return [(streams[raw.topic], ROWS[raw.msgtype](msg))] if raw.topic in streams else []
 
 
-def _sentences(topic: str, msg: Any, streams: dict[str, Stream]) -> list[tuple[Stream, Row | None]]:
+def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:
     """Return the stream, created at first use, and the row of each sentence."""
-    said: list[tuple[Stream, Row | None]] = []
+    said: list[tuple[TopicData, Row | None]] = []
     text = nmea.text_of(msg)
     for talker, kind in nmea.identities(text):
         if kind in SENTENCES:
             msgtype, row_of = SENTENCES[kind]
             name = f"{topic} {talker}{kind}"
-            said.append((streams.setdefault(name, Stream(name, msgtype)), row_of(text, talker + kind)))
+            said.append((streams.setdefault(name, TopicData(name, msgtype)), row_of(text, talker + kind)))
     return said

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import Motion, Turning
+from graphloc.frontends._assess import MeasuredMotion, Turning
 from graphloc.frontends._mount_yaw import FEWEST, HALF_S, MOVES_M, STEP_S, Felt, bent
 from graphloc.frontends._turns import without_line
 from graphloc.time import NS_PER_S
@@ -53,7 +53,7 @@ def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: A
     return (value, sigma) if clear else None
 
 
-def motion_time_offset(felt: Felt, motion: Motion) -> tuple[float, float] | None:
+def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> tuple[float, float] | None:
     """Return what should be added to the stamps of a motion, s, and its sigma; None if the accelerometer does not show it.
 
     Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. With correlation

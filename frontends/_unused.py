@@ -10,14 +10,14 @@ import numpy as np
 from graphloc.frontends._assess import sane
 from graphloc.frontends._assess_imu import samples_of
 from graphloc.frontends._source import TopicSummary
-from graphloc.frontends._streams import Stream
+from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import GPS_FIXES, IMU, NAV_SAT_FIX
 
 _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
 
 
-def unused_topics(streams: Sequence[Stream], used: Container[str]) -> list[str]:
+def unused_topics(streams: Sequence[TopicData], used: Container[str]) -> list[str]:
     """Return a line for each IMU and GNSS topic that is not used, with the reason: otherwise they would seem to be missing."""
     lines = (
         []
@@ -47,7 +47,7 @@ def unused_magnetometers(topics: Iterable[TopicSummary]) -> list[str]:
     ]
 
 
-def _why_unused(stream: Stream) -> str:
+def _why_unused(stream: TopicData) -> str:
     rows = stream.rows[sane(stream)] if len(stream) else np.zeros((0, 8))
     if stream.msgtype == IMU and len(rows) and not rows[:, :6].any():
         return "they hold neither accelerations nor rates, an orientation at most"

@@ -51,7 +51,7 @@ from graphloc.frontends.decode import (
     stamp_ns_of,
     supported_types,
 )
-from graphloc.ledger import LedgerRow, Outcome
+from graphloc.ledger import RECORDED_AT, LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Progress, Recording, Span
 from graphloc.time import utc_text
@@ -211,10 +211,7 @@ class _Reader:
         try:
             msg = self._bag.decode(raw)
         except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
-            broken = malformed(
-                f"{raw.file}: cannot be decoded as {raw.msgtype} ({type(error).__name__}), "
-                f"recorded at {utc_text(raw.log_ns)}"
-            )
+            broken = malformed(f"{raw.file}: cannot be decoded as {raw.msgtype} ({type(error).__name__}){_when(raw)}")
         for readings in self._sensors.get(raw.topic, ()):
             seq, self._seq = self._seq, self._seq + 1
             if msg is None:
@@ -236,12 +233,12 @@ class _Reader:
         """Decode a message for a sensor; add a row if it gives no reading."""
         stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=readings.config.stamps == "recorded")
         if stamp_ns is None:
-            text = f"{raw.file}: header stamp is zero or negative, recorded at {utc_text(raw.log_ns)}: {NO_STAMP}"
+            text = f"{raw.file}: header stamp is zero or negative{_when(raw)}: {NO_STAMP}"
             self._rows.append(readings.row(seq, 0, malformed(text)))
             return
         stamp_ns = corrected_ns(stamp_ns, readings.config, raw.elapsed_ns)
         if not 0 < stamp_ns <= LATEST_NS:
-            text = f"{raw.file}: no time with time_offset_s on it, recorded at {utc_text(raw.log_ns)}"
+            text = f"{raw.file}: no time with time_offset_s on it{_when(raw)}"
             self._rows.append(readings.row(seq, 0, malformed(text)))
             return
         decoder = decoder_of(readings.config.kind, raw.msgtype)
@@ -280,6 +277,11 @@ class _Reader:
             missing = summary.messages - read[topic]
             add(topic, missing, Outcome.MALFORMED, "announced by the bag's index, but cannot be read")
         return rows
+
+
+def _when(raw: RawMessage) -> str:
+    """Return the clause that tells a message without a stamp from others."""
+    return f"{RECORDED_AT}{utc_text(raw.log_ns)}"
 
 
 def _subscriptions(config: VesselConfig, topics: Mapping[str, TopicSummary], bag: str) -> list[Readings]:

@@ -18,7 +18,7 @@ from graphloc.config import STANDARD_GRAVITY_MPS2, GnssConfig
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import (
     Courses,
-    Motion,
+    MeasuredMotion,
     Turning,
     compass_report,
     courses_of,
@@ -56,7 +56,7 @@ from graphloc.frontends._reports import (
     filtered,
 )
 from graphloc.frontends._source import Bag, TopicSummary
-from graphloc.frontends._streams import Stream, read_streams
+from graphloc.frontends._streams import TopicData, read_streams
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._time_offsets import heading_time_offset, motion_time_offset
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
@@ -124,18 +124,18 @@ class _Contents:
 
     source: str
     topics: Mapping[str, TopicSummary]
-    streams: Mapping[str, Stream]
-    aligned: Mapping[str, Stream]
+    streams: Mapping[str, TopicData]
+    aligned: Mapping[str, TopicData]
     tree: StaticTree
     lidars: Mapping[str, _First]
     cameras: Mapping[str, _First]
     warnings: tuple[str, ...]
 
-    def of_type(self, *msgtypes: str) -> list[Stream]:
+    def of_type(self, *msgtypes: str) -> list[TopicData]:
         """Return the aligned streams of some message types."""
         return [stream for stream in self.aligned.values() if stream.msgtype in msgtypes]
 
-    def tf_frame(self, stream: Stream) -> str | None:
+    def tf_frame(self, stream: TopicData) -> str | None:
         """Return the frame of a stream where /tf_static connects it with the body."""
         frame = stream.frame_id
         return frame if self.tree.resolve(self.tree.body(), frame) and frame in self.tree.frames else None
@@ -259,7 +259,7 @@ def _octave(gnss: GnssReport) -> int:
 
 def _odometry_reports(
     bag: _Contents, gnss: Sequence[GnssReport], reference: _Track
-) -> list[tuple[Stream, OdometryReport]]:
+) -> list[tuple[TopicData, OdometryReport]]:
     frame = gnss[0].tf_frame if gnss else None
     mount = bag.tree.resolve(bag.tree.body(), frame) if frame else None
     antenna_m = None if mount is None else mount[0]
@@ -271,7 +271,7 @@ def _odometry_reports(
 
 
 def _late_s(
-    bag: _Contents, imus: Sequence[ImuReport], motions: Sequence[Motion]
+    bag: _Contents, imus: Sequence[ImuReport], motions: Sequence[MeasuredMotion]
 ) -> dict[str, tuple[float, float] | None]:
     """Return by topic what should be added to the stamps of a motion by the best IMU, s, and its sigma."""
     felt = felt_of(bag.aligned[imus[0].topic], imus[0], bag.tree, bag.tree.body()) if imus else None
@@ -303,9 +303,9 @@ def _lacking(
     return lines
 
 
-def _without_echoes(compasses: Sequence[tuple[CompassReport, Stream]]) -> list[tuple[CompassReport, Stream]]:
+def _without_echoes(compasses: Sequence[tuple[CompassReport, TopicData]]) -> list[tuple[CompassReport, TopicData]]:
     """Return the compasses, those of types without a stamp last; one that repeats another names it in `like`."""
-    distinct: list[tuple[CompassReport, Stream]] = []
+    distinct: list[tuple[CompassReport, TopicData]] = []
     found = []
     for report, stream in sorted(compasses, key=lambda pair: pair[1].msgtype in NUMBERS):
         for other, other_stream in distinct if report.usable else ():
@@ -318,7 +318,7 @@ def _without_echoes(compasses: Sequence[tuple[CompassReport, Stream]]) -> list[t
     return found
 
 
-def _timed(report: CompassReport, stream: Stream, recorded: Stream, turning: Turning | None) -> CompassReport:
+def _timed(report: CompassReport, stream: TopicData, recorded: TopicData, turning: Turning | None) -> CompassReport:
     """Add the time offset that the gyroscope shows, relative to the stamps as recorded."""
     if turning is None or not report.usable:
         return report
@@ -331,7 +331,7 @@ def _timed(report: CompassReport, stream: Stream, recorded: Stream, turning: Tur
     return replace(report, why=f"{report.why}; by the gyro, time_offset_s should be {value:.3f} +- {sigma:.3f}")
 
 
-def _beside_gyro(report: CompassReport, stream: Stream, best: tuple[ImuReport, Stream] | None) -> CompassReport:
+def _beside_gyro(report: CompassReport, stream: TopicData, best: tuple[ImuReport, TopicData] | None) -> CompassReport:
     """Add the wander and the number of scattered headings, both relative to the gyroscope of the best IMU."""
     if best is None or not report.usable:
         return report
@@ -361,8 +361,8 @@ def _beside_gyro(report: CompassReport, stream: Stream, best: tuple[ImuReport, S
 def _timed_fixes(
     gnss: GnssReport,
     late: Mapping[str, tuple[float, float] | None],
-    velocities: Sequence[tuple[Stream, VelocityReport]],
-    streams: Mapping[str, Stream],
+    velocities: Sequence[tuple[TopicData, VelocityReport]],
+    streams: Mapping[str, TopicData],
 ) -> GnssReport:
     """Return the report with how late the fixes' stamps are: by the fixes, or by a velocity over ground that tells it better.
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.solution import Health
+from graphloc.solution import Health, HealthReason
 from graphloc.trajectory import bounds_95
 
 
@@ -19,7 +19,7 @@ class Event(NamedTuple):
 
     Attributes:
         text: a line. warns: it makes the track, or a sensor, doubtful, so that a reader must see it.
-        heading_guessed: from here on the heading is a guess, for as long as estimates say so in their reason.
+        heading_guessed: from here on the heading is a guess, for as long as that is the cause of estimates' health.
     """
 
     text: str
@@ -56,7 +56,7 @@ class Estimate:
     accel_bias_mps2: Array
     gyro_bias_radps: Array
     health: Health
-    reason: str
+    reason: HealthReason
     since_agreed_s: Mapping[str, float]
 
     @property

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 from graphloc.errors import GraphlocError
 
+RECORDED_AT = ", recorded at "  # in a reason, before the time that tells its message from others
+
 
 class Outcome(enum.StrEnum):
     """What became of a message."""
@@ -62,6 +64,11 @@ class LedgerRow:
     reason: str = ""
     detail: str = ""
     count: int = 1
+
+    @property
+    def common_reason(self) -> str:
+        """The reason without the time at which its message was recorded: as others with it have it."""
+        return self.reason.partition(RECORDED_AT)[0]
 
 
 class Ledger:

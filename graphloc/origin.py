@@ -70,8 +70,8 @@ def _why_no_fix(recording: Recording, config: VesselConfig) -> str:
         return f"no GNSS sensor to take a datum from{_why_no_receiver(recording, config)}"
     reasons: Counter[str] = Counter()
     for row in recording.rows:
-        if row.sensor in receivers:  # when each was recorded is no reason of its own
-            reasons[f"{row.sensor}: {row.reason.partition(', recorded at ')[0]}"] += row.count
+        if row.sensor in receivers:
+            reasons[f"{row.sensor}: {row.common_reason}"] += row.count
     if not reasons:
         return f"no GNSS fix from {', '.join(receivers)}: the topic holds no message"
     (reason, count), *_ = reasons.most_common(1)
@@ -81,7 +81,7 @@ def _why_no_fix(recording: Recording, config: VesselConfig) -> str:
 def _why_no_receiver(recording: Recording, config: VesselConfig) -> str:
     if not config.sensors:
         return "; vessel.yaml names no sensor at all: `graphloc inspect` writes a first one"
-    off = [name for name, sensor in config.sensors.items() if getattr(sensor, "kind", None) == "gnss"]
+    off = [name for name, sensor in config.sensors.items() if sensor.kind == "gnss"]
     if off:
         return f": {', '.join(off)} is switched off (enabled: false); switch it on, or set datum: in vessel.yaml"
     unread = sorted({row.topic for row in recording.rows if not row.sensor and any(f in row.reason for f in _FIXES)})

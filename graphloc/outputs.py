@@ -176,7 +176,7 @@ def _solution_rows(solution: Solution, picked: Array) -> Iterator[list[object]]:
             *(f"{v:.4f}" for v in track.v_world_mps[k]),
             *(f"{v:.4f}" for v in bound[i]),
             solution.health[k].value,
-            solution.health_reason[k],
+            solution.health_reason[k].text,
             *(f"{since[k]:.3f}" for since in solution.since_agreed_s.values()),
         ]
 

@@ -100,13 +100,10 @@ class Recording:
     span: Span | None = None
 
     def lost(self, sensors: Container[str]) -> str:
-        """Return a clause on why most of the messages of these sensors that gave nothing gave nothing; empty where none is.
-
-        When each was recorded is no reason of its own.
-        """
+        """Return a clause on why most of the messages of these sensors that gave nothing gave nothing; empty where none is."""
         reasons: Counter[str] = Counter()
         for row in self.rows:
             if row.sensor in sensors:
-                reasons[row.reason.partition(", recorded at ")[0]] += row.count
+                reasons[row.common_reason] += row.count
         ((reason, count),) = reasons.most_common(1) or (("", 0),)
         return f"; {count} of its messages gave nothing: {reason}" if count else ""

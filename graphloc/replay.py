@@ -26,7 +26,7 @@ from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement, TagSighting
 from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
-from graphloc.solution import Solution, SolveStats
+from graphloc.solution import Cause, Solution, SolveStats
 from graphloc.solve._warnings import disagreement_warning, joint_rejection_warning
 from graphloc.trajectory import Trajectory
 
@@ -232,12 +232,14 @@ def _result(session: _Session, recording: Recording, config: VesselConfig, *, in
 def _timed(happened: Sequence[tuple[int, Event]], estimates: Sequence[Estimate]) -> list[Event]:
     """Return events with their times, s since the first pose; of a guessed heading also until when, and what would end that."""
     begin_ns = estimates[0].stamp_ns
+    guesses_ns = [stamp_ns for stamp_ns, event in happened if event.heading_guessed]
     timed = []
     for stamp_ns, event in happened:
         line = f"at {max(stamp_ns - begin_ns, 0) / 1e9:.0f} s: {event.text}"
         if event.heading_guessed:
-            held = [e.stamp_ns for e in estimates if e.stamp_ns >= stamp_ns and event.text in e.reason]
-            last_ns = max(held, default=stamp_ns)
+            next_ns = min((at for at in guesses_ns if at > stamp_ns), default=estimates[-1].stamp_ns + 1)
+            guessed_ns = (e.stamp_ns for e in estimates if e.reason.cause is Cause.GUESSED_HEADING)
+            last_ns = max((at for at in guessed_ns if stamp_ns <= at < next_ns), default=stamp_ns)
             until = (
                 "to the end of the run"
                 if last_ns >= estimates[-1].stamp_ns

@@ -26,6 +26,33 @@ class Health(enum.StrEnum):
     LOST = "lost"  # the covariance, or the solver, says that the pose is not known
 
 
+class Cause(enum.Enum):
+    """What keeps an estimate from being good: what would have to change."""
+
+    BOUND = enum.auto()  # its 95 % bound is too large
+    NO_POSITION = enum.auto()  # no absolute sensor agrees
+    SENSORS = enum.auto()  # some absolute sensors are missing or do not agree
+    GUESSED_HEADING = enum.auto()  # no sensor measures the heading, and the motion does not tell it yet
+    CONTRADICTION = enum.auto()  # measurements contradict each other or the motion, as a warning says
+
+
+@dataclass(frozen=True, slots=True)
+class HealthReason:
+    """Why an estimate is not good; as text, its `text`.
+
+    Attributes:
+        text: for a reader; empty where it is good. cause: what to do something about; None where it is good.
+        sensors: those that are missing or do not agree, if that is the cause.
+    """
+
+    text: str = ""
+    cause: Cause | None = None
+    sensors: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return self.text
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SlowEstimate:
     """A slow state of one sensor over time, e.g. the GNSS error: what must be subtracted from its fixes.
@@ -89,7 +116,7 @@ class Solution:
         v_cov: (N, 3, 3) covariance of velocity, world axes, m^2/s^2.
         accel_bias_mps2, gyro_bias_radps: (N, 3) in IMU axes.
         gyro_radps: (N, 3) angular rate of the body, body axes, bias removed.
-        health: N values of `Health`; health_reason: one short text each.
+        health, health_reason: N each.
         since_agreed_s: per absolute sensor, (N,) s since it last agreed (inf: never).
         slow: slow states by sensor.
         berths: the vessel seen from each berth, where it is near.
@@ -106,7 +133,7 @@ class Solution:
     gyro_bias_radps: Array
     gyro_radps: Array
     health: tuple[Health, ...]
-    health_reason: tuple[str, ...]
+    health_reason: tuple[HealthReason, ...]
     since_agreed_s: Mapping[str, Array]
     slow: Mapping[str, SlowEstimate]
     berths: tuple[BerthTrack, ...]
@@ -123,8 +150,9 @@ class Solution:
     def doubted(self, why: str) -> Solution:
         """Return it with no pose called good."""
         good = [health is Health.GOOD for health in self.health]
+        doubt = HealthReason(why, Cause.CONTRADICTION)
         return replace(
             self,
             health=tuple(Health.DEGRADED if g else health for g, health in zip(good, self.health, strict=True)),
-            health_reason=tuple(why if g else reason for g, reason in zip(good, self.health_reason, strict=True)),
+            health_reason=tuple(doubt if g else reason for g, reason in zip(good, self.health_reason, strict=True)),
         )

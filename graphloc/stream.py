@@ -19,10 +19,7 @@ from typing import BinaryIO, Protocol, TextIO
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from graphloc.config import (
-    VesselConfig,
-    load_config,
-)
+from graphloc.config import VesselConfig, load_config
 from graphloc.errors import ConfigError
 from graphloc.estimate import Estimate, Event
 from graphloc.factors import INERTIAL, KINDS, SENSORS
@@ -69,7 +66,7 @@ def as_json(estimate: Estimate, datum: Datum) -> dict[str, object]:
         "bound_95_m": estimate.bound_95_m,
         "heading_bound_95_deg": float(np.degrees(estimate.heading_bound_95_rad)),
         "health": estimate.health.value,
-        "reason": estimate.reason,
+        "reason": estimate.reason.text,
         "since_agreed_s": {name: round(s, 3) for name, s in estimate.since_agreed_s.items()},
     }
     return {key: plain(value) for key, value in told.items()}
@@ -169,8 +166,9 @@ def run(
         found = smoother.feed(said)
         session.news()
         if period_ns:
-            before, slot = slot, said.stamp_ns // period_ns if isinstance(said, ImuSample) else slot
-            found = smoother.predict() if slot != before else None
+            found = None
+            if isinstance(said, ImuSample) and said.stamp_ns // period_ns != slot:
+                slot, found = said.stamp_ns // period_ns, smoother.predict()
         if found is not None:
             session.estimate(found)
         session.account(smoother.rows())

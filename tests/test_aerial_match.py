@@ -29,7 +29,7 @@ from graphloc.frontends.aerial.layers import (
     shore_layer,
     weighed,
 )
-from graphloc.frontends.aerial.match import Grid, Mode, modes_of
+from graphloc.frontends.aerial.match import Mode, SearchGrid, modes_of
 from graphloc.frontends.aerial.scan import LevelCloud, inside, outline
 from graphloc.frontends.aerial.vector import VectorMap
 from graphloc.trajectory import Trajectory
@@ -238,15 +238,15 @@ def test_drawn_lines_are_edges_and_shores() -> None:
     assert shores[:, row - 3 : row + 4, column - 3 : column + 4].max() == 0.0
 
 
-def grid(half: int = 20) -> Grid:
-    return Grid(
+def grid(half: int = 20) -> SearchGrid:
+    return SearchGrid(
         np.radians(0.5) * np.arange(-8, 9),
         0.25 * np.arange(half, -half - 1, -1, dtype=float),
         0.25 * np.arange(-half, half + 1, dtype=float),
     )
 
 
-def volume(g: Grid, *peaks: tuple[float, Array, Array]) -> NDArray[np.float32]:
+def volume(g: SearchGrid, *peaks: tuple[float, Array, Array]) -> NDArray[np.float32]:
     """Log of a sum of Gaussians: share, mean (east, north, yaw), sigma."""
     h, n, e = np.meshgrid(g.yaw_rad, g.north_m, g.east_m, indexing="ij")
     total = np.full(h.shape, 1e-30)

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 from graphloc import app
 from graphloc.config import BodyVelocityConfig, ImuConfig, VelocityConfig, VesselConfig
 from graphloc.eval.calibrate import PROBE, Calibration, Check, Suggestion, _check
-from graphloc.eval.calibrate._evidence import Estimate, Evidence
+from graphloc.eval.calibrate._evidence import Evidence, OffsetEstimate
 from graphloc.eval.calibrate._imu import imu_noise
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
@@ -343,7 +343,9 @@ def test_it_is_written_and_shown(right: app.Run, tmp_path: Path) -> None:
 def test_an_offset_of_three_and_a_half_sigmas_does_not_fit(right: app.Run) -> None:
     """It read 'fits, within 0.019 s'."""
     said = [
-        _check(("gnss", "time"), Estimate(value=off_s, sigma=0.0097, drop=6.0), right.recording, right.config).said
+        _check(
+            ("gnss", "time"), OffsetEstimate(value=off_s, sigma=0.0097, drop=6.0), right.recording, right.config
+        ).said
         for off_s in (0.034, -0.034, 0.01)
     ]
     assert said == [

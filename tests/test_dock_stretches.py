@@ -11,7 +11,7 @@ from graphloc.eval.simulate import find_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
 from graphloc.solve._align import align
-from graphloc.solve._decide import decisions, weigh
+from graphloc.solve._decide import Stage, decisions, weigh
 from graphloc.solve._grow import grow
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._start import solve_start
@@ -39,7 +39,7 @@ def test_a_stretch_may_end_anywhere() -> None:
     seen = next(s for s in problem.streams if s.name == "tags")
     for stop in (int(k) for k in seen.state[len(seen.state) // 2 :][:6]):
         first = stop - 60
-        verdicts = weigh(problem, values, first=first, last=stop, stage="final")
+        verdicts = weigh(problem, values, first=first, last=stop, stage=Stage.FINAL)
         assert any(v.at.slow_next is not None for key, v in verdicts.items() if key[0] == seen.number)
         start = weak_prior(problem, values, first)
         step = solve_stretch(problem, gtsam.Values(values), first, stop, start, decisions(verdicts))
@@ -52,7 +52,7 @@ def test_the_past_says_of_a_state_what_the_whole_stretch_says_without_what_comes
     problem, values = grown()
     slow_of, last = problem.timeline.slow_of, len(problem.timeline) - 1
     first, stop = 60, last - 40
-    verdicts = weigh(problem, values, first=first, last=stop, stage="final")
+    verdicts = weigh(problem, values, first=first, last=stop, stage=Stage.FINAL)
     prior = weak_prior(problem, values, first)
     here = gtsam.Values(values)
     for _ in range(6):  # until the tails of the constants' priors stand

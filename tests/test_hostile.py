@@ -32,7 +32,7 @@ from graphloc.frontends.inspect import inspect_bag
 from graphloc.frontends.lines import Trouble, parse
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.recording import Recording
-from graphloc.solve._align import _swell
+from graphloc.solve._standstill import _swell
 from tests.bagfactory import START_NS, Item, Messages, S, still_run, write_bag
 
 MAKE, MAKE1 = Messages(2), Messages(1)

@@ -15,7 +15,7 @@ from graphloc.config import CompassConfig, ImuConfig, VesselConfig, load_config
 from graphloc.frames import Datum, Geodetic
 from graphloc.frontends._assess_velocity import axes_of
 from graphloc.frontends._source import Bag, RawMessage
-from graphloc.frontends._streams import Stream
+from graphloc.frontends._streams import TopicData
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import TWIST
 from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
@@ -319,7 +319,7 @@ def test_a_velocity_is_judged_without_the_noise_of_the_fixes(scatter_m: float, a
     t, rng = np.arange(300.0), np.random.default_rng(2)
     way = 60.0 * np.column_stack([np.sin(t / 40.0), np.cos(t / 40.0), np.zeros(len(t))])
     stamps = START_NS + (t * S).astype(np.int64)
-    stream = Stream("/vel", TWIST)
+    stream = TopicData("/vel", TWIST)
     for stamp, velocity in zip(stamps.tolist(), np.gradient(way, 1.0, axis=0).tolist(), strict=True):
         stream.add(stamp, stamp, tuple(velocity), "run.db3")
     told, why = axes_of(stream, stamps, way + rng.normal(0.0, scatter_m, way.shape), scatter_m)

@@ -34,8 +34,9 @@ from graphloc.frontends.decode import (
 )
 from graphloc.measurements import GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Recording
-from graphloc.solve._align import _position_and_velocity, _Track
+from graphloc.solve._align import _position_and_velocity
 from graphloc.solve._covariances import world_covariance
+from graphloc.solve._standstill import Track
 from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import Messages, still_run, write_bag
@@ -354,7 +355,7 @@ def test_the_speed_at_the_start_is_as_sure_as_the_positions_say(every_s: float, 
     for _ in range(200):
         t = np.asarray(10.0 + every_s * np.arange(count), dtype=np.float64)
         p = np.column_stack([t[:, None] * true + rng.normal(0.0, sigma_m, (count, 2)), np.zeros(count)])
-        track = _Track(t, p, np.full((count, 3), sigma_m))
+        track = Track(t, p, np.full((count, 3), sigma_m))
         _, _, v, sigma = _position_and_velocity({}, track, None)
         squared.append(((v[:2] - true) / sigma[:2]) ** 2)
     assert np.mean(squared) < 1.2

@@ -77,6 +77,6 @@ def test_an_imu_turned_in_the_file_is_reported_in_the_report(run: SimulatedRun) 
     found, right = (app.smooth_recording(run.recording, c) for c in (config, usual))
     assert any("unless the vessel goes sideways" in line for line in found.recording.warnings)
     assert Health.GOOD not in found.solution.health
-    assert any(why.startswith("the course is more than 45 deg off") for why in found.solution.health_reason)
+    assert any(why.text.startswith("the course is more than 45 deg off") for why in found.solution.health_reason)
     assert right.recording.warnings == run.recording.warnings
     assert Health.GOOD in right.solution.health

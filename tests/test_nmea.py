@@ -20,7 +20,7 @@ from graphloc.factors import KINDS
 from graphloc.frontends import nmea
 from graphloc.frontends._assess_velocity import motions_of, velocity_report
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends._streams import Stream
+from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import OTHER_TYPES
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import TWIST
@@ -134,7 +134,7 @@ def test_a_message_may_hold_a_burst() -> None:
 
 
 def test_a_velocity_that_begins_without_a_fix_still_tells_the_motion() -> None:
-    stream = Stream("/nmea GPVTG", TWIST)
+    stream = TopicData("/nmea GPVTG", TWIST)
     for k in range(60):
         speed = (np.nan, np.nan, np.nan) if k < 20 else (0.1 * k, 1.0, 0.0)
         stream.add((1 + k) * S, (1 + k) * S, speed, "run.db3")
@@ -300,6 +300,23 @@ def test_a_sentence_is_read_once(one: str, other: str, twice: bool) -> None:
         for name, asked in zip("ab", (one, other), strict=True)
     }
     with pytest.raises(ConfigError, match="a and b both read /line") if twice else nullcontext():
+        parse_config({"sensors": blocks}, KINDS, "vessel.yaml")
+
+
+@pytest.mark.parametrize(
+    ("kind", "one", "other", "what"),
+    [
+        ("pose", ["x", "y"], ["y", "yaw"], "y of /pose"),
+        ("pose", ["x", "y", "yaw"], ["y", "x"], "x, y of /pose"),
+        ("pose", ["x", "y"], ["y", "x"], "/pose"),
+        ("pose", ["x", "y"], ["z", "yaw"], ""),
+        ("body_velocity", ["x"], ["x", "y"], "x of /pose"),
+    ],
+)
+def test_an_axis_is_read_once(kind: str, one: list[str], other: list[str], what: str) -> None:
+    blocks = {name: {"kind": kind, "topic": "/pose", "axes": axes} for name, axes in (("a", one), ("b", other))}
+    refused = f"^vessel.yaml: .*sensors: a and b both read {what}, which would count twice: delete .*$"
+    with pytest.raises(ConfigError, match=refused) if what else nullcontext():
         parse_config({"sensors": blocks}, KINDS, "vessel.yaml")
 
 

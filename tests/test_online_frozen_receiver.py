@@ -115,7 +115,7 @@ def frozen(run: SimulatedRun, begin_ns: int, end_ns: int, sensors: Collection[st
 
 
 def test_online_a_frozen_receiver_and_compass_do_not_pull_the_estimate() -> None:
-    """ConditionalGaussian a compass alone. It takes 7 s to find, by when the estimate has been set back by 16 m, and braked: 86 m later."""
+    """Beside a compass alone. It takes 7 s to find, by when the estimate has been set back by 16 m, and braked: 86 m later."""
     scenario = Scenario(
         path="loops", duration_s=50.0, noise="clean", gnss_hz=5.0, gnss_sigma_m=0.5, accel_bias_mps2=0.3, gyro_bias_radps=0.03,
         wave_roll_deg=5.0, wave_heave_m=0.3,
@@ -134,7 +134,7 @@ def test_online_a_frozen_receiver_and_compass_do_not_pull_the_estimate() -> None
 
 
 def test_online_frozen_sensors_are_not_followed() -> None:
-    """ConditionalGaussian matches, 40 % of them false. Followed, it would be off by 30 m and more, and call that good."""
+    """Beside matches, 40 % of them false. Followed, it would be off by 30 m and more, and call that good."""
     run = simulate_slowly(Scenario(path="loops", duration_s=45.0, noise="drift"), 1)
     begin_ns = next(m.stamp_ns for m in run.recording.measurements if isinstance(m, GnssPosition)) + 18 * 10**9
     end_ns = begin_ns + 15 * 10**9

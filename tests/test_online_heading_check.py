@@ -61,7 +61,7 @@ def test_a_compass_in_other_axes_is_reported_under_way(sense: float, off_deg: fl
     """By how much it is off is told as well, as the truth has it."""
     found = replayed(read_as(run.recording, sense, off_deg), run.config)
     (event,) = (line for line in found.solution.stats.events if "the heading is off by about" in line)
-    said = [e for e in found.estimates if "the heading is off by about" in e.reason]
+    said = [e for e in found.estimates if "the heading is off by about" in e.reason.text]
     assert said
     assert all(e.health is not Health.GOOD for e in said)
     yaw = np.arctan2(said[0].R_world_body[1, 0], said[0].R_world_body[0, 0])

@@ -24,7 +24,7 @@ from graphloc.position_jumps import JumpDetector, jump_warnings, position_jumps
 from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
 from graphloc.solution import Health
-from graphloc.solve._decide import _by_kernel
+from graphloc.solve._decide import Stage, _by_kernel
 from tests.slowly import simulate_slowly, with_few_states
 
 
@@ -229,7 +229,7 @@ def test_a_run_with_a_jump_that_the_bounds_do_not_cover_is_not_good() -> None:
     config = with_few_states(config, rate_hz=2.5)
     usual, jumped = (app.smooth_recording(of, config).solution for of in (right, wrong))
     assert not any("position jump" in line for line in usual.stats.warnings)
-    assert "position jump of gnss, and no other sensor measures position" not in usual.health_reason
+    assert "position jump of gnss, and no other sensor measures position" not in map(str, usual.health_reason)
     assert any(line.startswith("gnss: position jump of 0.") for line in jumped.stats.warnings)
     assert Health.GOOD in usual.health
     assert Health.GOOD not in jumped.health
@@ -423,5 +423,5 @@ def test_a_sensor_that_lies_by_more_than_numbers_hold_is_an_outlier() -> None:
         row=SimpleNamespace(absolute=True), config=SimpleNamespace(kernel=KernelConfig(kind="cauchy"))
     )
     at: Any = None
-    verdicts = _by_kernel(stream, [0, 1, 2], [at] * 3, [(off,)] * 3, "final")
+    verdicts = _by_kernel(stream, [0, 1, 2], [at] * 3, [(off,)] * 3, Stage.FINAL)
     assert max(v.weight for v in verdicts) < 1e-6

@@ -15,7 +15,7 @@ from graphloc import outputs
 from graphloc.config import VesselConfig
 from graphloc.frames import Datum, Geodetic
 from graphloc.ledger import Ledger, LedgerRow, Outcome
-from graphloc.solution import Health, SlowEstimate, Solution, SolveStats
+from graphloc.solution import Cause, Health, HealthReason, SlowEstimate, Solution, SolveStats
 from graphloc.trajectory import Trajectory
 
 START_NS = 1_700_000_000_000_000_005  # a fraction that a float, or a missing zero, would lose
@@ -48,7 +48,7 @@ def written(out: Path, origin: Geodetic) -> Path:
         gyro_bias_radps=np.zeros((n, 3)),
         gyro_radps=np.tile([0.01, 0.02, 0.03], (n, 1)),
         health=(Health.GOOD,) * 20 + (Health.DEGRADED,),
-        health_reason=("",) * 20 + ("gnss missing",),
+        health_reason=(HealthReason(),) * 20 + (HealthReason("gnss missing", Cause.SENSORS, ("gnss",)),),
         since_agreed_s={"gnss": np.asarray(np.arange(n) * 0.5, dtype=np.float64)},
         slow={
             "gnss": SlowEstimate(

@@ -20,6 +20,7 @@ from graphloc.eval.simulate import SimulatedRun, bl_scenario, find_scenario, sim
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.measurements import GnssPosition, ImuSample
 from graphloc.replay import Replayed, _timed, arrivals, replay
+from graphloc.solution import Cause, HealthReason
 
 
 @pytest.fixture(scope="module")
@@ -150,12 +151,17 @@ def test_a_guessed_heading_is_reported_with_its_times(whole: Replayed) -> None:
     estimates = whole.estimates
     doubt = "the heading is a guess: 2 candidates explain the motion so far"
     first_ns = estimates[0].stamp_ns
-    some = [replace(e, reason=f"95 % bound 3 m; {doubt}" if k <= 50 else "") for k, e in enumerate(estimates)]
+    guessed = HealthReason(f"95 % bound 3 m; {doubt}", Cause.GUESSED_HEADING)
+    some = [replace(e, reason=guessed if k <= 50 else HealthReason()) for k, e in enumerate(estimates)]
     (said,) = _timed([(first_ns, Event(doubt, heading_guessed=True))], some)
     assert said.text.startswith(f"at 0 s: {doubt}; it stays so until 5 s (5 s) and is not rated good")
     assert "start.heading_deg" in said.text
-    every = [replace(e, reason=doubt) for e in estimates]
+    every = [replace(e, reason=guessed) for e in estimates]
     assert "to the end of the run" in _timed([(first_ns, Event(doubt, heading_guessed=True))], every)[0].text
+    again_ns = first_ns + 3_000_000_000  # restarted, with a guess of its own
+    first, second = _timed([(ns, Event(doubt, heading_guessed=True)) for ns in (first_ns, again_ns)], some)
+    assert "until 3 s (3 s)" in first.text
+    assert "until 5 s (2 s)" in second.text
     assert _timed([(first_ns + 2_000_000_000, Event("rebuilt"))], some) == [Event("at 2 s: rebuilt")]
 
 

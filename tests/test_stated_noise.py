@@ -19,7 +19,7 @@ from graphloc.imu_scatter import noise_density
 from graphloc.measurements import CompassHeading, Measurement, PoseFix
 from graphloc.replay import replay
 from graphloc.solve._align import align
-from graphloc.solve._decide import weigh
+from graphloc.solve._decide import Stage, weigh
 from graphloc.solve._scatter import noisier_than_stated, white_scatter
 from graphloc.solve._start import solve_start
 from tests.slowly import slowly
@@ -100,7 +100,7 @@ def test_while_far_off_fixes_keep_their_weight_and_matches_weigh_as_they_scatter
     for k in range(last + 1):
         pose = values.atPose3(keys.pose(k))
         values.update(keys.pose(k), gtsam.Pose3(pose.rotation(), pose.translation() + np.array([300.0, 0.0, 0.0])))
-    verdicts = weigh(problem, values, first=0, last=last, stage="far", hypotheses=False)
+    verdicts = weigh(problem, values, first=0, last=last, stage=Stage.FAR, hypotheses=False)
     weights = {
         s.name: [v.decision.weight for (n, _), v in verdicts.items() if n == s.number and v.decision is not None]
         for s in problem.streams

@@ -27,7 +27,7 @@ from graphloc.frontends.bag import read_recording
 from graphloc.frontends.lines import MAX_LINE, Request, Trouble, parse
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, ImuSample, Measurement, PoseFix
-from graphloc.solution import Health
+from graphloc.solution import Cause, Health, HealthReason
 from graphloc.stream import Lines, as_json, run, serve
 from tests.bagfactory import START_NS, Messages, write_bag
 
@@ -321,7 +321,7 @@ def estimate(stamp_ns: int = 1_700_000_000_000_000_007) -> Estimate:
         stamp_ns=stamp_ns, p_world_m=np.array([10.0, 0.0, 2.0]), R_world_body=left, v_world_mps=np.array([0.0, 1.5, 0.0]),
         cov=np.diag([4.0, 1.0, 1.0, 0.01, 0.01, 0.0004]), v_cov=np.eye(3), p_odom_m=np.array([1.0, 0.0, 0.0]), R_odom_body=np.eye(3),
         step_cov=np.eye(6), gyro_radps=np.array([0.0, 0.0, 0.1]), accel_bias_mps2=np.zeros(3), gyro_bias_radps=np.zeros(3),
-        health=Health.DEGRADED, reason="no match yet", since_agreed_s={"gnss": 0.5, "match": float("inf")},
+        health=Health.DEGRADED, reason=HealthReason("no match yet", Cause.SENSORS), since_agreed_s={"gnss": 0.5, "match": float("inf")},
     )  # fmt: skip
 
 

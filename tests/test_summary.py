@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from graphloc.eval.summary import as_markdown, blocks, read_runs, write_summary
+from graphloc.eval.summary import as_markdown, metric_tables, read_runs, write_summary
 from tests.commands import called
 
 
@@ -37,7 +37,7 @@ def three(tmp_path: Path) -> list[Path]:
 
 def test_mean_and_worst(three: list[Path]) -> None:
     """Means 0.9 / 3 and 2.4 / 2; the worst error is the largest, the worst coverage the lowest."""
-    rmse, coverage = blocks(read_runs(three))
+    rmse, coverage = metric_tables(read_runs(three))
     assert (rmse.metric, coverage.metric) == ("position_rmse_m", "coverage_95")
     assert rmse.estimates == ("graphloc", "BL EKF")
     assert rmse.rows[2] == ("d", (0.5, None))
@@ -49,7 +49,7 @@ def test_mean_and_worst(three: list[Path]) -> None:
 def test_the_ratio_is_over_runs_that_both_have(three: list[Path]) -> None:
     """The EKF has a and b: 2.4 there, ours 0.4 there: 6 times, not 1.2 / 0.3 = 4."""
     runs = read_runs(three)
-    text = as_markdown(runs, blocks(runs))
+    text = as_markdown(runs, metric_tables(runs))
     assert "| times the mean of graphloc |  | 6.0 x |" in text
     assert "| b\\|<c> | 0.300 | 1.400 |" in text
     assert text.count("- b|<c>: warning: w") == 2
@@ -61,8 +61,8 @@ def test_the_worst_of_a_number_with_a_sign_is_the_farthest_from_zero(tmp_path: P
     runs = [
         run_folder(tmp_path, n, {"Forward speed": {"graphloc": {"mean_mps": v}}}) for n, v in (("a", -0.5), ("b", 0.2))
     ]
-    (block,) = blocks(read_runs(runs))
-    assert block.worst == (-0.5,)
+    (table,) = metric_tables(read_runs(runs))
+    assert table.worst == (-0.5,)
 
 
 def test_counts_are_no_decimals(tmp_path: Path) -> None:
@@ -70,7 +70,7 @@ def test_counts_are_no_decimals(tmp_path: Path) -> None:
         run_folder(tmp_path, n, {"Other": {"graphloc": {"fixes": v, "some_m": 0.5}}})
         for n, v in (("a", 100), ("b", 101))
     ]
-    text = as_markdown(read := read_runs(runs), blocks(read))
+    text = as_markdown(read := read_runs(runs), metric_tables(read))
     assert "| a | 100 |" in text
     assert "| mean of the runs | 100.5 |" in text
     assert "| worst of the runs | 100 |" in text  # of fixes the fewest

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graphloc.frames import Array
-from graphloc.frontends.tags.camera import Camera, camera_of
+from graphloc.frontends.tags.camera import CameraModel, camera_of
 from tests.bagfactory import START_NS, Messages
 
 K = (620.0, 0.0, 655.5, 0.0, 610.0, 340.25, 0.0, 0.0, 1.0)
@@ -48,7 +48,7 @@ def info(ros: int = 2, **changes: Any) -> Any:
     )
 
 
-def camera(lens: str = "none", **changes: Any) -> Camera:
+def camera(lens: str = "none", **changes: Any) -> CameraModel:
     model, coefficients = LENSES[lens]
     return camera_of(info(distortion_model=model, D=coefficients, **changes), rectified=False)
 
@@ -108,8 +108,8 @@ def test_jacobian_is_that_of_the_formulae(lens: str) -> None:
     np.testing.assert_allclose(camera(lens).jacobian(rays), numeric, atol=1e-4)
 
 
-def folding(model: str, *coefficients: float) -> Camera:
-    return Camera(0, 0, np.eye(3), model, np.array(coefficients))
+def folding(model: str, *coefficients: float) -> CameraModel:
+    return CameraModel(0, 0, np.eye(3), model, np.array(coefficients))
 
 
 def test_a_folding_lens_says_nan_and_never_the_wrong_ray() -> None:

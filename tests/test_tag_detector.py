@@ -17,7 +17,7 @@ from graphloc.eval.simulate import harbour_scenarios, simulate
 from graphloc.eval.simulate.camera import Camera
 from graphloc.eval.simulate.scene import scene_of
 from graphloc.frames import Array
-from graphloc.frontends.tags.camera import Camera as Lens
+from graphloc.frontends.tags.camera import CameraModel
 from graphloc.frontends.tags.detect import Detector
 
 Image = NDArray[np.uint8]
@@ -77,7 +77,9 @@ def draw(
     return np.rint(255.0 * np.clip(light_px, 0.0, 1.0) ** (1.0 / gamma)).astype(np.uint8), at
 
 
-def bowed(lens: Lens, number: int, middle: Array, side_px: float, R: Array, size: int = 160) -> tuple[Image, Array]:
+def bowed(
+    lens: CameraModel, number: int, middle: Array, side_px: float, R: Array, size: int = 160
+) -> tuple[Image, Array]:
     """An image (size, size) of a tag through a lens: each fine pixel's ray, by OpenCV, meets its plane; and its corners."""
     fisheye = lens.model == "equidistant"
     axes = np.stack(np.meshgrid(*[(np.arange(size * 3) + 0.5) / 3 - 0.5] * 2), axis=-1).reshape(-1, 1, 2)
@@ -173,17 +175,17 @@ def test_sharpened_and_compressed_by_a_camera() -> None:
 
 # What lies 250 px beside and above the middle of a 1440 x 1080 image, and 300 px below it to the left.
 LENSES = [
-    Lens(160, 160, np.array([[820.0, 0.0, -150.0], [0.0, 821.0, -150.0], [0.0, 0.0, 1.0]]), "plumb_bob",
+    CameraModel(160, 160, np.array([[820.0, 0.0, -150.0], [0.0, 821.0, -150.0], [0.0, 0.0, 1.0]]), "plumb_bob",
          np.array([-0.17, 0.03, 4e-4, -3e-4, 0.0])),
-    Lens(160, 160, np.array([[800.0, 0.0, 400.0], [0.0, 800.0, -200.0], [0.0, 0.0, 1.0]]), "plumb_bob",
+    CameraModel(160, 160, np.array([[800.0, 0.0, 400.0], [0.0, 800.0, -200.0], [0.0, 0.0, 1.0]]), "plumb_bob",
          np.array([-0.3, 0.08, 0.0, 0.0, 0.0])),
-    Lens(160, 160, np.array([[500.0, 0.0, -150.0], [0.0, 500.0, -150.0], [0.0, 0.0, 1.0]]), "equidistant",
+    CameraModel(160, 160, np.array([[500.0, 0.0, -150.0], [0.0, 500.0, -150.0], [0.0, 0.0, 1.0]]), "equidistant",
          np.array([-0.02, 0.003, 0.0, 0.0])),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=["launch", "strong", "fisheye"])
-def test_a_lens_bows_the_sides_of_a_tag(lens: Lens) -> None:
+def test_a_lens_bows_the_sides_of_a_tag(lens: CameraModel) -> None:
     """The middle of a side is off the line between its corners by half a pixel and more; corners stay points of the image."""
     without, nees = [], []
     for k in range(3):
@@ -201,7 +203,7 @@ def test_a_lens_bows_the_sides_of_a_tag(lens: Lens) -> None:
 
 def test_a_lens_without_distortion_changes_nothing() -> None:
     image, _ = draw(cells_of(8), 160, 60.0)
-    plain = Lens(160, 160, np.diag([FOCAL_PX, FOCAL_PX, 1.0]), "none", np.empty(0))
+    plain = CameraModel(160, 160, np.diag([FOCAL_PX, FOCAL_PX, 1.0]), "none", np.empty(0))
     for ours, theirs in zip(Detector().detect(image, plain), Detector().detect(image), strict=True):
         assert np.array_equal(ours.corners_px, theirs.corners_px)
         assert np.array_equal(ours.cov_px2, theirs.cov_px2)

@@ -14,7 +14,8 @@ from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verd
 from graphloc.eval.report._health import cure, section
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.ledger import Ledger
-from graphloc.solution import Health, Solution
+from graphloc.solution import Cause, Health, HealthReason, Solution
+from graphloc.solve._health import health_of
 from graphloc.trajectory import Trajectory
 
 
@@ -30,7 +31,7 @@ def data() -> ReportData:
         stamps = solution.trajectory.stamps_ns[truth.covers(solution.trajectory.stamps_ns)]
         track = replace(truth.at(stamps), cov=np.tile(np.eye(6), (len(stamps), 1, 1)))
         n = len(stamps)
-        good = replace(solution, trajectory=track, health=(Health.GOOD,) * n, health_reason=("",) * n)
+        good = replace(solution, trajectory=track, health=(Health.GOOD,) * n, health_reason=(HealthReason(),) * n)
         return replace(good, stats=replace(solution.stats, warnings=(), converged=True))
 
     recording = replace(found.recording, warnings=())
@@ -184,16 +185,19 @@ def test_when_it_was_less_than_good(data: ReportData) -> None:
     n = len(stamps)
     track = Trajectory(stamps_ns=stamps, p_world_m=np.zeros((n, 3)), R_world_body=np.tile(np.eye(3), (n, 1, 1)))
     health = [Health.GOOD] * n
-    why = [""] * n
+    why = [HealthReason()] * n
     for k in range(20, 50):
-        health[k], why[k] = Health.DEAD_RECKONING, f"no position for {k / 10:.1f} s"
+        health[k], why[k] = Health.DEAD_RECKONING, HealthReason(f"no position for {k / 10:.1f} s", Cause.NO_POSITION)
     for k in range(80, n):
-        health[k], why[k] = Health.DEGRADED, "compass missing or not agreeing"
+        health[k], why[k] = (
+            Health.DEGRADED,
+            HealthReason("compass missing or not agreeing", Cause.SENSORS, ("compass",)),
+        )
     solution = replace(data.solution, trajectory=track, health=tuple(health), health_reason=tuple(why))
     first, second = stretches(solution, 0)
     assert first.health is Health.DEAD_RECKONING
     assert (first.begin_s, first.end_s) == pytest.approx((2.0, 5.0))
-    assert first.reason == "no position for 2.0 s"
+    assert first.reason.text == "no position for 2.0 s"
     assert second.health is Health.DEGRADED
     assert (second.begin_s, second.end_s) == pytest.approx((8.0, 9.9))
     lasting = durations_s(solution)
@@ -203,7 +207,7 @@ def test_when_it_was_less_than_good(data: ReportData) -> None:
     assert "<td>1</td><td>3.0 s</td><td>2 to 5</td>" in page
     assert "good for 50 % (5.0 s), degraded for 20 % (1.9 s), dead reckoning for 30 % (3.0 s)" in page
     for k in range(60, 70):
-        health[k], why[k] = Health.DEAD_RECKONING, "no position for 9 s"
+        health[k], why[k] = Health.DEAD_RECKONING, HealthReason("no position for 9 s", Cause.NO_POSITION)
     page = section([replace(solution, health=tuple(health), health_reason=tuple(why))], 0)
     assert "<td>2</td><td>4.0 s</td><td>2 to 5</td>" in page  # the same reason but for its number: one row
     assert section([data.solution], 0) == ""  # all good
@@ -213,8 +217,11 @@ def test_when_it_was_less_than_good(data: ReportData) -> None:
 
 
 def test_what_would_end_it_is_reported_of_the_cause() -> None:
-    assert cure(Health.DEGRADED, "compass, gnss missing or not agreeing").startswith("compass, gnss agreeing again")
-    assert "start.heading_deg" in cure(
-        Health.LOST, "95 % bound 3 m, heading 60 deg; the heading is a guess: 2 candidates explain"
-    )
-    assert "fix" in cure(Health.DEAD_RECKONING, "no absolute position agrees")
+    known, unknown = np.eye(6) * 1e-4, np.eye(6) * 100.0
+    away = {"compass": 20.0, "gnss": 12.0, "match": 1.0}
+    assert cure(*health_of(known, away)).startswith("compass, gnss agreeing again")
+    assert "for the heading" in cure(*health_of(unknown, {"gnss": 1.0}))
+    assert "fix" in cure(*health_of(known, {"gnss": 6.0}))
+    assert "second position sensor" in cure(*health_of(np.diag([4.0, 4.0, 1.0, 1e-4, 1e-4, 1e-4]), {"gnss": 1.0}))
+    assert "warnings" in cure(*health_of(known, {"gnss": 1.0}, "the measurements contradict each other"))
+    assert "start.heading_deg" in cure(Health.LOST, HealthReason("in whatever words", Cause.GUESSED_HEADING))

@@ -8,7 +8,7 @@ import numpy as np
 from graphloc.build import mount_of
 from graphloc.chi2 import SIGMAS_95
 from graphloc.config import GnssConfig, VesselConfig
-from graphloc.eval.calibrate._evidence import LEAST, Estimate, Evidence, Name
+from graphloc.eval.calibrate._evidence import LEAST, Evidence, Name, OffsetEstimate
 from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
 from graphloc.eval.calibrate._imu import imu_noise
 from graphloc.eval.formatting import significant
@@ -100,7 +100,7 @@ def _of_one_antenna(sensor: str, recording: Recording, config: VesselConfig) -> 
 
 
 def _suggestion(
-    name: Name, found: Estimate, others: dict[Name, Estimate], recording: Recording, config: VesselConfig
+    name: Name, found: OffsetEstimate, others: dict[Name, OffsetEstimate], recording: Recording, config: VesselConfig
 ) -> Suggestion:
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
@@ -123,13 +123,13 @@ def _suggestion(
     )  # fmt: skip
 
 
-def _instead(name: Name, found: Estimate, recording: Recording, config: VesselConfig) -> str:
+def _instead(name: Name, found: OffsetEstimate, recording: Recording, config: VesselConfig) -> str:
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
     return f"{key} {configured + factor * found.value:.3g} {unit}"
 
 
-def _check(name: Name, found: Estimate, recording: Recording, config: VesselConfig) -> Check:
+def _check(name: Name, found: OffsetEstimate, recording: Recording, config: VesselConfig) -> Check:
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
     if found.sigma > _USEFUL[name[1]]:

@@ -29,7 +29,7 @@ _UNSEEN = 1e-9  # a curvature below this is rounding
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class OffsetEstimate:
     """An offset (m, rad or s), its 1 sigma, and the decrease of the cost if it is free."""
 
     value: float
@@ -59,7 +59,7 @@ class Evidence:
         found = (name for name, s in zip(offsets.names, seen, strict=True) if s)
         self.names = tuple(sorted(found, key=order))
 
-    def estimates(self, free: tuple[Name, ...]) -> dict[Name, Estimate]:
+    def estimates(self, free: tuple[Name, ...]) -> dict[Name, OffsetEstimate]:
         """Return the free offsets, with all others as configured."""
         if not free:
             return {}
@@ -71,7 +71,7 @@ class Evidence:
         sigma = np.sqrt(np.maximum(np.diagonal(cov), _jackknife(g, H)))
         # What the cost drops by if this one is free, too: theta^2 / its own variance.
         return {
-            name: Estimate(float(v), float(s), float(v**2 / c))
+            name: OffsetEstimate(float(v), float(s), float(v**2 / c))
             for name, v, s, c in zip(free, theta, sigma, np.diagonal(cov), strict=True)
         }
 
@@ -89,7 +89,7 @@ class Evidence:
         found = self.estimates(free)
         return tuple(name for name in free if self._stands(name, found[name]))
 
-    def alternatives(self, name: Name, free: tuple[Name, ...]) -> dict[Name, Estimate]:
+    def alternatives(self, name: Name, free: tuple[Name, ...]) -> dict[Name, OffsetEstimate]:
         """Return the offsets that explain the run about as well as `name`, with the others of `free` free."""
         rest = tuple(n for n in free if n != name)
         drop = self.estimates((*rest, name))[name].drop
@@ -97,11 +97,11 @@ class Evidence:
         return {n: e for n, e in tried.items() if e.drop > _EXPLAINS * drop}
 
     @staticmethod
-    def _stands(name: Name, e: Estimate) -> bool:
+    def _stands(name: Name, e: OffsetEstimate) -> bool:
         return abs(e.z) > CLEAR and abs(e.value) > LEAST[name[1]]
 
 
-def _solvable(found: dict[Name, Estimate]) -> bool:
+def _solvable(found: dict[Name, OffsetEstimate]) -> bool:
     return all(np.isfinite([e.value, e.sigma]).all() and e.sigma > 0.0 for e in found.values())
 
 

@@ -6,15 +6,15 @@ from graphloc.eval.report._health import Stretch, durations_s, stretches
 from graphloc.eval.report._page import write_report
 from graphloc.eval.report._theses import theses_section
 from graphloc.eval.report._track_verdict import Reason, TrackVerdict, Trust
-from graphloc.eval.report._verdict import Verdict, verdict
+from graphloc.eval.report._verdict import RunVerdict, verdict
 
 __all__ = [
     "Reason",
     "ReportData",
+    "RunVerdict",
     "Stretch",
     "TrackVerdict",
     "Trust",
-    "Verdict",
     "all_warnings",
     "durations_s",
     "figures",

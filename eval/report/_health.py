@@ -13,7 +13,7 @@ import numpy as np
 from graphloc.eval.formatting import percent
 from graphloc.eval.html import note, table
 from graphloc.frames import Array
-from graphloc.solution import Health, Solution
+from graphloc.solution import Cause, Health, HealthReason, Solution
 from graphloc.time import seconds_since
 
 _MOST = 12  # reasons that a table has
@@ -25,7 +25,7 @@ class Stretch:
     """A period of constant health: begin and end in s since the run's track begins, and the reason at its begin."""
 
     health: Health
-    reason: str
+    reason: HealthReason
     begin_s: float
     end_s: float
 
@@ -59,7 +59,7 @@ def stretches(solution: Solution, begin_ns: int) -> list[Stretch]:
     ends = t + _lasting_s(solution)
 
     def kind(k: int) -> tuple[Health, str]:
-        return solution.health[k], _kind(solution.health_reason[k])
+        return solution.health[k], _masked(solution.health_reason[k].text)
 
     found = []
     for (health, _), group in groupby(range(len(t)), key=kind):
@@ -78,18 +78,17 @@ def said_of(solution: Solution) -> str:
     return ", ".join(parts)
 
 
-def cure(health: Health, reason: str) -> str:
+def cure(health: Health, reason: HealthReason) -> str:
     """Return what would end a state of health that is not good."""
-    if "heading is a guess" in reason:
+    if reason.cause is Cause.GUESSED_HEADING:
         return "a heading sensor (compass, dual antenna), or start.heading_deg"
     if health is Health.LOST:
         return "a fix, match or tag that agrees; for the heading, a compass or some metres of travel"
     if health is Health.DEAD_RECKONING:
         return "a fix, match or tag that agrees"
-    if "missing or not agreeing" in reason:
-        sensors = reason.split(" missing or not agreeing")[0]
-        return f"{sensors} agreeing again; the ledger says what became of its measurements"
-    if "95 % bound" in reason:
+    if reason.cause is Cause.SENSORS:
+        return f"{', '.join(reason.sensors)} agreeing again; the ledger says what became of its measurements"
+    if reason.cause is Cause.BOUND:
         return "a better fix, or a second position sensor (match, tag)"
     return "correcting what the warnings name: noise, mounts, stamps"
 
@@ -104,7 +103,7 @@ def section(solutions: Sequence[Solution], begin_ns: int) -> str:
     for solution in solutions:
         alike: dict[tuple[Health, str], list[Stretch]] = {}
         for stretch in stretches(solution, begin_ns):
-            alike.setdefault((stretch.health, _kind(stretch.reason)), []).append(stretch)
+            alike.setdefault((stretch.health, _masked(stretch.reason.text)), []).append(stretch)
         whole = sorted(alike.values(), key=lambda same: -sum(s.end_s - s.begin_s for s in same))
         rows = []
         for same in whole[:_MOST]:
@@ -112,7 +111,7 @@ def section(solutions: Sequence[Solution], begin_ns: int) -> str:
             total_s = sum(s.end_s - s.begin_s for s in same)
             rows.append(
                 [_words(longest.health), str(len(same)), _seconds(total_s), f"{longest.begin_s:.0f} to {longest.end_s:.0f}",
-                 longest.reason, cure(longest.health, longest.reason)]
+                 longest.reason.text, cure(longest.health, longest.reason)]
             )  # fmt: skip
         if rows:
             left = f"{len(whole) - _MOST} more reasons are in solution.csv." if len(whole) > _MOST else ""
@@ -121,9 +120,9 @@ def section(solutions: Sequence[Solution], begin_ns: int) -> str:
     return "".join(parts)
 
 
-def _kind(reason: str) -> str:
-    """Return a reason with its numbers masked."""
-    return re.sub(r"\d[\d.]*", "#", reason)
+def _masked(text: str) -> str:
+    """Return a text with its numbers masked."""
+    return re.sub(r"\d[\d.]*", "#", text)
 
 
 def _words(health: Health) -> str:

@@ -12,7 +12,7 @@ from graphloc.eval.metrics import Table
 from graphloc.eval.plots import HEALTH, OUTAGE
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._track_verdict import Trust, main_table, times
-from graphloc.eval.report._verdict import Verdict
+from graphloc.eval.report._verdict import RunVerdict
 from graphloc.solution import Solution
 
 _REASONS = 60
@@ -32,7 +32,7 @@ _SHARES = (("coverage_95", "in 95 % bounds"), ("matched", "covered"))
 _WIDE = ("95 %, m", "worst, m", "covered")  # a phone does without
 
 
-def first_screen(data: ReportData, verdict: Verdict) -> str:
+def first_screen(data: ReportData, verdict: RunVerdict) -> str:
     """Return the verdict on each track, the key numbers, what they were measured against, and the reasons."""
     several = len(verdict.tracks) > 1
     boxes, lists = [], []

@@ -10,7 +10,7 @@ from graphloc.eval.report._track_verdict import Reason, TrackVerdict, Trust, tra
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class RunVerdict:
     """Verdict on a run.
 
     Attributes:
@@ -30,6 +30,6 @@ class Verdict:
         return worst(track.trust for track in self.tracks)
 
 
-def verdict(data: ReportData) -> Verdict:
+def verdict(data: ReportData) -> RunVerdict:
     """Return the verdict on each track of a run."""
-    return Verdict(tracks=tuple(track_verdict(data, solution) for solution in data.solutions))
+    return RunVerdict(tracks=tuple(track_verdict(data, solution) for solution in data.solutions))

@@ -25,7 +25,7 @@ numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ign
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grid:
+class SearchGrid:
     """Candidate poses: yaw (H,) rad, north (R,) m and east (C,) m, in world."""
 
     yaw_rad: Array
@@ -33,13 +33,13 @@ class Grid:
     east_m: Array
 
 
-def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) -> Grid:
+def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) -> SearchGrid:
     """Return the candidates around a pose (3,): east, north, yaw, on the cells of the layers."""
     patch = layers.patch
     column, row = np.rint(patch.cells(prior[None, :2])[0]).astype(int)
     k = np.arange(-int(np.ceil(half_m / patch.cell_m)), int(np.ceil(half_m / patch.cell_m)) + 1)
     h = np.arange(-int(np.ceil(half_deg / STEP_DEG)), int(np.ceil(half_deg / STEP_DEG)) + 1)
-    return Grid(
+    return SearchGrid(
         prior[2] + np.radians(STEP_DEG) * h,
         patch.north_m - (row + k) * patch.cell_m,
         patch.west_m + (column + k) * patch.cell_m,
@@ -70,7 +70,7 @@ def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, column
     return out
 
 
-def log_likelihood_of(found: Outline, layers: Layers, grid: Grid) -> Layer:
+def log_likelihood_of(found: Outline, layers: Layers, grid: SearchGrid) -> Layer:
     """Return the log-likelihood of each pose of the grid (H, R, C).
 
     The sum over lines grows with their number, but so do chance and common errors (boats at other berths than in the image), so it is
@@ -104,7 +104,7 @@ class Mode:
 
 
 def modes_of(
-    log_likelihood: NDArray[np.float32], grid: Grid, none_log: float, alien: float, most: int = 5
+    log_likelihood: NDArray[np.float32], grid: SearchGrid, none_log: float, alien: float, most: int = 5
 ) -> tuple[list[Mode], float]:
     """Return the modes of a posterior (H, R, C), best first, and the probability that none is right.
 
@@ -144,7 +144,7 @@ def _cut_off(spot: NDArray[np.int64], cells: tuple[NDArray[np.int64], ...], shap
 
 
 def _moments(
-    log_likelihood: NDArray[np.float32], part: tuple[NDArray[np.int64], ...], mass: Array, grid: Grid
+    log_likelihood: NDArray[np.float32], part: tuple[NDArray[np.int64], ...], mass: Array, grid: SearchGrid
 ) -> tuple[Array, Array]:
     """Return mean (3,) and covariance (3, 3) of a part of the posterior; along narrow axes interpolated between cells."""
     low, high = (np.array([f(axis) for axis in part]) for f in (np.min, np.max))

@@ -13,7 +13,7 @@ from graphloc.config import AerialConfig
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.frontends.aerial.layers import Layer, Layers
 from graphloc.frontends.aerial.maps import Map
-from graphloc.frontends.aerial.match import Grid, Mode, grid_around, log_likelihood_of, modes_of
+from graphloc.frontends.aerial.match import Mode, SearchGrid, grid_around, log_likelihood_of, modes_of
 from graphloc.frontends.aerial.scan import LevelCloud, Outline, outline
 from graphloc.measurements import PoseFix, PoseMode
 
@@ -45,7 +45,7 @@ class Match:
     prior: Prior
     found: Outline
     layers: Layers | None = None
-    grid: Grid | None = None
+    grid: SearchGrid | None = None
     score: Layer | None = None
     modes: tuple[Mode, ...] = ()
     none: float = 1.0

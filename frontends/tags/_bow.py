@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.frontends.tags.camera import Camera
+from graphloc.frontends.tags.camera import CameraModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +22,7 @@ class Unbowed:
         middle_px: (2,) of the image. ray: (1, 2) there. J_px: (2, 2).
     """
 
-    lens: Camera
+    lens: CameraModel
     middle_px: Array
     ray: Array
     J_px: Array
@@ -43,7 +43,7 @@ class Unbowed:
         return np.asarray(self.ray + (flat_px - self.middle_px) @ np.linalg.inv(self.J_px).T)
 
 
-def unbowed(lens: Camera | None, corners_px: Array) -> Unbowed | None:
+def unbowed(lens: CameraModel | None, corners_px: Array) -> Unbowed | None:
     """Return the undistorted image at a tag's corners (4, 2); None if there is no distortion, or there are no rays."""
     if lens is None or lens.model == "none":
         return None

@@ -28,7 +28,7 @@ _STEPS = 20  # Newton's takes three or four
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Camera:
+class CameraModel:
     """A camera and its lens.
 
     Attributes:
@@ -137,7 +137,7 @@ def _radii(model: str, distortion: tuple[float, ...]) -> tuple[Array, Array]:
     return radii[:count], seen[:count]
 
 
-def camera_of(msg: Any, *, rectified: bool) -> Camera:
+def camera_of(msg: Any, *, rectified: bool) -> CameraModel:
     """Return the camera of a `sensor_msgs/CameraInfo` of ROS 1 or 2.
 
     Region of interest and binning are applied: a pixel of the image is the mean of `binning` ones of the region.
@@ -159,7 +159,7 @@ def camera_of(msg: Any, *, rectified: bool) -> Camera:
     to_image[:2, 2] = (0.5 - offset) / binning - 0.5
     whole = np.maximum(np.array([msg.width, msg.height]) - offset, 0)
     width, height = np.where([roi.width, roi.height], [roi.width, roi.height], whole) // binning
-    return Camera(int(width), int(height), to_image @ K, model, distortion)
+    return CameraModel(int(width), int(height), to_image @ K, model, distortion)
 
 
 def _matrix(msg: Any, *, rectified: bool) -> Array:

@@ -22,7 +22,7 @@ from graphloc.frontends.tags._bow import unbowed
 from graphloc.frontends.tags._decode import Codebook, codebook, read, spots
 from graphloc.frontends.tags._edges import fit_tag
 from graphloc.frontends.tags._quads import quads_in
-from graphloc.frontends.tags.camera import Camera
+from graphloc.frontends.tags.camera import CameraModel
 
 _THREADS = 2
 _STRIPS, _OVERLAP_PX = 3, 96  # what is taller than the overlap is found at half the resolution
@@ -87,7 +87,7 @@ class Detector:
         self._books = [codebook(family, (numbers or {}).get(family)) for family in dict.fromkeys(families)]
         self._max_hamming, self._min_margin, self._min_side_px = max_hamming, min_margin, min_side_px
 
-    def detect(self, grey: NDArray[np.uint8], lens: Camera | None = None) -> list[Detection]:
+    def detect(self, grey: NDArray[np.uint8], lens: CameraModel | None = None) -> list[Detection]:
         """Return the tags that are wholly visible in an image (rows, columns), on two threads; lowest number first.
 
         Args:
@@ -114,7 +114,7 @@ class Detector:
                     found.append(_Candidate(book, tag, corners, off))
         return found
 
-    def _settled(self, grey: NDArray[np.uint8], lens: Camera | None, candidate: _Candidate) -> Detection | None:
+    def _settled(self, grey: NDArray[np.uint8], lens: CameraModel | None, candidate: _Candidate) -> Detection | None:
         """Return the tag fitted to the image, if its bits there are those of a tag."""
         book = candidate.book
         straight = unbowed(lens, candidate.corners_px)

@@ -22,7 +22,7 @@ from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag, RawMessage
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
 from graphloc.frontends.tags.bundles import Seeing, SeenTag, sightings_of
-from graphloc.frontends.tags.camera import Camera, camera_of
+from graphloc.frontends.tags.camera import CameraModel, camera_of
 from graphloc.frontends.tags.detect import Detector
 from graphloc.frontends.tags.images import grey_image
 from graphloc.frontends.tags.listed import LISTS, ListedTag, read_list
@@ -64,7 +64,7 @@ class _Eye:
     name: str
     topic: str
     listed: bool
-    lens: Camera | None
+    lens: CameraModel | None
     mount: tuple[Array, Array]
 
 
@@ -142,7 +142,7 @@ def camera_info_topic(topic: str) -> str:
     return f"{topic.removesuffix('/compressed').rsplit('/', 1)[0]}/camera_info"
 
 
-def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callable[[str], None]) -> Camera | None:
+def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callable[[str], None]) -> CameraModel | None:
     """Return the camera's calibration, from the first message of its CameraInfo in the whole bag."""
     topic = config.info_topic
     if not topic and listed:
@@ -221,7 +221,9 @@ def _detected(msg: Any, msgtype: str, eye: _Eye, detector: Detector) -> _Raw:
     return found
 
 
-def _add(found: _Raw, lens: Camera, number: int, family: str, px: Array, cov_px2: Array, size_m: float | None) -> None:
+def _add(
+    found: _Raw, lens: CameraModel, number: int, family: str, px: Array, cov_px2: Array, size_m: float | None
+) -> None:
     rays = lens.rays(px)
     if not np.isfinite(rays).all():
         found.troubles.append(f"tag {number} lies where the lens model cannot be inverted")

@@ -235,9 +235,9 @@ def _add_slow_chain(
         else:
             for factor in slow_begin(slow, key[0], values.atVector(key[0]), jumps=jumps):
                 graph.add(factor)
-    leaps_m = _jumps_m(problem, stream)
+    sizes_m = _jumps_m(problem, stream)
     for n, j in enumerate(nodes[:-1]):
-        for factor in _step(slow, key[n], key[n + 1], _node_dt_s(problem, j), jumps, leaps_m.get(j, 0.0)):
+        for factor in _step(slow, key[n], key[n + 1], _node_dt_s(problem, j), jumps, sizes_m.get(j, 0.0)):
             graph.add(factor)
     for factor in slow_end(slow, key[-1], jumps=jumps):
         graph.add(factor)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build._attach import nav_state, state_of
+from graphloc.build._attach import Carry, nav_state, state_of
 from graphloc.build._chains import without_drift
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import SolveError
@@ -58,7 +58,7 @@ class Stream:
     mount: Any
     measurements: tuple[Measurement, ...]
     state: NDArray[np.int64]
-    carry: tuple[tuple[int, Any] | None, ...]
+    carry: tuple[Carry | None, ...]
     gyro_radps: Array
     apart_s: Array
 
@@ -138,16 +138,7 @@ def make_problem(
     Raises:
         SolveError: the recording has no usable IMU data.
     """
-    imu = recording.imu
-    if not any(sensor.kind == inertial.kind and sensor.enabled for sensor in config.sensors.values()):
-        raise SolveError(
-            f"{recording.source}: no enabled sensor of kind {inertial.kind} in vessel.yaml, and it needs one"
-        )
-    if imu is None or len(imu) < 10:
-        lost = recording.lost(config.of_kind(inertial.kind))
-        raise SolveError(
-            f"{recording.source}: no IMU data (need at least 10 samples); check its topic and stamps{lost}"
-        )
+    imu = _usable_imu(recording, config, inertial.kind)
     imu_config = config.sensors[imu.sensor]
     t_body_imu, R = mount_of(imu.sensor, imu_config, recording.mounts)
 
@@ -164,24 +155,33 @@ def make_problem(
         by_sensor.setdefault(m.sensor, []).append(m)
     if company is None:
         company = company_of(config, rows, by_sensor)
+    alone = sum(by_kind[config.sensors[name].kind].absolute for name in by_sensor) == 1
     streams = []
-    one_place = sum(by_kind[config.sensors[name].kind].absolute for name in by_sensor) == 1
     for number, (name, sensor) in enumerate(config.sensors.items()):
-        if name in by_sensor:
-            row = by_kind[sensor.kind]
-            t, R_mount = mount_of(name, sensor, recording.mounts)
-            mount = (t - t_body_imu, R_mount)
-            slow, left_out = slow_or_left_out(row, sensor, company)
-            position_jumps = _NO_JUMPS
-            if one_place and slow is None and row.absolute and row.false is None:
-                position_jumps = _position_jumps(row, by_sensor[name], datum, allowed_jump_m(left_out))
-            if left_out is not None and len(position_jumps[0]):
-                slow, left_out = without_drift(left_out), None
-            streams.append(
-                _stream(
-                    number, name, row, sensor, slow, left_out, position_jumps, mount, by_sensor[name], timeline, links
-                )
+        if name not in by_sensor:
+            continue
+        row, own = by_kind[sensor.kind], by_sensor[name]
+        t, R_mount = mount_of(name, sensor, recording.mounts)
+        slow, left_out, jumps = _slow_and_jumps(row, sensor, own, datum, company, alone=alone)
+        state, carry = _states_and_carries(own, timeline, links)
+        streams.append(
+            Stream(
+                number=number,
+                name=name,
+                row=row,
+                config=sensor,
+                slow=slow,
+                left_out=left_out,
+                position_jumps=jumps,
+                constants=row.constants(sensor),
+                mount=gtsam.Pose3(gtsam.Rot3(R_mount), t - t_body_imu),
+                measurements=tuple(own),
+                state=state,
+                carry=carry,
+                gyro_radps=links.gyro_at(np.array([m.stamp_ns for m in own])),
+                apart_s=apart_s_of(own),
             )
+        )
     preintegrated = _preintegrate(timeline, links)
     warnings += [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
     return Problem(
@@ -201,6 +201,17 @@ def make_problem(
         warnings=tuple(warnings),
         silent=_silent(recording, config, by_sensor, imu),
     )
+
+
+def _usable_imu(recording: Recording, config: VesselConfig, kind: str) -> ImuSeries:
+    if not any(sensor.kind == kind and sensor.enabled for sensor in config.sensors.values()):
+        raise SolveError(f"{recording.source}: no enabled sensor of kind {kind} in vessel.yaml, and it needs one")
+    if recording.imu is None or len(recording.imu) < 10:
+        lost = recording.lost(config.of_kind(kind))
+        raise SolveError(
+            f"{recording.source}: no IMU data (need at least 10 samples); check its topic and stamps{lost}"
+        )
+    return recording.imu
 
 
 def _silent(recording: Recording, config: VesselConfig, heard: Container[str], imu: ImuSeries) -> str:
@@ -313,6 +324,19 @@ def bridged(problem: Problem, values: gtsam.Values) -> Problem:
     return replace(problem, preintegrated=tuple(preintegrated), inertial=tuple(inertial))
 
 
+def _slow_and_jumps(
+    row: Sensor, config: SensorConfig, measurements: Sequence[Measurement], datum: Datum, company: int, *, alone: bool
+) -> tuple[SlowProcess | None, SlowProcess | None, PositionJumps]:
+    """Return `slow`, `left_out` and `position_jumps` of a `Stream`; `alone`: one sensor measures position."""
+    slow, left_out = slow_or_left_out(row, config, company)
+    jumps = _NO_JUMPS
+    if alone and slow is None and row.absolute and row.false is None:
+        jumps = _position_jumps(row, measurements, datum, allowed_jump_m(left_out))
+    if left_out is not None and len(jumps[0]):
+        slow, left_out = without_drift(left_out), None
+    return slow, left_out, jumps
+
+
 def _position_jumps(row: Sensor, measurements: Sequence[Measurement], datum: Datum, allowed_m: float) -> PositionJumps:
     """Return stamps and sizes of the position jumps of the only sensor that measures position."""
     hints = [(m.stamp_ns, row.hint(m, 0.0, datum)) for m in measurements]
@@ -329,19 +353,10 @@ def apart_s_of(measurements: Sequence[Measurement]) -> Array:
     return np.concatenate([[np.inf], np.diff(stamps_ns) * 1e-9])[: len(stamps_ns)]
 
 
-def _stream(
-    number: int,
-    name: str,
-    row: Sensor,
-    config: SensorConfig,
-    slow: SlowProcess | None,
-    left_out: SlowProcess | None,
-    position_jumps: PositionJumps,
-    mount: tuple[Array, Array],
-    measurements: list[Measurement],
-    timeline: Timeline,
-    links: InertialLink,
-) -> Stream:
+def _states_and_carries(
+    measurements: Sequence[Measurement], timeline: Timeline, links: InertialLink
+) -> tuple[NDArray[np.int64], tuple[Carry | None, ...]]:
+    """Return `state` and `carry` of a `Stream`."""
     zero = gtsam.imuBias.ConstantBias()
     state, carry, holes = [], [], links.gaps()
     for m in measurements:
@@ -349,20 +364,4 @@ def _stream(
         state.append(state_of(m, floor, timeline.nearest(m.stamp_ns), timeline.stamps_ns, holes))
         at = int(timeline.stamps_ns[floor])
         carry.append(None if m.stamp_ns <= at else (floor, links.integrate(at, m.stamp_ns, zero)))
-    T_state_sensor = gtsam.Pose3(gtsam.Rot3(mount[1]), mount[0])
-    return Stream(
-        number,
-        name,
-        row,
-        config,
-        slow,
-        left_out,
-        position_jumps,
-        row.constants(config),
-        T_state_sensor,
-        tuple(measurements),
-        np.array(state, dtype=np.int64),
-        tuple(carry),
-        links.gyro_at(np.array([m.stamp_ns for m in measurements])),
-        apart_s_of(measurements),
-    )
+    return np.array(state, dtype=np.int64), tuple(carry)

@@ -38,14 +38,14 @@ def summary(
 
     read = summaries.read_runs(runs)
     page = summaries.write_summary(out, read, overwrite=overwrite)
-    found = summaries.blocks(read)
+    found = summaries.metric_tables(read)
     if as_json:
         numbers = {
-            f"{b.title}: {b.metric}": {
-                name: dict(zip(b.estimates, values, strict=True))
-                for name, values in (("mean", b.mean), ("worst", b.worst))
+            f"{t.title}: {t.metric}": {
+                name: dict(zip(t.estimates, values, strict=True))
+                for name, values in (("mean", t.mean), ("worst", t.worst))
             }
-            for b in found
+            for t in found
         }
         typer.echo(json.dumps(numbers, indent=2))
     else:

@@ -64,10 +64,8 @@ class OutputConfig(Block):
     """Georeferenced image under the report's map, path as for an aerial sensor; empty: that of the first such sensor."""
 
 
-def _read_the_same(a: Any, b: Any) -> bool:
-    """Whether two sensors of a kind and topic take the same axes, and a sentence in common (`GGA` is that of any talker, also `GPGGA`)."""
-    if getattr(a, "axes", None) != getattr(b, "axes", None):
-        return False
+def _read_alike(a: Any, b: Any) -> bool:
+    """Whether two sensors of a kind and topic read the same messages, or a sentence in common (`GGA` is that of any talker, also `GPGGA`)."""
     pairs = list(product(getattr(a, "nmea", ()), getattr(b, "nmea", ())))
     return not pairs or any(one.endswith(other) or other.endswith(one) for one, other in pairs)
 
@@ -113,7 +111,17 @@ class VesselConfig(Block):
         """What two sensors read of the same messages would count as two measurements with errors of their own."""
         readers = [(name, sensor) for name, sensor in self.sensors.items() if sensor.enabled and sensor.topic]
         for (one, a), (other, b) in combinations(readers, 2):
-            if (a.kind, a.topic) == (b.kind, b.topic) and _read_the_same(a, b):
+            if (a.kind, a.topic) != (b.kind, b.topic) or not _read_alike(a, b):
+                continue
+            axes = getattr(a, "axes", ())
+            shared = [axis for axis in axes if axis in b.axes]
+            if shared and a.axes != b.axes:
+                what = ", ".join(shared)
+                raise ValueError(
+                    f"sensors: {one} and {other} both read {what} of {a.topic}, which would count twice: delete {what} from the "
+                    "axes of one"
+                )
+            if shared or not axes:
                 raise ValueError(f"sensors: {one} and {other} both read {a.topic}, which would count twice: delete one")
         return self
 
@@ -127,4 +135,4 @@ class VesselConfig(Block):
 
     def of_kind(self, kind: str) -> dict[str, Any]:
         """Return the enabled sensors of a kind, by name."""
-        return {n: s for n, s in self.sensors.items() if getattr(s, "kind", None) == kind and s.enabled}
+        return {n: s for n, s in self.sensors.items() if s.kind == kind and s.enabled}

@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import Residual
-from graphloc.solve._hypotheses import log_repeat, log_right_and_false
+from graphloc.solve._hypotheses import log_false_again, log_right_and_false
 from graphloc.solve._prediction import taken_of
 
 _MOST, _LEAST = 16, 12.0  # choices that are kept; log probability (nats) below the best at which one is dropped
@@ -76,7 +76,7 @@ def choices(
                 before = tuple(replace(r, raw=r.raw + c.step[at[n - 1]]) for r in residuals[n - 1])
                 cross = c.cov[at[n - 1], at[n]]
                 walked = P + c.cov[at[n - 1], at[n - 1]] - cross - cross.T
-                again = np.log(repeats * model.probability) + log_repeat(before, seen, walked)
+                again = log_false_again(model, before, seen, walked)
                 log = float(np.logaddexp(np.log1p(-repeats) + log, again))
             grown.append(Choice(c.log + log, (*c.modes, None), c.step, c.cov))
         grown.sort(key=lambda c: -c.log)

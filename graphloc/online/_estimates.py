@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from graphloc.online._lag import Lag
 from graphloc.online._odometry import Odometry
 from graphloc.online._propagate import Propagated
 from graphloc.online._unmodelled import UnmodelledError
+from graphloc.solution import Cause
 from graphloc.solve._covariances import (
     limit_heading,
     unmodelled_covariance,
@@ -32,6 +34,7 @@ def estimate_of(
     doubt: str,
     heading_off_rad: float,
     heading_var: float,
+    guess: bool,
     unmodelled: UnmodelledError | None,
 ) -> Estimate:
     """Return the estimate at a state of the window, or propagated beyond it.
@@ -42,6 +45,7 @@ def estimate_of(
         unmodelled: what slow errors that are left out do to the newest state; the covariances then include it.
         heading_off_rad: by how much the motion shows the heading to be off; the covariance then includes it.
         heading_var: of the heading, rad^2, where no sensor measures it and the window's own covariance is too sure; else 0.
+        guess: whether the heading is a guess.
     """
     newest, problem = lag.newest, lag.problem
     at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
@@ -60,8 +64,10 @@ def estimate_of(
     limit_heading(cov)
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
     health, reason = health_of(cov, since, doubt)
-    if doubt and reason != doubt:
-        reason = f"{reason}; {doubt}"
+    if doubt and reason.text != doubt:
+        reason = replace(reason, text=f"{reason}; {doubt}")
+    if guess:
+        reason = replace(reason, cause=Cause.GUESSED_HEADING)
     return Estimate(
         stamp_ns=at_ns,
         p_world_m=np.asarray(now.pose.transformFrom(lever)) + others_m,

@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from graphloc.online._lag import Lag
-from graphloc.solve._batch import CONTRADICTION, LARGEST_NOISE_SCALE
+from graphloc.solve._batch import CONTRADICTION, LARGEST_NOISE_SCALE, noise_step
 
 _EVERY_S, _MISFITS = 5.0, 2  # how often the fit is checked, and how many checks in a row must fail
 
@@ -43,5 +41,5 @@ class ImuNoise:
         if self._misfits < _MISFITS or self.scale >= LARGEST_NOISE_SCALE:
             return ""
         self._misfits = 0
-        self.scale = min(self.scale * float(np.clip(np.sqrt(misfit), 1.5, 3.0)), LARGEST_NOISE_SCALE)
+        self.scale = min(self.scale * noise_step(misfit), LARGEST_NOISE_SCALE)
         return f"the IMU contradicts the other sensors: its noise is scaled up to {self.scale:.1f} times"

@@ -256,6 +256,7 @@ class Tracking:
             doubt="; ".join(doubt for doubt in doubts if doubt),
             heading_off_rad=persistent.heading_check.off_rad,
             heading_var=heading_var,
+            guess=bool(guess),
             unmodelled=persistent.unmodelled,
         )
 

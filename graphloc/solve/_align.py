@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -22,13 +21,10 @@ from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.errors import SolveError
 from graphloc.frames import Array, skew, wrap_angle, yaw_from_heading_deg
 from graphloc.graph import Hint
-from graphloc.time import duration_ns, utc_text
+from graphloc.solve._standstill import Track, gyro_bias, samples_of, slope_of, standstill
+from graphloc.time import utc_text
 
-_STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
-_STILL_SPEED_MPS = 0.15
-_FEWEST_HEADINGS = 4  # of a standstill, that show a turn
 _USUAL_SPEED_MPS = 10.0  # 1 sigma, where the speed is unknown
-_BLOCK_S, _SWELL_S = 0.5, 10.0
 _CARRIED_RAD = np.radians(20.0)  # error by gyro bias, 1 sigma: from later on, a heading is no longer one of the start
 _OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, without accelerometer data
 MOVED_M = 15.0  # travel from which the heading is observable without a heading sensor
@@ -65,15 +61,6 @@ class Start:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class _Track:
-    """Positions in world, moved from antenna to body as far as that needs no attitude: t (M,), s; p (M, 3), m; sigma (M, 3), m."""
-
-    t: Array
-    p: Array
-    sigma: Array
-
-
 def align(problem: Problem) -> Start:
     """Return the start of a run.
 
@@ -89,8 +76,8 @@ def align(problem: Problem) -> Start:
             f"no position from {utc_text(origin)} on: no GNSS fix and no pose was accepted; "
             f"check the topics, the status and the stamps with `graphloc inspect`{problem.silent}"
         )
-    still = _standstill(problem, track, yaws)
-    bias, bias_sigma, notes = _gyro_bias(problem, window, still, yaws)
+    still = standstill(problem, track, yaws)
+    bias, bias_sigma, notes = gyro_bias(problem, window, still, yaws)
     early = {name: rows for name, rows in yaws.items() if rows[0, 0] * bias_sigma[2] < _CARRIED_RAD}
     moved_s = _moved_at(track)
     if early or (moved_s is not None and moved_s < min((rows[0, 0] for rows in yaws.values()), default=np.inf)):
@@ -98,14 +85,14 @@ def align(problem: Problem) -> Start:
     turn = _turns(problem, max([window, *(rows[0, 0] for rows in yaws.values())]) + 10.0 if yaws else 180.0, bias)
     at_start = still if still is not None and still[0] == 0.0 else None
     R_level, tilt_sigma, level, tilt_note = _level(problem, window, at_start, turn, bias)
-    heading = _headings(problem, track, yaws, turn)
+    yaws_rad, yaw_sigma_rad, window_s, heading_note = _headings(problem, track, yaws, turn)
     p0, p_sigma, v0, v_sigma = _position_and_velocity(hints, track, at_start)
     return Start(
         R_level_body=R_level,
         tilt_sigma_rad=tilt_sigma,
         level=level,
-        yaws_rad=heading[0],
-        yaw_sigma_rad=heading[1],
+        yaws_rad=yaws_rad,
+        yaw_sigma_rad=yaw_sigma_rad,
         by_motion=not yaws and moved_s is not None,
         tried=not yaws and problem.config.start.heading_deg is None,
         p_world_m=p0,
@@ -114,8 +101,8 @@ def align(problem: Problem) -> Start:
         v_sigma_mps=v_sigma,
         gyro_bias_radps=problem.R_body_imu.T @ bias,
         gyro_bias_sigma_radps=bias_sigma,
-        window_s=heading[2],
-        notes=(*notes, tilt_note, heading[3]),
+        window_s=window_s,
+        notes=(*notes, tilt_note, heading_note),
     )
 
 
@@ -131,10 +118,10 @@ def _hints(problem: Problem, origin: int) -> dict[str, list[tuple[float, Hint]]]
     return found
 
 
-def _track(hints: dict[str, list[tuple[float, Hint]]]) -> _Track:
+def _track(hints: dict[str, list[tuple[float, Hint]]]) -> Track:
     rows = [(t, h) for found in hints.values() for t, h in found if np.isfinite(h.p_world_m[:2]).all()]
     rows.sort(key=lambda row: row[0])
-    return _Track(
+    return Track(
         np.array([t for t, _ in rows]),
         np.array([h.p_world_m for _, h in rows]).reshape(-1, 3),
         np.array([h.p_sigma_m for _, h in rows]).reshape(-1, 3),
@@ -150,139 +137,10 @@ def _yaws(hints: dict[str, list[tuple[float, Hint]]]) -> dict[str, Array]:
     return {name: np.array(found) for name, found in rows.items() if found}
 
 
-def _samples(problem: Problem, start_s: float, stop_s: float) -> tuple[Array, Array, Array]:
-    """Return t (M,) s, specific force and rate (M, 3) in body axes over a span."""
-    origin = problem.imu.stamps_ns[0]
-    lo, hi = np.searchsorted(problem.imu.stamps_ns, [origin + duration_ns(start_s), origin + duration_ns(stop_s)])
-    hi = max(int(hi), int(lo) + 2)
-    t = (problem.imu.stamps_ns[lo:hi] - origin) * 1e-9
-    R = problem.R_body_imu
-    return t, problem.imu.accel_mps2[lo:hi] @ R.T, problem.imu.gyro_radps[lo:hi] @ R.T
-
-
-def _standstill(problem: Problem, track: _Track, yaws: dict[str, Array]) -> tuple[float, float] | None:
-    """Return the longest stretch of the run (at least 3 s) without rotation, acceleration or vibration."""
-    span = float((problem.imu.stamps_ns[-1] - problem.imu.stamps_ns[0]) * 1e-9)
-    t, f, w = _samples(problem, 0.0, span)
-    block = np.floor(t).astype(np.int64)
-    start = np.searchsorted(block, np.arange(block[-1] + 2))
-    quiet = [
-        b - a > 3
-        and bool((w[a:b].std(axis=0) < _STILL_GYRO_RADPS).all() and (f[a:b].std(axis=0) < _STILL_ACCEL_MPS2).all())
-        for a, b in pairwise(start)
-    ]
-    best: tuple[float, float] | None = None
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.array(quiet, dtype=int), [0]])))
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        longer = best is None or last - first > best[1] - best[0]
-        if last - first >= 3 and longer and _rests(track, yaws, float(first), float(last)):
-            best = (float(first), float(last))
-    return best
-
-
-def _rests(track: _Track, yaws: dict[str, Array], first: float, last: float) -> bool:
-    """Whether positions and headings confirm that a quiet stretch is standstill, and no steady motion or turn."""
-    inside = (track.t >= first) & (track.t <= last)
-    if inside.sum() < 4 or np.ptp(track.t[inside]) < 0.5 * (last - first):
-        return False
-    slope = [_slope(track.t[inside], track.p[inside, i]) for i in range(2)]
-    noise = 2.0 * float(np.nanmedian(track.sigma[inside, :2])) / float(np.ptp(track.t[inside]))
-    if np.hypot(slope[0], slope[1]) > _STILL_SPEED_MPS + min(noise, 0.3):
-        return False
-    for rows in yaws.values():
-        near = _within(rows, first, last)
-        if len(near) >= _FEWEST_HEADINGS:
-            noise = 3.0 * float(near[:, 2].mean()) / float(np.ptp(near[:, 0])) / np.sqrt(len(near))
-            if abs(_slope(near[:, 0], np.unwrap(near[:, 1]))) > 0.01 + noise:
-                return False
-    return True
-
-
-def _within(rows: Array, first: float, last: float) -> Array:
-    """Return the headings (M, 3) of a sensor from `first` to `last`, s."""
-    return rows[(rows[:, 0] >= first) & (rows[:, 0] <= last)]
-
-
-def _headed(yaws: dict[str, Array], first: float, last: float) -> bool:
-    """Whether a sensor tells the heading through a stretch, and with it any turn."""
-    found = (_within(rows, first, last) for rows in yaws.values())
-    return any(len(rows) >= _FEWEST_HEADINGS and np.ptp(rows[:, 0]) > 0.5 * (last - first) for rows in found)
-
-
-def _slope(t: Array, y: Array) -> float:
-    """Return the Theil-Sen slope: the median over pairs that are far enough apart."""
-    n = len(t)
-    i = np.arange(n)
-    j = (i + max(n // 2, 1)) % n
-    dt = t[j] - t[i]
-    use = np.abs(dt) > 1e-3
-    return float(np.median((y[j] - y[i])[use] / dt[use])) if use.any() else 0.0
-
-
-def _gyro_bias(
-    problem: Problem, window: float, still: tuple[float, float] | None, yaws: dict[str, Array]
-) -> tuple[Array, Array, tuple[str, ...]]:
-    """Bias (3,) in body axes and its sigma (3,), rad/s: of each axis from standstill or from motion, whichever tells it better."""
-    prior = problem.links.bias_sigmas()[3:]
-    t, _, w = _samples(problem, 0.0, window)
-    span = float(np.ptp(t))
-    mean = w.mean(axis=0)
-    bias, sigma = np.zeros(3), np.array(prior)
-    rate = None
-    for rows in yaws.values():
-        near = rows[rows[:, 0] <= window]
-        if len(near) >= 8 and np.ptp(near[:, 0]) > 0.5 * window:
-            rate = _slope(near[:, 0], np.unwrap(near[:, 1]))
-            # A slope from two halves of the window, with allowance for outliers and slow errors of the sensor.
-            sigma[2] = min(sigma[2], 0.002 + 0.1 / np.ptp(near[:, 0]))
-            bias[2] = mean[2] - rate
-            break
-    # Roll and pitch return to where they were (to 0.1 rad): the rest of their mean rate is bias.
-    turn = abs(rate) if rate is not None else abs(mean[2])
-    around = np.hypot(0.1 / span, 0.1 * turn)
-    bias[:2] = np.where(around < prior[:2], mean[:2], 0.0)
-    sigma[:2] = np.minimum(prior[:2], around)
-    if still is not None:
-        at_rest, its_sigma = _bias_at_rest(*_samples(problem, *still)[::2], prior, turns=not _headed(yaws, *still))
-        better = its_sigma < sigma
-        found = np.where(better, at_rest, bias), np.where(better, its_sigma, sigma)
-        return *found, (f"gyro bias from {still[1] - still[0]:.0f} s of standstill",)
-    if rate is None:
-        return bias, sigma, ("gyro bias about the vertical unknown at the start",)
-    return bias, sigma, (f"gyro bias from {span:.0f} s of motion and heading",)
-
-
-def _bias_at_rest(t: Array, w: Array, prior: Array, *, turns: bool) -> tuple[Array, Array]:
-    """Return the bias (3,) and its sigma (3,), rad/s, by the rates (M, 3) of a standstill.
-
-    Args:
-        prior: (3,) sigma of the bias, rad/s. turns: whether the vessel may turn on the spot, as no heading tells that it does not.
-    """
-    bias = w.mean(axis=0)
-    sigma = np.minimum(w.std(axis=0) / np.sqrt(len(w)) + 3e-4 + _swell(t, w), prior)
-    if turns:  # any part of the mean rate is bias, as far as the prior has it
-        half = bias[2] / 2.0
-        share = prior[2] ** 2 / (prior[2] ** 2 + half**2)
-        bias[2], sigma[2] = share * half, np.hypot(sigma[2], np.sqrt(share) * half)
-    return bias, sigma
-
-
-def _swell(t: Array, w: Array) -> Array:
-    """Return how far (3,), rad/s, the mean rate of a quiet stretch may be from zero because of slow waves.
-
-    Three quiet seconds are half a period of swell, whose rates do not average out: the mean may be off by as much as means over half
-    a second scatter, and by less only where the stretch is longer than wave periods.
-    """
-    block = np.floor((t - t[0]) / _BLOCK_S).astype(np.int64)
-    starts = np.flatnonzero(np.diff(block, prepend=-1))  # a gap may leave blocks empty
-    means = np.add.reduceat(w, starts) / np.diff(np.append(starts, len(w)))[:, None]
-    return np.asarray(means.std(axis=0) * min(1.0, float(np.sqrt(_SWELL_S / max(t[-1] - t[0], 1e-3)))))
-
-
 def _turns(problem: Problem, span_s: float, bias: Array) -> Callable[[float], Array]:
     """Return a function t (s) -> R_body0_body(t) (3, 3), integrated from the gyroscope over the beginning of the run."""
     span = float((problem.imu.stamps_ns[-1] - problem.imu.stamps_ns[0]) * 1e-9)
-    t, _, w = _samples(problem, 0.0, min(span_s, span))
+    t, _, w = samples_of(problem, 0.0, min(span_s, span))
     R = np.empty((len(t), 3, 3))
     R[0] = np.eye(3)
     steps = Rotation.from_rotvec((0.5 * (w[:-1] + w[1:]) - bias) * np.diff(t)[:, None]).as_matrix()
@@ -303,9 +161,9 @@ def _level(
     Args:
         turn: t -> R_body0_body(t), by the gyroscope less its bias (3,), in body axes.
     """
-    if getattr(problem.config.sensors[problem.imu.sensor], "gravity", "included") == "removed":
+    if problem.config.sensors[problem.imu.sensor].gravity == "removed":
         return np.eye(3), 0.1, None, "roll and pitch unknown (gravity removed by the driver): taken level"
-    t, f, _ = _samples(problem, 0.0, still[1] if still else min(window, 10.0))
+    t, f, _ = samples_of(problem, 0.0, still[1] if still else min(window, 10.0))
     span = float(np.ptp(t))  # online, a start comes before ten seconds have
     R = np.array([turn(s) for s in t])
     forces = np.einsum("nij,nj->ni", R, f)
@@ -328,7 +186,7 @@ def _level(
 
 
 def _headings(
-    problem: Problem, track: _Track, yaws: dict[str, Array], turn: Callable[[float], Array]
+    problem: Problem, track: Track, yaws: dict[str, Array], turn: Callable[[float], Array]
 ) -> tuple[tuple[float, ...], float, float, str]:
     """Return candidates for the yaw at the start, their sigma, the span that distinguishes them, and a note."""
     config = problem.config.start
@@ -365,7 +223,7 @@ def _headings(
     )
 
 
-def _moved_at(track: _Track) -> float | None:
+def _moved_at(track: Track) -> float | None:
     """Return when (s) the vessel has travelled far enough for a heading from its course; None: never."""
     moved = np.hypot(*(track.p[:, :2] - np.median(track.p[:5, :2], axis=0)).T)
     noise = 5.0 * float(np.nanmedian(track.sigma[:, :2]))
@@ -383,7 +241,7 @@ def _circular_median(angles: Array) -> float:
 
 
 def _position_and_velocity(
-    hints: dict[str, list[tuple[float, Hint]]], track: _Track, still: tuple[float, float] | None
+    hints: dict[str, list[tuple[float, Hint]]], track: Track, still: tuple[float, float] | None
 ) -> tuple[Array, Array, Array, Array]:
     first = track.t[0]
     near = track.t <= first + 3.0
@@ -400,7 +258,7 @@ def _position_and_velocity(
     elif still is None:
         soon = track.t <= first + 5.0
         soon[: min(4, len(soon))] = True
-        slope = np.array([_slope(track.t[soon], track.p[soon, i]) for i in range(2)])
+        slope = np.array([slope_of(track.t[soon], track.p[soon, i]) for i in range(2)])
         # Two sightings within a quarter of a second, each a metre off, give the speed to 6 m/s at best.
         noise = float(np.median(np.nan_to_num(track.sigma[soon, :2], nan=5.0))) / max(
             float(np.std(track.t[soon]) * np.sqrt(soon.sum())), 1e-3

@@ -26,7 +26,7 @@ from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
 from graphloc.solve._choices import other_choices, take_more_probable
-from graphloc.solve._decide import Verdicts, weigh
+from graphloc.solve._decide import Stage, Verdicts, weigh
 from graphloc.solve._grow import grow
 from graphloc.solve._imu_noise import with_needed_noise
 from graphloc.solve._levels import at_usual_level
@@ -69,6 +69,14 @@ class BatchResult:
         return replace(self, tree=gtsam.ISAM2(), graph=gtsam.NonlinearFactorGraph())
 
 
+def noise_step(ratio: float) -> float:
+    """Return the factor by which the IMU's noise is scaled up at once where the cost is `ratio` times its expectation.
+
+    At most by 3: modes and weights are chosen anew before it is looked at again.
+    """
+    return float(np.clip(np.sqrt(ratio), 1.5, 3.0))
+
+
 def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     """Solve a whole run.
 
@@ -80,7 +88,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     heading_var = np.interp(problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1], few_var)
     begun = int(few.states[known])
     iterations += grow(few.problem, grown, prior, known, progress)
-    grown, used, _ = rough_passes(few.problem, grown, prior, progress, ("final",), _SEAM_PASSES)
+    grown, used, _ = rough_passes(few.problem, grown, prior, progress, (Stage.FINAL,), _SEAM_PASSES)
     iterations += used
     passes, estimate = 0, few.filled(problem, grown)
     if problem.links.gaps():
@@ -95,14 +103,15 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         if ratio < CONTRADICTION:
             noisier = with_needed_noise(problem, estimate, settled.verdicts, prior)
         else:
-            scale = problem.noise_scale * float(np.clip(np.sqrt(ratio), 1.5, 3.0))
-            noisier = with_noise_scale(problem, scale)
+            noisier = with_noise_scale(problem, problem.noise_scale * noise_step(ratio))
         if noisier is None:
             break
         problem = bridged(noisier, estimate)
         few = thinned(problem)
         if ratio >= CONTRADICTION:
-            estimate, used, passed = rough_passes(problem, estimate, prior, progress, ("far", "open"), _OPEN_PASSES)
+            estimate, used, passed = rough_passes(
+                problem, estimate, prior, progress, (Stage.FAR, Stage.OPEN), _OPEN_PASSES
+            )
             passes, iterations = passes + passed, iterations + used
     settled, levels_cov = at_usual_level(problem, settled, prior, progress, _LAST_PASSES)
     if settled.values is not estimate:
@@ -135,9 +144,8 @@ def _final_passes(
     A choice confirms itself, because the estimate follows it; another one that is more probable replaces it.
     """
     last = len(problem.timeline) - 1
-    settled = settle(
-        problem, estimate, weigh(problem, estimate, first=0, last=last, stage="final"), prior, progress, _FIRST_PASSES
-    )
+    verdicts = weigh(problem, estimate, first=0, last=last, stage=Stage.FINAL)
+    settled = settle(problem, estimate, verdicts, prior, progress, _FIRST_PASSES)
     changed, iterations = False, settled.iterations
     for others, used in other_choices(problem, few, settled, prior):
         changed = take_more_probable(problem, settled, others, prior) or changed

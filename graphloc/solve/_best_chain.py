@@ -13,8 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from graphloc.build import Judged
-from graphloc.graph import Residual
-from graphloc.solve._hypotheses import log_repeat
+from graphloc.frames import Array
+from graphloc.graph import FalseModel, Residual
+from graphloc.solve._hypotheses import log_false_again
 from graphloc.solve._prediction import Prediction, carried, kept_of, moved, taken_of, walk_of
 
 _LOOK_BACK = 64  # candidates for the right one before
@@ -43,14 +44,7 @@ def best_chain(
     )
     stamps = np.array([m.stamp_ns for m in taken]) * 1e-9
     walk = np.array([walk_of(m) for m in models])
-    again = np.zeros(count)
-    for n in range(1, count):
-        repeats, age_s = models[n].repeats, stamps[n] - stamps[n - 1]
-        walked = walk[n] * age_s + (0.0 if predictions is None else moved(predictions[n - 1], predictions[n], age_s))
-        same = np.log(max(repeats * models[n].probability, 1e-12))
-        same += log_repeat(residuals[n - 1], residuals[n], walked)
-        again[n] = max(0.0, float(np.logaddexp(np.log1p(-repeats), same - nothing[n])))
-    gained = np.concatenate([[0.0], np.cumsum(again)])  # by false ones that repeat, up to and without n
+    gained = _gained_by_repeats(models, residuals, predictions, nothing, stamps, walk)
     node = [(n, mode) for n, found in enumerate(residuals) for mode in range(len(found))]
     at = np.array([n for n, _ in node])
     raw = np.array([residuals[n][mode].raw for n, mode in node])
@@ -91,3 +85,25 @@ def best_chain(
         chosen[n] = mode
         k = int(before[k])
     return chosen
+
+
+def _gained_by_repeats(
+    models: Sequence[FalseModel],
+    residuals: Sequence[tuple[Residual, ...]],
+    predictions: Sequence[Prediction] | None,
+    nothing: Array,
+    stamps_s: Array,
+    walk: Array,
+) -> Array:
+    """Return the log likelihood (N + 1,) gained by false measurements that repeat the one before, up to and without each.
+
+    Args:
+        nothing: (N,) log of prior x density of a false one by itself. walk: (N, k, k) as of `walk_of`.
+    """
+    again = np.zeros(len(models))
+    for n in range(1, len(models)):
+        age_s = stamps_s[n] - stamps_s[n - 1]
+        walked = walk[n] * age_s + (0.0 if predictions is None else moved(predictions[n - 1], predictions[n], age_s))
+        same = log_false_again(models[n], residuals[n - 1], residuals[n], walked)
+        again[n] = max(0.0, float(np.logaddexp(np.log1p(-models[n].repeats), same - nothing[n])))
+    return np.concatenate([[0.0], np.cumsum(again)])

@@ -18,6 +18,7 @@ import numpy as np
 from graphloc.build import Decisions, Problem, StartPrior, Thinned, attach, build_graph
 from graphloc.graph import Attachment, Decision
 from graphloc.solve._decide import (
+    Stage,
     Verdict,
     Verdicts,
     along_best_chains,
@@ -76,7 +77,7 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
             rest.values,
             first=0,
             last=len(problem.timeline) - 1,
-            stage="final",
+            stage=Stage.FINAL,
             covariance=predicted_covariance(rest.tree),
             only=own,
         )
@@ -212,7 +213,7 @@ def _solve_around(
     local = copy_states(problem, values, max(first - 1, 0), min(last + 1, len(problem.timeline) - 1))
     for _ in range(_AROUND_PASSES):
         step = solve_until_written_there(problem, local, first, last, prior, decisions(verdicts), tol=1e-3)
-        used, verdicts = verdicts, weigh(problem, local, first=first, last=last, stage="final")
+        used, verdicts = verdicts, weigh(problem, local, first=first, last=last, stage=Stage.FINAL)
         if unlike is not None and all(_alike(v, unlike[key]) for key, v in verdicts.items()):
             return None
         if step.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:

@@ -9,6 +9,7 @@ reject the right measurements.
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -29,9 +30,20 @@ from graphloc.solve._hypotheses import log_evidence_of, sequence_of
 from graphloc.solve._prediction import Prediction, predict_residuals, prediction_of
 from graphloc.solve._scatter import noisier_than_stated, scatter_of, scatter_of_pairs, white_scatter
 
-# By stage, for every sensor that has a kernel at all: Huber is convex, so a start that is tens of metres
-# off still pulls in; Cauchy forgets outliers better and still lets the truth back in.
-_STAGE_KERNEL = {"far": KernelConfig(kind="huber", scale=1.5), "open": KernelConfig(kind="cauchy", scale=1.5)}
+
+class Stage(enum.StrEnum):
+    """How far off the estimate may be, and so how gentle the kernels of all sensors that have one."""
+
+    FAR = "far"  # tens of metres: Huber at most; it is convex, so such a start still pulls in
+    OPEN = "open"  # metres: Cauchy at most; it forgets outliers better and still lets the truth back in
+    FINAL = "final"  # each sensor's own kernel
+
+
+_GENTLEST = {
+    Stage.FAR: KernelConfig(kind="huber", scale=1.5),
+    Stage.OPEN: KernelConfig(kind="cauchy", scale=1.5),
+    Stage.FINAL: None,
+}
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
 _WIDEST = 1e9  # sigmas: larger residuals (0.1 mm stated, 100 km off) count the same
 AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
@@ -94,7 +106,7 @@ def weigh(
     *,
     first: int,
     last: int,
-    stage: str,
+    stage: Stage,
     covariance: PredictedCovariance = lambda _state, _key: None,
     hypotheses: bool = True,
     only: Container[tuple[int, int]] | None = None,
@@ -104,7 +116,7 @@ def weigh(
     Args:
         problem: the run. values: current estimate.
         first: first state. last: last state, inclusive.
-        stage: 'far' (Huber at most), 'open' (Cauchy at most) or 'final' (each sensor's own kernel).
+        stage: how far off the estimate may be.
         covariance: (state, key) -> covariance of the key's prediction (a pose's in the body tangent), or None.
         hypotheses: weigh sensors that can be false by their hypotheses; else by the stage's kernel, on the
             nearest mode.
@@ -141,30 +153,28 @@ def residuals_at(
 
 
 def _by_kernel(
-    stream: Stream, indices: list[int], attached: list[Attachment], residuals: list[tuple[Residual, ...]], stage: str
+    stream: Stream, indices: list[int], attached: list[Attachment], residuals: list[tuple[Residual, ...]], stage: Stage
 ) -> list[Verdict]:
     """The sensor's own kernel, or the stage's where that one is gentler."""
     nis = _nis([r for found in residuals for r in found])
     starts = np.cumsum([0, *(len(found) for found in residuals)])
     mode = [int(np.argmin(nis[a:b])) for a, b in pairwise(starts)]
     best = [float(nis[a + m]) for a, m in zip(starts, mode, strict=False)]
-    own, limit = stream.config.kernel, _STAGE_KERNEL.get(stage, stream.config.kernel)
+    own, limit = stream.config.kernel, _GENTLEST[stage] or stream.config.kernel
     gentle = _CONVEXITY.index(own.kind) <= _CONVEXITY.index(limit.kind)
     # The norm of k whitened residuals is about sqrt(k): the threshold is larger by that.
     dof = len(residuals[0][0].raw)
-    times, noisier = scatter_of(best, dof), 1.0
-    # Around an estimate that is metres off, right matches are many sigmas away. At full weight they, and false ones, bend the motion
-    # until the solver diverges; at the weight of what they are off by, the rest holds it together. Not so of fixes, which lead
-    # back; nor of what shares an error (a mount), which has to give way.
-    by_scatter = stage == "far" and stream.row.false is not None and not stream.constants
+    times, white = scatter_of(best, dof), 1.0
     if times > 1.0 and not stream.row.absolute:  # of positions, a shared error may be that of the estimate
         stamps_ns = np.array([stream.measurements[i].stamp_ns for i in indices])
         normal = np.array([found[m].normalised() for m, found in zip(mode, residuals, strict=True)])
         times = min(times, scatter_of_pairs(stamps_ns, normal))
-        if not by_scatter:
-            noisier = noisier_than_stated(min(times, white_scatter(stamps_ns, normal)))
-    if by_scatter:
-        noisier = times
+        white = min(times, white_scatter(stamps_ns, normal))
+    # Around an estimate that is metres off, right matches are many sigmas away. At full weight they, and false ones, bend the motion
+    # until the solver diverges; at the weight of what they are off by, the rest holds it together. Not so of fixes, which lead
+    # back; nor of what shares an error (a mount), which has to give way.
+    by_scatter = stage is Stage.FAR and stream.row.false is not None and not stream.constants
+    noisier = times if by_scatter else noisier_than_stated(white)
     scale = min(own.scale * times / noisier * float(np.sqrt(dof)), _WIDEST)
     kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=scale)
     decided = {m: Decision(mode=m, weight=noisier**-2, kernel=kernel) for m in set(mode)}

@@ -10,7 +10,7 @@ import numpy as np
 
 from graphloc.build import Past, Problem, StartPrior
 from graphloc.recording import Progress
-from graphloc.solve._decide import PredictedCovariance, Verdicts, decisions, predicted_covariance, weigh
+from graphloc.solve._decide import PredictedCovariance, Stage, Verdicts, decisions, predicted_covariance, weigh
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._stretch import StretchStep, dead_reckon, past_at, solve_stretch, solve_until_written_there
 
@@ -38,7 +38,7 @@ def grow(
     """
     stamps, slow_of, end = problem.timeline.stamps_ns, problem.timeline.slow_of, len(problem.timeline) - 1
     prior: StartPrior | Past = start
-    verdicts = weigh(problem, estimate, first=0, last=known, stage="final")
+    verdicts = weigh(problem, estimate, first=0, last=known, stage=Stage.FINAL)
     step = solve_stretch(problem, estimate, 0, known, prior, decisions(verdicts))
     iterations, first = step.iterations, 0
     while known < end:
@@ -67,9 +67,11 @@ def _solve_grown(
     """
     fresh = {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
     iterations = 0
-    for stage in ("final", *["far"] * _MAX_FAR_ROUNDS, "final"):
+    for stage in (Stage.FINAL, *[Stage.FAR] * _MAX_FAR_ROUNDS, Stage.FINAL):
         verdicts = weigh(problem, values, first=first, last=last, stage=stage)
-        step = solve_stretch(problem, values, first, last, prior, decisions(verdicts, fresh), jumps=stage != "far")
+        step = solve_stretch(
+            problem, values, first, last, prior, decisions(verdicts, fresh), jumps=stage is not Stage.FAR
+        )
         iterations += step.iterations
         if step.moved_m < _FAR_SETTLED_M:
             break
@@ -78,7 +80,7 @@ def _solve_grown(
     predicted = predicted_covariance(bayes_tree(step.graph, step.values))
     covariance: PredictedCovariance = lambda k, key: predicted(k, key) if k > known else None
     for _ in range(2):
-        verdicts = weigh(problem, values, first=first, last=last, stage="final", covariance=covariance)
+        verdicts = weigh(problem, values, first=first, last=last, stage=Stage.FINAL, covariance=covariance)
         step = solve_until_written_there(problem, values, first, last, prior, decisions(verdicts))
         iterations += step.iterations
         covariance = lambda _state, _key: None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from graphloc.build import Problem, Stream
 from graphloc.frames import Array
 from graphloc.position_jumps import LASTS_S, why_in_doubt
-from graphloc.solution import Health, SolveStats
+from graphloc.solution import Cause, Health, HealthReason, SolveStats
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
 from graphloc.solve._decide import AGREES, Verdict
 from graphloc.trajectory import Trajectory, bounds_95
@@ -61,7 +61,7 @@ def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
 
 def health_over_time(
     trajectory: Trajectory, since: dict[str, Array], misfits: Sequence[str]
-) -> tuple[tuple[Health, ...], tuple[str, ...]]:
+) -> tuple[tuple[Health, ...], tuple[HealthReason, ...]]:
     assert trajectory.cov is not None
     away = {name: _or_until(s, trajectory.stamps_ns) for name, s in since.items()}
     found = [
@@ -71,7 +71,7 @@ def health_over_time(
     return tuple(health for health, _ in found), tuple(why for _, why in found)
 
 
-def health_of(cov: Array, away_s: Mapping[str, float], misfit: str = "") -> tuple[Health, str]:
+def health_of(cov: Array, away_s: Mapping[str, float], misfit: str = "") -> tuple[Health, HealthReason]:
     """Return how far a pose can be trusted, and why not fully.
 
     Args:
@@ -81,11 +81,15 @@ def health_of(cov: Array, away_s: Mapping[str, float], misfit: str = "") -> tupl
     bound_m, _, heading_deg = (float(v) for v in bounds_95(cov[None])[0])
     silent = [name for name, s in away_s.items() if s > _SILENT_S]
     if bound_m > _LOST_BOUND_M or heading_deg > _LOST_HEADING_DEG:
-        return Health.LOST, f"95 % bound {bound_m:.0f} m, heading {heading_deg:.0f} deg"
+        return Health.LOST, HealthReason(f"95 % bound {bound_m:.0f} m, heading {heading_deg:.0f} deg", Cause.BOUND)
     if min(away_s.values(), default=np.inf) > _DEAD_RECKONING_S:
-        return Health.DEAD_RECKONING, "no absolute position agrees"
+        return Health.DEAD_RECKONING, HealthReason("no absolute position agrees", Cause.NO_POSITION)
     if bound_m > _GOOD_BOUND_M:
-        return Health.DEGRADED, f"95 % bound {bound_m:.1f} m"
+        return Health.DEGRADED, HealthReason(f"95 % bound {bound_m:.1f} m", Cause.BOUND)
     if silent:
-        return Health.DEGRADED, f"{', '.join(silent)} missing or not agreeing"
-    return (Health.DEGRADED, misfit) if misfit else (Health.GOOD, "")
+        return Health.DEGRADED, HealthReason(
+            f"{', '.join(silent)} missing or not agreeing", Cause.SENSORS, tuple(silent)
+        )
+    if misfit:
+        return Health.DEGRADED, HealthReason(misfit, Cause.CONTRADICTION)
+    return Health.GOOD, HealthReason()

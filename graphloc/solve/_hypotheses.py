@@ -96,8 +96,7 @@ def sequence_of(
     for n in range(1, len(models)):
         model = models[n]
         walked = moved(predictions[n - 1], predictions[n], (taken[n].stamp_ns - taken[n - 1].stamp_ns) * 1e-9)
-        again = np.log(max(model.repeats * model.probability, 1e-12))
-        again += log_repeat(residuals[n - 1], residuals[n], walked)
+        again = log_false_again(model, residuals[n - 1], residuals[n], walked)
         repeated[:, n] = np.logaddexp(np.log1p(-model.repeats) + fresh[:, n], again)
     return FalseSequence(right, fresh, repeated, np.array([prediction is not None for prediction in predictions]))
 
@@ -117,7 +116,14 @@ def log_right_and_false(modes: tuple[Residual, ...], P: Array | None, model: Fal
     return float(right), float(np.log(model.probability) + np.logaddexp.reduce(logs))
 
 
-def log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...], walked: Array | float = 0.0) -> float:
+def log_false_again(
+    model: FalseModel, before: tuple[Residual, ...], now: tuple[Residual, ...], walked: Array | float
+) -> float:
+    """Return the log of prior x density that a measurement is false by the error of the one before it; `walked` as in `_log_repeat`."""
+    return float(np.log(max(model.repeats * model.probability, 1e-12))) + _log_repeat(before, now, walked)
+
+
+def _log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...], walked: Array | float = 0.0) -> float:
     """Return the log density that the error of one measurement repeats in the next, over pairs of modes.
 
     Args:

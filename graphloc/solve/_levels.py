@@ -17,7 +17,7 @@ from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.position_jumps import MEAN_S
 from graphloc.recording import Progress
-from graphloc.solve._decide import Verdicts, weigh
+from graphloc.solve._decide import Stage, Verdicts, weigh
 from graphloc.solve._passes import Settled, settle
 from graphloc.time import NS_PER_S
 
@@ -50,7 +50,7 @@ def at_usual_level(
     if usual == 0:
         return settled, others
     values = _moved(problem, settled.values, streams, -levels[usual])
-    verdicts = weigh(problem, values, first=0, last=len(problem.timeline) - 1, stage="final")
+    verdicts = weigh(problem, values, first=0, last=len(problem.timeline) - 1, stage=Stage.FINAL)
     other = settle(problem, values, verdicts, prior, progress, most)
     if _error(other) - _error(settled) > cost[0] - cost[usual]:
         return settled, alone  # another sensor determines the position

@@ -10,7 +10,7 @@ import gtsam
 
 from graphloc.build import Problem, StartPrior, build_graph
 from graphloc.recording import Progress
-from graphloc.solve._decide import Verdicts, decisions, weigh
+from graphloc.solve._decide import Stage, Verdicts, decisions, weigh
 from graphloc.solve._optimize import full_step, optimize
 from graphloc.solve._stretch import moved
 
@@ -84,7 +84,7 @@ def settle(
         # The first pass removes the seams between windows; after it one step per pass is enough.
         done = (optimise_run if n == 0 else refine_run)(problem, estimate, verdicts, prior)
         estimate, iterations = done.values, iterations + done.iterations
-        used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage="final")
+        used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage=Stage.FINAL)
         _date(verdicts, used, n + 1)
         progress("final passes", n + 1, most)
         if n > 0 and done.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
@@ -120,7 +120,7 @@ def rough_passes(
     estimate: gtsam.Values,
     prior: StartPrior,
     progress: Progress,
-    stages: Sequence[str],
+    stages: Sequence[Stage],
     most: int,
 ) -> tuple[gtsam.Values, int, int]:
     """Solve the whole run with the losses of each stage; rebuild the graph until the estimate hardly moves, as attachments depend on it.
@@ -133,7 +133,7 @@ def rough_passes(
     for stage in stages:
         for n in range(most):
             verdicts = weigh(problem, estimate, first=0, last=last, stage=stage)
-            done = optimise_run(problem, estimate, verdicts, prior, jumps=stage != "far")
+            done = optimise_run(problem, estimate, verdicts, prior, jumps=stage is not Stage.FAR)
             estimate = done.values
             passes, iterations = passes + 1, iterations + done.iterations
             progress(f"{stage} passes", n + 1, most)

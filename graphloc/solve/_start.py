@@ -22,7 +22,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array, wrap_angle
 from graphloc.recording import Progress
 from graphloc.solve._align import Start, start_pose
-from graphloc.solve._decide import cost_of_noise, decisions, weigh
+from graphloc.solve._decide import Stage, cost_of_noise, decisions, weigh
 from graphloc.solve._passes import expected_cost
 from graphloc.solve._stretch import copy_states, dead_reckon, fill_slow, solve_stretch
 
@@ -31,7 +31,7 @@ _COST_APART, _LONGEST_S, _LONGEST_UNTOLD_S = 8.0, 60.0, 600.0
 _STEP_NS = 15_000_000_000  # most that a candidate is dead-reckoned before it is solved again
 _PLACE_S, _LATE_PLACE_S = 5.0, 90.0  # of positions in the first window; latest time of the first one
 # Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
-_STAGES = (("far", 8, 0.5, False), ("open", 2, 0.5, False), ("final", 2, 0.5, True))
+_STAGES = ((Stage.FAR, 8, 0.5, False), (Stage.OPEN, 2, 0.5, False), (Stage.FINAL, 2, 0.5, True))
 # What stands for all headings: turned from the best one by angles, and how much of the circle each stands for; the best: 30 deg.
 _OTHERS_RAD = np.radians([-30.0, 30.0, -60.0, 60.0, -120.0, 120.0, 180.0])
 _WIDTHS_RAD = np.radians([30.0, 30.0, 45.0, 45.0, 60.0, 60.0, 60.0])
@@ -219,7 +219,7 @@ def _solve_candidate(
     for stage, limit, settled_m, hypotheses in _STAGES[0 if held is None else 1 :]:
         for _ in range(limit):
             verdicts = weigh(problem, candidate.values, first=0, last=last, stage=stage, hypotheses=hypotheses)
-            decided, jumps = decisions(verdicts), stage != "far"
+            decided, jumps = decisions(verdicts), stage is not Stage.FAR
             step = solve_stretch(
                 problem, candidate.values, 0, last, candidate.prior, decided, jumps=jumps, tol=1e-4, beside=held
             )

@@ -114,7 +114,23 @@ def _too_quiet(problem: Problem, result: BatchResult) -> list[str]:
 
 def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
     expected = expected_cost(problem, result.verdicts)
-    warnings = list(problem.warnings)
+    warnings = [*problem.warnings, *_of_the_run(problem, result, expected)]
+    for stream in problem.streams:
+        warnings += _of_a_sensor(stream, result)
+    return SolveStats(
+        passes=result.passes,
+        iterations=result.iterations,
+        states=len(problem.timeline),
+        factors=int(result.graph.size()),
+        cost=result.cost,
+        expected_cost=expected,
+        converged=result.converged,
+        warnings=tuple(warnings),
+    )
+
+
+def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[str]:
+    warnings = list[str]()
     if not result.converged:
         warnings.append("the solver did not converge: the last pass still moved the track by centimetres or more")
     if result.noise_scale > 1.0:
@@ -141,40 +157,35 @@ def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
             "the fixes jump, and no other sensor shows which level is right: the one held longest is taken, "
             f"and the bounds include {beside_m:.1f} m (1 sigma) for the others"
         )
-    for stream in problem.streams:
-        far, said = _far_from_prior(stream, result)
-        if far > _FAR_OFF:
+    return warnings
+
+
+def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
+    warnings = list[str]()
+    far, said = _far_from_prior(stream, result)
+    if far > _FAR_OFF:
+        warnings.append(
+            f"{stream.name}: {said} from zero: check its mount and the IMU's, or raise the configured sigma"
+        )
+    for constant, value in solved_constants(stream, result.values):
+        off = float(np.abs(value / constant.sigma).max())
+        if off > _FAR_OFF and constant.corrects:
             warnings.append(
-                f"{stream.name}: {said} from zero: check its mount and the IMU's, or raise the configured sigma"
+                f"{stream.name}: {constant.name} is {off:.1f} sigmas from zero: add {value[0]:+.3f} to its {constant.corrects}"
             )
-        for constant, value in solved_constants(stream, result.values):
-            off = float(np.abs(value / constant.sigma).max())
-            if off > _FAR_OFF and constant.corrects:
-                warnings.append(
-                    f"{stream.name}: {constant.name} is {off:.1f} sigmas from zero: add {value[0]:+.3f} to its {constant.corrects}"
-                )
-            elif off > _FAR_OFF:
-                warnings.append(
-                    f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
-                    "its sigmas"
-                )
-        warnings += slow_error_warning(stream.name, stream.left_out)
-        allowed = stream.left_out is not None
-        warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
-        weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
-        warnings += disagreement_warning(stream.name, weights)
-        warnings += noisier_warning(stream.name, _noisier(stream, result))
-        if stream.row.false is not None:
-            stamps_ns = np.array([m.stamp_ns for m in stream.measurements])
-            false = np.array([stream.row.false(m, stream.config).probability for m in stream.measurements])
-            warnings += joint_rejection_warning(stream.name, stamps_ns, weights, false)
-    return SolveStats(
-        passes=result.passes,
-        iterations=result.iterations,
-        states=len(problem.timeline),
-        factors=int(result.graph.size()),
-        cost=result.cost,
-        expected_cost=expected,
-        converged=result.converged,
-        warnings=tuple(warnings),
-    )
+        elif off > _FAR_OFF:
+            warnings.append(
+                f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
+                "its sigmas"
+            )
+    warnings += slow_error_warning(stream.name, stream.left_out)
+    allowed = stream.left_out is not None
+    warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
+    weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
+    warnings += disagreement_warning(stream.name, weights)
+    warnings += noisier_warning(stream.name, _noisier(stream, result))
+    if stream.row.false is not None:
+        stamps_ns = np.array([m.stamp_ns for m in stream.measurements])
+        false = np.array([stream.row.false(m, stream.config).probability for m in stream.measurements])
+        warnings += joint_rejection_warning(stream.name, stamps_ns, weights, false)
+    return warnings

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Matches of scans made around the track of a solved run (during a run: `_live.py`)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from graphloc.config import VesselConfig
+from graphloc.eval.match_picture import Gallery
+from graphloc.frames import Datum
+from graphloc.frontends._part import Bags
+from graphloc.frontends.aerial import match_bag
+from graphloc.gather._gathering import Gathering
+from graphloc.recording import Progress, Recording, quiet
+from graphloc.solution import Solution
+
+
+@dataclass(frozen=True, slots=True)
+class Scans:
+    """Where scans are matched from: the bags, and the folder that relative image paths count from."""
+
+    bags: Bags
+    folder: Path
+
+
+def with_matches(
+    recording: Recording,
+    config: VesselConfig,
+    datum: Datum,
+    solution: Solution,
+    scans: Scans,
+    progress: Progress = quiet,
+    gallery: Gallery | None = None,
+) -> Recording:
+    """Add the matches of every aerial sensor, made around a solution; a scan that gave none is a row of the ledger.
+
+    Raises:
+        InputError: an image or LiDAR that cannot be used.
+    """
+    gathered, track = Gathering(recording), solution.trajectory
+    span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
+    for name, sensor in config.of_kind("aerial").items():
+        gathered.sensor(name, dict.fromkeys((lidar.topic for lidar in sensor.lidars.values()), f"read by {name}"))
+        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=gathered.said.append)
+        for item in found:
+            if item.match is not None and gallery is not None:
+                gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
+            if item.match is not None and item.match.modes:
+                gathered.take(item.match.fix(item.stamp_ns, name, item.news, sensor.axes))
+            else:
+                gathered.refuse(name, item.stamp_ns, item.why_not)
+            progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)
+        progress("matching", span_s, span_s)
+        gathered.said += _few_matches(name, gathered.refused(name))
+    return gathered.recording()
+
+
+def _few_matches(sensor: str, reasons: Counter[str]) -> list[str]:
+    """Say so where most scans of a sensor gave no match."""
+    if reasons.total() < 5:
+        return []
+    ((most, count),) = reasons.most_common(1)
+    return [f"{sensor}: {reasons.total()} scans gave no match, {count} of them: {most}; `graphloc match` shows one"]

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sightings of tags: found in the images of a bag, placed by a survey."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from graphloc.config import VesselConfig
+from graphloc.errors import ConfigError
+from graphloc.frontends._part import Bags
+from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_bag
+from graphloc.frontends.tags.sizes import size_factors
+from graphloc.gather._gathering import Gathering
+from graphloc.measurements import TagSighting
+from graphloc.recording import Progress, Recording, quiet
+from graphloc.survey import Survey, load_survey
+
+_REASONS = 8  # that are said, of those why something was refused
+_DOUBTFUL = 0.5  # share of the images with tags, above which those that a limit refuses are said
+
+
+def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
+    """Read the surveys that tag sensors name; relative paths count from `folder`.
+
+    Raises:
+        ConfigError: there is none, or it cannot be used.
+    """
+    read = {}
+    for name, sensor in config.of_kind("apriltag").items():
+        if not sensor.survey:
+            raise ConfigError(f"sensors.{name}.survey: name the tags.yaml that says where the tags are (docs/tags.md)")
+        if isinstance(sensor.survey, str):
+            read[name] = sensor.model_copy(update={"survey": load_survey(folder / sensor.survey)})
+    return config.with_sensors(read)
+
+
+def with_sightings(recording: Recording, config: VesselConfig, bags: Bags, progress: Progress = quiet) -> Recording:
+    """Add what every tag sensor sees; each sighting, and each thing that cannot be used, is a row of the ledger.
+
+    Raises:
+        InputError: a camera that cannot be used.
+    """
+    gathered, views = Gathering(recording), list(recording.tag_views)
+    for name, sensor in config.of_kind("apriltag").items():
+        cameras = {camera.topic for camera in sensor.cameras.values()}
+        total, without = sum(r.count for r in recording.rows if r.topic in cameras), 0
+        infos = {camera.info_topic or camera_info_topic(camera.topic) for camera in sensor.cameras.values()}
+        taken: list[TagSighting] = []
+        reasons, doubts, shown = Counter[str](), Counter[str](), Counter[str]()
+        found = sightings_of_bag(bags, name, sensor, config.body_frame, warn=gathered.said.append)
+        for done, seen in enumerate(found, start=1):
+            views += seen.views
+            without += not seen.sightings
+            taken += seen.sightings
+            for why in (*seen.troubles, *seen.doubtful):
+                gathered.refuse(name, seen.stamp_ns, why)
+            reasons.update(seen.troubles)
+            doubts.update(seen.doubtful)
+            shown["doubtful"] += bool(seen.doubtful)
+            shown["tags"] += bool(seen.sightings or seen.views or seen.doubtful)
+            progress("looking for tags", min(done, total), total)
+        _take_sized(gathered, name, taken, sensor.surveyed)
+        read = f"read by {name}; {without} of {total} show no tag that can be used"
+        gathered.sensor(name, dict.fromkeys(infos, f"read by {name} for its lens") | dict.fromkeys(cameras, read))
+        if total and without == total:
+            gathered.said.append(
+                f"{name}: none of {total} images or detection messages shows a tag of the survey: check ids and family there"
+            )
+        if shown["doubtful"] > _DOUBTFUL * shown["tags"]:  # else a limit does what it is there for
+            gathered.said.append(
+                f"{name}: {shown['doubtful']} of {shown['tags']} images with tags have a rejected detection, most often: "
+                f"{doubts.most_common(1)[0][0]}"
+            )
+        gathered.said += [f"{name}: {why} ({count} times)" for why, count in reasons.most_common(_REASONS)]
+        if len(reasons) > _REASONS:
+            gathered.said.append(f"{name}: {len(reasons) - _REASONS} more such reasons are in the ledger")
+    return replace(gathered.recording(), tag_views=tuple(views))
+
+
+def _take_sized(gathered: Gathering, name: str, sightings: Sequence[TagSighting], survey: Survey) -> None:
+    """Take the sightings but of frames whose tags have sizes that cannot be: a run that follows those is metres off."""
+    reasons = {}
+    for frame, factor in size_factors(sightings, survey).items():
+        off = 100.0 * abs(1.0 / factor - 1.0)
+        reasons[frame] = f"sizes in tags.yaml disagree with the spacing of the tags by {off:.0f} %"
+        gathered.said.append(
+            f"{name}: {reasons[frame]}: measure a tag (the black square without its white margin) and the spacing; in {frame} "
+            f"size_m times {factor:.2f} would agree. Until then no sighting of these tags is used"
+        )
+    for m in sightings:
+        if m.frame in reasons:
+            gathered.refuse(name, m.stamp_ns, reasons[m.frame])
+        else:
+            gathered.take(m)
