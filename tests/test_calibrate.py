@@ -24,7 +24,7 @@ from graphloc.measurements import GnssVelocity, ImuSeries
 from graphloc.offsets import Misfit, Offset, Offsets, joined
 from graphloc.solve import smooth
 from graphloc.solve._imu_noise import imu_misfit
-from graphloc.solve._linearised import Rows, normal_solver
+from graphloc.solve._linearised import normal_solver
 from tests.bagfactory import Messages
 from tests.slowly import simulate_slowly
 from tests.test_inspect import drive, look
@@ -240,11 +240,8 @@ def test_imu_noise_that_is_configured_too_large_is_seen(times: float, needed: fl
     e = rng.normal(size=9 * n)
     J = csr_array(np.vstack([np.eye(9 * n) / times, np.eye(9 * n) * 100.0]))
     b = np.concatenate([e / times, np.zeros(9 * n)])
-    rows = Rows(
-        J=J, b=b, states=n + 1, starts=np.arange(2), stamps_ns=np.zeros(len(b), dtype=np.int64), made={}, kernels=[]
-    )  # fmt: skip
     solve = normal_solver(J)
-    found = imu_misfit(rows, np.ones(len(b)), b, (J, b - J @ solve(J.T @ b), solve))
+    found = imu_misfit(J, np.ones(len(b)), b, (J, b - J @ solve(J.T @ b), solve), n)
     for misfit, share in zip(found, (3, 6), strict=True):
         assert misfit.freedom == pytest.approx(share * n, rel=0.01)
         assert misfit.needed == pytest.approx(needed, rel=0.2 if times > 1.0 else 1e-9)

@@ -110,10 +110,10 @@ def test_while_far_off_fixes_keep_their_weight_and_matches_weigh_as_they_scatter
     assert max(weights["matcher"]) < 1e-3
 
 
-def shaken(seed: int) -> SimulatedRun:
-    """Half a minute of BL's case 1 with good matches and a noisy IMU."""
+def shaken(seed: int, duration_s: float = 30.0) -> SimulatedRun:
+    """BL's case 1 with good matches and a noisy IMU."""
     scenario = replace(
-        bl_scenario(1, "drift", false_fraction=0.0), duration_s=30.0, pose_hz=4.0, pose_sigma_m=0.05,
+        bl_scenario(1, "drift", false_fraction=0.0), duration_s=duration_s, pose_hz=4.0, pose_sigma_m=0.05,
         accel_noise_ug_per_sqrt_hz=2000.0, gyro_noise_mdps_per_sqrt_hz=40.0,
     )  # fmt: skip
     return slowly(simulate(scenario, seed))
@@ -143,6 +143,25 @@ def test_an_imu_that_is_noisier_than_its_data_sheet_is_believed_less() -> None:
     assert 600.0 < float(taken[0]) < 2300.0
     assert 25.0 < float(taken[1]) < 46.0
     assert not [w for s in (as_told, right) for w in s.stats.warnings if "too small" in w]
+
+
+def test_online_an_imu_that_is_noisier_than_its_data_sheet_is_believed_less() -> None:
+    """Twenty seconds after the start: what the window holds is more probable with the noise that the samples have."""
+    run = shaken(1, 45.0)
+    solved = [replay(run.recording, by_data_sheet(run, adapt_noise=adapt)).solution for adapt in (False, True)]
+    late_ns = run.truth.stamps_ns[0] + 25 * SECOND
+    nees = []
+    for solution in solved:
+        track = solution.trajectory
+        k = np.flatnonzero(track.stamps_ns > late_ns)
+        assert track.cov is not None
+        off = (track.p_world_m[k] - run.truth.at(track.stamps_ns[k]).p_world_m)[:, :2]
+        nees.append(np.mean([e @ np.linalg.solve(P[:2, :2], e) for e, P in zip(off, track.cov[k], strict=True)]))
+    assert nees[0] > 10.0  # or there is nothing to mend
+    assert nees[1] < 5.0
+    told = [[line for line in s.stats.events if "its noise is configured too small" in line] for s in solved]
+    assert list(map(len, told)) == [0, 1]
+    assert float(re.findall(r"([0-9.e+]+) is taken", told[1][0])[-1]) == pytest.approx(40.0, rel=0.15)
 
 
 def test_vibration_that_does_not_go_on_into_the_motion_is_no_noise() -> None:

@@ -287,14 +287,18 @@ def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
 def with_imu_noise(problem: Problem, gyro: float, accel: float) -> Problem:
     """Return the problem with the configured noise densities of gyroscope and accelerometer so many times as large."""
     name = problem.imu.sensor
-    sensor = problem.config.sensors[name]
-    noisier = sensor.model_copy(
+    noisier = noisier_imu(problem.config.sensors[name], gyro, accel)
+    return _relinked(problem, problem.config.with_sensors({name: noisier}), problem.noise_scale)
+
+
+def noisier_imu(sensor: Any, gyro: float, accel: float) -> Any:
+    """Return the configuration of an IMU with noise densities so many times as large."""
+    return sensor.model_copy(
         update={
             "gyro_noise_mdps_per_sqrt_hz": sensor.gyro_noise_mdps_per_sqrt_hz * gyro,
             "accel_noise_ug_per_sqrt_hz": sensor.accel_noise_ug_per_sqrt_hz * accel,
         }
     )
-    return _relinked(problem, problem.config.with_sensors({name: noisier}), problem.noise_scale)
 
 
 def _relinked(problem: Problem, config: VesselConfig, noise_scale: float) -> Problem:

@@ -28,6 +28,7 @@ from graphloc.online._states import Newest, States
 from graphloc.online._unmodelled import UnmodelledError, estimated_beside
 from graphloc.online._window import Window
 from graphloc.position_jumps import why_in_doubt
+from graphloc.solve._imu_noise import log_likelihood
 from graphloc.solve._unmodelled import Unmodelled
 from graphloc.solve._warnings import noisier_warning
 
@@ -230,6 +231,12 @@ class Lag:
     def held(self) -> list[LedgerRow]:
         """Return ledger rows of the measurements in the window, as judged now."""
         return self._entries.held()
+
+    def likelihoods(self, times: Sequence[tuple[float, float]]) -> Array:
+        """Return the log-likelihoods of the window if the noise of gyroscope and accelerometer is so many times as large."""
+        links = self._states.links()
+        J, b = self._window.linear(links)
+        return np.array([log_likelihood(J, b, len(links), *each) for each in times])
 
     def misfit(self) -> float:
         """Return the cost of the window over its expectation (see `solve._passes.expected_cost`); 1 where the IMU agrees.

@@ -233,6 +233,7 @@ def live_problem(
     datum: Datum,
     imu: ImuSeries,
     start_ns: int,
+    imu_config: Any,
     noise_scale: float,
     motion_model: MotionModel,
     jump_detectors: MutableMapping[str, JumpDetector],
@@ -241,12 +242,11 @@ def live_problem(
     """Return a problem whose first state is at `start_ns`.
 
     Args:
-        imu: the samples known from there on. jump_detectors: by sensor; missing ones are added.
+        imu: the samples known from there on. imu_config: with the noise that they have, up to `noise_scale`. jump_detectors: by sensor; missing ones are added.
         slow_known: names of the sensors whose slow error is known at the start.
     """
     config, rows, mounts = setup.config, setup.rows, setup.mounts
-    sensor = config.sensors[imu.sensor]
-    t, R = mount_of(imu.sensor, sensor, mounts)
+    t, R = mount_of(imu.sensor, imu_config, mounts)
     by_kind = {row.kind: row for row in rows}
     asked = {n: s for n, s in config.sensors.items() if s.kind in by_kind and s.enabled}
     company = company_of(config, rows)
@@ -272,7 +272,7 @@ def live_problem(
         timeline=LiveTimeline(config.timeline, start_ns),
         t_body_imu_m=t,
         R_body_imu=R,
-        links=setup.inertial.link(imu, sensor, R, datum.gravity_mps2, noise_scale),
+        links=setup.inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale),
         streams=streams,
         motion_model=motion_model,
     )

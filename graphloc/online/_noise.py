@@ -1,39 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scale of the IMU noise: raised where the IMU contradicts the other sensors."""
+"""Noise of the IMU: raised where the IMU contradicts the other sensors, and where its samples scatter more and what is measured bears that out."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from graphloc.build import noisier_imu
+from graphloc.measurements import ImuSeries
 from graphloc.online._lag import Lag
 from graphloc.solve._batch import CONTRADICTION, LARGEST_NOISE_SCALE, noise_step
+from graphloc.solve._imu_noise import LEAST_TIMES, scattered, too_quiet
 
 _EVERY_S, _MISFITS = 5.0, 2  # how often the fit is checked, and how many checks in a row must fail
+_WINDOWS_S, _FEWEST = 10.0, 200  # how often a larger noise is tried; samples that show how they scatter
+_SURE = 10.0  # log-likelihood that it must gain
 
 
 class ImuNoise:
-    """Factor on the configured noise densities; it only grows.
+    """Factors on the configured noise densities; they only grow.
 
     Args:
-        adapt: whether it may grow (`adapt_noise`).
+        adapt: whether they may grow (`adapt_noise`).
 
     Attributes:
-        scale: at least 1.
+        scale: of both, at least 1. gyro, accel: beside it, of each.
     """
 
     def __init__(self, *, adapt: bool) -> None:
-        self.scale = 1.0
+        self.scale, self.gyro, self.accel = 1.0, 1.0, 1.0
         self._adapt = adapt
-        self._looked_ns, self._misfits = 0, 0
+        self._looked_ns, self._misfits, self._weighed_ns = 0, 0, 0
+        self._gained = np.zeros(3)  # log-likelihood by a larger noise of both, of the gyroscope, of the accelerometer
 
     def begin(self, at_ns: int) -> None:
         """A window has begun at a stamp: it is not checked until it has settled."""
-        self._looked_ns, self._misfits = at_ns, 0
+        self._looked_ns, self._misfits, self._weighed_ns = at_ns, 0, at_ns
 
-    def contradicted(self, lag: Lag) -> str:
-        """Raise the scale where the window contradicts the IMU repeatedly, as the batch solver does; return a line on that, or empty."""
-        at_ns = lag.newest.stamp_ns
-        if at_ns - self._looked_ns < _EVERY_S * 1e9 or not self._adapt:
+    def at_least(self, scale: float, gyro: float, accel: float) -> None:
+        """Raise the factors to those that are known from elsewhere."""
+        self.scale, self.gyro, self.accel = max(self.scale, scale), max(self.gyro, gyro), max(self.accel, accel)
+
+    def of(self, sensor: Any) -> Any:
+        """Return the configuration of the IMU with its noise raised but for the scale."""
+        return noisier_imu(sensor, self.gyro, self.accel)
+
+    def raised(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
+        """Raise the noise where that is needed; return a line on that, or empty.
+
+        Args:
+            samples: gives those of the window.
+        """
+        if (
+            not self._adapt or not lag.fresh
+        ):  # until relinearised, the cost of a step includes how far its states have moved since
             return ""
-        if not lag.fresh:  # until relinearised, the cost of a step includes how far its states have moved since
+        return self._contradicted(lag) or self._too_quiet(lag, samples)
+
+    def _contradicted(self, lag: Lag) -> str:
+        """Scale the noise up where the window contradicts the IMU repeatedly, as the batch solver does."""
+        at_ns = lag.newest.stamp_ns
+        if at_ns - self._looked_ns < _EVERY_S * 1e9:
             return ""
         self._looked_ns = at_ns
         misfit = lag.misfit()
@@ -43,3 +72,30 @@ class ImuNoise:
         self._misfits = 0
         self.scale = min(self.scale * noise_step(misfit), LARGEST_NOISE_SCALE)
         return f"the IMU contradicts the other sensors: its noise is scaled up to {self.scale:.1f} times"
+
+    def _too_quiet(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
+        """Raise the noise to what the samples scatter, where that makes what was measured more probable (see `solve._imu_noise`).
+
+        Not by the IMU's residuals alone, as offline: in a window of seconds, the prior of the data before it takes up most of a misfit.
+        """
+        at_ns = lag.newest.stamp_ns
+        if at_ns - self._weighed_ns < _WINDOWS_S * 1e9:
+            return ""
+        self._weighed_ns = at_ns
+        imu = samples()
+        if len(imu) < _FEWEST:
+            return ""
+        sensor = lag.problem.config.sensors[imu.sensor]
+        gyro, accel = np.maximum(scattered(imu, self.of(sensor), self.scale), 1.0).tolist()
+        if max(gyro, accel) < LEAST_TIMES:
+            return ""
+        times = ((1.0, 1.0), (gyro, accel), (gyro, 1.0), (1.0, accel))
+        likely = lag.likelihoods(times)
+        self._gained += likely[1:] - likely[0]
+        best = int(np.argmax(self._gained))
+        if self._gained[best] < _SURE:
+            return ""
+        self._gained = np.zeros(3)
+        gyro, accel = times[1 + best]
+        self.gyro, self.accel = self.gyro * gyro, self.accel * accel
+        return too_quiet(imu.sensor, sensor, self.of(sensor))

@@ -25,7 +25,7 @@ class PersistentState:
 
     Attributes:
         datum: origin of world; None before it is known.
-        noise: by how much the IMU noise is scaled up.
+        noise: by how much the IMU's noise is raised.
         heights_m: configured heights (m, up in world), by the name of the sensor that measures them.
         heading: where no sensor measures it, how far it may be off; None: one does, or the motion has confirmed it.
         agreed_ns: stamp at which each absolute sensor last agreed, as known when the last window ended.
@@ -53,9 +53,9 @@ class PersistentState:
         """Return what a snapshot holds.
 
         Args:
-            noise: its scale is set to the snapshot's. sensors: names of the enabled ones.
+            noise: raised as the snapshot's is. sensors: names of the enabled ones.
         """
-        noise.scale = found.noise_scale
+        noise.at_least(*found.noise)
         return cls(
             datum=found.datum,
             noise=noise,
@@ -80,7 +80,7 @@ class PersistentState:
             datum=self.datum,
             heights_m=self.heights_m,
             agreed_ns={**self.agreed_ns, **agreed_ns},
-            noise_scale=self.noise.scale,
+            noise=(self.noise.scale, self.noise.gyro, self.noise.accel),
             heading=self.heading,
             p_odom_m=self.odometry.p_m,
             R_odom_body=self.odometry.R,

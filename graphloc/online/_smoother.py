@@ -245,8 +245,8 @@ class OnlineSmoother:
             if jumped := tracking.lag.unmodelled_jumps:
                 self._rebuild(f"position jump of {', '.join(jumped)}")
                 return self._estimate()
-            if contradiction := self._persistent.noise.contradicted(tracking.lag):
-                self._rebuild(contradiction)
+            if noisier := self._persistent.noise.raised(tracking.lag, tracking.samples):
+                self._rebuild(noisier)
                 return self._estimate()
             return tracking.estimate()
         except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
@@ -324,7 +324,7 @@ class OnlineSmoother:
         self._setup = self._setup.without_start_heading()
         persistent.datum, persistent.heights_m = started.datum, started.heights_m
         persistent.heading = started.heading
-        persistent.noise.scale = max(persistent.noise.scale, started.noise_scale)
+        persistent.noise.at_least(started.noise_scale, started.gyro_noise, started.accel_noise)
         persistent.heading_check.begin()
         for sample in samples:
             self._ledger.used(sample)

@@ -28,7 +28,8 @@ class Snapshot:
     Attributes:
         vessel: its name. anchor: the newest state. imu: the sample at it or before.
         datum: origin of world. heights_m: configured heights (m, up in world), by sensor.
-        agreed_ns: stamp at which each absolute sensor last agreed. noise_scale: factor on the IMU noise.
+        agreed_ns: stamp at which each absolute sensor last agreed. noise: factors on the IMU noise, on that of the gyroscope,
+            and on that of the accelerometer.
         heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
         unmodelled: covariance of `UnmodelledError`; None where no slow error is left out.
@@ -40,7 +41,7 @@ class Snapshot:
     datum: Datum
     heights_m: Mapping[str, float]
     agreed_ns: Mapping[str, int]
-    noise_scale: float
+    noise: tuple[float, float, float]
     heading: UnmeasuredHeading | None
     p_odom_m: Array
     R_odom_body: Array
@@ -59,7 +60,7 @@ class Snapshot:
             "anchor": self.anchor.as_dict(),
             "imu": [self.imu.stamp_ns, *self.imu.accel_mps2.tolist(), *self.imu.gyro_radps.tolist()],
             "heights_m": dict(self.heights_m),
-            "noise_scale": self.noise_scale,
+            "noise": list(self.noise),
             "heading": None if self.heading is None else asdict(self.heading),
             "agreed_ns": dict(self.agreed_ns),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
@@ -84,7 +85,7 @@ class Snapshot:
         stamp, *six = raw["imu"]
         p, R = (np.array(raw["odom"][n], dtype=np.float64).reshape(shape) for n, shape in ((0, 3), (1, (3, 3))))
         heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
-        scale = float(raw["noise_scale"])
+        scale, gyro, accel = (float(times) for times in raw["noise"])
         datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
         unmodelled = None if raw["unmodelled"] is None else np.array(raw["unmodelled"], dtype=np.float64)
         heading = None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"])
@@ -94,7 +95,7 @@ class Snapshot:
                 R.ravel(),
                 datum.origin,
                 list(heights_m.values()),
-                [scale],
+                [scale, gyro, accel],
                 [] if unmodelled is None else unmodelled.ravel(),
             ]
         )
@@ -107,7 +108,7 @@ class Snapshot:
             datum=datum,
             heights_m=heights_m,
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
-            noise_scale=float(np.clip(scale, 1.0, LARGEST_NOISE_SCALE)),
+            noise=(float(np.clip(scale, 1.0, LARGEST_NOISE_SCALE)), max(gyro, 1.0), max(accel, 1.0)),
             heading=heading,
             p_odom_m=p,
             R_odom_body=R,

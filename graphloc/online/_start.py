@@ -53,7 +53,7 @@ class Started:
             (6,), accelerometer first.
         heights_m: configured heights (m, up in world), by sensor.
         heading: where no sensor measures it, how far it may be off; None: one does, or the motion told it.
-        noise_scale: factor on the IMU noise.
+        noise_scale: factor on the IMU noise. gyro_noise, accel_noise: beside it, on that of each.
         unmodelled: what slow errors that are left out did to that state; None: nothing that is known.
         notes: what the alignment was based on. rows: ledger rows of what was measured before the first state.
     """
@@ -66,6 +66,8 @@ class Started:
     heights_m: Mapping[str, float]
     heading: UnmeasuredHeading | None
     noise_scale: float
+    gyro_noise: float
+    accel_noise: float
     unmodelled: Unmodelled | None
     notes: tuple[str, ...]
     rows: tuple[LedgerRow, ...]
@@ -153,6 +155,7 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         if row.synthetic is not None
         for name, sensor in config.of_kind(row.kind).items()
     }
+    stated, taken = (c.sensors[problem.imu.sensor] for c in (config, result.problem.config))
     k, anchor = _anchor(result, setup.lag_s)
     before = [
         row_of(stream, m, stream.config.topic, result.verdicts[stream.number, i])
@@ -169,6 +172,8 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         heights_m=heights,
         heading=heading,
         noise_scale=result.noise_scale,
+        gyro_noise=taken.gyro_noise_radps / stated.gyro_noise_radps,
+        accel_noise=taken.accel_noise_mps2 / stated.accel_noise_mps2,
         unmodelled=_unmodelled(result, k),
         notes=result.notes,
         rows=tuple(before),

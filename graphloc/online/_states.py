@@ -278,6 +278,11 @@ class States:
                 J[rows, first[at.slow_key] : first[at.slow_key] + width] = residual.slow_jacobian()
         return np.asarray(J @ window.covariance([*poses, *slow]) @ J.T)
 
+    def links(self) -> list[Held]:
+        """Return the IMU factors, but for the oldest tenth: the solver cannot relinearise the poses there."""
+        held = [held for _, held in sorted(self._links.items()) if held.slots]
+        return held[len(held) // 10 + 1 :]
+
     def step_cost(self) -> float:
         """Return the median cost of the IMU factors; 0 where none is in the graph."""
         steps = self._window.errors_of(held for held in self._links.values() if held.slots)

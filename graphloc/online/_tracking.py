@@ -15,7 +15,7 @@ from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate, Event
 from graphloc.frames import Array
 from graphloc.ledger import Outcome
-from graphloc.measurements import ImuSample, Measurement
+from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._estimates import estimate_of
 from graphloc.online._intake import series_of
@@ -92,7 +92,7 @@ class Tracking:
         known = [m for m in samples if m.stamp_ns >= since_ns] or samples[-1:]
         assert persistent.datum is not None
         problem = live_problem(
-            setup, persistent.datum, series_of(known), anchor.stamp_ns, persistent.noise.scale, persistent.motion_model,
+            setup, persistent.datum, series_of(known), anchor.stamp_ns, persistent.noise.of(setup.imu), persistent.noise.scale, persistent.motion_model,
             persistent.jump_detectors, anchor.slow,
         )  # fmt: skip
         if before is not None:
@@ -259,6 +259,10 @@ class Tracking:
             guess=bool(guess),
             unmodelled=persistent.unmodelled,
         )
+
+    def samples(self) -> ImuSeries:
+        """Return the samples of the window."""
+        return series_of(self._recent.samples())
 
     def heading_measured(self) -> bool:
         """Return whether sensors have measured the heading in the window, for as long as a start takes."""

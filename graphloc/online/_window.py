@@ -22,6 +22,7 @@ import numpy as np
 from graphloc.errors import SolveError, not_solved
 from graphloc.frames import Array
 from graphloc.keys import is_leaf, is_pose
+from graphloc.solve._linearised import sparse_rows
 
 _RELINEARIZE = 0.02  # of any tangent: m, rad, m/s; the gap to the batch is millimetres
 _NEVER = 1_000_000_000  # updates
@@ -264,6 +265,17 @@ class Window:
         """Return the cost of committed factors, of each `Held` together."""
         factors = self._solver.getFactorsUnsafe()
         return [float(sum(factors.at(slot).error(self.values) for slot in held.slots)) for held in parts]
+
+    def linear(self, first: Iterable[Held]) -> tuple[Any, Array]:
+        """Return J (rows, columns) and b (rows,) of all factors in whitened rows, linearised at the estimate; those of `first` come first."""
+        factors = self._solver.getFactorsUnsafe()
+        begin = [slot for held in first for slot in held.slots]
+        rest = set(range(factors.size())).difference(begin)
+        graph = gtsam.NonlinearFactorGraph()
+        for slot in (*begin, *sorted(rest)):
+            if (factor := factors.at(slot)) is not None:
+                graph.add(factor)
+        return sparse_rows(graph, self.values)
 
     def is_committed(self, key: int) -> bool:
         return key in self._alive

@@ -7,7 +7,7 @@ whole run hardly shows it, as most of it is of the other sensors.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import gtsam
@@ -19,9 +19,10 @@ from scipy.stats import chi2
 from graphloc.build import Problem, StartPrior, with_imu_noise
 from graphloc.frames import Array
 from graphloc.imu_scatter import FEWEST, noise_density
+from graphloc.measurements import ImuSeries
 from graphloc.offsets import Misfit
 from graphloc.solve._decide import Verdicts
-from graphloc.solve._linearised import Rows, linearised, normal_solver, root_weights
+from graphloc.solve._linearised import linearised, normal_solver, normal_solver_and_log_det, root_weights
 
 Solved = tuple[Any, Array, Callable[[Array], Array]]
 """J, weighted; residuals (rows,); and the solution of J'J x = y."""
@@ -29,7 +30,9 @@ Solved = tuple[Any, Array, Callable[[Array], Array]]
 _DRAWS = 16  # random vectors for the estimate of a trace
 _NOISE_ROUNDS, _LEAST_FREEDOM, _UNLIKELY = 5, 3.0, 1e-4
 _UNLIKELY_IF_SCATTERED = 1e-2  # where the samples themselves say that the noise is larger
-_LEAST_TIMES, _MOST_STEP = 1.5, 3.0  # noise that is this much larger is taken; most that a round changes it by
+_MOST_STEP = 3.0  # that a round changes the noise by
+LEAST_TIMES = 1.5
+"""The noise must be so many times as large to be taken."""
 
 
 class ImuMisfit(NamedTuple):
@@ -39,18 +42,21 @@ class ImuMisfit(NamedTuple):
     accelerometer: Misfit
 
 
-def imu_misfit(rows: Rows, root: Array, b: Array, solved: Solved, most: tuple[float, float] = (1.0, 1.0)) -> ImuMisfit:
+def imu_misfit(
+    unweighted: Any, root: Array, b: Array, solved: Solved, links: int, most: Sequence[float] = (1.0, 1.0)
+) -> ImuMisfit:
     """Return the misfit of gyroscope and accelerometer, and by what factor other noise would explain it.
 
-    The IMU factors come first, nine rows each: attitude (gyroscope), position, velocity. With other noise the share of the other
-    sensors changes, so the factor is found in some rounds (variance components, Helmert).
+    With other noise the share of the other sensors changes, so the factor is found in some rounds (variance components, Helmert).
 
     Args:
-        root: (rows,) of the weights. b: (rows,) of `rows`, the offsets taken out. solved: the run with these.
+        unweighted, b: J (rows, columns) and right side (rows,) before weighting. root: (rows,) of the weights.
+        solved: the run with these. links: the number of IMU factors, which come first, nine rows each: attitude (gyroscope), position,
+            velocity.
         most: largest factors that are looked for; 1: only whether the noise is smaller.
     """
-    links = np.arange(9 * (rows.states - 1)).reshape(-1, 9)
-    own, needed = (links[:, :3].ravel(), links[:, 3:].ravel()), np.ones(2)
+    rows = np.arange(9 * links).reshape(-1, 9)
+    own, needed = (rows[:, :3].ravel(), rows[:, 3:].ravel()), np.ones(2)
     squares, freedom = first = _squares_and_freedom(solved, own)
     low = np.array([f > _LEAST_FREEDOM and chi2.cdf(s, f) < _UNLIKELY for s, f in zip(squares, freedom, strict=True)])
     high = np.array([chi2.sf(s, max(f, 0.1)) < _UNLIKELY_IF_SCATTERED for s, f in zip(squares, freedom, strict=True)])
@@ -64,7 +70,7 @@ def imu_misfit(rows: Rows, root: Array, b: Array, solved: Solved, most: tuple[fl
         scaled = root.copy()
         for part, times in zip(own, needed, strict=True):
             scaled[part] /= times
-        J = diags_array(scaled) @ rows.J
+        J = diags_array(scaled) @ unweighted
         solve = normal_solver(J)
         squares, freedom = _squares_and_freedom((J, scaled * b - J @ solve(J.T @ (scaled * b)), solve), own)
     sigma = needed / np.sqrt(2.0 * np.maximum(freedom, 1.0))
@@ -88,6 +94,26 @@ def _squares_and_freedom(solved: Solved, parts: tuple[NDArray[np.intp], ...]) ->
     return squares, np.maximum(np.array([len(part) for part in parts]) - explained, 0.0)
 
 
+def log_likelihood(J: Any, b: Array, links: int, gyro: float, accel: float) -> float:
+    """Return the restricted log-likelihood, but for a constant, of a linear system if the noise of its IMU factors is so many times as large.
+
+    Args:
+        J, b: (rows, columns), (rows,), whitened with the noise as it is. links: as for `imu_misfit`.
+    """
+    weight = np.ones(len(b))
+    weight[: 9 * links] = np.tile(np.repeat([1.0 / gyro, 1.0 / accel], [3, 6]), links)
+    scaled, right = diags_array(weight) @ J, weight * b
+    solve, log_det = normal_solver_and_log_det(scaled)
+    r = right - scaled @ solve(scaled.T @ right)
+    return float(-0.5 * (r @ r) - 0.5 * log_det + np.log(weight).sum())
+
+
+def scattered(imu: ImuSeries, config: Any, noise_scale: float) -> Array:
+    """Return how many times the configured noise the samples of gyroscope and accelerometer scatter (2,)."""
+    scatter = np.array([noise_density(imu.stamps_ns, columns)[0] for columns in (imu.gyro_radps, imu.accel_mps2)])
+    return scatter / (np.array([config.gyro_noise_radps, config.accel_noise_mps2]) * noise_scale)
+
+
 def with_needed_noise(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Problem | None:
     """Return the problem with as much IMU noise as its residuals need, where that is clearly more than it has; else None.
 
@@ -97,16 +123,30 @@ def with_needed_noise(problem: Problem, values: gtsam.Values, verdicts: Verdicts
     imu, config = problem.imu, problem.config.sensors[problem.imu.sensor]
     if len(imu) < FEWEST:
         return None
-    stated = np.array([config.gyro_noise_radps, config.accel_noise_mps2]) * problem.noise_scale
-    scatter = np.array([noise_density(imu.stamps_ns, columns)[0] for columns in (imu.gyro_radps, imu.accel_mps2)])
-    most = scatter / stated
-    if (most < _LEAST_TIMES).all():
+    most = scattered(imu, config, problem.noise_scale)
+    if (most < LEAST_TIMES).all():
         return None
     rows = linearised(problem, values, verdicts, prior)
     root = root_weights(rows, -rows.b)
     J = diags_array(root) @ rows.J
     solve = normal_solver(J)
     solved = J, root * rows.b - J @ solve(J.T @ (root * rows.b)), solve
-    found = imu_misfit(rows, root, rows.b, solved, (float(most[0]), float(most[1])))
+    found = imu_misfit(rows.J, root, rows.b, solved, rows.states - 1, most.tolist())
     gyro, accel = (max(misfit.needed, 1.0) for misfit in found)
-    return with_imu_noise(problem, gyro, accel) if max(gyro, accel) > _LEAST_TIMES else None
+    return with_imu_noise(problem, gyro, accel) if max(gyro, accel) > LEAST_TIMES else None
+
+
+def too_quiet(name: str, stated: Any, taken: Any) -> str:
+    """Return a line on an IMU whose noise is configured too small, and what is taken instead; empty where it is not.
+
+    Args:
+        stated, taken: its configuration, and that with the noise that is taken.
+    """
+    changed = [
+        f"{key} is {getattr(stated, key):.3g}, {getattr(taken, key):.3g} is taken"
+        for key in ("accel_noise_ug_per_sqrt_hz", "gyro_noise_mdps_per_sqrt_hz")
+        if getattr(taken, key) > getattr(stated, key)
+    ]
+    if not changed:
+        return ""
+    return f"{name}: its noise is configured too small for how its samples scatter: {'; '.join(changed)}"

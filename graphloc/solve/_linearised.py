@@ -95,16 +95,21 @@ def linearised(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior
     ]
     held = [graph.at(f).keys() for f in range(graph.size())]
     kernels += [(range(f, f + 1), JUMP) for f in _jumps(problem, held)]
-    row, column, entry = np.asarray(graph.linearize(guess).sparseJacobian_())
-    row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
     starts = np.concatenate([[0], np.cumsum([graph.at(f).dim() for f in range(graph.size())])])
-    width = int(column.max())  # the last column is b
-    right = column == width
-    b = np.zeros(int(starts[-1]))
-    b[row[right]] = entry[right]
-    J = csr_array((entry[~right], (row[~right], column[~right])), shape=(len(b), width))
+    J, b = sparse_rows(graph, guess)
     stamps = np.repeat(_stamps_ns(problem, held), np.diff(starts))
     return Rows(J=J, b=b, states=last + 1, starts=starts, stamps_ns=stamps, made=made, kernels=kernels)
+
+
+def sparse_rows(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[Any, Array]:
+    """Return J (rows, columns), sparse, and b (rows,) of a graph linearised at `values`, whitened, with its losses."""
+    row, column, entry = np.asarray(graph.linearize(values).sparseJacobian_())
+    row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
+    width = int(column.max())  # the last column is b
+    right = column == width
+    b = np.zeros(sum(graph.at(f).dim() for f in range(graph.size())))
+    b[row[right]] = entry[right]
+    return csr_array((entry[~right], (row[~right], column[~right])), shape=(len(b), width)), b
 
 
 def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: gtsam.Values) -> Attachment:
@@ -146,6 +151,11 @@ def root_weights(rows: Rows, misfit: Array) -> Array:
 
 def normal_solver(J: Any) -> Callable[[Array], Array]:
     """Return the solution of J'J x = y as a function of y."""
+    return normal_solver_and_log_det(J)[0]
+
+
+def normal_solver_and_log_det(J: Any) -> tuple[Callable[[Array], Array], float]:
+    """Return the solution of J'J x = y as a function of y, and the logarithm of the determinant of J'J."""
     N = (J.T @ J).tocsc()
     scale = 1.0 / np.sqrt(N.diagonal())
     scaled = (diags_array(scale) @ N @ diags_array(scale)).tocsc()
@@ -155,4 +165,4 @@ def normal_solver(J: Any) -> Callable[[Array], Array]:
         by = scale if y.ndim == 1 else scale[:, None]
         return np.asarray(by * factor.solve(np.asarray(by * y)))
 
-    return solve
+    return solve, float(np.log(np.abs(factor.U.diagonal())).sum() - 2.0 * np.log(scale).sum())

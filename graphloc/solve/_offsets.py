@@ -76,7 +76,7 @@ def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
         if moved < _SAME if n else np.abs(fresh**2 - root**2).max() < _SAME_WEIGHT:
             break
     gradient, curvature = _in_blocks(rows, left, r)
-    gyroscope, accelerometer = imu_misfit(rows, root, rows.b - B @ theta, (J, r_free, solve))
+    gyroscope, accelerometer = imu_misfit(rows.J, root, rows.b - B @ theta, (J, r_free, solve), rows.states - 1)
     return Offsets(
         names=tuple(names),
         block_s=BLOCK_S,

@@ -15,6 +15,7 @@ from graphloc.solution import SolveStats
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
 from graphloc.solve._decide import AGREES
 from graphloc.solve._health import CONTRADICTING_COST
+from graphloc.solve._imu_noise import too_quiet
 from graphloc.solve._passes import expected_cost
 from graphloc.time import utc_text
 
@@ -96,22 +97,6 @@ def _noisier(stream: Stream, result: BatchResult) -> float:
     return max((decision.weight**-0.5 for decision in found if decision is not None), default=1.0)
 
 
-def _too_quiet(problem: Problem, result: BatchResult) -> list[str]:
-    """Say that the IMU's noise is configured too small, and what was taken instead."""
-    name = problem.imu.sensor
-    stated, taken = problem.config.sensors[name], result.problem.config.sensors[name]
-    changed = [
-        f"{key} is {getattr(stated, key):.3g}, {getattr(taken, key):.3g} is taken"
-        for key in ("accel_noise_ug_per_sqrt_hz", "gyro_noise_mdps_per_sqrt_hz")
-        if getattr(taken, key) > getattr(stated, key)
-    ]
-    if not changed:
-        return []
-    return [
-        f"{name}: its noise is configured too small for how its samples scatter and for its residuals: {'; '.join(changed)}"
-    ]
-
-
 def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
     expected = expected_cost(problem, result.verdicts)
     warnings = [*problem.warnings, *_of_the_run(problem, result, expected)]
@@ -146,7 +131,9 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
             if any(not constant.corrects for stream in problem.streams for constant in stream.constants):
                 cure += ", or for tags on a floating dock that the survey has as fixed"
         warnings.append(f"{said}; {cure}")
-    warnings += _too_quiet(problem, result)
+    name = problem.imu.sensor
+    if said := too_quiet(name, problem.config.sensors[name], result.problem.config.sensors[name]):
+        warnings.append(said)
     if expected > 0 and result.cost > CONTRADICTING_COST * expected:
         warnings.append(
             f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
