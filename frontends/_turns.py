@@ -47,8 +47,10 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
     """
     together, power, apart, turns = 0.0, 0.0, [], []
     for _, turned, yaw, at_s in _blocks(imu, _said(headings)):
+        if len(at_s) < 20:
+            continue
         step = max(1, round(_STEP_S / max(float(np.median(np.diff(at_s))), 1e-3)))
-        if len(at_s) < 20 or step >= len(at_s):
+        if step >= len(at_s):
             continue
         by_gyro, by_compass = turned[step:] - turned[:-step], wrap_angle(yaw[step:] - yaw[:-step])
         together += float((by_gyro * by_compass).sum())

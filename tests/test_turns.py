@@ -51,6 +51,14 @@ def test_good_headings_are_left_alone(offset: float, axes: str, run: SimulatedRu
     assert turn_warnings(turned(imu, R.as_matrix()), "compass", headings, "enu") == []
 
 
+def test_a_single_heading_in_the_last_block_tells_nothing(run: SimulatedRun) -> None:
+    """Blocks are two minutes long: the last heading of a run of exactly two minutes is alone in the second."""
+    imu, headings = of(run)
+    end_ns = int(imu.stamps_ns[0]) + 120 * S
+    first = [m for m in headings if m.stamp_ns < end_ns]
+    assert turn_warnings(imu, "compass", [*first, replace(first[-1], stamp_ns=end_ns)], "enu") == []
+
+
 @pytest.mark.parametrize(("convention", "other"), [("enu", "ned"), ("ned", "enu")])
 def test_the_other_convention_is_named(convention: str, other: str, run: SimulatedRun) -> None:
     imu, headings = of(run)
