@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from graphloc.config import GnssConfig
 from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m
@@ -236,14 +237,18 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
     status, counts = np.unique(fixes.rows[:, 3].astype(int), return_counts=True)
     known = (rows[:, 4] > 0) & np.isfinite(rows[:, 5:8]).all(axis=1) & (rows[:, 5:8] > 0.0).all(axis=1)
     sigma = np.sqrt(np.median(rows[known, 5:8], axis=0)) if known.any() else None
-    worst_m = float(np.sqrt(np.percentile(rows[known, 5:7].max(axis=1), 95))) if known.any() else 0.0
+    sigmas = np.where(
+        known, np.sqrt(np.where(known, rows[:, 5:7].max(axis=1), 0.0)), GnssConfig().default_horizontal_sigma_m
+    )
+    worst_m = float(np.percentile(sigmas, 95)) if known.any() else 0.0
     bad = frozen_fixes(stamps, rows[:, :2], p[:, :2])
     own = p[~bad]
     scatter = white_noise_m(own) if len(own) > 10 else None
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
     precise = sigma is not None and float(sigma[:2].max()) < RTK_SIGMA_M and float(np.median(rows[:, 3])) >= 2.0
     if precise:
-        why = f"status gbas (RTK) and a reported sigma below {RTK_SIGMA_M:g} m"
+        told = "quality 4 (RTK, fixed)," if " " in fixes.topic else "status gbas (RTK) and a reported"
+        why = f"{told} sigma below {RTK_SIGMA_M:g} m"
     elif sigma is None:
         why = "no covariance is reported"
     else:

@@ -334,7 +334,7 @@ def _rtk_slow_error(gnss: GnssReport) -> str:
     floats_m = min(gnss.sigma_p95_m, SlowErrorConfig().horizontal_sigma_m)
     if floats_m < RTK_SIGMA_M:
         return f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {gnss.why}"
-    said = f"{gnss.why}, but 5 % claim {gnss.sigma_p95_m:.2g} m or worse (float?), and such an error is slow"
+    said = f"{gnss.why}, but 5 % are good to {gnss.sigma_p95_m:.2g} m or worse (float?), and such an error is slow"
     return (
         f"  slow_error: {{horizontal_sigma_m: {floats_m:.2g}, vertical_sigma_m: {2.0 * floats_m:.2g}}}  # guess: {said}"
     )
