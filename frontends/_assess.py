@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from graphloc.config import GnssConfig
 from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.frontends import _clock
-from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m
+from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m, stored, stored_warning
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec, two_antennas
 from graphloc.frontends._sanity import far_fixes_of
@@ -153,10 +153,23 @@ def on_one_clock(streams: Sequence[Stream]) -> list[Stream]:
 
 
 def track(fixes: Stream) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return stamps (N,), positions (N, 3) m about the first good fix, and the good fixes' rows.
+    """Return stamps (N,), positions (N, 3) m about the first good fix, and the good fixes' rows (not those of a stored position).
 
     Fixes without a height lie as high as most of the others, or at 0.
     """
+    keep, rows = _placed(fixes)
+    there = ~stored(fixes.stamps_ns[keep], rows[:, :3])
+    keep, rows = keep[there], rows[there]
+    near = ~far_fixes_of(rows[:, :3])
+    keep, rows = keep[near], rows[near]
+    if len(keep) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), rows
+    datum = Datum(Geodetic(*rows[0, :3]))
+    return fixes.stamps_ns[keep], datum.enu_from_geodetic(rows[:, 0], rows[:, 1], rows[:, 2]), rows
+
+
+def _placed(fixes: Stream) -> tuple[NDArray[np.intp], Array]:
+    """Return indices and rows of the fixes that state a place, each with a height."""
     keep = sane(fixes)
     rows = fixes.rows[keep] if len(keep) else np.zeros((0, 8))
     good = (
@@ -166,12 +179,7 @@ def track(fixes: Stream) -> tuple[NDArray[np.int64], Array, Array]:
     keep, rows = keep[good], rows[good]
     flat = np.isnan(rows[:, 2])
     rows[flat, 2] = 0.0 if flat.all() else np.median(rows[~flat, 2])
-    near = ~far_fixes_of(rows[:, :3])
-    keep, rows = keep[near], rows[near]
-    if len(keep) == 0:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), rows
-    datum = Datum(Geodetic(*rows[0, :3]))
-    return fixes.stamps_ns[keep], datum.enu_from_geodetic(rows[:, 0], rows[:, 1], rows[:, 2]), rows
+    return keep, rows
 
 
 def courses_of(stamps_ns: NDArray[np.int64], p_m: Array, noise_m: float) -> Courses:
@@ -241,6 +249,8 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         known, np.sqrt(np.where(known, rows[:, 5:7].max(axis=1), 0.0)), GnssConfig().default_horizontal_sigma_m
     )
     worst_m = float(np.percentile(sigmas, 95)) if known.any() else 0.0
+    every, places = _placed(fixes)
+    old = stored(fixes.stamps_ns[every], places[:, :3])
     bad = frozen_fixes(stamps, rows[:, :2], p[:, :2])
     own = p[~bad]
     scatter = white_noise_m(own) if len(own) > 10 else None
@@ -268,6 +278,7 @@ def gnss_report(fixes: Stream, tf_frame: str | None) -> GnssReport | None:
         white_m=scatter_m(stamps[~bad], own[:, :2]),
         spans_s=float(stamps[-1] - stamps[0]) / NS_PER_S,
         frozen="".join(frozen_fixes_warning(fixes.topic, stamps, bad)),
+        stored="".join(stored_warning(fixes.topic, places[:, :3], old)),
         slow_error=not precise,
         why=why,
         sigma_p95_m=worst_m,

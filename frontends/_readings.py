@@ -298,6 +298,18 @@ def _content(value: Decoded) -> object:
             return id(value)
 
 
+def reject_stored(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
+    """Drop the first fixes of a receiver that only says where it was last."""
+    fixes = [(i, v) for i, v in enumerate(readings.values) if isinstance(v, GnssPosition)]
+    fixes.sort(key=lambda pair: (pair[1].stamp_ns, pair[1].seq))
+    lla = np.array([v.position for _, v in fixes]).reshape(-1, 3)
+    found = _fixes.stored(np.array([v.stamp_ns for _, v in fixes], dtype=np.int64), lla)
+    warnings += _fixes.stored_warning(readings.sensor, lla, found)
+    bad = np.zeros(len(readings.values), dtype=bool)
+    bad[[i for (i, _), old in zip(fixes, found, strict=True) if old]] = True
+    return readings.drop(bad, rejected(_fixes.STORED))
+
+
 def reject_far(readings: Readings, config: VesselConfig, warnings: list[str]) -> list[LedgerRow]:
     """Drop fixes that are far from all others."""
     fixes = [v for v in readings.values if isinstance(v, GnssPosition)]

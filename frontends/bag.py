@@ -32,6 +32,7 @@ from graphloc.frontends._readings import (
     reject_repeats,
     reject_scattered,
     reject_set_back,
+    reject_stored,
     thin_headings,
 )
 from graphloc.frontends._references import Reference, check_speed, true_trajectory
@@ -137,7 +138,8 @@ def _usable(
             imu, more = imu_series(readings, warnings)
             rows += more
         else:
-            rows += reject_repeats(readings) + reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
+            rows += reject_repeats(readings) + reject_stored(readings, warnings)
+            rows += reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
             rows += thin_headings(readings) + reject_scattered(imu, readings, warnings)
             measurements += [v for v in readings.values if isinstance(v, Measurement)]
     return imu, measurements, rows

@@ -196,7 +196,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         body_frame=body,
         warnings=(
             *bag.warnings,
-            *(report.frozen for report in gnss if report.frozen),
+            *(said for report in gnss for said in (report.stored, report.frozen) if said),
             *unused_topics(list(bag.streams.values()), used),
             *_lacking(bag, imus, gnss, reports),
             *([] if any(c.usable for c in compasses) else unused_magnetometers(bag.topics.values())),
