@@ -39,7 +39,7 @@ from graphloc.frontends._references import Reference, check_speed, true_trajecto
 from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turns import Yaws, refuse_unit, turn_warnings, wander_warning
+from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, turn_warnings, wander_warning
 from graphloc.frontends.decode import (
     NO_STAMP,
     ODOMETRY,
@@ -336,14 +336,20 @@ def _refuse_unit(imu: ImuSeries, sensors: Sequence[Readings]) -> None:
     (config,) = (r.config for r in sensors if r.sensor == imu.sensor and isinstance(r.config, ImuConfig))
     yaws: dict[str, Yaws] = {}
     for readings in sensors:
-        yaw = np.array([_yaw_of(v) for v in readings.values])
         fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
-        if np.isfinite(yaw).any():
-            yaws[f"the headings of {readings.sensor}"] = readings.stamps()[np.isfinite(yaw)], yaw[np.isfinite(yaw)]
+        if own := _yaws_of(readings):
+            yaws[f"the headings of {readings.sensor}"] = own
         elif fixes:
             courses = courses_of_fixes(fixes)
             yaws[f"the courses of {readings.sensor}"] = courses.stamps_ns, courses.course_rad
     refuse_unit(imu, config, yaws)
+
+
+def _yaws_of(readings: Readings) -> Yaws | None:
+    """Return the stamps and yaws of headings or poses; None of a sensor that tells none."""
+    yaw = np.array([_yaw_of(v) for v in readings.values])
+    known = np.isfinite(yaw)
+    return (readings.stamps()[known], yaw[known]) if known.any() else None
 
 
 def _yaw_of(value: Decoded) -> float:
@@ -360,6 +366,8 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
             headings = [v for v in readings.values if isinstance(v, CompassHeading)]
             lines += turn_warnings(imu, readings.sensor, headings, readings.config.convention)
             lines += wander_warning(imu, readings.sensor, headings, readings.config)
+        elif yaws := _yaws_of(readings):
+            lines += pose_turn_warning(imu, readings.sensor, yaws)
     return lines
 
 
