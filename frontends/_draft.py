@@ -99,8 +99,10 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         yield [*_aerial_block(inspection.lidars), *_recorded_lines(inspection, inspection.lidars)]
     if inspection.cameras:
         yield [*_tags_block(inspection.cameras), *_recorded_lines(inspection, inspection.cameras)]
-    if inspection.gnss:
-        yield ["height:", "  enabled: false  # guess: true for a vessel that floats"]
+    fixes, poses = inspection.gnss or in_a_grid, any(item.role == "pose" for item in inspection.odometry)
+    if fixes or poses or inspection.lidars:
+        alone = "" if fixes else "; nothing else tells the height, unless z of a pose is used (axes)"
+        yield ["height:", f"  enabled: false  # guess: true for a vessel that floats{alone}"]
 
 
 def _in_a_grid(inspection: Inspection) -> list[OdometryReport]:

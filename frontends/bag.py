@@ -105,7 +105,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
     if imu is not None:
         _refuse_unit(imu, sensors)
         warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, sensors, mounts, config)
-    warnings += _silent(sensors, rows, topics) + _unstamped(sensors, topics)
+    warnings += _silent(sensors, rows, topics) + _unstamped(sensors, topics) + _heightless(sensors, config)
     warnings += [
         f"{b.topic}: {b.unstamped} of its headers hold no stamp: recording times are used"
         for b in (truth, check)
@@ -405,6 +405,23 @@ def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) 
                 + (", or stamp_sigma_s" if r.config.kind == "gnss" else "")
             )
     return lines
+
+
+def _heightless(sensors: Sequence[Readings], config: VesselConfig) -> list[str]:
+    """Say that poses without z alone leave the height to the accelerometer; of fixes, `_fixes.height_warning` says it."""
+    poses = {**config.of_kind("pose"), **config.of_kind("aerial")}
+    kinds = {sensor.kind for sensor in config.sensors.values() if sensor.enabled}
+    telling = kinds - {"imu", "compass", "gnss", "gnss_velocity", "body_velocity", "pose", "aerial"}
+    fixes = any(isinstance(value, GnssPosition) for readings in sensors for value in readings.values)
+    if not poses or telling or fixes or any("z" in pose.axes for pose in poses.values()):
+        return []
+    axes = ", ".join(f"{name} ({', '.join(pose.axes)})" for name, pose in poses.items())
+    said = (
+        f"nothing tells the height: {axes}; the track's height is a guess that drifts away by tens of metres a minute"
+    )
+    return [
+        f"{said}: enable a sensor of kind height (a vessel that floats), or put z among the axes of poses whose height is right"
+    ]
 
 
 def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary]) -> list[str]:
