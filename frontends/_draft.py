@@ -382,7 +382,8 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
 
 
 def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
-    frame = f"tf_frame: {json.dumps(twist.tf_frame)}" if twist.tf_frame else "xyz_m: [0.0, 0.0, 0.0]"
+    turned = ", rpy_deg: [0.0, 0.0, 180.0]" if twist.reverse else ""
+    frame = f"tf_frame: {json.dumps(twist.tf_frame)}" if twist.tf_frame else f"xyz_m: [0.0, 0.0, 0.0]{turned}"
     known = "from /tf_static" if twist.tf_frame else "guess: where it sits is not in the bag; measure it"
     water = through_water(twist.topic)
     fuse = "true to fuse it" if water else "true to fuse it, through: water for a speed log"

@@ -170,7 +170,10 @@ class CompassReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityReport:
-    """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why; `late_s` as of a receiver."""
+    """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why; `late_s` as of a receiver.
+
+    `reverse`: it says astern throughout, which is taken for a wrong sign.
+    """
 
     topic: str
     msgtype: str
@@ -178,6 +181,7 @@ class VelocityReport:
     why: str
     tf_frame: str | None
     late_s: tuple[float, float] | None = None
+    reverse: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
