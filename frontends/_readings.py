@@ -164,10 +164,15 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
             )
     gains = {r.sensor: _clock.gain(r.stamps(), r.logs()) for r in sensors}
     usual = gains[reference]
+    steps = {r.sensor: _clock.step(r.stamps(), r.logs()) for r in sensors}
     for r in sensors:
         own = gains[r.sensor]
         gain_s, drift_ppm = own.gained_s - usual.gained_s, own.drift_ppm - usual.drift_ppm
         if abs(gain_s) <= _clock.GAIN_LIMIT_S:
+            continue
+        whose = r.sensor if steps[r.sensor] else reference
+        if (step := steps[whose]) is not None:
+            lines.append(f"{r.sensor}: {step.said(whose)}")
             continue
         cure = "synchronise the clocks, or smooth short parts (--start, --duration)"
         if own.even and usual.even and drift_ppm:
