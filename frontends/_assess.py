@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from graphloc.config import GnssConfig
 from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.frontends import _clock
-from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m
+from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m, stored, stored_warning
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec, two_antennas
 from graphloc.frontends._sanity import far_fixes_of
@@ -152,10 +153,23 @@ def on_one_clock(streams: Sequence[TopicData]) -> list[TopicData]:
 
 
 def track(fixes: TopicData) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return stamps (N,), positions (N, 3) m about the first good fix, and the good fixes' rows.
+    """Return stamps (N,), positions (N, 3) m about the first good fix, and the good fixes' rows (not those of a stored position).
 
     Fixes without a height lie as high as most of the others, or at 0.
     """
+    keep, rows = _placed(fixes)
+    there = ~stored(fixes.stamps_ns[keep], rows[:, :3])
+    keep, rows = keep[there], rows[there]
+    near = ~far_fixes_of(rows[:, :3])
+    keep, rows = keep[near], rows[near]
+    if len(keep) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), rows
+    datum = Datum(Geodetic(*rows[0, :3]))
+    return fixes.stamps_ns[keep], datum.enu_from_geodetic(rows[:, 0], rows[:, 1], rows[:, 2]), rows
+
+
+def _placed(fixes: TopicData) -> tuple[NDArray[np.intp], Array]:
+    """Return indices and rows of the fixes that state a place, each with a height."""
     keep = sane(fixes)
     rows = fixes.rows[keep] if len(keep) else np.zeros((0, 8))
     good = (
@@ -165,12 +179,7 @@ def track(fixes: TopicData) -> tuple[NDArray[np.int64], Array, Array]:
     keep, rows = keep[good], rows[good]
     flat = np.isnan(rows[:, 2])
     rows[flat, 2] = 0.0 if flat.all() else np.median(rows[~flat, 2])
-    near = ~far_fixes_of(rows[:, :3])
-    keep, rows = keep[near], rows[near]
-    if len(keep) == 0:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), rows
-    datum = Datum(Geodetic(*rows[0, :3]))
-    return fixes.stamps_ns[keep], datum.enu_from_geodetic(rows[:, 0], rows[:, 1], rows[:, 2]), rows
+    return keep, rows
 
 
 def courses_of(stamps_ns: NDArray[np.int64], p_m: Array, noise_m: float) -> Courses:
@@ -236,14 +245,20 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
     status, counts = np.unique(fixes.rows[:, 3].astype(int), return_counts=True)
     known = (rows[:, 4] > 0) & np.isfinite(rows[:, 5:8]).all(axis=1) & (rows[:, 5:8] > 0.0).all(axis=1)
     sigma = np.sqrt(np.median(rows[known, 5:8], axis=0)) if known.any() else None
-    worst_m = float(np.sqrt(np.percentile(rows[known, 5:7].max(axis=1), 95))) if known.any() else 0.0
+    sigmas = np.where(
+        known, np.sqrt(np.where(known, rows[:, 5:7].max(axis=1), 0.0)), GnssConfig().default_horizontal_sigma_m
+    )
+    worst_m = float(np.percentile(sigmas, 95)) if known.any() else 0.0
+    every, places = _placed(fixes)
+    old = stored(fixes.stamps_ns[every], places[:, :3])
     bad = frozen_fixes(stamps, rows[:, :2], p[:, :2])
     own = p[~bad]
     scatter = white_noise_m(own) if len(own) > 10 else None
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
     precise = sigma is not None and float(sigma[:2].max()) < RTK_SIGMA_M and float(np.median(rows[:, 3])) >= 2.0
     if precise:
-        why = f"status gbas (RTK) and a reported sigma below {RTK_SIGMA_M:g} m"
+        told = "quality 4 (RTK, fixed)," if " " in fixes.topic else "status gbas (RTK) and a reported"
+        why = f"{told} sigma below {RTK_SIGMA_M:g} m"
     elif sigma is None:
         why = "no covariance is reported"
     else:
@@ -263,6 +278,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         white_m=scatter_m(stamps[~bad], own[:, :2]),
         spans_s=float(stamps[-1] - stamps[0]) / NS_PER_S,
         frozen="".join(frozen_fixes_warning(fixes.topic, stamps, bad)),
+        stored="".join(stored_warning(fixes.topic, places[:, :3], old)),
         slow_error=not precise,
         why=why,
         sigma_p95_m=worst_m,

@@ -179,7 +179,7 @@ def _righted(
         mount = _turned(imu, accel, gyro, motions, np.diag([1.0, -1.0, -1.0]), why)
         return replace(report, mount=mount)
     if pose is None and sense < 0:
-        why = f"{against}: its accelerations look inverted, or its axes are left-handed; check the sensor"
+        why = f"{against}: its accelerations look inverted, or its axes are left-handed; or the fixes have latitude and longitude swapped"
         mount = mount_guess(imu, -accel, gyro, motions, tree, body)
         mount = replace(mount, evidence=f"with accelerations inverted, {mount.evidence}")
         return replace(report, gravity="inverted", mount=mount, why=(*report.why, why))

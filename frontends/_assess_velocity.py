@@ -20,6 +20,8 @@ _CHORD_S = 2.0
 _FITS = 0.4  # largest error of an axis convention that fits, as a share of the speed
 _AXES = (EAST_AXES, NORTH_AXES, BODY_AXES)
 _FEWEST = 20
+_ASTERN, _MOVES_MPS = 0.95, 0.3
+_REVERSED = "it goes astern nearly all the time: its sign looks wrong, and is taken for reversed"
 
 
 def axes_of(
@@ -68,7 +70,18 @@ def velocity_report(
     axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
     if through_water(stream.topic):
         axes, why = BODY_AXES, f"a speed through the water; {why}"
-    return VelocityReport(topic=stream.topic, msgtype=stream.msgtype, axes=axes, why=why, tf_frame=tf_frame)
+    rows = stream.rows[sane(stream)]
+    reverse = axes == BODY_AXES and tf_frame is None and len(rows) > 0 and _astern(rows[:, -3])
+    why = f"{why}; {_REVERSED}" if reverse else why
+    return VelocityReport(
+        topic=stream.topic, msgtype=stream.msgtype, axes=axes, why=why, tf_frame=tf_frame, reverse=reverse
+    )
+
+
+def _astern(forward_mps: Array) -> bool:
+    """Whether speeds (N,) along the vessel are negative nearly whenever it moves."""
+    moves = np.abs(forward_mps) > _MOVES_MPS
+    return bool(moves.sum() >= _FEWEST and (forward_mps[moves] < 0.0).mean() > _ASTERN)
 
 
 def odometry_report(
@@ -90,6 +103,7 @@ def odometry_report(
     else:
         axes, fit = axes_of(stream, stamps_ns, p_m, scatter_m)
         role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: looks like wheel odometry"
+        why = f"{why}; {_REVERSED}" if _astern(rows[:, 7]) else why
         if axes not in (None, BODY_AXES):
             role, why = "pose", f"its speeds are none along the craft: {fit}"
     if not world.pose and role != "check_speed":
@@ -141,7 +155,7 @@ def _told(stream: TopicData, axes: str) -> MeasuredMotion | None:
     origin = int(stream.stamps_ns[keep[0]])
     t = (stream.stamps_ns[keep] - origin) / NS_PER_S
     if axes == BODY_AXES:
-        return MeasuredMotion(stream.topic, origin, t, v[:, 0])
+        return MeasuredMotion(stream.topic, origin, t, -v[:, 0] if _astern(v[:, 0]) else v[:, 0])
     east, north = (v[:, 1], v[:, 0]) if axes == NORTH_AXES else (v[:, 0], v[:, 1])
     return MeasuredMotion(stream.topic, origin, t, np.hypot(east, north), summed(t, east + 1j * north))
 

@@ -88,7 +88,13 @@ def world_of(
     apart = float(np.median(np.hypot(*(p - q - offset)[:, :2].T)))
     # What the fixes' scatter, and an antenna whose place is not known, can turn a track of this extent by.
     tolerance = np.degrees((_SLACK_M if antenna_m is None else 1.0) / extent) + 0.2
-    if abs(turned) > tolerance or apart > max(_APART_M, _APART * extent):
+    largest = max(_APART_M, _APART * extent)
+    if abs(turned) > tolerance or apart > largest:
+        as_turned = float(np.median(np.abs(b - a * np.exp(1j * np.radians(turned)))))
+        as_ned = float(np.median(np.abs(b - 1j * a.conj())))  # east of it is its y
+        if as_ned < min(largest, 0.5 * as_turned):
+            why = f"its frame looks like north, east, down ({as_ned:.1f} m apart from the fixes): convert it to east, north, up"
+            return World(None, f"{why}; as it is it cannot be used")
         return World(
             None, f"its frame is not east-north-up: turned by {turned:+.1f} deg, {apart:.1f} m apart from the fixes"
         )

@@ -32,6 +32,7 @@ FEWEST_STAMPS = 100
 _TENTHS = 10  # of a run
 _EVEN = 0.15  # of the gain, that a clock may be off an even one
 _SET_BACK_S = 0.5
+_STEADY = 0.95  # share of messages that are near one of the two levels of a step
 _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
 _AT_ONCE, _AFTER_GAP = 0.1, 1.3  # usual steps: within a burst at most, at a gap at least
 _BURSTS = 0.3  # share of samples in bursts, from which they are laid out
@@ -81,6 +82,36 @@ def gain(stamps_ns: Stamps, logs_ns: Stamps) -> Gain:
     slope, at_start = np.polyfit(t_s, ahead_s, 1)
     uneven_s = float(np.abs(ahead_s - at_start - slope * t_s).max())
     return Gain(gained_s, 0.0 if uneven_s > _EVEN * abs(gained_s) else float(slope) * 1e6)
+
+
+class Step(NamedTuple):
+    """How a clock was set against the recording times: by how much, s, forward positive, and when, recording time, ns."""
+
+    by_s: float
+    at_ns: int
+
+    def said(self, whose: str) -> str:
+        """Return it in words, with what to do."""
+        way = "forward" if self.by_s > 0.0 else "back"
+        said = f"the clock of {whose} was set {way} by {abs(self.by_s):.2f} s at {utc_text(self.at_ns)}, recording time"
+        return f"{said}: no time_offset_s holds on both sides, and no bound includes it; take one side (--start, --duration)"
+
+
+def step(stamps_ns: Stamps, logs_ns: Stamps) -> Step | None:
+    """Return the one step in which a clock gains all that it gains on the recording times; None where it gains otherwise, or hardly."""
+    gained_s = gain(stamps_ns, logs_ns).gained_s
+    if abs(gained_s) < EPOCH_LIMIT_S:  # messages are delayed by less
+        return None
+    ahead_s = (stamps_ns - logs_ns) / NS_PER_S * np.sign(gained_s)
+    part = max(len(ahead_s) // _TENTHS, 1)
+    before_s, after_s = (float(np.median(ahead_s[own])) for own in (slice(part), slice(-part, None)))
+    later = ahead_s > 0.5 * (before_s + after_s)
+    first = int(np.argmax(np.cumsum(np.where(later, -1, 1)))) + 1
+    if not part <= first <= len(later) - part:
+        return None
+    off_s = np.abs(ahead_s - np.where(np.arange(len(later)) < first, before_s, after_s))
+    even = float(np.percentile(off_s, 100.0 * _STEADY)) < _EVEN * abs(gained_s)
+    return Step(gained_s, int(logs_ns[first])) if even else None
 
 
 def corrected_ns(stamp_ns: int, config: SensorConfig, elapsed_ns: int) -> int:

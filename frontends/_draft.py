@@ -99,8 +99,10 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         yield [*_aerial_block(inspection.lidars), *_recorded_lines(inspection, inspection.lidars)]
     if inspection.cameras:
         yield [*_tags_block(inspection.cameras), *_recorded_lines(inspection, inspection.cameras)]
-    if inspection.gnss:
-        yield ["height:", "  enabled: false  # guess: true for a vessel that floats"]
+    fixes, poses = inspection.gnss or in_a_grid, any(item.role == "pose" for item in inspection.odometry)
+    if fixes or poses or inspection.lidars:
+        alone = "" if fixes else "; nothing else tells the height, unless z of a pose is used (axes)"
+        yield ["height:", f"  enabled: false  # guess: true for a vessel that floats{alone}"]
 
 
 def _in_a_grid(inspection: Inspection) -> list[OdometryReport]:
@@ -334,7 +336,7 @@ def _rtk_slow_error(gnss: GnssReport) -> str:
     floats_m = min(gnss.sigma_p95_m, SlowErrorConfig().horizontal_sigma_m)
     if floats_m < RTK_SIGMA_M:
         return f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {gnss.why}"
-    said = f"{gnss.why}, but 5 % claim {gnss.sigma_p95_m:.2g} m or worse (float?), and such an error is slow"
+    said = f"{gnss.why}, but 5 % are good to {gnss.sigma_p95_m:.2g} m or worse (float?), and such an error is slow"
     return (
         f"  slow_error: {{horizontal_sigma_m: {floats_m:.2g}, vertical_sigma_m: {2.0 * floats_m:.2g}}}  # guess: {said}"
     )
@@ -380,7 +382,8 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
 
 
 def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
-    frame = f"tf_frame: {json.dumps(twist.tf_frame)}" if twist.tf_frame else "xyz_m: [0.0, 0.0, 0.0]"
+    turned = ", rpy_deg: [0.0, 0.0, 180.0]" if twist.reverse else ""
+    frame = f"tf_frame: {json.dumps(twist.tf_frame)}" if twist.tf_frame else f"xyz_m: [0.0, 0.0, 0.0]{turned}"
     known = "from /tf_static" if twist.tf_frame else "guess: where it sits is not in the bag; measure it"
     water = through_water(twist.topic)
     fuse = "true to fuse it" if water else "true to fuse it, through: water for a speed log"

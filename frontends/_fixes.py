@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.config import GnssConfig
-from graphloc.frames import Array, Datum
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition
 from graphloc.time import NS_PER_S
 
@@ -19,6 +19,8 @@ _OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp aga
 _AT_ONCE, _BURST_S = 0.1, 0.3  # of the mean step: within a burst; bursts that are closer than that are left alone
 _FAST_S, _SLOW_S, _EVEN, _FEWEST = 0.25, 1.5, 0.2, 100  # steps: motion hides in none, in few, how even, how many tell
 _UNSTEADY_MPS2 = 4.0  # of slow ones, twice what a craft's acceleration changes by from step to step, most of the time
+_STORED_M, _ANY_MPS = 100.0, 50.0  # how far the first fixes are off the rest, and what no craft's speed is
+STORED = "a position that the receiver had stored: it repeats it from the first fix on, and the next one is far off"
 NOTHING_M = 100.0
 """1 sigma from which a fix is none."""
 SCATTERS = 2.0
@@ -41,6 +43,35 @@ def held(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
                 bad[order[first + 1 : k]] = True
             first = k
     return bad if len(bad) and bad.mean() >= _OFTEN else np.zeros_like(bad)
+
+
+def stored(stamps_ns: NDArray[np.int64], lla: Array) -> NDArray[np.bool_]:
+    """Return (N,) which fixes of one receiver hold the place where it was when it was last switched off; drivers may say they are fixes.
+
+    One place is repeated from the first fix on, the next fix is farther than any craft goes meanwhile, and none comes back. At rest, a
+    receiver that holds its position, or has multipath, jumps by less.
+
+    Args:
+        stamps_ns: (N,), increasing. lla: (N, 3) deg, deg, m, as received.
+    """
+    bad = np.zeros(len(stamps_ns), dtype=bool)
+    changes = np.flatnonzero((lla[1:, :2] != lla[:-1, :2]).any(axis=1)) + 1
+    if len(changes) < 2 or changes[0] < 2:
+        return bad
+    after = int(changes[0])
+    places = Datum(Geodetic(*lla[0])).enu_from_geodetic(*lla[after:].T)
+    silent_s = float(stamps_ns[after] - stamps_ns[after - 1]) / NS_PER_S
+    bad[:after] = np.linalg.norm(places[:, :2], axis=1).min() > _STORED_M + _ANY_MPS * silent_s
+    return bad
+
+
+def stored_warning(sensor: str, lla: Array, bad: NDArray[np.bool_]) -> list[str]:
+    """Return a line on what `stored` found in fixes (N, 3) deg, deg, m."""
+    if not bad.any():
+        return []
+    (old, new), count = lla[[0, int(bad.sum())], :2], int(bad.sum())
+    said = f"{sensor}: its first {count} fixes repeat {old[0]:.5f}, {old[1]:.5f}, and the next is at {new[0]:.5f}, {new[1]:.5f}"
+    return [f"{said}: {STORED}; they are rejected"]
 
 
 def held_warning(sensor: str, bad: NDArray[np.bool_]) -> list[str]:

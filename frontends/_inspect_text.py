@@ -114,7 +114,8 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
     if gnss.without_height:
         lines.append(f"  {gnss.without_height} messages have no height (NaN) and are used as horizontal fixes")
     if gnss.reported_sigma_m is not None:
-        lines.append(f"  reported sigma east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
+        source = "sigma by quality" if " " in gnss.topic else "reported sigma"
+        lines.append(f"  {source} east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
     if gnss.tf_frame is None:
         lines.append(
             "  no /tf_static tells where its antenna sits: drafted at 0, 0, 0; measure it: the track is off by that distance, and no "

@@ -164,10 +164,15 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
             )
     gains = {r.sensor: _clock.gain(r.stamps(), r.logs()) for r in sensors}
     usual = gains[reference]
+    steps = {r.sensor: _clock.step(r.stamps(), r.logs()) for r in sensors}
     for r in sensors:
         own = gains[r.sensor]
         gain_s, drift_ppm = own.gained_s - usual.gained_s, own.drift_ppm - usual.drift_ppm
         if abs(gain_s) <= _clock.GAIN_LIMIT_S:
+            continue
+        whose = r.sensor if steps[r.sensor] else reference
+        if (step := steps[whose]) is not None:
+            lines.append(f"{r.sensor}: {step.said(whose)}")
             continue
         cure = "synchronise the clocks, or smooth short parts (--start, --duration)"
         if own.even and usual.even and drift_ppm:
@@ -296,6 +301,18 @@ def _content(value: Decoded) -> object:
             return tuple(value.modes[0].value)
         case _:
             return id(value)
+
+
+def reject_stored(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
+    """Drop the first fixes of a receiver that only says where it was last."""
+    fixes = [(i, v) for i, v in enumerate(readings.values) if isinstance(v, GnssPosition)]
+    fixes.sort(key=lambda pair: (pair[1].stamp_ns, pair[1].seq))
+    lla = np.array([v.position for _, v in fixes]).reshape(-1, 3)
+    found = _fixes.stored(np.array([v.stamp_ns for _, v in fixes], dtype=np.int64), lla)
+    warnings += _fixes.stored_warning(readings.sensor, lla, found)
+    bad = np.zeros(len(readings.values), dtype=bool)
+    bad[[i for (i, _), old in zip(fixes, found, strict=True) if old]] = True
+    return readings.drop(bad, rejected(_fixes.STORED))
 
 
 def reject_far(readings: Readings, config: VesselConfig, warnings: list[str]) -> list[LedgerRow]:

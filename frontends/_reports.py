@@ -112,7 +112,7 @@ class GnssReport:
         white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
         spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
             1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
-        frozen: warning where it repeats one position while the vessel moves; '' where it does not.
+        frozen, stored: warning where it repeats one position while the vessel moves, or one of before the run; '' where it does not.
         without_height: messages with a place and no height. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
 
@@ -132,6 +132,7 @@ class GnssReport:
     tf_frame: str | None = None
     white_m: float | None = None
     frozen: str = ""
+    stored: str = ""
     without_height: int = 0
     spans_s: float = 0.0
     late_s: tuple[float, float] | None = None
@@ -169,7 +170,10 @@ class CompassReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityReport:
-    """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why; `late_s` as of a receiver."""
+    """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why; `late_s` as of a receiver.
+
+    `reverse`: it says astern throughout, which is taken for a wrong sign.
+    """
 
     topic: str
     msgtype: str
@@ -177,6 +181,7 @@ class VelocityReport:
     why: str
     tf_frame: str | None
     late_s: tuple[float, float] | None = None
+    reverse: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -33,8 +33,10 @@ from graphloc.frontends.decode import (
     UNSTAMPED,
     VECTOR,
     nav_sat_status,
+    nmea_sigmas_m,
     stamp_ns_of,
 )
+from graphloc.ledger import Outcome
 from graphloc.time import NS_PER_S
 
 Row = tuple[float, ...]
@@ -84,31 +86,41 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
 _HEADING = re.compile(r"head|hdg|hdt|yaw|compass|azimuth", re.IGNORECASE)  # a topic of numbers that may be one
 
 
-def _nmea_fix(text: str, wanted: str) -> tuple[float, ...]:
+def _nmea_fix(text: str, wanted: str) -> Row | None:
     said = nmea.fix(text, [wanted])
     if isinstance(said, Rejection):
-        return (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)
-    return (said.latitude_deg, said.longitude_deg, said.height_m, NMEA_STATUS.get(said.quality, 0), 0.0, 0.0, 0.0, 0.0)
+        return None if said.outcome is Outcome.MALFORMED else (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)
+    # Of RTK the quality tells a sigma; else nothing does, as of a NavSatFix without a covariance (kind 0).
+    horizontal, vertical = nmea_sigmas_m(said, (0.0, 0.0))
+    status = NMEA_STATUS.get(said.quality, 0)
+    place = (said.latitude_deg, said.longitude_deg, said.height_m)
+    return (*place, status, float(horizontal > 0.0), horizontal**2, horizontal**2, vertical**2)
 
 
-def _nmea_heading(text: str, wanted: str) -> tuple[float, ...]:
+def _nmea_heading(text: str, wanted: str) -> Row | None:
     said = nmea.heading_deg(text, [wanted])
+    if isinstance(said, Rejection) and said.outcome is Outcome.MALFORMED:
+        return None
     half = np.nan if isinstance(said, Rejection) else np.radians(90.0 - said) / 2.0
     return (0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
 
 
-def _nmea_velocity(text: str, wanted: str) -> tuple[float, ...]:
+def _nmea_velocity(text: str, wanted: str) -> Row | None:
     said = nmea.velocity_mps(text, [wanted])
+    if isinstance(said, Rejection) and said.outcome is Outcome.MALFORMED:
+        return None
     return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (*said, 0.0)
 
 
-def _nmea_speed(text: str, wanted: str) -> tuple[float, ...]:
+def _nmea_speed(text: str, wanted: str) -> Row | None:
     said = nmea.water_speed_mps(text, [wanted])
+    if isinstance(said, Rejection) and said.outcome is Outcome.MALFORMED:
+        return None
     return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (said, 0.0, 0.0)
 
 
-# Of a sentence: the message type that says the same, and its row.
-SENTENCES: dict[str, tuple[str, Callable[[str, str], tuple[float, ...]]]] = {
+# Of a sentence: the message type that says the same, and its row; None of a damaged one.
+SENTENCES: dict[str, tuple[str, Callable[[str, str], Row | None]]] = {
     **dict.fromkeys(nmea.HEADINGS, (QUATERNION, _nmea_heading)),
     "VTG": (TWIST, _nmea_velocity),
     **dict.fromkeys(nmea.SPEEDS, (TWIST, _nmea_speed)),

@@ -19,6 +19,7 @@ _BLOCK_S = 120.0  # within it a gyro's bias and a compass's offset are steady
 _HOLE_S, _STEP_S = 0.5, 2.0
 _TURNS_DEG = 5.0  # RMS of the turns in 2 s, or all in all, from which they tell
 _CLEAR = 0.5  # correlation
+_LIKELY = 2.0  # of the fastest turn by the gyro
 _NEAR_S, _ASKED, _FEW, _LOST_DEG = 2.0, 20, 3, 30.0
 """Headings within `_NEAR_S`, the next `_ASKED` to either side at most and `_FEW` at least, are asked whether they agree: a
 bias of 3 deg/s is 6 deg by then, a craft in a sharp turn 30 deg off what it was."""
@@ -45,22 +46,13 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
     Args:
         headings: of one compass, converted as configured. convention: the configured one.
     """
-    together, power, apart, turns = 0.0, 0.0, [], []
-    for _, turned, yaw, at_s in _blocks(imu, _said(headings)):
-        step = max(1, round(_STEP_S / max(float(np.median(np.diff(at_s))), 1e-3)))
-        if len(at_s) < 20 or step >= len(at_s):
-            continue
-        by_gyro, by_compass = turned[step:] - turned[:-step], wrap_angle(yaw[step:] - yaw[:-step])
-        together += float((by_gyro * by_compass).sum())
-        power += float(np.sqrt((by_gyro**2).sum() * (by_compass**2).sum()))
-        apart.append(without_line(np.unwrap(yaw - turned), at_s))
-        turns.append(without_line(turned, at_s))
-    if not apart or np.degrees(_rms(turns)) < _TURNS_DEG:
-        return []
-    if together < -_CLEAR * power:
+    against, apart = _compared(imu, _said(headings))
+    if against:
         other = "enu" if convention == "ned" else "ned"
         said = f"{sensor}: its headings turn the other way than {imu.sensor}, levelled by its own gravity: set convention: "
         return [f"{said}{other}; or the signs of {imu.sensor} are wrong (gravity: inverted)"]
+    if not apart:
+        return []
     claimed, part = float(np.degrees(np.median([m.sigma_rad for m in headings]))), float(np.degrees(_rms(apart)))
     if part < max(_PART_DEG, _PART * claimed):
         return []
@@ -68,6 +60,37 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
     return [
         f"{said}magnetic deviation, frozen or late headings (enabled: false may be better); or the unit of {imu.sensor}'s rates"
     ]
+
+
+def pose_turn_warning(imu: ImuSeries, sensor: str, yaws: Yaws) -> list[str]:
+    """Return a line if the yaws of poses turn against the gyroscope, as those in north, east, down do."""
+    if not _compared(imu, yaws)[0]:
+        return []
+    said = f"{sensor}: its yaw turns the other way than {imu.sensor}, levelled by its own gravity: its frame is not east, north, up"
+    return [
+        f"{said} but looks like north, east, down: convert it; or the signs of {imu.sensor} are wrong (gravity: inverted)"
+    ]
+
+
+def _compared(imu: ImuSeries, yaws: Yaws) -> tuple[bool, list[Array]]:
+    """Return whether yaws turn against the gyroscope, and by block how far they are off its turn, rad; none if there is hardly a turn."""
+    together, power, apart, turns = 0.0, 0.0, [], []
+    for _, turned, yaw, at_s in _blocks(imu, yaws):
+        if len(at_s) < 20:
+            continue
+        step = max(1, round(_STEP_S / max(float(np.median(np.diff(at_s))), 1e-3)))
+        if step >= len(at_s):
+            continue
+        by_gyro, by_yaw = turned[step:] - turned[:-step], wrap_angle(yaw[step:] - yaw[:-step])
+        likely = np.abs(by_yaw) <= _LIKELY * np.abs(by_gyro).max()  # without most of false matches
+        by_gyro, by_yaw = by_gyro[likely], by_yaw[likely]
+        together += float((by_gyro * by_yaw).sum())
+        power += float(np.sqrt((by_gyro**2).sum() * (by_yaw**2).sum()))
+        apart.append(without_line(np.unwrap(yaw - turned), at_s))
+        turns.append(without_line(turned, at_s))
+    if not apart or np.degrees(_rms(turns)) < _TURNS_DEG:
+        return False, []
+    return together < -_CLEAR * power, apart
 
 
 def without_line(values: Array, at_s: Array, *columns: Array) -> Array:

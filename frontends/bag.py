@@ -32,13 +32,14 @@ from graphloc.frontends._readings import (
     reject_repeats,
     reject_scattered,
     reject_set_back,
+    reject_stored,
     thin_headings,
 )
 from graphloc.frontends._references import Reference, check_speed, true_trajectory
 from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turns import Yaws, refuse_unit, turn_warnings, wander_warning
+from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, turn_warnings, wander_warning
 from graphloc.frontends.decode import (
     NO_STAMP,
     ODOMETRY,
@@ -104,7 +105,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
     if imu is not None:
         _refuse_unit(imu, sensors)
         warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, sensors, mounts, config)
-    warnings += _silent(sensors, rows, topics) + _unstamped(sensors, topics)
+    warnings += _silent(sensors, rows, topics) + _unstamped(sensors, topics) + _heightless(sensors, config)
     warnings += [
         f"{b.topic}: {b.unstamped} of its headers hold no stamp: recording times are used"
         for b in (truth, check)
@@ -137,7 +138,8 @@ def _usable(
             imu, more = imu_series(readings, warnings)
             rows += more
         else:
-            rows += reject_repeats(readings) + reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
+            rows += reject_repeats(readings) + reject_stored(readings, warnings)
+            rows += reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
             rows += thin_headings(readings) + reject_scattered(imu, readings, warnings)
             measurements += [v for v in readings.values if isinstance(v, Measurement)]
     return imu, measurements, rows
@@ -336,14 +338,20 @@ def _refuse_unit(imu: ImuSeries, sensors: Sequence[Readings]) -> None:
     (config,) = (r.config for r in sensors if r.sensor == imu.sensor and isinstance(r.config, ImuConfig))
     yaws: dict[str, Yaws] = {}
     for readings in sensors:
-        yaw = np.array([_yaw_of(v) for v in readings.values])
         fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
-        if np.isfinite(yaw).any():
-            yaws[f"the headings of {readings.sensor}"] = readings.stamps()[np.isfinite(yaw)], yaw[np.isfinite(yaw)]
+        if own := _yaws_of(readings):
+            yaws[f"the headings of {readings.sensor}"] = own
         elif fixes:
             courses = courses_of_fixes(fixes)
             yaws[f"the courses of {readings.sensor}"] = courses.stamps_ns, courses.course_rad
     refuse_unit(imu, config, yaws)
+
+
+def _yaws_of(readings: Readings) -> Yaws | None:
+    """Return the stamps and yaws of headings or poses; None of a sensor that tells none."""
+    yaw = np.array([_yaw_of(v) for v in readings.values])
+    known = np.isfinite(yaw)
+    return (readings.stamps()[known], yaw[known]) if known.any() else None
 
 
 def _yaw_of(value: Decoded) -> float:
@@ -360,6 +368,8 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
             headings = [v for v in readings.values if isinstance(v, CompassHeading)]
             lines += turn_warnings(imu, readings.sensor, headings, readings.config.convention)
             lines += wander_warning(imu, readings.sensor, headings, readings.config)
+        elif yaws := _yaws_of(readings):
+            lines += pose_turn_warning(imu, readings.sensor, yaws)
     return lines
 
 
@@ -397,6 +407,23 @@ def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) 
                 + (", or stamp_sigma_s" if r.config.kind == "gnss" else "")
             )
     return lines
+
+
+def _heightless(sensors: Sequence[Readings], config: VesselConfig) -> list[str]:
+    """Say that poses without z alone leave the height to the accelerometer; of fixes, `_fixes.height_warning` says it."""
+    poses = {**config.of_kind("pose"), **config.of_kind("aerial")}
+    kinds = {sensor.kind for sensor in config.sensors.values() if sensor.enabled}
+    telling = kinds - {"imu", "compass", "gnss", "gnss_velocity", "body_velocity", "pose", "aerial"}
+    fixes = any(isinstance(value, GnssPosition) for readings in sensors for value in readings.values)
+    if not poses or telling or fixes or any("z" in pose.axes for pose in poses.values()):
+        return []
+    axes = ", ".join(f"{name} ({', '.join(pose.axes)})" for name, pose in poses.items())
+    said = (
+        f"nothing tells the height: {axes}; the track's height is a guess that drifts away by tens of metres a minute"
+    )
+    return [
+        f"{said}: enable a sensor of kind height (a vessel that floats), or put z among the axes of poses whose height is right"
+    ]
 
 
 def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary]) -> list[str]:

@@ -194,6 +194,13 @@ def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) ->
     return _placed(place, cov, stamp_ns, seq, sensor, config)
 
 
+def nmea_sigmas_m(fix: nmea.Fix, default_m: tuple[float, float]) -> tuple[float, float]:
+    """Return sigmas, horizontal and vertical, m, by quality (RTK; of others the default at a dilution of 1) and dilution."""
+    horizontal, vertical = _RTK_SIGMAS_M.get(fix.quality, default_m)
+    dilution = min(max(fix.hdop, 1.0), 100.0) if isfinite(fix.hdop) else 1.0
+    return dilution * horizontal, dilution * vertical
+
+
 def _gnss_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:
     fix = nmea.fix(nmea.text_of(msg), config.nmea)
     if isinstance(fix, Rejection):
@@ -201,11 +208,8 @@ def _gnss_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfi
     status = NMEA_STATUS.get(fix.quality, 0)
     if status < _MIN_STATUS[config.min_status]:
         return rejected(f"quality {fix.quality} is below min_status '{config.min_status}'")
-    horizontal, vertical = _RTK_SIGMAS_M.get(
-        fix.quality, (config.default_horizontal_sigma_m, config.default_vertical_sigma_m)
-    )
-    dilution = max(fix.hdop, 1.0) if isfinite(fix.hdop) else 1.0
-    cov = np.diag([horizontal, horizontal, vertical]) ** 2 * min(dilution, 100.0) ** 2
+    horizontal, vertical = nmea_sigmas_m(fix, (config.default_horizontal_sigma_m, config.default_vertical_sigma_m))
+    cov = np.diag([horizontal, horizontal, vertical]) ** 2
     return _placed((fix.latitude_deg, fix.longitude_deg, fix.height_m), cov, stamp_ns, seq, sensor, config)
 
 

@@ -37,7 +37,7 @@ from graphloc.frontends._assess import (
 from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
-from graphloc.frontends._clock import refuse_woven, usual_latency_s
+from graphloc.frontends._clock import FEWEST_STAMPS, GAIN_LIMIT_S, refuse_woven, step, usual_latency_s
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
 from graphloc.frontends._reports import (
@@ -73,6 +73,7 @@ from graphloc.frontends.decode import (
     POSE,
     QUATERNION,
     TWIST,
+    UNSTAMPED,
     VECTOR,
     header_stamp_ns,
 )
@@ -196,7 +197,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         body_frame=body,
         warnings=(
             *bag.warnings,
-            *(report.frozen for report in gnss if report.frozen),
+            *(said for report in gnss for said in (report.stored, report.frozen) if said),
+            *_steps(bag),
             *unused_topics(list(bag.streams.values()), used),
             *_lacking(bag, imus, gnss, reports),
             *([] if any(c.usable for c in compasses) else unused_magnetometers(bag.topics.values())),
@@ -285,6 +287,19 @@ def _compass_reports(bag: _Contents, imus: Sequence[ImuReport], courses: Courses
     found = _without_echoes([(r, s) for s in candidates if (r := compass_report(s, courses, turning))])
     best = (imus[0], bag.aligned[imus[0].topic]) if imus else None
     return tuple(_beside_gyro(_timed(r, s, bag.streams[s.topic], turning), s, best) for r, s in found)
+
+
+def _steps(bag: _Contents) -> list[str]:
+    """Say which clocks were set during the run, unless all were alike: then they are one clock, and what it leaves is a gap."""
+    stamped = [
+        s for s in bag.streams.values() if len(s) >= FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED
+    ]
+    steps = {s.topic.partition(" ")[0]: step(s.stamps_ns, s.logs_ns) for s in stamped}
+    found = {topic: at for topic, at in steps.items() if at is not None}
+    sizes = [at.by_s for at in found.values()]
+    if not found or (len(found) == len(steps) and max(sizes) - min(sizes) < GAIN_LIMIT_S):
+        return []
+    return [at.said(topic) for topic, at in found.items()]
 
 
 def _lacking(

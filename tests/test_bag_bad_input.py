@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer
 from graphloc.errors import InputError
 from graphloc.frontends._clock import longest_increasing
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.inspect import inspect_bag
+from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, PoseFix
 from graphloc.recording import Recording
@@ -559,3 +559,35 @@ def test_swapped_latitude_and_longitude(tmp_path: Path) -> None:
     datum = {"latitude_deg": 57.7, "longitude_deg": 11.9}
     warnings = read(other, items, imu=None, datum=datum).warnings
     assert any("latitude and longitude look swapped" in w for w in warnings)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "said"),
+    [
+        ({}, True),
+        ({"pose": {"topic": "/pose", "axes": ["x", "y", "z", "yaw"]}}, False),
+        ({"height": {"sigma_m": 0.3}}, False),
+        ({"gnss": {"topic": "/fix"}}, False),
+    ],
+    ids=["nothing", "poses with z", "height", "fixes"],
+)
+def test_a_height_that_nothing_tells_is_reported(sensors: dict[str, Any], said: bool, tmp_path: Path) -> None:
+    """Of poses x, y and yaw are used: a minute of such a run was 90 m high, with 'did not converge' for a reason."""
+    make = Messages(2)
+    items = still_run(make)
+    items += [("/pose", stamp, make.pose(stamp, (0.0, 0.0, 0.0))) for stamp in (START_NS + S, START_NS + 2 * S)]
+    bag = write_bag(tmp_path / "run", make, sorted(items, key=lambda item: item[1]))
+    config = vessel(**{"gnss": None, "pose": {"topic": "/pose"}, **sensors})
+    lines = [w for w in read_recording(bag, config).warnings if "nothing tells the height" in w]
+    assert len(lines) == said
+    assert all("pose (x, y, yaw)" in line and "kind height" in line for line in lines)
+
+
+def test_a_bag_of_poses_alone_is_drafted_with_a_height(tmp_path: Path) -> None:
+    make = Messages(2)
+    items = [item for item in still_run(make) if item[0] != "/fix"]
+    items += [
+        ("/pose", stamp, make.pose(stamp, (0.01 * k, 0.0, 0.0))) for k in range(30) if (stamp := START_NS + k * S // 10)
+    ]
+    bag = write_bag(tmp_path / "run", make, sorted(items, key=lambda item: item[1]))
+    assert "nothing else tells the height" in draft_config(inspect_bag(bag))

@@ -82,6 +82,49 @@ def test_fixes_that_move_or_stand_are_kept(every: int, tmp_path: Path) -> None:
     assert recording.warnings == ()
 
 
+def stored_first(
+    away_m: float, *, count: int = 100, silent_s: int = 0, noise_m: float = 0.0, back: bool = False
+) -> list[Item]:
+    """The first `count` fixes say another place; `back`: so do the last ones."""
+    items, rng = fixes(10), np.random.default_rng(9)
+    for k, (_, _, fix) in enumerate(items):
+        if k < count or (back and k > 350):
+            p = np.array([[0.6 * away_m, 0.8 * away_m, 0.0]]) + noise_m * rng.normal(size=3)
+            fix.latitude, fix.longitude, fix.altitude = DATUM.geodetic_from_enu(p)[0]
+    return items[:count] + items[count + 10 * silent_s :]
+
+
+@pytest.mark.parametrize("away_m", [150.0, 3e3, 80e3, 500e3])
+@pytest.mark.parametrize("count", [20, 250])
+def test_a_place_of_before_the_run_is_no_fix(away_m: float, count: int, tmp_path: Path) -> None:
+    """Receivers say where they were last until they have a fix, and some drivers call it one; even if that is most of the run."""
+    items = stored_first(away_m, count=count)
+    recording = read(tmp_path, items)
+    assert len(recording.measurements) == 400 - count
+    assert len([r for r in rows_of(recording, "gnss") if "had stored" in r.reason]) == count
+    (line,) = recording.warnings
+    assert f"gnss: its first {count} fixes repeat" in line
+    seen = inspect_bag(tmp_path / "run")
+    assert seen.gnss[0].fixes == 400 - count
+    assert max(seen.gnss[0].extent_m) < 20.0
+    assert [w.partition(":")[2] for w in seen.warnings if "had stored" in w] == [line.partition(":")[2]]
+
+
+@pytest.mark.parametrize(
+    "items",
+    [
+        stored_first(60.0),  # multipath jumps so far from a receiver that holds at rest
+        stored_first(300.0, back=True),
+        stored_first(300.0, noise_m=0.02),
+        stored_first(300.0, silent_s=5),  # it went there
+        stored_first(300.0, count=1),
+    ],
+    ids=["near", "comes back", "measured", "after a silence", "not repeated"],
+)
+def test_first_fixes_that_may_be_right_are_kept(items: list[Item], tmp_path: Path) -> None:
+    assert len(read(tmp_path, items).measurements) == len(items)
+
+
 def test_a_few_repeated_positions_are_no_pattern(tmp_path: Path) -> None:
     items = fixes(10)
     for k in range(20, 400, 40):

@@ -12,7 +12,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from graphloc.config import CompassConfig, ImuConfig, VesselConfig, load_config
-from graphloc.frames import Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._assess_velocity import axes_of
 from graphloc.frontends._source import Bag, RawMessage
 from graphloc.frontends._streams import TopicData
@@ -25,6 +25,7 @@ from tests.commands import called
 from tests.test_bag import HUSKY, KINDS
 
 DATUM = Datum(Geodetic(57.7, 11.9, 40.0))
+NORTH_EAST_DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 G = 9.81
 
 
@@ -341,17 +342,24 @@ def test_body_frame_by_its_name_or_as_the_root(body: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("turned_deg", "moved_m", "found"), [(0.0, (700.0, -300.0, -20.0), True), (90.0, (0.0, 0.0, 0.0), False)]
+    ("axes", "moved_m", "said"),
+    [
+        (np.eye(3), (700.0, -300.0, -20.0), ""),
+        (rotation_z(90.0), (0.0, 0.0, 0.0), "not east-north-up"),
+        (NORTH_EAST_DOWN, (0.0, 0.0, 0.0), "looks like north, east, down"),
+    ],
+    ids=["east, north, up", "turned", "north, east, down"],
 )
 def test_where_the_frame_of_the_truth_lies(
-    turned_deg: float, moved_m: tuple[float, float, float], found: bool, tmp_path: Path
+    axes: Array, moved_m: tuple[float, float, float], said: str, tmp_path: Path
 ) -> None:
     """Truth in a frame whose origin is not the first fix: the draft's datum is that origin, by geodesy done here."""
+    found = not said
     make, items = Messages(2), drive(Messages(2))
     for _, log_ns, fix in [item for item in items if item[0] == "/fix"]:
         enu = DATUM.enu_from_geodetic(*np.array([[fix.latitude], [fix.longitude], [fix.altitude]]))[0]
         stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
-        items.append(("/truth", log_ns, make.odometry(stamp, rotation_z(turned_deg) @ (enu - moved_m))))
+        items.append(("/truth", log_ns, make.odometry(stamp, axes @ (enu - moved_m))))
     _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     assert (config.truth_topic == "/truth") is found
     assert (config.datum is not None) is found
@@ -363,7 +371,7 @@ def test_where_the_frame_of_the_truth_lies(
         assert east == pytest.approx(moved_m[0], rel=0.01)
         assert at.height_m == pytest.approx(20.0, abs=0.5)
     else:
-        assert "not east-north-up" in text
+        assert said in text
 
 
 @pytest.mark.parametrize("convention", ["enu", "ned"])

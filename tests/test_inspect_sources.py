@@ -149,6 +149,25 @@ def test_a_vector_that_is_no_velocity_is_neither_fused_nor_the_motion(tmp_path: 
     assert "# /imu/mag: left out" in text
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("topic", ["/wheel/odom", "/vehicle/twist"])
+def test_wheels_that_go_astern_throughout_do_not_turn_the_imu(topic: str, sign: float, tmp_path: Path) -> None:
+    """A wrong sign of the driver: by it the IMU was drafted backwards, and the heading was off by 180 deg."""
+    make, items = Messages(2), []
+    for name, at, m in drive(Messages(2), rotation_z(90.0)):
+        if name == "/wheel/odom":
+            m.twist.twist.linear.x *= sign
+        wheels = name == "/wheel/odom" and topic == "/vehicle/twist"
+        said = plain_twist(make, at, (m.twist.twist.linear.x, 0.0, 0.0)) if wheels else m
+        items.append((topic if wheels else name, at, said))
+    found, config, text = look(tmp_path, items, make)
+    assert f"yaw by the motion of {topic}" in found.imus[0].mount.evidence
+    assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
+    assert ("goes astern nearly all the time" in text) == (sign < 0.0)
+    if topic == "/vehicle/twist":
+        assert config.sensors["body_velocity"].mount.rpy_deg[2] == (0.0 if sign > 0.0 else 180.0)
+
+
 def test_a_vector_that_nothing_tells_to_be_a_velocity_is_not_fused(tmp_path: Path) -> None:
     make = Messages(2)
     items = [item for item in drive(make, seconds=9) if item[0] != "/wheel/odom"]  # at rest

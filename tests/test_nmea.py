@@ -2,6 +2,7 @@
 """Sentences of NMEA 0183 as a source of places, headings and velocities; messages of other packages that say the same."""
 
 import operator
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import reduce
 from math import isnan
@@ -24,7 +25,7 @@ from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import OTHER_TYPES
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import TWIST
-from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.frontends.inspect import draft_config, inspect_bag, render
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
 from tests.bagfactory import Item, Messages, S, write_bag
@@ -246,6 +247,37 @@ def test_lines_in_plain_strings_count_from_when_they_were_recorded(tmp_path: Pat
     headings = [m for m in recording.measurements if isinstance(m, CompassHeading)]
     assert [np.degrees(m.yaw_rad) for m in headings] == pytest.approx([80.0 - k for k in range(40)])
     assert sum("has no stamp" in w for w in recording.warnings) == 2
+
+
+def gga_bag(path: Path, quality: Callable[[int], int], damaged: int = 0) -> Path:
+    """200 fixes at 5 Hz on the way east; of the first `damaged` the checksum is wrong."""
+    make, items = Messages(2), []
+    for k in range(200):
+        place = f"{minutes(57.7, 'NS', 2)},{minutes(11.9 + 1e-6 * k, 'EW', 3)}"
+        line = sealed(f"GNGGA,120000.00,{place},{quality(k)},14,0.7,41.5,M,36.5,M,1.0,0001")
+        line = line[:-2] + f"{int(line[-2:], 16) ^ 1:02X}" if k < damaged else line
+        items.append(("/line", 1_700_000_000 * S + k * S // 5, make.text(line)))
+    return write_bag(path, make, items)
+
+
+@pytest.mark.parametrize(
+    ("quality", "slow_m"),
+    [(lambda _: 4, 0.03), (lambda k: 5 if k % 10 == 0 else 4, 0.3), (lambda k: 1 if k % 10 == 0 else 4, 1.5), (lambda _: 1, 2.0)],
+    ids=["fixed", "float at times", "no RTK at times", "no RTK"],
+)  # fmt: skip
+def test_the_slow_error_is_drafted_by_quality(quality: Callable[[int], int], slow_m: float, tmp_path: Path) -> None:
+    drafted = tmp_path / "vessel.yaml"
+    drafted.write_text(draft_config(inspect_bag(gga_bag(tmp_path / "run", quality))))
+    gnss = load_config(drafted, KINDS).sensors["gnss"]
+    assert isinstance(gnss, GnssConfig)
+    assert gnss.slow_error.horizontal_sigma_m == slow_m
+
+
+def test_a_damaged_sentence_is_not_one_without_a_fix(tmp_path: Path) -> None:
+    seen = inspect_bag(gga_bag(tmp_path / "run", lambda _: 4, damaged=7))
+    assert [g.statuses for g in seen.gnss] == [{"gbas": 193}]
+    assert [t.undecodable for t in seen.topics if t.topic == "/line GNGGA"] == [7]
+    assert "/line GNGGA: 7 messages cannot be decoded" in render(seen)
 
 
 def test_messages_of_other_packages_say_the_same(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
-from graphloc.time import duration_ns
+from graphloc.time import duration_ns, utc_text
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag_bad_input import accounted, vessel
 from tests.test_inspect import drive, look
@@ -173,6 +173,26 @@ def test_a_clock_that_is_set_during_the_run_does_not_drift(tmp_path: Path) -> No
     assert config.sensors["gnss"].clock_drift_ppm == 0.0
     (line,) = [w for w in read(tmp_path, config).warnings if "during the run, by the recording times" in w]
     assert "synchronise the clocks" in line
+
+
+@pytest.mark.parametrize(
+    ("topic", "by_s", "way"), [("/fix", 3, "forward"), ("/fix", -3, "back"), ("/imu", 3, "forward")]
+)
+def test_a_clock_that_was_set_is_named_with_the_time(topic: str, by_s: int, way: str, tmp_path: Path) -> None:
+    """By inspect, which drafted an offset as if it held throughout, and when the bag is read."""
+    change = {topic: lambda ns: ns + by_s * S * (ns > START_NS + 25 * S)}
+    seen, config, _ = look(tmp_path, restamped(change), MAKE)
+    (said,) = [w for w in seen.warnings if "was set" in w]
+    assert said.startswith(f"the clock of {topic} was set {way} by 3.0")
+    assert utc_text(START_NS + 25 * S)[:18] in said  # to the second
+    (line,) = [w for w in read(tmp_path, config).warnings if w.startswith("gnss: the clock of")]
+    assert f"the clock of {'gnss' if topic == '/fix' else 'imu'} was set {way} by 3.0" in line
+
+
+def test_clocks_that_are_set_together_are_one(tmp_path: Path) -> None:
+    ahead = lambda ns: ns + 3 * S * (ns > START_NS + 25 * S)
+    seen, config, _ = look(tmp_path, restamped(dict.fromkeys(WAY_NS, ahead)), MAKE)
+    assert not any("was set" in w for w in (*seen.warnings, *read(tmp_path, config).warnings))
 
 
 def test_a_clock_that_is_set_is_not_said_to_drift_because_that_of_the_imu_does(tmp_path: Path) -> None:

@@ -14,7 +14,15 @@ from graphloc.errors import InputError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array
 from graphloc.frontends._assess import courses_of_fixes
-from graphloc.frontends._turns import Yaws, refuse_unit, scattered, turn_warnings, wander_deg, wander_warning
+from graphloc.frontends._turns import (
+    Yaws,
+    pose_turn_warning,
+    refuse_unit,
+    scattered,
+    turn_warnings,
+    wander_deg,
+    wander_warning,
+)
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries
@@ -51,11 +59,31 @@ def test_good_headings_are_left_alone(offset: float, axes: str, run: SimulatedRu
     assert turn_warnings(turned(imu, R.as_matrix()), "compass", headings, "enu") == []
 
 
+def test_a_single_heading_in_the_last_block_tells_nothing(run: SimulatedRun) -> None:
+    """Blocks are two minutes long: the last heading of a run of exactly two minutes is alone in the second."""
+    imu, headings = of(run)
+    end_ns = int(imu.stamps_ns[0]) + 120 * S
+    first = [m for m in headings if m.stamp_ns < end_ns]
+    assert turn_warnings(imu, "compass", [*first, replace(first[-1], stamp_ns=end_ns)], "enu") == []
+
+
 @pytest.mark.parametrize(("convention", "other"), [("enu", "ned"), ("ned", "enu")])
 def test_the_other_convention_is_named(convention: str, other: str, run: SimulatedRun) -> None:
     imu, headings = of(run)
     (line,) = turn_warnings(imu, "compass", changed(headings, lambda yaw: np.pi / 2.0 - yaw), convention)
     assert f"convention: {other}" in line
+
+
+@pytest.mark.parametrize("against", [False, True])
+def test_poses_whose_yaw_turns_the_other_way_are_reported(against: bool, run: SimulatedRun) -> None:
+    """As those in north, east, down do; also if every fifth is a false match."""
+    imu, headings = of(run)
+    yaw = np.array([m.yaw_rad for m in headings])
+    yaw = np.pi / 2.0 - yaw if against else yaw
+    yaw[::5] = np.random.default_rng(3).uniform(-np.pi, np.pi, len(yaw[::5]))
+    lines = pose_turn_warning(imu, "slam", (np.array([m.stamp_ns for m in headings]), yaw))
+    assert len(lines) == against
+    assert all("slam: its yaw turns the other way than imu" in line and "north, east, down" in line for line in lines)
 
 
 def test_accelerations_of_the_wrong_sign_are_among_the_suspects(run: SimulatedRun) -> None:
@@ -213,11 +241,14 @@ def test_a_bag_is_looked_at(tmp_path: object) -> None:
         if k % 5 == 0:
             half = -0.5 * (1.0 - np.cos(0.2 * k / 50.0))
             items.append(("/compass", stamp, make.compass(stamp, (0, 0, np.sin(half), np.cos(half)))))
+            items.append(("/pose", stamp, make.pose(stamp, (0, 0, 0), (0, 0, np.sin(half), np.cos(half)))))
     path = write_bag(tmp_path / "run", make, items, "mcap")  # type: ignore[operator]
     for convention, said in (("enu", 1), ("ned", 0)):
         config = vessel(gnss=None, imu={"topic": "/imu"}, compass={"topic": "/compass", "convention": convention})
         found = [w for w in read_recording(path, config).warnings if "turn the other way" in w]
         assert len(found) == said
+    poses = vessel(gnss=None, imu={"topic": "/imu"}, pose={"topic": "/pose"})
+    assert sum("its yaw turns the other way" in w for w in read_recording(path, poses).warnings) == 1
 
 
 @pytest.mark.parametrize("hz", [1, 10])

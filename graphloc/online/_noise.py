@@ -16,7 +16,7 @@ from graphloc.solve._imu_noise import LEAST_TIMES, scattered, too_quiet
 
 _EVERY_S, _MISFITS = 5.0, 2  # how often the fit is checked, and how many checks in a row must fail
 _WINDOWS_S, _FEWEST = 10.0, 200  # how often a larger noise is tried; samples that show how they scatter
-_SURE = 10.0  # log-likelihood that it must gain
+_SURE = 8.0  # log-likelihood that it must gain
 
 
 class ImuNoise:
