@@ -6,6 +6,8 @@ import json
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +18,10 @@ from graphloc.cli import app as cli
 from graphloc.errors import SolveError
 from graphloc.estimate import Event
 from graphloc.eval.metrics import compare_to_truth
-from graphloc.eval.simulate import SimulatedRun, bl_scenario, find_scenario, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
-from graphloc.measurements import GnssPosition, ImuSample
+from graphloc.gather import Gathering, _live, with_busy_warning
+from graphloc.measurements import GnssPosition, ImuSample, PoseFix
 from graphloc.replay import Replayed, _timed, arrivals, replay
 from graphloc.solution import Cause, HealthReason
 
@@ -170,3 +173,16 @@ def test_the_start_is_told_but_no_warning(whole: Replayed) -> None:
     for routine in ("started at", "time per update"):
         assert any(routine in line for line in stats.events)
         assert not any(routine in line for line in stats.warnings)
+
+
+@pytest.mark.parametrize(("busy", "said"), [(2, False), (5, True)])
+def test_scans_that_were_never_tried_are_said_where_they_are_many(busy: int, said: bool) -> None:
+    """Of all scans, not of those that gave no match: ten of fifteen or twelve were matched."""
+    run = simulate(Scenario(duration_s=10.0, pose_hz=1.0), 0)
+    matched = [m for m in run.recording.measurements if isinstance(m, PoseFix)]
+    gathering = Gathering(replace(run.recording, measurements=tuple(matched[:10]), rows=()))
+    for k in range(busy):
+        gathering.refuse("matcher", run.recording.imu.stamps_ns[k], _live._BUSY)  # type: ignore[union-attr]  # noqa: SLF001
+    config: Any = SimpleNamespace(of_kind=lambda kind: {"matcher": None} if kind == "aerial" else {})
+    warned = with_busy_warning(gathering.recording(), config).warnings
+    assert any(f"{busy} scans were never tried" in line for line in warned) is said

@@ -36,6 +36,7 @@ class LiveMatching:
         self._matcher: LiveMatcher | None = None
         self._gathering = gathering
         self._next: Turn | None = next(self._turns, None)
+        self._offered_ns = 0  # stamp of the scan that is underway
         self._underway: Future[Matched | Literal["wait"] | None] | None = None
         gathering.sensor(
             name, dict.fromkeys((lidar.topic for lidar in self._sensor.lidars.values()), f"read by {name}")
@@ -46,7 +47,7 @@ class LiveMatching:
         if self._underway is not None and self._underway.done():
             found, self._underway = self._underway.result(), None
             if found == "wait":  # offered too early, and too late to be offered again
-                self._gathering.refuse(self._name, now_ns, "the scan ended after the newest pose")
+                self._gathering.refuse(self._name, self._offered_ns, "the scan ended after the newest pose")
             elif found is not None:
                 yield from self._taken(found)
         while self._next is not None and self._next.last_ns <= now_ns:
@@ -60,7 +61,7 @@ class LiveMatching:
             if self._matcher is None:
                 self._matcher = LiveMatcher(self._sensor, self._scans.folder, datum, self._feed.mounts)
             if self._pool is not None:
-                self._underway = self._pool.submit(self._matcher.offer, turn, window)
+                self._underway, self._offered_ns = self._pool.submit(self._matcher.offer, turn, window), turn.stamp_ns
                 self._next = next(self._turns, None)
                 return
             found = self._matcher.offer(turn, window)
@@ -92,9 +93,10 @@ class LiveMatching:
 
 def with_busy_warning(recording: Recording, config: VesselConfig) -> Recording:
     """Add a warning if many scans were skipped because the matcher was busy."""
-    refused = [row.reason for row in recording.rows if row.sensor in config.of_kind("aerial")]
-    busy = refused.count(_BUSY)
-    if busy <= 0.2 * len(refused):
+    matchers = config.of_kind("aerial")
+    refused = [row.reason for row in recording.rows if row.sensor in matchers]
+    scans, busy = len(refused) + sum(m.sensor in matchers for m in recording.measurements), refused.count(_BUSY)
+    if busy <= 0.2 * scans:
         return recording
     warning = f"the matcher did not keep up: {busy} scans were never tried"
     return replace(recording, warnings=(*recording.warnings, warning))
