@@ -312,6 +312,17 @@ def test_an_unmeasured_heading_goes_off_by_the_gyroscope_until_the_motion_tells_
     assert told.narrowed(5 * 10**9, np.inf) is told.narrowed(5 * 10**9, 0.2) is told  # it was known better
 
 
+def test_a_noise_that_is_configured_too_small_excludes_no_headings() -> None:
+    """Found after the start, it is used from the start on: which headings the motion excludes was found with the smaller noise."""
+    recording, config, t, yaw = robot(0, 60.0)
+    quiet = {"accel_noise_ug_per_sqrt_hz": 200.0, "gyro_noise_mdps_per_sqrt_hz": 10.0}
+    imu = config.sensors["imu"].model_copy(update=quiet)
+    solved = app.smooth_recording(recording, config.with_sensors({"imu": imu})).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert any("its noise is configured too small" in line for line in solved.stats.warnings)
+    assert (np.abs(error) < 2.5 * sigma).all()
+
+
 def test_a_leg_takes_no_guess_as_known() -> None:
     """What the leg before could not tell is no heading to start the next one with."""
     recording, config, _, _ = robot(0, 130.0)

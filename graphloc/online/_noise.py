@@ -15,7 +15,7 @@ from graphloc.solve._batch import CONTRADICTION, LARGEST_NOISE_SCALE, noise_step
 from graphloc.solve._imu_noise import LEAST_TIMES, scattered, too_quiet
 
 _EVERY_S, _MISFITS = 5.0, 2  # how often the fit is checked, and how many checks in a row must fail
-_WINDOWS_S, _FEWEST = 10.0, 200  # how often a larger noise is tried; samples that show how they scatter
+_WINDOWS_S = 10.0  # how often a larger noise is tried
 _SURE = 8.0  # log-likelihood that it must gain
 
 
@@ -83,8 +83,6 @@ class ImuNoise:
             return ""
         self._weighed_ns = at_ns
         imu = samples()
-        if len(imu) < _FEWEST:
-            return ""
         sensor = lag.problem.config.sensors[imu.sensor]
         gyro, accel = np.maximum(scattered(imu, self.of(sensor), self.scale), 1.0).tolist()
         if max(gyro, accel) < LEAST_TIMES:

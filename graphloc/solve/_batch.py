@@ -106,6 +106,8 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
             noisier = with_noise_scale(problem, problem.noise_scale * noise_step(ratio))
         if noisier is None:
             break
+        if start.by_motion and ratio < CONTRADICTION:
+            return solve_batch(noisier, progress)  # which headings the motion excludes was found with the smaller noise
         problem = bridged(noisier, estimate)
         few = thinned(problem)
         if ratio >= CONTRADICTION:

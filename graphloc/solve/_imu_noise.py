@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from graphloc.build import Problem, StartPrior, with_imu_noise
 from graphloc.frames import Array
-from graphloc.imu_scatter import FEWEST, noise_density
+from graphloc.imu_scatter import noise_density
 from graphloc.measurements import ImuSeries
 from graphloc.offsets import Misfit
 from graphloc.solve._decide import Verdicts
@@ -30,6 +30,7 @@ Solved = tuple[Any, Array, Callable[[Array], Array]]
 _DRAWS = 16  # random vectors for the estimate of a trace
 _NOISE_ROUNDS, _LEAST_FREEDOM, _UNLIKELY = 5, 3.0, 1e-4
 _UNLIKELY_IF_SCATTERED = 1e-2  # where the samples themselves say that the noise is larger
+_FEWEST = 200  # samples that show how they scatter
 _MOST_STEP = 3.0  # that a round changes the noise by
 LEAST_TIMES = 1.5
 """The noise must be so many times as large to be taken."""
@@ -109,7 +110,9 @@ def log_likelihood(J: Any, b: Array, links: int, gyro: float, accel: float) -> f
 
 
 def scattered(imu: ImuSeries, config: Any, noise_scale: float) -> Array:
-    """Return how many times the configured noise the samples of gyroscope and accelerometer scatter (2,)."""
+    """Return how many times the configured noise the samples of gyroscope and accelerometer scatter (2,); 1 where they are too few."""
+    if len(imu) < _FEWEST:
+        return np.ones(2)
     scatter = np.array([noise_density(imu.stamps_ns, columns)[0] for columns in (imu.gyro_radps, imu.accel_mps2)])
     return scatter / (np.array([config.gyro_noise_radps, config.accel_noise_mps2]) * noise_scale)
 
@@ -121,8 +124,6 @@ def with_needed_noise(problem: Problem, values: gtsam.Values, verdicts: Verdicts
     scatter is not enough: vibration does not go on into the motion.
     """
     imu, config = problem.imu, problem.config.sensors[problem.imu.sensor]
-    if len(imu) < FEWEST:
-        return None
     most = scattered(imu, config, problem.noise_scale)
     if (most < LEAST_TIMES).all():
         return None
