@@ -12,6 +12,7 @@ import argparse
 import json
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory
 
 SEEDS = range(1000, 1080)  # none was looked at when a model or a number was chosen
+NOISE_SEEDS = range(1100, 1116)  # nor these
 Found = dict[str, Any]
 _TOO_SURE = 6.0  # horizontal NEES: 2 where the covariance is true
 
@@ -88,6 +90,55 @@ def figures(pool: ProcessPoolExecutor) -> list[Row]:
         both = [f for f in found if "rmse_m" in f[way] and "honest EKF" in f]
         better = sum(f[way]["rmse_m"] < f["honest EKF"]["rmse_m"] for f in both)
         rows.append(row("F.drawn", f"{label}: {way} better than the honest EKF, of {len(both)}", better, "runs"))
+    return rows
+
+
+def _by_data_sheet(run: DrawnRun, *, adapt: bool) -> DrawnRun:
+    """The vessel, whose IMU is configured by a data sheet: 50 ug and 2 mdeg/s per sqrt(Hz); drawn are 60 to 3000 ug and 3 to 60 mdeg/s."""
+    quiet = {"accel_noise_ug_per_sqrt_hz": 50.0, "gyro_noise_mdps_per_sqrt_hz": 2.0, "adapt_noise": adapt}
+    return replace(run, config=run.config.with_sensors({"imu": run.config.sensors["imu"].model_copy(update=quiet)}))
+
+
+def _vibrating(run: DrawnRun) -> DrawnRun:
+    """The vessel, whose IMU an engine shakes: 2 m/s^2 and 3 deg/s at some frequency."""
+    rng, imu = np.random.default_rng(run.drawn["seed"]), run.recording.imu
+    assert imu is not None
+    t_s = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    phase = 2.0 * np.pi * (rng.uniform(11.0, 37.0) * t_s[:, None, None] + rng.uniform(size=(2, 3)))
+    shake = np.sin(phase) * np.array([[2.0], [0.05]])
+    shaken = replace(imu, accel_mps2=imu.accel_mps2 + shake[:, 0], gyro_radps=imu.gyro_radps + shake[:, 1])
+    return replace(run, recording=replace(run.recording, imu=shaken))
+
+
+def _with_noise(seed: int) -> Found:
+    drawn = drawn_run(seed)
+    runs = {
+        "as it is": drawn,
+        "by data sheet, not adapted": _by_data_sheet(drawn, adapt=False),
+        "by data sheet": _by_data_sheet(drawn, adapt=True),
+        "vibrating": _vibrating(drawn),
+    }
+    found: Found = {}
+    for name, run in runs.items():
+        found[f"{name}, batch"] = _tried(lambda run=run: app.smooth_recording(run.recording, run.config).solution, run)
+        found[f"{name}, online"] = _tried(
+            lambda run=run: replay(run.recording, run.config, late_ns=run.late_ns).solution, run
+        )
+    return found
+
+
+def noise(pool: ProcessPoolExecutor) -> list[Row]:
+    """Figures of an IMU that is noisier than configured, and of one that vibrates."""
+    found = list(pool.map(_with_noise, NOISE_SEEDS))
+    label = f"{len(found)} drawn vessels, IMU noise"
+    rows = []
+    for way in found[0]:
+        nees = _column(found, way, "nees")
+        rows += [
+            row("F.noise", f"{label} {way}: position RMSE, mean", _column(found, way, "rmse_m").mean(), "m"),
+            row("F.noise", f"{label} {way}: NEES (2 when true), median", np.median(nees), ""),
+            row("F.noise", f"{label} {way}: NEES above {_TOO_SURE:g}", np.sum(nees > _TOO_SURE), "runs"),
+        ]
     return rows
 
 

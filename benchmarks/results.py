@@ -70,6 +70,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "F.6": sweep.workers,
     "F.cal": calibration.figures,
     "F.drawn": drawn.figures,
+    "F.noise": drawn.noise,
 }
 
 
