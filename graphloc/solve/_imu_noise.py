@@ -144,7 +144,7 @@ def too_quiet(name: str, stated: Any, taken: Any) -> str:
         stated, taken: its configuration, and that with the noise that is taken.
     """
     changed = [
-        f"{key} is {getattr(stated, key):.3g}, {getattr(taken, key):.3g} is taken"
+        f"{key} is {getattr(stated, key):.4g}, {getattr(taken, key):.4g} is taken"
         for key in ("accel_noise_ug_per_sqrt_hz", "gyro_noise_mdps_per_sqrt_hz")
         if getattr(taken, key) > getattr(stated, key)
     ]
