@@ -113,7 +113,8 @@ class HeadingCheck:
         """Integrate the IMU to the newest state and check the heading; return whether it is newly found to be wrong."""
         newest = lag.newest
         self._carry_on(lag, newest)
-        if not self._steps or newest.stamp_ns - self._looked_ns < _EVERY_S * 1e9:
+        since_ns = newest.stamp_ns - self._looked_ns
+        if not self._steps or 0 <= since_ns < _EVERY_S * 1e9:  # less than 0: the clock was set back
             return False
         self._looked_ns, self.within_rad = newest.stamp_ns, np.inf
         if self._sensor not in lag.problem.streams:
