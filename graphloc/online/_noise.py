@@ -15,7 +15,10 @@ from graphloc.solve._batch import CONTRADICTION, LARGEST_NOISE_SCALE, noise_step
 from graphloc.solve._imu_noise import LEAST_TIMES, scattered, too_quiet
 
 _EVERY_S, _MISFITS = 5.0, 2  # how often the fit is checked, and how many checks in a row must fail
-_WINDOWS_S, _FEWEST = 10.0, 200  # how often a larger noise is tried; samples that show how they scatter
+_WINDOWS_S, _FEWEST = (
+    10.0,
+    200,
+)  # how often a larger noise is tried, where the lag is no longer; samples that show how they scatter
 _SURE = 8.0  # log-likelihood that it must gain
 
 
@@ -79,7 +82,7 @@ class ImuNoise:
         Not by the IMU's residuals alone, as offline: in a window of seconds, the prior of the data before it takes up most of a misfit.
         """
         at_ns = lag.newest.stamp_ns
-        if at_ns - self._weighed_ns < _WINDOWS_S * 1e9:
+        if at_ns - self._weighed_ns < max(_WINDOWS_S, lag.lag_s) * 1e9:  # no data count twice
             return ""
         self._weighed_ns = at_ns
         imu = samples()
@@ -90,7 +93,12 @@ class ImuNoise:
         if max(gyro, accel) < LEAST_TIMES:
             return ""
         times = ((1.0, 1.0), (gyro, accel), (gyro, 1.0), (1.0, accel))
-        likely = lag.likelihoods(times)
+        try:
+            likely = lag.likelihoods(times)
+        except RuntimeError:  # not determined by normal equations; the window stands
+            return ""
+        if not np.isfinite(likely).all():
+            return ""
         self._gained += likely[1:] - likely[0]
         best = int(np.argmax(self._gained))
         if self._gained[best] < _SURE:
