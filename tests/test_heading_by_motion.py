@@ -280,6 +280,16 @@ def test_a_configured_heading_is_carried_by_a_gyroscope_of_unknown_bias(online: 
     assert np.abs(error[0]) < 2.5 * sigma[0] < 60.0
 
 
+def test_online_a_wheel_that_is_configured_and_silent_measures_no_heading() -> None:
+    recording, config, t, yaw = robot(3, 45.0)
+    wheel = BodyVelocityConfig.model_validate({"topic": "/wheel", "axes": ["x", "y"]})
+    config = config.model_copy(update={"sensors": {**config.sensors, "wheel": wheel}})
+    solved = app.replay_recording(recording, with_start_heading(config, yaw)).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert (np.abs(error) < 2.5 * sigma).all()
+    assert any("guess" in str(line) for line in solved.health_reason)
+
+
 def test_online_speed_along_the_body_measures_the_heading() -> None:
     """With positions: a car that drives straight on knows it, whatever its gyroscope does."""
     recording, config, t, yaw = robot(3, 60.0)

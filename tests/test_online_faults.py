@@ -519,6 +519,11 @@ def _nan(text: str) -> str:
     return json.dumps(raw)
 
 
+def _heading(text: str) -> str:
+    heading = {"why": "a guess", "since_ns": 0, "sigma_rad": float("nan"), "drift_radps": 0.01}
+    return json.dumps(json.loads(text) | {"heading": heading})
+
+
 def _other(text: str) -> str:
     return json.dumps(json.loads(text) | {"vessel": "another"})
 
@@ -546,7 +551,17 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.mark.parametrize(
     "damage",
-    [lambda _: "", lambda _: "[1, 2]", lambda _: "{}", _truncated, _nan, _other, _elsewhere, _slow_of_other_size],
+    [
+        lambda _: "",
+        lambda _: "[1, 2]",
+        lambda _: "{}",
+        _truncated,
+        _nan,
+        _heading,
+        _other,
+        _elsewhere,
+        _slow_of_other_size,
+    ],
 )
 def test_a_damaged_snapshot_is_reported_and_not_used(tmp_path: Path, saved: str, damage: Callable[[str], str]) -> None:
     path, base = tmp_path / "snapshot.json", arrivals_of(run_of())

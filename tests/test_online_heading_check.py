@@ -112,8 +112,11 @@ def at_two_hertz() -> SimulatedRun:
     return simulate(scenario, 4)
 
 
-def said_of(run: SimulatedRun, jump_s: tuple[float, float], turned_rad: float) -> list[str]:
-    """What is said of an estimate that is right but for its heading, where the fixes are 8 m further east for a while."""
+def said_of(run: SimulatedRun, jump_s: tuple[float, float], turned_rad: float, before_ns: int = 0) -> list[str]:
+    """What is said of an estimate that is right but for its heading, where the fixes are 8 m further east for a while.
+
+    `before_ns`: stamp of a state before, by a clock that was then set back.
+    """
     datum, of_imu = app.choose_datum(run.recording, run.config), run.config.sensors["imu"].mount
     assert run.recording.imu is not None
     links = imu.ROW.link(
@@ -130,6 +133,9 @@ def said_of(run: SimulatedRun, jump_s: tuple[float, float], turned_rad: float) -
     begin_ns = int(run.truth.stamps_ns[0])
     waiting = deque(m for m in run.recording.measurements if isinstance(m, GnssPosition))
     check, said = HeadingCheck(), list[str]()
+    if before_ns:
+        at_once: Any = SimpleNamespace(stamp_ns=before_ns)
+        check.look(SimpleNamespace(first_ns=before_ns - SECOND // 5, problem=problem, newest=at_once))  # type: ignore[arg-type]
     for stamp_ns in range(begin_ns + SECOND // 5, begin_ns + 69 * SECOND, SECOND // 5):
         at = run.truth.at(np.array([stamp_ns]))
         pose = gtsam.Pose3(gtsam.Rot3.Yaw(turned_rad).compose(gtsam.Rot3(at.R_world_body[0])), at.p_world_m[0])
@@ -154,3 +160,8 @@ def test_fixes_that_jump_neither_hide_a_wrong_heading_nor_make_one(
 ) -> None:
     assert len(said_of(at_two_hertz, jump_s, np.radians(70.0))) == 1
     assert said_of(at_two_hertz, jump_s, 0.0) == []
+
+
+def test_a_wrong_heading_is_found_after_the_clock_was_set_back(at_two_hertz: SimulatedRun) -> None:
+    an_hour_ahead_ns = int(at_two_hertz.truth.stamps_ns[0]) + 3600 * SECOND
+    assert len(said_of(at_two_hertz, (0.0, 0.0), np.radians(70.0), an_hour_ahead_ns)) == 1

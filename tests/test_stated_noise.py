@@ -18,6 +18,7 @@ from graphloc.frames import wrap_angle
 from graphloc.imu_scatter import noise_density
 from graphloc.measurements import CompassHeading, Measurement, PoseFix
 from graphloc.replay import replay
+from graphloc.solve import _imu_noise
 from graphloc.solve._align import align
 from graphloc.solve._decide import Stage, weigh
 from graphloc.solve._scatter import noisier_than_stated, white_scatter
@@ -176,3 +177,13 @@ def test_vibration_that_does_not_go_on_into_the_motion_is_no_noise() -> None:
     assert noise_density(imu.stamps_ns, shake)[0] > 30.0 * run.config.sensors["imu"].accel_noise_mps2
     assert not [w for w in solution.stats.warnings if "too small" in w or "IMU" in w]
     assert compare_to_truth(solution.trajectory, run.truth).position_rmse_m < 0.3
+
+
+def test_where_normal_equations_do_not_tell_the_noise_the_solution_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    def singular(_: object) -> None:
+        raise RuntimeError("Factor is exactly singular")
+
+    run = shaken(1, 10.0)
+    monkeypatch.setattr(_imu_noise, "normal_solver", singular)
+    solution = app.smooth_recording(run.recording, by_data_sheet(run)).solution
+    assert not [w for w in solution.stats.warnings if "too small" in w]

@@ -74,7 +74,8 @@ class HeadingCheck:
     Attributes:
         said: what is wrong with the heading, in plain words; empty where nothing is known to be.
         off_rad: by how much it is off, as far as that is known; 0 while nothing is said.
-        within_rad: 1 sigma of the heading by the last check alone, its error included; infinite where that told nothing.
+        looked_ns: stamp of the last check. within_rad: 1 sigma of the heading by it alone, its error included; infinite where it told
+            nothing.
     """
 
     def __init__(self) -> None:
@@ -82,7 +83,7 @@ class HeadingCheck:
         self._steps: deque[_Step] = deque()
         self._fixes: deque[_Fix] = deque()
         self._sensor = ""
-        self._looked_ns, self._wrong, self._right, self._fits = 0, 0, 0, 0
+        self.looked_ns, self._wrong, self._right, self._fits = 0, 0, 0, 0
 
     def begin(self) -> None:
         """Forget what earlier checks found right: the estimate starts anew."""
@@ -113,9 +114,10 @@ class HeadingCheck:
         """Integrate the IMU to the newest state and check the heading; return whether it is newly found to be wrong."""
         newest = lag.newest
         self._carry_on(lag, newest)
-        if not self._steps or newest.stamp_ns - self._looked_ns < _EVERY_S * 1e9:
+        since_ns = newest.stamp_ns - self.looked_ns
+        if not self._steps or 0 <= since_ns < _EVERY_S * 1e9:  # less than 0: the clock was set back
             return False
-        self._looked_ns, self.within_rad = newest.stamp_ns, np.inf
+        self.looked_ns, self.within_rad = newest.stamp_ns, np.inf
         if self._sensor not in lag.problem.streams:
             return False
         # Not with the estimated bias, which a guess has bent until it fits.

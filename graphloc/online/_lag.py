@@ -54,7 +54,7 @@ class Lag:
     def __init__(
         self, problem: LiveProblem, anchor: Anchor, lag_s: float, guess: tuple[gtsam.Pose3, Array, Array] | None = None
     ) -> None:
-        self.problem, self._window = problem, Window(lag_s)
+        self.problem, self.lag_s, self._window = problem, lag_s, Window(lag_s)
         self._constants = Constants(problem, self._window, anchor.constants)
         begin = guess or (anchor.pose, anchor.velocity, anchor.bias)
         self._states = States(problem, self._window, self._constants, anchor, begin)

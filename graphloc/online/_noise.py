@@ -15,7 +15,7 @@ from graphloc.solve._batch import CONTRADICTION, LARGEST_NOISE_SCALE, noise_step
 from graphloc.solve._imu_noise import LEAST_TIMES, scattered, too_quiet
 
 _EVERY_S, _MISFITS = 5.0, 2  # how often the fit is checked, and how many checks in a row must fail
-_WINDOWS_S = 10.0  # how often a larger noise is tried
+_WINDOWS_S = 10.0  # how often a larger noise is tried, where the lag is no longer
 _SURE = 8.0  # log-likelihood that it must gain
 
 
@@ -79,7 +79,7 @@ class ImuNoise:
         Not by the IMU's residuals alone, as offline: in a window of seconds, the prior of the data before it takes up most of a misfit.
         """
         at_ns = lag.newest.stamp_ns
-        if at_ns - self._weighed_ns < _WINDOWS_S * 1e9:
+        if at_ns - self._weighed_ns < max(_WINDOWS_S, lag.lag_s) * 1e9:  # no data count twice
             return ""
         self._weighed_ns = at_ns
         imu = samples()
@@ -88,8 +88,14 @@ class ImuNoise:
         if max(gyro, accel) < LEAST_TIMES:
             return ""
         times = ((1.0, 1.0), (gyro, accel), (gyro, 1.0), (1.0, accel))
-        likely = lag.likelihoods(times)
-        self._gained += likely[1:] - likely[0]
+        try:
+            likely = lag.likelihoods(times)
+        except RuntimeError:  # not determined by normal equations; the window stands
+            return ""
+        if not np.isfinite(likely).all():
+            return ""
+        # Hours in which it was less probable must not hide for hours that it is more probable now.
+        self._gained = np.maximum(self._gained + likely[1:] - likely[0], -_SURE)
         best = int(np.argmax(self._gained))
         if self._gained[best] < _SURE:
             return ""

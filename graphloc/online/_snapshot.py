@@ -97,6 +97,7 @@ class Snapshot:
                 list(heights_m.values()),
                 [scale, gyro, accel],
                 [] if unmodelled is None else unmodelled.ravel(),
+                [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
             ]
         )
         if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:

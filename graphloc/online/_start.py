@@ -182,7 +182,8 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
 
 def _measured(setup: Setup, recording: Recording, datum: Datum) -> bool:
     """Whether sensors measure the heading: by themselves, or along the body's axes, beside positions."""
-    along_body = any(setup.config.of_kind(row.kind) for row in setup.rows if row.along_body)
+    heard = {m.sensor for m in recording.measurements}
+    along_body = any(heard & setup.config.of_kind(row.kind).keys() for row in setup.rows if row.along_body)
     return along_body or any(np.isfinite(setup.hint(m, datum).yaw_rad) for m in recording.measurements)
 
 

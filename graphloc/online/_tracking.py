@@ -299,7 +299,7 @@ class Tracking:
         known, at_ns, check = self._persistent.heading, self.lag.newest.stamp_ns, self._persistent.heading_check
         if known is None:
             return []
-        self._persistent.heading = known = known.narrowed(at_ns, check.within_rad)
+        self._persistent.heading = known = known.narrowed(check.looked_ns, check.within_rad)
         why, said = known.doubt(at_ns), self._guessed
         if check.confirmed or (not why and self.heading_measured()):
             self._persistent.heading, self._guessed = None, False

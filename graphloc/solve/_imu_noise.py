@@ -130,9 +130,12 @@ def with_needed_noise(problem: Problem, values: gtsam.Values, verdicts: Verdicts
     rows = linearised(problem, values, verdicts, prior)
     root = root_weights(rows, -rows.b)
     J = diags_array(root) @ rows.J
-    solve = normal_solver(J)
-    solved = J, root * rows.b - J @ solve(J.T @ (root * rows.b)), solve
-    found = imu_misfit(rows.J, root, rows.b, solved, rows.states - 1, most.tolist())
+    try:
+        solve = normal_solver(J)
+        solved = J, root * rows.b - J @ solve(J.T @ (root * rows.b)), solve
+        found = imu_misfit(rows.J, root, rows.b, solved, rows.states - 1, most.tolist())
+    except RuntimeError:  # not determined by normal equations; the solution stands
+        return None
     gyro, accel = (max(misfit.needed, 1.0) for misfit in found)
     return with_imu_noise(problem, gyro, accel) if max(gyro, accel) > LEAST_TIMES else None
 
