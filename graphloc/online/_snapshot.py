@@ -17,7 +17,7 @@ from graphloc.online._anchor import Anchor
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.solve._batch import LARGEST_NOISE_SCALE
 
-_VERSION = 5
+_VERSION = 6
 _EVERY_S = 2.0
 
 
@@ -29,7 +29,7 @@ class Snapshot:
         vessel: its name. anchor: the newest state. imu: the sample at it or before.
         datum: origin of world. heights_m: configured heights (m, up in world), by sensor.
         agreed_ns: stamp at which each absolute sensor last agreed. noise: factors on the IMU noise, on that of the gyroscope,
-            and on that of the accelerometer.
+            and on that of the accelerometer. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
         heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
         unmodelled: covariance of `UnmodelledError`; None where no slow error is left out.
@@ -42,6 +42,7 @@ class Snapshot:
     heights_m: Mapping[str, float]
     agreed_ns: Mapping[str, int]
     noise: tuple[float, float, float]
+    sensor_noise: Mapping[str, Mapping[str, float]]
     heading: UnmeasuredHeading | None
     p_odom_m: Array
     R_odom_body: Array
@@ -61,6 +62,7 @@ class Snapshot:
             "imu": [self.imu.stamp_ns, *self.imu.accel_mps2.tolist(), *self.imu.gyro_radps.tolist()],
             "heights_m": dict(self.heights_m),
             "noise": list(self.noise),
+            "sensor_noise": {name: dict(times) for name, times in self.sensor_noise.items()},
             "heading": None if self.heading is None else asdict(self.heading),
             "agreed_ns": dict(self.agreed_ns),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
@@ -86,6 +88,10 @@ class Snapshot:
         p, R = (np.array(raw["odom"][n], dtype=np.float64).reshape(shape) for n, shape in ((0, 3), (1, (3, 3))))
         heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
         scale, gyro, accel = (float(times) for times in raw["noise"])
+        sensor_noise = {
+            str(name): {str(key): max(float(by), 1.0) for key, by in times.items()}
+            for name, times in raw["sensor_noise"].items()
+        }
         datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
         unmodelled = None if raw["unmodelled"] is None else np.array(raw["unmodelled"], dtype=np.float64)
         heading = None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"])
@@ -96,6 +102,7 @@ class Snapshot:
                 datum.origin,
                 list(heights_m.values()),
                 [scale, gyro, accel],
+                [by for times in sensor_noise.values() for by in times.values()],
                 [] if unmodelled is None else unmodelled.ravel(),
                 [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
             ]
@@ -110,6 +117,7 @@ class Snapshot:
             heights_m=heights_m,
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
             noise=(float(np.clip(scale, 1.0, LARGEST_NOISE_SCALE)), max(gyro, 1.0), max(accel, 1.0)),
+            sensor_noise=sensor_noise,
             heading=heading,
             p_odom_m=p,
             R_odom_body=R,

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build import Problem, Stream, solved_constants
+from graphloc.config import SIGMA_SCALES
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.position_jumps import jump_warnings, largest_sigma
@@ -53,6 +56,15 @@ def noisier_warning(sensor: str, noisier: float) -> list[str]:
     return [
         f"{sensor}: its measurements scatter more than they state, and are taken with {noisier:.1f} times their sigma: {cure}"
     ]
+
+
+def scale_warning(sensor: str, stated: Any, taken: Any) -> list[str]:
+    """Say where factors on a sensor's sigmas are taken to be larger than configured: a line, or none."""
+    keys = [key for key in SIGMA_SCALES if getattr(taken, key, 1.0) > getattr(stated, key, 1.0)]
+    if not keys:
+        return []
+    cure = " and ".join(f"{key}: {getattr(taken, key):.1f}" for key in keys)
+    return [f"{sensor}: its measurements scatter more than they state; taken with, and to be set: {cure}"]
 
 
 def joint_rejection_warning(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, false: Array) -> list[str]:
@@ -132,6 +144,8 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
                 cure += ", or for tags on a floating dock that the survey has as fixed"
         warnings.append(f"{said}; {cure}")
     name = problem.imu.sensor
+    for stream in problem.streams:
+        warnings += scale_warning(stream.name, stream.config, result.problem.config.sensors[stream.name])
     if said := too_quiet(name, problem.config.sensors[name], result.problem.config.sensors[name]):
         warnings.append(said)
     if expected > 0 and result.cost > CONTRADICTING_COST * expected:
