@@ -14,7 +14,7 @@ from graphloc.solve._warnings import scale_warning
 
 _EVERY_S = 5.0
 _SETTLED_S = 1.5  # after so long a measurement has been judged again
-_REMEMBERED = 150  # steps
+_REMEMBERED = 100  # steps
 
 
 class SensorNoise:
@@ -28,7 +28,7 @@ class SensorNoise:
         self.times = {name: dict(own) for name, own in (times or {}).items()}
         self._looked_ns = 0
         self._last: dict[str, tuple[Measurement, Residual]] = {}
-        self._steps: dict[str, dict[tuple[str, int], deque[Step]]] = {}
+        self._steps: dict[str, dict[tuple[tuple[str, int], ...], deque[tuple[Step, ...]]]] = {}
 
     def raised(self, lag: Lag) -> str:
         """Raise the factors of a sensor that clearly scatters more than it states; return a line on that, or empty."""
