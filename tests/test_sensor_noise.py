@@ -68,6 +68,24 @@ def test_the_factor_is_that_of_the_right_ones(times: float) -> None:
     assert found == ({} if times == 1.0 else {"sigma_scale": pytest.approx(times, rel=0.15)})
 
 
+@pytest.mark.parametrize("turned_deg", [0.0, 5.0, 30.0])
+@pytest.mark.parametrize("far_m", [(0.7, 2.0), (1.5, 5.0), (5.0, 20.0)])
+def test_false_ones_of_any_size_make_no_noise_of_right_ones(far_m: tuple[float, float], turned_deg: float) -> None:
+    """40 % are false, in rows; sigmas of 0.1 to 0.6 m and 1 deg, as stated: errors between two sizes that are looked for are no noise."""
+    rng = np.random.default_rng(6)
+    for sigma in (0.1, 0.3, 0.6):
+        for _ in range(4):
+            length, angle = rng.normal(0.0, sigma, (100, 2)), rng.normal(0.0, 1.0, (100, 1))
+            for first in range(0, 100, 5):
+                bearing = rng.uniform(0.0, 2.0 * np.pi)
+                length[first : first + 2] += rng.uniform(*far_m) * np.array([np.cos(bearing), np.sin(bearing)])
+                angle[first : first + 2] += rng.uniform(-turned_deg, turned_deg)
+            ((_, lengths),) = steps_of(length, sigma).items()
+            ((_, angles),) = steps_of(angle, 1.0).items()
+            both = [(a, b) for (a,), (b,) in zip(lengths, angles, strict=True)]
+            assert times_stated({(("sigma_scale", 2), ("angle_sigma_scale", 1)): both}) == {}
+
+
 def test_few_steps_and_false_ones_alone_tell_nothing() -> None:
     rng = np.random.default_rng(5)
     assert times_stated(steps_of(rng.normal(0.0, 1.0, (15, 2)), 0.1)) == {}
@@ -82,7 +100,7 @@ def test_matches_that_state_a_third_of_their_noise_are_taken_as_they_scatter() -
     (said,) = (w for w in solved.stats.warnings if "scatter more than they state" in w)
     assert said.startswith("matcher: ")
     scales = [float(scale) for scale in re.findall(r"scale: ([0-9.]+)", said)]
-    assert scales == [pytest.approx(3.0, rel=0.25)] * 2
+    assert scales == [pytest.approx(3.0, rel=0.3)] * 2
     assert found.position_rmse_m < 1.2 * best.position_rmse_m + 0.01
     assert found.nees is not None
     assert found.nees < 4.0

@@ -25,9 +25,10 @@ _PAIRED_S = 10.0  # apart at most: over longer, the error of the estimate change
 _FEWEST = 15  # pairs
 _FALSE_M = 5.0  # what a sensor without hypotheses errs by where it errs
 _FACTORS = np.geomspace(1.0, 20.0, 16)
-# Of right pairs. With fewer, those that err by some metres would be right ones with that noise.
-_SHARES = np.linspace(0.15, 0.95, 9)
-_ERRORS = (0.5, 1.0)  # of the largest error of a false one: many are smaller
+# Of right pairs. With fewer, those that err by their noise could all be false by little, and no noise would show.
+_SHARES = np.linspace(0.3, 0.95, 8)
+_ERRORS = (0.2, 0.4, 0.8, 1.6, 3.2)  # times the error that is expected of a false one
+_ANY_SIZE = 0.1  # share of the others that err by any of these sizes, and not by the one of most
 _LEAST_TIMES = 1.4
 _SURE = 8.0  # log-likelihood that a factor must gain
 
@@ -96,29 +97,34 @@ def times_stated(steps: Steps) -> dict[str, float]:
 def _likeliest(steps: Sequence[Step]) -> list[float]:
     """Return the likeliest factor on the stated sigmas of M steps, of each key; 1 where it is not clear.
 
-    Keys share which pairs are right: where positions tell false ones, the angles of the others show their noise.
+    Keys share which pairs are right: where positions tell false ones, the angles of the others show their noise. How far most of the
+    others err is what explains them best if the right ones err as stated, so that errors which are merely of another size make no noise.
 
     Args:
         steps: of each key, with one more axis (M) in front.
     """
-    right: Array = np.zeros((1, len(steps[0].change)))  # (factors of each key, M)
-    other = np.zeros(len(steps[0].change))
+    right, other = np.zeros((1, len(steps[0].change))), np.zeros(len(steps[0].change))  # (factors of each key, M), (M,)
     for change, stated, error in steps:
         own = np.array([_log_densities(change, times**2 * stated) for times in _FACTORS])
-        right = right[..., None, :] + own
         false = [_log_densities(change, stated + size**2 * error) for size in _ERRORS]
-        other = other + np.logaddexp.reduce(false) - np.log(len(_ERRORS))
-    right = right[0]
-    likely = np.max(
-        [np.logaddexp(np.log(share) + right, np.log1p(-share) + other).sum(axis=-1) for share in _SHARES], axis=0
-    )
-    best = np.unravel_index(int(np.argmax(likely)), likely.shape)
+        right = right[..., None, :] + own
+        best = max(false, key=lambda wide: float(_log_likelihoods(own[0], wide)))
+        any_size = np.logaddexp.reduce(false) - np.log(len(false))
+        other = other + np.logaddexp(np.log1p(-_ANY_SIZE) + best, np.log(_ANY_SIZE) + any_size)
+    likely = _log_likelihoods(right[0], other)
+    at = tuple(int(k) for k in np.unravel_index(int(np.argmax(likely)), likely.shape))
     found = []
-    for axis, k in enumerate(best):
-        without = (*best[:axis], 0, *best[axis + 1 :])
+    for axis, k in enumerate(at):
+        without = (*at[:axis], 0, *at[axis + 1 :])
         # Two steps in a row have a residual in common, so each counts half.
-        found.append(float(_FACTORS[k]) if 0.5 * (likely[best] - likely[without]) > _SURE else 1.0)
+        found.append(float(_FACTORS[k]) if 0.5 * (likely[at] - likely[without]) > _SURE else 1.0)
     return found
+
+
+def _log_likelihoods(right: Array, other: Array) -> Array:
+    """Return those of M pairs, by log densities of right ones (..., M) and of others (M,), with the likeliest share of right ones."""
+    mixed = [np.logaddexp(np.log(share) + right, np.log1p(-share) + other).sum(axis=-1) for share in _SHARES]
+    return np.asarray(np.max(mixed, axis=0))
 
 
 def _log_densities(steps: Array, cov: Array) -> Array:
