@@ -19,6 +19,7 @@ from graphloc.solve._batch import LARGEST_NOISE_SCALE
 
 _VERSION = 5
 _EVERY_S = 2.0
+_MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,7 +101,8 @@ class Snapshot:
                 [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
             ]
         )
-        if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
+        no_noise = not 1.0 <= min(scale, gyro, accel) or scale > LARGEST_NOISE_SCALE or max(gyro, accel) > _MOST_TIMES
+        if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or no_noise:
             raise ValueError("it is damaged")
         return cls(
             vessel=str(raw["vessel"]),
@@ -109,7 +111,7 @@ class Snapshot:
             datum=datum,
             heights_m=heights_m,
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
-            noise=(float(np.clip(scale, 1.0, LARGEST_NOISE_SCALE)), max(gyro, 1.0), max(accel, 1.0)),
+            noise=(scale, gyro, accel),
             heading=heading,
             p_odom_m=p,
             R_odom_body=R,
