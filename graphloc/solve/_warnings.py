@@ -11,7 +11,7 @@ from graphloc.build import Problem, Stream, solved_constants
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.position_jumps import jump_warnings, largest_sigma
-from graphloc.solution import SolveStats
+from graphloc.solution import Graded, SolveStats
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
 from graphloc.solve._decide import AGREES
 from graphloc.solve._health import CONTRADICTING_COST
@@ -50,9 +50,8 @@ def noisier_warning(sensor: str, noisier: float) -> list[str]:
     if noisier < _MUCH_NOISIER:
         return []
     cure = "set its sigma or the floor of it accordingly (a compass also use_reported_sigma: false)"
-    return [
-        f"{sensor}: its measurements scatter more than they state, and are taken with {noisier:.1f} times their sigma: {cure}"
-    ]
+    said = f"{sensor}: its measurements scatter more than they state, and are taken with {noisier:.1f} times their sigma: {cure}"
+    return [Graded(said, f"scatter of {sensor}", noisier)]
 
 
 def joint_rejection_warning(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, false: Array) -> list[str]:
@@ -130,15 +129,16 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
             )
             if any(not constant.corrects for stream in problem.streams for constant in stream.constants):
                 cure += ", or for tags on a floating dock that the survey has as fixed"
-        warnings.append(f"{said}; {cure}")
+        warnings.append(Graded(f"{said}; {cure}", "IMU noise by contradiction", result.noise_scale))
     name = problem.imu.sensor
-    if said := too_quiet(name, problem.config.sensors[name], result.problem.config.sensors[name]):
-        warnings.append(said)
+    stated, taken = (p.config.sensors[name] for p in (problem, result.problem))
+    if said := too_quiet(name, stated, taken):
+        times = (taken.gyro_noise_radps / stated.gyro_noise_radps, taken.accel_noise_mps2 / stated.accel_noise_mps2)
+        warnings.append(Graded(said, "IMU noise by its samples", max(times)))
     if expected > 0 and result.cost > CONTRADICTING_COST * expected:
-        warnings.append(
-            f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
-            "mount, a unit or a time offset is wrong"
-        )
+        said = f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
+        said += "mount, a unit or a time offset is wrong"
+        warnings.append(Graded(said, "cost", result.cost / expected))
     if (beside_m := largest_sigma(result.levels_cov)) > _LEVELS_M:
         warnings.append(
             "the fixes jump, and no other sensor shows which level is right: the one held longest is taken, "
