@@ -153,14 +153,15 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
     if len(latency) < 2:
         return []
     reference = next((r.sensor for r in sensors if r.config.kind == "imu" and r.stamps_ns), next(iter(latency)))
-    lines = []
+    lines, configs = [], {r.sensor: r.config for r in sensors}
     for sensor, value in latency.items():
         behind = value - latency[reference]
         if abs(behind) > _clock.EPOCH_LIMIT_S:
+            now_s = configs[sensor].time_offset_s
             lines.append(
                 f"{sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "
-                f"{reference}, by the recording times; if that is right, add {behind:.3f} to its time_offset_s (how much longer its "
-                "messages take than those of the other is in it)"
+                f"{reference}, by the recording times; if that is right, set its time_offset_s to {now_s + behind:.3f}"
+                f"{f' instead of {now_s:g}' if now_s else ''} (how much longer its messages take than those of the other is in it)"
             )
     gains = {r.sensor: _clock.gain(r.stamps(), r.logs()) for r in sensors}
     usual = gains[reference]
