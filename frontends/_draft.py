@@ -240,8 +240,8 @@ def _with_clock(block: list[str], inspection: Inspection) -> list[str]:
 
 def _topic_lines(topic: str) -> list[str]:
     """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
-    name, _, sentence = topic.partition(" ")
-    return [f"  topic: {name}", *([f"  nmea: [{sentence}]"] if sentence else [])]
+    name, *sentence = topic.split(" ")[:2]
+    return [f"  topic: {name}", *(f"  nmea: [{said}]" for said in sentence)]
 
 
 def _numbered(name: str, k: int) -> str:
