@@ -55,3 +55,13 @@ class SensorConfig(Block):
     used by `graphloc stream`."""
     kernel: KernelConfig = KernelConfig()
     """Robust loss."""
+
+    @property
+    def tells_height(self) -> bool:
+        """Whether its measurements say how high the vessel lies, in world."""
+        return False
+
+    @property
+    def synthetic_every_s(self) -> float:
+        """Time between two of the measurements that the configuration makes itself (`Sensor.synthetic`), s."""
+        return 1.0
