@@ -400,8 +400,8 @@ def _wheels_block(name: str, item: OdometryReport) -> list[str]:
     turned = ["  mount: {rpy_deg: [0.0, 0.0, 180.0]}  # guess: its sign looks wrong"] if item.reverse else []
     return [
         f"{name}:", "  kind: body_velocity", f"  topic: {item.topic}",
-        "  enabled: false  # guess: true to fuse it, if it slips little; then delete check_speed_topic",
-        "  axes: [x]  # guess: [x, y] for wheels that do not slip sideways, which tell the heading as well",
+        "  enabled: false  # guess: true to fuse it, if held-out fixes come out no worse; then delete check_speed_topic",
+        "  axes: [x]  # guess: [x, y] for wheels that do not slip sideways",
         *turned,
     ]  # fmt: skip
 
