@@ -24,12 +24,13 @@ from graphloc import app
 from graphloc.errors import GraphlocError
 from graphloc.eval import ekf
 from graphloc.eval.metrics import compare_to_truth
+from graphloc.measurements import NO_HEIGHT_M2, GnssPosition, Measurement, PoseFix
 from graphloc.replay import replay
 from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory
 
 SEEDS = range(1000, 1080)  # none was looked at when a model or a number was chosen
-NOISE_SEEDS = range(1100, 1116)  # nor these
+NOISE_SEEDS, STATED_SEEDS = range(1100, 1116), range(1120, 1136)  # nor these
 Found = dict[str, Any]
 _TOO_SURE = 6.0  # horizontal NEES: 2 where the covariance is true
 
@@ -118,6 +119,10 @@ def _with_noise(seed: int) -> Found:
         "by data sheet": _by_data_sheet(drawn, adapt=True),
         "vibrating": _vibrating(drawn),
     }
+    return _both_ways(runs)
+
+
+def _both_ways(runs: dict[str, DrawnRun]) -> Found:
     found: Found = {}
     for name, run in runs.items():
         found[f"{name}, batch"] = _tried(lambda run=run: app.smooth_recording(run.recording, run.config).solution, run)
@@ -127,19 +132,55 @@ def _with_noise(seed: int) -> Found:
     return found
 
 
-def noise(pool: ProcessPoolExecutor) -> list[Row]:
-    """Figures of an IMU that is noisier than configured, and of one that vibrates."""
-    found = list(pool.map(_with_noise, NOISE_SEEDS))
-    label = f"{len(found)} drawn vessels, IMU noise"
+def _variants(item: str, label: str, found: list[Found]) -> list[Row]:
     rows = []
     for way in found[0]:
         nees = _column(found, way, "nees")
         rows += [
-            row("F.noise", f"{label} {way}: position RMSE, mean", _column(found, way, "rmse_m").mean(), "m"),
-            row("F.noise", f"{label} {way}: NEES (2 when true), median", np.median(nees), ""),
-            row("F.noise", f"{label} {way}: NEES above {_TOO_SURE:g}", np.sum(nees > _TOO_SURE), "runs"),
+            row(item, f"{label} {way}: position RMSE, mean", _column(found, way, "rmse_m").mean(), "m"),
+            row(item, f"{label} {way}: NEES (2 when true), median", np.median(nees), ""),
+            row(item, f"{label} {way}: NEES above {_TOO_SURE:g}", np.sum(nees > _TOO_SURE), "runs"),
         ]
     return rows
+
+
+def noise(pool: ProcessPoolExecutor) -> list[Row]:
+    """Figures of an IMU that is noisier than configured, and of one that vibrates."""
+    found = list(pool.map(_with_noise, NOISE_SEEDS))
+    return _variants("F.noise", f"{len(found)} drawn vessels, IMU noise", found)
+
+
+def stating(run: DrawnRun, kind: type[Measurement], share: float) -> DrawnRun:
+    """The vessel, whose fixes (`GnssPosition`) or matches (`PoseFix`) state only a share of their sigmas."""
+
+    def less(m: Measurement) -> Measurement:
+        if isinstance(m, kind) and isinstance(m, GnssPosition):
+            return replace(m, cov_enu_m2=np.where(m.cov_enu_m2 < NO_HEIGHT_M2, share**2 * m.cov_enu_m2, m.cov_enu_m2))
+        if isinstance(m, kind) and isinstance(m, PoseFix):
+            return replace(m, modes=tuple(replace(mode, cov=share**2 * mode.cov) for mode in m.modes))
+        return m
+
+    return replace(
+        run, recording=replace(run.recording, measurements=tuple(less(m) for m in run.recording.measurements))
+    )
+
+
+def _stating(seed: int) -> Found:
+    drawn = drawn_run(seed)
+    return _both_ways(
+        {
+            "as they are": drawn,
+            "of matches a third": stating(drawn, PoseFix, 1 / 3),
+            "of matches a tenth": stating(drawn, PoseFix, 0.1),
+            "of fixes a tenth": stating(drawn, GnssPosition, 0.1),
+        }
+    )
+
+
+def stated(pool: ProcessPoolExecutor) -> list[Row]:
+    """Figures of fixes and matches that state less noise than they have."""
+    found = list(pool.map(_stating, STATED_SEEDS))
+    return _variants("F.stated", f"{len(found)} drawn vessels, stated sigmas", found)
 
 
 def _line(found: Found, before: Found | None) -> str:

@@ -71,6 +71,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "F.cal": calibration.figures,
     "F.drawn": drawn.figures,
     "F.noise": drawn.noise,
+    "F.stated": drawn.stated,
 }
 
 

@@ -165,6 +165,7 @@ ROW = Sensor(
     hint=hint,
     slow=slow,
     constants=constants,
+    scaled=lambda _fix: {"sigma_scale": [0, 1]},
     absolute=True,
     company=True,
 )

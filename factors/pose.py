@@ -32,8 +32,10 @@ FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(5.0))
 
 
 def _covariance(mode: PoseMode, axes: tuple[str, ...], config: AnyPoseConfig) -> Array:
-    floors = np.array([config.min_sigma_m if AXES.index(a) < 3 else np.radians(config.min_sigma_deg) for a in axes])
-    return with_floors(mode.cov, floors**2)
+    long = np.array([AXES.index(a) < 3 for a in axes])
+    scale = np.where(long, config.sigma_scale, config.angle_sigma_scale)
+    floors = np.where(long, config.min_sigma_m, np.radians(config.min_sigma_deg))
+    return with_floors(scale[:, None] * mode.cov * scale, floors**2)
 
 
 def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor: Any) -> Any:
@@ -132,6 +134,12 @@ def hint(m: PoseFix, mount_yaw_rad: float, datum: Datum) -> Hint:
     )
 
 
+def scaled(m: PoseFix) -> dict[str, list[int]]:
+    """Return which axes each factor of the configuration scales."""
+    long = [k for k, axis in enumerate(m.axes) if AXES.index(axis) < 3]
+    return {"sigma_scale": long, "angle_sigma_scale": [k for k in range(len(m.axes)) if k not in long]}
+
+
 ROW = Sensor(
     kind="pose",
     measurement=PoseFix,
@@ -141,6 +149,7 @@ ROW = Sensor(
     ideal=ideal,
     hint=hint,
     false=false,
+    scaled=scaled,
     absolute=True,
     company=True,
     in_world=True,

@@ -9,7 +9,7 @@ at all. Builder and solvers know rows only through this module, never by name.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -246,6 +246,7 @@ class Sensor:
         false: the hypothesis that a measurement is false; None: the sensor has no such hypothesis
             and is guarded by its kernel alone.
         constants: that a config's measurements may share.
+        scaled: keys of its configuration that scale the sigmas of a measurement, and the axes (of k) that each scales.
         describe: what of a measurement its row of the ledger should say.
         berths: places that its slow state moves, and that the vessel is seen from.
         synthetic: measurements made from the configuration over the run's stamps (no topic).
@@ -268,6 +269,7 @@ class Sensor:
     slow: Callable[[Any], SlowProcess | None] = lambda _config: None
     false: Callable[[Any, Any], FalseModel] | None = None
     constants: Callable[[Any], tuple[Constant, ...]] = lambda _config: ()
+    scaled: Callable[[Any], Mapping[str, list[int]]] = lambda _measurement: {}
     describe: Callable[[Any], str] = lambda _measurement: ""
     berths: Callable[[Any], tuple[Berth, ...]] = lambda _config: ()
     synthetic: Callable[[str, Any, Sequence[int], float], Sequence[Measurement]] | None = None

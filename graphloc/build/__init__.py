@@ -36,6 +36,7 @@ from graphloc.build._problem import (
     slow_or_left_out,
     with_imu_noise,
     with_noise_scale,
+    with_sensor_noise,
 )
 from graphloc.build._thinned import Thinned, thinned
 
@@ -76,5 +77,6 @@ __all__ = [
     "walk_between_nodes",
     "with_imu_noise",
     "with_noise_scale",
+    "with_sensor_noise",
     "without_drift",
 ]

@@ -291,14 +291,16 @@ def with_imu_noise(problem: Problem, gyro: float, accel: float) -> Problem:
     return _relinked(problem, problem.config.with_sensors({name: noisier}), problem.noise_scale)
 
 
+def with_sensor_noise(problem: Problem, times: Mapping[str, Mapping[str, float]]) -> Problem:
+    """Return the problem with sigmas of its sensors so many times as large; `times`: by sensor and key of its configuration."""
+    config = problem.config.scaled(times)
+    streams = tuple(replace(stream, config=config.sensors[stream.name]) for stream in problem.streams)
+    return replace(problem, config=config, streams=streams)
+
+
 def noisier_imu(sensor: Any, gyro: float, accel: float) -> Any:
     """Return the configuration of an IMU with noise densities so many times as large."""
-    return sensor.model_copy(
-        update={
-            "gyro_noise_mdps_per_sqrt_hz": sensor.gyro_noise_mdps_per_sqrt_hz * gyro,
-            "accel_noise_ug_per_sqrt_hz": sensor.accel_noise_ug_per_sqrt_hz * accel,
-        }
-    )
+    return sensor.scaled({"gyro_noise_mdps_per_sqrt_hz": gyro, "accel_noise_ug_per_sqrt_hz": accel})
 
 
 def _relinked(problem: Problem, config: VesselConfig, noise_scale: float) -> Problem:

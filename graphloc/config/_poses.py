@@ -23,6 +23,10 @@ class AnyPoseConfig(SensorConfig):
     """Expected share of false poses, if the message or matcher does not say."""
     false_repeats: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
     """Probability that a false pose repeats the error of the false pose before it (a moored boat stays)."""
+    sigma_scale: Positive = 1.0
+    """Factor on the position sigmas that a pose or match comes with."""
+    angle_sigma_scale: Positive = 1.0
+    """The same for angles."""
     min_sigma_m: Positive = 0.02
     """Floor of the position sigma, m."""
     min_sigma_deg: Positive = 0.1

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Literal, Self
 
 from pydantic import Field
 
@@ -31,6 +32,10 @@ class KernelConfig(Block):
         if self.kind == "geman_mcclure":
             return 1.0 / (1.0 + u2) ** 2
         return (1.0 - u2) ** 2 if u2 < 1.0 else 0.0
+
+
+SIGMA_SCALES = ("sigma_scale", "angle_sigma_scale")
+"""Keys of factors on the sigmas that a sensor's measurements come with, where it has them."""
 
 
 class SensorConfig(Block):
@@ -65,3 +70,7 @@ class SensorConfig(Block):
     def synthetic_every_s(self) -> float:
         """Time between two of the measurements that the configuration makes itself (`Sensor.synthetic`), s."""
         return 1.0
+
+    def scaled(self, times: Mapping[str, float]) -> Self:
+        """Return the configuration with some of its numbers, by key, so many times as large."""
+        return self.model_copy(update={key: getattr(self, key) * by for key, by in times.items()})

@@ -143,6 +143,10 @@ class VesselConfig(Block):
         """Return the configuration with some of its sensors replaced."""
         return self.model_copy(update={"sensors": {**self.sensors, **changed}})
 
+    def scaled(self, times: Mapping[str, Mapping[str, float]]) -> VesselConfig:
+        """Return the configuration with numbers of sensors so many times as large; `times`: by sensor and key."""
+        return self.with_sensors({name: self.sensors[name].scaled(by) for name, by in times.items()})
+
     def with_start_heading(self, heading_deg: float | None) -> VesselConfig:
         """Return the configuration of a run that starts with this heading, deg; None: with none that is configured."""
         return self.model_copy(update={"start": self.start.model_copy(update={"heading_deg": heading_deg})})

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.frames import Array
+from graphloc.graph import Residual
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
@@ -152,6 +153,11 @@ class Lag:
         return self._window.factor_slots
 
     # Measurements
+
+    def judged(self, sensor: str, after_ns: int, until_ns: int) -> list[tuple[Measurement, Residual]]:
+        """Return the measurements of a sensor with stamps from after one to another, by stamp, each with the residual of its mode."""
+        own = self._entries.of(self.problem.streams[sensor])
+        return [(e.measurement, e.verdict.residual) for e in own if after_ns < e.measurement.stamp_ns <= until_ns]
 
     def take(self, m: Measurement) -> None:
         """Stage a measurement whose stamp lies within the window."""

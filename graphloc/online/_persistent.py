@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
+from graphloc.config import SIGMA_SCALES
 from graphloc.frames import Datum
 from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
@@ -13,6 +15,7 @@ from graphloc.online._heading_check import HeadingCheck
 from graphloc.online._motion_model import MotionModel
 from graphloc.online._noise import ImuNoise
 from graphloc.online._odometry import Odometry
+from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import UnmodelledError
@@ -25,7 +28,7 @@ class PersistentState:
 
     Attributes:
         datum: origin of world; None before it is known.
-        noise: by how much the IMU's noise is raised.
+        noise: by how much the IMU's noise is raised. sensor_noise: the same of sensors that scatter more than they state.
         heights_m: configured heights (m, up in world), by the name of the sensor that measures them.
         heading: where no sensor measures it, how far it may be off; None: one does, or the motion has confirmed it.
         agreed_ns: stamp at which each absolute sensor last agreed, as known when the last window ended.
@@ -38,6 +41,7 @@ class PersistentState:
 
     datum: Datum | None
     noise: ImuNoise
+    sensor_noise: SensorNoise = field(default_factory=SensorNoise)
     heights_m: Mapping[str, float] = field(default_factory=dict)
     heading: UnmeasuredHeading | None = None
     agreed_ns: dict[str, int] = field(default_factory=dict)
@@ -49,16 +53,23 @@ class PersistentState:
     unmodelled: UnmodelledError | None = None
 
     @classmethod
-    def resumed(cls, found: Snapshot, noise: ImuNoise, sensors: Collection[str]) -> PersistentState:
+    def resumed(cls, found: Snapshot, noise: ImuNoise, sensors: Mapping[str, Any]) -> PersistentState:
         """Return what a snapshot holds.
 
         Args:
-            noise: raised as the snapshot's is. sensors: names of the enabled ones.
+            noise: raised as the snapshot's is. sensors: the enabled ones, by name: their configuration.
         """
         noise.at_least(*found.noise)
         return cls(
             datum=found.datum,
             noise=noise,
+            sensor_noise=SensorNoise(
+                {
+                    name: {key: by for key, by in times.items() if key in SIGMA_SCALES and hasattr(sensors[name], key)}
+                    for name, times in found.sensor_noise.items()
+                    if name in sensors
+                }
+            ),
             heights_m={name: height_m for name, height_m in found.heights_m.items() if name in sensors},
             heading=found.heading,
             agreed_ns=dict(found.agreed_ns),
@@ -80,6 +91,7 @@ class PersistentState:
             datum=self.datum,
             heights_m=self.heights_m,
             agreed_ns={**self.agreed_ns, **agreed_ns},
+            sensor_noise=self.sensor_noise.times,
             noise=(self.noise.scale, self.noise.gyro, self.noise.accel),
             heading=self.heading,
             p_odom_m=self.odometry.p_m,

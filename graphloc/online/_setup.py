@@ -77,6 +77,10 @@ class Setup:
         row = next(row for row in self.rows if row.kind == sensor.kind)
         return row.hint(m, float(np.arctan2(R[1, 0], R[0, 0])), datum)
 
+    def scaled(self, times: Mapping[str, Mapping[str, float]]) -> Setup:
+        """Return the same with numbers of sensors so many times as large; `times`: by sensor and key of its configuration."""
+        return replace(self, config=self.config.scaled(times))
+
     def without_start_heading(self) -> Setup:
         """Return the same for a later start: the configured heading is that of the first start alone."""
         return replace(self, config=self.config.with_start_heading(None))

@@ -245,7 +245,10 @@ class OnlineSmoother:
             if jumped := tracking.lag.unmodelled_jumps:
                 self._rebuild(f"position jump of {', '.join(jumped)}")
                 return self._estimate()
-            if noisier := self._persistent.noise.raised(tracking.lag, tracking.samples):
+            persistent = self._persistent
+            if noisier := persistent.sensor_noise.raised(tracking.lag) or persistent.noise.raised(
+                tracking.lag, tracking.samples
+            ):
                 self._rebuild(noisier)
                 return self._estimate()
             return tracking.estimate()
@@ -314,7 +317,8 @@ class OnlineSmoother:
         """Return the start, or what it waits for; what lies ahead of `until_ns`, the newest sample's stamp, is left out."""
         reached = [m for m in others if m.stamp_ns <= until_ns]
         try:
-            return try_start(self._setup, series_of(samples), reached, self.datum)
+            setup = self._setup.scaled(self._persistent.sensor_noise.times)
+            return try_start(setup, series_of(samples), reached, self.datum)
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             return f"data from which the start can be solved: {in_one_line(error)}"
 
@@ -386,13 +390,15 @@ class OnlineSmoother:
     def _resume(self, newest: ImuSample) -> None:
         """Go on from the snapshot, if the first sample is not too far from it."""
         assert self._resumable is not None
-        found, self._resumable = self._resumable, None
-        age_s, bridge_s = (newest.stamp_ns - found.anchor.stamp_ns) * 1e-9, self._setup.bridge_s
+        found, self._resumable, setup = self._resumable, None, self._setup
+        age_s, bridge_s = (newest.stamp_ns - found.anchor.stamp_ns) * 1e-9, setup.bridge_s
         if not 0.0 < age_s <= bridge_s:
             self._say(f"the snapshot is {age_s:.1f} s old, more than the {bridge_s:g} s (max_bridge_s) that "
                       "can be bridged: starts without it")  # fmt: skip
             return
-        persistent = PersistentState.resumed(found, self._configured_noise(), self._setup.measuring)
+        persistent = PersistentState.resumed(
+            found, self._configured_noise(), {n: setup.config.sensors[n] for n in setup.measuring}
+        )
         try:
             tracking = Tracking(self._setup, persistent, self._ledger, found.anchor, [found.imu, newest])
             persistent.unmodelled = tracking.lag.unmodelled(cov=found.unmodelled)

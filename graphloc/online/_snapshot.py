@@ -17,7 +17,7 @@ from graphloc.online._anchor import Anchor
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.solve._batch import LARGEST_NOISE_SCALE
 
-_VERSION = 5
+_VERSION = 6
 _EVERY_S = 2.0
 _MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
 
@@ -30,7 +30,7 @@ class Snapshot:
         vessel: its name. anchor: the newest state. imu: the sample at it or before.
         datum: origin of world. heights_m: configured heights (m, up in world), by sensor.
         agreed_ns: stamp at which each absolute sensor last agreed. noise: factors on the IMU noise, on that of the gyroscope,
-            and on that of the accelerometer.
+            and on that of the accelerometer. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
         heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
         unmodelled: covariance of `UnmodelledError`; None where no slow error is left out.
@@ -43,6 +43,7 @@ class Snapshot:
     heights_m: Mapping[str, float]
     agreed_ns: Mapping[str, int]
     noise: tuple[float, float, float]
+    sensor_noise: Mapping[str, Mapping[str, float]]
     heading: UnmeasuredHeading | None
     p_odom_m: Array
     R_odom_body: Array
@@ -62,6 +63,7 @@ class Snapshot:
             "imu": [self.imu.stamp_ns, *self.imu.accel_mps2.tolist(), *self.imu.gyro_radps.tolist()],
             "heights_m": dict(self.heights_m),
             "noise": list(self.noise),
+            "sensor_noise": {name: dict(times) for name, times in self.sensor_noise.items()},
             "heading": None if self.heading is None else asdict(self.heading),
             "agreed_ns": dict(self.agreed_ns),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
@@ -87,21 +89,25 @@ class Snapshot:
         p, R = (np.array(raw["odom"][n], dtype=np.float64).reshape(shape) for n, shape in ((0, 3), (1, (3, 3))))
         heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
         scale, gyro, accel = (float(times) for times in raw["noise"])
+        sensor_noise = {
+            str(name): {str(key): float(by) for key, by in times.items()} for name, times in raw["sensor_noise"].items()
+        }
         datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
         unmodelled = None if raw["unmodelled"] is None else np.array(raw["unmodelled"], dtype=np.float64)
         heading = None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"])
+        raised = [scale, gyro, accel, *(by for times in sensor_noise.values() for by in times.values())]
         numbers = np.concatenate(
             [
                 p,
                 R.ravel(),
                 datum.origin,
                 list(heights_m.values()),
-                [scale, gyro, accel],
+                raised,
                 [] if unmodelled is None else unmodelled.ravel(),
                 [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
             ]
         )
-        no_noise = not 1.0 <= min(scale, gyro, accel) or scale > LARGEST_NOISE_SCALE or max(gyro, accel) > _MOST_TIMES
+        no_noise = not 1.0 <= min(raised) or scale > LARGEST_NOISE_SCALE or max(raised) > _MOST_TIMES
         if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or no_noise:
             raise ValueError("it is damaged")
         return cls(
@@ -112,6 +118,7 @@ class Snapshot:
             heights_m=heights_m,
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
             noise=(scale, gyro, accel),
+            sensor_noise=sensor_noise,
             heading=heading,
             p_odom_m=p,
             R_odom_body=R,

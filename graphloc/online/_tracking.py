@@ -87,7 +87,8 @@ class Tracking:
         before: Lag | None = None,
     ) -> Lag:
         """Return a window that begins at an anchor; `before`: the one that it replaces."""
-        setup, persistent = self._setup, self._persistent
+        persistent = self._persistent
+        setup = self._setup.scaled(persistent.sensor_noise.times)
         since_ns = anchor.stamp_ns - 2 * duration_ns(setup.gap_s)
         known = [m for m in samples if m.stamp_ns >= since_ns] or samples[-1:]
         assert persistent.datum is not None

@@ -21,7 +21,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from graphloc.build import Problem, StartPrior, Thinned, bridged, thinned, with_noise_scale
+from graphloc.build import Problem, StartPrior, Thinned, bridged, thinned, with_noise_scale, with_sensor_noise
 from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
@@ -32,6 +32,7 @@ from graphloc.solve._imu_noise import with_needed_noise
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import Settled, cost_without_outliers, expected_cost, rough_passes, settle
+from graphloc.solve._sensor_noise import scattering
 from graphloc.solve._start import solve_start
 
 _MAX_NOISE_ROUNDS = 5
@@ -97,6 +98,10 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
     for attempt in range(_MAX_NOISE_ROUNDS):
         settled = _final_passes(problem, few, estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
+        if attempt < _MAX_NOISE_ROUNDS - 1 and (times := scattering(problem, settled.verdicts)):
+            problem = with_sensor_noise(problem, times)
+            few = thinned(problem)
+            continue
         ratio = cost_without_outliers(settled) / max(expected_cost(problem, settled.verdicts), 1.0)
         if attempt == _MAX_NOISE_ROUNDS - 1 or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break

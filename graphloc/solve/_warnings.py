@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build import Problem, Stream, solved_constants
+from graphloc.config import SIGMA_SCALES
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.position_jumps import jump_warnings, largest_sigma
@@ -52,6 +55,17 @@ def noisier_warning(sensor: str, noisier: float) -> list[str]:
     cure = "set its sigma or the floor of it accordingly (a compass also use_reported_sigma: false)"
     said = f"{sensor}: its measurements scatter more than they state, and are taken with {noisier:.1f} times their sigma: {cure}"
     return [Graded(said, f"scatter of {sensor}", noisier)]
+
+
+def scale_warning(sensor: str, stated: Any, taken: Any) -> list[str]:
+    """Say where factors on a sensor's sigmas are taken to be larger than configured: a line, or none."""
+    times = {key: getattr(taken, key, 1.0) / getattr(stated, key, 1.0) for key in SIGMA_SCALES}
+    keys = [key for key, by in times.items() if by > 1.0]
+    if not keys:
+        return []
+    cure = " and ".join(f"{key}: {getattr(taken, key):.1f}" for key in keys)
+    said = f"{sensor}: its measurements scatter more than they state; taken with, and to be set: {cure}"
+    return [Graded(said, f"sigmas of {sensor}", max(times.values()))]
 
 
 def joint_rejection_warning(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, false: Array) -> list[str]:
@@ -131,9 +145,14 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
                 cure += ", or for tags on a floating dock that the survey has as fixed"
         warnings.append(Graded(f"{said}; {cure}", "IMU noise by contradiction", result.noise_scale))
     name = problem.imu.sensor
-    stated, taken = (p.config.sensors[name] for p in (problem, result.problem))
-    if said := too_quiet(name, stated, taken):
-        times = (taken.gyro_noise_radps / stated.gyro_noise_radps, taken.accel_noise_mps2 / stated.accel_noise_mps2)
+    stated, taken = problem.config.sensors, result.problem.config.sensors
+    for stream in problem.streams:
+        warnings += scale_warning(stream.name, stream.config, taken[stream.name])
+    if said := too_quiet(name, stated[name], taken[name]):
+        times = (
+            taken[name].gyro_noise_radps / stated[name].gyro_noise_radps,
+            taken[name].accel_noise_mps2 / stated[name].accel_noise_mps2,
+        )
         warnings.append(Graded(said, "IMU noise by its samples", max(times)))
     if expected > 0 and result.cost > CONTRADICTING_COST * expected:
         said = f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "

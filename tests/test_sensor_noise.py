@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixes, poses and matches whose stated sigmas are too small: they are taken as they scatter from one to the next."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.config import PoseConfig
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
+from graphloc.factors import INERTIAL, SENSORS
+from graphloc.frames import Array
+from graphloc.measurements import GnssPosition, Measurement, PoseFix
+from graphloc.online import OnlineSmoother
+from graphloc.online._noise import ImuNoise
+from graphloc.online._persistent import PersistentState
+from graphloc.online._snapshot import Snapshot
+from graphloc.replay import arrivals, replay
+from graphloc.solve._sensor_noise import Step, Steps, times_stated
+from tests.slowly import slowly
+from tests.test_factors import attachment
+
+SECOND = 1_000_000_000
+
+
+def stating(run: SimulatedRun, kind: type[Measurement], share: float) -> SimulatedRun:
+    """The run, whose fixes or matches state only a share of their sigmas."""
+
+    def less(m: Measurement) -> Measurement:
+        if not isinstance(m, kind):
+            return m
+        if isinstance(m, GnssPosition):
+            return replace(m, cov_enu_m2=share**2 * m.cov_enu_m2)
+        assert isinstance(m, PoseFix)
+        return replace(m, modes=tuple(replace(mode, cov=share**2 * mode.cov) for mode in m.modes))
+
+    recording = replace(run.recording, measurements=tuple(less(m) for m in run.recording.measurements))
+    return replace(run, recording=recording)
+
+
+def matched(seed: int, duration_s: float = 40.0) -> SimulatedRun:
+    """BL's case 1 with matches of 0.3 m, 40 % of them false, and GNSS that drifts."""
+    return slowly(simulate(replace(bl_scenario(1, "drift"), duration_s=duration_s, pose_hz=4.0), seed))
+
+
+def steps_of(residuals: Array, sigma: float, false_sigma: float = 5.0) -> Steps:
+    """Of residuals (N, k) with a stated sigma."""
+    k = residuals.shape[1]
+    stated = 2.0 * sigma**2 * np.eye(k)
+    error = false_sigma**2 * np.eye(k)
+    return {(("sigma_scale", k),): [(Step(step, stated, error),) for step in np.diff(residuals, axis=0)]}
+
+
+@pytest.mark.parametrize("times", [1.0, 3.0, 8.0])
+def test_the_factor_is_that_of_the_right_ones(times: float) -> None:
+    """Of 200, a third is false, in rows that repeat their error; and all share one that drifts away by metres."""
+    rng = np.random.default_rng(4)
+    residuals = rng.normal(0.0, 0.1 * times, (200, 2)) + np.linspace(0.0, 5.0, 200)[:, None]
+    for first in range(0, 200, 15):
+        residuals[first : first + 5] += rng.normal(0.0, 3.0, 2)
+    found = times_stated(steps_of(residuals, 0.1))
+    assert found == ({} if times == 1.0 else {"sigma_scale": pytest.approx(times, rel=0.15)})
+
+
+def test_few_steps_and_false_ones_alone_tell_nothing() -> None:
+    rng = np.random.default_rng(5)
+    assert times_stated(steps_of(rng.normal(0.0, 1.0, (15, 2)), 0.1)) == {}
+    assert times_stated(steps_of(rng.normal(0.0, 3.5, (100, 2)), 0.01)) == {}
+
+
+def test_matches_that_state_a_third_of_their_noise_are_taken_as_they_scatter() -> None:
+    right = matched(1)
+    run = stating(right, PoseFix, 1 / 3)
+    solved, as_stated = (app.smooth_recording(r.recording, r.config).solution for r in (run, right))
+    found, best = (compare_to_truth(s.trajectory, run.truth) for s in (solved, as_stated))
+    (said,) = (w for w in solved.stats.warnings if "scatter more than they state" in w)
+    assert said.startswith("matcher: ")
+    scales = [float(scale) for scale in re.findall(r"scale: ([0-9.]+)", said)]
+    assert scales == [pytest.approx(3.0, rel=0.25)] * 2
+    assert found.position_rmse_m < 1.2 * best.position_rmse_m + 0.01
+    assert found.nees is not None
+    assert found.nees < 4.0
+    assert not [w for w in as_stated.stats.warnings if "scatter" in w]
+    weights = [row.weight for row in solved.ledger if row.sensor == "matcher"]
+    assert np.mean([w is not None and w > 0.5 for w in weights]) == pytest.approx(
+        0.6, abs=0.15
+    )  # what is right of them
+
+
+def test_online_matches_that_state_a_third_are_taken_as_they_scatter_from_then_on() -> None:
+    run = stating(matched(2), PoseFix, 1 / 3)
+    solution = replay(run.recording, run.config).solution
+    told = [line for line in solution.stats.events if "matcher: its measurements scatter more" in line]
+    assert 1 <= len(told) <= 2
+    assert not [line for line in solution.stats.events if "IMU" in line]
+    track = solution.trajectory
+    k = np.flatnonzero(track.stamps_ns > run.truth.stamps_ns[0] + 25 * SECOND)
+    assert track.cov is not None
+    off = (track.p_world_m[k] - run.truth.at(track.stamps_ns[k]).p_world_m)[:, :2]
+    nees = np.mean([e @ np.linalg.solve(P[:2, :2], e) for e, P in zip(off, track.cov[k], strict=True)])
+    assert nees < 4.0
+
+
+def test_fixes_that_state_a_tenth_of_their_noise_are_taken_as_they_scatter() -> None:
+    """Of a lone receiver: believed, they drew the track after their noise."""
+    scenario = replace(bl_scenario(1, "clean"), duration_s=40.0, pose_hz=0.0, gnss_sigma_m=0.5)
+    run = stating(slowly(simulate(scenario, 3)), GnssPosition, 0.1)
+    solution = app.smooth_recording(run.recording, run.config).solution
+    (said,) = (w for w in solution.stats.warnings if "scatter more than they state" in w)
+    assert re.match(r"gnss: .* sigma_scale: ([0-9.]+)$", said)
+    assert float(said.rsplit(" ", 1)[1]) == pytest.approx(10.0, rel=0.2)
+    assert not [w for w in solution.stats.warnings if "IMU" in w]
+    assert compare_to_truth(solution.trajectory, run.truth).position_rmse_m < 0.3
+
+
+def test_a_pose_has_a_factor_on_lengths_and_one_on_angles() -> None:
+    run = matched(1, 3.0)
+    m = next(m for m in run.recording.measurements if isinstance(m, PoseFix))
+    row = next(row for row in SENSORS if row.kind == "pose")
+    config = PoseConfig(topic="/p", min_sigma_m=1e-6, min_sigma_deg=1e-6)
+    scaled = config.scaled({"sigma_scale": 2.0, "angle_sigma_scale": 3.0})
+    at = attachment(row, config)
+    plain, wider = (row.residuals(m, c, at)[0] for c in (config, scaled))
+    np.testing.assert_allclose(np.diagonal(wider.cov) / np.diagonal(plain.cov), [4.0, 4.0, 9.0])
+
+
+def test_a_snapshot_knows_what_sensors_scatter(tmp_path: Path) -> None:
+    run = stating(matched(2), PoseFix, 1 / 3)
+    path = tmp_path / "snapshot.json"
+    smoother = OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, snapshot=path)
+    for m in arrivals(run.recording):
+        smoother.feed(m)
+    found = Snapshot.read(path, "imu")
+    assert found.sensor_noise["matcher"]["sigma_scale"] > 1.5
+    sensors = {"matcher": run.config.sensors["matcher"], "gnss": run.config.sensors["gnss"]}
+    strange = replace(
+        found, sensor_noise={**found.sensor_noise, "gone": {"sigma_scale": 2.0}, "gnss": {"time_offset_s": 2.0}}
+    )
+    resumed = PersistentState.resumed(strange, ImuNoise(adapt=True), sensors)
+    assert resumed.sensor_noise.times == {"matcher": found.sensor_noise["matcher"], "gnss": {}}
