@@ -528,6 +528,10 @@ def _noise(text: str) -> str:
     return json.dumps(json.loads(text) | {"noise": [1.0, 1e6, 1.0]})  # 20 kdeg/s in a second
 
 
+def _sensor_noise(text: str) -> str:
+    return json.dumps(json.loads(text) | {"sensor_noise": {"gnss": {"sigma_scale": 1e6}}})
+
+
 def _other(text: str) -> str:
     return json.dumps(json.loads(text) | {"vessel": "another"})
 
@@ -563,6 +567,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> str:
         _nan,
         _heading,
         _noise,
+        _sensor_noise,
         _other,
         _elsewhere,
         _slow_of_other_size,
