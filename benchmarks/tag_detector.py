@@ -58,7 +58,7 @@ def views(condition: str, seed: int, times: Any) -> Iterator[View]:
 
 
 def _on_sides(_grey: Any, about_px: Any, _cells: Any, _straight: Any) -> Any:
-    return _edges.Fit(about_px, np.eye(8), 1.0)
+    return _edges.TagFit(about_px, np.eye(8), 1.0)
 
 
 # A step is switched off by what stands in for it.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from graphloc.build import mount_of
 from graphloc.chi2 import chi2_95
-from graphloc.config import SensorConfig, VesselConfig
+from graphloc.config import VesselConfig
 from graphloc.eval.metrics import held_out_errors
 from graphloc.frames import Array, Datum, heading_deg_from_yaw
 from graphloc.measurements import GnssPosition
@@ -65,7 +65,7 @@ def gnss_offset_warnings(track: Trajectory, datum: Datum, recording: Recording, 
         if any(not m.has_height for m in fixes):
             continue
         size, mean = _steady(off[:, 2:])
-        others = [n for n in others if _tells_height(config.sensors[n])] + list(config.of_kind("height"))
+        others = [n for n in others if config.sensors[n].tells_height] + list(config.of_kind("height"))
         if others and size**2 >= _HEIGHT_SIGMAS**2 * _mean_variance(
             process.vertical_sigma_m, process.time_constant_s, lasts_s
         ):
@@ -75,10 +75,6 @@ def gnss_offset_warnings(track: Trajectory, datum: Datum, recording: Recording, 
                 "the other above the ellipsoid"
             )
     return lines
-
-
-def _tells_height(sensor: SensorConfig) -> bool:
-    return sensor.kind in ("apriltag", "gnss") or "z" in getattr(sensor, "axes", ())
 
 
 def _steady(off_m: Array) -> tuple[float, Array]:

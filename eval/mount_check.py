@@ -7,6 +7,8 @@ with it, and where GNSS positions are the only other measurements, nothing contr
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from graphloc.build import mount_of
@@ -23,52 +25,65 @@ _KNOWN_DEG = 20.0  # 95 % bound of a heading that is claimed to be known
 _STEADY = 0.8  # length of the mean direction: 1 where the angle is the same all the way
 
 
-def mount_warnings(track: Trajectory, recording: Recording, config: VesselConfig) -> list[str]:
-    """Return a line for a tilted vessel, and one for a course that differs from the heading over most of the distance.
+class MountDoubt(NamedTuple):
+    """What is odd about a solved track, and what to do about it; as text, both."""
+
+    seen: str
+    cure: str
+
+    def __str__(self) -> str:
+        return f"{self.seen}: {self.cure}"
+
+
+def mount_doubts(track: Trajectory, recording: Recording, config: VesselConfig) -> list[MountDoubt]:
+    """Return a doubt for a tilted vessel, and one for a course that differs from the heading over most of the distance.
 
     Args:
         track: solved, with covariance and velocity. recording, config: name the IMU and its mount.
     """
     found = (_tilted(track), _sideways(track, recording, config))
-    return [line for line in found if line]
+    return [doubt for doubt in found if doubt is not None]
 
 
-def _tilted(track: Trajectory) -> str:
+def _tilted(track: Trajectory) -> MountDoubt | None:
     tilt_deg = (
         float(np.degrees(np.median(np.arccos(np.clip(track.R_world_body[:, 2, 2], -1.0, 1.0))))) if len(track) else 0.0
     )
     if tilt_deg < _TILTED_DEG or track.planar:
-        return ""
-    return (
-        f"the vessel is tilted by {tilt_deg:.0f} deg for most of the run: check the IMU's mount.rpy_deg and the sign of its "
-        "accelerations"
-    )
+        return None
+    seen = f"the vessel is tilted by {tilt_deg:.0f} deg for most of the run"
+    return MountDoubt(seen, "check the IMU's mount.rpy_deg and the sign of its accelerations")
 
 
-def _sideways(track: Trajectory, recording: Recording, config: VesselConfig) -> str:
+def _sideways(track: Trajectory, recording: Recording, config: VesselConfig) -> MountDoubt | None:
     if track.v_world_mps is None or track.cov is None or len(track) < 2:
-        return ""
+        return None
     v, step_s = track.v_world_mps, np.diff(track.stamps_ns, append=track.stamps_ns[-1]) / 1e9
     speed = np.hypot(v[:, 0], v[:, 1])
     judged = (speed > _MOVES_MPS) & (bounds_95(track.cov)[:, 2] < _KNOWN_DEG) & (step_s < 1.0)
     way_m = (speed * step_s)[judged]
     if way_m.sum() < _WAY_M:
-        return ""
+        return None
     off = np.asarray(wrap_angle(np.arctan2(v[judged, 1], v[judged, 0]) - track.yaw_rad[judged]))
     share = float(way_m[np.abs(off) > np.radians(_SIDEWAYS_DEG)].sum() / way_m.sum())
     if share < _MOST:
-        return ""
-    said = (
+        return None
+    seen = (
         f"the course is more than {_SIDEWAYS_DEG:.0f} deg off the solved heading for {percent(share)} of the {way_m.sum():.0f} m "
-        f"made above {_MOVES_MPS:.0f} m/s: unless the vessel goes sideways or astern"
+        f"made above {_MOVES_MPS:.0f} m/s"
     )
+    unless = "unless the vessel goes sideways or astern"
     mean = complex((way_m * np.exp(1j * off)).sum() / way_m.sum())
     if abs(mean) < _STEADY or recording.imu is None or recording.imu.sensor not in config.sensors:
-        return f"{said}, the heading is wrong: check the IMU's axes (mount, signs of its rates and accelerations) and the compasses"
+        wrong = (
+            "the heading is wrong: check the IMU's axes (mount, signs of its rates and accelerations) and the compasses"
+        )
+        return MountDoubt(seen, f"{unless}, {wrong}")
     _, R_body_imu = mount_of(recording.imu.sensor, config.sensors[recording.imu.sensor], recording.mounts)
     yaw_deg = float(np.degrees(rpy_from_rotation(R_body_imu)[2]))
     turned = float(np.degrees(wrap_angle(np.radians(yaw_deg) - np.angle(mean))))
-    return (
-        f"{said}, {recording.imu.sensor}.mount.rpy_deg[2] should be about {turned:.0f} instead of {yaw_deg:.0f}, or the heading from "
-        "a compass, a pose sensor or start.heading_deg is off by that much"
+    cure = (
+        f"{unless}, {recording.imu.sensor}.mount.rpy_deg[2] should be about {turned:.0f} instead of {yaw_deg:.0f}, or the heading "
+        "from a compass, a pose sensor or start.heading_deg is off by that much"
     )
+    return MountDoubt(seen, cure)

@@ -94,7 +94,7 @@ def odometry_report(
     """
     rows = stream.rows[sane(stream)]
     speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
-    name = stream.topic.lower()
+    name, reverse = stream.topic.lower(), False
     truth = any(word in name for word in ("truth", "groundtruth", "/gt"))
     if truth:
         role, why = "truth", "its name says so"
@@ -103,7 +103,8 @@ def odometry_report(
     else:
         axes, fit = axes_of(stream, stamps_ns, p_m, scatter_m)
         role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: looks like wheel odometry"
-        why = f"{why}; {_REVERSED}" if _astern(rows[:, 7]) else why
+        reverse = _astern(rows[:, 7])
+        why = f"{why}; {_REVERSED}" if reverse else why
         if axes not in (None, BODY_AXES):
             role, why = "pose", f"its speeds are none along the craft: {fit}"
     if not world.pose and role != "check_speed":
@@ -118,6 +119,7 @@ def odometry_report(
         origin=world.origin,
         world=world.why,
         grid=world.grid and not truth,
+        reverse=reverse,
     )
 
 

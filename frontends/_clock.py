@@ -84,7 +84,7 @@ def gain(stamps_ns: Stamps, logs_ns: Stamps) -> Gain:
     return Gain(gained_s, 0.0 if uneven_s > _EVEN * abs(gained_s) else float(slope) * 1e6)
 
 
-class Step(NamedTuple):
+class ClockStep(NamedTuple):
     """How a clock was set against the recording times: by how much, s, forward positive, and when, recording time, ns."""
 
     by_s: float
@@ -97,7 +97,7 @@ class Step(NamedTuple):
         return f"{said}: no time_offset_s holds on both sides, and no bound includes it; take one side (--start, --duration)"
 
 
-def step(stamps_ns: Stamps, logs_ns: Stamps) -> Step | None:
+def step(stamps_ns: Stamps, logs_ns: Stamps) -> ClockStep | None:
     """Return the one step in which a clock gains all that it gains on the recording times; None where it gains otherwise, or hardly."""
     gained_s = gain(stamps_ns, logs_ns).gained_s
     if abs(gained_s) < EPOCH_LIMIT_S:  # messages are delayed by less
@@ -111,7 +111,7 @@ def step(stamps_ns: Stamps, logs_ns: Stamps) -> Step | None:
         return None
     off_s = np.abs(ahead_s - np.where(np.arange(len(later)) < first, before_s, after_s))
     even = float(np.percentile(off_s, 100.0 * _STEADY)) < _EVEN * abs(gained_s)
-    return Step(gained_s, int(logs_ns[first])) if even else None
+    return ClockStep(gained_s, int(logs_ns[first])) if even else None
 
 
 def corrected_ns(stamp_ns: int, config: SensorConfig, elapsed_ns: int) -> int:

@@ -83,6 +83,8 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     for compass in (c for c in inspection.compasses if not c.usable):
         yield [f"# orientation of {compass.topic}: left out as a compass; {compass.why}"]
     yield from _velocities(inspection)
+    wheels = [o for o in inspection.odometry if o.role == "check_speed" and not filtered(o.topic)]
+    yield from (_wheels_block(_numbered("wheels", k), item) for k, item in enumerate(wheels))
     for k, item in enumerate(o for o in inspection.odometry if o.role == "pose"):
         yield [
             f"{_numbered('pose', k)}:",
@@ -240,8 +242,8 @@ def _with_clock(block: list[str], inspection: Inspection) -> list[str]:
 
 def _topic_lines(topic: str) -> list[str]:
     """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
-    name, _, sentence = topic.partition(" ")
-    return [f"  topic: {name}", *([f"  nmea: [{sentence}]"] if sentence else [])]
+    name, *sentence = topic.split(" ")[:2]
+    return [f"  topic: {name}", *(f"  nmea: [{said}]" for said in sentence)]
 
 
 def _numbered(name: str, k: int) -> str:
@@ -394,6 +396,16 @@ def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
     ]  # fmt: skip
 
 
+def _wheels_block(name: str, item: OdometryReport) -> list[str]:
+    turned = ["  mount: {rpy_deg: [0.0, 0.0, 180.0]}  # guess: its sign looks wrong"] if item.reverse else []
+    return [
+        f"{name}:", "  kind: body_velocity", f"  topic: {item.topic}",
+        "  enabled: false  # guess: true to fuse it, if held-out fixes come out no worse; then delete check_speed_topic",
+        "  axes: [x]  # guess: [x, y] for wheels that do not slip sideways",
+        *turned,
+    ]  # fmt: skip
+
+
 def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, off: str | None) -> list[str]:
     lines = [f"{name}:", "  kind: gnss_velocity", *_topic_lines(twist.topic)]
     if off is not None:
@@ -502,6 +514,4 @@ def _beside(odometry: tuple[OdometryReport, ...]) -> list[str]:
         lines.append(f"{off}truth_topic: {item.topic}  # guess: {item.why}; {item.world}; for comparison, never fused")
     for k, item in enumerate(o for o in odometry if o.role == "check_speed"):
         lines.append(f"{'# ' if k else ''}check_speed_topic: {item.topic}  # guess: {item.why}; compared, never fused")
-    if any(o.role == "check_speed" for o in odometry):
-        lines.append("# to fuse a speed along the vessel instead: a sensor of kind body_velocity, if it slips little")
     return lines

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from graphloc.blocks import MountConfig
 from graphloc.frames import Array
+from graphloc.frontends._sanity import lever_warning
 from graphloc.frontends._source import TF_STATIC, Bag
 from graphloc.frontends._tf import StaticTree
 
@@ -34,9 +35,12 @@ def mounts_of(
             tree.take(raw.msgtype, msg)
     if tree.damage:
         bag.warnings.append(f"{bag.name}: {tree.damage}; {block} have their mounts from the rest")
-    return {
+    found = {
         name: tree.mount(body_frame, mount.tf_frame, f"{bag.name}: {block}.{name}.mount.tf_frame")
         if mount.tf_frame
         else (mount.t_body_sensor_m, mount.R_body_sensor)
         for name, mount in mounts.items()
     }
+    for name, (t, _) in found.items():
+        bag.warnings += lever_warning(f"{block}.{name}", t, mounts[name].tf_frame)
+    return found

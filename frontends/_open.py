@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import logging
+import re
 import warnings
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +22,9 @@ from graphloc.frontends._unpack import limit_unpacking
 
 log = logging.getLogger(__name__)
 limit_unpacking()
+_PART = re.compile(r"_(\d{1,6})$")  # at the end of a stem: number of a part of a split bag
+_GOES_ON_S = 2.0  # within which a recorder has opened the next part
+_MOST_LOOKED_AT = 20  # files whose number would fit
 HINTS = {
     ".bag": "try `rosbag reindex`",
     ".mcap": "try `mcap recover`",
@@ -130,6 +134,36 @@ class BagOpener:
             return False
         self._append(path, reader)
         return True
+
+
+def left_beside(opened: Sequence[Opened]) -> list[str]:
+    """Return a line for each file of a split bag that lies beside the part after or before it, which is not read.
+
+    By its number and its recording times: `run_1.bag` and `run_2.bag` may be two runs.
+    """
+    lines, read = [], {o.path.resolve() for o in opened}
+    read |= {file for folder in list(read) if folder.is_dir() for file in folder.iterdir()}
+    for path, reader in opened:
+        number = _PART.search(path.stem)
+        if path.is_dir() or number is None or not reader.message_count:
+            continue
+        for step, how in ((1, "goes on in"), (-1, "begins in")):
+            named = sorted(path.resolve().parent.glob(f"*_{int(number[1]) + step}{path.suffix}"))
+            for other in [file for file in named if file not in read][:_MOST_LOOKED_AT]:
+                if _meets(reader, other, step):
+                    lines.append(f"{path}: its recording {how} {other.name}, which is not read: give all parts of it")
+    return lines
+
+
+def _meets(reader: Reader1 | Reader2, other: Path, step: int) -> bool:
+    """Whether another file is recorded right after this one (step 1), or right before it (-1)."""
+    try:
+        with closing(_open_reader(type(reader), as_ros2(other) or other)) as beside:
+            gap_ns = beside.start_time - reader.end_time if step > 0 else reader.start_time - beside.end_time
+            return bool(beside.message_count and abs(gap_ns) <= _GOES_ON_S * 1e9)
+    except Exception as error:  # noqa: BLE001 - as `BagOpener` does
+        log.debug("%s: not looked at: %s", other, error)
+        return False
 
 
 def _not_named(folder: Path) -> list[str]:

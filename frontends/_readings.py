@@ -148,40 +148,42 @@ def _drop(readings: Readings, bad: NDArray[np.bool_], rejection: Rejection, warn
 
 
 def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
-    """Return a line for each sensor whose clock differs from that of the IMU (or, without one, of the first sensor)."""
-    latency = {r.sensor: _clock.usual_latency_s(r.stamps(), r.logs()) for r in sensors if r.stamps_ns}
-    if len(latency) < 2:
+    """Return a line for each sensor whose clock differs from that of the IMU (or, without one, of the first sensor).
+
+    Where a clock was set during the run, a line on that instead, for all whom it concerns: if it is the IMU's, all others.
+    """
+    told = [r for r in sensors if r.stamps_ns]
+    if len(told) < 2:
         return []
-    reference = next((r.sensor for r in sensors if r.config.kind == "imu" and r.stamps_ns), next(iter(latency)))
+    reference = next((r for r in told if r.config.kind == "imu"), told[0])
+    gains = {r.sensor: _clock.gain(r.stamps(), r.logs()) for r in told}
+    usual, usual_s = gains[reference.sensor], _clock.usual_latency_s(reference.stamps(), reference.logs())
+    steps = {r.sensor: _clock.step(r.stamps(), r.logs()) for r in told}
+    stepped: dict[str, list[str]] = {}
     lines = []
-    for sensor, value in latency.items():
-        behind = value - latency[reference]
-        if abs(behind) > _clock.EPOCH_LIMIT_S:
-            lines.append(
-                f"{sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "
-                f"{reference}, by the recording times; if that is right, add {behind:.3f} to its time_offset_s (how much longer its "
-                "messages take than those of the other is in it)"
-            )
-    gains = {r.sensor: _clock.gain(r.stamps(), r.logs()) for r in sensors}
-    usual = gains[reference]
-    steps = {r.sensor: _clock.step(r.stamps(), r.logs()) for r in sensors}
-    for r in sensors:
-        own = gains[r.sensor]
+    for r in told:
+        own, behind = gains[r.sensor], _clock.usual_latency_s(r.stamps(), r.logs()) - usual_s
         gain_s, drift_ppm = own.gained_s - usual.gained_s, own.drift_ppm - usual.drift_ppm
-        if abs(gain_s) <= _clock.GAIN_LIMIT_S:
+        whose = r.sensor if steps[r.sensor] else reference.sensor
+        if abs(gain_s) > _clock.GAIN_LIMIT_S and (step := steps[whose]) is not None:
+            stepped.setdefault(step.said(whose), []).append(r.sensor)
             continue
-        whose = r.sensor if steps[r.sensor] else reference
-        if (step := steps[whose]) is not None:
-            lines.append(f"{r.sensor}: {step.said(whose)}")
-            continue
-        cure = "synchronise the clocks, or smooth short parts (--start, --duration)"
-        if own.even and usual.even and drift_ppm:
-            cure = f"set its clock_drift_ppm to {r.config.clock_drift_ppm + drift_ppm:.1f}"
-        lines.append(
-            f"{r.sensor}: its clock {'gains' if gain_s > 0 else 'loses'} {abs(gain_s):.2f} s on that of {reference} during the "
-            f"run, by the recording times: no time_offset_s holds throughout, and no bound includes it; {cure}"
-        )
-    return lines
+        if abs(behind) > _clock.EPOCH_LIMIT_S:
+            now_s = r.config.time_offset_s
+            lines.append(
+                f"{r.sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "
+                f"{reference.sensor}, by the recording times; if that is right, set its time_offset_s to {now_s + behind:.3f}"
+                f"{f' instead of {now_s:g}' if now_s else ''} (how much longer its messages take than those of the other is in it)"
+            )
+        if abs(gain_s) > _clock.GAIN_LIMIT_S:
+            cure = "synchronise the clocks, or smooth short parts (--start, --duration)"
+            if own.even and usual.even and drift_ppm:
+                cure = f"set its clock_drift_ppm to {r.config.clock_drift_ppm + drift_ppm:.1f}"
+            lines.append(
+                f"{r.sensor}: its clock {'gains' if gain_s > 0 else 'loses'} {abs(gain_s):.2f} s on that of {reference.sensor} "
+                f"during the run, by the recording times: no time_offset_s holds throughout, and no bound includes it; {cure}"
+            )
+    return [*(f"{', '.join(names)}: {said}" for said, names in stepped.items()), *lines]
 
 
 def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | None, list[LedgerRow]]:

@@ -189,7 +189,8 @@ class OdometryReport:
     """An odometry or pose topic: role is 'truth', 'check_speed', 'pose', or 'other' of what is no pose of the vessel.
 
     `origin`: latitude, longitude (deg) and height (m) of its frame's origin, where the frame is
-    east-north-up by the fixes; `world`: the evidence. `grid`: whether its positions are as large as in a map grid.
+    east-north-up by the fixes; `world`: the evidence. `grid`: whether its positions are as large as in a map grid. `reverse`: as of a
+    velocity.
     """
 
     topic: str
@@ -201,6 +202,7 @@ class OdometryReport:
     origin: Vec | None
     world: str
     grid: bool = False
+    reverse: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

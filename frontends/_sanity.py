@@ -18,9 +18,24 @@ FAR_M = 100e3
 NEVER_STILL_RADPS = 0.5
 """Median rate that no vessel keeps up for a whole run (29 deg/s)."""
 HALF = "half an IMU, and both halves must come in one message (RealSense: unite_imu_method)"
+FAR_LEVER_M = 50.0
+"""A sensor this far from the origin of body is on a ship, or its mount is not in metres."""
 _FEWEST = 100  # samples, that are not all 0 by chance
 _SWING_NS, _NO_SWING_RAD = 5_000_000_000, 1.5
 _STEP_S = 0.2  # at most, of a step that rates are integrated over
+
+
+def lever_warning(name: str, t_body_sensor_m: Array, tf_frame: str | None) -> list[str]:
+    """Return a line on a sensor (its `name`, as in vessel.yaml) so far from body (3,), m, that a mount in cm or mm is likelier.
+
+    Args:
+        tf_frame: its frame in /tf_static, where the mount is from there.
+    """
+    far_m = float(np.linalg.norm(t_body_sensor_m))
+    if far_m <= FAR_LEVER_M:
+        return []
+    by = f"{tf_frame} in /tf_static" if tf_frame else "mount.xyz_m"
+    return [f"{name}: by {by} it sits {far_m:.0f} m from the origin of body: metres are meant; right on a ship only"]
 
 
 def without_gravity(accel: Array) -> bool:

@@ -23,7 +23,7 @@ from rosbags.rosbag1 import Reader as Reader1
 
 from graphloc.errors import InputError
 from graphloc.frontends._clock import refuse_set_back
-from graphloc.frontends._open import HINTS, BagOpener, Opened, text_of
+from graphloc.frontends._open import HINTS, BagOpener, Opened, left_beside, text_of
 from graphloc.frontends._part import BagPart, Bags, recording_times
 from graphloc.frontends._types import MessageTypes
 from graphloc.recording import Span
@@ -89,7 +89,7 @@ class Bag:
             self._stack.close()
             raise InputError("; ".join(opener.broken))
         self._opened = opener.opened
-        self.warnings.extend(opener.broken)
+        self.warnings += [*opener.broken, *left_beside(opener.opened)]
         self.ros1 = isinstance(self._opened[0].reader, Reader1)
         if any(isinstance(o.reader, Reader1) != self.ros1 for o in self._opened):
             self._stack.close()

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import compress
 from typing import Any
@@ -126,6 +126,7 @@ SENTENCES: dict[str, tuple[str, Callable[[str, str], Row | None]]] = {
     **dict.fromkeys(nmea.SPEEDS, (TWIST, _nmea_speed)),
     **dict.fromkeys(nmea.PLACES, (NAV_SAT_FIX, _nmea_fix)),
 }
+_COURSE = " (course, speed)"  # at the end of the name of a stream: what RMC says beside a place
 
 
 _MOST = 1e12
@@ -221,7 +222,8 @@ class TopicData:
 def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
     """Read all topics of the types in `ROWS`, and the static transforms.
 
-    An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type.
+    An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type. RMC gives another one of
+    velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no VTG is on the line.
     """
     streams = {
         t.topic: TopicData(t.topic, t.msgtypes[0])
@@ -248,9 +250,20 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
             if raw.msgtype not in UNSTAMPED:
                 stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
             stream.add(stamp_ns or 0, raw.log_ns, row, raw.file, raw.elapsed_ns)
+    for name in [
+        name for name, stream in streams.items() if name.endswith(_COURSE) and _told_elsewhere(stream, streams)
+    ]:
+        del streams[name]
     for stream in streams.values():
         stream.settle()
     return list(streams.values()), tree
+
+
+def _told_elsewhere(stream: TopicData, streams: Mapping[str, TopicData]) -> bool:
+    """Whether velocities of RMC say nothing, or what VTG on the same line says as well."""
+    line = stream.topic.partition(" ")[0]
+    vtg = any(name.startswith(f"{line} ") and name.endswith("VTG") for name in streams)
+    return vtg or not np.isfinite(stream.rows).any()
 
 
 def _plain(raw: RawMessage, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:
@@ -266,4 +279,6 @@ def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tupl
             msgtype, row_of = SENTENCES[kind]
             name = f"{topic} {talker}{kind}"
             said.append((streams.setdefault(name, TopicData(name, msgtype)), row_of(text, talker + kind)))
+        if kind == "RMC" and (row := _nmea_velocity(text, talker + kind)) is not None:
+            said.append((streams.setdefault(name + _COURSE, TopicData(name + _COURSE, TWIST)), row))
     return said

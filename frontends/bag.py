@@ -37,6 +37,7 @@ from graphloc.frontends._readings import (
 )
 from graphloc.frontends._references import Reference, check_speed, true_trajectory
 from graphloc.frontends._rejections import Rejection, malformed
+from graphloc.frontends._sanity import lever_warning
 from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, turn_warnings, wander_warning
@@ -100,6 +101,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
     rows += reject_set_back(sensors, [b for b in (truth, check) if b], warnings)
     warnings += clock_warnings(sensors)
     mounts = _mounts(config, tree, bag.name)
+    warnings += _far_levers(config, mounts)
     imu, measurements, dropped = _usable(sensors, config, warnings)
     rows += dropped
     if imu is not None:
@@ -332,6 +334,15 @@ def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str
         for name, sensor in config.sensors.items()
         if sensor.enabled and sensor.mount.tf_frame
     }
+
+
+def _far_levers(config: VesselConfig, mounts: Mapping[str, tuple[Array, Array]]) -> list[str]:
+    enabled = ((name, sensor.mount) for name, sensor in config.sensors.items() if sensor.enabled)
+    return [
+        line
+        for name, mount in enabled
+        for line in lever_warning(name, mounts[name][0] if name in mounts else mount.t_body_sensor_m, mount.tf_frame)
+    ]
 
 
 def _refuse_unit(imu: ImuSeries, sensors: Sequence[Readings]) -> None:

@@ -13,7 +13,7 @@ from graphloc import app
 from graphloc.config import VesselConfig
 from graphloc.errors import ConfigError, InputError, SolveError
 from graphloc.eval import ekf
-from graphloc.eval.drill import Case, Failure, Measured, Struck, Times, Window, cut, judge, schedule, script
+from graphloc.eval.drill import Case, DrillWindow, Failure, Measured, Struck, Times, cut, judge, schedule, script
 from graphloc.eval.drill.measure import Drilled, compared
 from graphloc.eval.drill.plan import judged_until, windows
 from graphloc.eval.parallel import run_jobs
@@ -91,7 +91,7 @@ class _Bench:
         run: its track is the reference where there is no truth. parts: the windows. jobs: parallel processes.
     """
 
-    def __init__(self, run: app.Run, parts: Sequence[Window], jobs: int, progress: Progress) -> None:
+    def __init__(self, run: app.Run, parts: Sequence[DrillWindow], jobs: int, progress: Progress) -> None:
         self._run, self._parts, self._processes, self._progress = run, parts, jobs, progress
         self._pieces = [cut(run.recording, part) for part in parts]
         track = run.solution.trajectory
@@ -162,7 +162,7 @@ def _stamps(recording: Recording) -> np.ndarray:
     return recording.imu.stamps_ns
 
 
-def _first_ns(tracks: Tracks, part: Window) -> int:
+def _first_ns(tracks: Tracks, part: DrillWindow) -> int:
     online, _ = tracks["graphloc online"]
     return part.begin_ns if online is None else int(online.stamps_ns[0])
 
@@ -172,7 +172,7 @@ def _typical_bound_m(track: Trajectory) -> float:
     return float(np.median(bounds_95(track.cov)[:, 0]))
 
 
-def _started_there(config: VesselConfig, recording: Recording, part: Window, track: Trajectory) -> VesselConfig:
+def _started_there(config: VesselConfig, recording: Recording, part: DrillWindow, track: Trajectory) -> VesselConfig:
     """Return the configuration for a window; without a heading sensor, it starts with the heading of the run there."""
     told = any(isinstance(m, CompassHeading) for m in recording.measurements)
     at = np.array([max(part.begin_ns, int(track.stamps_ns[0]))])

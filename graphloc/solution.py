@@ -6,6 +6,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +77,24 @@ class SlowEstimate:
             return None
         columns = [self.axes.index(axis) for axis in axes]
         return np.asarray(self.value[np.argmin(self.sigma[:, columns].sum(axis=1)), columns])
+
+
+class Graded(str):
+    """A warning whose figure each leg of a run finds for itself; a plain line to all who read it.
+
+    Attributes:
+        about: what it says, whatever the figure. figure: the larger, the worse.
+    """
+
+    __slots__ = ("about", "figure")
+    about: str
+    figure: float
+
+    def __new__(cls, line: str, about: str = "", figure: float = 0.0) -> Self:
+        """Return the line; by default, for those who copy it, without what it is about."""
+        made = super().__new__(cls, line)
+        made.about, made.figure = about, figure
+        return made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,7 +17,7 @@ from graphloc.eval.simulate import SimulatedRun, find_scenario, harbour_scenario
 from graphloc.eval.simulate._truth import Motion
 from graphloc.eval.simulate.camera import Camera
 from graphloc.eval.simulate.harbour import make_harbour
-from graphloc.eval.simulate.rig import CameraConfig, HullConfig, RigConfig, load_rig
+from graphloc.eval.simulate.rig import HullConfig, RigCamera, RigConfig, load_rig
 from graphloc.eval.simulate.scene import Scene, scene_of
 from graphloc.frames import Array
 
@@ -58,7 +58,7 @@ def seen_from(p: Array, R: Array, K: Array) -> Array:
 
 @contextmanager
 def bench(
-    tag: dict[str, Any], camera: CameraConfig | None = None, condition: str = "optimal", **more: Any
+    tag: dict[str, Any], camera: RigCamera | None = None, condition: str = "optimal", **more: Any
 ) -> Iterator[tuple[SimulatedRun, Camera]]:
     """A vessel lying still at the origin, bow to the north, before one tag on a wall."""
     harbour = make_harbour(
@@ -73,7 +73,7 @@ def bench(
     block = ((-3.0, -1.0), (-2.0, -1.0), (-2.0, 1.0), (-3.0, 1.0))  # the vessel: behind the camera
     hull = HullConfig(outline=block, top_m=0.5, cabin=block, cabin_top_m=1.0)
     rig = RigConfig(
-        **{**dict(load_rig("tiara")), "hull": hull, "cameras": {"camera": camera or CameraConfig(mount=LOOKING_AHEAD)}}
+        **{**dict(load_rig("tiara")), "hull": hull, "cameras": {"camera": camera or RigCamera(mount=LOOKING_AHEAD)}}
     )
     run = replace(run, harbour=harbour, docks=(), rig=rig, motion=_Still())
     yield run, Camera("camera", Scene(harbour, (), 0.0, (), rig.hull), run)

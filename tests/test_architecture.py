@@ -63,6 +63,16 @@ def test_only_the_door_opens_to_all() -> None:
     } == DOOR
 
 
+def test_a_name_means_one_class() -> None:
+    """But for private ones, of a module alone."""
+    places: dict[str, list[str]] = {}
+    for path in MODULES:
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
 def test_import_is_light_and_writes_nothing(tmp_path: Path) -> None:
     code = (
         "import sys, graphloc, graphloc.cli; heavy = {'gtsam', 'cv2', 'open3d', 'matplotlib', 'plotly', 'rosbags'}; "

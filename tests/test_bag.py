@@ -139,6 +139,45 @@ def test_split_ros1_bags(tmp_path: Path) -> None:
         assert recording.warnings == ()
 
 
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        ("ros1", ["run_9.bag", "run_10.bag", "run_11.bag"]),
+        ("ros1", ["2023-11-14-22-13-20_0.bag", "2023-11-14-22-13-24_1.bag", "2023-11-14-22-13-28_2.bag"]),
+        ("mcap", ["run_0.mcap", "run_1.mcap", "run_2.mcap"]),
+        ("sqlite3", ["run_0.db3", "run_1.db3", "run_2.db3"]),
+    ],
+)
+def test_parts_of_a_split_bag_that_are_left_beside_are_said(tmp_path: Path, kind: str, names: list[str]) -> None:
+    make, parts = Messages(1 if kind == "ros1" else 2), []
+    for k, name in enumerate(names):
+        start_ns = START_NS + 4 * k * S
+        if kind == "ros1":
+            write_bag(tmp_path / name, make, still_run(make, start_ns=start_ns), kind)
+        else:
+            stem, _, suffix = name.partition(".")
+            folder = write_bag(tmp_path / "written" / stem, make, still_run(make, start_ns=start_ns), kind)
+            (folder / f"{stem}.{suffix}").rename(tmp_path / name)
+        parts.append(tmp_path / name)
+    assert read_recording(parts, vessel()).warnings == ()
+    assert read_recording(parts[0], vessel()).warnings == (
+        f"{parts[0]}: its recording goes on in {names[1]}, which is not read: give all parts of it",
+    )
+    assert [w.partition(" its ")[2] for w in read_recording(parts[1], vessel()).warnings] == [
+        f"recording goes on in {names[2]}, which is not read: give all parts of it",
+        f"recording begins in {names[0]}, which is not read: give all parts of it",
+    ]
+
+
+def test_runs_with_numbers_are_no_parts(tmp_path: Path) -> None:
+    """Recorded a minute apart; and of one the beginning alone is there."""
+    make = Messages(1)
+    for k in range(2):
+        write_bag(tmp_path / f"run_{k}.bag", make, still_run(make, start_ns=START_NS + 60 * k * S), "ros1")
+    (tmp_path / "run_2.bag").write_bytes(b"#ROSBAG V2.0\n")
+    assert read_recording(tmp_path / "run_1.bag", vessel()).warnings == ()
+
+
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
 def test_files_that_metadata_does_not_name_are_reported(tmp_path: Path, kind: str) -> None:
     """Half of a run was left out without a word."""

@@ -472,9 +472,20 @@ def test_a_sensor_in_another_epoch_is_reported_and_not_fixed(tmp_path: Path) -> 
     assert recording.measurements[0].stamp_ns == START_NS + 18 * S
     (line,) = recording.warnings
     assert "gnss: its clock is 18.000 s ahead of that of imu" in line
-    assert "add -18.000 to its time_offset_s" in line
+    assert "set its time_offset_s to -18.000 (" in line
     path = tmp_path / "run"
     assert read_recording(path, vessel(gnss={"topic": "/fix", "time_offset_s": -18.0})).warnings == ()
+    (line,) = read_recording(path, vessel(gnss={"topic": "/fix", "time_offset_s": -50.0})).warnings
+    assert "gnss: its clock is 32.000 s behind" in line
+    assert "set its time_offset_s to -18.000 instead of -50 (" in line
+
+
+@pytest.mark.parametrize(("xyz_m", "far"), [([1.5, 0.0, 0.8], ""), ([150.0, 0.0, 80.0], "170 m")])
+def test_a_mount_in_centimetres_is_said(tmp_path: Path, xyz_m: list[float], far: str) -> None:
+    recording = read(tmp_path, still_run(MAKE), gnss={"topic": "/fix", "mount": {"xyz_m": xyz_m}})
+    assert [w for w in recording.warnings if "mount.xyz_m" in w] == [
+        f"gnss: by mount.xyz_m it sits {far} from the origin of body: metres are meant; right on a ship only"
+    ] * bool(far)
 
 
 # units, gravity, swapped axes

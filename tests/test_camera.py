@@ -19,7 +19,7 @@ from graphloc.errors import ConfigError
 from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
 from graphloc.eval.simulate._lens import digitise, exposure, through_lens
 from graphloc.eval.simulate.camera import Camera
-from graphloc.eval.simulate.rig import CameraConfig
+from graphloc.eval.simulate.rig import RigCamera
 from graphloc.eval.simulate.scene import scene_of
 from tests.camerabench import CORNERS, LINEAR, LOOKING_AHEAD, bench, detected, detectors, docking, seen_from
 
@@ -129,7 +129,7 @@ def test_a_tag_is_not_seen_from_behind(detector: Detector) -> None:
 )
 def test_lenses_distort_as_their_model_says(model: str, distortion: tuple[float, ...], detector: Detector) -> None:
     """Corners of a tag off the axis, by the published formulae, hand-coded here."""
-    camera = CameraConfig(mount=LOOKING_AHEAD, model=model, distortion=distortion)  # type: ignore[arg-type]
+    camera = RigCamera(mount=LOOKING_AHEAD, model=model, distortion=distortion)  # type: ignore[arg-type]
     with bench({"at": [8.0, 15.0], "height_m": 5.0, "size_m": 0.8}, camera) as (_, taker):  # larger, its edges bend
         found = detected(detector, LINEAR[taker.take(0.0, 0).pixels])[5]
         corners = np.array([(-0.4, 0.4), (0.4, 0.4), (0.4, -0.4), (-0.4, -0.4)])
@@ -152,7 +152,7 @@ def test_lenses_distort_as_their_model_says(model: str, distortion: tuple[float,
 
 def test_a_lens_that_folds_is_refused() -> None:
     """Past the radius where its polynomial turns round, no ray leads to a pixel."""
-    camera = CameraConfig(mount=LOOKING_AHEAD, distortion=(-0.3, 0.1, 0.001, 0.001, -0.02))
+    camera = RigCamera(mount=LOOKING_AHEAD, distortion=(-0.3, 0.1, 0.001, 0.001, -0.02))
     with pytest.raises(ConfigError, match="distortion"), bench({"at": [0.0, 15.0], "height_m": 3.0}, camera):
         pass
 
@@ -197,7 +197,7 @@ def test_darkness_costs_light_and_gains_noise_and_drops_hide(detector: Detector)
 
 def test_exposure_makes_the_mean_grey_and_noise_is_that_of_counts() -> None:
     """A flat field: 0.2 of white; variance of shot noise is its count, read noise adds its square."""
-    camera = CameraConfig(mount=LOOKING_AHEAD, width_px=640, height_px=480)
+    camera = RigCamera(mount=LOOKING_AHEAD, width_px=640, height_px=480)
     field = np.full((480, 640), 0.5, dtype=np.float32)
     ms, gain = exposure(field, camera)
     assert gain == 1.0
@@ -210,7 +210,7 @@ def test_exposure_makes_the_mean_grey_and_noise_is_that_of_counts() -> None:
 
 def test_motion_smears_by_its_length() -> None:
     """A point becomes a streak: its variance along the motion is L^2 / 12 (and little more, from the grid)."""
-    camera = CameraConfig(mount=LOOKING_AHEAD, width_px=256, height_px=256, blur_px=0.0)
+    camera = RigCamera(mount=LOOKING_AHEAD, width_px=256, height_px=256, blur_px=0.0)
     field = np.zeros((256, 256), dtype=np.float32)
     field[128, 128] = 1.0
     for motion in (np.array([6.0, 0.0]), np.array([3.0, -4.0])):
@@ -264,7 +264,7 @@ def test_two_cameras_share_the_sun_and_no_noise() -> None:
 
 
 def test_a_dark_field_has_its_read_noise() -> None:
-    camera = CameraConfig(mount=LOOKING_AHEAD, width_px=640, height_px=480)
+    camera = RigCamera(mount=LOOKING_AHEAD, width_px=640, height_px=480)
     noise = np.random.default_rng(1).standard_normal((480, 640), dtype=np.float32)
     ms, gain = 30.0, 16.0
     electrons = 60.0
@@ -275,7 +275,7 @@ def test_a_dark_field_has_its_read_noise() -> None:
 
 def test_a_point_of_light_is_blurred_and_veiled() -> None:
     """Its core is a Gaussian of the lens; stray light takes 4.5 % of it, times its weather, and loses none."""
-    camera = CameraConfig(mount=LOOKING_AHEAD, width_px=1600, height_px=1600, blur_px=1.5)
+    camera = RigCamera(mount=LOOKING_AHEAD, width_px=1600, height_px=1600, blur_px=1.5)
     field = np.zeros((1600, 1600), dtype=np.float32)
     field[800, 800] = 1.0
     for times in (1.0, 4.0):
@@ -296,7 +296,7 @@ def test_tags_are_hidden_by(way: str, detector: Detector) -> None:
     more: dict[str, Any] = {}
     camera = None
     if way == "own cabin":  # from behind it
-        camera = CameraConfig(mount=MountConfig(xyz_m=(-5.0, 0.0, -0.5), rpy_deg=(-90.0, 0.0, -90.0)))
+        camera = RigCamera(mount=MountConfig(xyz_m=(-5.0, 0.0, -0.5), rpy_deg=(-90.0, 0.0, -90.0)))
     elif way == "water":
         tags["height_m"] = -1.0
     else:

@@ -77,6 +77,11 @@ def test_a_draft_from_inspect_gives_a_track(
         ("kind: gnss", "kind: gnsss", "did you mean 'gnss'"),
         ("sensors:", "sensros:", "did you mean 'sensors'"),
         ("sensors:", "sensors:\n  b: {kind: gnss, topic: /gnss/fix}", "both read /gnss/fix, which would count twice"),
+        (
+            "topic: /matcher/pose",
+            "topic: /truth",
+            "truth_topic: matcher fuses /truth, and a comparison with it says nothing",
+        ),
         ("topic: /gnss/fix", "topic: /gnss/fxi", "/gnss/fix"),
         ("kind: imu", "kind: imu\n    accel_unit: furlong", "accel_unit"),
         ("kind: imu", "kind: imu\n    accel_noise_ug_per_sqrt_hz: -3", "accel_noise_ug_per_sqrt_hz"),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from graphloc.drills import _or_why_not, _started_there, as_it_comes, drill
-from graphloc.eval.drill import Case, Failure, Times, Window, cut, figures, judge, page, schedule, script
+from graphloc.eval.drill import Case, DrillWindow, Failure, Times, cut, figures, judge, page, schedule, script
 from graphloc.eval.drill.measure import Drilled, Measured, State, compared, summed
 from graphloc.eval.drill.plan import judged_until, windows
 from graphloc.eval.plots import Line, Points, colour_of
@@ -216,7 +216,7 @@ def straight(length_s: float, off_m: Callable[[Array], Array], sigma_m: float = 
 
 def judged(off_m: Callable[[Array], Array], sigma_m: float = 0.2, normal: Trajectory | None = None) -> Measured:
     """A failure from 30 s to 40 s of 100 s."""
-    window, truth = Window(begin_ns=0, end_ns=100 * S, whole=True), straight(100.0, lambda t: 0.0 * t)
+    window, truth = DrillWindow(begin_ns=0, end_ns=100 * S, whole=True), straight(100.0, lambda t: 0.0 * t)
     failure = Failure(name="f", family="f", length_s=10.0, strike=lambda *_: pytest.fail("not struck"))
     case = Case(failure=failure, window=0, begin_ns=30 * S, seed=0)
 
@@ -249,7 +249,7 @@ def test_locked_out_and_unsure_are_told_apart() -> None:
 
 
 def test_an_estimator_that_gives_nothing_is_reported() -> None:
-    window, truth = Window(begin_ns=0, end_ns=100 * S, whole=True), straight(100.0, lambda t: 0.0 * t)
+    window, truth = DrillWindow(begin_ns=0, end_ns=100 * S, whole=True), straight(100.0, lambda t: 0.0 * t)
     failure = Failure(name="f", family="f", length_s=10.0, strike=lambda *_: pytest.fail("not struck"))
     nothing = compared(None, truth, window, sure=True)
     found = judge(Case(failure=failure, window=0, begin_ns=30 * S, seed=0), "e", nothing, nothing, 0, "never started")
@@ -275,7 +275,7 @@ def test_a_filter_that_a_failure_broke_ends_no_drill() -> None:
 
 def test_headings_are_apart_by_the_shorter_way() -> None:
     """175 deg beside -175 deg."""
-    window, track = Window(begin_ns=0, end_ns=10 * S, whole=True), straight(10.0, lambda t: 0.0 * t)
+    window, track = DrillWindow(begin_ns=0, end_ns=10 * S, whole=True), straight(10.0, lambda t: 0.0 * t)
 
     def turned(deg: float) -> Trajectory:
         R = rotation_from_rpy_deg(np.array([0.0, 0.0, deg]))
@@ -297,7 +297,7 @@ def test_only_a_window_without_a_compass_is_told_its_heading(run: SimulatedRun, 
     imu = recording.imu
     assert imu is not None
     begin = int(imu.stamps_ns[len(imu) // 2])
-    whole = Window(begin_ns=begin, end_ns=begin + 10 * S, whole=True)
+    whole = DrillWindow(begin_ns=begin, end_ns=begin + 10 * S, whole=True)
     blind = replace(
         recording, measurements=tuple(m for m in recording.measurements if not isinstance(m, CompassHeading))
     )
@@ -314,7 +314,7 @@ def test_only_a_window_without_a_compass_is_told_its_heading(run: SimulatedRun, 
 
 def test_the_reference_is_only_as_good_as_its_own_bound() -> None:
     """0.6 m off with 0.2 m and 0.2 m: 0.6^2 / (0.2^2 + 0.2^2) = 4.5 < 5.99 < 0.6^2 / 0.2^2."""
-    window, reference = Window(begin_ns=0, end_ns=20 * S, whole=True), straight(20.0, lambda t: 0.0 * t)
+    window, reference = DrillWindow(begin_ns=0, end_ns=20 * S, whole=True), straight(20.0, lambda t: 0.0 * t)
     track = straight(20.0, lambda t: 0.0 * t + 0.6)
     assert compared(track, reference, window, sure=False).held.all()
     assert not compared(track, reference, window, sure=True).held.any()
@@ -333,7 +333,7 @@ def test_failures_strike_where_they_fit(recording: Recording) -> None:
     first, last = int(recording.imu.stamps_ns[0]), int(recording.imu.stamps_ns[-1])
     failures = script(recording)[0]
     parts = windows(recording, 120.0, 3)
-    assert parts == (Window(begin_ns=first, end_ns=last, whole=True),)
+    assert parts == (DrillWindow(begin_ns=first, end_ns=last, whole=True),)
     cases, left = schedule(failures, parts, [first + 20 * S], 3, 0)
     ((name, why),) = left
     assert name == "GNSS outage, 120 s"

@@ -164,8 +164,9 @@ def test_wheels_that_go_astern_throughout_do_not_turn_the_imu(topic: str, sign: 
     assert f"yaw by the motion of {topic}" in found.imus[0].mount.evidence
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
     assert ("goes astern nearly all the time" in text) == (sign < 0.0)
-    if topic == "/vehicle/twist":
-        assert config.sensors["body_velocity"].mount.rpy_deg[2] == (0.0 if sign > 0.0 else 180.0)
+    (along,) = [sensor for sensor in config.sensors.values() if sensor.kind == "body_velocity"]
+    assert (along.topic, along.axes, along.enabled) == (topic, ("x",), False)
+    assert along.mount.rpy_deg[2] == (0.0 if sign > 0.0 else 180.0)
 
 
 def test_a_vector_that_nothing_tells_to_be_a_velocity_is_not_fused(tmp_path: Path) -> None:

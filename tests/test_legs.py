@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run of hours is solved in legs: as good as in one, and every message has its row."""
 
+import re
 from collections.abc import Sized
 from dataclasses import replace
 from typing import Any
@@ -184,3 +185,25 @@ def test_turning_where_legs_meet_is_no_jump(legs: Solution) -> None:
     dt = np.diff(legs.trajectory.stamps_ns) * 1e-9
     rate = legs.gyro_radps[:-1, 2]
     assert np.abs(wrap_angle(np.diff(yaw) - rate * dt)).max() < np.radians(2.0)
+
+
+def test_a_figure_that_each_leg_finds_anew_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an IMU configured with a tenth of its noise: the line of the leg that needs most, not one of each leg."""
+    noisy: dict[str, Any] = {"accel_noise_ug_per_sqrt_hz": 2000.0, "gyro_noise_mdps_per_sqrt_hz": 40.0}
+    run = simulate(replace(LOOPS, duration_s=60.0, pose_hz=4.0, pose_sigma_m=0.05, false_fraction=0.0, **noisy), 1)
+    make, lines = graphloc.solve.make_solution, list[str]()
+
+    def noted(*args: Any) -> Solution:
+        found = make(*args)
+        lines.extend(w for w in found.stats.warnings if "configured too small" in w)
+        return found
+
+    def times(line: str) -> float:
+        return max(float(to) / float(of) for of, to in re.findall(r"is ([0-9.e+]+), ([0-9.e+]+) is taken", line))
+
+    monkeypatch.setattr(graphloc.solve, "make_solution", noted)
+    imu = run.config.sensors["imu"].model_copy(update={name: 0.1 * value for name, value in noisy.items()})
+    found = solved(replace(run, config=run.config.with_sensors({"imu": imu})), 30.0)
+    assert len(set(lines)) == 2  # or there is nothing to join
+    (said,) = (w for w in found.stats.warnings if "configured too small" in w)
+    assert said == f"{max(lines, key=times)} (the worst of 2 parts of the run that show this)"

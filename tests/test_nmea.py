@@ -5,7 +5,7 @@ import operator
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import reduce
-from math import isnan
+from math import cos, isnan, radians, sin
 from pathlib import Path
 from typing import Any
 
@@ -247,6 +247,51 @@ def test_lines_in_plain_strings_count_from_when_they_were_recorded(tmp_path: Pat
     headings = [m for m in recording.measurements if isinstance(m, CompassHeading)]
     assert [np.degrees(m.yaw_rad) for m in headings] == pytest.approx([80.0 - k for k in range(40)])
     assert sum("has no stamp" in w for w in recording.warnings) == 2
+
+
+def rmc_bag(path: Path, more: Callable[[float, float], list[str]], speeds: bool = True) -> Path:
+    """40 s at 5 Hz in a circle, at 2 m/s, the first 4 s at rest; `more`: sentences beside RMC by speed (kn) and course (deg)."""
+    make, items, lat, lon = Messages(2), list[Item](), 57.7, 11.9
+    for k in range(200):
+        mps, course = (2.0 if k > 20 else 0.0), (3.0 * k) % 360.0
+        lat += 0.2 * mps * cos(radians(course)) / 111_400.0
+        lon += 0.2 * mps * sin(radians(course)) / (111_400.0 * cos(radians(lat)))
+        knots = mps * 3600.0 / 1852.0
+        # At rest receivers leave the course out, or make one up.
+        said = f"{knots:.3f},{course if k > 10 else 222.0:.1f}" if speeds else ","
+        place = f"{minutes(lat, 'NS', 2)},{minutes(lon, 'EW', 3)}"
+        bodies = [f"GPRMC,120000.00,A,{place},{said},141123,,,A", *more(knots, course)]
+        items += [("/line", 1_700_000_000 * S + k * S // 5, make.text(sealed(body))) for body in bodies]
+    return write_bag(path, make, items)
+
+
+@pytest.mark.parametrize(
+    ("more", "speeds", "read"),
+    [
+        (lambda *_: [], True, ("GPRMC",)),
+        (lambda *_: [], False, None),
+        (lambda kn, deg: [f"GPVTG,{deg:.1f},T,,M,{kn:.3f},N,{kn * 1.852:.3f},K,A"], True, ("GPVTG",)),
+        (lambda kn, deg: [f"GNVTG,{deg:.1f},T,,M,{kn:.3f},N,{kn * 1.852:.3f},K,A"], True, ("GNVTG",)),
+    ],
+    ids=["RMC", "without a speed", "VTG", "VTG of another talker"],
+)
+def test_course_and_speed_of_rmc_are_drafted_where_no_vtg_says_them(
+    more: Callable[[float, float], list[str]], speeds: bool, read: tuple[str, ...] | None, tmp_path: Path
+) -> None:
+    drafted, bag = tmp_path / "vessel.yaml", rmc_bag(tmp_path / "run", more, speeds)
+    drafted.write_text(draft_config(inspect_bag(bag)))
+    config = load_config(drafted, KINDS)
+    assert config.of_kind("gnss")["gnss"].nmea == ("GPRMC",)
+    used = config.of_kind("gnss_velocity")
+    assert [sensor.nmea for sensor in used.values()] == ([read] if read else [])
+    if read != ("GPRMC",):
+        return
+    velocities = [m for m in read_recording(bag, config).measurements if isinstance(m, GnssVelocity)]
+    assert len(velocities) == 200
+    # A course at rest says nothing: it is a velocity of zero, as well known to all sides.
+    assert all(not m.v_world_mps[:2].any() for m in velocities[:21])
+    assert all(m.cov_m2ps2[0, 0] == m.cov_m2ps2[1, 1] == pytest.approx(0.3**2) for m in velocities)
+    assert velocities[30].v_world_mps[:2] == pytest.approx([2.0, 0.0], abs=2e-3)  # course 90
 
 
 def gga_bag(path: Path, quality: Callable[[int], int], damaged: int = 0) -> Path:

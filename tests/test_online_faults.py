@@ -524,6 +524,14 @@ def _heading(text: str) -> str:
     return json.dumps(json.loads(text) | {"heading": heading})
 
 
+def _noise(text: str) -> str:
+    return json.dumps(json.loads(text) | {"noise": [1.0, 1e6, 1.0]})  # 20 kdeg/s in a second
+
+
+def _sensor_noise(text: str) -> str:
+    return json.dumps(json.loads(text) | {"sensor_noise": {"gnss": {"sigma_scale": 1e6}}})
+
+
 def _other(text: str) -> str:
     return json.dumps(json.loads(text) | {"vessel": "another"})
 
@@ -558,6 +566,8 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> str:
         _truncated,
         _nan,
         _heading,
+        _noise,
+        _sensor_noise,
         _other,
         _elsewhere,
         _slow_of_other_size,
@@ -572,6 +582,20 @@ def test_a_damaged_snapshot_is_reported_and_not_used(tmp_path: Path, saved: str,
     assert [e for e in fed.events if "the snapshot cannot be used" in e and e.endswith("starts without it")]
     assert [e for e in fed.events if e.startswith("started")]
     assert fed.errors_m[-1] < 2.0
+
+
+@pytest.mark.parametrize("adapt", [True, False])
+def test_raised_noise_is_resumed_while_adapt_noise_is_on(tmp_path: Path, saved: str, *, adapt: bool) -> None:
+    """What a snapshot says of the IMU's noise ends where `adapt_noise` has been switched off since."""
+    path, base = tmp_path / "snapshot.json", arrivals_of(run_of())
+    path.write_text(json.dumps(json.loads(saved) | {"noise": [2.0, 3.0, 4.0]}), encoding="utf-8")
+    run = run_of()
+    imu = run.config.sensors["imu"].model_copy(update={"adapt_noise": adapt})
+    config = run.config.with_sensors({"imu": imu})
+    online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, snapshot=path)
+    fed = feed(online, run, base[at_s(base, 8.5) : at_s(base, 11.0)])
+    assert [e for e in fed.events if e.startswith("resumed from a snapshot")]
+    assert json.loads(path.read_text(encoding="utf-8"))["noise"] == ([2.0, 3.0, 4.0] if adapt else [1.0, 1.0, 1.0])
 
 
 def test_an_old_snapshot_is_not_resumed(tmp_path: Path) -> None:

@@ -79,10 +79,10 @@ def test_an_outage_and_bad_health_are_shaded_by_both(data: ReportData) -> None:
     n = len(data.solution.health)
     solution = replace(data.solution, health=(Health.GOOD,) * (n - 20) + (Health.LOST,) * 20)
     figure = plots.error_over_time(data.recording, solution, (), (), {})
-    spans = marks(figure, plots.Span)
+    spans = marks(figure, plots.Shaded)
     assert [s.name for s in spans] == ["no GNSS fix", "lost"]
     lost = spans[1]
-    assert isinstance(lost, plots.Span)
+    assert isinstance(lost, plots.Shaded)
     assert lost.stop - lost.start == pytest.approx(1.9, abs=0.01)  # 20 states at 10 Hz
     assert len(plots.interactive(figure).layout.shapes) == 4  # two in each of two panels
     assert [len(axes.patches) for axes in on_paper(figure).axes] == [2, 2]
@@ -130,7 +130,7 @@ def test_panels_beside_each_other() -> None:
     """Three in two columns: the last cell stays empty; two panels are the last of their columns. Named ticks, logarithmic x."""
     x = np.array([0.1, 1.0, 10.0])
     marks = (
-        plots.Span(name="s", start=0.2, stop=0.5, colour="#000000"),
+        plots.Shaded(name="s", start=0.2, stop=0.5, colour="#000000"),
         plots.Points(name="p", x=x, y=x, colour="#123456", shape="circle-open"),
         plots.Points(name="q", x=x, y=x, colour="#123456", shape="x"),
     )

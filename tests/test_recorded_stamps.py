@@ -185,8 +185,10 @@ def test_a_clock_that_was_set_is_named_with_the_time(topic: str, by_s: int, way:
     (said,) = [w for w in seen.warnings if "was set" in w]
     assert said.startswith(f"the clock of {topic} was set {way} by 3.0")
     assert utc_text(START_NS + 25 * S)[:18] in said  # to the second
-    (line,) = [w for w in read(tmp_path, config).warnings if w.startswith("gnss: the clock of")]
-    assert f"the clock of {'gnss' if topic == '/fix' else 'imu'} was set {way} by 3.0" in line
+    lines = [w for w in read(tmp_path, config).warnings if "the clock of" in w or "its clock is" in w]
+    (line,) = lines  # nor an offset beside it, which holds on one side only
+    whose, others = ("gnss", "gnss") if topic == "/fix" else ("imu", "gnss, compass")
+    assert line.startswith(f"{others}: the clock of {whose} was set {way} by 3.0")
 
 
 def test_clocks_that_are_set_together_are_one(tmp_path: Path) -> None:

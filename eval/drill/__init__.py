@@ -3,6 +3,6 @@
 
 from graphloc.eval.drill.failures import Failure, Struck, script
 from graphloc.eval.drill.measure import Measured, Times, judge
-from graphloc.eval.drill.plan import Case, Window, cut, schedule
+from graphloc.eval.drill.plan import Case, DrillWindow, cut, schedule
 
-__all__ = ["Case", "Failure", "Measured", "Struck", "Times", "Window", "cut", "judge", "schedule", "script"]
+__all__ = ["Case", "DrillWindow", "Failure", "Measured", "Struck", "Times", "cut", "judge", "schedule", "script"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from graphloc.eval.drill.measure import Drilled, Row, Times, summed
 from graphloc.eval.drill.plan import TAIL_S, Case
-from graphloc.eval.plots import Figure, Line, Mark, Panel, Points, Shape, Span, colour_of
+from graphloc.eval.plots import Figure, Line, Mark, Panel, Points, Shaded, Shape, colour_of
 
 _SHOWN_S = 10.0  # of an error over time, before the failure
 _FEWEST_M = 0.05  # lower end of logarithmic axes
@@ -96,7 +96,9 @@ def over_time(drilled: Drilled) -> Figure:
     shown = _range_m(max(float(np.nanmax(t.off_m, initial=1.0)) for _, times in first.values() for t in times.values()))
     panels: list[Panel] = []
     for name, (case, times) in first.items():
-        marks: list[Mark] = [Span(name="failure", start=0.0, stop=case.failure.length_s, colour="#000000", opacity=0.1)]
+        marks: list[Mark] = [
+            Shaded(name="failure", start=0.0, stop=case.failure.length_s, colour="#000000", opacity=0.1)
+        ]
         for estimator, t in reversed(times.items()):
             at_s = (t.stamps_ns - case.begin_ns) * 1e-9
             near = (at_s >= -_SHOWN_S) & (at_s <= case.failure.length_s + TAIL_S)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.chi2 import chi2_95
-from graphloc.eval.drill.plan import TAIL_S, Case, Window
+from graphloc.eval.drill.plan import TAIL_S, Case, DrillWindow
 from graphloc.eval.metrics import squared_over_covariance
 from graphloc.frames import Array, wrap_angle
 from graphloc.time import NS_PER_S
@@ -74,7 +74,7 @@ class Measured:
     why: str = ""
 
 
-def compared(track: Trajectory | None, reference: Trajectory, window: Window, *, sure: bool) -> Times:
+def compared(track: Trajectory | None, reference: Trajectory, window: DrillWindow, *, sure: bool) -> Times:
     """Return the errors of an estimate over a window; None: there is no estimate.
 
     Args:
@@ -221,7 +221,7 @@ class Drilled:
     measured: tuple[Measured, ...]
     shown: tuple[tuple[Case, dict[str, Times]], ...]
     left: tuple[tuple[str, str], ...]
-    windows: tuple[Window, ...]
+    windows: tuple[DrillWindow, ...]
     warnings: tuple[str, ...] = ()
 
     @property

@@ -19,7 +19,7 @@ _SETTLED_S = 10.0  # after the online mode's first pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Window:
+class DrillWindow:
     """A part of the recording for the estimators: its stamps, and whether it is the whole."""
 
     begin_ns: int
@@ -42,19 +42,19 @@ class Case:
         return self.begin_ns + round(self.failure.length_s * NS_PER_S)
 
 
-def windows(recording: Recording, longest_s: float, times: int) -> tuple[Window, ...]:
+def windows(recording: Recording, longest_s: float, times: int) -> tuple[DrillWindow, ...]:
     """Return the whole recording, or `times` parts of a long one, spread evenly."""
     assert recording.imu is not None
     begin, end = int(recording.imu.stamps_ns[0]), int(recording.imu.stamps_ns[-1])
     if end - begin <= WHOLE_S * NS_PER_S:
-        return (Window(begin_ns=begin, end_ns=end, whole=True),)
+        return (DrillWindow(begin_ns=begin, end_ns=end, whole=True),)
     size = round((WINDOW_LEAD_S + longest_s + WINDOW_TAIL_S) * NS_PER_S)
     starts = begin + (np.arange(times) + 0.5) / times * (end - begin - size)
-    return tuple(Window(begin_ns=int(s), end_ns=int(s) + size, whole=False) for s in starts)
+    return tuple(DrillWindow(begin_ns=int(s), end_ns=int(s) + size, whole=False) for s in starts)
 
 
 def schedule(
-    failures: Sequence[Failure], parts: Sequence[Window], ready_ns: Sequence[int], times: int, seed: int
+    failures: Sequence[Failure], parts: Sequence[DrillWindow], ready_ns: Sequence[int], times: int, seed: int
 ) -> tuple[tuple[Case, ...], tuple[tuple[str, str], ...]]:
     """Return the cases, and the failures that do not fit, with reasons.
 
@@ -86,13 +86,13 @@ def schedule(
     return tuple(cases), tuple(left)
 
 
-def judged_until(case: Case, window: Window) -> Window:
+def judged_until(case: Case, window: DrillWindow) -> DrillWindow:
     """Return the window without what is more than `WINDOW_TAIL_S` after the failure, which is not evaluated."""
     end_ns = min(window.end_ns, case.end_ns + round(WINDOW_TAIL_S * NS_PER_S))
     return replace(window, end_ns=end_ns, whole=window.whole and end_ns == window.end_ns)
 
 
-def cut(recording: Recording, window: Window) -> Recording:
+def cut(recording: Recording, window: DrillWindow) -> Recording:
     """Return the part of a recording in a window, with the whole truth, without the rows of other messages."""
     if window.whole or recording.imu is None:
         return recording

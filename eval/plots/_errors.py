@@ -22,7 +22,7 @@ from graphloc.eval.plots._marks import (
     Mark,
     Panel,
     Points,
-    Span,
+    Shaded,
     colour_of,
     peaks,
     thinned,
@@ -105,18 +105,18 @@ def _zoomed(largest_m: Mapping[str, float]) -> tuple[str, tuple[float, float] | 
     return f"position error; {beyond} is beyond, to {first:.1f} m", (0.0, _SHOWN * second)
 
 
-def spans(recording: Recording, solution: Solution) -> Iterator[Span]:
+def spans(recording: Recording, solution: Solution) -> Iterator[Shaded]:
     """Yield the periods without fixes and those in which health was not good; of too many, the longest."""
     start, found = int(solution.trajectory.stamps_ns[0]), []
     for a, b in outages(recording):
-        found.append(Span(name="no GNSS fix", start=(a - start) / 1e9, stop=(b - start) / 1e9, colour=OUTAGE))
+        found.append(Shaded(name="no GNSS fix", start=(a - start) / 1e9, stop=(b - start) / 1e9, colour=OUTAGE))
     t = seconds_since(start, solution.trajectory.stamps_ns)
     for health, group in groupby(range(len(t)), key=lambda k: solution.health[k]):
         inside = list(group)
         if health in HEALTH:
             stop = float(t[min(inside[-1] + 1, len(t) - 1)])
             said = health.value.replace("_", " ")
-            found.append(Span(name=said, start=float(t[inside[0]]), stop=stop, colour=HEALTH[health]))
+            found.append(Shaded(name=said, start=float(t[inside[0]]), stop=stop, colour=HEALTH[health]))
     longest = sorted(found, key=lambda s: s.start - s.stop)[:_SPANS]
     yield from sorted(longest, key=lambda s: s.start)
 

@@ -11,7 +11,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from graphloc.eval.plots._marks import Band, Figure, Line, Mark, Panel, Points, Span
+from graphloc.eval.plots._marks import Band, Figure, Line, Mark, Panel, Points, Shaded
 from graphloc.frames import Array
 
 _GAP_PX, _ABOVE_PX, _LEGEND_PX, _BELOW_PX = 42, 26, 38, 46
@@ -22,7 +22,7 @@ _WEIGHTS = {"colorscale": "Cividis", "cmin": 0, "cmax": 1}
 def interactive(figure: Figure) -> go.Figure:
     """Return the figure for plotly; names in the legend switch lines on and off."""
     n, columns = len(figure.panels), figure.columns
-    named = any(not isinstance(m, Span) and m.listed and not p.keyed for p in figure.panels for m in p.marks)
+    named = any(not isinstance(m, Shaded) and m.listed and not p.keyed for p in figure.panels for m in p.marks)
     above_px = _ABOVE_PX + _LEGEND_PX * named
     drawn = _empty(figure, above_px)
     listed: set[str] = set()
@@ -30,7 +30,7 @@ def interactive(figure: Figure) -> go.Figure:
     for number, panel in enumerate(figure.panels):
         place = {"row": number // columns + 1, "col": number % columns + 1}
         for mark in panel.marks:
-            if isinstance(mark, Span):
+            if isinstance(mark, Shaded):
                 shades.append(_shade(mark, number + 1))
                 continue
             trace = _trace(mark)
@@ -82,7 +82,7 @@ def _y_axis(panel: Panel) -> dict[str, Any]:
     return axis
 
 
-def _shade(span: Span, number: int) -> dict[str, Any]:
+def _shade(span: Shaded, number: int) -> dict[str, Any]:
     """Return a rectangle over the height of a panel; plotly takes all at once, since one by one they take seconds."""
     axis = str(number) if number > 1 else ""
     return {
@@ -103,7 +103,7 @@ def _light(values: Array) -> NDArray[np.float32]:
 
 
 def _trace(mark: Mark) -> Any:
-    assert not isinstance(mark, Span)
+    assert not isinstance(mark, Shaded)
     x = _light(mark.x)
     if isinstance(mark, Line):
         line = {"color": mark.colour, "dash": mark.dash, "width": mark.width}

@@ -67,7 +67,7 @@ class Band:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Span:
+class Shaded:
     """A stretch of x shaded over the whole height, behind everything."""
 
     name: str
@@ -92,7 +92,7 @@ class Underlay:
     north_m: float
 
 
-Mark = Line | Points | Band | Span
+Mark = Line | Points | Band | Shaded
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -17,7 +17,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure as Sheet
 from matplotlib.patches import Patch
 
-from graphloc.eval.plots._marks import Band, Figure, Line, Panel, Points, Span, Underlay
+from graphloc.eval.plots._marks import Band, Figure, Line, Panel, Points, Shaded, Underlay
 
 _WIDTH_IN, _PX_PER_IN, _DPI = 7.0, 110.0, 200
 _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
@@ -84,7 +84,7 @@ def _panel(axes: Axes, panel: Panel) -> None:
         axes.set_yticks(range(len(panel.ticks_y)), panel.ticks_y)
     spans: dict[str, Patch] = {}
     for mark in panel.marks:
-        if isinstance(mark, Span):
+        if isinstance(mark, Shaded):
             patch = axes.axvspan(mark.start, mark.stop, color=mark.colour, alpha=mark.opacity, lw=0, zorder=0)
             if mark.name not in spans:
                 spans[mark.name] = patch

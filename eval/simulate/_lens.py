@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.eval.simulate._light import Picture
-from graphloc.eval.simulate.rig import CameraConfig
+from graphloc.eval.simulate.rig import RigCamera
 from graphloc.frames import Array
 
 Image = NDArray[np.uint8]
@@ -32,7 +32,7 @@ class Drop:
     slides: float
 
 
-def draw_drops(rng: np.random.Generator, camera: CameraConfig, duration_s: float) -> tuple[Drop, ...]:
+def draw_drops(rng: np.random.Generator, camera: RigCamera, duration_s: float) -> tuple[Drop, ...]:
     """Draw drops that come and go: three to five on the lens at any time, as wide as a tag nearby."""
     found = []
     for _ in range(max(1, int(duration_s / 2.5))):
@@ -51,7 +51,7 @@ def draw_drops(rng: np.random.Generator, camera: CameraConfig, duration_s: float
     return tuple(found)
 
 
-def exposure(picture: Picture, camera: CameraConfig) -> tuple[float, float]:
+def exposure(picture: Picture, camera: RigCamera) -> tuple[float, float]:
     """Return exposure (ms) and gain that make the mean grey, as far as both go."""
     light = picture[::8, ::8]
     scale = _MIDDLE_GREY / max(float(light.mean()), 1e-9)
@@ -62,7 +62,7 @@ def exposure(picture: Picture, camera: CameraConfig) -> tuple[float, float]:
 
 
 def through_lens(
-    picture: Picture, camera: CameraConfig, stray_times: float, drops: tuple[Drop, ...], t_s: float, motion_px: Array
+    picture: Picture, camera: RigCamera, stray_times: float, drops: tuple[Drop, ...], t_s: float, motion_px: Array
 ) -> Picture:
     """Return the light on the sensor: with stray light, drops, blur, and motion (2,) px during the exposure."""
     rows, columns = picture.shape
@@ -112,7 +112,7 @@ def _wet(picture: Picture, drop: Drop, t_s: float) -> None:
     patch[:] = patch * (1.0 - inside) + inside * (0.9 * blurred + 0.06 * float(blurred.mean()))
 
 
-def digitise(picture: Picture, camera: CameraConfig, exposed: tuple[float, float], noise: Picture) -> Image:
+def digitise(picture: Picture, camera: RigCamera, exposed: tuple[float, float], noise: Picture) -> Image:
     """Return the image (rows, columns) of light: shot and read noise, gain, gamma 2.2, eight bits.
 
     Args:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from graphloc.errors import ConfigError
 from graphloc.eval.simulate.docks import tag_pose
 from graphloc.eval.simulate.harbour import Harbour, Tag
-from graphloc.eval.simulate.rig import CameraConfig
+from graphloc.eval.simulate.rig import RigCamera
 from graphloc.eval.simulate.scene import Rays, Scene
 from graphloc.eval.simulate.weather import Weather
 from graphloc.frames import Array
@@ -40,7 +40,7 @@ _STEP = 3  # pixels between rays of the background
 _GRAIN = 512  # pixels of the tile that surfaces take their grain from
 
 
-def rays(camera: CameraConfig, u_px: Array, v_px: Array) -> Rays:
+def rays(camera: RigCamera, u_px: Array, v_px: Array) -> Rays:
     """Return directions (N, 3), z = 1, in camera, of image points (N,); distortion undone."""
     points = np.column_stack([u_px, v_px])[:, None].astype(np.float64)
     if any(camera.distortion):
@@ -53,7 +53,7 @@ def rays(camera: CameraConfig, u_px: Array, v_px: Array) -> Rays:
     return np.column_stack([flat, np.ones(len(flat))]).astype(np.float32)
 
 
-def project(camera: CameraConfig, points_m: Array) -> Array:
+def project(camera: RigCamera, points_m: Array) -> Array:
     """Return image points (N, 2), px, of points (N, 3) in camera that are in front of it."""
     turn_none = np.zeros(3)
     if camera.model == "equidistant":
@@ -112,7 +112,7 @@ def tag_in_world(tag: Tag, harbour: Harbour, scene: Scene, t_s: float) -> Pose:
 class Light:
     """Renders a harbour for one camera."""
 
-    def __init__(self, camera: CameraConfig, harbour: Harbour, scene: Scene, weather: Weather) -> None:
+    def __init__(self, camera: RigCamera, harbour: Harbour, scene: Scene, weather: Weather) -> None:
         self._camera, self._harbour, self._scene, self._weather = camera, harbour, scene, weather
         self.size = (camera.height_px, camera.width_px)
         self._coarse = (-(-camera.height_px // _STEP), -(-camera.width_px // _STEP))

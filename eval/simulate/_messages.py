@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.eval.simulate._lens import Image
 from graphloc.eval.simulate.lidar import Scan
-from graphloc.eval.simulate.rig import CameraConfig
+from graphloc.eval.simulate.rig import RigCamera
 from graphloc.frames import Array
 from graphloc.measurements import AXES, BodyVelocity, CompassHeading, GnssPosition, PoseFix
 
@@ -138,7 +138,7 @@ class Messages:
         _, coded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         return kind, self._t[kind](header=header, format="mono8; jpeg compressed ", data=coded.reshape(-1))
 
-    def camera_info(self, stamp_ns: int, frame: str, camera: CameraConfig) -> Any:
+    def camera_info(self, stamp_ns: int, frame: str, camera: RigCamera) -> Any:
         kind, K = "sensor_msgs/msg/CameraInfo", camera.K
         given = {
             "D": np.array(camera.distortion), "K": K.reshape(9), "R": np.eye(3).reshape(9),

@@ -57,7 +57,7 @@ _SEASONS = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AerialImage:
+class RenderedImage:
     """An image with its georeference.
 
     Attributes:
@@ -110,7 +110,7 @@ def _to_grid(epsg: int) -> Transformer:
     return Transformer.from_crs(CRS.from_epsg(4326), CRS.from_epsg(epsg), always_xy=True)
 
 
-def render(harbour: Harbour, seed: int, pixel_m: float = 0.16, shift_sigma_m: float = 0.3) -> AerialImage:
+def render(harbour: Harbour, seed: int, pixel_m: float = 0.16, shift_sigma_m: float = 0.3) -> RenderedImage:
     """Take the image of a harbour: its own day, sun, boats and misregistration, from `seed`."""
     rng = np.random.default_rng([seed, 11])
     west, south, east, north = harbour.config.image_m
@@ -129,7 +129,7 @@ def render(harbour: Harbour, seed: int, pixel_m: float = 0.16, shift_sigma_m: fl
     noisy = soft * season.light * rng.uniform(0.9, 1.08) + rng.normal(0.0, 3.0, soft.shape)
     coded = cv2.imencode(".jpg", np.clip(noisy, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 82])[1]
     pixels = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), dtype=np.uint8)
-    return AerialImage(pixels, epsg, left, top, pixel_m, shift)
+    return RenderedImage(pixels, epsg, left, top, pixel_m, shift)
 
 
 class _Pen:

@@ -28,7 +28,7 @@ from graphloc.eval.simulate.aerial import render
 from graphloc.eval.simulate.camera import Camera
 from graphloc.eval.simulate.docks import survey, tag_pose
 from graphloc.eval.simulate.lidar import scan
-from graphloc.eval.simulate.rig import CameraConfig, LidarConfig
+from graphloc.eval.simulate.rig import RigCamera, RigLidar
 from graphloc.eval.simulate.scene import Scene, scene_of
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, PoseFix
 from graphloc.outputs import fresh_folder
@@ -157,12 +157,12 @@ def _seen(run: SimulatedRun, make: Messages) -> list[Iterator[_Item]]:
     return [_clouds(run, make, scene), *found] if lidars else found
 
 
-def _lidars(run: SimulatedRun) -> dict[str, LidarConfig]:
+def _lidars(run: SimulatedRun) -> dict[str, RigLidar]:
     """Return the LiDARs whose scans are in the bag."""
     return run.rig.lidars if run.harbour is not None and run.scenario.lidar_hz > 0.0 else {}
 
 
-def _cameras(run: SimulatedRun) -> dict[str, CameraConfig]:
+def _cameras(run: SimulatedRun) -> dict[str, RigCamera]:
     """Return the cameras whose images are in the bag."""
     return run.rig.cameras if run.harbour is not None and run.scenario.camera_hz > 0.0 else {}
 

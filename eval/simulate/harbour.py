@@ -69,7 +69,7 @@ class Pole(Block):
     """Copies of it."""
 
 
-class Berth(Block):
+class Mooring(Block):
     """A place for a boat. Which boats lie there differs between the image and the day of the run."""
 
     at: Point
@@ -141,7 +141,7 @@ class HarbourConfig(Block):
     """AprilTags."""
     poles: tuple[Pole, ...] = ()
     """Poles."""
-    berths: tuple[Berth, ...] = ()
+    berths: tuple[Mooring, ...] = ()
     """Places for boats."""
     routes: dict[str, Annotated[tuple[Point, ...], Field(min_length=1)]] = Field(default_factory=dict)
     """Waypoints of a run, by name; one waypoint: the vessel lies still there."""

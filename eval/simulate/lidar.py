@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.eval.simulate._truth import Motion
-from graphloc.eval.simulate.rig import LidarConfig
+from graphloc.eval.simulate.rig import RigLidar
 from graphloc.eval.simulate.scene import Scene
 from graphloc.frames import Array
 
@@ -36,7 +36,7 @@ class Scan:
     intensity: Array
 
 
-def scan(name: str, lidar: LidarConfig, scene: Scene, motion: Motion, t_s: float, rng: np.random.Generator) -> Scan:
+def scan(name: str, lidar: RigLidar, scene: Scene, motion: Motion, t_s: float, rng: np.random.Generator) -> Scan:
     """Take one turn of a LiDAR that begins at `t_s`."""
     azimuth, columns, beams, ray = _rays(lidar.step_deg, lidar.lowest_deg, lidar.highest_deg, lidar.beams)
     dt = azimuth / (2.0 * np.pi) * lidar.scan_s
@@ -78,7 +78,7 @@ def _rays(
     return azimuth, column, beam, ray
 
 
-def world_points(scan: Scan, lidar: LidarConfig, motion: Motion) -> Array:
+def world_points(scan: Scan, lidar: RigLidar, motion: Motion) -> Array:
     """Return the points (N, 3) of a scan in world, each by the true pose of the vessel at its time."""
     p, R, _ = motion.pose(scan.t_s + scan.dt_s)
     T = lidar.T_body_lidar

@@ -41,7 +41,7 @@ class HullConfig(Block):
     """Height of its roof, m."""
 
 
-class LidarConfig(Block):
+class RigLidar(Block):
     """A turning LiDAR. With a `make`, only what differs from it is written."""
 
     make: Literal["bpearl", "helios"] | None = None
@@ -78,7 +78,7 @@ class LidarConfig(Block):
         return T
 
 
-class CameraConfig(Block):
+class RigCamera(Block):
     """A grey camera that exposes its whole image at once. Defaults are Digerud's ZED 2i (D eq. 3.1)."""
 
     mount: MountConfig
@@ -109,7 +109,7 @@ class CameraConfig(Block):
     """Highest gain."""
 
     @model_validator(mode="after")
-    def _as_many_as_the_model_has(self) -> CameraConfig:
+    def _as_many_as_the_model_has(self) -> RigCamera:
         needed = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}[self.model]
         if len(self.distortion) != needed:
             raise ValueError(f"distortion: {self.model} has {needed} coefficients, not {len(self.distortion)}")
@@ -133,9 +133,9 @@ class RigConfig(Block):
     """Where the IMU sits."""
     gnss: MountConfig
     """Where the antenna sits."""
-    lidars: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")], LidarConfig] = Field(default_factory=dict)
+    lidars: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")], RigLidar] = Field(default_factory=dict)
     """LiDARs by name; all turn together."""
-    cameras: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")], CameraConfig] = Field(default_factory=dict)
+    cameras: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")], RigCamera] = Field(default_factory=dict)
     """Cameras by name."""
 
     @model_validator(mode="after")

@@ -37,7 +37,7 @@ _EVEN_U, _EVEN_V = 0.7548776662466927, 0.5698402909980532  # multiples of them f
 _PEAK = 1.0 / math.sqrt(2.0 * math.pi)
 
 
-class Fit(NamedTuple):
+class TagFit(NamedTuple):
     """Corners (4, 2) of a tag, their covariance (8, 8), px^2, and the share of its pixels' variance that is explained."""
 
     corners_px: Array
@@ -47,7 +47,7 @@ class Fit(NamedTuple):
 
 def fit_tag(
     grey: NDArray[np.uint8], about_px: Array, cells: NDArray[np.uint8], straight: Unbowed | None = None
-) -> Fit | None:
+) -> TagFit | None:
     """Fit a tag to an image; None if it does not converge near the given corners.
 
     First with some of its pixels, then with more.
@@ -77,10 +77,10 @@ def fit_tag(
     cov = _TOO_SURE * max(_together(A, b, inverse, variance), 1.0) * inverse[:8, :8] + floor_px**2 * np.eye(8)
     explained = 1.0 - variance / float(pixels[:, 2].var())
     if straight is None:
-        return Fit(rest.corners, cov, explained)
+        return TagFit(rest.corners, cov, explained)
     bow = block_diag(*straight.slope(rest.corners))
     corners = straight.bowed(rest.corners)
-    return Fit(corners, bow @ cov @ bow.T, explained) if np.isfinite(corners).all() else None
+    return TagFit(corners, bow @ cov @ bow.T, explained) if np.isfinite(corners).all() else None
 
 
 def _pixels(

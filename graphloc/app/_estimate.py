@@ -16,7 +16,7 @@ from graphloc.eval import calibrate, ekf, holdout
 from graphloc.eval.digerud import run_digerud
 from graphloc.eval.gnss_check import gnss_offset_warnings
 from graphloc.eval.match_picture import Gallery
-from graphloc.eval.mount_check import mount_warnings
+from graphloc.eval.mount_check import MountDoubt, mount_doubts
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.tag_check import suspect_tags
 from graphloc.eval.underlay import underlay
@@ -94,8 +94,8 @@ def smooth_recording(
     tags, said = found_tags.about_tags(recording, config, solution)
     mounts, offsets = _track_warnings(solution, recording, config)
     if mounts:
-        solution = solution.doubted(mounts[0].partition(":")[0])
-    said += [*mounts, *offsets, *([never] if never else [])]
+        solution = solution.doubted(mounts[0].seen)
+    said += [*map(str, mounts), *offsets, *([never] if never else [])]
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution,
         held=_when_measured(held, solution),
@@ -135,10 +135,12 @@ def _filters(
     return filters
 
 
-def _track_warnings(solution: Solution, recording: Recording, config: VesselConfig) -> tuple[list[str], list[str]]:
+def _track_warnings(
+    solution: Solution, recording: Recording, config: VesselConfig
+) -> tuple[list[MountDoubt], list[str]]:
     """What a solved track, offline or online, tells of the configuration: of how the craft lies and goes, and of its sensors."""
     track = solution.trajectory
-    return mount_warnings(track, recording, config), gnss_offset_warnings(track, solution.datum, recording, config)
+    return mount_doubts(track, recording, config), gnss_offset_warnings(track, solution.datum, recording, config)
 
 
 def _online(
@@ -165,7 +167,7 @@ def replay_recording(
     replayed = replay(recording, config, scans=scans, speed=speed, lag_s=lag_s, stoppable=True, status=status)
     recording, solution = replayed.recording, replayed.solution
     mounts, offsets = _track_warnings(solution, recording, config)
-    said = [*suspect_tags(recording, config, solution), *mounts, *offsets]
+    said = [*suspect_tags(recording, config, solution), *map(str, mounts), *offsets]
     run = Run(recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution)
     return made_comparable(_with_underlay(run, scans))
 

@@ -135,6 +135,11 @@ class GnssConfig(SensorConfig):
     nmea: Places = ("GGA",)
     """NMEA sentences to read, from one talker (`GPGGA`) or any (`GGA`): GGA, GNS, RMC, GLL."""
 
+    @property
+    def tells_height(self) -> bool:
+        """Its fixes do."""
+        return True
+
 
 class CompassConfig(SensorConfig):
     """Heading: `geometry_msgs/QuaternionStamped`, orientation of `sensor_msgs/Imu`, NMEA (as `gnss`), `std_msgs/Float64` or `Float32`."""
@@ -228,3 +233,8 @@ class HeightConfig(SensorConfig):
     """Time between two priors, s."""
     kernel: KernelConfig = KernelConfig(kind="none")
     """Robust loss: not used for the height prior."""
+
+    @property
+    def synthetic_every_s(self) -> float:
+        """Its period."""
+        return self.period_s

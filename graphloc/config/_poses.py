@@ -47,6 +47,11 @@ class AnyPoseConfig(SensorConfig):
             )
         return tuple(a for a in AXES if a in axes)
 
+    @property
+    def tells_height(self) -> bool:
+        """Where z is used."""
+        return "z" in self.axes
+
 
 class PoseConfig(AnyPoseConfig):
     """Absolute pose in world (`geometry_msgs/PoseWithCovarianceStamped`, `nav_msgs/Odometry`)."""
@@ -198,3 +203,8 @@ class AprilTagConfig(SensorConfig):
     def surveyed(self) -> Survey:
         """The survey, once it is read; before that one without tags."""
         return self.survey if isinstance(self.survey, Survey) else Survey()
+
+    @property
+    def tells_height(self) -> bool:
+        """By the survey of its tags."""
+        return True

@@ -61,6 +61,16 @@ class SensorConfig(Block):
     kernel: KernelConfig = KernelConfig()
     """Robust loss."""
 
+    @property
+    def tells_height(self) -> bool:
+        """Whether its measurements say how high the vessel lies, in world."""
+        return False
+
+    @property
+    def synthetic_every_s(self) -> float:
+        """Time between two of the measurements that the configuration makes itself (`Sensor.synthetic`), s."""
+        return 1.0
+
     def scaled(self, times: Mapping[str, float]) -> Self:
         """Return the configuration with some of its numbers, by key, so many times as large."""
         return self.model_copy(update={key: getattr(self, key) * by for key, by in times.items()})

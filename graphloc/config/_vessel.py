@@ -125,6 +125,20 @@ class VesselConfig(Block):
                 raise ValueError(f"sensors: {one} and {other} both read {a.topic}, which would count twice: delete one")
         return self
 
+    @model_validator(mode="after")
+    def _references_are_not_fused(self) -> VesselConfig:
+        """What the track follows cannot say how good it is."""
+        for key in ("truth_topic", "check_speed_topic"):
+            topic = getattr(self, key)
+            fused = [
+                name for name, sensor in self.sensors.items() if sensor.enabled and topic and sensor.topic == topic
+            ]
+            if fused:
+                raise ValueError(
+                    f"{key}: {', '.join(fused)} fuses {topic}, and a comparison with it says nothing: delete one"
+                )
+        return self
+
     def with_sensors(self, changed: Mapping[str, Any]) -> VesselConfig:
         """Return the configuration with some of its sensors replaced."""
         return self.model_copy(update={"sensors": {**self.sensors, **changed}})

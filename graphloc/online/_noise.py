@@ -40,7 +40,9 @@ class ImuNoise:
         self._looked_ns, self._misfits, self._weighed_ns = at_ns, 0, at_ns
 
     def at_least(self, scale: float, gyro: float, accel: float) -> None:
-        """Raise the factors to those that are known from elsewhere."""
+        """Raise the factors to those that are known from elsewhere: of a start, or of a snapshot."""
+        if not self._adapt:
+            return
         self.scale, self.gyro, self.accel = max(self.scale, scale), max(self.gyro, gyro), max(self.accel, accel)
 
     def of(self, sensor: Any) -> Any:
@@ -53,9 +55,8 @@ class ImuNoise:
         Args:
             samples: gives those of the window.
         """
-        if (
-            not self._adapt or not lag.fresh
-        ):  # until relinearised, the cost of a step includes how far its states have moved since
+        # Until relinearised, the cost of a step includes how far its states have moved since.
+        if not self._adapt or not lag.fresh:
             return ""
         return self._contradicted(lag) or self._too_quiet(lag, samples)
 

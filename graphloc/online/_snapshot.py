@@ -19,6 +19,7 @@ from graphloc.solve._batch import LARGEST_NOISE_SCALE
 
 _VERSION = 6
 _EVERY_S = 2.0
+_MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -89,25 +90,25 @@ class Snapshot:
         heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
         scale, gyro, accel = (float(times) for times in raw["noise"])
         sensor_noise = {
-            str(name): {str(key): max(float(by), 1.0) for key, by in times.items()}
-            for name, times in raw["sensor_noise"].items()
+            str(name): {str(key): float(by) for key, by in times.items()} for name, times in raw["sensor_noise"].items()
         }
         datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
         unmodelled = None if raw["unmodelled"] is None else np.array(raw["unmodelled"], dtype=np.float64)
         heading = None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"])
+        raised = [scale, gyro, accel, *(by for times in sensor_noise.values() for by in times.values())]
         numbers = np.concatenate(
             [
                 p,
                 R.ravel(),
                 datum.origin,
                 list(heights_m.values()),
-                [scale, gyro, accel],
-                [by for times in sensor_noise.values() for by in times.values()],
+                raised,
                 [] if unmodelled is None else unmodelled.ravel(),
                 [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
             ]
         )
-        if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
+        no_noise = not 1.0 <= min(raised) or scale > LARGEST_NOISE_SCALE or max(raised) > _MOST_TIMES
+        if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or no_noise:
             raise ValueError("it is damaged")
         return cls(
             vessel=str(raw["vessel"]),
@@ -116,7 +117,7 @@ class Snapshot:
             datum=datum,
             heights_m=heights_m,
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
-            noise=(float(np.clip(scale, 1.0, LARGEST_NOISE_SCALE)), max(gyro, 1.0), max(accel, 1.0)),
+            noise=(scale, gyro, accel),
             sensor_noise=sensor_noise,
             heading=heading,
             p_odom_m=p,

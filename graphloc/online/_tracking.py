@@ -214,7 +214,7 @@ class Tracking:
                 continue
             for m in stream.row.synthetic(name, stream.config, (at_ns, at_ns + 1), height_m):
                 self.lag.take(m)
-            self._height_due_ns[name] = at_ns + duration_ns(getattr(stream.config, "period_s", 1.0))
+            self._height_due_ns[name] = at_ns + duration_ns(stream.config.synthetic_every_s)
 
     def _take_pending(self, reached_ns: int) -> None:
         """Take the measurements whose stamps the states have reached."""

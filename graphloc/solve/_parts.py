@@ -7,6 +7,7 @@ bridges the gap (120 s: errors of 4.6 m and 30 deg beside it, where 0.1 m is usu
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ from graphloc.errors import SolveError
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.offsets import joined
 from graphloc.recording import Recording
-from graphloc.solution import SlowEstimate, Solution, SolveStats
+from graphloc.solution import Graded, SlowEstimate, Solution, SolveStats
 from graphloc.solve._legs import Solve, seams, solve_legs
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory
@@ -188,5 +189,22 @@ def _join_stats(parts: Sequence[SolveStats], warnings: Sequence[str]) -> SolveSt
         cost=sum(p.cost for p in parts),
         expected_cost=sum(p.expected_cost for p in parts),
         converged=all(p.converged for p in parts),
-        warnings=(*warnings, *dict.fromkeys(w for p in parts for w in p.warnings)),
+        warnings=(*warnings, *_said_once([w for p in parts for w in p.warnings])),
     )
+
+
+def _said_once(lines: Sequence[str]) -> list[str]:
+    """Return the warnings of all parts, each once; of graded ones about the same, the one with the largest figure."""
+    worst, parts = dict[str, Graded](), Counter[str]()
+    for line in lines:
+        if isinstance(line, Graded):
+            parts[line.about] += 1
+            if line.about not in worst or line.figure > worst[line.about].figure:
+                worst[line.about] = line
+    said = dict[str, None]()
+    for line in lines:
+        if not isinstance(line, Graded) or parts[line.about] == 1:
+            said[line] = None
+        elif line is worst[line.about]:
+            said[f"{line} (the worst of {parts[line.about]} parts of the run that show this)"] = None
+    return list(said)

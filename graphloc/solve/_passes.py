@@ -21,7 +21,7 @@ _OUTLIER = 0.1  # weight under its own kernel below which a measurement is an ou
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class Optimised:
     """One optimisation of the whole run: values, the graph they come from, and how far any pose moved.
 
     `made`: where the factors of each measurement stand in the graph.
@@ -36,15 +36,15 @@ class Step:
 
 def optimise_run(
     problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior, *, jumps: bool = True
-) -> Step:
+) -> Optimised:
     """Optimise the whole run with the given decisions."""
     last, made = len(problem.timeline) - 1, dict[tuple[int, int], range]()
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps, made=made)
     solved = optimize(graph, guess, 12, 1e-3)
-    return Step(solved.values, graph, made, solved.iterations, moved(guess, solved.values))
+    return Optimised(solved.values, graph, made, solved.iterations, moved(guess, solved.values))
 
 
-def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Step:
+def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Optimised:
     """Take one step over the whole run, and iterate only where the cost rises by more than a nonlinear step near the minimum does."""
     last, made = len(problem.timeline) - 1, dict[tuple[int, int], range]()
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, made=made)
@@ -52,12 +52,12 @@ def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, pri
     before = float(graph.error(guess))
     if not float(graph.error(values)) < _UPHILL * before + 1.0:
         values, iterations, _ = optimize(graph, guess, 12, 1e-3)
-    return Step(values, graph, made, iterations, moved(guess, values))
+    return Optimised(values, graph, made, iterations, moved(guess, values))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settled:
-    """A solution of the whole run, and the graph of its last step (`made` as in `Step`)."""
+    """A solution of the whole run, and the graph of its last step (`made` as in `Optimised`)."""
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
@@ -78,7 +78,7 @@ def settle(
 ) -> Settled:
     """Run passes until modes and weights no longer change, at most `most`."""
     last, iterations = len(problem.timeline) - 1, 0
-    done: Step | None = None
+    done: Optimised | None = None
     for n in range(most):
         done = None  # frees its graph before the next one is made: gigabytes on a run of hours
         # The first pass removes the seams between windows; after it one step per pass is enough.

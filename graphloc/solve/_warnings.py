@@ -14,7 +14,7 @@ from graphloc.config import SIGMA_SCALES
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.position_jumps import jump_warnings, largest_sigma
-from graphloc.solution import SolveStats
+from graphloc.solution import Graded, SolveStats
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
 from graphloc.solve._decide import AGREES
 from graphloc.solve._health import CONTRADICTING_COST
@@ -53,18 +53,19 @@ def noisier_warning(sensor: str, noisier: float) -> list[str]:
     if noisier < _MUCH_NOISIER:
         return []
     cure = "set its sigma or the floor of it accordingly (a compass also use_reported_sigma: false)"
-    return [
-        f"{sensor}: its measurements scatter more than they state, and are taken with {noisier:.1f} times their sigma: {cure}"
-    ]
+    said = f"{sensor}: its measurements scatter more than they state, and are taken with {noisier:.1f} times their sigma: {cure}"
+    return [Graded(said, f"scatter of {sensor}", noisier)]
 
 
 def scale_warning(sensor: str, stated: Any, taken: Any) -> list[str]:
     """Say where factors on a sensor's sigmas are taken to be larger than configured: a line, or none."""
-    keys = [key for key in SIGMA_SCALES if getattr(taken, key, 1.0) > getattr(stated, key, 1.0)]
+    times = {key: getattr(taken, key, 1.0) / getattr(stated, key, 1.0) for key in SIGMA_SCALES}
+    keys = [key for key, by in times.items() if by > 1.0]
     if not keys:
         return []
     cure = " and ".join(f"{key}: {getattr(taken, key):.1f}" for key in keys)
-    return [f"{sensor}: its measurements scatter more than they state; taken with, and to be set: {cure}"]
+    said = f"{sensor}: its measurements scatter more than they state; taken with, and to be set: {cure}"
+    return [Graded(said, f"sigmas of {sensor}", max(times.values()))]
 
 
 def joint_rejection_warning(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, false: Array) -> list[str]:
@@ -142,17 +143,21 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
             )
             if any(not constant.corrects for stream in problem.streams for constant in stream.constants):
                 cure += ", or for tags on a floating dock that the survey has as fixed"
-        warnings.append(f"{said}; {cure}")
+        warnings.append(Graded(f"{said}; {cure}", "IMU noise by contradiction", result.noise_scale))
     name = problem.imu.sensor
+    stated, taken = problem.config.sensors, result.problem.config.sensors
     for stream in problem.streams:
-        warnings += scale_warning(stream.name, stream.config, result.problem.config.sensors[stream.name])
-    if said := too_quiet(name, problem.config.sensors[name], result.problem.config.sensors[name]):
-        warnings.append(said)
-    if expected > 0 and result.cost > CONTRADICTING_COST * expected:
-        warnings.append(
-            f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
-            "mount, a unit or a time offset is wrong"
+        warnings += scale_warning(stream.name, stream.config, taken[stream.name])
+    if said := too_quiet(name, stated[name], taken[name]):
+        times = (
+            taken[name].gyro_noise_radps / stated[name].gyro_noise_radps,
+            taken[name].accel_noise_mps2 / stated[name].accel_noise_mps2,
         )
+        warnings.append(Graded(said, "IMU noise by its samples", max(times)))
+    if expected > 0 and result.cost > CONTRADICTING_COST * expected:
+        said = f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
+        said += "mount, a unit or a time offset is wrong"
+        warnings.append(Graded(said, "cost", result.cost / expected))
     if (beside_m := largest_sigma(result.levels_cov)) > _LEVELS_M:
         warnings.append(
             "the fixes jump, and no other sensor shows which level is right: the one held longest is taken, "
