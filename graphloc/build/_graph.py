@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -16,7 +16,8 @@ from graphloc.build._attach import constants_of
 from graphloc.build._chains import CONSTANT_TAILS, bias_step, slow_begin, slow_end, slow_step
 from graphloc.build._problem import Problem, Stream
 from graphloc.frames import Array, skew
-from graphloc.graph import Attachment, Decision, SlowProcess
+from graphloc.graph import Attachment, Decision, Residual, SlowProcess
+from graphloc.linear import factors_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,8 +84,16 @@ class Past:
     known: Collection[int]
 
 
-# By (stream number, measurement index): the decision and the attachment; missing or None: left out of the graph.
-Decisions = Mapping[tuple[int, int], tuple[Decision, Attachment] | None]
+class Decided(NamedTuple):
+    """How a measurement enters the graph; `residual`: of the decision's hypothesis at the attachment, None: not reckoned yet."""
+
+    decision: Decision
+    at: Attachment
+    residual: Residual | None = None
+
+
+# By (stream number, measurement index); missing or None: left out of the graph.
+Decisions = Mapping[tuple[int, int], Decided | None]
 
 
 def build_graph(
@@ -122,10 +131,10 @@ def build_graph(
             decided = decisions.get((stream.number, i))
             if decided is None:
                 continue
-            decision, at = decided
+            decision, at, residual = decided
             if at.slow_next is not None and not guess.exists(at.slow_next[0]):
-                at = replace(at, slow_next=None)  # the next node lies beyond the stretch
-            update = stream.row.factors(stream.measurements[i], stream.config, at, decision)
+                at, residual = replace(at, slow_next=None), None  # the next node lies beyond the stretch
+            update = factors_of(stream.row, stream.measurements[i], stream.config, at, decision, residual)
             if made is not None:
                 made[(stream.number, i)] = range(graph.size(), graph.size() + len(update.factors))
             for factor in update.factors:
