@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -16,7 +16,7 @@ from graphloc.build._attach import constants_of
 from graphloc.build._chains import CONSTANT_TAILS, bias_step, slow_begin, slow_end, slow_step
 from graphloc.build._problem import Problem, Stream
 from graphloc.frames import Array, skew
-from graphloc.graph import Attachment, Decision, Residual, SlowProcess
+from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
 from graphloc.linear import factors_of
 
 
@@ -84,12 +84,21 @@ class Past:
     known: Collection[int]
 
 
-class Decided(NamedTuple):
-    """How a measurement enters the graph; `residual`: of the decision's hypothesis at the attachment, None: not reckoned yet."""
+@dataclass(slots=True, eq=False)
+class Decided:
+    """How a measurement enters graphs; `residual`: of the decision's hypothesis at the attachment, None: not reckoned yet."""
 
     decision: Decision
     at: Attachment
     residual: Residual | None = None
+    _update: GraphUpdate | None = field(init=False, default=None)
+
+    def update(self, stream: Stream, i: int) -> GraphUpdate:
+        """Return the factors of measurement `i`; they are made once, as several graphs may have them."""
+        if self._update is None:
+            m, config = stream.measurements[i], stream.config
+            self._update = factors_of(stream.row, m, config, self.at, self.decision, self.residual)
+        return self._update
 
 
 # By (stream number, measurement index); missing or None: left out of the graph.
@@ -131,10 +140,10 @@ def build_graph(
             decided = decisions.get((stream.number, i))
             if decided is None:
                 continue
-            decision, at, residual = decided
-            if at.slow_next is not None and not guess.exists(at.slow_next[0]):
-                at, residual = replace(at, slow_next=None), None  # the next node lies beyond the stretch
-            update = factors_of(stream.row, stream.measurements[i], stream.config, at, decision, residual)
+            at = decided.at
+            if at.slow_next is not None and not guess.exists(at.slow_next[0]):  # it lies beyond the stretch
+                decided = Decided(decided.decision, replace(at, slow_next=None))
+            update = decided.update(stream, i)
             if made is not None:
                 made[(stream.number, i)] = range(graph.size(), graph.size() + len(update.factors))
             for factor in update.factors:
