@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a sensor row promises to the graph builder, and what it gets to see.
 
-A row turns a measurement into residuals (to weigh it, choose its mode, and write its ledger row) and
-into native GTSAM factors. Both functions are pure; what a row returns enters the graph whole or not
+A row turns a measurement into residuals (to weigh it, choose its mode, write its ledger row, and make its factor of) and,
+where they serve better, into native GTSAM factors. Both functions are pure; what a row returns enters the graph whole or not
 at all. Builder and solvers know rows only through this module, never by name.
 """
 
