@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import itertools
 import json
 import resource
@@ -37,6 +38,7 @@ def peak_mib() -> float:
 def solved(length_s: float, times: int = 1) -> Solved:
     """What came of a run, and the middle time of some, s: on the wall, and of the processor."""
     run = loops(length_s)
+    gc.freeze()  # as the commands do
     before, took = peak_mib(), []
     for _ in range(times):
         begin, began = time.perf_counter(), time.process_time()

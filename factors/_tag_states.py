@@ -46,16 +46,17 @@ class SlowRows(NamedTuple):
         """Return the rows for tags of a frame seen by a camera; `size`: of the whole slow state, 0 where there is none."""
         if not size:
             return cls(range(0), range(0), range(0), range(0))
-        docks, cameras = docks_of(config.surveyed), _camera_rows(config)
+        docks = docks_of(config.surveyed)
+        cameras = _camera_rows(config, 6 * len(docks))
         first = 6 * docks.index(frame) if frame in docks else 0
         mount, stamp = cameras.get(camera, (range(0), range(0)))
         others = max([6 * len(docks), *(stamps.stop for _, stamps in cameras.values())])
         return cls(range(first, first + 6 * (frame in docks)), mount, stamp, range(max(others, size - 1), size))
 
 
-def _camera_rows(config: AprilTagConfig) -> dict[str, tuple[range, range]]:
-    """Return the rows of the slow state that hold each camera's mount and delay; empty where these are not estimated."""
-    found, first = {}, 6 * len(docks_of(config.surveyed))
+def _camera_rows(config: AprilTagConfig, first: int) -> dict[str, tuple[range, range]]:
+    """Return the rows, from `first` on, that hold each camera's mount and delay; empty where these are not estimated."""
+    found = {}
     for name, camera in config.cameras.items():
         stop = first + 3 * (camera.mount_sigma_deg > 0.0)
         found[name] = (range(first, stop), range(stop, stop + (camera.stamp_sigma_s > 0.0)))

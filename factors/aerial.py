@@ -17,7 +17,6 @@ from graphloc.config import AerialConfig
 from graphloc.factors import pose
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
-from graphloc.linear import linear_factor
 from graphloc.measurements import PoseFix, PoseMode
 
 
@@ -44,11 +43,9 @@ def residuals(m: PoseFix, config: AerialConfig, at: Attachment) -> tuple[Residua
     )
 
 
-def factors(m: PoseFix, config: AerialConfig, at: Attachment, decision: Decision) -> GraphUpdate:
-    """Return the factor of the chosen mode."""
-    if at.slow_key is None:
-        return pose.factors(m, config, at, decision)
-    return linear_factor(residuals(m, config, at)[decision.mode], at, decision)
+def factors(m: PoseFix, config: AerialConfig, at: Attachment, decision: Decision) -> GraphUpdate | None:
+    """Return the native factor of the chosen mode; None where the image may be off."""
+    return pose.factors(m, config, at, decision) if at.slow_key is None else None
 
 
 def slow(config: AerialConfig) -> SlowProcess | None:

@@ -55,19 +55,18 @@ class _Seen:
     """A sighting at the linearisation point.
 
     Attributes:
-        R, p: camera in world. points_m: (n, 3) corners in world, docks as they are now. middle_m: their mean.
+        R, p: camera in world. middle_m: (3,) the tags' middle in world, docks as they are now; middle_at_rest_m: at rest.
         body: (6, 6) d (position, rotation about world axes) of the camera / d tangent of the state.
         by_mount: (3, 3) d that rotation / d u. by_late: (6,) d (position, rotation) / d l. by_turn: (3, 3) of the dock.
         own: rows of the slow state that the sighting depends on, in the order dock (6), mount (3), stamp (1), edge (1).
             Whether each is there: rides, mounted, timed, edges.
-        slow: their values; moved: (6,) of the dock; edge_px: b. constants: key and value of each tag's survey error.
+        slow: their values; moved: (6,) of the dock; edge_px: b.
     """
 
     def __init__(self, m: TagSighting, config: AprilTagConfig, at: Attachment) -> None:
         self._read_slow_state(m, config, at)
         self._place_camera(m, at)
-        self.constants = _constants_of(m, config, at)
-        self._place_tags(m)
+        self._turn_dock(m)
 
     def _read_slow_state(self, m: TagSighting, config: AprilTagConfig, at: Attachment) -> None:
         self.slow_size = 0 if at.slow_value is None else len(at.slow_value)
@@ -99,20 +98,28 @@ class _Seen:
             R_world_body = R_world_body @ gtsam.Rot3.Expmap(off).matrix()
         self.R = R_world_body @ m.R_body_camera
 
-    def _place_tags(self, m: TagSighting) -> None:
+    def _turn_dock(self, m: TagSighting) -> None:
         self.turn = self.by_turn = np.eye(3)
         if self.rides:
             self.turn = gtsam.Rot3.Expmap(self.moved[3:]).matrix()
             # Exp(w + dw) = Exp(by_turn dw) Exp(w)
             self.by_turn = np.asarray(gtsam.Rot3.ExpmapDerivative(-self.moved[3:]))
+        self.middle_at_rest_m = _middle_at_rest_m(m)
+        self.middle_m = m.pivot_m + self.moved[:3] + (self.middle_at_rest_m - m.pivot_m) @ self.turn.T
+
+    def corners(self, m: TagSighting, constants: list[tuple[int, Array] | None]) -> tuple[Array, Array, Array]:
+        """Return places in world (n, 3), arms from the dock's pivot (n, 3), and each corner from its tag's middle at rest (K, 4, 3).
+
+        Args:
+            constants: of the K tags, see `_constants_of`.
+        """
         tags = np.array(m.points_m).reshape(-1, 4, 3)
-        self.within = tags - 0.25 * tags.sum(axis=1, keepdims=True)  # each corner from its tag's middle
-        for k, constant in enumerate(self.constants):
+        within = tags - 0.25 * tags.sum(axis=1, keepdims=True)
+        for k, constant in enumerate(constants):
             if constant is not None:
-                tags[k] += constant[1][:3] + self.within[k] @ skew(constant[1][3:]).T
-        self.arms = (tags.reshape(-1, 3) - m.pivot_m) @ self.turn.T
-        self.points_m = m.pivot_m + self.moved[:3] + self.arms
-        self.middle_m = m.pivot_m + self.moved[:3] + (m.points_m.mean(axis=0) - m.pivot_m) @ self.turn.T
+                tags[k] += constant[1][:3] + within[k] @ skew(constant[1][3:]).T
+        arms = (tags.reshape(-1, 3) - m.pivot_m) @ self.turn.T
+        return m.pivot_m + self.moved[:3] + arms, arms, within
 
     def placed(self, per_own: Array) -> Array:
         """Put d / d its own rows of the slow state (k, len(own)), or the first of them, where these stand (k, n)."""
@@ -137,8 +144,12 @@ def _constants_of(m: TagSighting, config: AprilTagConfig, at: Attachment) -> lis
     return [at.constants[k] if k is not None and k < len(at.constants) else None for k in found]
 
 
-def _middle_in_camera(m: TagSighting, mode: TagMode) -> Array:
-    return np.asarray(mode.R_world_camera.T @ (m.points_m.mean(axis=0) - mode.p_world_camera_m))
+def _middle_at_rest_m(m: TagSighting) -> Array:
+    return np.asarray(m.points_m.sum(axis=0) / len(m.points_m))
+
+
+def _middle_in_camera(middle_at_rest_m: Array, mode: TagMode) -> Array:
+    return np.asarray(mode.R_world_camera.T @ (middle_at_rest_m - mode.p_world_camera_m))
 
 
 def _turned(R: Array) -> Array:
@@ -148,15 +159,15 @@ def _turned(R: Array) -> Array:
     return turn
 
 
-def _off_mode(m: TagSighting, seen: _Seen, mode: TagMode) -> tuple[Array, Array]:
+def _off_mode(seen: _Seen, mode: TagMode) -> tuple[Array, Array]:
     """Return the error (6,) of a mode, m and rad, and the tags' middle (3,) from the camera by that mode, in world's axes."""
-    toward = seen.R @ _middle_in_camera(m, mode)
+    toward = seen.R @ _middle_in_camera(seen.middle_at_rest_m, mode)
     rotation = gtsam.Rot3.Logmap(gtsam.Rot3(seen.R @ (seen.turn @ mode.R_world_camera).T))
     return np.concatenate([seen.p + toward - seen.middle_m, rotation]), toward
 
 
 def _by_mode(m: TagSighting, config: AprilTagConfig, seen: _Seen, mode: TagMode) -> Residual:
-    raw, toward = _off_mode(m, seen, mode)
+    raw, toward = _off_mode(seen, mode)
 
     def jacobian() -> Array:
         turned = np.eye(6)
@@ -199,16 +210,18 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
     """Return the factors of a sighting: of its corners, or of the chosen mode where the estimate is far from it."""
     seen = _Seen(m, config, at)
     mode = m.modes[decision.mode]
-    toward = (seen.points_m - seen.p) @ seen.R
-    if not _near(m, decision.mode, _off_mode(m, seen, mode)[0], toward):
+    survey_errors = _constants_of(m, config, at)
+    points_m, arms, within = seen.corners(m, survey_errors)
+    toward = (points_m - seen.p) @ seen.R
+    if not _near(m, seen, decision.mode, toward):
         return linear_factor(_by_mode(m, config, seen, mode), at, decision)
     flat, projected = pinhole(toward)
     by_point = projected @ seen.R.T  # d flat / d place of the corner
-    turning = _turning(by_point, seen.points_m - seen.p)
+    turning = _turning(by_point, points_m - seen.p)
     camera = np.concatenate([-by_point, -turning], axis=2).reshape(-1, 6)
     by_own = []
     if seen.rides:
-        swing = _turning(by_point, seen.arms) @ seen.by_turn
+        swing = _turning(by_point, arms) @ seen.by_turn
         by_own.append(np.concatenate([by_point, swing], axis=2).reshape(-1, 6))
     if seen.mounted:
         by_own.append(-turning.reshape(-1, 3) @ seen.by_mount)
@@ -221,21 +234,21 @@ def factors(m: TagSighting, config: AprilTagConfig, at: Attachment, decision: De
     by_slow = np.hstack(by_own) if by_own else np.zeros((m.rays.size, 0))
     raw, by_body = (flat - m.rays).ravel(), pose_term(at, camera @ seen.body)
     at_rest = by_point @ seen.turn  # d flat / d place of the corner, its dock at rest
-    by_tag = np.concatenate([at_rest, _turning(at_rest, seen.within.reshape(-1, 3))], axis=2).reshape(-1, 6)
+    by_tag = np.concatenate([at_rest, _turning(at_rest, within.reshape(-1, 3))], axis=2).reshape(-1, 6)
     dock = config.surveyed.dock(m.frame) if seen.rides else None
     tie = None if dock is None else _tie(seen, dock, config, at)
+    slow_key, slow_value = (at.slow_key, at.slow_value) if tie is None else (at.leaf_keys[0], seen.slow)
+    by_slow = seen.placed(by_slow) if tie is None else by_slow
     found: list[Any] = [] if tie is None else list(tie.factors)
     points = gtsam.Values()
-    for k, constant in enumerate(seen.constants):  # GTSAM's linear factors have at most three keys: one for each tag
+    for k, constant in enumerate(survey_errors):  # GTSAM's linear factors have at most three keys: one for each tag
         own = slice(8 * k, 8 * k + 8)
         corners = Residual(
             raw=raw[own], cov=m.cov[own, own], jacobian=lambda: np.zeros((8, 6)), prior=1.0, size_m=None, size_deg=None
         )
         terms = [by_body._replace(jacobian=by_body.jacobian[own])]
-        if tie is not None:
-            terms.append(Term(at.leaf_keys[0], seen.slow, by_slow[own]))
-        elif seen.own and at.slow_key is not None:
-            terms.append(Term(at.slow_key, np.array(at.slow_value), seen.placed(by_slow[own])))
+        if seen.own and slow_key is not None:
+            terms.append(Term(slow_key, slow_value, by_slow[own]))
         if constant is not None:
             terms.append(Term(constant[0], np.array(constant[1]), by_tag[own]))
         found += linear_update(corners, terms, decision, points).factors
@@ -294,14 +307,10 @@ def _outwards(rays: Array) -> Array:
     return np.asarray(((before + normal) / np.maximum(opened, 0.1)).reshape(-1, 2))
 
 
-def _near(m: TagSighting, chosen: int, off: Array, toward: Array) -> bool:
-    """Return whether the corners, linearised at the estimate, lead to the chosen mode.
-
-    Args:
-        off: (6,) error of that mode. toward: (n, 3) corners in the camera.
-    """
+def _near(m: TagSighting, seen: _Seen, chosen: int, toward: Array) -> bool:
+    """Return whether the corners, linearised at the estimate, lead to the chosen mode; toward: (n, 3) corners in the camera."""
     mode = m.modes[chosen]
-    reach = _middle_in_camera(m, mode)[2]
+    off, reach = _off_mode(seen, mode)[0], _middle_in_camera(seen.middle_at_rest_m, mode)[2]
     turned = float(np.linalg.norm(off[3:]))
     if toward[:, 2].min() < _AHEAD * reach or np.linalg.norm(off[:3]) > (1.0 - _AHEAD) * reach:
         return False
@@ -351,7 +360,7 @@ def hint(m: TagSighting, mount_yaw_rad: float, datum: Datum) -> Hint:
     R_world_body = mode.R_world_camera @ m.R_body_camera.T
     turn = _turned(mode.R_world_camera)
     sigma = np.sqrt(np.diagonal(turn @ mode.cov @ turn.T))
-    reach = float(np.linalg.norm(_middle_in_camera(m, mode)))
+    reach = float(np.linalg.norm(_middle_in_camera(_middle_at_rest_m(m), mode)))
     return Hint(
         p_world_m=mode.p_world_camera_m - R_world_body @ m.t_body_camera_m,
         p_sigma_m=np.hypot(sigma[:3], reach * float(sigma[5])),

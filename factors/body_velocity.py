@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from graphloc.config import BodyVelocityConfig
 from graphloc.factors._noise import with_floors
 from graphloc.frames import Array, Datum, skew
-from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import linear_factor
+from graphloc.graph import Attachment, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import BodyVelocity
 
 _CURRENT = slice(1, 3)  # after the scale error, in a slow state that has both
@@ -75,11 +74,6 @@ def residuals(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment) -> tu
     )
 
 
-def factors(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment, decision: Decision) -> GraphUpdate:
-    """Return the factor of one velocity."""
-    return linear_factor(residuals(m, config, at)[0], at, decision)
-
-
 def slow(config: BodyVelocityConfig) -> SlowProcess | None:
     """Return the process of scale error and current, as configured; None if neither is modelled."""
     there = _there(config)
@@ -115,7 +109,6 @@ ROW = Sensor(
     measurement=BodyVelocity,
     config=BodyVelocityConfig,
     residuals=residuals,
-    factors=factors,
     ideal=ideal,
     hint=hint,
     slow=slow,

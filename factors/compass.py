@@ -23,8 +23,7 @@ import numpy as np
 
 from graphloc.config import CompassConfig
 from graphloc.frames import Array, Datum, skew, wrap_angle
-from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import linear_factor
+from graphloc.graph import Attachment, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import CompassHeading
 from graphloc.thinning import HEADINGS_APART_NS
 
@@ -95,11 +94,6 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
     )
 
 
-def factors(m: CompassHeading, config: CompassConfig, at: Attachment, decision: Decision) -> GraphUpdate:
-    """Return the factor of one heading."""
-    return linear_factor(residuals(m, config, at)[0], at, decision)
-
-
 def slow(config: CompassConfig) -> SlowProcess | None:
     """Return the process of mount offset, deviation and wander, as configured; None if none is modelled."""
     sigma, time_constant_s = _sigmas(config), np.array([np.inf] * 5 + [config.wander_time_constant_s])
@@ -134,7 +128,6 @@ ROW = Sensor(
     measurement=CompassHeading,
     config=CompassConfig,
     residuals=residuals,
-    factors=factors,
     ideal=ideal,
     hint=hint,
     slow=slow,

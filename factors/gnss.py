@@ -26,7 +26,6 @@ from graphloc.config import GnssConfig
 from graphloc.factors._noise import noise_model, with_floors
 from graphloc.frames import Array, Datum, Geodetic, skew
 from graphloc.graph import Attachment, Constant, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import Term, linear_factor
 from graphloc.measurements import GnssPosition, world_from_fixes
 
 _TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
@@ -81,6 +80,7 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
             cov=cov,
             jacobian=lambda: _antenna_jacobian(at),
             slow_jacobian=lambda: -np.eye(3),
+            constant_jacobians=lambda: tuple(at.sensor_velocity_mps()[:, None] for _ in at.constants),
             prior=1.0,
             size_m=math.hypot(raw[0], raw[1]),
             size_deg=None,
@@ -89,11 +89,10 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
     )
 
 
-def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decision) -> GraphUpdate:
-    """Return the factors of one fix."""
+def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decision) -> GraphUpdate | None:
+    """Return the native factors of one fix; None where the linear one serves better."""
     if at.constants or (at.slow_key is not None and at.T_solver is None):
-        delay = [Term(key, np.array(late), at.sensor_velocity_mps()[:, None]) for key, late in at.constants]
-        return linear_factor(residuals(m, config, at)[0], at, decision, *delay)
+        return None
     z = _fix_world_m(m, at)
     lever = np.asarray(at.T_state_sensor.translation())
     model = noise_model(_covariance(white_covariance(m, config), at), decision)

@@ -20,7 +20,6 @@ from graphloc.config import HeightConfig
 from graphloc.factors._noise import robust
 from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
-from graphloc.linear import linear_factor
 from graphloc.measurements import HeightPrior
 from graphloc.time import duration_ns
 
@@ -58,10 +57,10 @@ def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Res
     )
 
 
-def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Decision) -> GraphUpdate:
-    """Return the factor of one height."""
+def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Decision) -> GraphUpdate | None:
+    """Return the native factor of one height; None where there is a tide."""
     if at.slow_key is not None:
-        return linear_factor(residuals(m, config, at)[0], at, decision)
+        return None
     sigmas = np.array([_WIDE_M, _WIDE_M, m.sigma_m / np.sqrt(decision.weight)])
     model = robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas), decision.kernel)
     lever = np.asarray(at.T_state_sensor.translation())

@@ -16,8 +16,7 @@ import numpy as np
 from graphloc.config import VelocityConfig
 from graphloc.factors._noise import with_floors
 from graphloc.frames import Array, Datum, skew
-from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor
-from graphloc.linear import linear_factor
+from graphloc.graph import Attachment, Hint, Residual, Sensor
 from graphloc.measurements import GnssVelocity
 
 
@@ -43,11 +42,6 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
     )
 
 
-def factors(m: GnssVelocity, config: VelocityConfig, at: Attachment, decision: Decision) -> GraphUpdate:
-    """Return the factor of one velocity."""
-    return linear_factor(residuals(m, config, at)[0], at, decision)
-
-
 def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
     """Return the noise-free velocity at the attachment's state."""
     return GnssVelocity(
@@ -65,7 +59,6 @@ ROW = Sensor(
     measurement=GnssVelocity,
     config=VelocityConfig,
     residuals=residuals,
-    factors=factors,
     ideal=ideal,
     hint=hint,
     company=True,

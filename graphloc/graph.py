@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a sensor row promises to the graph builder, and what it gets to see.
 
-A row turns a measurement into residuals (to weigh it, choose its mode, and write its ledger row) and
-into native GTSAM factors. Both functions are pure; what a row returns enters the graph whole or not
+A row turns a measurement into residuals (to weigh it, choose its mode, write its ledger row, and make its factor of) and,
+where they serve better, into native GTSAM factors. Both functions are pure; what a row returns enters the graph whole or not
 at all. Builder and solvers know rows only through this module, never by name.
 """
 
@@ -93,6 +93,7 @@ class Residual:
         jacobian: gives (k, 6) d raw / d (body tangent of the state's pose), for the predicted covariance.
         slow_jacobian: gives (k, n) d raw / d (slow state), for the same; None: it has no part in that.
         velocity_jacobian: gives (k, 3) d raw / d (velocity in world), for the same; None: it has no part in that.
+        constant_jacobians: gives (k, n) d raw / d (each of the attachment's constants), for its factor.
         expected_nis: expected square of the factor; None: that of its length, one per axis.
         prior: prior probability of this hypothesis.
         size_m, size_deg: physical size, for the ledger.
@@ -106,6 +107,7 @@ class Residual:
     size_deg: float | None
     slow_jacobian: Callable[[], Array] | None = None
     velocity_jacobian: Callable[[], Array] | None = None
+    constant_jacobians: Callable[[], tuple[Array, ...]] = tuple
     expected_nis: float | None = None
 
     def nis(self, inflation: Array | None = None) -> float:
@@ -239,10 +241,10 @@ class Sensor:
         kind: what `kind:` in vessel.yaml says.
         measurement, config: their classes.
         residuals: all hypotheses of a measurement at the current estimate.
-        factors: the factors of the chosen one.
         ideal: the noise-free measurement that a state would give (used by conformance tests).
         hint: what a measurement says at the start; takes it, the mount's yaw (rad) and the datum.
         slow: the slow state that a config asks for.
+        factors: factors of the chosen hypothesis; None: the linear one of its residual is its factor (`graphloc.linear`).
         false: the hypothesis that a measurement is false; None: the sensor has no such hypothesis
             and is guarded by its kernel alone.
         constants: that a config's measurements may share.
@@ -263,10 +265,10 @@ class Sensor:
     measurement: type[Measurement]
     config: type[SensorConfig]
     residuals: Callable[[Any, Any, Attachment], tuple[Residual, ...]]
-    factors: Callable[[Any, Any, Attachment, Decision], GraphUpdate]
     ideal: Callable[[Attachment, Any], Measurement]
     hint: Callable[[Any, float, Datum], Hint]
     slow: Callable[[Any], SlowProcess | None] = lambda _config: None
+    factors: Callable[[Any, Any, Attachment, Decision], GraphUpdate | None] = lambda *_: None
     false: Callable[[Any, Any], FalseModel] | None = None
     constants: Callable[[Any], tuple[Constant, ...]] = lambda _config: ()
     scaled: Callable[[Any], Mapping[str, list[int]]] = lambda _measurement: {}

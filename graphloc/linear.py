@@ -15,7 +15,7 @@ import numpy as np
 
 from graphloc import gauss
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, GraphUpdate, Residual
+from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor
 
 
 @cache
@@ -52,14 +52,28 @@ def pose_term(at: Attachment, jacobian: Array) -> Term:
     return Term(at.pose_key, at.T_solver, carried, at.T_solver.localCoordinates(at.T_world_body))
 
 
-def linear_factor(residual: Residual, at: Attachment, decision: Decision, *more: Term) -> GraphUpdate:
-    """Return the factor of a residual in the states that it has Jacobians for, pose, velocity and slow state, and in `more`."""
+def factors_of(
+    row: Sensor, m: Any, config: Any, at: Attachment, decision: Decision, residual: Residual | None = None
+) -> GraphUpdate:
+    """Return the factors of a measurement: its row's own, else the linear one of its residual.
+
+    Args:
+        residual: of the chosen hypothesis at `at`, where it is known.
+    """
+    own = row.factors(m, config, at, decision)
+    return own or linear_factor(residual or row.residuals(m, config, at)[decision.mode], at, decision)
+
+
+def linear_factor(residual: Residual, at: Attachment, decision: Decision) -> GraphUpdate:
+    """Return the factor of a residual in the states that it has Jacobians for: pose, velocity, slow state and constants."""
     terms = [pose_term(at, residual.jacobian())]
     if residual.velocity_jacobian is not None:
         terms.append(Term(at.velocity_key, at.v_world_mps, residual.velocity_jacobian()))
     if at.slow_key is not None and residual.slow_jacobian is not None:
         terms.append(Term(at.slow_key, np.array(at.slow_value), residual.slow_jacobian()))
-    return linear_update(residual, [*terms, *more], decision)
+    constants = zip(at.constants, residual.constant_jacobians(), strict=False)
+    terms += [Term(key, np.array(value), jacobian) for (key, value), jacobian in constants]
+    return linear_update(residual, terms, decision)
 
 
 def linear_update(

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc import keys
 from graphloc.config import AprilTagConfig, CameraConfig
-from graphloc.factors.apriltag import ROW
+from graphloc.factors.apriltag import ROW, factors
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.tags.pose import modes_of, poses_of
 from graphloc.graph import Attachment, Decision
@@ -93,7 +93,7 @@ def led_from(T: Any, m: TagSighting, mode: int) -> Any:
     for _ in range(10):
         values = gtsam.Values()
         values.insert(1, T)
-        update = ROW.factors(m, FIXED, attached(T), Decision(mode=mode))
+        update = factors(m, FIXED, attached(T), Decision(mode=mode))
         T = step([*update.factors, prior], values).atPose3(1)
     return T
 
@@ -230,7 +230,7 @@ def test_a_docks_known_motion_explains_what_is_seen() -> None:
         found = ROW.residuals(m, TWO_DOCKS, at)
         right = int(np.argmin([float(r.raw @ r.raw) for r in found]))
         np.testing.assert_allclose(found[right].raw, 0.0, atol=2e-3)
-        update = ROW.factors(m, TWO_DOCKS, at, Decision(mode=right))
+        update = factors(m, TWO_DOCKS, at, Decision(mode=right))
         values = gtsam.Values()
         values.insert(1, true)
         values.insert(3, np.array(at.slow_value))
@@ -252,7 +252,7 @@ def test_a_dock_is_found_between_two_nodes(share: float) -> None:
         at = replace(attached(true, slow), slow_next=(6, following, share, 1.0))
         found = ROW.residuals(m, DOCKED, at)
         right = int(np.argmin([float(r.raw @ r.raw) for r in found]))
-        update = ROW.factors(m, DOCKED, at, Decision(mode=right))
+        update = factors(m, DOCKED, at, Decision(mode=right))
         values = gtsam.Values()
         values.insert(1, true)
         values.insert(3, slow)
@@ -275,7 +275,7 @@ def test_how_far_a_dock_may_be_from_the_line_between_two_nodes() -> None:
     assert process is not None
     at = replace(attached(true, np.zeros(6)), slow_next=(6, np.zeros(6), 0.5, 1.0))
     right = int(np.argmin([float(r.raw @ r.raw) for r in ROW.residuals(m, DOCKED, at)]))
-    tie = ROW.factors(m, DOCKED, at, Decision(mode=right)).factors[0]
+    tie = factors(m, DOCKED, at, Decision(mode=right)).factors[0]
     values = gtsam.Values()
     values.insert(3, np.zeros(6))
     values.insert(4, np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
@@ -293,7 +293,7 @@ def test_a_dock_goes_on_while_its_next_node_is_not_there_yet() -> None:
     process = ROW.slow(DOCKED)
     assert process is not None
     at = replace(attached(true, np.zeros(6)), slow_age_s=0.8)
-    tie = ROW.factors(m, DOCKED, at, Decision()).factors[0]
+    tie = factors(m, DOCKED, at, Decision()).factors[0]
     values = gtsam.Values()
     values.insert(3, np.zeros(6))
     values.insert(4, np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
@@ -302,7 +302,7 @@ def test_a_dock_goes_on_while_its_next_node_is_not_there_yet() -> None:
     assert set(tie.keys()) == {3, 4}
     assert tie.error(values) == pytest.approx(0.5 * (0.02 / step_m) ** 2, rel=1e-6)
     away = np.array([0.1, -0.05, 0.3, 0.01, 0.0, -0.02])
-    back = ROW.factors(m, DOCKED, replace(at, slow_value=away), Decision()).factors[0]
+    back = factors(m, DOCKED, replace(at, slow_value=away), Decision()).factors[0]
     values.update(3, away)
     values.update(4, away * np.exp(-0.8 / process.time_constant_s[:6]))  # it returns to its place at rest
     assert back.error(values) == pytest.approx(0.0, abs=1e-9)
@@ -319,7 +319,7 @@ def test_what_the_survey_errs_about_a_tag_is_a_constant() -> None:
     constant = np.zeros(6)
     for _ in range(8):
         at = replace(attached(true), constants=((6, constant),))
-        update = ROW.factors(m, config, at, Decision(mode=0))
+        update = factors(m, config, at, Decision(mode=0))
         values = gtsam.Values()
         values.insert(1, true)
         values.insert(6, constant)
@@ -342,7 +342,7 @@ def slow_found(
     slow = prior
     for _ in range(times):
         at = attach(slow)
-        update = ROW.factors(m, config, at, Decision(mode=mode))
+        update = factors(m, config, at, Decision(mode=mode))
         values = gtsam.Values()
         values.insert(1, at.T_world_body)
         values.insert(3, slow)
@@ -520,7 +520,7 @@ def heading_off_deg(seed: int, count: int, gaussian: bool, bearing_deg: float = 
             if gaussian:
                 made += linear_update(found[mode], [Term(1, T, found[mode].jacobian())], Decision(mode=mode)).factors
             else:
-                made += ROW.factors(m, FIXED, at, Decision(mode=mode)).factors
+                made += factors(m, FIXED, at, Decision(mode=mode)).factors
         values = gtsam.Values()
         values.insert(1, T)
         T = step([*made, prior], values).atPose3(1)
@@ -576,7 +576,7 @@ def test_many_sightings_of_a_far_tag_do_not_make_its_distance_surer_than_its_edg
             values = gtsam.Values()
             values.insert(1, T)
             made = [
-                f for m, decision in zip(seen, nearer, strict=True) for f in ROW.factors(m, FIXED, attached(T, slow), decision).factors
+                f for m, decision in zip(seen, nearer, strict=True) for f in factors(m, FIXED, attached(T, slow), decision).factors
             ]  # fmt: skip
             if slow is not None:
                 values.insert(3, slow)

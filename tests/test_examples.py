@@ -13,6 +13,7 @@ import pytest
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.graph import Decision
+from graphloc.linear import factors_of
 from tests.test_factors import attachment, values_of
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -79,7 +80,7 @@ def test_the_new_sensor_is_as_ours_are(monkeypatch: pytest.MonkeyPatch) -> None:
     m = beacon.ROW.ideal(at, config)
     antenna = np.asarray(at.T_world_body.matrix()) @ np.array([-1.5, 0.4, 2.2, 1.0])
     assert m.range_m == pytest.approx(float(np.linalg.norm(antenna[:3] - [90.0, -70.0, 12.0])))
-    (factor,) = beacon.ROW.factors(m, config, at, Decision()).factors
+    (factor,) = factors_of(beacon.ROW, m, config, at, Decision()).factors
     assert factor.error(values_of(at, ())) < 1e-12
     (residual,) = beacon.ROW.residuals(m, config, at)
     for axis, slope in enumerate(residual.jacobian()[0]):

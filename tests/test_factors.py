@@ -11,6 +11,7 @@ from graphloc.config import KernelConfig
 from graphloc.factors import KINDS, SENSORS
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.graph import Attachment, Decision, Sensor
+from graphloc.linear import factors_of
 from graphloc.measurements import CompassHeading
 
 DATUM = Datum(Geodetic(59.3, 18.1, 20.0))
@@ -75,7 +76,7 @@ def test_zero_at_the_truth(row: Sensor, slow: bool) -> None:
         m = row.ideal(at, config)
         for residual in row.residuals(m, config, at):
             assert np.allclose(residual.raw, 0.0, atol=1e-6)
-        update = row.factors(m, config, at, Decision())
+        update = factors_of(row, m, config, at, Decision())
         values = values_of(at, update.guesses)
         assert sum(f.error(values) for f in update.factors) < 1e-8
 
@@ -86,7 +87,7 @@ def test_jacobians_are_numeric_ones(row: Sensor, slow: bool) -> None:
     config = config_of(row)
     at = attachment(row, config, slow=slow)
     m = row.ideal(at, config)
-    update = row.factors(m, config, at, Decision())
+    update = factors_of(row, m, config, at, Decision())
     values = values_of(at, update.guesses)
     sizes = {1: 6, 2: 3, 3: 0 if at.slow_value is None else len(at.slow_value)}
     sizes |= {key: len(value) for key, value in update.guesses}
@@ -237,7 +238,7 @@ def test_weight_scales_the_information(weight: float) -> None:
     config = row.config(kind="pose")
     at = attachment(row, config, tilt=0.0)
     m = row.ideal(at, config)
-    factor = row.factors(m, config, at, Decision(weight=weight)).factors[0]
+    factor = factors_of(row, m, config, at, Decision(weight=weight)).factors[0]
     values = gtsam.Values()
     moved = gtsam.Pose3(at.T_world_body.rotation(), at.T_world_body.translation() + np.array([0.3, 0.0, 0.0]))
     values.insert(1, moved)
@@ -250,7 +251,7 @@ def test_pose_leaves_unmeasured_axes_free() -> None:
     config = row.config(kind="pose")
     at = replace(attachment(row, config, tilt=0.0), T_state_sensor=gtsam.Pose3())
     m = row.ideal(at, config)
-    factor = row.factors(m, config, at, Decision()).factors[0]
+    factor = factors_of(row, m, config, at, Decision()).factors[0]
     values = gtsam.Values()
     turned = at.T_world_body.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(0.05, 0.05, 0.0), np.array([0.0, 0.0, 1.0])))
     values.insert(1, turned)
@@ -268,7 +269,7 @@ def test_a_fix_tells_a_solver_that_goes_on_the_same(kind: Literal["none", "cauch
     at = replace(at, slow_value=at.slow_value + np.array([0.4, -0.3, 0.2]))  # a residual
     told = []
     for solver in (None, at.T_world_body):
-        update = row.factors(m, config, replace(at, T_solver=solver), Decision(kernel=KernelConfig(kind=kind)))
+        update = factors_of(row, m, config, replace(at, T_solver=solver), Decision(kernel=KernelConfig(kind=kind)))
         assert bool(update.guesses) == (solver is not None)
         graph = gtsam.NonlinearFactorGraph()
         for factor in update.factors:
@@ -290,7 +291,7 @@ def test_kernel_bounds_the_error_of_an_outlier() -> None:
     values = gtsam.Values()
     values.insert(1, far)
     plain, cauchy = (
-        row.factors(m, config, at, Decision(kernel=KernelConfig(kind=kind))).factors[0].error(values)
+        factors_of(row, m, config, at, Decision(kernel=KernelConfig(kind=kind))).factors[0].error(values)
         for kind in ("none", "cauchy")
     )
     assert plain == pytest.approx(0.5 * (50.0 / 0.5) ** 2, rel=1e-3)
@@ -332,7 +333,7 @@ def test_a_factor_in_the_solvers_tangent_says_nothing_of_where_vessel_and_dock_a
     at = attachment(row, config)
     turned = at.T_world_body.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, -0.03, 0.05), np.array([0.3, -0.2, 0.1])))
     seen = row.ideal(at, config)
-    plain, written = (row.factors(seen, config, a, Decision()) for a in (at, replace(at, T_solver=turned)))
+    plain, written = (factors_of(row, seen, config, a, Decision()) for a in (at, replace(at, T_solver=turned)))
     here = values_of(at, plain.guesses)
     for one, other in zip(plain.factors, written.factors, strict=True):
         assert other.error(here) == pytest.approx(one.error(here), abs=1e-6)

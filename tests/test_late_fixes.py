@@ -14,6 +14,7 @@ from graphloc.eval.metrics import TruthMetrics, compare_to_held_out, compare_to_
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors.gnss import ROW
 from graphloc.graph import Decision
+from graphloc.linear import factors_of
 from graphloc.measurements import GnssPosition
 from graphloc.replay import replay
 from tests.slowly import with_few_states
@@ -62,7 +63,7 @@ def test_the_jacobians_are_those_of_the_residual() -> None:
     at = replace(attachment(ROW, config), constants=((6, np.array([0.07])),))
     assert at.slow_value is not None
     m = ROW.ideal(at, config)
-    (factor,) = ROW.factors(m, config, at, Decision()).factors
+    (factor,) = factors_of(ROW, m, config, at, Decision()).factors
     values = values_of(at, ())
     values.insert(6, np.array([0.07]))
     found = factor.linearize(values)

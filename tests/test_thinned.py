@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from graphloc import app, keys
-from graphloc.build import Problem, Thinned, attach, build_graph, make_problem, thinned
+from graphloc.build import Decided, Problem, Thinned, attach, build_graph, make_problem, thinned
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.graph import Decision
@@ -48,7 +48,7 @@ def solved(problem: Problem, values: gtsam.Values, chosen: dict[int, list[int]])
     prior, last = weak_prior(problem, values, 0), len(problem.timeline) - 1
     for _ in range(3):  # where measurements attach follows the estimate
         decided = {
-            (s.number, i): (Decision(), attach(problem, s, i, values))
+            (s.number, i): Decided(Decision(), attach(problem, s, i, values))
             for s in problem.streams
             for i in chosen[s.number]
         }

@@ -17,8 +17,7 @@ from pydantic import Field
 from graphloc.blocks import Positive, Triple
 from graphloc.config import SensorConfig
 from graphloc.frames import Array, Datum
-from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor
-from graphloc.linear import linear_factor
+from graphloc.graph import Attachment, FalseModel, Hint, Residual, Sensor
 from graphloc.measurements import Measurement
 
 
@@ -62,12 +61,6 @@ def residuals(m: BeaconRange, config: RangeBeaconConfig, at: Attachment) -> tupl
     )  # fmt: skip
 
 
-def factors(m: BeaconRange, config: RangeBeaconConfig, at: Attachment, decision: Decision) -> GraphUpdate:
-    """Return the factor of one range."""
-    (residual,) = residuals(m, config, at)
-    return linear_factor(residual, at, decision)
-
-
 def false(m: BeaconRange, config: RangeBeaconConfig) -> FalseModel:
     """A false range is off by some 30 m, and one that follows it errs alike: a moved beacon stays moved."""
     return FalseModel(probability=config.false_fraction, cov=np.array([[30.0**2]]), repeats=0.9)
@@ -92,6 +85,6 @@ def decode(msg: Any, stamp_ns: int, seq: int, sensor: str, config: RangeBeaconCo
 
 DECODERS = {"sensor_msgs/msg/Range": decode}
 ROW = Sensor(
-    kind="range_beacon", measurement=BeaconRange, config=RangeBeaconConfig, residuals=residuals, factors=factors,
-    ideal=ideal, hint=hint, false=false, company=True, in_world=True,
+    kind="range_beacon", measurement=BeaconRange, config=RangeBeaconConfig, residuals=residuals, ideal=ideal, hint=hint,
+    false=false, company=True, in_world=True,
 )  # fmt: skip

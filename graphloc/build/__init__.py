@@ -23,7 +23,7 @@ from graphloc.build._chains import (
     walk_between_nodes,
     without_drift,
 )
-from graphloc.build._graph import Decisions, Level, Past, StartPrior, build_graph, state_keys
+from graphloc.build._graph import Decided, Decisions, Level, Past, StartPrior, build_graph, state_keys
 from graphloc.build._problem import (
     Mounts,
     Problem,
@@ -44,6 +44,7 @@ __all__ = [
     "CONSTANT_TAILS",
     "JUMP",
     "Carry",
+    "Decided",
     "Decisions",
     "Judged",
     "Level",

@@ -16,7 +16,8 @@ from graphloc.build._attach import constants_of
 from graphloc.build._chains import CONSTANT_TAILS, bias_step, slow_begin, slow_end, slow_step
 from graphloc.build._problem import Problem, Stream
 from graphloc.frames import Array, skew
-from graphloc.graph import Attachment, Decision, SlowProcess
+from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
+from graphloc.linear import factors_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,8 +84,25 @@ class Past:
     known: Collection[int]
 
 
-# By (stream number, measurement index): the decision and the attachment; missing or None: left out of the graph.
-Decisions = Mapping[tuple[int, int], tuple[Decision, Attachment] | None]
+@dataclass(slots=True, eq=False)
+class Decided:
+    """How a measurement enters graphs; `residual`: of the decision's hypothesis at the attachment, None: not reckoned yet."""
+
+    decision: Decision
+    at: Attachment
+    residual: Residual | None = None
+    _update: GraphUpdate | None = field(init=False, default=None)
+
+    def update(self, stream: Stream, i: int) -> GraphUpdate:
+        """Return the factors of measurement `i`; they are made once, as several graphs may have them."""
+        if self._update is None:
+            m, config = stream.measurements[i], stream.config
+            self._update = factors_of(stream.row, m, config, self.at, self.decision, self.residual)
+        return self._update
+
+
+# By (stream number, measurement index); missing or None: left out of the graph.
+Decisions = Mapping[tuple[int, int], Decided | None]
 
 
 def build_graph(
@@ -122,10 +140,10 @@ def build_graph(
             decided = decisions.get((stream.number, i))
             if decided is None:
                 continue
-            decision, at = decided
-            if at.slow_next is not None and not guess.exists(at.slow_next[0]):
-                at = replace(at, slow_next=None)  # the next node lies beyond the stretch
-            update = stream.row.factors(stream.measurements[i], stream.config, at, decision)
+            at = decided.at
+            if at.slow_next is not None and not guess.exists(at.slow_next[0]):  # it lies beyond the stretch
+                decided = Decided(decided.decision, replace(at, slow_next=None))
+            update = decided.update(stream, i)
             if made is not None:
                 made[(stream.number, i)] = range(graph.size(), graph.size() + len(update.factors))
             for factor in update.factors:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import sys
 from pathlib import Path
@@ -68,7 +67,6 @@ def replay(
 
     options.check_outputs()
     recording, vessel, scans = options.load(progress())
-    gc.freeze()  # as in `graphloc.stream`: what is loaded stays
     run = application.replay_recording(recording, vessel, scans=scans, speed=speed, lag_s=lag, status=status_line())
     if sys.stderr.isatty():
         sys.stderr.write("\r\033[K")

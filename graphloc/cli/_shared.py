@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -181,6 +182,7 @@ class BagOptions:
         recording, vessel = application.load(self.part, self.config, show)
         if recording.span is not None:
             typer.echo(f"{', '.join(str(p) for p in self.bag)}: {recording.span}", err=True)
+        gc.freeze()  # as in `graphloc.stream`: what is loaded stays
         return recording, vessel, application.Scans(self.part, self.config.parent)
 
 

@@ -14,6 +14,7 @@ from graphloc.build import attach
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Residual
 from graphloc.ledger import LedgerRow
+from graphloc.linear import factors_of
 from graphloc.measurements import Measurement
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
@@ -167,7 +168,7 @@ class Entries:
         window, timeline = self._window, self._problem.timeline
         t = timeline.page_s(timeline.stamps_ns[entry.state])
         at = replace(verdict.at, T_solver=window.linearised_at(verdict.at.pose_key))
-        update = stream.row.factors(m, stream.config, at, verdict.decision)
+        update = factors_of(stream.row, m, stream.config, at, verdict.decision)
         for key, value in update.guesses:
             if not window.values.exists(key):
                 window.guess(key, value, t)

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from graphloc.build import Decisions, Problem, StartPrior, Thinned, attach, build_graph
-from graphloc.graph import Attachment, Decision
+from graphloc.build import Decided, Decisions, Problem, StartPrior, Thinned, attach, build_graph
+from graphloc.graph import Decision
 from graphloc.solve._decide import (
     Stage,
     Verdict,
@@ -56,7 +56,7 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
     at once, so three solutions are enough for the whole run.
     """
     problem, values = few.problem, few.of(settled.values)
-    start_ns = int(problem.timeline.stamps_ns[0])
+    start_ns, streams = int(problem.timeline.stamps_ns[0]), {s.number: s for s in problem.streams}
     at_s = {  # time of each hypothesis in the run
         (s.number, i): (m.stamp_ns - start_ns) * 1e-9
         for s in problem.streams
@@ -82,8 +82,10 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
             only=own,
         )
         for (number, i), verdict in fresh.items():
-            key = number, int(few.chosen[number][i])
-            judged[key] = _decisive(verdict, judged[key].at)
+            key, stream = (number, int(few.chosen[number][i])), streams[number]
+            at = judged[key].at  # of the whole run
+            residual = stream.row.residuals(stream.measurements[i], stream.config, at)[verdict.mode]
+            judged[key] = _decisive(replace(verdict, at=at, residual=residual))
         iterations += 1
         del rest  # and its tree, before the next one is made
     return judged, iterations
@@ -91,13 +93,12 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
 
 def _decided(few: Thinned, verdicts: Verdicts, values: gtsam.Values) -> Decisions:
     """Return the decisions on the measurements of a thinned run, from verdicts on the whole one."""
-    decided: dict[tuple[int, int], tuple[Decision, Attachment] | None] = {}
-    for stream in few.problem.streams:
-        for i, whole in enumerate(few.chosen[stream.number].tolist()):
-            decision = verdicts[stream.number, whole].decision
-            at = None if decision is None else attach(few.problem, stream, i, values)
-            decided[stream.number, i] = None if decision is None or at is None else (decision, at)
-    return decided
+    return {
+        (stream.number, i): Decided(decision, attach(few.problem, stream, i, values))
+        for stream in few.problem.streams
+        for i, whole in enumerate(few.chosen[stream.number].tolist())
+        if (decision := verdicts[stream.number, whole].decision) is not None
+    }
 
 
 def _without_its_ends(problem: Problem, settled: Settled) -> Verdicts:
@@ -136,10 +137,10 @@ def _without(
     return _Rest(gtsam.Values(tree.calculateBestEstimate()), tree)
 
 
-def _decisive(verdict: Verdict, at: Attachment) -> Verdict:
+def _decisive(verdict: Verdict) -> Verdict:
     """Round weights to 0 or 1: half a weight for each of several that repeat each other would pull the estimate to them."""
     sure = verdict.weight > _SURE
-    return replace(verdict, decision=Decision(mode=verdict.mode) if sure else None, weight=float(sure), at=at)
+    return replace(verdict, decision=Decision(mode=verdict.mode) if sure else None, weight=float(sure))
 
 
 def take_more_probable(problem: Problem, settled: Settled, others: Verdicts, prior: StartPrior) -> bool:

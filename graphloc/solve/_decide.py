@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from graphloc import keys
-from graphloc.build import Decisions, Judged, Problem, Sited, Stream, attach
+from graphloc.build import Decided, Decisions, Judged, Problem, Sited, Stream, attach
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
@@ -61,7 +61,7 @@ class Verdict:
         decision: None leaves the measurement out. mode: the chosen one, also then.
         weight: posterior probability that the mode is right (or the kernel's weight).
         mode_probability: of the chosen mode among the modes.
-        residual: of the chosen mode. at: its attachment.
+        residual: of the chosen mode, at the attachment `at`.
         settled: pass over the whole run from which on this mode was the chosen one.
     """
 
@@ -266,7 +266,10 @@ def believing(
 
 def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> Decisions:
     """Return the decisions of verdicts for the graph builder, without those of `without`."""
-    return {key: None if v.decision is None or key in without else (v.decision, v.at) for key, v in verdicts.items()}
+    return {
+        key: None if v.decision is None or key in without else Decided(v.decision, v.at, v.residual)
+        for key, v in verdicts.items()
+    }
 
 
 def predicted_covariance(tree: Any) -> PredictedCovariance:

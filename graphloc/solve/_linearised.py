@@ -14,7 +14,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from graphloc import keys
-from graphloc.build import JUMP, Problem, StartPrior, Stream, build_graph
+from graphloc.build import JUMP, Decided, Problem, StartPrior, Stream, build_graph
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision
@@ -86,7 +86,7 @@ def linearised(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior
     for key, verdict in verdicts.items():
         if verdict.decision is not None:
             plain = Decision(mode=verdict.decision.mode, weight=verdict.decision.weight)
-            decided[key] = (plain, _attached(problem, streams[key[0]], key[1], verdict.at, values))
+            decided[key] = Decided(plain, _attached(problem, streams[key[0]], key[1], verdict.at, values))
     graph, guess = build_graph(problem, values, decided, 0, last, prior, jumps=False, made=made)
     kernels = [
         (factors, kernel)

@@ -10,6 +10,7 @@ import numpy as np
 
 from graphloc import keys
 from graphloc.build import (
+    Decided,
     Decisions,
     Past,
     Problem,
@@ -98,7 +99,7 @@ def _written_anew(problem: Problem, values: gtsam.Values, first: int, last: int,
         if stream.row.false is not None:
             for i in stream.between(first, last):
                 if (found := decided.get((stream.number, i))) is not None:
-                    written[stream.number, i] = (found[0], attach(problem, stream, i, values))
+                    written[stream.number, i] = Decided(found.decision, attach(problem, stream, i, values))
     return written
 
 
