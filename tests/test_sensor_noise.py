@@ -167,13 +167,13 @@ class Fixes:
     def __init__(self, residuals: Array) -> None:
         self.problem = SimpleNamespace(streams={"gnss": self})
         self.row, self.config = next(row for row in SENSORS if row.kind == "gnss"), GnssConfig(topic="/fix")
-        self._residuals, self._now_ns = residuals, 0
+        self._residuals, self._now_ns, self._back_ns = residuals, 0, 0
 
     def seen_by(self, noise: SensorNoise, set_back_s: float = 0.0) -> list[str]:
         """What is said while they come, a look each second; their stamps are of a clock that was set back by so much."""
-        said = []
-        for self._now_ns in range(0, len(self._residuals) * SECOND // 10, SECOND):
-            self._back_ns = int(set_back_s * SECOND)
+        said, self._back_ns = [], int(set_back_s * SECOND)
+        for now_ns in range(0, len(self._residuals) * SECOND // 10, SECOND):
+            self._now_ns = now_ns
             if line := noise.raised(self):  # type: ignore[arg-type]
                 said.append(line)
         return said
