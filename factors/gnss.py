@@ -78,6 +78,7 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
         Residual(
             raw=raw,
             cov=cov,
+            white=white,
             jacobian=lambda: _antenna_jacobian(at),
             slow_jacobian=lambda: -np.eye(3),
             constant_jacobians=lambda: tuple(at.sensor_velocity_mps()[:, None] for _ in at.constants),

@@ -94,6 +94,7 @@ class Residual:
         slow_jacobian: gives (k, n) d raw / d (slow state), for the same; None: it has no part in that.
         velocity_jacobian: gives (k, 3) d raw / d (velocity in world), for the same; None: it has no part in that.
         constant_jacobians: gives (k, n) d raw / d (each of the attachment's constants), for its factor.
+        white: (k, k) covariance of what it does not share with the measurements beside it; None: all of `cov`.
         expected_nis: expected square of the factor; None: that of its length, one per axis.
         prior: prior probability of this hypothesis.
         size_m, size_deg: physical size, for the ledger.
@@ -108,6 +109,7 @@ class Residual:
     slow_jacobian: Callable[[], Array] | None = None
     velocity_jacobian: Callable[[], Array] | None = None
     constant_jacobians: Callable[[], tuple[Array, ...]] = tuple
+    white: Array | None = None
     expected_nis: float | None = None
 
     def nis(self, inflation: Array | None = None) -> float:

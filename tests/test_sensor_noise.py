@@ -6,20 +6,24 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.config import PoseConfig
+from graphloc.config import GnssConfig, PoseConfig
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
-from graphloc.frames import Array
+from graphloc.frames import Array, Geodetic
+from graphloc.graph import Residual
 from graphloc.measurements import GnssPosition, Measurement, PoseFix
 from graphloc.online import OnlineSmoother
 from graphloc.online._noise import ImuNoise
 from graphloc.online._persistent import PersistentState
+from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.replay import arrivals, replay
 from graphloc.solve._sensor_noise import Step, Steps, times_stated
@@ -162,3 +166,68 @@ def test_a_snapshot_knows_what_sensors_scatter(tmp_path: Path) -> None:
     )
     resumed = PersistentState.resumed(strange, ImuNoise(adapt=True), sensors)
     assert resumed.sensor_noise.times == {"matcher": found.sensor_noise["matcher"], "gnss": {}}
+
+
+def test_floors_are_raised_with_the_factor() -> None:
+    """Of fixes that state a micrometre, the factor alone would have to be 300 000 to be felt; all rounds were used up, and none left for the IMU."""
+    scenario = replace(bl_scenario(1, "clean"), duration_s=40.0, pose_hz=0.0, gnss_sigma_m=0.3)
+    run = stating(slowly(simulate(scenario, 3)), GnssPosition, 1e-6 / 0.3)
+    said = app.smooth_recording(run.recording, run.config).solution.stats.warnings
+    (line,) = (w for w in said if "scatter more than they state" in w)
+    found = {key: float(value) for key, value in re.findall(r"(\w+): ([0-9.]+)", line)}
+    assert found["min_horizontal_sigma_m"] == pytest.approx(0.3, rel=0.2)
+    assert found["sigma_scale"] == pytest.approx(15.0, rel=0.2)  # of the floor, 0.02 m
+
+
+class Fixes:
+    """A window of fixes of 10 Hz that state 2 cm, with the residuals (N, 2) that they are given."""
+
+    def __init__(self, residuals: Array) -> None:
+        self.problem = SimpleNamespace(streams={"gnss": self})
+        self.row, self.config = next(row for row in SENSORS if row.kind == "gnss"), GnssConfig(topic="/fix")
+        self._residuals, self._now_ns, self._back_ns = residuals, 0, 0
+
+    def seen_by(self, noise: SensorNoise, set_back_s: float = 0.0) -> list[str]:
+        """What is said while they come, a look each second; their stamps are of a clock that was set back by so much."""
+        said, self._back_ns = [], int(set_back_s * SECOND)
+        for now_ns in range(0, len(self._residuals) * SECOND // 10, SECOND):
+            self._now_ns = now_ns
+            if line := noise.raised(self):  # type: ignore[arg-type]
+                said.append(line)
+        return said
+
+    @property
+    def newest(self) -> Any:
+        return SimpleNamespace(stamp_ns=1000 * SECOND + self._now_ns - self._back_ns)
+
+    def judged(self, _sensor: str, after_ns: int, until_ns: int) -> list[tuple[Measurement, Residual]]:
+        place, cov = Geodetic(59.0, 10.0, 0.0), 0.02**2 * np.eye(3)
+        found: list[tuple[Measurement, Residual]] = []
+        for k, raw in enumerate(self._residuals):
+            stamp_ns = 1000 * SECOND - self._back_ns + k * SECOND // 10
+            if max(after_ns, self.newest.stamp_ns - 10 * SECOND) < stamp_ns <= until_ns:
+                fix = GnssPosition(stamp_ns=stamp_ns, sensor="gnss", seq=k, position=place, cov_enu_m2=cov)
+                error = np.append(raw, 0.0)
+                residual = Residual(raw=error, cov=cov, jacobian=lambda: cov, prior=1.0, size_m=0.0, size_deg=None)
+                found.append((fix, residual))
+        return found
+
+
+def test_online_some_seconds_of_multipath_do_not_widen_all_fixes_after_them() -> None:
+    """12 s of ten times the noise are 120 fixes, more than are remembered; factors only grow."""
+    residuals = np.random.default_rng(3).normal(0.0, 0.02, (1000, 2))
+    residuals[400:520] *= 10.0
+    assert Fixes(residuals).seen_by(noise := SensorNoise()) == []
+    assert noise.times == {}
+    residuals[520:] *= 10.0
+    assert len(Fixes(residuals).seen_by(SensorNoise())) >= 1
+
+
+def test_online_noise_is_seen_after_the_clock_was_set_back() -> None:
+    """By the stamps before, nothing was newer until the clock had caught up, and the IMU was blamed meanwhile."""
+    rng = np.random.default_rng(3)
+    noise = SensorNoise()
+    persistent = PersistentState(datum=None, noise=ImuNoise(adapt=True), sensor_noise=noise)
+    assert Fixes(rng.normal(0.0, 0.02, (100, 2))).seen_by(noise) == []
+    persistent.forget_clock(900 * SECOND)
+    assert len(Fixes(rng.normal(0.0, 0.2, (400, 2))).seen_by(noise, set_back_s=100.0)) >= 1

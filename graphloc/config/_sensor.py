@@ -36,6 +36,11 @@ class KernelConfig(Block):
 
 SIGMA_SCALES = ("sigma_scale", "angle_sigma_scale")
 """Keys of factors on the sigmas that a sensor's measurements come with, where it has them."""
+SIGMA_FLOORS = {
+    "sigma_scale": ("min_horizontal_sigma_m", "min_vertical_sigma_m", "min_sigma_m"),
+    "angle_sigma_scale": ("min_sigma_deg",),
+}
+"""By such a key, the floors of the scaled sigmas: a factor that leaves these has no effect on what states less."""
 
 
 class SensorConfig(Block):
@@ -72,5 +77,6 @@ class SensorConfig(Block):
         return 1.0
 
     def scaled(self, times: Mapping[str, float]) -> Self:
-        """Return the configuration with some of its numbers, by key, so many times as large."""
-        return self.model_copy(update={key: getattr(self, key) * by for key, by in times.items()})
+        """Return the configuration with some of its numbers, by key, so many times as large; of a factor on sigmas, their floors too."""
+        floors = {floor: by for key, by in times.items() for floor in SIGMA_FLOORS.get(key, ()) if hasattr(self, floor)}
+        return self.model_copy(update={key: getattr(self, key) * by for key, by in (floors | dict(times)).items()})

@@ -107,5 +107,6 @@ class PersistentState:
     def forget_clock(self, stamp_ns: int) -> None:
         """Forget stamps of a clock that was set back; `stamp_ns`: by the clock as it is now."""
         self.agreed_ns, self.jump_detectors = {}, {}
+        self.sensor_noise.forget_clock()
         if self.odometry is not None:
             self.odometry.stamp_ns = stamp_ns

@@ -15,6 +15,9 @@ from graphloc.solve._warnings import scale_warning
 _EVERY_S = 5.0
 _SETTLED_S = 1.5  # after so long a measurement has been judged again
 _REMEMBERED = 100  # steps
+# Of the steps since the last look, so that the remembered ones are of a minute or more: factors only grow, and ten seconds of multipath
+# are as many steps of a fast receiver.
+_AT_ONCE = 6
 
 
 class SensorNoise:
@@ -30,6 +33,10 @@ class SensorNoise:
         self._last: dict[str, tuple[Measurement, Residual]] = {}
         self._steps: dict[str, dict[tuple[tuple[str, int], ...], deque[tuple[Step, ...]]]] = {}
 
+    def forget_clock(self) -> None:
+        """Forget stamps of a clock that was set back: by these, nothing would be newer until it has caught up."""
+        self._looked_ns, self._last = 0, {}
+
     def raised(self, lag: Lag) -> str:
         """Raise the factors of a sensor that clearly scatters more than it states; return a line on that, or empty."""
         at_ns = lag.newest.stamp_ns
@@ -42,7 +49,7 @@ class SensorNoise:
             if not judged or not stream.row.scaled(judged[0][0]):
                 continue
             for key, new in steps_of(stream, [last, *judged] if last else judged).items():
-                steps.setdefault(key, deque(maxlen=_REMEMBERED)).extend(new)
+                steps.setdefault(key, deque(maxlen=_REMEMBERED)).extend(new[:: -(-len(new) // _AT_ONCE)])
             self._last[name] = judged[-1]
             if times := times_stated(steps):
                 own = self.times.setdefault(name, {})

@@ -10,6 +10,7 @@
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
 6. A Bayes tree of the last graph gives the covariances of every state.
 
+Sensors that scatter more than they state are taken as they scatter, and 3 and 4 repeated.
 Where the IMU contradicts the other sensors, its noise is scaled up, and 3 and 4 are repeated, beginning with gentle losses.
 """
 
@@ -35,7 +36,7 @@ from graphloc.solve._passes import Settled, cost_without_outliers, expected_cost
 from graphloc.solve._sensor_noise import scattering
 from graphloc.solve._start import solve_start
 
-_MAX_NOISE_ROUNDS = 5
+_MAX_NOISE_ROUNDS, _MAX_SENSOR_ROUNDS = 5, 2
 # Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
 _FIRST_PASSES, _LAST_PASSES = 6, 15
 # At most: over the thinned run after growing; with each gentle loss, where the IMU's noise has changed.
@@ -96,12 +97,8 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         problem = bridged(problem, estimate)
         few = thinned(problem)
     for attempt in range(_MAX_NOISE_ROUNDS):
-        settled = _final_passes(problem, few, estimate, prior, progress)
+        problem, few, settled = _as_they_scatter(problem, few, estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
-        if attempt < _MAX_NOISE_ROUNDS - 1 and (times := scattering(problem, settled.verdicts)):
-            problem = with_sensor_noise(problem, times)
-            few = thinned(problem)
-            continue
         ratio = cost_without_outliers(settled) / max(expected_cost(problem, settled.verdicts), 1.0)
         if attempt == _MAX_NOISE_ROUNDS - 1 or not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
@@ -141,6 +138,25 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         levels_cov=levels_cov,
         notes=start.notes,
     )
+
+
+def _as_they_scatter(
+    problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
+) -> tuple[Problem, Thinned, Settled]:
+    """Make the final passes, again with larger sigmas of the sensors that scatter more than they state (see `_sensor_noise`).
+
+    Returns:
+        The problem with these, its thinned run, and the solution.
+    """
+    passes = iterations = 0
+    for more in range(_MAX_SENSOR_ROUNDS, -1, -1):
+        settled = _final_passes(problem, few, estimate, prior, progress)
+        passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
+        if not more or not (times := scattering(problem, settled.verdicts)):
+            break
+        problem = with_sensor_noise(problem, times)
+        few = thinned(problem)
+    return problem, few, replace(settled, passes=passes, iterations=iterations)
 
 
 def _final_passes(

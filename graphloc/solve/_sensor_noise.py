@@ -22,7 +22,7 @@ from graphloc.measurements import Measurement
 from graphloc.solve._decide import Verdicts
 
 _PAIRED_S = 10.0  # apart at most: over longer, the error of the estimate changes, too
-_FEWEST = 15  # pairs
+_FEWEST, _MOST = 15, 2000  # pairs
 _FALSE_M = 5.0  # what a sensor without hypotheses errs by where it errs
 _FACTORS = np.geomspace(1.0, 20.0, 16)
 # Of right pairs. With fewer, those that err by their noise could all be false by little, and no noise would show.
@@ -72,7 +72,8 @@ def steps_of(
         scaled = {key: axes for key, axes in stream.row.scaled(b).items() if axes}
         if not scaled or b.stamp_ns - a.stamp_ns > _PAIRED_S * 1e9 or len(before.raw) != len(now.raw):
             continue
-        change, stated, error = now.raw - before.raw, before.cov + now.cov, _error(stream, b, len(now.raw))
+        change, error = now.raw - before.raw, _error(stream, b, len(now.raw))
+        stated = np.add(*(r.cov if r.white is None else r.white for r in (before, now)))
         parts = [(axes, np.ix_(axes, axes)) for axes in scaled.values()]
         step = tuple(Step(change[axes], stated[part], error[part]) for axes, part in parts)
         steps.setdefault(tuple((key, len(axes)) for key, axes in scaled.items()), []).append(step)
@@ -90,7 +91,8 @@ def times_stated(steps: Steps) -> dict[str, float]:
     keys, most = max(steps.items(), key=lambda item: len(item[1]), default=((), ()))
     if len(most) < _FEWEST:
         return {}
-    times = _likeliest([Step(*map(np.array, zip(*own, strict=True))) for own in zip(*most, strict=True)])
+    some = list(most)[:: -(-len(most) // _MOST)]
+    times = _likeliest([Step(*map(np.array, zip(*own, strict=True))) for own in zip(*some, strict=True)])
     return {key: by for (key, _), by in zip(keys, times, strict=True) if by > _LEAST_TIMES}
 
 
