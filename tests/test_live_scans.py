@@ -310,6 +310,7 @@ class Heap:
 
     def __init__(self, *messages: tuple[str, float, float]) -> None:
         self._messages = messages
+        self.warnings: list[str] = []
         self.topics = {f"/{n}": TopicSummary(f"/{n}", (CLOUD,), 1) for n in ("one", "two")}
 
     def messages(self, _topics: set[str]) -> Iterator[RawMessage]:
