@@ -17,11 +17,10 @@ from graphloc.config._instruments import (
     VelocityConfig,
 )
 from graphloc.config._poses import AerialConfig, AnyPoseConfig, AprilTagConfig, CameraConfig, LidarConfig, PoseConfig
-from graphloc.config._sensor import SIGMA_FLOORS, SIGMA_SCALES, KernelConfig, SensorConfig
+from graphloc.config._sensor import SIGMA_SCALES, KernelConfig, SensorConfig
 from graphloc.config._vessel import DatumConfig, OutputConfig, StartConfig, TimelineConfig, VesselConfig
 
 __all__ = [
-    "SIGMA_FLOORS",
     "SIGMA_SCALES",
     "STANDARD_GRAVITY_MPS2",
     "AerialConfig",

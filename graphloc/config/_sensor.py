@@ -34,13 +34,12 @@ class KernelConfig(Block):
         return (1.0 - u2) ** 2 if u2 < 1.0 else 0.0
 
 
-SIGMA_SCALES = ("sigma_scale", "angle_sigma_scale")
-"""Keys of factors on the sigmas that a sensor's measurements come with, where it has them."""
-SIGMA_FLOORS = {
+SIGMA_SCALES = {
     "sigma_scale": ("min_horizontal_sigma_m", "min_vertical_sigma_m", "min_sigma_m"),
     "angle_sigma_scale": ("min_sigma_deg",),
 }
-"""By such a key, the floors of the scaled sigmas: a factor that leaves these has no effect on what states less."""
+"""Keys of factors on the sigmas that a sensor's measurements come with, where it has them; and floors of these sigmas, which grow with them:
+else a factor has no effect on what states less."""
 
 
 class SensorConfig(Block):
@@ -78,5 +77,5 @@ class SensorConfig(Block):
 
     def scaled(self, times: Mapping[str, float]) -> Self:
         """Return the configuration with some of its numbers, by key, so many times as large; of a factor on sigmas, their floors too."""
-        floors = {floor: by for key, by in times.items() for floor in SIGMA_FLOORS.get(key, ()) if hasattr(self, floor)}
+        floors = {floor: by for key, by in times.items() for floor in SIGMA_SCALES.get(key, ()) if hasattr(self, floor)}
         return self.model_copy(update={key: getattr(self, key) * by for key, by in (floors | dict(times)).items()})

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build import Problem, Stream, solved_constants
-from graphloc.config import SIGMA_FLOORS, SIGMA_SCALES
+from graphloc.config import SIGMA_SCALES
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.position_jumps import jump_warnings, largest_sigma
@@ -63,7 +63,7 @@ def scale_warning(sensor: str, stated: Any, taken: Any) -> list[str]:
     keys = [key for key, by in times.items() if by > 1.0]
     if not keys:
         return []
-    floors = [floor for key in keys for floor in SIGMA_FLOORS[key] if hasattr(taken, floor)]
+    floors = [floor for key in keys for floor in SIGMA_SCALES[key] if hasattr(taken, floor)]
     cure = ", ".join(
         [f"{key}: {getattr(taken, key):.2g}" for key in floors] + [f"{key}: {getattr(taken, key):.1f}" for key in keys]
     )
