@@ -50,7 +50,9 @@ def stating(run: SimulatedRun, kind: type[Measurement], share: float) -> Simulat
 
 def matched(seed: int, duration_s: float = 40.0) -> SimulatedRun:
     """BL's case 1 with matches of 0.3 m, 40 % of them false, and GNSS that drifts."""
-    return slowly(simulate(replace(bl_scenario(1, "drift"), duration_s=duration_s, pose_hz=4.0), seed))
+    return slowly(
+        simulate(replace(bl_scenario(1, "drift"), duration_s=duration_s, pose_hz=4.0, imu_hz=50.0, gnss_hz=5.0), seed)
+    )
 
 
 def steps_of(residuals: Array, sigma: float, false_sigma: float = 5.0) -> Steps:
