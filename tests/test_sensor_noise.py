@@ -204,10 +204,10 @@ class Fixes:
         self.row, self.config = next(row for row in SENSORS if row.kind == "gnss"), GnssConfig(topic="/fix")
         self._residuals, self._now_ns, self._back_ns, self._scale = residuals, 0, 0, 1.0
 
-    def seen_by(self, noise: SensorNoise, set_back_s: float = 0.0) -> list[str]:
-        """What is said while they come, a look each second; their stamps are of a clock that was set back by so much."""
+    def seen_by(self, noise: SensorNoise, set_back_s: float = 0.0, looks: int | None = None) -> list[str]:
+        """What is said while they come, or at so many looks, one each second; their stamps are of a clock that was set back by so much."""
         said, self._back_ns = [], int(set_back_s * SECOND)
-        for now_ns in range(0, len(self._residuals) * SECOND // 10, SECOND):
+        for now_ns in range(0, (looks or len(self._residuals) // 10) * SECOND, SECOND):
             self._now_ns = now_ns
             self._scale = noise.times.get("gnss", {}).get("sigma_scale", 1.0)
             self.config = GnssConfig(topic="/fix", sigma_scale=self._scale)
@@ -253,6 +253,12 @@ def test_online_a_minute_of_multipath_ends() -> None:
     said = Fixes(residuals).seen_by(noise := SensorNoise())
     assert noise.times == {"gnss": {}}
     assert said[-1] == "gnss: its measurements scatter less again; taken as configured"
+
+
+def test_online_a_fix_without_another_near_it_is_no_pair() -> None:
+    """The first is alone; and the solver failed for it."""
+    assert Fixes(np.zeros((1, 2))).seen_by(noise := SensorNoise(), looks=4) == []
+    assert noise.times == {}
 
 
 def test_online_noise_that_stays_keeps_its_factor() -> None:

@@ -57,7 +57,7 @@ class SensorNoise:
                 continue
             new = pairs_of(stream, [last, *judged] if last else judged)
             pairs = self._pairs.setdefault(name, deque(maxlen=_REMEMBERED))
-            pairs.extend(_as_configured(pair, times) for pair in new[:: -(-len(new) // _AT_ONCE)])
+            pairs.extend(_as_configured(pair, times) for pair in new[:: max(-(-len(new) // _AT_ONCE), 1)])
             self._last[name] = judged[-1]
             if (found := times_stated(pairs, times)) != times:
                 self.times[name] = found
