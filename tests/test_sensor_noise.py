@@ -257,7 +257,7 @@ def test_online_a_minute_of_multipath_ends() -> None:
 
 def test_online_a_fix_without_another_near_it_is_no_pair() -> None:
     """The first is alone; and the solver failed for it."""
-    assert Fixes(np.zeros((1, 2))).seen_by(noise := SensorNoise(), looks=4) == []
+    assert Fixes(np.zeros((1, 2))).seen_by(noise := SensorNoise(), looks=8) == []
     assert noise.times == {}
 
 
