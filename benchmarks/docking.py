@@ -327,8 +327,6 @@ class Alone:
     error: Any
     cov: Any
     corners_px: Any
-    modes: int
-    best_is_right: bool
 
 
 def alone(job: Job, step_s: float = 0.5) -> list[Alone]:
@@ -382,8 +380,6 @@ def alone(job: Job, step_s: float = 0.5) -> list[Alone]:
                     np.concatenate([shift, turn]),
                     np.asarray(mode.cov),
                     seen.corners_px - px,
-                    len(modes),
-                    right == 0,
                 )
             )
     return found

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.frames import Array
 
 _STEP_S = 0.02  # knots of the velocity spline
+_WAVES = 12  # sinusoids that stand for a sea
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +34,15 @@ class Waves:
         return np.asarray(np.sin(angle) @ (self.amplitude * self.omega**derivative))
 
     @staticmethod
-    def jonswap(rng: np.random.Generator, rms: float, peak_s: float, count: int = 12) -> Waves:
+    def jonswap(rng: np.random.Generator, rms: float, peak_s: float) -> Waves:
         """Draw waves whose sum has a standard deviation `rms`, spectrum JONSWAP (gamma 3.3), peak period in s."""
         peak = 2.0 * np.pi / peak_s
-        omega = peak * np.sort(rng.uniform(0.6, 2.2, count))
+        omega = peak * np.sort(rng.uniform(0.6, 2.2, _WAVES))
         width = np.where(omega <= peak, 0.07, 0.09)
         bump = 3.3 ** np.exp(-((omega / peak - 1.0) ** 2) / (2.0 * width**2))
         power = omega**-5.0 * np.exp(-1.25 * (peak / omega) ** 4) * bump
         amplitude = np.sqrt(power / power.sum()) * rms * np.sqrt(2.0)
-        return Waves(amplitude, omega, rng.uniform(0.0, 2.0 * np.pi, count))
+        return Waves(amplitude, omega, rng.uniform(0.0, 2.0 * np.pi, _WAVES))
 
 
 @dataclass(frozen=True, slots=True)
