@@ -26,6 +26,7 @@ from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE
 from graphloc.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.time import NS_PER_S
+from graphloc.white_noise import white_noise
 
 _TURNS_DEG, _SAME_DEG = 5.0, 0.2
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
@@ -206,7 +207,7 @@ def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
     if len(fixes) < 20:
         return Courses(np.zeros(0, dtype=np.int64), np.zeros(0))
     p = world_from_fixes(fixes, Datum(fixes[0].position))[:, :2]
-    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(white_noise_m(p).max()))
+    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(white_noise(p).max()))
 
 
 def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> MeasuredMotion | None:
@@ -231,12 +232,6 @@ def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> M
     return MeasuredMotion(source, int(stamps_ns[0]), t, speed, p_m[:, 0] + 1j * p_m[:, 1], rests=fast)
 
 
-def white_noise_m(p_m: Array) -> Array:
-    """Return the white noise of each axis of places (N, k), m."""
-    # Third differences remove position, velocity and acceleration; those of white noise have 20 x its variance.
-    return np.asarray(1.4826 * np.median(np.abs(np.diff(p_m, n=3, axis=0)), axis=0) / np.sqrt(20.0))
-
-
 def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
     """Return status, spread and a guess on slow errors; None where there is no fix at all."""
     stamps, p, rows = track(fixes)
@@ -253,7 +248,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
     old = stored(fixes.stamps_ns[every], places[:, :3])
     bad = frozen_fixes(stamps, rows[:, :2], p[:, :2])
     own = p[~bad]
-    scatter = white_noise_m(own) if len(own) > 10 else None
+    scatter = white_noise(own) if len(own) > 10 else None
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
     precise = sigma is not None and float(sigma[:2].max()) < RTK_SIGMA_M and float(np.median(rows[:, 3])) >= 2.0
     if precise:

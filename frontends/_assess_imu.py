@@ -21,6 +21,7 @@ from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
 from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
 from graphloc.time import NS_PER_S
+from graphloc.white_noise import white_noise
 
 # Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
 _COURSE_S, _COURSE_CLEAR = 12.0, 0.6
@@ -232,8 +233,8 @@ def imu_report(
         why=(*frozen, *([f"all its {missing} are 0: {HALF}"] if missing else []), *units.why),
         still_s=float(still.sum()) * root_dt**2,
         gyro_bias_radps=vec(gyro[still].mean(axis=0)) if quiet else None,
-        accel_noise_ug=_scatter(accel) * root_dt / ug,
-        gyro_noise_mdps=_scatter(gyro) * root_dt / mdps,
+        accel_noise_ug=float(white_noise(accel).max()) * root_dt / ug,
+        gyro_noise_mdps=float(white_noise(gyro).max()) * root_dt / mdps,
         reported_accel_ug=reported(10, ug),
         reported_gyro_mdps=reported(11, mdps),
         mount=mount_guess(imu, accel, gyro, motions, tree, body),
@@ -269,15 +270,6 @@ def _units_of(accel: Array, gyro: Array) -> _Units:
     if gyro_unit == "deg/s":
         why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")
     return _Units(accel_unit, gyro_unit, gravity, size, tuple(why))
-
-
-def _scatter(columns: Array) -> float:
-    """Return the white noise of the worst axis of (N, 3), in their unit, with the vibration of hull, engine and wheels.
-
-    Third differences remove motion; those of white noise have 20 times its variance.
-    """
-    usual = np.median(np.abs(np.diff(columns, n=3, axis=0)), axis=0)
-    return float(1.4826 * usual.max() / np.sqrt(20.0))
 
 
 def _standstill(

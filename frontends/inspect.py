@@ -31,7 +31,6 @@ from graphloc.frontends._assess import (
     says_the_same,
     topic_report,
     track,
-    white_noise_m,
     without_drift,
 )
 from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
@@ -82,6 +81,7 @@ from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic
 from graphloc.frozen_receiver import frozen_fixes
 from graphloc.measurements import CompassHeading, ImuSeries
 from graphloc.time import NS_PER_S, seconds_between
+from graphloc.white_noise import white_noise
 
 __all__ = [
     "CompassReport",
@@ -465,5 +465,5 @@ def _grid_track(bag: _Contents) -> _Track:
         good = np.isfinite(p_m).all(axis=1)
         if in_map_grid(stream) and good.sum() > _FEWEST:
             p_m = p_m[good] - p_m[good][0]
-            return _Track(stream.stamps_ns[keep][good], p_m, float(white_noise_m(p_m)[:2].max()), None)
+            return _Track(stream.stamps_ns[keep][good], p_m, float(white_noise(p_m)[:2].max()), None)
     return _Track(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None)
