@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
-from graphloc.frontends._assess import Courses, MeasuredMotion, Turning, against_turning, sane, summed, vec
+from graphloc.frontends._assess import Courses, MeasuredMotion, sane, summed, vec
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
 from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, without_gravity
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._turning import Turning, against_turning
 from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
 from graphloc.time import NS_PER_S
 from graphloc.white_noise import white_noise

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import MeasuredMotion, Turning
+from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._mount_yaw import FEWEST, HALF_S, MOVES_M, STEP_S, Felt, bent
+from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import without_line
 from graphloc.time import NS_PER_S
 

@@ -19,20 +19,17 @@ from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import (
     Courses,
     MeasuredMotion,
-    Turning,
-    compass_report,
     courses_of,
     evenly,
     gnss_report,
-    headings,
     motion_of_places,
     on_one_clock,
     sane,
-    says_the_same,
     topic_report,
     track,
     without_drift,
 )
+from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
 from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
@@ -58,6 +55,7 @@ from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import TopicData, read_streams
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._time_offsets import heading_time_offset, motion_time_offset
+from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends._unused import unused_magnetometers, unused_topics
 from graphloc.frontends.aerial.cloud import CLOUD
