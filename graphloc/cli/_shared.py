@@ -150,7 +150,7 @@ def _check_rerun(path: Path, overwrite: bool) -> None:
     from graphloc.errors import OutputError
     from graphloc.eval.rerun_log import make_folder
     from graphloc.extras import need
-    from graphloc.outputs import check_writable
+    from graphloc.folders import check_writable
 
     need("rerun", "rerun")
     if path.is_dir() or (path.exists() and not overwrite):
@@ -203,9 +203,9 @@ class FolderOptions(BagOptions):
         Raises:
             OutputError: it exists, or the disk refuses.
         """
-        from graphloc import outputs
+        from graphloc.folders import check_folder
 
-        outputs.check_folder(self.out, overwrite=self.overwrite, mark=mark)
+        check_folder(self.out, overwrite=self.overwrite, mark=mark)
 
     def write_page(self, page: str, mark: str, write: Callable[[Path, str], None], summary: Sequence[str]) -> None:
         """Write the folder and print a summary of it.
@@ -214,9 +214,9 @@ class FolderOptions(BagOptions):
             page: name of the page. mark: as for `check`; it holds JSON, which is printed for --json.
             write: fills a folder, given the command line. summary: lines to print otherwise.
         """
-        from graphloc import outputs
+        from graphloc.folders import fresh_folder
 
-        with outputs.fresh_folder(self.out, overwrite=self.overwrite, mark=mark) as fresh:
+        with fresh_folder(self.out, overwrite=self.overwrite, mark=mark) as fresh:
             write(fresh, " ".join(sys.argv[1:]))
         if self.as_json:
             typer.echo((self.out / mark).read_text(encoding="utf-8"), nl=False)
