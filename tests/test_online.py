@@ -542,9 +542,9 @@ def test_memory_does_not_grow() -> None:
                     largest[name] = max(size, largest.get(name, 0))
     full = ("scatter._pairs", "scatter._squares", "scatter._bent", "heading_check._steps", "heading_check._fixes")
     # fill up to their limit
-    remembered = {name for name in early if name.endswith(full) or ".sensor_noise._steps" in name}
-    # 40 s: at most six steps in five seconds
-    assert max(size for name, size in late.items() if ".sensor_noise._steps." in name) <= 54
+    remembered = {name for name in early if name.endswith(full) or ".sensor_noise._pairs" in name}
+    # 40 s: at most six pairs in five seconds
+    assert max(size for name, size in late.items() if ".sensor_noise._pairs" in name) <= 54
     # 40 s: at the 10 Hz of states, at the 2 Hz of fixes
     assert late["online._persistent.heading_check._steps"] <= 401
     assert late["online._persistent.heading_check._fixes"] <= 83

@@ -26,7 +26,7 @@ from graphloc.online._persistent import PersistentState
 from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.replay import arrivals, replay
-from graphloc.solve._sensor_noise import Step, Steps, times_stated
+from graphloc.solve._sensor_noise import Pair, Step, times_stated
 from tests.slowly import slowly
 from tests.test_factors import attachment
 
@@ -55,12 +55,12 @@ def matched(seed: int, duration_s: float = 40.0) -> SimulatedRun:
     )
 
 
-def steps_of(residuals: Array, sigma: float, false_sigma: float = 5.0) -> Steps:
+def pairs_of(residuals: Array, sigma: float, false_sigma: float = 5.0, key: str = "sigma_scale") -> list[Pair]:
     """Of residuals (N, k) with a stated sigma."""
     k = residuals.shape[1]
     stated = 2.0 * sigma**2 * np.eye(k)
     error = false_sigma**2 * np.eye(k)
-    return {(("sigma_scale", k),): [(Step(step, stated, error),) for step in np.diff(residuals, axis=0)]}
+    return [(Step(key, step, stated, error),) for step in np.diff(residuals, axis=0)]
 
 
 @pytest.mark.parametrize("times", [1.0, 3.0, 8.0])
@@ -70,7 +70,7 @@ def test_the_factor_is_that_of_the_right_ones(times: float) -> None:
     residuals = rng.normal(0.0, 0.1 * times, (200, 2)) + np.linspace(0.0, 5.0, 200)[:, None]
     for first in range(0, 200, 15):
         residuals[first : first + 5] += rng.normal(0.0, 3.0, 2)
-    found = times_stated(steps_of(residuals, 0.1))
+    found = times_stated(pairs_of(residuals, 0.1))
     assert found == ({} if times == 1.0 else {"sigma_scale": pytest.approx(times, rel=0.15)})
 
 
@@ -86,16 +86,14 @@ def test_false_ones_of_any_size_make_no_noise_of_right_ones(far_m: tuple[float, 
                 bearing = rng.uniform(0.0, 2.0 * np.pi)
                 length[first : first + 2] += rng.uniform(*far_m) * np.array([np.cos(bearing), np.sin(bearing)])
                 angle[first : first + 2] += rng.uniform(-turned_deg, turned_deg)
-            ((_, lengths),) = steps_of(length, sigma).items()
-            ((_, angles),) = steps_of(angle, 1.0).items()
-            both = [(a, b) for (a,), (b,) in zip(lengths, angles, strict=True)]
-            assert times_stated({(("sigma_scale", 2), ("angle_sigma_scale", 1)): both}) == {}
+            angles = pairs_of(angle, 1.0, key="angle_sigma_scale")
+            assert times_stated([a + b for a, b in zip(pairs_of(length, sigma), angles, strict=True)]) == {}
 
 
 def test_few_steps_and_false_ones_alone_tell_nothing() -> None:
     rng = np.random.default_rng(5)
-    assert times_stated(steps_of(rng.normal(0.0, 1.0, (15, 2)), 0.1)) == {}
-    assert times_stated(steps_of(rng.normal(0.0, 3.5, (100, 2)), 0.01)) == {}
+    assert times_stated(pairs_of(rng.normal(0.0, 1.0, (15, 2)), 0.1)) == {}
+    assert times_stated(pairs_of(rng.normal(0.0, 3.5, (100, 2)), 0.01)) == {}
 
 
 def test_matches_that_state_a_third_of_their_noise_are_taken_as_they_scatter() -> None:
@@ -170,6 +168,23 @@ def test_a_snapshot_knows_what_sensors_scatter(tmp_path: Path) -> None:
     assert resumed.sensor_noise.times == {"matcher": found.sensor_noise["matcher"], "gnss": {}}
 
 
+def test_what_a_start_finds_is_handed_on() -> None:
+    """Found anew by the window, it came 15 s later; and nothing was said of what the start took."""
+    run = stating(matched(2, 8.0), GnssPosition, 0.1)
+    smoother = OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL)
+    said: list[str] = []
+    for m in arrivals(run.recording):
+        smoother.feed(m)
+        said += [event.text for event in smoother.events()]
+    (line,) = (text for text in said if "scatter" in text)
+    assert line.startswith("gnss: ")
+    assert smoother._persistent.sensor_noise.times["gnss"]["sigma_scale"] == pytest.approx(10.0, rel=0.3)
+    assert smoother._tracking is not None
+    taken = smoother._tracking.lag.problem.config.sensors["gnss"]
+    assert isinstance(taken, GnssConfig)
+    assert taken.sigma_scale > 7.0
+
+
 def test_floors_are_raised_with_the_factor() -> None:
     """Of fixes that state a micrometre, the factor alone would have to be 300 000 to be felt; all rounds were used up, and none left for the IMU."""
     scenario = replace(bl_scenario(1, "clean"), duration_s=40.0, pose_hz=0.0, gnss_sigma_m=0.3)
@@ -187,14 +202,16 @@ class Fixes:
     def __init__(self, residuals: Array) -> None:
         self.problem = SimpleNamespace(streams={"gnss": self})
         self.row, self.config = next(row for row in SENSORS if row.kind == "gnss"), GnssConfig(topic="/fix")
-        self._residuals, self._now_ns, self._back_ns = residuals, 0, 0
+        self._residuals, self._now_ns, self._back_ns, self._scale = residuals, 0, 0, 1.0
 
-    def seen_by(self, noise: SensorNoise, set_back_s: float = 0.0) -> list[str]:
-        """What is said while they come, a look each second; their stamps are of a clock that was set back by so much."""
+    def seen_by(self, noise: SensorNoise, set_back_s: float = 0.0, looks: int | None = None) -> list[str]:
+        """What is said while they come, or at so many looks, one each second; their stamps are of a clock that was set back by so much."""
         said, self._back_ns = [], int(set_back_s * SECOND)
-        for now_ns in range(0, len(self._residuals) * SECOND // 10, SECOND):
+        for now_ns in range(0, (looks or len(self._residuals) // 10) * SECOND, SECOND):
             self._now_ns = now_ns
-            if line := noise.raised(self):  # type: ignore[arg-type]
+            self._scale = noise.times.get("gnss", {}).get("sigma_scale", 1.0)
+            self.config = GnssConfig(topic="/fix", sigma_scale=self._scale)
+            if line := noise.changed(self):  # type: ignore[arg-type]
                 said.append(line)
         return said
 
@@ -203,7 +220,7 @@ class Fixes:
         return SimpleNamespace(stamp_ns=1000 * SECOND + self._now_ns - self._back_ns)
 
     def judged(self, _sensor: str, after_ns: int, until_ns: int) -> list[tuple[Measurement, Residual]]:
-        place, cov = Geodetic(59.0, 10.0, 0.0), 0.02**2 * np.eye(3)
+        place, cov = Geodetic(59.0, 10.0, 0.0), (0.02 * self._scale) ** 2 * np.eye(3)
         found: list[tuple[Measurement, Residual]] = []
         for k, raw in enumerate(self._residuals):
             stamp_ns = 1000 * SECOND - self._back_ns + k * SECOND // 10
@@ -216,13 +233,40 @@ class Fixes:
 
 
 def test_online_some_seconds_of_multipath_do_not_widen_all_fixes_after_them() -> None:
-    """12 s of ten times the noise are 120 fixes, more than are remembered; factors only grow."""
+    """12 s of ten times the noise are 120 fixes, more than are remembered."""
     residuals = np.random.default_rng(3).normal(0.0, 0.02, (1000, 2))
     residuals[400:520] *= 10.0
     assert Fixes(residuals).seen_by(noise := SensorNoise()) == []
     assert noise.times == {}
     residuals[520:] *= 10.0
     assert len(Fixes(residuals).seen_by(SensorNoise())) >= 1
+
+
+def test_online_a_minute_of_multipath_ends() -> None:
+    """A minute of five times the noise is felt, and forgotten two minutes later, with a line on each."""
+    residuals = np.random.default_rng(3).normal(0.0, 0.02, (2400, 2))
+    residuals[300:900] *= 5.0
+    noise = SensorNoise()
+    said = Fixes(residuals[:900]).seen_by(noise)
+    assert noise.times == {"gnss": {"sigma_scale": pytest.approx(5.0, rel=0.25)}}
+    assert all("scatter more than they state" in line for line in said)
+    said = Fixes(residuals).seen_by(noise := SensorNoise())
+    assert noise.times == {"gnss": {}}
+    assert said[-1] == "gnss: its measurements scatter less again; taken as configured"
+
+
+def test_online_a_fix_without_another_near_it_is_no_pair() -> None:
+    """The first is alone; and the solver failed for it."""
+    assert Fixes(np.zeros((1, 2))).seen_by(noise := SensorNoise(), looks=8) == []
+    assert noise.times == {}
+
+
+def test_online_noise_that_stays_keeps_its_factor() -> None:
+    """Every line is a window that is rebuilt: ten minutes of the same noise change the factor a few times at most."""
+    noise = SensorNoise()
+    said = Fixes(np.random.default_rng(3).normal(0.0, 0.06, (6000, 2))).seen_by(noise)
+    assert len(said) <= 2
+    assert noise.times == {"gnss": {"sigma_scale": pytest.approx(3.0, rel=0.2)}}
 
 
 def test_online_noise_is_seen_after_the_clock_was_set_back() -> None:

@@ -79,3 +79,8 @@ class SensorConfig(Block):
         """Return the configuration with some of its numbers, by key, so many times as large; of a factor on sigmas, their floors too."""
         floors = {floor: by for key, by in times.items() for floor in SIGMA_SCALES.get(key, ()) if hasattr(self, floor)}
         return self.model_copy(update={key: getattr(self, key) * by for key, by in (floors | dict(times)).items()})
+
+    def sigmas_over(self, stated: SensorConfig) -> dict[str, float]:
+        """Return by key how many times its factors on sigmas are those of another configuration, where larger."""
+        times = {key: getattr(self, key, 1.0) / getattr(stated, key, 1.0) for key in SIGMA_SCALES}
+        return {key: by for key, by in times.items() if by > 1.0}

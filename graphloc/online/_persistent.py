@@ -28,7 +28,7 @@ class PersistentState:
 
     Attributes:
         datum: origin of world; None before it is known.
-        noise: by how much the IMU's noise is raised. sensor_noise: the same of sensors that scatter more than they state.
+        noise: by how much the IMU's noise is raised. sensor_noise: factors of sensors that scatter more than they state.
         heights_m: configured heights (m, up in world), by the name of the sensor that measures them.
         heading: where no sensor measures it, how far it may be off; None: one does, or the motion has confirmed it.
         agreed_ns: stamp at which each absolute sensor last agreed, as known when the last window ended.

@@ -6,55 +6,76 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 
+from graphloc.config import SensorConfig
 from graphloc.graph import Residual
 from graphloc.measurements import Measurement
 from graphloc.online._lag import Lag
-from graphloc.solve._sensor_noise import Step, steps_of, times_stated
+from graphloc.solve._sensor_noise import Pair, pairs_of, times_stated
 from graphloc.solve._warnings import scale_warning
 
 _EVERY_S = 5.0
 _SETTLED_S = 1.5  # after so long a measurement has been judged again
-_REMEMBERED = 100  # steps
-# Of the steps since the last look, so that the remembered ones are of a minute or more: factors only grow, and ten seconds of multipath
-# are as many steps of a fast receiver.
+_REMEMBERED = 100  # pairs
+# Of the pairs since the last look, so that the remembered ones are of a minute or more: ten seconds of multipath are as many pairs of a
+# fast receiver.
 _AT_ONCE = 6
 
 
 class SensorNoise:
-    """Factors on the sigmas that measurements come with; they only grow.
+    """Factors on the sigmas that measurements come with, by the last minute or more.
 
     Attributes:
-        times: by sensor and key of its configuration.
+        times: by sensor and key of its configuration; where there is none, sigmas are as stated.
     """
 
     def __init__(self, times: Mapping[str, Mapping[str, float]] | None = None) -> None:
         self.times = {name: dict(own) for name, own in (times or {}).items()}
         self._looked_ns = 0
         self._last: dict[str, tuple[Measurement, Residual]] = {}
-        self._steps: dict[str, dict[tuple[tuple[str, int], ...], deque[tuple[Step, ...]]]] = {}
+        self._pairs: dict[str, deque[Pair]] = {}
 
     def forget_clock(self) -> None:
         """Forget stamps of a clock that was set back: by these, nothing would be newer until it has caught up."""
         self._looked_ns, self._last = 0, {}
 
-    def raised(self, lag: Lag) -> str:
-        """Raise the factors of a sensor that clearly scatters more than it states; return a line on that, or empty."""
+    def enlarge(self, by: Mapping[str, Mapping[str, float]]) -> None:
+        """Enlarge the factors; `by`: as `times`."""
+        for name, own in by.items():
+            times = self.times.setdefault(name, {})
+            times |= {key: times.get(key, 1.0) * each for key, each in own.items()}
+
+    def changed(self, lag: Lag) -> str:
+        """Change the factors of a sensor where others clearly explain better how it scatters; return a line on that, or empty."""
         at_ns = lag.newest.stamp_ns
         if 0 <= at_ns - self._looked_ns < _EVERY_S * 1e9:
             return ""
         self._looked_ns = at_ns
         for name, stream in lag.problem.streams.items():
-            steps, last = self._steps.setdefault(name, {}), self._last.get(name)
+            last, times = self._last.get(name), self.times.get(name, {})
             judged = lag.judged(name, last[0].stamp_ns if last else 0, at_ns - int(_SETTLED_S * 1e9))
             if not judged or not stream.row.scaled(judged[0][0]):
                 continue
-            for key, new in steps_of(stream, [last, *judged] if last else judged).items():
-                steps.setdefault(key, deque(maxlen=_REMEMBERED)).extend(new[:: -(-len(new) // _AT_ONCE)])
+            new = pairs_of(stream, [last, *judged] if last else judged)
+            pairs = self._pairs.setdefault(name, deque(maxlen=_REMEMBERED))
+            pairs.extend(_as_configured(pair, times) for pair in new[:: max(-(-len(new) // _AT_ONCE), 1)])
             self._last[name] = judged[-1]
-            if times := times_stated(steps):
-                own = self.times.setdefault(name, {})
-                stated = stream.config
-                own |= {key: own.get(key, 1.0) * by for key, by in times.items()}
-                del self._steps[name], self._last[name]  # of another sigma
-                return "; ".join(scale_warning(name, stated, stated.scaled(times)))
+            if (found := times_stated(pairs, times)) != times:
+                self.times[name] = found
+                del self._last[name]  # of another sigma
+                return _line(name, stream.config, times, found)
         return ""
+
+
+def _as_configured(pair: Pair, times: Mapping[str, float]) -> Pair:
+    """Return a pair with its covariances as they would be stated without factors on the sigmas."""
+    return tuple(step._replace(stated=step.stated / times.get(step.key, 1.0) ** 2) for step in pair)
+
+
+def _line(name: str, taken: SensorConfig, before: Mapping[str, float], now: Mapping[str, float]) -> str:
+    """Return what is said of factors that have changed; `taken`: the configuration with those before."""
+    stated = taken.scaled({key: 1.0 / by for key, by in before.items()})
+    said = scale_warning(name, stated, stated.scaled(now))
+    if said and any(by > before.get(key, 1.0) for key, by in now.items()):
+        return said[0]
+    factors = ", ".join(f"{key}: {getattr(stated, key) * by:.1f}" for key, by in now.items())
+    return f"{name}: its measurements scatter less again; taken " + (f"with {factors}" if factors else "as configured")

@@ -246,10 +246,10 @@ class OnlineSmoother:
                 self._rebuild(f"position jump of {', '.join(jumped)}")
                 return self._estimate()
             persistent = self._persistent
-            if noisier := persistent.sensor_noise.raised(tracking.lag) or persistent.noise.raised(
+            if noise := persistent.sensor_noise.changed(tracking.lag) or persistent.noise.raised(
                 tracking.lag, tracking.samples
             ):
-                self._rebuild(noisier)
+                self._rebuild(noise)
                 return self._estimate()
             return tracking.estimate()
         except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
@@ -329,6 +329,7 @@ class OnlineSmoother:
         persistent.datum, persistent.heights_m = started.datum, started.heights_m
         persistent.heading = started.heading
         persistent.noise.at_least(started.noise_scale, started.gyro_noise, started.accel_noise)
+        persistent.sensor_noise.enlarge(started.sensor_noise)
         persistent.heading_check.begin()
         for sample in samples:
             self._ledger.used(sample)
@@ -342,6 +343,8 @@ class OnlineSmoother:
         newest_ns = tracking.lag.newest.stamp_ns
         persistent.noise.begin(newest_ns)
         self._say(f"started at {utc_text(newest_ns)}: {'; '.join(started.notes)}", warns=False)
+        for said in started.warnings:
+            self._say(said)
         for stream in tracking.lag.problem.streams.values():
             for said in slow_error_warning(stream.name, stream.left_out):
                 self._say(said)

@@ -31,6 +31,7 @@ from graphloc.solve._decide import AGREES, decisions
 from graphloc.solve._ledger import row_of
 from graphloc.solve._stretch import StretchStep, past_at
 from graphloc.solve._unmodelled import Unmodelled, unmodelled
+from graphloc.solve._warnings import noise_warnings
 from graphloc.time import duration_ns
 
 LEAST_S = 5.0  # of IMU data: gives gyro bias, roll and pitch of a vessel in waves
@@ -54,8 +55,9 @@ class Started:
         heights_m: configured heights (m, up in world), by sensor.
         heading: where no sensor measures it, how far it may be off; None: one does, or the motion told it.
         noise_scale: factor on the IMU noise. gyro_noise, accel_noise: beside it, on that of each.
+        sensor_noise: factors on sigmas of other sensors, by sensor and key of its configuration.
         unmodelled: what slow errors that are left out did to that state; None: nothing that is known.
-        notes: what the alignment was based on. rows: ledger rows of what was measured before the first state.
+        notes: what the alignment was based on. warnings: on noise that is taken to be larger than configured. rows: ledger rows of what was measured before the first state.
     """
 
     datum: Datum
@@ -68,8 +70,10 @@ class Started:
     noise_scale: float
     gyro_noise: float
     accel_noise: float
+    sensor_noise: Mapping[str, Mapping[str, float]]
     unmodelled: Unmodelled | None
     notes: tuple[str, ...]
+    warnings: tuple[str, ...]
     rows: tuple[LedgerRow, ...]
 
 
@@ -136,7 +140,8 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         if row.synthetic is not None
         for name, sensor in config.of_kind(row.kind).items()
     }
-    stated, taken = (c.sensors[problem.imu.sensor] for c in (config, result.problem.config))
+    stated, taken = config.sensors, result.problem.config.sensors
+    imu, taken_imu = stated[problem.imu.sensor], taken[problem.imu.sensor]
     k, anchor = _anchor(result, setup.lag_s)
     before = [
         row_of(stream, m, stream.config.topic, result.verdicts[stream.number, i])
@@ -153,10 +158,12 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         heights_m=heights,
         heading=heading,
         noise_scale=result.noise_scale,
-        gyro_noise=taken.gyro_noise_radps / stated.gyro_noise_radps,
-        accel_noise=taken.accel_noise_mps2 / stated.accel_noise_mps2,
+        gyro_noise=taken_imu.gyro_noise_radps / imu.gyro_noise_radps,
+        accel_noise=taken_imu.accel_noise_mps2 / imu.accel_noise_mps2,
+        sensor_noise={stream.name: taken[stream.name].sigmas_over(stated[stream.name]) for stream in problem.streams},
         unmodelled=_unmodelled(result, k),
         notes=result.notes,
+        warnings=tuple(noise_warnings(problem, result)),
         rows=tuple(before),
     )
 

@@ -37,16 +37,18 @@ class Step(NamedTuple):
     """From one residual to the next, on the axes (k) that one key of the configuration scales.
 
     Attributes:
+        key: of the configuration.
         change: (k,). stated: (k, k), its covariance as stated. error: (k, k), covariance of the error of a false one.
     """
 
+    key: str
     change: Array
     stated: Array
     error: Array
 
 
-Steps = Mapping[tuple[tuple[str, int], ...], Sequence[tuple[Step, ...]]]
-"""By the keys that scale them, each with its number of axes: of each pair of residuals, the step of each key."""
+Pair = tuple[Step, ...]
+"""Two residuals in a row: their steps, one of each key."""
 
 
 def scattering(problem: Problem, verdicts: Verdicts) -> dict[str, dict[str, float]]:
@@ -54,30 +56,27 @@ def scattering(problem: Problem, verdicts: Verdicts) -> dict[str, dict[str, floa
     found = {}
     for stream in problem.streams:
         judged = [verdicts[stream.number, i].residual for i in range(len(stream.measurements))]
-        if times := times_stated(steps_of(stream, zip(stream.measurements, judged, strict=True))):
+        if times := times_stated(pairs_of(stream, zip(stream.measurements, judged, strict=True))):
             found[stream.name] = times
     return found
 
 
-def steps_of(
-    stream: Judged, judged: Iterable[tuple[Measurement, Residual]]
-) -> dict[tuple[tuple[str, int], ...], list[tuple[Step, ...]]]:
-    """Return the steps from one residual to the next (see `Steps`).
+def pairs_of(stream: Judged, judged: Iterable[tuple[Measurement, Residual]]) -> list[Pair]:
+    """Return the pairs of residuals in a row.
 
     Args:
         judged: measurements of the stream by stamp, and the residual of each.
     """
-    steps: dict[tuple[tuple[str, int], ...], list[tuple[Step, ...]]] = {}
+    pairs = []
     for (a, before), (b, now) in pairwise(judged):
         scaled = {key: axes for key, axes in stream.row.scaled(b).items() if axes}
         if not scaled or b.stamp_ns - a.stamp_ns > _PAIRED_S * 1e9 or len(before.raw) != len(now.raw):
             continue
         change, error = now.raw - before.raw, _error(stream, b, len(now.raw))
         stated = np.add(*(r.cov if r.white is None else r.white for r in (before, now)))
-        parts = [(axes, np.ix_(axes, axes)) for axes in scaled.values()]
-        step = tuple(Step(change[axes], stated[part], error[part]) for axes, part in parts)
-        steps.setdefault(tuple((key, len(axes)) for key, axes in scaled.items()), []).append(step)
-    return steps
+        parts = [(key, axes, np.ix_(axes, axes)) for key, axes in scaled.items()]
+        pairs.append(tuple(Step(key, change[axes], stated[part], error[part]) for key, axes, part in parts))
+    return pairs
 
 
 def _error(stream: Judged, m: Measurement, axes: int) -> Array:
@@ -86,26 +85,39 @@ def _error(stream: Judged, m: Measurement, axes: int) -> Array:
     return stream.row.false(m, stream.config).cov
 
 
-def times_stated(steps: Steps) -> dict[str, float]:
-    """Return by key how many times its stated sigma a sensor scatters, where it is clearly more."""
-    keys, most = max(steps.items(), key=lambda item: len(item[1]), default=((), ()))
+def times_stated(pairs: Iterable[Pair], now: Mapping[str, float] | None = None) -> dict[str, float]:
+    """Return by key how many times its stated sigma a sensor scatters, where it is clearly more.
+
+    Args:
+        now: factors that are taken now; they stay, but where others are clearly likelier.
+    """
+    alike: dict[tuple[tuple[str, int], ...], list[Pair]] = {}  # with and without height, with and without heading
+    for pair in pairs:
+        alike.setdefault(tuple((step.key, len(step.change)) for step in pair), []).append(pair)
+    kinds, most = max(alike.items(), key=lambda item: len(item[1]), default=((), []))
+    now = now or {}
     if len(most) < _FEWEST:
-        return {}
-    some = list(most)[:: -(-len(most) // _MOST)]
-    times = _likeliest([Step(*map(np.array, zip(*own, strict=True))) for own in zip(*some, strict=True)])
-    return {key: by for (key, _), by in zip(keys, times, strict=True) if by > _LEAST_TIMES}
+        return dict(now)
+    some = most[:: -(-len(most) // _MOST)]
+    keys = [key for key, _ in kinds]
+    parts = [
+        [np.array(part) for part in zip(*(step[1:] for step in own), strict=True)] for own in zip(*some, strict=True)
+    ]
+    times = dict(zip(keys, _likeliest(parts, [now.get(key, 1.0) for key in keys]), strict=True))
+    return {key: by for key, by in {**now, **times}.items() if by > 1.0}
 
 
-def _likeliest(steps: Sequence[Step]) -> list[float]:
-    """Return the likeliest factor on the stated sigmas of M steps, of each key; 1 where it is not clear.
+def _likeliest(steps: Sequence[Sequence[Array]], now: Sequence[float]) -> list[float]:
+    """Return the likeliest factor on the stated sigmas of M steps, of each key; what it is now where no other is clearly likelier.
 
     Keys share which pairs are right: where positions tell false ones, the angles of the others show their noise. How far most of the
     others err is what explains them best if the right ones err as stated, so that errors which are merely of another size make no noise.
 
     Args:
-        steps: of each key, with one more axis (M) in front.
+        steps: of each key, its changes, stated covariances and errors (see `Step`), each with one more axis (M) in front.
+        now: factor of each key.
     """
-    right, other = np.zeros((1, len(steps[0].change))), np.zeros(len(steps[0].change))  # (factors of each key, M), (M,)
+    right, other = np.zeros((1, len(steps[0][0]))), np.zeros(len(steps[0][0]))  # (factors of each key, M), (M,)
     for change, stated, error in steps:
         own = np.array([_log_densities(change, times**2 * stated) for times in _FACTORS])
         false = [_log_densities(change, stated + size**2 * error) for size in _ERRORS]
@@ -116,10 +128,11 @@ def _likeliest(steps: Sequence[Step]) -> list[float]:
     likely = _log_likelihoods(right[0], other)
     at = tuple(int(k) for k in np.unravel_index(int(np.argmax(likely)), likely.shape))
     found = []
-    for axis, k in enumerate(at):
-        without = (*at[:axis], 0, *at[axis + 1 :])
+    for axis, (k, times) in enumerate(zip(at, now, strict=True)):
+        as_now = (*at[:axis], int(np.argmin(np.abs(np.log(_FACTORS / times)))), *at[axis + 1 :])
         # Two steps in a row have a residual in common, so each counts half.
-        found.append(float(_FACTORS[k]) if 0.5 * (likely[at] - likely[without]) > _SURE else 1.0)
+        clear = 0.5 * (likely[at] - likely[as_now]) > _SURE
+        found.append(times if not clear else float(_FACTORS[k]) if _FACTORS[k] > _LEAST_TIMES else 1.0)
     return found
 
 

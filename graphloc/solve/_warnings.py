@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build import Problem, Stream, solved_constants
-from graphloc.config import SIGMA_SCALES
+from graphloc.config import SIGMA_SCALES, SensorConfig
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.position_jumps import jump_warnings, largest_sigma
@@ -57,15 +55,14 @@ def noisier_warning(sensor: str, noisier: float) -> list[str]:
     return [Graded(said, f"scatter of {sensor}", noisier)]
 
 
-def scale_warning(sensor: str, stated: Any, taken: Any) -> list[str]:
+def scale_warning(sensor: str, stated: SensorConfig, taken: SensorConfig) -> list[str]:
     """Say where factors on a sensor's sigmas are taken to be larger than configured: a line, or none."""
-    times = {key: getattr(taken, key, 1.0) / getattr(stated, key, 1.0) for key in SIGMA_SCALES}
-    keys = [key for key, by in times.items() if by > 1.0]
-    if not keys:
+    times = taken.sigmas_over(stated)
+    if not times:
         return []
-    floors = [floor for key in keys for floor in SIGMA_SCALES[key] if hasattr(taken, floor)]
+    floors = [floor for key in times for floor in SIGMA_SCALES[key] if hasattr(taken, floor)]
     cure = ", ".join(
-        [f"{key}: {getattr(taken, key):.2g}" for key in floors] + [f"{key}: {getattr(taken, key):.1f}" for key in keys]
+        [f"{key}: {getattr(taken, key):.2g}" for key in floors] + [f"{key}: {getattr(taken, key):.1f}" for key in times]
     )
     said = f"{sensor}: its measurements scatter more than they state; taken with, and to be set unless its mount or stamps are wrong: {cure}"
     return [Graded(said, f"sigmas of {sensor}", max(times.values()))]
@@ -134,6 +131,26 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
     warnings = list[str]()
     if not result.converged:
         warnings.append("the solver did not converge: the last pass still moved the track by centimetres or more")
+    warnings += noise_warnings(problem, result)
+    if expected > 0 and result.cost > CONTRADICTING_COST * expected:
+        said = f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
+        said += "mount, a unit or a time offset is wrong"
+        warnings.append(Graded(said, "cost", result.cost / expected))
+    if (beside_m := largest_sigma(result.levels_cov)) > _LEVELS_M:
+        warnings.append(
+            "the fixes jump, and no other sensor shows which level is right: the one held longest is taken, "
+            f"and the bounds include {beside_m:.1f} m (1 sigma) for the others"
+        )
+    return warnings
+
+
+def noise_warnings(problem: Problem, result: BatchResult) -> list[str]:
+    """Say of which sensors the noise is taken to be larger than configured.
+
+    Args:
+        problem: as configured.
+    """
+    warnings = list[str]()
     if result.noise_scale > 1.0:
         said = (
             f"IMU noise scaled up {result.noise_scale:.1f} times: as configured, the IMU contradicts the other sensors"
@@ -157,15 +174,6 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
             taken[name].accel_noise_mps2 / stated[name].accel_noise_mps2,
         )
         warnings.append(Graded(said, "IMU noise by its samples", max(times)))
-    if expected > 0 and result.cost > CONTRADICTING_COST * expected:
-        said = f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
-        said += "mount, a unit or a time offset is wrong"
-        warnings.append(Graded(said, "cost", result.cost / expected))
-    if (beside_m := largest_sigma(result.levels_cov)) > _LEVELS_M:
-        warnings.append(
-            "the fixes jump, and no other sensor shows which level is right: the one held longest is taken, "
-            f"and the bounds include {beside_m:.1f} m (1 sigma) for the others"
-        )
     return warnings
 
 
