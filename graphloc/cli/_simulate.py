@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from graphloc.cli._shared import OutOption, OverwriteOption, RunOptions, SeedOption, progress, smooth_bags
+from graphloc.cli._progress import progress
+from graphloc.cli._shared import OutOption, OverwriteOption, RunOptions, SeedOption, smooth_bags
 
 
 def pairs(changes: list[str]) -> dict[str, str]:
