@@ -55,7 +55,6 @@ class Docked:
             at the end. ekf_m: RMSE of the honest EKF.
     """
 
-    job: Job
     range_m: Any
     off_m: Any
     berth_m: Any
@@ -180,7 +179,6 @@ def solve(run: SimulatedRun, recording: Recording, config: VesselConfig, job: Jo
         kf_true = run.truth.at(kf.trajectory.stamps_ns).p_world_m
         kf_m = np.hypot(*(kf.trajectory.p_world_m - kf_true)[:, :2].T)
     return Docked(
-        job=job,
         range_m=range_m,
         off_m=np.hypot(*off.T),
         berth_m=(berth_range, np.hypot(*error[:, :2].T)),
