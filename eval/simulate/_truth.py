@@ -118,8 +118,18 @@ def make_motion(
     velocity = CubicSpline(t, v)
     position = velocity.antiderivative()
     position.c[-1] += np.array(start_m) - position(0.0)
+    roll, pitch, heave = waves
     return Motion(
-        velocity, position, yaw, yaw_rate, waves[0], waves[1], waves[2], lean_per_mps2, CubicSpline(t, surge), tide_m
+        velocity=velocity,
+        position=position,
+        yaw=yaw,
+        yaw_rate=yaw_rate,
+        roll=roll,
+        pitch=pitch,
+        heave=heave,
+        lean_per_mps2=lean_per_mps2,
+        speed=CubicSpline(t, surge),
+        tide_m=tide_m,
     )
 
 
@@ -168,12 +178,12 @@ def make_way_motion(
     swing = Waves(*np.zeros((3, 1))) if swing is None else swing
     return make_motion(
         duration_s,
-        speed,
-        lambda s: way.heading(at(s), 1) * speed(s) + swing.at(s, 1),
-        float(way.heading(before) + swing.at(np.zeros(1))[0]),
-        sway_mps,
-        waves,
-        lean_per_mps2,
-        (way.start_m[0] + before * float(np.cos(first)), way.start_m[1] + before * float(np.sin(first))),
-        tide_m,
+        speed_mps=speed,
+        yaw_rate_radps=lambda s: way.heading(at(s), 1) * speed(s) + swing.at(s, 1),
+        yaw0_rad=float(way.heading(before) + swing.at(np.zeros(1))[0]),
+        sway_mps=sway_mps,
+        waves=waves,
+        lean_per_mps2=lean_per_mps2,
+        start_m=(way.start_m[0] + before * float(np.cos(first)), way.start_m[1] + before * float(np.sin(first))),
+        tide_m=tide_m,
     )
