@@ -21,6 +21,7 @@ from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turning import Turning, against_turning
 from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
+from graphloc.measurements import ImuSeries
 from graphloc.time import NS_PER_S
 from graphloc.white_noise import white_noise
 
@@ -113,36 +114,39 @@ def _mount_yaw(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[Meas
     return yaw, f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
 
 
-def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning | None:
+def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning:
     """Return the integrated rate of an IMU whose mount is known or guessed, with its gyro bias removed if known."""
-    said = _in_body(imu, report, tree, body)
-    if said is None:
-        return None
-    stamps, _, gyro = said
+    stamps, _, gyro = _in_body(imu, report, tree, body)
     t = (stamps - stamps[0]) / NS_PER_S
     return Turning(int(stamps[0]), t, summed(t, gyro[:, 2]))
 
 
-def felt_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Felt | None:
+def felt_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Felt:
     """Return the motion by an IMU whose mount is known or guessed, in the axes of the vessel."""
-    said = _in_body(imu, report, tree, body)
-    return None if said is None else Felt.of(*said)
+    return Felt.of(*_in_body(imu, report, tree, body))
 
 
-def _in_body(
-    imu: TopicData, report: ImuReport, tree: StaticTree, body: str
-) -> tuple[NDArray[np.int64], Array, Array] | None:
-    """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel; None of few samples."""
-    keep, _ = samples_of(imu)
-    keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)] if len(keep) else keep
-    if len(keep) < 20:
-        return None
+def _in_body(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel."""
+    series = series_of(imu, report)
     known = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
     R = known[1] if known else Rotation.from_euler("xyz", report.mount.rpy_deg, degrees=True).as_matrix()
+    unbiased = series.gyro_radps - (report.gyro_bias_radps or (0.0, 0.0, 0.0))
+    return series.stamps_ns, series.accel_mps2 @ R.T, unbiased @ R.T
+
+
+def series_of(imu: TopicData, report: ImuReport) -> ImuSeries:
+    """Return the usable samples of an IMU that has a report, in SI units, axes of the sensor."""
+    keep, _ = samples_of(imu)
+    keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)]
     unit = STANDARD_GRAVITY_MPS2 if report.accel_unit == "g" else 1.0
-    accel = imu.rows[keep, :3] * (-unit if report.gravity == "inverted" else unit)
-    gyro = imu.rows[keep, 3:6] * (np.pi / 180.0 if report.gyro_unit == "deg/s" else 1.0)
-    return imu.stamps_ns[keep], accel @ R.T, (gyro - (report.gyro_bias_radps or (0.0, 0.0, 0.0))) @ R.T
+    return ImuSeries(
+        sensor=imu.topic,
+        stamps_ns=imu.stamps_ns[keep],
+        accel_mps2=imu.rows[keep, :3] * (-unit if report.gravity == "inverted" else unit),
+        gyro_radps=imu.rows[keep, 3:6] * (np.pi / 180.0 if report.gyro_unit == "deg/s" else 1.0),
+        seqs=keep.astype(np.int64),
+    )
 
 
 def _against_courses(imu: TopicData, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str) -> int:

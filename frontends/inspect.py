@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.config import STANDARD_GRAVITY_MPS2, GnssConfig
+from graphloc.config import GnssConfig
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import (
     Courses,
@@ -30,7 +30,7 @@ from graphloc.frontends._assess import (
     without_drift,
 )
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
-from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
+from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
 from graphloc.frontends._clock import FEWEST_STAMPS, GAIN_LIMIT_S, refuse_woven, step, usual_latency_s
@@ -77,7 +77,7 @@ from graphloc.frontends.decode import (
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic
 from graphloc.frozen_receiver import frozen_fixes
-from graphloc.measurements import CompassHeading, ImuSeries
+from graphloc.measurements import CompassHeading
 from graphloc.time import NS_PER_S, seconds_between
 from graphloc.white_noise import white_noise
 
@@ -349,17 +349,7 @@ def _beside_gyro(report: CompassReport, stream: TopicData, best: tuple[ImuReport
     if best is None or not report.usable:
         return report
     imu, samples = best
-    keep = samples_of(samples)[0]
-    keep = keep[np.isfinite(samples.rows[keep, :6]).all(axis=1)]
-    rows = samples.rows[keep]
-    unit = STANDARD_GRAVITY_MPS2 if imu.accel_unit == "g" else 1.0
-    series = ImuSeries(
-        sensor=imu.topic,
-        stamps_ns=samples.stamps_ns[keep],
-        accel_mps2=rows[:, :3] * (-unit if imu.gravity == "inverted" else unit),
-        gyro_radps=np.radians(rows[:, 3:6]) if imu.gyro_unit == "deg/s" else rows[:, 3:6],
-        seqs=keep.astype(np.int64),
-    )
+    series = series_of(samples, imu)
     stamps, angle = headings(stream)
     yaw = angle if report.convention == "enu" else np.pi / 2.0 - angle
     measured = [
