@@ -60,7 +60,7 @@ from graphloc.frontends._streams import TopicData, read_streams
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._time_offsets import heading_time_offset, motion_time_offset
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
-from graphloc.frontends._unused import unused_magnetometers, unused_topics
+from graphloc.frontends._unused import unused_magnetometers, unused_numbers, unused_topics
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import (
     GPS_FIXES,
@@ -103,7 +103,9 @@ _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visua
 _MOST_NAMED = 6
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _FEWEST = 20  # places of a track
-_COVERS = 0.8  # of the run, from which a receiver is there throughout
+_COVERS = (
+    0.8  # of the run, from which a receiver is there throughout; of the fixes, from which it says as much as another
+)
 
 
 class _First(NamedTuple):
@@ -201,6 +203,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             *_steps(bag),
             *unused_topics(list(bag.streams.values()), used),
             *_lacking(bag, imus, gnss, reports),
+            *unused_numbers(t for t in bag.topics.values() if t.topic not in bag.streams),
             *([] if any(c.usable for c in compasses) else unused_magnetometers(bag.topics.values())),
         ),
     )
@@ -240,12 +243,15 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     """Report the receivers, the best one first."""
     found = [r for s in bag.of_type(*_FIXES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
     longest_s = max((r.spans_s for r in found), default=0.0)
+    most = max((r.fixes for r in found if r.spans_s >= _COVERS * longest_s), default=0)
     found.sort(
         key=lambda r: (
             filtered(r.topic),
             r.spans_s < _COVERS * longest_s,
             r.slow_error,
             _octave(r),
+            r.fixes < _COVERS * most,
+            r.without_height == r.fixes,
             -r.fixes,
             r.without_height,
         )
@@ -308,10 +314,11 @@ def _lacking(
     """Say which required sensors are missing, and then also which topics have an unsupported type: they may be it."""
     lines = []
     if not any(not imu.missing for imu in imus):
-        lines.append("no whole IMU in it: smooth, replay and compare need one")
+        lines.append("no whole IMU in it: smooth, replay and compare need one (sensor_msgs/Imu, 50 Hz or more)")
     if not (gnss or bag.lidars or bag.cameras or any(report.role == "pose" or report.grid for report in odometry)):
         lines.append("nothing in it tells the place: no GNSS fix that can be used, no pose")
-    others = [t for t in bag.topics.values() if t.topic not in bag.streams and not _KNOWN.match(t.msgtypes[0])]
+    read = {name.partition(" ")[0] for name in bag.streams}  # of NMEA a stream is a sentence
+    others = [t for t in bag.topics.values() if t.topic not in read and not _KNOWN.match(t.msgtypes[0])]
     if lines and others:
         named = ", ".join(f"{t.topic} ({' or '.join(t.msgtypes).replace('/msg/', '/')})" for t in others[:_MOST_NAMED])
         lines.append(f"of no type that is read here: {named}{', ...' if len(others) > _MOST_NAMED else ''}")

@@ -336,6 +336,16 @@ def test_what_no_run_can_do_without_is_reported(tmp_path: Path) -> None:
     assert "IMU" not in said
 
 
+@pytest.mark.parametrize(("topic", "said"), [("/speed_log", True), ("/battery_voltage", False)])
+def test_numbers_that_may_be_a_speed_are_said_to_be_one(topic: str, said: bool, tmp_path: Path) -> None:
+    """Nothing of such a topic was in the text or in the draft."""
+    make = Messages(2)
+    number = make.t["std_msgs/msg/Float64"]
+    more = [(topic, START_NS + k * S // 5, number(data=3.0)) for k in range(200)]
+    found, _, _ = look(tmp_path, sorted([*drive(make), *more], key=lambda item: item[1]), make)
+    assert [topic in w and "kind body_velocity" in w for w in found.warnings] == [True] * said
+
+
 @pytest.mark.parametrize("compass", [True, False])
 def test_a_magnetometer_alone_is_said_to_be_no_compass(compass: bool, tmp_path: Path) -> None:
     make = Messages(2)
