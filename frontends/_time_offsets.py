@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion, Turning
+from graphloc.frontends._clock import MOST_LATE_S
 from graphloc.frontends._mount_yaw import FEWEST, HALF_S, MOVES_M, STEP_S, Felt, bent
 from graphloc.frontends._turns import without_line
 from graphloc.time import NS_PER_S
 
 _BLOCK_S = 20.0
 _CLEAR, _LEAST_S = 4.0, 0.02  # sigmas, s
-_MOST_S, _APART_S, _LEAST_OF_WAY_S = 1.5, 0.05, 0.1  # how far, and how closely, is looked; from which it is said
+_APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # how closely is looked; from which it is said
 
 
 def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[float, float] | None:
@@ -65,10 +66,10 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> tuple[float, float
     if motion.way_m is None:
         return None
     t, at = felt.t_s, felt.times_of(motion)
-    lags = np.arange(-_MOST_S, _MOST_S + 0.5 * _APART_S, _APART_S)
+    lags = np.arange(-MOST_LATE_S, MOST_LATE_S + 0.5 * _APART_S, _APART_S)
     found: list[tuple[float, float, float]] = []
     for half_s in HALF_S:
-        margin = half_s + _MOST_S
+        margin = half_s + MOST_LATE_S
         middle = np.arange(max(t[0], at[0]) + margin, min(t[-1], at[-1]) - margin, STEP_S)
         moved, chord = bent(at, motion.way_m, middle, half_s)
         good = np.abs(chord) > MOVES_M
