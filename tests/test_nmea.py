@@ -380,6 +380,7 @@ def test_the_curvature_of_the_earth_is_no_height(height_m: float | None, tmp_pat
     assert seen.gnss[0].height_range_m == pytest.approx(0.0, abs=1e-6)
     assert "height ranges" not in draft_config(seen)
     assert "vertical_sigma_m" not in draft_config(seen)
+    assert ("height 0.0 m" in render(seen)) == (height_m is not None)  # of none, no height is said
 
 
 @pytest.mark.parametrize("hz", [1, 10])
