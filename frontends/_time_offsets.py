@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,8 +56,21 @@ def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: A
     return (value, sigma) if clear else None
 
 
-def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> tuple[float, float] | None:
-    """Return what should be added to the stamps of a motion, s, and its sigma; None if the accelerometer does not show it.
+class MotionOffset(NamedTuple):
+    """What should be added to the stamps of a motion, s, 1 sigma; `clear`: whether it is better than nothing by far."""
+
+    value_s: float
+    sigma_s: float
+    clear: bool
+
+    def denies(self, other: MotionOffset) -> bool:
+        """Return whether another offset cannot be that of the same clock."""
+        apart_s = abs(other.value_s - self.value_s)
+        return apart_s > max(_CLEAR * float(np.hypot(self.sigma_s, other.sigma_s)), _LEAST_OF_WAY_S)
+
+
+def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | None:
+    """Return by how much the stamps of a motion are off, by the accelerometer; None if that does not show it.
 
     Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. With correlation
     c at the best offset and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
@@ -87,9 +102,10 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> tuple[float, float
         left = max(1.0 - float(c[k]) ** 2, 1e-9)
         better = windows * (float(c[k]) ** 2 - float(np.interp(0.0, lags, c)) ** 2) / left
         found.append((better, value, float(np.sqrt(left / (windows * c[k] * bend)))))
-    better, value, sigma = max(found, default=(0.0, 0.0, 1.0))
-    clear = better > _CLEAR**2 and abs(value) > max(_CLEAR * sigma, _LEAST_OF_WAY_S)
-    return (value, sigma) if clear else None
+    if not found:
+        return None
+    better, value, sigma = max(found)
+    return MotionOffset(value, sigma, better > _CLEAR**2 and abs(value) > max(_CLEAR * sigma, _LEAST_OF_WAY_S))
 
 
 def _felt_along(felt: Felt, middle_s: Array, half_s: float) -> Array:
