@@ -124,5 +124,7 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
             "bound includes it"
         )
     if gnss.scatter_m is not None:
-        lines.append(f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m)} m")
+        lines.append(
+            f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m[: 2 if flat else 3])} m"
+        )
     return lines

@@ -381,6 +381,8 @@ def test_the_curvature_of_the_earth_is_no_height(height_m: float | None, tmp_pat
     assert "height ranges" not in draft_config(seen)
     assert "vertical_sigma_m" not in draft_config(seen)
     assert ("height 0.0 m" in render(seen)) == (height_m is not None)  # of none, no height is said
+    (scatter,) = (line for line in render(seen).split("\n") if "scatter from fix to fix" in line)
+    assert len(scatter.split()) == (9 if height_m else 8)
 
 
 @pytest.mark.parametrize("hz", [1, 10])
