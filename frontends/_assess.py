@@ -257,7 +257,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         known_covariance=float(known.mean()),
         reported_sigma_m=None if sigma is None else vec(sigma),
         scatter_m=None if scatter is None else vec(scatter),
-        height_range_m=float(np.subtract(*np.percentile(p[:, 2], [95, 5]))),
+        height_range_m=float(np.subtract(*np.percentile(rows[:, 2], [95, 5]))),
         extent_m=(float(np.ptp(p[:, 0])), float(np.ptp(p[:, 1]))),
         travelled_m=float(np.hypot(chords[:, 0], chords[:, 1]).sum()),
         first=vec(rows[0, :3]),

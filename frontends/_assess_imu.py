@@ -16,7 +16,7 @@ from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import Courses, MeasuredMotion, sane, summed, vec
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
 from graphloc.frontends._reports import ImuReport, MountGuess
-from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, without_gravity
+from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, turns_gravity, without_gravity
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turning import Turning, against_turning
@@ -215,7 +215,7 @@ def imu_report(
     stamps = imu.stamps_ns[keep]
     accel, gyro = np.where(finite[:, None], rows[:, :3], 0.0), np.where(finite[:, None], rows[:, 3:6], 0.0)
     missing = missing_half(accel, gyro)
-    units = _units_of(accel, gyro)
+    units = _units_of(stamps, accel, gyro)
     accel = accel * (STANDARD_GRAVITY_MPS2 if units.accel == "g" else 1.0)
     gyro = gyro * (np.pi / 180.0 if units.gyro == "deg/s" else 1.0)
     up = np.median(accel, axis=0)
@@ -258,13 +258,13 @@ class _Units(NamedTuple):
     why: tuple[str, ...]
 
 
-def _units_of(accel: Array, gyro: Array) -> _Units:
-    """Return the likely units of accelerations (N, 3) and rates (N, 3)."""
+def _units_of(stamps: NDArray[np.int64], accel: Array, gyro: Array) -> _Units:
+    """Return the likely units of accelerations (N, 3) and rates (N, 3), at stamps (N,) ns."""
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     rate = float(np.median(np.linalg.norm(gyro, axis=1)))
     gravity = "removed" if without_gravity(accel) else "included"
     accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
-    gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS else "rad/s"
+    gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS and not turns_gravity(stamps, accel, gyro) else "rad/s"
     why = []
     if accel_unit == "g":
         why.append(f"median acceleration is {size:.2f}: looks like g")

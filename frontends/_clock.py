@@ -21,6 +21,10 @@ HOLE_LIMIT_S = 600.0
 """Where no sensor says anything for so long, nothing can bridge it: the run falls apart there."""
 EPOCH_LIMIT_S = 1.0
 """Clocks of two sensors that differ by more are said to disagree."""
+MOST_LATE_S = 1.5
+"""Stamps of a sensor may be off by so much on one clock: a receiver filters its velocity, a driver waits for the rest of a burst."""
+MOST_ON_ITS_WAY_S = 0.6
+"""A fix is stamped late by no more if all that delays it is its way to the computer."""
 NO_DATE_NS = 946_684_800 * NS_PER_S
 """2000-01-01: a stamp before it is no date."""
 GAIN_LIMIT_S = 0.1

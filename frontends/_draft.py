@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SlowErrorConfig
@@ -174,7 +175,7 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
 def _topic_lines(topic: str) -> list[str]:
     """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
     name, *sentence = topic.split(" ")[:2]
-    return [f"  topic: {name}", *(f"  nmea: [{said}]" for said in sentence)]
+    return [f"  topic: {name}", *(f"  nmea: [{', '.join(said.split('+'))}]" for said in sentence)]
 
 
 def _numbered(name: str, k: int) -> str:
@@ -221,7 +222,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         why = (
             _FILTERED
             if filtered(gnss.topic)
-            else "one receiver is used: RTK throughout, else the most accurate by its claims, of equal ones that with most fixes"
+            else "one receiver is used: RTK throughout, else the most accurate by its claims, of equal ones that with heights, then with most fixes"
         )
         lines.append(f"  enabled: false  # guess: {why}")
     else:
@@ -296,16 +297,17 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
         v for v in known if v.axes is None and v.msgtype != VECTOR
     ]
     used = min(told, key=lambda v: filtered(v.topic), default=None)
-    for k, twist in enumerate(known):
+    body, world = count(), count()
+    for twist in known:
         off = None
         if twist.axes == BODY_AXES:
-            yield _body_velocity_block(_numbered("body_velocity", k), twist)
+            yield _body_velocity_block(_numbered("body_velocity", next(body)), twist)
             continue
         if twist.axes is None and twist.msgtype == VECTOR:
             off = f"nothing tells that it is a velocity; {twist.why}"
         elif twist is not used:
             off = f"true if it comes of another receiver than {used.topic if used else 'that'}; {twist.why}"
-        yield _velocity_block(_numbered("gnss_velocity", k), twist, gnss, off)
+        yield _velocity_block(_numbered("gnss_velocity", next(world)), twist, gnss, off)
     for twist in inspection.velocities:
         if twist not in known:
             yield [f"# {twist.topic}: left out, it is no velocity of the craft; {twist.why}"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from graphloc.frontends._clock import EPOCH_LIMIT_S, Clock, behind_s, reference_of
+from graphloc.frontends._clock import EPOCH_LIMIT_S, MOST_ON_ITS_WAY_S, Clock, behind_s, reference_of
 from graphloc.frontends._reports import GnssReport, Inspection, MountedTopic, TopicReport
 from graphloc.frontends.decode import UNSTAMPED
 
@@ -78,6 +78,12 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
         by = found.late_by if isinstance(found, GnssReport) and found.late_by.partition(" ")[0] != topic else ""
         whose = f"the motion of {by}, taken for the same receiver's," if by else "its motion"
         why.append(f"what the IMU feels fits {whose} {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
+        fixes_late = next((r.late_s[0] for r in inspection.gnss if r.late_s), 0.0)
+        if kind == "gnss_velocity" and late[0] < fixes_late - MOST_ON_ITS_WAY_S:
+            why.append(
+                "so late, it is filtered, and its error lasts: a larger default_sigma_mps, or none of it, may be better "
+                "(compare --hold-out)"
+            )
     lines = [f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else []
     if kind == "gnss":
         lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}")

@@ -47,7 +47,7 @@ from graphloc.frontends.decode import (
     Decoded,
     supported_types,
 )
-from graphloc.ledger import LedgerRow
+from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Progress, Recording, Span
 
@@ -312,7 +312,9 @@ def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapp
     """Return a line for each sensor without a reading, with the main reason."""
     lines = []
     for readings in (r for r in sensors if not r.values):
-        reasons = Counter(r.reason for r in rows if r.sensor == readings.sensor)
+        own = [r for r in rows if r.sensor == readings.sensor]
+        # Of a line of NMEA most is for others, which is no reason.
+        reasons = Counter(r.reason for r in own if r.outcome is not Outcome.IGNORED) or Counter(r.reason for r in own)
         why = f", mostly: {reasons.most_common(1)[0][0]}" if reasons else ""
         count = topics[readings.config.topic].messages
         lines.append(f"{readings.sensor}: none of the {count} messages on {readings.config.topic} could be used{why}")
