@@ -194,7 +194,7 @@ def _geotiff(case: Case) -> Callable[[], None]:
         path, "w", driver="GTiff", width=400, height=400, count=3, dtype=dtype, crs="EPSG:32632",
         transform=from_origin(east - 100.0, north + 100.0, 0.5, 0.5), **ways[int(rng.integers(len(ways)))],
     ) as out:  # fmt: skip
-        out.write(noise_image(rng, 400).astype(dtype))
+        out.write(noise_image(rng).astype(dtype))
     for _ in range(int(rng.integers(0, 3))):
         path.write_bytes(damaged(rng, path.read_bytes()))
     return lambda: _patch(path)

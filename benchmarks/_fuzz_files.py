@@ -188,5 +188,5 @@ def hostile_geojson(rng: Rng) -> bytes:
     return hostile_text(rng, json.dumps(GEOJSON, indent=1))
 
 
-def noise_image(rng: Rng, size: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    return rng.integers(0, 256, (3, size, size), dtype=np.uint8)
+def noise_image(rng: Rng) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    return rng.integers(0, 256, (3, 400, 400), dtype=np.uint8)

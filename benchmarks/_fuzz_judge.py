@@ -30,6 +30,7 @@ from graphloc.solution import Solution
 
 MOST_MIB = 700  # that a case may take on top; its inputs are smaller than 10 MiB
 _LONGEST_LINE = 3000
+_LIMIT_S = 250.0  # that a command may take
 
 
 class Found(Exception):
@@ -270,7 +271,7 @@ def install() -> Watch:
     return watch
 
 
-def run_command(arguments: list[str], room: Path, limit_s: float = 250.0) -> tuple[int, str]:
+def run_command(arguments: list[str], room: Path) -> tuple[int, str]:
     """Run the command line; return exit code and what it said on stderr. By hand, as `Watch` lets no process be started."""
     said = room / "stderr"
     child = os.fork()
@@ -279,7 +280,7 @@ def run_command(arguments: list[str], room: Path, limit_s: float = 250.0) -> tup
         os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT), 2)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.execv(sys.executable, [sys.executable, "-B", "-m", "graphloc", *arguments])
-    until = time.monotonic() + limit_s
+    until = time.monotonic() + _LIMIT_S
     while time.monotonic() < until:
         pid, status = os.waitpid(child, os.WNOHANG)
         if pid:
@@ -287,4 +288,4 @@ def run_command(arguments: list[str], room: Path, limit_s: float = 250.0) -> tup
         time.sleep(0.01)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    raise Found("hang", f"graphloc {arguments[0]}: no end after {limit_s:g} s")
+    raise Found("hang", f"graphloc {arguments[0]}: no end after {_LIMIT_S:g} s")

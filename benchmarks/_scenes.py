@@ -42,8 +42,6 @@ class Sample:
         image, datum: where the image lies. vector: the GeoJSON of what stands still. config: an aerial sensor's.
     """
 
-    scene: str
-    seed: int
     clouds: tuple[LevelCloud, ...]
     true: Array
     prior: Prior
@@ -76,7 +74,7 @@ def samples(scene: str, seed: int, folder: Path, count: int = 8, scans: int = 1)
         off = np.array([*rng.uniform(-OFF_M, OFF_M, 2), np.radians(rng.uniform(-OFF_DEG, OFF_DEG))])
         wide = np.array([0.5 * OFF_M, 0.5 * OFF_M, np.radians(0.5 * OFF_DEG)])  # so off as that is 2 sigma
         found.append(
-            Sample(scene, seed, clouds, true, Prior(true + off, wide), stem.with_suffix(".tif"),
+            Sample(clouds, true, Prior(true + off, wide), stem.with_suffix(".tif"),
                    stem.with_suffix(".geojson"), run.harbour.datum, sensor)
         )  # fmt: skip
     return found

@@ -59,8 +59,8 @@ def moved(config: VesselConfig, sensor: str, lever_m: tuple[float, float], yaw_d
     )
 
 
-def late(recording: Recording, sensor: str, by_s: float) -> Recording:
-    by_ns = round(by_s * 1e9)
+def late(recording: Recording, sensor: str) -> Recording:
+    by_ns = round(LATE_S * 1e9)
     shifted = (replace(m, stamp_ns=m.stamp_ns + by_ns) if m.sensor == sensor else m for m in recording.measurements)
     return replace(recording, measurements=tuple(sorted(shifted, key=lambda m: m.stamp_ns)))
 
@@ -69,7 +69,7 @@ def plant(recording: Recording, config: VesselConfig, fault: str) -> tuple[Recor
     if fault == "lever":
         return recording, moved(config, "gnss", LEVER_M)
     if fault.endswith("late"):
-        return late(recording, fault.split()[0], LATE_S), config
+        return late(recording, fault.split()[0]), config
     if fault == "compass turned":
         return recording, moved(config, "compass", (0.0, 0.0), TURNED_DEG)
     return recording, config

@@ -15,8 +15,6 @@ from typing import Any
 import cv2
 import numpy as np
 from _rows import Row, row
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from graphloc import app
 from graphloc.berths import seen_from
@@ -25,13 +23,8 @@ from graphloc.config import VesselConfig
 from graphloc.eval import digerud, ekf
 from graphloc.eval.docking import tag_range_m
 from graphloc.eval.simulate import SimulatedRun, harbour_scenarios, simulate
-from graphloc.eval.simulate._light import tag_in_world
 from graphloc.eval.simulate.bag import write_bag
-from graphloc.eval.simulate.camera import Camera
-from graphloc.eval.simulate.scene import scene_of
 from graphloc.factors import INERTIAL, SENSORS
-from graphloc.frontends.tags.bundles import Seeing, SeenTag, sightings_of
-from graphloc.frontends.tags.detect import Detector
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.recording import Recording
 from graphloc.solve import smooth
@@ -39,7 +32,6 @@ from graphloc.solve._align import align
 from graphloc.solve._decide import Verdicts
 from graphloc.solve._grow import grow
 from graphloc.solve._start import solve_start
-from graphloc.survey import Survey, TagConfig
 
 SEEDS = {"illuminated": range(2)}  # of a condition
 OTHER_SEEDS = range(10)  # a run takes two minutes of a core
@@ -47,7 +39,6 @@ CONDITIONS = ("optimal", "fog", "counterlight", "droplet", "darkness", "illumina
 CAMERA_HZ = 3.0
 _DIGERUD_SAW_M = {"optimal": 28.0, "fog": 22.0, "counterlight": 25.0, "droplet": 16.0, "darkness": 16.0}
 _CUT_M, _HIDDEN_S = 20.0, 5.0
-_ALONE_M, _ALONE_BANDS_M = (2.0, 20.0), (2.0, 5.0, 8.0, 12.0, 16.0, 20.0)
 _STEP_S, _LAG_S = 1.0, 9.0  # of what one knew at the time
 Job = tuple[str, str, int]  # fixed or floating, condition, seed
 
@@ -64,7 +55,6 @@ class Docked:
             at the end. ekf_m: RMSE of the honest EKF.
     """
 
-    job: Job
     range_m: Any
     off_m: Any
     berth_m: Any
@@ -80,7 +70,7 @@ class Docked:
     ekf_m: float
 
 
-def _scenario(job: Job) -> Any:
+def scenario_of(job: Job) -> Any:
     kind, condition, _ = job
     return replace(harbour_scenarios()[f"dock-{kind}-{condition}"], lidar_hz=0.0, camera_hz=CAMERA_HZ)
 
@@ -88,7 +78,7 @@ def _scenario(job: Job) -> Any:
 def read(job: Job, keep: Path | None = None) -> tuple[SimulatedRun, Recording, VesselConfig]:
     """Write the bag of a run, and read it as a user does; `keep`: a folder of readings made before."""
     cv2.setNumThreads(1)
-    run = simulate(_scenario(job), job[2])
+    run = simulate(scenario_of(job), job[2])
     kept = None if keep is None else keep / ("-".join(map(str, job)) + ".pickle")
     if kept is not None and kept.exists():
         recording, config = pickle.loads(kept.read_bytes())  # our own, of a moment ago
@@ -189,7 +179,6 @@ def solve(run: SimulatedRun, recording: Recording, config: VesselConfig, job: Jo
         kf_true = run.truth.at(kf.trajectory.stamps_ns).p_world_m
         kf_m = np.hypot(*(kf.trajectory.p_world_m - kf_true)[:, :2].T)
     return Docked(
-        job=job,
         range_m=range_m,
         off_m=np.hypot(*off.T),
         berth_m=(berth_range, np.hypot(*error[:, :2].T)),
@@ -232,7 +221,7 @@ def _cut(run: SimulatedRun, recording: Recording, config: VesselConfig, job: Job
     return solve(run, replace(recording, measurements=kept), config, job)
 
 
-def _jobs(kind: str, condition: str) -> list[Job]:
+def jobs_of(kind: str, condition: str) -> list[Job]:
     return [(kind, condition, seed) for seed in SEEDS.get(condition, OTHER_SEEDS)]
 
 
@@ -245,7 +234,7 @@ def docking(pool: ProcessPoolExecutor) -> list[Row]:
     """D.1, D.2, D.3, D.5: whole runs in every condition."""
     rows: list[Row] = []
     kinds = list(itertools.product(("fixed", "floating"), CONDITIONS))
-    jobs = [job for kind, condition in kinds for job in _jobs(kind, condition)]
+    jobs = [job for kind, condition in kinds for job in jobs_of(kind, condition)]
     by_job, failed = {}, []
     for job, future in {job: pool.submit(_whole, job) for job in jobs}.items():
         try:
@@ -255,7 +244,7 @@ def docking(pool: ProcessPoolExecutor) -> list[Row]:
             failed.append(job)
     rows.append(row("D.2", f"runs of {len(jobs)} that end in an exception", len(failed), "runs", 0, "<="))
     for kind, condition in kinds:
-        done = [by_job[job] for job in _jobs(kind, condition) if job in by_job]
+        done = [by_job[job] for job in jobs_of(kind, condition) if job in by_job]
         found, cut = [whole for whole, _ in done], [part for _, part in done if part is not None]
         runs = [r for r in found if r is not None]
         rows += _cut_rows(cut) if cut else []
@@ -317,107 +306,3 @@ def _cut_rows(runs: list[Docked]) -> list[Row]:
         row("D.3", f"{label}: error at the berth, 95 %", at_berth, "m", 0.15, "<="),
         row("D.3", f"{label}: error from the first sighting on, 95 %", _p95([r.off_m for r in runs]), "m"),
     ]
-
-
-@dataclass(frozen=True)
-class Alone:
-    """A tag alone against its true pose: range, errors (6,) of the nearer mode, its covariance, corner errors in px."""
-
-    range_m: float
-    error: Any
-    cov: Any
-    corners_px: Any
-    modes: int
-    best_is_right: bool
-
-
-def alone(job: Job, step_s: float = 0.5) -> list[Alone]:
-    """Each tag of an approach alone, its true place given, in images as a bag has them (JPEG)."""
-    cv2.setNumThreads(1)
-    run = simulate(_scenario(job), job[2])
-    config = run.rig.cameras["camera"]
-    scene = scene_of(run)
-    camera, detector = Camera("camera", scene, run), Detector()
-    assert run.harbour is not None
-    tags = {tag.number: tag for tag in run.harbour.config.tags}
-    found = []
-    for k, t in enumerate(np.arange(16.0, run.scenario.duration_s - 0.3, step_s)):
-        p, R = camera.pose(float(t))
-        there = camera.tag_poses(float(t))
-        if min(float(np.linalg.norm(at)) for at, _ in there.values()) > _ALONE_M[1]:
-            continue
-        _, coded = cv2.imencode(".jpg", camera.take(float(t), k).pixels, [cv2.IMWRITE_JPEG_QUALITY, 90])
-        for seen in detector.detect(np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)):
-            tag = tags.get(seen.number)
-            if tag is None:
-                continue
-            at, turned = tag_in_world(tag, run.harbour, scene, float(t))
-            roll, pitch, yaw = Rotation.from_matrix(turned).as_euler("xyz", degrees=True)
-            surveyed = TagConfig(
-                id=tag.number,
-                size_m=tag.size_m,
-                xyz_m=tuple(at),
-                rpy_deg=(roll, pitch, yaw),
-                sigma_m=0.0,
-                sigma_deg=0.0,
-            )
-            rays = (seen.corners_px - np.array(config.centre_px)) / np.array(config.focal_px)
-            cov = seen.cov_px2 / config.focal_px[0] ** 2
-            survey = Survey(tags=(surveyed,))
-            seeing = Seeing(0, "tags", "camera", np.zeros(3), np.eye(3))
-            sightings, _ = sightings_of([SeenTag(surveyed, rays, cov)], survey, seeing)
-            if not sightings:
-                continue
-            modes = sightings[0].modes
-            right = int(np.argmin([np.linalg.norm(np.asarray(m.R_world_camera) - R) for m in modes]))
-            mode = modes[right]
-            middle = surveyed.corners_m.mean(axis=0)
-            shift = (middle - p) @ R - (middle - mode.p_world_camera_m) @ mode.R_world_camera
-            turn = Rotation.from_matrix(mode.R_world_camera.T @ R).as_rotvec()
-            flat = (surveyed.corners_m - p) @ R
-            px = flat[:, :2] / flat[:, 2:] * np.array(config.focal_px) + np.array(config.centre_px)
-            found.append(
-                Alone(
-                    float(np.linalg.norm(at - p)),
-                    np.concatenate([shift, turn]),
-                    np.asarray(mode.cov),
-                    seen.corners_px - px,
-                    len(modes),
-                    right == 0,
-                )
-            )
-    return found
-
-
-def single_tags(pool: ProcessPoolExecutor) -> list[Row]:
-    """D.4: are the covariances of single tags honest, and do corners lie where they should?"""
-    found = [a for part in pool.map(alone, _jobs("fixed", "optimal")) for a in part]
-    rows = []
-    for low, high in itertools.pairwise(_ALONE_BANDS_M):
-        there = [a for a in found if low <= a.range_m < high]
-        if not there:
-            continue
-        nees = np.array([float(a.error @ np.linalg.solve(a.cov, a.error)) for a in there])
-        label = f"single tags, optimal, {low:g}-{high:g} m"
-        bound = _mean_bound(len(nees))
-        rows.append(
-            row("D.4", f"{label}: NEES / 6 (95 % bound of so many: {bound:.2f})", nees.mean() / 6.0, "", bound, "<=")
-        )
-        rows.append(
-            row("D.4", f"{label}: within the 95 % region", (nees < chi2.ppf(0.95, 6)).mean(), "share", 0.93, ">=")
-        )
-        shrunk = np.mean([_outward(a.corners_px) for a in there])
-        rows.append(row("D.4", f"{label}: corners off from the middle outwards, mean", shrunk, "px"))
-        off = np.sqrt(np.mean([np.mean(a.corners_px**2) for a in there]))
-        rows.append(row("D.4", f"{label}: corners off, RMS of an axis", off, "px"))
-    return rows
-
-
-def _mean_bound(count: int) -> float:
-    """Upper end of the 95 % interval of the mean of `count` values of chi-square 6, over 6."""
-    return float(chi2.ppf(0.975, 6 * count) / (6 * count))
-
-
-def _outward(off_px: Any) -> float:
-    """Mean way of the four corners (top-left, top-right, bottom-right, bottom-left) away from the middle, each axis."""
-    return float((off_px * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])).mean())

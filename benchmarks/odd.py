@@ -33,11 +33,11 @@ from graphloc.trajectory import Trajectory
 _HONEST = 0.85  # share of the time inside the 95 % bounds, at the least
 
 
-def _restamped(topic: str, stamped: Callable[[int, int], int]) -> Change:
-    """Other header stamps; `stamped` takes the number of a message and its stamp, ns."""
+def _restamped(stamped: Callable[[int, int], int]) -> Change:
+    """Other header stamps of the IMU; `stamped` takes the number of a message and its stamp, ns."""
 
     def change(craft: Craft, items: list[Item]) -> list[Item]:
-        own = [m for name, _, m in items if name == topic]
+        own = [m for name, _, m in items if name == "/imu/data"]
         for k, m in enumerate(own):
             old_ns = m.header.stamp.sec * 10**9 + m.header.stamp.nanosec
             m.header = craft.make.header(stamped(k, old_ns), m.header.frame_id)
@@ -126,12 +126,12 @@ CASES: dict[str, Odd] = {
     ),
     "IMU turned by 90 deg": Odd(imu_rpy_deg=(0.0, 0.0, 90.0), draft=(r"0.0, 0.0, 90.0\]",)),
     "covariances NaN": Odd(change=_no_covariance),
-    "IMU stamps zero": Odd(change=_restamped("/imu/data", lambda k, ns: 0), draft=("stamps: recorded",)),
+    "IMU stamps zero": Odd(change=_restamped(lambda k, ns: 0), draft=("stamps: recorded",)),
     "IMU stamps from boot": Odd(
-        change=_restamped("/imu/data", lambda k, ns: ns - START_NS + 5 * 10**9), draft=("time_offset_s",)
+        change=_restamped(lambda k, ns: ns - START_NS + 5 * 10**9), draft=("time_offset_s",)
     ),
     "IMU in bursts of ten": Odd(
-        change=_restamped("/imu/data", lambda k, ns: stamp(0.09 + k // 10 / 10.0 + 5e-5 * (k % 10))), **_RTK
+        change=_restamped(lambda k, ns: stamp(0.09 + k // 10 / 10.0 + 5e-5 * (k % 10))), **_RTK
     ),
     "IMU clock 800 ppm fast": Odd(seconds=300.0, imu_hz=50.0, gnss_hz=2.0, ppm=800.0, draft=("clock_drift_ppm: [78]",), **_RTK),
     "second receiver, faster and worse": Odd(

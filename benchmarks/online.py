@@ -3,32 +3,22 @@
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import itertools
-import json
 import os
-import signal
-import subprocess
 import sys
-import tempfile
-import traceback
 from collections import Counter
-from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import soak
 from _rows import ROOT, Row, row
-from ruamel.yaml import YAML
 from scipy.stats import chi2
 from smoothing import hard_start, loss_ns
 
 from graphloc import app
-from graphloc.config import effective
 from graphloc.errors import SolveError
 from graphloc.eval import ekf
 from graphloc.eval.metrics import compare_to_truth
@@ -36,7 +26,7 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, harbour_
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import wrap_angle
 from graphloc.ledger import Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, Measurement, PoseFix
+from graphloc.measurements import ImuSample, PoseFix
 from graphloc.online import OnlineSmoother
 from graphloc.replay import replay
 
@@ -44,23 +34,22 @@ sys.path.append(str(ROOT))
 from tests import faults as bad
 from tests import tagfactory
 
-_LOOPS = Scenario(path="loops", noise="drift")
+LOOPS = Scenario(path="loops", noise="drift")
 _HORIZONTAL = slice(0, 2)
-_SLOW_S = 30.0  # a recovery that is worth a look
 _FALSE_M = 1.5  # from the truth: right matches err by tenths of it
 Case = tuple[int, str, int]
 Values = dict[str, float]
 
 
-def _smoother(run: SimulatedRun, lag_s: float = 10.0) -> OnlineSmoother:
+def smoother_for(run: SimulatedRun, lag_s: float = 10.0) -> OnlineSmoother:
     return OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, mounts=run.recording.mounts, lag_s=lag_s)
 
 
-def _cut(run: SimulatedRun, length_s: float) -> int:
+def cut(run: SimulatedRun, length_s: float) -> int:
     return int(run.truth.stamps_ns[0]) + round(length_s * 1e9)
 
 
-def _off_m(run: SimulatedRun, stamps_ns: Any, p_world_m: Any) -> Any:
+def horizontal_off_m(run: SimulatedRun, stamps_ns: Any, p_world_m: Any) -> Any:
     """Horizontal errors (N,) at increasing stamps."""
     true = run.truth.at(np.array(stamps_ns, dtype=np.int64)).p_world_m
     return np.hypot(*(np.asarray(p_world_m) - true).T[_HORIZONTAL])
@@ -91,7 +80,7 @@ def _without_false(job: Case) -> float:
     run = simulate(bl_scenario(job[0], job[1]), job[2])  # type: ignore[arg-type]
     right = [
         m for m in run.recording.measurements
-        if not isinstance(m, PoseFix) or _off_m(run, [m.stamp_ns], [m.modes[0].value])[0] < _FALSE_M
+        if not isinstance(m, PoseFix) or horizontal_off_m(run, [m.stamp_ns], [m.modes[0].value])[0] < _FALSE_M
     ]  # fmt: skip
     track = replay(replace(run.recording, measurements=tuple(right)), run.config).solution.trajectory
     return compare_to_truth(track, run.truth.at(track.stamps_ns)).position_rmse_m
@@ -101,7 +90,7 @@ def _to_batch(job: Case) -> Any:
     """Distance of each state of a lag as long as the run from the batch's, m."""
     scenario = replace(bl_scenario(job[0], job[1]), duration_s=60.0)  # type: ignore[arg-type]
     run = simulate(scenario, job[2])
-    smoother = _smoother(run, lag_s=2.0 * scenario.duration_s)
+    smoother = smoother_for(run, lag_s=2.0 * scenario.duration_s)
     for a in bad.arrivals_of(run):
         smoother.feed(a.m)
     window = smoother.window()
@@ -201,8 +190,8 @@ def _start(seed: int) -> tuple[float, float, float, float] | None:
         return None
     track, first = found.solution.trajectory, found.estimates[0].stamp_ns
     off_deg = np.degrees(np.abs(wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad)))
-    last = off_deg[track.stamps_ns >= _cut(run, 50.0)]
-    off_m = _off_m(run, track.stamps_ns[:1], track.p_world_m[:1])
+    last = off_deg[track.stamps_ns >= cut(run, 50.0)]
+    off_m = horizontal_off_m(run, track.stamps_ns[:1], track.p_world_m[:1])
     waited_s = (first - int(run.truth.stamps_ns[0])) * 1e-9
     return waited_s, float(off_m[0]), float(off_deg[0]), float(last.max()) if len(last) else np.inf
 
@@ -211,10 +200,10 @@ def _outage(job: tuple[float, int]) -> tuple[float, float]:
     """Error 10 s after an outage, m."""
     length, seed = job
     end = 60.0 + length
-    run = simulate(replace(_LOOPS, duration_s=end + 12.0, outage_s=(60.0, end)), seed)
+    run = simulate(replace(LOOPS, duration_s=end + 12.0, outage_s=(60.0, end)), seed)
     track = replay(run.recording, run.config).solution.trajectory
-    n = int(np.searchsorted(track.stamps_ns, _cut(run, end + 10.0), side="right")) - 1
-    return length, float(_off_m(run, track.stamps_ns[n : n + 1], track.p_world_m[n : n + 1])[0])
+    n = int(np.searchsorted(track.stamps_ns, cut(run, end + 10.0), side="right")) - 1
+    return length, float(horizontal_off_m(run, track.stamps_ns[n : n + 1], track.p_world_m[n : n + 1])[0])
 
 
 def starts(pool: ProcessPoolExecutor, seeds: int = 20) -> list[Row]:
@@ -249,7 +238,7 @@ def starts(pool: ProcessPoolExecutor, seeds: int = 20) -> list[Row]:
 
 def _fed(run: SimulatedRun, arrivals: bad.Arrivals) -> tuple[Any, int, int]:
     """Where the vessel is at the last stamp (inf: not known), messages without their one row, and those not taken."""
-    smoother = _smoother(run)
+    smoother = smoother_for(run)
     rows = []
     for a in arrivals:
         smoother.feed(a.m)
@@ -265,7 +254,7 @@ def _fed(run: SimulatedRun, arrivals: bad.Arrivals) -> tuple[Any, int, int]:
 def _shuffled(seed: int) -> list[tuple[float, int, int]]:
     """With the IMU in order, and delayed too: m from the pose in order; as above."""
     run = simulate(replace(bl_scenario(1, "drift"), duration_s=60.0), seed)
-    silent_ns = _cut(run, 57.0)  # so that all has arrived at the end
+    silent_ns = cut(run, 57.0)  # so that all has arrived at the end
     ordered = [a for a in bad.arrivals_of(run) if isinstance(a.m, ImuSample) or a.true_ns < silent_ns]
     place, *_ = _fed(run, ordered)
     assert np.isfinite(place).all()
@@ -290,151 +279,6 @@ def shuffled(pool: ProcessPoolExecutor, seeds: int = 5) -> list[Row]:
     return rows
 
 
-# E.5: faults, kills
-
-
-@dataclass(frozen=True)
-class Faulted:
-    """A fault that was fed: what went wrong, if anything, and s from its end until the error was below 3 m."""
-
-    name: str
-    seed: int
-    crash: str = ""
-    complaints: tuple[str, ...] = ()
-    recovered_s: float = np.inf
-
-
-def _fault(job: tuple[str, int]) -> Faulted:
-    name, seed = job
-    rng = np.random.default_rng([seed, list(bad.FAULTS).index(name), 5])
-    run = simulate(replace(_LOOPS, duration_s=130.0), seed)
-    arrivals, over_ns = bad.FAULTS[name](bad.arrivals_of(run), _cut(run, float(rng.uniform(15.0, 30.0))), rng)
-    arrivals, smoother, fed = bad.numbered(arrivals), _smoother(run), bad.Fed()
-    enough = next((n for n, a in enumerate(arrivals) if a.true_ns > over_ns + 10 * bad.STEP_NS), len(arrivals))
-    try:
-        bad.feed(smoother, run, arrivals[:enough], fed)
-        if fed.recovered_s(over_ns) < np.inf:
-            arrivals = arrivals[:enough]
-        bad.feed(smoother, run, arrivals[enough:], fed)
-        bad.finish(smoother, fed)
-    except Exception:  # noqa: BLE001 - that is what is counted
-        return Faulted(name, seed, traceback.format_exc(limit=-1).replace("\n", " "))
-    return Faulted(name, seed, "", tuple(bad.complaints(arrivals, fed)), fed.recovered_s(over_ns))
-
-
-def _worst_m(seed: int) -> float:
-    """Of such a run without a fault, from 15 s on."""
-    run = simulate(replace(_LOOPS, duration_s=130.0), seed)
-    return bad.feed(_smoother(run), run, bad.arrivals_of(run)).worst_m(_cut(run, 15.0))
-
-
-def _line(m: Measurement) -> bytes:
-    """What `graphloc stream` reads."""
-    said: dict[str, Any] = {"stamp_ns": m.stamp_ns, "sensor": m.sensor}
-    if isinstance(m, ImuSample):
-        said |= {"type": "imu", "accel_mps2": m.accel_mps2.tolist(), "gyro_radps": m.gyro_radps.tolist()}
-    elif isinstance(m, GnssPosition):
-        lat, lon, height = m.position
-        said |= {
-            "type": "gnss",
-            "lat_deg": lat,
-            "lon_deg": lon,
-            "height_m": height,
-            "cov_enu_m2": m.cov_enu_m2.tolist(),
-        }
-    elif isinstance(m, CompassHeading):
-        said |= {"type": "heading", "yaw_rad": m.yaw_rad, "sigma_deg": float(np.degrees(m.sigma_rad))}
-    elif isinstance(m, PoseFix):
-        modes = []
-        for mode in m.modes:
-            x, y, yaw = mode.value.tolist()
-            cov = np.eye(6)
-            cov[np.ix_([0, 1, 5], [0, 1, 5])] = mode.cov
-            modes.append({"xyz_m": [x, y, 0.0], "rpy_deg": [0.0, 0.0, float(np.degrees(yaw))],
-                          "cov_m_rad": cov.tolist(), "probability": mode.probability})  # fmt: skip
-        said |= {"type": "pose", "modes": modes}
-    return json.dumps(said).encode() + b"\n"
-
-
-def _stream(folder: Path, lines: Sequence[bytes], kill: bool) -> list[dict[str, Any]]:
-    """Feed a `graphloc stream` as fast as it reads; kill it once all is written, or let it end."""
-    command = [sys.executable, "-m", "graphloc", "stream"]
-    options = ["-c", str(folder / "vessel.yaml"), "--snapshot", str(folder / "snapshot.json")]
-    with (folder / "out").open("wb") as out, (folder / "err").open("wb") as err:
-        child = subprocess.Popen([*command, *options], stdin=subprocess.PIPE, stdout=out, stderr=err, bufsize=0)
-    assert child.stdin is not None
-    fcntl.fcntl(child.stdin, fcntl.F_SETPIPE_SZ, 4096)  # so that it is never far behind
-    with child.stdin as pipe:
-        for line in lines:
-            pipe.write(line)
-        if kill:
-            child.send_signal(signal.SIGKILL)
-    child.wait()
-    whole = [line for line in (folder / "out").read_bytes().split(b"\n")[:-1] if line]
-    return [json.loads(line) for line in whole]
-
-
-def _killed(seed: int) -> tuple[bool, bool, float, float, float] | None:
-    """Whether it resumed, whether the first bound holds, error of the first estimate, largest from 1 s, 10 s on, m."""
-    rng = np.random.default_rng([seed, 9])
-    run = simulate(replace(_LOOPS, duration_s=60.0), seed)
-    lines = [(a.true_ns, _line(a.m)) for a in bad.arrivals_of(run)]
-    killed_s = float(rng.uniform(12.0, 40.0))
-    again_s = killed_s + float(rng.uniform(0.5, 5.0))  # what comes while nobody reads is lost
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        with (folder / "vessel.yaml").open("w", encoding="utf-8") as stream:
-            YAML(typ="safe", pure=True).dump(effective(run.config), stream)
-        _stream(folder, [line for at, line in lines if at < _cut(run, killed_s)], kill=True)
-        said = _stream(folder, [line for at, line in lines if at >= _cut(run, again_s)], kill=False)
-    poses = [s for s in said if s["type"] == "estimate"]
-    if not poses or said[-1]["type"] != "end":
-        return None
-    resumed = any(s["type"] == "event" and s["text"].startswith("resumed") for s in said)
-    stamps = np.array([s["stamp_ns"] for s in poses])
-    off = _off_m(run, stamps, [s["map"]["xyz_m"] for s in poses])
-    after = [float(off[stamps >= _cut(run, again_s + wait_s)].max()) for wait_s in (1.0, 10.0)]
-    return resumed, bool(off[0] <= poses[0]["bound_95_m"]), float(off[0]), after[0], after[1]
-
-
-def faults(pool: ProcessPoolExecutor, count: int = 1000, kills: int = 50) -> list[Row]:
-    names = list(bad.FAULTS)
-    jobs = [(names[n % len(names)], n // len(names)) for n in range(count)]
-    done = list(pool.map(_fault, jobs, chunksize=4))
-    for d in done:
-        if d.crash or d.complaints or d.recovered_s > _SLOW_S:
-            what = d.crash or "; ".join(d.complaints) or f"within 3 m after {d.recovered_s:.0f} s"
-            print(f"E.5: {d.name}, seed {d.seed}: {what}"[:300])
-    survived = [d for d in done if not d.crash]
-    runs = sorted({seed for _, seed in jobs})
-    astray = sum(m >= 3.0 for m in pool.map(_worst_m, runs))
-    took = np.array([d.recovered_s for d in survived if d.recovered_s < np.inf])
-    label = f"{count} faults of {len(names)} kinds"
-    rows = [
-        row("E.5", f"{label}: crashes", count - len(survived), "count", 0, "<="),
-        row("E.5", f"{label}: ledgers that do not add up, estimates that are no numbers", sum(bool(d.complaints) for d in survived), "count", 0, "<="),
-        row("E.5", f"{label}: of the {len(runs)} runs, over 3 m off at some time without a fault", astray, "runs"),
-        row("E.5", f"{label}: never within 3 m again", len(survived) - len(took), "count", 0, "<="),
-        row("E.5", f"{label}: from its end until within 3 m, median", float(np.median(took)), "s"),
-        row("E.5", f"{label}: from its end until within 3 m, 95 %", float(np.quantile(took, 0.95)), "s"),
-        row("E.5", f"{label}: from its end until within 3 m, max", took.max(), "s"),
-    ]  # fmt: skip
-    if not kills:
-        return rows
-    ends = list(pool.map(_killed, range(kills)))
-    alive = np.array([e for e in ends if e is not None], dtype=float).reshape(-1, 5)
-    label = f"stream killed (-9) {kills} times, started again 0.5 to 5 s later"
-    rows += [
-        row("E.5", f"{label}: resumed from the snapshot", int(alive[:, 0].sum()), "count", kills, ">="),
-        row("E.5", f"{label}: no estimate, or no end", kills - len(alive), "count", 0, "<="),
-        row("E.5", f"{label}: first estimate within its own 95 %", 100.0 * float(alive[:, 1].mean()), "%"),
-    ]
-    for column, text in ((2, "error of the first estimate"), (3, "largest error from 1 s on"), (4, "largest error from 10 s on")):  # fmt: skip
-        rows.append(row("E.5", f"{label}: {text}, median", float(np.median(alive[:, column])), "m"))
-        rows.append(row("E.5", f"{label}: {text}, max", alive[:, column].max(), "m"))
-    return rows
-
-
 # E.6: odom
 
 
@@ -456,7 +300,7 @@ def _steps(job: tuple[Scenario, int]) -> Any:
 
 
 def odometry(pool: ProcessPoolExecutor, seeds: int = 3) -> list[Row]:
-    outage = [replace(_LOOPS, duration_s=72.0 + length, outage_s=(60.0, 60.0 + length)) for length in (20.0, 60.0)]
+    outage = [replace(LOOPS, duration_s=72.0 + length, outage_s=(60.0, 60.0 + length)) for length in (20.0, 60.0)]
     cases = [bl_scenario(case, noise) for case in (1, 2, 3) for noise in ("drift", "jump")]
     rows = []
     for name, scenarios in (("BL's cases", cases), ("outages of 20 and 60 s", outage)):

@@ -50,7 +50,8 @@ def overlay(scenario: str, at_s: float, out: Path) -> None:
     cv2.imwrite(str(out), cv2.resize(canvas, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
-def conditions(at_s: float, out: Path) -> None:
+def conditions(out: Path) -> None:
+    at_s = 56.0
     pictures = []
     for condition in WEATHER:
         run = simulate(harbour_scenarios()[f"dock-fixed-{condition}"], SEED)
@@ -69,13 +70,13 @@ def match(scene: str, view: int, out: Path) -> None:
     cv2.imwrite(str(out), cv2.resize(picture, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA))
 
 
-def report(name: str, scenario: Scenario, out: Path, seed: int = 0) -> None:
+def report(name: str, scenario: Scenario, out: Path) -> None:
     """The first screens of the report of `graphloc compare` on a simulated bag."""
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     assert chromium, "no Chromium on PATH"
     with tempfile.TemporaryDirectory() as scratch_folder:
         folder = Path(scratch_folder)
-        bag, config_path = write_bag(simulate(scenario, seed), folder / name, ros=2)
+        bag, config_path = write_bag(simulate(scenario, 0), folder / name, ros=2)
         recording, config = app.load([bag], config_path)
         scans = app.Scans((bag,), config_path.parent)
         run = app.smooth_recording(recording, config, compare=True, scans=scans)
@@ -119,7 +120,7 @@ def main() -> None:
     overlay("bl1-drift", 60.0, FOLDER / "marina.jpg")
     overlay("bl2-drift", 70.0, FOLDER / "basin.jpg")
     match("crowded", 4, FOLDER / "match.jpg")
-    conditions(56.0, FOLDER / "conditions.jpg")
+    conditions(FOLDER / "conditions.jpg")
     reports()
 
 

@@ -27,7 +27,9 @@ import fuzz
 import matcher
 import odd
 import online
+import online_faults
 import simulator
+import single_tags
 import smoothing
 import sweep
 import tag_detector
@@ -54,14 +56,14 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "C.5": matcher.speed,
     "D.0": tag_detector.steps,
     "D.1": docking.docking,
-    "D.4": docking.single_tags,
+    "D.4": single_tags.figures,
     "D.6": tag_detector.cost,
     "D.7": tag_detector.agreement,
     "E.1": online.cases,
     "E.2": online.latency,
     "E.3": online.starts,
     "E.4": online.shuffled,
-    "E.5": online.faults,
+    "E.5": online_faults.faults,
     "E.6": online.odometry,
     "F.3": batch.figures,
     "F.3p": where.figures,

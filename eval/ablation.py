@@ -101,13 +101,13 @@ def off(solution: Solution, full: Solution, truth: Trajectory | None, held: Sequ
         NoCommonTimeError: they share no time.
     """
     if truth is None and held:
-        stamps, error, _ = held_out_errors(solution.trajectory, held, solution.datum, levers)
-        return Off(stamps_ns=stamps, off_m=np.hypot(error[:, 0], error[:, 1]), off_deg=None)
-    stamps, error, heading, _, _ = errors(solution.trajectory, truth or full.trajectory)
+        fixes = held_out_errors(solution.trajectory, held, solution.datum, levers)
+        return Off(stamps_ns=fixes.stamps_ns, off_m=fixes.horizontal_m, off_deg=None)
+    found = errors(solution.trajectory, truth or full.trajectory)
     return Off(
-        stamps_ns=stamps,
-        off_m=np.hypot(error[:, 0], error[:, 1]),
-        off_deg=np.degrees(np.abs(wrap_angle(heading))),
+        stamps_ns=found.stamps_ns,
+        off_m=found.horizontal_m,
+        off_deg=np.degrees(np.abs(wrap_angle(found.heading_rad))),
     )
 
 

@@ -242,8 +242,8 @@ def losses(result: FilterResult, truth: Trajectory) -> Losses:
     Raises:
         NoCommonTimeError: it covers none.
     """
-    stamps, error, _, _, _ = errors(result.trajectory, truth)
-    off = np.hypot(error[:, 0], error[:, 1]) > LOST_M
+    found = errors(result.trajectory, truth)
+    stamps, off = found.stamps_ns, found.horizontal_m > LOST_M
     step_s = float(np.median(np.diff(truth.stamps_ns))) / NS_PER_S
     return Losses(
         at_end=bool(off[stamps > stamps[-1] - round(END_S * NS_PER_S)].all()),

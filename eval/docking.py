@@ -101,9 +101,8 @@ def accurate_within_m(
     survey: Survey,
     sightings_ns: Stamps,
     lever_m: Array | None = None,
-    limit_m: float = DNV_M,
 ) -> float | None:
-    """Return the largest distance (m) to the tags within which 95 % of horizontal errors are below a limit; None if there is none.
+    """Return the largest distance (m) to the tags within which 95 % of horizontal errors are at most `DNV_M`; None if there is none.
 
     Args:
         estimate, truth: of the body. survey: with at least one tag.
@@ -115,7 +114,7 @@ def accurate_within_m(
     range_m = tag_range_m(truth, survey, lever_m)[seen]
     error = np.linalg.norm(_off(estimate, truth), axis=1)[seen]
     order = np.argsort(range_m, kind="stable")
-    share = np.cumsum(error[order] <= limit_m) / np.arange(1, len(order) + 1)
+    share = np.cumsum(error[order] <= DNV_M) / np.arange(1, len(order) + 1)
     enough = np.flatnonzero(share >= 0.95)
     return float(range_m[order][enough[-1]]) if len(enough) else None
 

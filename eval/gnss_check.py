@@ -49,8 +49,8 @@ def gnss_offset_warnings(track: Trajectory, datum: Datum, recording: Recording, 
         if not covered.any() or sensor.slow_error.enabled is False or not others:
             continue
         lever = {name: mount_of(name, sensor, recording.mounts)[0]}
-        stamps, error, _ = held_out_errors(track, fixes, datum, lever)
-        off = _means(stamps, -error)
+        found = held_out_errors(track, fixes, datum, lever)
+        stamps, off = found.stamps_ns, _means(found.stamps_ns, -found.position_m)
         if len(off) < _FEWEST:
             continue
         process, lasts_s = sensor.slow_error, float(stamps[-1] - stamps[0]) / NS_PER_S

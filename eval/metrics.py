@@ -75,11 +75,38 @@ class TruthMetrics:
     matched: float
 
 
-def errors(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], Array, Array, Trajectory, float]:
-    """Return the errors of an estimate at the stamps of the truth that it covers.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PositionErrors:
+    """Errors of an estimate where it covers what it is compared with.
 
-    Returns:
-        Stamps (M,) ns, position error (M, 3) m in world, heading error (M,) rad, the interpolated estimate, covered share.
+    Attributes:
+        stamps_ns: (M,). position_m: (M, 3), world. covered: share of all stamps that these are.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    position_m: Array
+    covered: float
+
+    @property
+    def horizontal_m(self) -> Array:
+        """(M,) length of the horizontal error."""
+        return np.asarray(np.hypot(self.position_m[:, 0], self.position_m[:, 1]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackErrors(PositionErrors):
+    """Errors against a track.
+
+    Attributes:
+        heading_rad: (M,). estimate: interpolated at the stamps.
+    """
+
+    heading_rad: Array
+    estimate: Trajectory
+
+
+def errors(estimate: Trajectory, truth: Trajectory) -> TrackErrors:
+    """Return the errors of an estimate at the stamps of the truth that it covers.
 
     Raises:
         NoCommonTimeError: it covers none of them.
@@ -89,12 +116,12 @@ def errors(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], 
     if not len(stamps):
         raise NoCommonTimeError("the track and the truth share no time: check the stamps of truth_topic")
     there, true = estimate.at(stamps), truth.at(stamps)
-    return (
-        stamps,
-        there.p_world_m - true.p_world_m,
-        wrap_angle(there.yaw_rad - true.yaw_rad),
-        there,
-        float(covered.mean()),
+    return TrackErrors(
+        stamps_ns=stamps,
+        position_m=there.p_world_m - true.p_world_m,
+        heading_rad=wrap_angle(there.yaw_rad - true.yaw_rad),
+        estimate=there,
+        covered=float(covered.mean()),
     )
 
 
@@ -114,8 +141,8 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
     Raises:
         NoCommonTimeError: it covers no stamp of the truth.
     """
-    _, error, heading, there, matched = errors(estimate, truth)
-    horizontal = np.hypot(error[:, 0], error[:, 1])
+    off = errors(estimate, truth)
+    error, heading, there, horizontal = off.position_m, off.heading_rad, off.estimate, off.horizontal_m
     nees = coverage = heading_coverage = None
     if there.cov is not None:
         squared = squared_over_covariance(error, there.cov)
@@ -132,7 +159,7 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
         nees=nees,
         coverage_95=coverage,
         heading_coverage_95=heading_coverage,
-        matched=matched,
+        matched=off.covered,
     )
 
 
@@ -154,14 +181,11 @@ class HeldOutMetrics:
 
 def held_out_errors(
     estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers
-) -> tuple[NDArray[np.int64], Array, float]:
+) -> PositionErrors:
     """Return the errors of the predicted antenna position at held-out fixes.
 
     Args:
         levers_m: antenna of each receiver in body, (3,) m.
-
-    Returns:
-        Stamps (M,) ns, errors (M, 3) m in world, and the covered share.
 
     Raises:
         NoCommonTimeError: the estimate covers none of the fixes.
@@ -175,7 +199,7 @@ def held_out_errors(
     there = estimate.at(moments)
     levers = np.array([levers_m[m.sensor] for m in held])[covered]
     antenna = there.p_world_m[index] + np.einsum("nij,nj->ni", there.R_world_body[index], levers)
-    return stamps[covered], antenna - fixes[covered], float(covered.mean())
+    return PositionErrors(stamps_ns=stamps[covered], position_m=antenna - fixes[covered], covered=float(covered.mean()))
 
 
 def compare_to_held_out(
@@ -189,8 +213,8 @@ def compare_to_held_out(
     Raises:
         NoCommonTimeError: the estimate covers none of the fixes.
     """
-    stamps, error, matched = held_out_errors(estimate, held, datum, levers_m)
-    horizontal = np.hypot(error[:, 0], error[:, 1])
+    off = held_out_errors(estimate, held, datum, levers_m)
+    stamps, horizontal = off.stamps_ns, off.horizontal_m
     solid = all(m.has_height for m in held)
     steps = np.diff(np.unique(stamps))
     usual = np.median(steps) if len(steps) else 1
@@ -200,10 +224,10 @@ def compare_to_held_out(
         horizontal_rmse_m=_rms(horizontal),
         horizontal_p95_m=float(np.percentile(horizontal, 95)),
         horizontal_max_m=float(horizontal.max()),
-        error_3d_rmse_m=None if estimate.planar or not solid else _rms(np.linalg.norm(error, axis=1)),
+        error_3d_rmse_m=None if estimate.planar or not solid else _rms(np.linalg.norm(off.position_m, axis=1)),
         outage_drift_m=_rms(largest) if len(largest) > 1 else None,
         fixes=len(stamps),
-        matched=matched,
+        matched=off.covered,
     )
 
 

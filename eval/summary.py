@@ -16,7 +16,8 @@ from urllib.parse import quote
 from graphloc.errors import InputError
 from graphloc.eval import html, markdown
 from graphloc.eval.formatting import LABELS, number
-from graphloc.outputs import MARK, fresh_folder
+from graphloc.folders import fresh_folder
+from graphloc.outputs import MARK
 
 SUMMARY = "summary.csv"  # a folder with this file is ours to replace
 _MOST_BYTES = 50_000_000  # of a run.json; of twelve hours it is some kB

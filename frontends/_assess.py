@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judging sensors by each other: how a topic arrives, how good the GNSS is, what a compass means.
+"""Judging sensors by each other: how a topic arrives, how good the GNSS is, how the craft moved.
 
 Everything here is a guess with its evidence in words; `draft_config` writes both down.
 """
@@ -14,26 +14,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graphloc.config import GnssConfig
-from graphloc.frames import Array, Datum, Geodetic, wrap_angle
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m, stored, stored_warning
-from graphloc.frontends._rejections import Rejection
-from graphloc.frontends._reports import CompassReport, GnssReport, TopicReport, Vec, two_antennas
+from graphloc.frontends._reports import GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends._turns import without_line
-from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, PLAIN_POSE, POSE, QUATERNION, UNSTAMPED, yaw_of_x_axis
+from graphloc.frontends.decode import IMU, PLAIN_POSE, POSE, UNSTAMPED
 from graphloc.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.time import NS_PER_S
+from graphloc.white_noise import white_noise
 
-_TURNS_DEG, _SAME_DEG = 5.0, 0.2
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
-_BLOCK_S = 30
-_SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
-_RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
-_STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
-_FOLLOWS_DEG, _FOLLOWS = 8.0, 3.0  # most RMS of what a heading and the gyroscope differ by; turns over that
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
 
 
@@ -206,7 +199,7 @@ def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
     if len(fixes) < 20:
         return Courses(np.zeros(0, dtype=np.int64), np.zeros(0))
     p = world_from_fixes(fixes, Datum(fixes[0].position))[:, :2]
-    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(white_noise_m(p).max()))
+    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(white_noise(p).max()))
 
 
 def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> MeasuredMotion | None:
@@ -231,12 +224,6 @@ def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> M
     return MeasuredMotion(source, int(stamps_ns[0]), t, speed, p_m[:, 0] + 1j * p_m[:, 1], rests=fast)
 
 
-def white_noise_m(p_m: Array) -> Array:
-    """Return the white noise of each axis of places (N, k), m."""
-    # Third differences remove position, velocity and acceleration; those of white noise have 20 x its variance.
-    return np.asarray(1.4826 * np.median(np.abs(np.diff(p_m, n=3, axis=0)), axis=0) / np.sqrt(20.0))
-
-
 def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
     """Return status, spread and a guess on slow errors; None where there is no fix at all."""
     stamps, p, rows = track(fixes)
@@ -253,7 +240,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
     old = stored(fixes.stamps_ns[every], places[:, :3])
     bad = frozen_fixes(stamps, rows[:, :2], p[:, :2])
     own = p[~bad]
-    scatter = white_noise_m(own) if len(own) > 10 else None
+    scatter = white_noise(own) if len(own) > 10 else None
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
     precise = sigma is not None and float(sigma[:2].max()) < RTK_SIGMA_M and float(np.median(rows[:, 3])) >= 2.0
     if precise:
@@ -270,7 +257,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         known_covariance=float(known.mean()),
         reported_sigma_m=None if sigma is None else vec(sigma),
         scatter_m=None if scatter is None else vec(scatter),
-        height_range_m=float(np.subtract(*np.percentile(p[:, 2], [95, 5]))),
+        height_range_m=float(np.subtract(*np.percentile(rows[:, 2], [95, 5]))),
         extent_m=(float(np.ptp(p[:, 0])), float(np.ptp(p[:, 1]))),
         travelled_m=float(np.hypot(chords[:, 0], chords[:, 1]).sum()),
         first=vec(rows[0, :3]),
@@ -283,207 +270,4 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         why=why,
         sigma_p95_m=worst_m,
         tf_frame=tf_frame,
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Turning:
-    """How the craft turned: times (N,) s since `origin_ns`, and the integral (N,) of its rate about up, rad."""
-
-    origin_ns: int
-    t_s: Array
-    turned_rad: Array
-
-
-def against_turning(
-    turning: Turning | None, at_ns: NDArray[np.int64], angle: Array, over_s: float = 2.0, clear: float = 0.5
-) -> int:
-    """Return +1 where an angle grows as the craft turns to port, -1 where it falls, 0 where nothing tells.
-
-    Args:
-        at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: time over which changes are compared: a gyro's bias
-            must be small beside them, and the angle's noise average out. clear: correlation that is believed.
-    """
-    at, own, turned = _beside(turning, at_ns, angle)
-    if len(at) < 20:
-        return 0
-    step = max(1, round(over_s / max(float(np.median(np.diff(at))), 1e-3)))
-    a, b = (v[step:] - v[:-step] for v in (own, turned))
-    power = float(np.sqrt((a**2).sum() * (b**2).sum()))
-    together = float((a * b).sum()) / power if power > 0.0 else 0.0
-    return int(np.sign(together)) if abs(together) > clear else 0
-
-
-def follows_turning(turning: Turning | None, at_ns: NDArray[np.int64], yaw: Array) -> bool:
-    """Return whether a heading turns as the gyroscope does, by far more than the two differ.
-
-    In blocks of two minutes, a straight line removed from each: the bias of the gyroscope, and what a heading is off by throughout.
-
-    Args:
-        at_ns: (N,), increasing. yaw: (N,) rad, unwrapped, positive to port.
-    """
-    at, own, turned = _beside(turning, at_ns, yaw)
-    apart, turns = [], []
-    blocks = (at - at[:1]) // _STEADY_S
-    for block in (blocks == k for k in np.unique(blocks)):
-        if block.sum() >= 20:
-            apart.append(without_line((own - turned)[block], at[block]))
-            turns.append(without_line(turned[block], at[block]))
-    if not apart:
-        return False
-    off_deg, turns_deg = (float(np.degrees(np.sqrt(np.mean(np.concatenate(part) ** 2)))) for part in (apart, turns))
-    return off_deg < min(_FOLLOWS_DEG, turns_deg / _FOLLOWS)
-
-
-def _beside(turning: Turning | None, at_ns: NDArray[np.int64], angle: Array) -> tuple[Array, Array, Array]:
-    """Return times (M,), s, of the angles that lie within a turning, these (M,) and the turning (M,) there; empty without one."""
-    if turning is None:
-        return np.zeros(0), np.zeros(0), np.zeros(0)
-    at = (at_ns - turning.origin_ns) / NS_PER_S
-    inside = (at > turning.t_s[0]) & (at < turning.t_s[-1])
-    return at[inside], angle[inside], np.interp(at[inside], turning.t_s, turning.turned_rad)
-
-
-def unit_of(stream: TopicData) -> str | None:
-    """Return the unit of a stream of bare numbers, if they are headings; None where it is none."""
-    if stream.msgtype not in NUMBERS:
-        return None
-    known = np.abs(stream.rows[np.isfinite(stream.rows)])
-    # Not the largest: a driver may say -999 while it knows none.
-    return "rad" if len(known) and float(np.percentile(known, 95)) < 2.0 * np.pi + 0.1 else "deg"
-
-
-def _quaternions(stream: TopicData, rows: Array) -> Array:
-    if unit := unit_of(stream):
-        angle = np.radians(rows[:, 0]) if unit == "deg" else rows[:, 0]
-        half = np.where(np.abs(angle) <= MOST_TURNS * 2.0 * np.pi, angle, np.nan) / 2.0
-        return np.column_stack([0.0 * half, 0.0 * half, np.sin(half), np.cos(half)])
-    return rows[:, 6:10] if stream.msgtype == IMU else rows[:, :4]
-
-
-def headings(stream: TopicData) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps (N,) and unwrapped yaw (N,), rad, as the messages say it, of those that say one."""
-    keep = sane(stream)
-    yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in _quaternions(stream, stream.rows[keep])]
-    good = np.array([not isinstance(y, Rejection) for y in yaw], dtype=bool)
-    return stream.stamps_ns[keep][good], np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
-
-
-def says_the_same(first: TopicData, second: TopicData, *, mirrored: bool) -> bool:
-    """Return whether two headings are one, but for an offset: two devices never agree so closely while the craft turns.
-
-    Args:
-        mirrored: whether one of them grows as the other falls.
-    """
-    (at, a), (there, b) = headings(first), headings(second)
-    if len(at) < 10:
-        return False
-    inside = (there >= at[0]) & (there <= at[-1])
-    there, b = there[inside], b[inside]
-    if len(there) < 10:
-        return False
-    a = np.interp((there - at[0]) / NS_PER_S, (at - at[0]) / NS_PER_S, a)
-    turns, apart = (_middle_deg(v)[1] for v in (b, a + b if mirrored else a - b))
-    return turns > _TURNS_DEG and apart < _SAME_DEG
-
-
-def _middle_deg(angle: Array) -> tuple[float, float]:
-    """Return a robust mean and standard deviation of angles (N,), deg: fixes may jump or be frozen."""
-    mean = float(np.angle(np.exp(1j * angle).mean()))
-    middle = mean + float(np.median(wrap_angle(angle - mean)))
-    scatter = 1.4826 * float(np.median(np.abs(wrap_angle(angle - middle))))
-    return float(np.degrees(wrap_angle(middle))), float(np.degrees(scatter))
-
-
-def _wanders_deg(stamps_ns: NDArray[np.int64], angle: Array) -> float | None:
-    """Return how far the middle of angles (N,), rad, differs from block to block, 1 sigma, deg; None of fewer than three."""
-    block = (stamps_ns - stamps_ns[0]) // (_BLOCK_S * NS_PER_S)
-    own = [angle[block == k] for k in np.unique(block)]
-    middles = np.radians([_middle_deg(part)[0] for part in own if len(part) >= 5])
-    if len(middles) < 3:
-        return None
-    return float(np.degrees(np.std(wrap_angle(middles - middles[0]), ddof=1)))
-
-
-def compass_report(stream: TopicData, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
-    """Return whether an orientation is a heading, and in which convention; None where there is none."""
-    keep = sane(stream)
-    if len(keep) < 10:
-        return None
-    rows = stream.rows[keep]
-    quaternions = _quaternions(stream, rows)
-    if stream.msgtype == IMU and (float(np.median(rows[:, 12])) == -1.0 or len(np.unique(quaternions, axis=0)) < 3):
-        return None
-    yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in quaternions]
-    good = np.array([not isinstance(y, Rejection) for y in yaw])
-    # Drivers of receivers with two antennas fill an Imu with the orientation alone.
-    gnss = not rows[:, :6].any() if stream.msgtype == IMU else two_antennas(stream.topic)
-    plain: dict[str, Any] = {
-        "topic": stream.topic,
-        "msgtype": stream.msgtype,
-        "unit": unit_of(stream),
-        "two_antennas": gnss,
-    }
-    if good.sum() < 10:
-        why = "its messages give no yaw"
-        return CompassReport(
-            **plain, usable=False, convention="enu", offset_deg=None, scatter_deg=None, samples=0, why=why
-        )
-    angle = np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
-    named = stream.msgtype == QUATERNION  # a topic of bare orientations is meant as a compass
-    sense = against_turning(turning, stream.stamps_ns[keep][good], angle)
-    by_gyro = {1: "enu", -1: "ned"}.get(sense)
-    spoke_ns = stream.stamps_ns[keep][good]
-    heard = 0 if courses is None else int(np.searchsorted(courses.stamps_ns, spoke_ns[[0, -1]]) @ [-1, 1])
-    if courses is None or heard < 20:
-        why = "no GNSS course in motion to check it against" + (", convention from the gyro" if by_gyro else "")
-        if courses is not None and not heard and stream.msgtype in NUMBERS:
-            why = "no GNSS course in motion at the times it was recorded (it has no stamp)"
-        return CompassReport(
-            **plain, usable=named, convention=by_gyro or "enu", offset_deg=None, scatter_deg=None, samples=0, why=why
-        )
-    origin = int(stream.stamps_ns[keep[0]])
-    measured = np.interp(
-        (courses.stamps_ns - origin) / NS_PER_S, (stream.stamps_ns[keep][good] - origin) / NS_PER_S, angle
-    )
-    fits = {}
-    for convention, value in (("enu", measured), ("ned", np.pi / 2.0 - measured)):
-        fits[convention] = _middle_deg(value - courses.course_rad)
-    turned = float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(max(abs(np.exp(1j * courses.course_rad).mean()), 1e-9))))))
-    if by_gyro:
-        convention = by_gyro
-    elif turned < 20.0:  # on a straight both conventions fit with some offset: the smaller offset is likelier
-        convention = min(fits, key=lambda c: abs(fits[c][0]))
-    else:
-        convention = min(fits, key=lambda c: fits[c][1])
-    offset, scatter = fits[convention]
-    apart = (measured if convention == "enu" else np.pi / 2.0 - measured) - courses.course_rad
-    # Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
-    # an IMU's own orientation follows the gyroscope wherever north is.
-    fits_course = bool(scatter < _SCATTERS_DEG)
-    sideways = (
-        not fits_course
-        and by_gyro is not None
-        and (stream.msgtype != IMU or abs(offset) < _RELATIVE_DEG)
-        and follows_turning(turning, spoke_ns, angle if convention == "enu" else np.pi / 2.0 - angle)
-    )
-    usable = fits_course or sideways
-    why = f"yaw minus GNSS course: {offset:+.0f} deg, scatter {scatter:.0f} deg over {len(measured)} courses"
-    if sideways:
-        why += ": a vessel that often goes sideways, since it turns as the gyro does"
-    elif not usable:
-        why += ": a relative or a disturbed heading, or a vessel that often goes sideways"
-    elif by_gyro:
-        why += "; convention from the gyro"
-    elif turned < 20.0:
-        why += ", on a nearly straight track: the convention is not certain"
-    return CompassReport(
-        **plain,
-        usable=usable,
-        convention=convention,
-        offset_deg=None if sideways else offset,
-        scatter_deg=scatter,
-        leeway_deg=None if sideways else _wanders_deg(courses.stamps_ns, apart),
-        samples=len(measured),
-        why=why,
     )

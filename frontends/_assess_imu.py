@@ -13,14 +13,17 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
-from graphloc.frontends._assess import Courses, MeasuredMotion, Turning, against_turning, sane, summed, vec
+from graphloc.frontends._assess import Courses, MeasuredMotion, sane, summed, vec
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
 from graphloc.frontends._reports import ImuReport, MountGuess
-from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, without_gravity
+from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, turns_gravity, without_gravity
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._turning import Turning, against_turning
 from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
+from graphloc.measurements import ImuSeries
 from graphloc.time import NS_PER_S
+from graphloc.white_noise import white_noise
 
 # Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
 _COURSE_S, _COURSE_CLEAR = 12.0, 0.6
@@ -111,36 +114,39 @@ def _mount_yaw(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[Meas
     return yaw, f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
 
 
-def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning | None:
+def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning:
     """Return the integrated rate of an IMU whose mount is known or guessed, with its gyro bias removed if known."""
-    said = _in_body(imu, report, tree, body)
-    if said is None:
-        return None
-    stamps, _, gyro = said
+    stamps, _, gyro = _in_body(imu, report, tree, body)
     t = (stamps - stamps[0]) / NS_PER_S
     return Turning(int(stamps[0]), t, summed(t, gyro[:, 2]))
 
 
-def felt_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Felt | None:
+def felt_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Felt:
     """Return the motion by an IMU whose mount is known or guessed, in the axes of the vessel."""
-    said = _in_body(imu, report, tree, body)
-    return None if said is None else Felt.of(*said)
+    return Felt.of(*_in_body(imu, report, tree, body))
 
 
-def _in_body(
-    imu: TopicData, report: ImuReport, tree: StaticTree, body: str
-) -> tuple[NDArray[np.int64], Array, Array] | None:
-    """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel; None of few samples."""
-    keep, _ = samples_of(imu)
-    keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)] if len(keep) else keep
-    if len(keep) < 20:
-        return None
+def _in_body(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel."""
+    series = series_of(imu, report)
     known = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
     R = known[1] if known else Rotation.from_euler("xyz", report.mount.rpy_deg, degrees=True).as_matrix()
+    unbiased = series.gyro_radps - (report.gyro_bias_radps or (0.0, 0.0, 0.0))
+    return series.stamps_ns, series.accel_mps2 @ R.T, unbiased @ R.T
+
+
+def series_of(imu: TopicData, report: ImuReport) -> ImuSeries:
+    """Return the usable samples of an IMU that has a report, in SI units, axes of the sensor."""
+    keep, _ = samples_of(imu)
+    keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)]
     unit = STANDARD_GRAVITY_MPS2 if report.accel_unit == "g" else 1.0
-    accel = imu.rows[keep, :3] * (-unit if report.gravity == "inverted" else unit)
-    gyro = imu.rows[keep, 3:6] * (np.pi / 180.0 if report.gyro_unit == "deg/s" else 1.0)
-    return imu.stamps_ns[keep], accel @ R.T, (gyro - (report.gyro_bias_radps or (0.0, 0.0, 0.0))) @ R.T
+    return ImuSeries(
+        sensor=imu.topic,
+        stamps_ns=imu.stamps_ns[keep],
+        accel_mps2=imu.rows[keep, :3] * (-unit if report.gravity == "inverted" else unit),
+        gyro_radps=imu.rows[keep, 3:6] * (np.pi / 180.0 if report.gyro_unit == "deg/s" else 1.0),
+        seqs=keep.astype(np.int64),
+    )
 
 
 def _against_courses(imu: TopicData, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str) -> int:
@@ -209,7 +215,7 @@ def imu_report(
     stamps = imu.stamps_ns[keep]
     accel, gyro = np.where(finite[:, None], rows[:, :3], 0.0), np.where(finite[:, None], rows[:, 3:6], 0.0)
     missing = missing_half(accel, gyro)
-    units = _units_of(accel, gyro)
+    units = _units_of(stamps, accel, gyro)
     accel = accel * (STANDARD_GRAVITY_MPS2 if units.accel == "g" else 1.0)
     gyro = gyro * (np.pi / 180.0 if units.gyro == "deg/s" else 1.0)
     up = np.median(accel, axis=0)
@@ -232,8 +238,8 @@ def imu_report(
         why=(*frozen, *([f"all its {missing} are 0: {HALF}"] if missing else []), *units.why),
         still_s=float(still.sum()) * root_dt**2,
         gyro_bias_radps=vec(gyro[still].mean(axis=0)) if quiet else None,
-        accel_noise_ug=_scatter(accel) * root_dt / ug,
-        gyro_noise_mdps=_scatter(gyro) * root_dt / mdps,
+        accel_noise_ug=float(white_noise(accel).max()) * root_dt / ug,
+        gyro_noise_mdps=float(white_noise(gyro).max()) * root_dt / mdps,
         reported_accel_ug=reported(10, ug),
         reported_gyro_mdps=reported(11, mdps),
         mount=mount_guess(imu, accel, gyro, motions, tree, body),
@@ -252,13 +258,13 @@ class _Units(NamedTuple):
     why: tuple[str, ...]
 
 
-def _units_of(accel: Array, gyro: Array) -> _Units:
-    """Return the likely units of accelerations (N, 3) and rates (N, 3)."""
+def _units_of(stamps: NDArray[np.int64], accel: Array, gyro: Array) -> _Units:
+    """Return the likely units of accelerations (N, 3) and rates (N, 3), at stamps (N,) ns."""
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     rate = float(np.median(np.linalg.norm(gyro, axis=1)))
     gravity = "removed" if without_gravity(accel) else "included"
     accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
-    gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS else "rad/s"
+    gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS and not turns_gravity(stamps, accel, gyro) else "rad/s"
     why = []
     if accel_unit == "g":
         why.append(f"median acceleration is {size:.2f}: looks like g")
@@ -269,15 +275,6 @@ def _units_of(accel: Array, gyro: Array) -> _Units:
     if gyro_unit == "deg/s":
         why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")
     return _Units(accel_unit, gyro_unit, gravity, size, tuple(why))
-
-
-def _scatter(columns: Array) -> float:
-    """Return the white noise of the worst axis of (N, 3), in their unit, with the vibration of hull, engine and wheels.
-
-    Third differences remove motion; those of white noise have 20 times its variance.
-    """
-    usual = np.median(np.abs(np.diff(columns, n=3, axis=0)), axis=0)
-    return float(1.4826 * usual.max() / np.sqrt(20.0))
 
 
 def _standstill(

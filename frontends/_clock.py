@@ -21,6 +21,10 @@ HOLE_LIMIT_S = 600.0
 """Where no sensor says anything for so long, nothing can bridge it: the run falls apart there."""
 EPOCH_LIMIT_S = 1.0
 """Clocks of two sensors that differ by more are said to disagree."""
+MOST_LATE_S = 1.5
+"""Stamps of a sensor may be off by so much on one clock: a receiver filters its velocity, a driver waits for the rest of a burst."""
+MOST_ON_ITS_WAY_S = 0.6
+"""A fix is stamped late by no more if all that delays it is its way to the computer."""
 NO_DATE_NS = 946_684_800 * NS_PER_S
 """2000-01-01: a stamp before it is no date."""
 GAIN_LIMIT_S = 0.1
@@ -147,12 +151,12 @@ def behind_s(own: Clock, imu: Clock, reference: Clock) -> float:
     return (imu if same else own).latency_s - reference.latency_s
 
 
-def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps, limit_s: float = JUMP_LIMIT_S) -> NDArray[np.bool_]:
-    """Return (N,) whether a stamp differs by more than `limit_s` from the usual latency of its topic."""
+def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps) -> NDArray[np.bool_]:
+    """Return (N,) whether a stamp differs by more than `JUMP_LIMIT_S` from the usual latency of its topic."""
     if len(stamps_ns) == 0:
         return np.zeros(0, dtype=bool)
     latency_ns = logs_ns - stamps_ns
-    return np.asarray(np.abs(latency_ns - np.int64(np.median(latency_ns))) > duration_ns(limit_s))
+    return np.asarray(np.abs(latency_ns - np.int64(np.median(latency_ns))) > duration_ns(JUMP_LIMIT_S))
 
 
 def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
@@ -314,9 +318,9 @@ def refuse_set_back(topic: str, file: str, logs_ns: Stamps) -> None:
         )
 
 
-def busiest_section(stamps_ns: Stamps, hole_s: float = HOLE_LIMIT_S) -> tuple[int, int]:
-    """Return first and last stamp of the section with most readings; sections are separated by gaps."""
+def busiest_section(stamps_ns: Stamps) -> tuple[int, int]:
+    """Return first and last stamp of the section with most readings; gaps of over `HOLE_LIMIT_S` separate sections."""
     ordered = np.sort(stamps_ns)
-    cuts = np.flatnonzero(np.diff(ordered) > duration_ns(hole_s)) + 1
+    cuts = np.flatnonzero(np.diff(ordered) > duration_ns(HOLE_LIMIT_S)) + 1
     section = max(np.split(ordered, cuts), key=len)
     return int(section[0]), int(section[-1])

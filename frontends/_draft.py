@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SlowErrorConfig
-from graphloc.frontends._clock import EPOCH_LIMIT_S, Clock, behind_s, reference_of
+from graphloc.frontends._draft_clock import recorded_lines, with_clock
 from graphloc.frontends._fixes import NOTHING_M, RTK_SIGMA_M, SCATTERS
 from graphloc.frontends._reports import (
     BODY_AXES,
@@ -25,15 +26,13 @@ from graphloc.frontends._reports import (
     through_water,
 )
 from graphloc.frontends._turns import WANDERS_DEG
-from graphloc.frontends.decode import IMU, UNSTAMPED, VECTOR
+from graphloc.frontends.decode import IMU, VECTOR
 
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 _TURNED_DEG = 10.0  # off the course, from which a compass is taken for turned in the craft
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
 _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
-_OWN_CLOCK_S = 10.0  # no message takes as long
-_FEWEST_STAMPS = 10  # that tell of a clock
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 # Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
@@ -43,9 +42,6 @@ _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off:
 _FILTERED = (
     "by its name a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 )
-_STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
-_STAMPS = "stamped when measured, or later? estimated with the run; 0 where a receiver's clock stamps"
-_SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clocks are set
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
 
@@ -61,7 +57,7 @@ def draft_config(inspection: Inspection) -> str:
         _datum_line(inspection),
         "sensors:" if inspection.usable else "sensors: {}  # nothing in this bag can be used",
     ]
-    blocks = [_with_clock(block, inspection) for block in _blocks(inspection)]
+    blocks = [with_clock(block, inspection) for block in _blocks(inspection)]
     lines += [f"  {line}" for block in blocks for line in block]
     lines += _beside(inspection.odometry)
     return "\n".join(lines) + "\n"
@@ -98,9 +94,9 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         instead = ": take the receiver's NavSatFix" if inspection.gnss and item.grid else ""
         yield [f"# {item.topic}: left out, {item.world}{instead}"]
     if inspection.lidars:
-        yield [*_aerial_block(inspection.lidars), *_recorded_lines(inspection, inspection.lidars)]
+        yield [*_aerial_block(inspection.lidars), *recorded_lines(inspection, inspection.lidars)]
     if inspection.cameras:
-        yield [*_tags_block(inspection.cameras), *_recorded_lines(inspection, inspection.cameras)]
+        yield [*_tags_block(inspection.cameras), *recorded_lines(inspection, inspection.cameras)]
     fixes, poses = inspection.gnss or in_a_grid, any(item.role == "pose" for item in inspection.odometry)
     if fixes or poses or inspection.lidars:
         alone = "" if fixes else "; nothing else tells the height, unless z of a pose is used (axes)"
@@ -147,23 +143,6 @@ def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
     return lines
 
 
-def _recorded_lines(inspection: Inspection, mounted: tuple[MountedTopic, ...]) -> list[str]:
-    """Say that recording times stand for the stamps of scans or images, where these have none, or are of a clock of their own.
-
-    Recording times are on the clock of the IMU, or on that which its stamps are set by, unless all stamps are of another time.
-    """
-    usual = [t.latency_s[1] for t in inspection.topics if t.latency_s and t.count >= _FEWEST_STAMPS]
-    if all(abs(latency_s) > EPOCH_LIMIT_S for latency_s in usual):
-        return []
-    for item in mounted:
-        if item.latency_s is None or abs(item.latency_s) > _OWN_CLOCK_S:
-            clock = (
-                "have no stamps" if item.latency_s is None else f"are stamped {item.latency_s:+.0f} s before they come"
-            )
-            return [f"  stamps: recorded  # guess: messages of {item.topic} {clock}; late by as long as one takes"]
-    return []
-
-
 def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
     lines = [
         "tags:",
@@ -193,57 +172,10 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
     return lines
 
 
-def _with_clock(block: list[str], inspection: Inspection) -> list[str]:
-    """Say where recording times stand for stamps; where a clock is off by them, or stamps are late by the motion, add an offset.
-
-    Poses may take their time.
-    """
-    topics = {t.topic.partition(" ")[0]: t for t in inspection.topics}
-    clocks = {n: Clock(t.start_ns, t.latency_s[1]) for n, t in topics.items() if t.start_ns is not None and t.latency_s}
-    imu = next((clocks[i.topic] for i in inspection.imus if i.topic in clocks), None)
-    kind = next((line.split()[1] for line in block if line.startswith("  kind:")), "")
-    topic = next((line.split()[1] for line in block if line.startswith("  topic:")), "")
-    if topic in topics and topics[topic].recorded:
-        unknown = "" if kind == "gnss" else ", which no bound includes"
-        said = f"guess: its headers hold no stamps, or whole seconds only; recording times are late by as long as a message takes{unknown}"
-        block = [*block, f"  stamps: recorded  # {said}"]
-    if topic in topics and (ppm := topics[topic].drift_ppm):
-        gained_s = 1e-6 * ppm * (topics[topic].span_s or 0.0)
-        said = f"it {'gains' if ppm > 0.0 else 'loses'} {abs(gained_s):.2f} s on the steadiest clock, by the recording times"
-        said += "" if ppm > 0.0 else "; 0 if its messages only took ever longer to come"
-        block = [*block, f"  clock_drift_ppm: {ppm:.1f}  # guess: {said}"]
-    if imu is None or kind not in _SET or topic not in clocks:
-        return block
-    own = (c for n, c in clocks.items() if not topics[n].recorded and topics[n].msgtype not in UNSTAMPED)
-    reference = reference_of(imu, own)
-    told = inspection.gnss if kind == "gnss" else inspection.velocities if kind == "gnss_velocity" else ()
-    found = next((r for r in told if r.topic.partition(" ")[0] == topic and r.late_s), None)
-    late = found.late_s if found else None
-    unstamped = topics[topic].recorded or topics[topic].msgtype in UNSTAMPED
-    offset_s, why, sigma_s = 0.0, [], _ON_ITS_WAY_S if unstamped else _STAMPED_LATE_S
-    behind = behind_s(clocks[topic], imu, reference)
-    if abs(behind) > EPOCH_LIMIT_S:
-        offset_s, sigma_s = offset_s + behind, _ON_ITS_WAY_S
-        clock = "the IMU's" if reference is imu else "one that tells the date"
-        why.append(
-            f"its clock is {'behind' if behind > 0 else 'ahead of'} {clock}, by the recording times; how much longer one "
-            f"message takes than the other is in it{'' if kind == 'gnss' else ', which no bound includes'}"
-        )
-    if late is not None:
-        offset_s, sigma_s = offset_s + late[0], max(late[1], _STAMPED_LATE_S)
-        by = found.late_by if isinstance(found, GnssReport) and found.late_by.partition(" ")[0] != topic else ""
-        whose = f"the motion of {by}, taken for the same receiver's," if by else "its motion"
-        why.append(f"what the IMU feels fits {whose} {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
-    lines = [f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else []
-    if kind == "gnss":
-        lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}")
-    return [*block, *lines]
-
-
 def _topic_lines(topic: str) -> list[str]:
     """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
     name, *sentence = topic.split(" ")[:2]
-    return [f"  topic: {name}", *(f"  nmea: [{said}]" for said in sentence)]
+    return [f"  topic: {name}", *(f"  nmea: [{', '.join(said.split('+'))}]" for said in sentence)]
 
 
 def _numbered(name: str, k: int) -> str:
@@ -290,15 +222,12 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         why = (
             _FILTERED
             if filtered(gnss.topic)
-            else "one receiver is used: RTK throughout, else the most accurate by its claims, of equal ones that with most fixes"
+            else "one receiver is used: RTK throughout, else the most accurate by its claims, of equal ones that with heights, then with most fixes"
         )
         lines.append(f"  enabled: false  # guess: {why}")
     else:
         lines += _filtered_lines(gnss.topic)
-    if gnss.tf_frame is not None:
-        lines.append(f"  mount: {{tf_frame: {json.dumps(gnss.tf_frame)}}}  # from /tf_static")
-    else:
-        lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
+    lines.append(_antenna_line(gnss.tf_frame, "from /tf_static"))
     lines += _scatter_lines(gnss)
     lines += _rtk_lines(gnss)
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
@@ -368,16 +297,17 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
         v for v in known if v.axes is None and v.msgtype != VECTOR
     ]
     used = min(told, key=lambda v: filtered(v.topic), default=None)
-    for k, twist in enumerate(known):
+    body, world = count(), count()
+    for twist in known:
         off = None
         if twist.axes == BODY_AXES:
-            yield _body_velocity_block(_numbered("body_velocity", k), twist)
+            yield _body_velocity_block(_numbered("body_velocity", next(body)), twist)
             continue
         if twist.axes is None and twist.msgtype == VECTOR:
             off = f"nothing tells that it is a velocity; {twist.why}"
         elif twist is not used:
             off = f"true if it comes of another receiver than {used.topic if used else 'that'}; {twist.why}"
-        yield _velocity_block(_numbered("gnss_velocity", k), twist, gnss, off)
+        yield _velocity_block(_numbered("gnss_velocity", next(world)), twist, gnss, off)
     for twist in inspection.velocities:
         if twist not in known:
             yield [f"# {twist.topic}: left out, it is no velocity of the craft; {twist.why}"]
@@ -417,11 +347,13 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, o
         lines.append("  convention: ned  # guess: by the GNSS track")
     frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
     evidence = "from /tf_static" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
-    if frame is not None:
-        lines.append(f"  mount: {{tf_frame: {json.dumps(frame)}}}  # {evidence}")
-    else:
-        lines.append("  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it")
-    return lines
+    return [*lines, _antenna_line(frame, evidence)]
+
+
+def _antenna_line(frame: str | None, evidence: str) -> str:
+    if frame is None:
+        return "  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it"
+    return f"  mount: {{tf_frame: {json.dumps(frame)}}}  # {evidence}"
 
 
 def _filtered_lines(topic: str) -> list[str]:

@@ -12,6 +12,7 @@ from graphloc.config import GnssConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition
 from graphloc.time import NS_PER_S
+from graphloc.white_noise import white_noise_of_thirds
 
 _HELD_S = 2.5
 """A place that is repeated for less, and then changes, was held by a driver; for longer, the receiver itself stands still."""
@@ -138,10 +139,7 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
 
 
 def scatter_m(stamps_ns: NDArray[np.int64], p_m: Array) -> float | None:
-    """Return the white noise of positions (N, 2), m, of the worst axis; None if it could be motion.
-
-    Third differences remove a constant acceleration; those of white noise have 20 times its variance.
-    """
+    """Return the white noise of positions (N, 2), m, of the worst axis; None if it could be motion."""
     steps = np.diff(stamps_ns) / NS_PER_S
     if len(steps) < _FEWEST:
         return None
@@ -150,7 +148,7 @@ def scatter_m(stamps_ns: NDArray[np.int64], p_m: Array) -> float | None:
     good = even[:-2] & even[1:-1] & even[2:]
     if usual > _SLOW_S or good.sum() < _FEWEST:
         return None
-    third = float(np.median(np.abs(np.diff(p_m, n=3, axis=0))[good], axis=0).max())
-    if usual > _FAST_S and third < _UNSTEADY_MPS2 * usual**2:
+    thirds = np.diff(p_m, n=3, axis=0)[good]
+    if usual > _FAST_S and np.median(np.abs(thirds), axis=0).max() < _UNSTEADY_MPS2 * usual**2:
         return None
-    return 1.4826 * third / float(np.sqrt(20.0))
+    return float(white_noise_of_thirds(thirds).max())

@@ -107,9 +107,11 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
     statuses = ", ".join(f"{n} {s}" for s, n in gnss.statuses.items())
     lat, lon, height = gnss.first
     east_m, north_m = gnss.extent_m
+    flat = gnss.without_height >= gnss.fixes
     lines = [
-        f"{gnss.topic}: {statuses}; first fix {lat:.7f}, {lon:.7f}, {height:.1f} m",
-        f"  track {gnss.travelled_m:.0f} m in a box of {east_m:.0f} x {north_m:.0f} m, height {gnss.height_range_m:.1f} m",
+        f"{gnss.topic}: {statuses}; first fix {lat:.7f}, {lon:.7f}{'' if flat else f', {height:.1f} m'}",
+        f"  track {gnss.travelled_m:.0f} m in a box of {east_m:.0f} x {north_m:.0f} m"
+        + ("" if flat else f", height {gnss.height_range_m:.1f} m"),
     ]
     if gnss.without_height:
         lines.append(f"  {gnss.without_height} messages have no height (NaN) and are used as horizontal fixes")
@@ -122,5 +124,7 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
             "bound includes it"
         )
     if gnss.scatter_m is not None:
-        lines.append(f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m)} m")
+        lines.append(
+            f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m[: 2 if flat else 3])} m"
+        )
     return lines

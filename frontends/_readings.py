@@ -168,8 +168,10 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
         if abs(gain_s) > _clock.GAIN_LIMIT_S and (step := steps[whose]) is not None:
             stepped.setdefault(step.said(whose), []).append(r.sensor)
             continue
-        if abs(behind) > _clock.EPOCH_LIMIT_S:
-            now_s = r.config.time_offset_s
+        now_s = r.config.time_offset_s
+        as_stamped = behind + now_s - reference.config.time_offset_s
+        meant = abs(as_stamped) <= _clock.EPOCH_LIMIT_S and abs(now_s) <= _clock.MOST_LATE_S
+        if abs(behind) > _clock.EPOCH_LIMIT_S and not meant:
             lines.append(
                 f"{r.sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "
                 f"{reference.sensor}, by the recording times; if that is right, set its time_offset_s to {now_s + behind:.3f}"
@@ -211,7 +213,9 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     _sanity.refuse_half(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     _sanity.refuse_degrees(readings.sensor, series.stamps_ns, series.accel_mps2, series.gyro_radps, readings.config)
     _sanity.refuse_accel_unit(readings.sensor, series.accel_mps2, readings.config)
-    warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
+    warnings += _sanity.imu_warnings(
+        readings.sensor, series.stamps_ns, series.accel_mps2, series.gyro_radps, readings.config
+    )
     return series, rows
 
 

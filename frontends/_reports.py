@@ -13,7 +13,7 @@ from graphloc.plain import plain
 Vec = tuple[float, float, float]
 # Of MAVROS, microstrain_inertial, robot_localization, xsens_mti: what an EKF makes of receiver and IMU.
 # HDT and THS of a GNSS receiver; topics of ublox_gps, septentrio_gnss_driver, mavros and their like.
-_TWO_ANTENNAS = re.compile(r" G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
+_TWO_ANTENNAS = re.compile(r"[ +]G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
 

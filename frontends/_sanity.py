@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig, VesselConfig
 from graphloc.errors import InputError
@@ -23,6 +24,8 @@ FAR_LEVER_M = 50.0
 _FEWEST = 100  # samples, that are not all 0 by chance
 _SWING_NS, _NO_SWING_RAD = 5_000_000_000, 1.5
 _STEP_S = 0.2  # at most, of a step that rates are integrated over
+_GRAVITY_S, _FEWEST_WINDOWS = 0.4, 10  # windows whose mean acceleration tells where up is
+_EXPLAINED = 0.75  # of what its direction moves by, that rates in rad/s leave at most
 
 
 def lever_warning(name: str, t_body_sensor_m: Array, tf_frame: str | None) -> list[str]:
@@ -45,7 +48,29 @@ def without_gravity(accel: Array) -> bool:
     return size < 0.5 or (size < 2.0 and steady < 0.5 * size)
 
 
-def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> list[str]:
+def turns_gravity(stamps_ns: NDArray[np.int64], accel: Array, gyro_radps: Array) -> bool:
+    """Return whether rates (N, 3) turn the direction of accelerations (N, 3) as rad/s would; in deg/s they turn it by far more.
+
+    Gravity stays where it is while the sensor turns. The thrust of a craft or of a hand is in it as well, so that half of the
+    windows may fit by chance; rates of 57 times the size fit in none.
+    """
+    t = (stamps_ns - stamps_ns[0]) / 1e9
+    begins = np.unique((t / _GRAVITY_S).astype(np.int64), return_index=True)[1]
+    if len(begins) < _FEWEST_WINDOWS:
+        return False
+    counts = np.diff(begins, append=len(t))[:, None]
+    mean = np.add.reduceat(accel, begins) / counts
+    up = mean / np.maximum(np.linalg.norm(mean, axis=1), 1e-9)[:, None]
+    steps_s = np.minimum(np.diff(t, prepend=t[0]), _STEP_S)
+    turned = np.diff(np.add.reduceat(np.cumsum(gyro_radps * steps_s[:, None], axis=0), begins) / counts, axis=0)
+    left = np.linalg.norm(up[1:] - Rotation.from_rotvec(-turned).apply(up[:-1]), axis=1)
+    moved = np.linalg.norm(np.diff(up, axis=0), axis=1)
+    return float(np.median(left)) < _EXPLAINED * float(np.median(moved))
+
+
+def imu_warnings(
+    sensor: str, stamps_ns: NDArray[np.int64], accel_mps2: Array, gyro_radps: Array, config: ImuConfig
+) -> list[str]:
     """Return lines on units and gravity of accelerations (N, 3) and rates (N, 3), converted as configured."""
     if len(accel_mps2) < 10:
         return []
@@ -60,7 +85,8 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
             lines.append(f"{said}, not about 9.8: check accel_unit, and the sensor itself")
     elif config.gravity == "removed" and g > 8.0:
         lines.append(f"{said}: looks like gravity is included; set gravity: included")
-    if config.gyro_unit == "rad/s" and rate > NEVER_STILL_RADPS:
+    fast = config.gyro_unit == "rad/s" and rate > NEVER_STILL_RADPS
+    if fast and not turns_gravity(stamps_ns, accel_mps2, gyro_radps):
         lines.append(f"{sensor}: median angular rate is {rate:.2f} rad/s: looks like deg/s; set gyro_unit: deg/s")
     return lines
 
@@ -112,7 +138,7 @@ def refuse_degrees(
     """Refuse rates (N, 3) in deg/s, with which the solver would run for many minutes.
 
     The test is by how much they roll and pitch the vessel within 5 s: a small boat in chop has high rates, and a vehicle may pivot
-    fast, but none rolls by a quarter turn all the time.
+    fast, but none rolls by a quarter turn all the time. What does, as a camera in the hand, turns gravity as its rates say.
 
     Raises:
         InputError: they are.
@@ -127,7 +153,7 @@ def refuse_degrees(
     begins = np.unique((stamps_ns - stamps_ns[0]) // _SWING_NS, return_index=True)[1]
     swings = np.maximum.reduceat(angle, begins) - np.minimum.reduceat(angle, begins)
     swing = float(np.median(np.linalg.norm(swings, axis=1)))
-    if swing > _NO_SWING_RAD:
+    if swing > _NO_SWING_RAD and not turns_gravity(stamps_ns, accel_mps2, gyro_radps):
         raise InputError(
             f"{sensor}: it rolls and pitches by {np.degrees(swing):.0f} deg within 5 s (median of {config.topic}), which no vessel "
             f"does for long: angular_velocity looks like deg/s; set gyro_unit: deg/s of sensors.{sensor}"

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
 from typing import Any
@@ -126,6 +126,8 @@ SENTENCES: dict[str, tuple[str, Callable[[str, str], Row | None]]] = {
     **dict.fromkeys(nmea.SPEEDS, (TWIST, _nmea_speed)),
     **dict.fromkeys(nmea.PLACES, (NAV_SAT_FIX, _nmea_fix)),
 }
+_SATELLITES = re.compile("(G[A-Z]|BD)[A-Z]{3}")  # a talker that names what a receiver sees
+_BESIDE, _BY_CHANCE = 0.75, 0.2  # steps: a sentence said at the same time; the share of those that one receiver may say
 _COURSE = " (course, speed)"  # at the end of the name of a stream: what RMC says beside a place
 
 
@@ -160,6 +162,19 @@ class TopicData:
         self._stamps.append(stamp_ns)
         self._logs.append(log_ns)
         self.tuples.append(row)
+
+    @classmethod
+    def joined(cls, topic: str, parts: Sequence[TopicData]) -> TopicData:
+        """Return the messages of several streams of one type as one, in the order of their recording."""
+        whole = cls(topic, parts[0].msgtype, parts[0].frame_id, sum(p.undecodable for p in parts))
+        messages = [
+            message
+            for p in parts
+            for message in zip(p.stamps_ns.tolist(), p.logs_ns.tolist(), p.tuples, p.files, p.elapsed, strict=True)
+        ]
+        for stamp_ns, log_ns, row, file, elapsed_ns in sorted(messages, key=lambda message: message[1]):
+            whole.add(stamp_ns, log_ns, row, file, elapsed_ns)
+        return whole
 
     def settle(self) -> None:
         """Drop messages without a stamp; if no message has one that tells when it was measured, use the recording times."""
@@ -222,8 +237,9 @@ class TopicData:
 def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
     """Read all topics of the types in `ROWS`, and the static transforms.
 
-    An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type. RMC gives another one of
-    velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no VTG is on the line.
+    An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type; 'TOPIC GPGGA+GNGGA' of a
+    receiver that changes its talker. RMC gives another one of velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no
+    VTG is on the line.
     """
     streams = {
         t.topic: TopicData(t.topic, t.msgtypes[0])
@@ -250,6 +266,7 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
             if raw.msgtype not in UNSTAMPED:
                 stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
             stream.add(stamp_ns or 0, raw.log_ns, row, raw.file, raw.elapsed_ns)
+    _join_talkers(streams)
     for name in [
         name for name, stream in streams.items() if name.endswith(_COURSE) and _told_elsewhere(stream, streams)
     ]:
@@ -257,6 +274,47 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
     for stream in streams.values():
         stream.settle()
     return list(streams.values()), tree
+
+
+def _join_talkers(streams: dict[str, TopicData]) -> None:
+    """Put sentences into one stream whose talkers take turns.
+
+    A receiver that sees satellites of GPS alone says GP, and GN once it sees others: the talkers of one receiver never say the same
+    sentence within a step of each other, those of two receivers nearly always.
+    """
+    alike: dict[tuple[str, str], list[TopicData]] = {}
+    for name, stream in streams.items():
+        line, _, said = name.partition(" ")
+        if _SATELLITES.match(said):
+            alike.setdefault((line, said[2:]), []).append(stream)
+    for (line, said), several in alike.items():
+        if len(several) < 2 or not _take_turns([s.logs_ns for s in several]):
+            continue
+        sentence = said.removesuffix(_COURSE)
+        talkers = "+".join(s.topic.removeprefix(f"{line} ")[:2] + sentence for s in several)
+        joined = f"{line} {talkers}{said.removeprefix(sentence)}"
+        place = list(streams).index(several[0].topic)
+        for stream in several:
+            del streams[stream.topic]
+        rest = list(streams.items())
+        streams.clear()
+        streams.update([*rest[:place], (joined, TopicData.joined(joined, several)), *rest[place:]])
+
+
+def _take_turns(logs_ns: Sequence[NDArray[np.int64]]) -> bool:
+    """Return whether no talker speaks while another one does, by the recording times (N,) of each, in order."""
+    steps = [float(np.median(np.diff(own))) for own in logs_ns if len(own) > 2]
+    if not steps:
+        return False
+    for k, own in enumerate(logs_ns):
+        others = np.sort(np.concatenate([*logs_ns[:k], *logs_ns[k + 1 :]]))
+        if not len(own) or len(own) > len(others):
+            continue
+        after = np.clip(np.searchsorted(others, own), 1, max(len(others) - 1, 1))
+        nearest = np.minimum(np.abs(own - others[after - 1]), np.abs(own - others[np.minimum(after, len(others) - 1)]))
+        if float((nearest < _BESIDE * min(steps)).mean()) > _BY_CHANCE:
+            return False
+    return True
 
 
 def _told_elsewhere(stream: TopicData, streams: Mapping[str, TopicData]) -> bool:

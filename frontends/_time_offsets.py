@@ -3,18 +3,22 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import MeasuredMotion, Turning
+from graphloc.frontends._assess import MeasuredMotion
+from graphloc.frontends._clock import MOST_LATE_S
 from graphloc.frontends._mount_yaw import FEWEST, HALF_S, MOVES_M, STEP_S, Felt, bent
+from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import without_line
 from graphloc.time import NS_PER_S
 
 _BLOCK_S = 20.0
 _CLEAR, _LEAST_S = 4.0, 0.02  # sigmas, s
-_MOST_S, _APART_S, _LEAST_OF_WAY_S = 1.5, 0.05, 0.1  # how far, and how closely, is looked; from which it is said
+_APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # how closely is looked; from which it is said
 
 
 def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[float, float] | None:
@@ -53,8 +57,21 @@ def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: A
     return (value, sigma) if clear else None
 
 
-def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> tuple[float, float] | None:
-    """Return what should be added to the stamps of a motion, s, and its sigma; None if the accelerometer does not show it.
+class MotionOffset(NamedTuple):
+    """What should be added to the stamps of a motion, s, 1 sigma; `clear`: whether it is better than nothing by far."""
+
+    value_s: float
+    sigma_s: float
+    clear: bool
+
+    def denies(self, other: MotionOffset) -> bool:
+        """Return whether another offset cannot be that of the same clock."""
+        apart_s = abs(other.value_s - self.value_s)
+        return apart_s > max(_CLEAR * float(np.hypot(self.sigma_s, other.sigma_s)), _LEAST_OF_WAY_S)
+
+
+def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | None:
+    """Return by how much the stamps of a motion are off, by the accelerometer; None if that does not show it.
 
     Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. With correlation
     c at the best offset and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
@@ -65,10 +82,10 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> tuple[float, float
     if motion.way_m is None:
         return None
     t, at = felt.t_s, felt.times_of(motion)
-    lags = np.arange(-_MOST_S, _MOST_S + 0.5 * _APART_S, _APART_S)
+    lags = np.arange(-MOST_LATE_S, MOST_LATE_S + 0.5 * _APART_S, _APART_S)
     found: list[tuple[float, float, float]] = []
     for half_s in HALF_S:
-        margin = half_s + _MOST_S
+        margin = half_s + MOST_LATE_S
         middle = np.arange(max(t[0], at[0]) + margin, min(t[-1], at[-1]) - margin, STEP_S)
         moved, chord = bent(at, motion.way_m, middle, half_s)
         good = np.abs(chord) > MOVES_M
@@ -86,9 +103,10 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> tuple[float, float
         left = max(1.0 - float(c[k]) ** 2, 1e-9)
         better = windows * (float(c[k]) ** 2 - float(np.interp(0.0, lags, c)) ** 2) / left
         found.append((better, value, float(np.sqrt(left / (windows * c[k] * bend)))))
-    better, value, sigma = max(found, default=(0.0, 0.0, 1.0))
-    clear = better > _CLEAR**2 and abs(value) > max(_CLEAR * sigma, _LEAST_OF_WAY_S)
-    return (value, sigma) if clear else None
+    if not found:
+        return None
+    better, value, sigma = max(found)
+    return MotionOffset(value, sigma, better > _CLEAR**2 and abs(value) > max(_CLEAR * sigma, _LEAST_OF_WAY_S))
 
 
 def _felt_along(felt: Felt, middle_s: Array, half_s: float) -> Array:

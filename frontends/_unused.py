@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Topics of IMUs, receivers and magnetometers in a bag that are not used, with reasons."""
+"""Topics of IMUs, receivers, magnetometers and speeds in a bag that are not used, with reasons."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Container, Iterable, Sequence
 
 import numpy as np
@@ -11,10 +12,11 @@ from graphloc.frontends._assess import sane
 from graphloc.frontends._assess_imu import samples_of
 from graphloc.frontends._source import TopicSummary
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends.decode import GPS_FIXES, IMU, NAV_SAT_FIX
+from graphloc.frontends.decode import GPS_FIXES, IMU, NAV_SAT_FIX, NUMBERS
 
 _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
+_SPEED = re.compile(r"speed|stw|sog|knots|velocity", re.IGNORECASE)
 
 
 def unused_topics(streams: Sequence[TopicData], used: Container[str]) -> list[str]:
@@ -44,6 +46,16 @@ def unused_magnetometers(topics: Iterable[TopicSummary]) -> list[str]:
         "imu_filter_madgwick makes an orientation of it, which is read as a compass"
         for t in topics
         if _MAGNETIC in t.msgtypes and t.messages
+    ]
+
+
+def unused_numbers(topics: Iterable[TopicSummary]) -> list[str]:
+    """Return a line for each topic of numbers that may be a speed, by its name: the unit is not in the bag, so none is drafted."""
+    return [
+        f"{t.topic}: its numbers look like a speed by their name; where it is one along the vessel, a sensor of kind body_velocity "
+        "reads it (unit: m/s, km/h or knots; through: water for a speed log)"
+        for t in topics
+        if set(t.msgtypes) <= set(NUMBERS) and t.messages and _SPEED.search(t.topic)
     ]
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import difflib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -18,9 +17,9 @@ from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import courses_of_fixes, motion_of_fixes
-from graphloc.frontends._clock import corrected_ns
 from graphloc.frontends._mount_yaw import yaw_in_craft
 from graphloc.frontends._part import Bags
+from graphloc.frontends._reader import Reader, either
 from graphloc.frontends._readings import (
     Readings,
     clock_warnings,
@@ -36,29 +35,21 @@ from graphloc.frontends._readings import (
     thin_headings,
 )
 from graphloc.frontends._references import Reference, check_speed, true_trajectory
-from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._sanity import lever_warning
-from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
+from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, turn_warnings, wander_warning
 from graphloc.frontends.decode import (
-    NO_STAMP,
     ODOMETRY,
     PLAIN_POSE,
     POSE,
     UNSTAMPED,
     Decoded,
-    decoder_of,
-    header_stamp_ns,
-    stamp_ns_of,
     supported_types,
 )
-from graphloc.ledger import RECORDED_AT, LedgerRow, Outcome
+from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Progress, Recording, Span
-from graphloc.time import utc_text
-
-_REPORT_EVERY = 2000  # messages between two calls of `progress`
 
 
 def check_bag(bags: Bags, config: VesselConfig) -> None:
@@ -93,7 +84,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         span = _span(bag, config)
         bag.refuse_set_back([r.config.topic for r in sensors if r.config.kind == "imu"])
         tree = StaticTree() if any(s.enabled and s.mount.tf_frame for s in config.sensors.values()) else None
-        rows = _Reader(bag, topics, sensors, [b for b in (truth, check) if b], tree).read(progress)
+        rows = Reader(bag, topics, sensors, [b for b in (truth, check) if b], tree).read(progress)
         warnings = list(bag.warnings)
 
     rows += reject_jumps(sensors, warnings)
@@ -172,122 +163,6 @@ def _asked_for(config: VesselConfig, bag: Bag) -> tuple[list[Readings], Referenc
     return sensors, truth, check
 
 
-class _Reader:
-    """One pass over the bag, which gives each message to the sensors and references that read its topic."""
-
-    def __init__(
-        self,
-        bag: Bag,
-        topics: Mapping[str, TopicSummary],
-        sensors: Sequence[Readings],
-        beside: Sequence[Reference],
-        tree: StaticTree | None,
-    ) -> None:
-        self._bag, self._topics, self._tree = bag, topics, tree
-        self._sensors: dict[str, list[Readings]] = {}
-        for readings in sensors:
-            self._sensors.setdefault(readings.config.topic, []).append(readings)
-        self._references: dict[str, list[Reference]] = {}
-        for item in beside:
-            self._references.setdefault(item.topic, []).append(item)
-        self._wanted = set(self._sensors) | set(self._references)
-        if tree is not None and TF_STATIC in topics:
-            self._wanted.add(TF_STATIC)
-        self._rows: list[LedgerRow] = []
-        self._seq = 0
-
-    def read(self, progress: Progress | None) -> list[LedgerRow]:
-        """Fill the sensors' readings; return the rows of all other messages."""
-        total = sum(self._topics[t].messages for t in self._wanted)
-        read: Counter[str] = Counter()
-        for done, raw in enumerate(self._bag.messages(self._wanted), start=1):
-            read[raw.topic] += 1
-            self._take(raw)
-            if progress is not None and done % _REPORT_EVERY == 0:
-                progress("reading", done, max(total, done))
-        if progress is not None:
-            progress("reading", total, total)
-        return self._rows + self._topic_rows(read)
-
-    def _take(self, raw: RawMessage) -> None:
-        msg: Any = None
-        broken = malformed("")
-        try:
-            msg = self._bag.decode(raw)
-        except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
-            broken = malformed(f"{raw.file}: cannot be decoded as {raw.msgtype} ({type(error).__name__}){_when(raw)}")
-        for readings in self._sensors.get(raw.topic, ()):
-            seq, self._seq = self._seq, self._seq + 1
-            if msg is None:
-                self._rows.append(readings.row(seq, 0, broken))
-            else:
-                self._decode(readings, raw, msg, seq)
-        for item in self._references.get(raw.topic, ()):
-            item.count, item.broken = item.count + 1, item.broken + (msg is None)
-            if msg is not None:
-                stamp_ns = header_stamp_ns(msg)
-                item.unstamped += stamp_ns is None
-                item.stamps_ns.append(raw.log_ns if stamp_ns is None else stamp_ns)
-                item.logs_ns.append(raw.log_ns)
-                item.messages.append(msg)
-        if raw.topic == TF_STATIC and self._tree is not None:
-            self._tree.take(raw.msgtype, msg)
-
-    def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:
-        """Decode a message for a sensor; add a row if it gives no reading."""
-        stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=readings.config.stamps == "recorded")
-        if stamp_ns is None:
-            text = f"{raw.file}: header stamp is zero or negative{_when(raw)}: {NO_STAMP}"
-            self._rows.append(readings.row(seq, 0, malformed(text)))
-            return
-        stamp_ns = corrected_ns(stamp_ns, readings.config, raw.elapsed_ns)
-        if not 0 < stamp_ns <= LATEST_NS:
-            text = f"{raw.file}: no time with time_offset_s on it{_when(raw)}"
-            self._rows.append(readings.row(seq, 0, malformed(text)))
-            return
-        decoder = decoder_of(readings.config.kind, raw.msgtype)
-        value: Decoded = malformed(f"{raw.msgtype} is not read by a {readings.config.kind} sensor")
-        if decoder is not None:
-            try:
-                value = decoder(msg, stamp_ns, seq, readings.sensor, readings.config)
-            except (ValueError, ArithmeticError, AttributeError) as error:
-                value = malformed(" ".join(str(error).split()))
-        if not isinstance(value, Rejection):
-            readings.add(seq, stamp_ns, raw.log_ns, value, raw.file)
-        elif value.outcome is Outcome.MALFORMED:
-            self._rows.append(readings.row(seq, stamp_ns, malformed(f"{raw.file}: {value.reason}")))
-        else:
-            self._rows.append(readings.row(seq, stamp_ns, value))
-
-    def _topic_rows(self, read: Counter[str]) -> list[LedgerRow]:
-        """Return rows for whole topics: unused, read but not fused, or unreadable."""
-        rows: list[LedgerRow] = []
-
-        def add(topic: str, count: int, outcome: Outcome, reason: str) -> None:
-            row = LedgerRow(seq=-1, stamp_ns=0, sensor="", topic=topic, outcome=outcome, reason=reason, count=count)
-            rows.extend([row] if count > 0 else [])
-
-        for topic, summary in self._topics.items():
-            if topic not in self._wanted:
-                reason = f"no sensor reads this topic ({_or(summary.msgtypes)})"
-                add(topic, summary.messages, Outcome.IGNORED, reason)
-                continue
-            for item in self._references.get(topic, ()):
-                add(topic, item.count - item.broken, Outcome.READ, item.reason)
-                add(topic, item.broken, Outcome.MALFORMED, "cannot be decoded")
-            if topic == TF_STATIC and self._tree is not None:
-                add(topic, read[topic] - self._tree.broken, Outcome.READ, "read for mounts")
-                add(topic, self._tree.broken, Outcome.MALFORMED, "cannot be decoded")
-            missing = summary.messages - read[topic]
-            add(topic, missing, Outcome.MALFORMED, "announced by the bag's index, but cannot be read")
-        return rows
-
-
-def _when(raw: RawMessage) -> str:
-    """Return the clause that tells a message without a stamp from others."""
-    return f"{RECORDED_AT}{utc_text(raw.log_ns)}"
-
-
 def _subscriptions(config: VesselConfig, topics: Mapping[str, TopicSummary], bag: str) -> list[Readings]:
     """Return `Readings` for each enabled sensor that reads a topic."""
     found = []
@@ -302,18 +177,14 @@ def _subscriptions(config: VesselConfig, topics: Mapping[str, TopicSummary], bag
 def _check_topic(topic: str, key: str, types: tuple[str, ...], topics: Mapping[str, TopicSummary], bag: str) -> None:
     """Raise an `InputError` if a topic is missing or has another type."""
     fitting = [t.topic for t in topics.values() if set(t.msgtypes) & set(types)]
-    offer = f"topics of a fitting type: {', '.join(fitting)}" if fitting else f"no topic holds {_or(types)}"
+    offer = f"topics of a fitting type: {', '.join(fitting)}" if fitting else f"no topic holds {either(types)}"
     if topic not in topics:
         close = difflib.get_close_matches(topic, list(topics), n=3, cutoff=0.3)
         near = f"nearest: {', '.join(close)}" if close else f"it holds: {', '.join(topics) or 'no topic at all'}"
         raise InputError(f"{bag}: {key} '{topic}' is not in the bag; {near}; {offer}")
     have = topics[topic].msgtypes
     if not set(have) & set(types):
-        raise InputError(f"{bag}: {key} '{topic}' holds {_or(have)}, but must hold {_or(types)}; {offer}")
-
-
-def _or(names: Sequence[str]) -> str:
-    return " or ".join(n.replace("/msg/", "/") for n in names)
+        raise InputError(f"{bag}: {key} '{topic}' holds {either(have)}, but must hold {either(types)}; {offer}")
 
 
 def _reference(
@@ -411,7 +282,7 @@ def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) 
         unstamped = set(types) & set(UNSTAMPED)
         estimated = isinstance(r.config, GnssConfig) and r.config.stamp_sigma_s > 0.0
         if (unstamped or r.config.stamps == "recorded") and r.config.time_offset_s == 0.0 and not estimated:
-            why = f"{_or(types)} has no stamp" if unstamped else "stamps: recorded"
+            why = f"{either(types)} has no stamp" if unstamped else "stamps: recorded"
             lines.append(
                 f"{r.sensor}: {why}: recording times are used, which are late by as long as a message takes (a receiver's often "
                 "0.1 s and more); no bound includes that: set time_offset_s (negative)"
@@ -441,7 +312,9 @@ def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapp
     """Return a line for each sensor without a reading, with the main reason."""
     lines = []
     for readings in (r for r in sensors if not r.values):
-        reasons = Counter(r.reason for r in rows if r.sensor == readings.sensor)
+        own = [r for r in rows if r.sensor == readings.sensor]
+        # Of a line of NMEA most is for others, which is no reason.
+        reasons = Counter(r.reason for r in own if r.outcome is not Outcome.IGNORED) or Counter(r.reason for r in own)
         why = f", mostly: {reasons.most_common(1)[0][0]}" if reasons else ""
         count = topics[readings.config.topic].messages
         lines.append(f"{readings.sensor}: none of the {count} messages on {readings.config.topic} could be used{why}")

@@ -14,30 +14,33 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.config import STANDARD_GRAVITY_MPS2, GnssConfig
+from graphloc.config import GnssConfig
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import (
     Courses,
     MeasuredMotion,
-    Turning,
-    compass_report,
     courses_of,
     evenly,
     gnss_report,
-    headings,
     motion_of_places,
     on_one_clock,
     sane,
-    says_the_same,
     topic_report,
     track,
-    white_noise_m,
     without_drift,
 )
-from graphloc.frontends._assess_imu import felt_of, imu_report, samples_of, turning_of
+from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
+from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
-from graphloc.frontends._clock import FEWEST_STAMPS, GAIN_LIMIT_S, refuse_woven, step, usual_latency_s
+from graphloc.frontends._clock import (
+    FEWEST_STAMPS,
+    GAIN_LIMIT_S,
+    MOST_ON_ITS_WAY_S,
+    refuse_woven,
+    step,
+    usual_latency_s,
+)
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
 from graphloc.frontends._reports import (
@@ -58,9 +61,10 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import TopicData, read_streams
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._time_offsets import heading_time_offset, motion_time_offset
+from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, motion_time_offset
+from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
-from graphloc.frontends._unused import unused_magnetometers, unused_topics
+from graphloc.frontends._unused import unused_magnetometers, unused_numbers, unused_topics
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import (
     GPS_FIXES,
@@ -80,8 +84,9 @@ from graphloc.frontends.decode import (
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic
 from graphloc.frozen_receiver import frozen_fixes
-from graphloc.measurements import CompassHeading, ImuSeries
+from graphloc.measurements import CompassHeading
 from graphloc.time import NS_PER_S, seconds_between
+from graphloc.white_noise import white_noise
 
 __all__ = [
     "CompassReport",
@@ -103,7 +108,9 @@ _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visua
 _MOST_NAMED = 6
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _FEWEST = 20  # places of a track
-_COVERS = 0.8  # of the run, from which a receiver is there throughout
+_COVERS = (
+    0.8  # of the run, from which a receiver is there throughout; of the fixes, from which it says as much as another
+)
 
 
 class _First(NamedTuple):
@@ -190,7 +197,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         gnss=tuple(_timed_fixes(report, late, velocities, bag.streams) for report in gnss),
         compasses=compasses,
         odometry=tuple(reports),
-        velocities=tuple(replace(report, late_s=late.get(report.topic)) for _, report in velocities),
+        velocities=tuple(replace(report, late_s=_clearly(late.get(report.topic))) for _, report in velocities),
         lidars=_mounted(bag, bag.lidars),
         cameras=tuple(_camera(bag, camera) for camera in _mounted(bag, bag.cameras)),
         tf_frames=tree.frames,
@@ -201,6 +208,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             *_steps(bag),
             *unused_topics(list(bag.streams.values()), used),
             *_lacking(bag, imus, gnss, reports),
+            *unused_numbers(t for t in bag.topics.values() if t.topic not in bag.streams),
             *([] if any(c.usable for c in compasses) else unused_magnetometers(bag.topics.values())),
         ),
     )
@@ -240,12 +248,15 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     """Report the receivers, the best one first."""
     found = [r for s in bag.of_type(*_FIXES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
     longest_s = max((r.spans_s for r in found), default=0.0)
+    most = max((r.fixes for r in found if r.spans_s >= _COVERS * longest_s), default=0)
     found.sort(
         key=lambda r: (
             filtered(r.topic),
             r.spans_s < _COVERS * longest_s,
             r.slow_error,
             _octave(r),
+            r.fixes < _COVERS * most,
+            r.without_height == r.fixes,
             -r.fixes,
             r.without_height,
         )
@@ -274,8 +285,8 @@ def _odometry_reports(
 
 def _late_s(
     bag: _Contents, imus: Sequence[ImuReport], motions: Sequence[MeasuredMotion]
-) -> dict[str, tuple[float, float] | None]:
-    """Return by topic what should be added to the stamps of a motion by the best IMU, s, and its sigma."""
+) -> dict[str, MotionOffset | None]:
+    """Return by topic what should be added to the stamps of a motion, by the best IMU."""
     felt = felt_of(bag.aligned[imus[0].topic], imus[0], bag.tree, bag.tree.body()) if imus else None
     return {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
 
@@ -308,10 +319,11 @@ def _lacking(
     """Say which required sensors are missing, and then also which topics have an unsupported type: they may be it."""
     lines = []
     if not any(not imu.missing for imu in imus):
-        lines.append("no whole IMU in it: smooth, replay and compare need one")
+        lines.append("no whole IMU in it: smooth, replay and compare need one (sensor_msgs/Imu, 50 Hz or more)")
     if not (gnss or bag.lidars or bag.cameras or any(report.role == "pose" or report.grid for report in odometry)):
         lines.append("nothing in it tells the place: no GNSS fix that can be used, no pose")
-    others = [t for t in bag.topics.values() if t.topic not in bag.streams and not _KNOWN.match(t.msgtypes[0])]
+    read = {name.partition(" ")[0] for name in bag.streams}  # of NMEA a stream is a sentence
+    others = [t for t in bag.topics.values() if t.topic not in read and not _KNOWN.match(t.msgtypes[0])]
     if lines and others:
         named = ", ".join(f"{t.topic} ({' or '.join(t.msgtypes).replace('/msg/', '/')})" for t in others[:_MOST_NAMED])
         lines.append(f"of no type that is read here: {named}{', ...' if len(others) > _MOST_NAMED else ''}")
@@ -351,17 +363,7 @@ def _beside_gyro(report: CompassReport, stream: TopicData, best: tuple[ImuReport
     if best is None or not report.usable:
         return report
     imu, samples = best
-    keep = samples_of(samples)[0]
-    keep = keep[np.isfinite(samples.rows[keep, :6]).all(axis=1)]
-    rows = samples.rows[keep]
-    unit = STANDARD_GRAVITY_MPS2 if imu.accel_unit == "g" else 1.0
-    series = ImuSeries(
-        sensor=imu.topic,
-        stamps_ns=samples.stamps_ns[keep],
-        accel_mps2=rows[:, :3] * (-unit if imu.gravity == "inverted" else unit),
-        gyro_radps=np.radians(rows[:, 3:6]) if imu.gyro_unit == "deg/s" else rows[:, 3:6],
-        seqs=keep.astype(np.int64),
-    )
+    series = series_of(samples, imu)
     stamps, angle = headings(stream)
     yaw = angle if report.convention == "enu" else np.pi / 2.0 - angle
     measured = [
@@ -375,15 +377,17 @@ def _beside_gyro(report: CompassReport, stream: TopicData, best: tuple[ImuReport
 
 def _timed_fixes(
     gnss: GnssReport,
-    late: Mapping[str, tuple[float, float] | None],
+    late: Mapping[str, MotionOffset | None],
     velocities: Sequence[tuple[TopicData, VelocityReport]],
     streams: Mapping[str, TopicData],
 ) -> GnssReport:
     """Return the report with how late the fixes' stamps are: by the fixes, or by a velocity over ground that tells it better.
 
-    A receiver measures both at once. One that is recorded at another time after its stamps is taken for another device.
+    A receiver measures both at once. One that is recorded at another time after its stamps is taken for another device. Plotters
+    average course and speed over seconds, and not the place: so late, a velocity tells it of the fixes only if these say so as well.
     """
-    candidates = {gnss.topic: late.get(gnss.topic)}
+    own_late = late.get(gnss.topic)
+    candidates = {gnss.topic: own_late}
     fixes = streams[gnss.topic]
     latency_s = usual_latency_s(fixes.stamps_ns, fixes.logs_ns)
     for stream, report in velocities:
@@ -393,10 +397,20 @@ def _timed_fixes(
             and own.recorded == fixes.recorded
         )
         if report.axes in (EAST_AXES, NORTH_AXES) and same and not filtered(stream.topic):
-            candidates[stream.topic] = late.get(stream.topic)
-    known = {topic: found for topic, found in candidates.items() if found is not None}
-    by = min(known, key=lambda topic: known[topic][1], default="")
-    return replace(gnss, late_s=known.get(by), late_by=by)
+            said = late.get(stream.topic)
+            confirmed = said is not None and (
+                abs(said.value_s) <= MOST_ON_ITS_WAY_S or bool(own_late and own_late.clear)
+            )
+            if said and confirmed and not (own_late and own_late.denies(said)):
+                candidates[stream.topic] = said
+    known = {topic: found for topic, found in candidates.items() if found is not None and found.clear}
+    by = min(known, key=lambda topic: known[topic].sigma_s, default="")
+    return replace(gnss, late_s=_clearly(known.get(by)), late_by=by)
+
+
+def _clearly(offset: MotionOffset | None) -> tuple[float, float] | None:
+    """Return an offset that is clear, s, and its sigma."""
+    return (offset.value_s, offset.sigma_s) if offset is not None and offset.clear else None
 
 
 def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic, ...]:
@@ -465,5 +479,5 @@ def _grid_track(bag: _Contents) -> _Track:
         good = np.isfinite(p_m).all(axis=1)
         if in_map_grid(stream) and good.sum() > _FEWEST:
             p_m = p_m[good] - p_m[good][0]
-            return _Track(stream.stamps_ns[keep][good], p_m, float(white_noise_m(p_m)[:2].max()), None)
+            return _Track(stream.stamps_ns[keep][good], p_m, float(white_noise(p_m)[:2].max()), None)
     return _Track(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None)

@@ -7,24 +7,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
+from graphloc.white_noise import white_noise_of_thirds
 
 _BLOCK = 1000  # samples
 FEWEST = 2 * _BLOCK
-"""Samples that tell it."""
+"""Samples that tell it with a sigma: two blocks. A tenth tells the density alone."""
 
 
 def noise_density(stamps_ns: NDArray[np.int64], columns: Array) -> tuple[float, float]:
     """Return the white-noise density of the worst axis, and its sigma, from its variation along the run.
 
-    Third differences remove motion; those of white noise have 20 times its variance.
-
     Args:
         stamps_ns: (N,). columns: (N, 3) in some unit; the density is in that unit per sqrt(Hz).
     """
     root_dt = float(np.sqrt(np.median(np.diff(stamps_ns)) * 1e-9))
-    step = np.abs(np.diff(columns, n=3, axis=0))
-    blocks = np.array_split(step, max(len(step) // _BLOCK, 2))
-    scatter = np.array([1.4826 * np.median(b, axis=0) for b in blocks]) / np.sqrt(20.0) * root_dt
+    thirds = np.diff(columns, n=3, axis=0)
+    blocks = np.array_split(thirds, max(len(thirds) // _BLOCK, 2))
+    scatter = np.array([white_noise_of_thirds(block) for block in blocks]) * root_dt
     axis = int(np.argmax(np.median(scatter, axis=0)))
     found = float(np.median(scatter[:, axis]))
     spread = 1.4826 * float(np.median(np.abs(scatter[:, axis] - found)))

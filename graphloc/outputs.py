@@ -1,23 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The run folder: solution.csv, .tum, .mcap, track.geojson, ledger.csv, slow.csv, run.json, effective config.
 
-Everything is written into a folder beside the wanted one and moved in place when complete, so an
-interrupted run leaves nothing half-written. Columns and units: docs/outputs.md.
+They are written into a folder of `folders.fresh_folder`, so an interrupted run leaves nothing half-written. Columns and units:
+docs/outputs.md.
 """
 
 from __future__ import annotations
 
 import csv
-import errno
 import importlib.metadata
 import json
-import os
 import platform
 import re
-import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -32,7 +27,6 @@ from scipy.spatial.transform import Rotation
 from graphloc.berths import BerthTrack
 from graphloc.chi2 import SIGMAS_95
 from graphloc.config import VesselConfig, effective
-from graphloc.errors import OutputError
 from graphloc.frames import Array, heading_deg_from_yaw
 from graphloc.ledger import LedgerRow
 from graphloc.plain import plain
@@ -42,63 +36,6 @@ from graphloc.time import utc_text
 from graphloc.trajectory import bounds_95
 
 MARK = "run.json"  # a folder with this file is ours to replace
-
-
-def check_folder(folder: Path, *, overwrite: bool, mark: str = MARK) -> None:
-    """Refuse early what `fresh_folder` would refuse after the work.
-
-    A folder is replaced only if it holds the file `mark`, so that nobody's own work is.
-
-    Raises:
-        OutputError: `folder` exists and may not be replaced, there is a file in its place, or it cannot be made there.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file, and a folder is wanted")
-    if folder.exists() and not (overwrite and (folder / mark).exists()) and any(folder.iterdir()):
-        what = (
-            f"holds no {mark}, so graphloc did not make it: it is not replaced"
-            if overwrite
-            else "exists already; give --overwrite"
-        )
-        raise OutputError(f"{folder}: {what}")
-    check_writable(folder)
-
-
-def check_writable(path: Path) -> None:
-    """Refuse what cannot be made at `path`, which need not be there, nor the folders that it lies in.
-
-    Raises:
-        OutputError: the nearest folder that is there may not be written to.
-    """
-    around = next(folder for folder in path.absolute().parents if folder.exists())
-    if not around.is_dir():
-        raise OutputError(f"{path}: {around} is a file, and a folder is wanted")
-    if not os.access(around, os.W_OK | os.X_OK):
-        raise OutputError(f"{path}: cannot be written ({os.strerror(errno.EACCES)} in {around})")
-
-
-@contextmanager
-def fresh_folder(folder: Path, *, overwrite: bool, mark: str = MARK) -> Iterator[Path]:
-    """Yield a folder to fill; move it to `folder` when all went well, and drop it when not.
-
-    Raises:
-        OutputError: `folder` exists and may not be replaced, or the disk refuses.
-    """
-    check_folder(folder, overwrite=overwrite, mark=mark)
-    fresh = None
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-        fresh.chmod(0o755)
-        yield fresh
-        if folder.exists():
-            shutil.rmtree(folder)
-        fresh.rename(folder)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written ({error.strerror or error})") from error
-    finally:
-        if fresh is not None and fresh.exists():
-            shutil.rmtree(fresh, ignore_errors=True)
 
 
 def write_run(

@@ -20,10 +20,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from graphloc import app, outputs
+from graphloc import app
 from graphloc.errors import InputError, OutputError, in_one_line
 from graphloc.eval import sweep_table
 from graphloc.extras import need
+from graphloc.folders import check_folder
 from graphloc.job import Job, Row, check, run_job
 from graphloc.plain import plain
 from graphloc.recording import Progress, quiet
@@ -96,7 +97,7 @@ def _inputs(jobs: Sequence[Job], folder: Path, overwrite: bool) -> dict[str, str
         if versions != _versions() or any(known.get(p, h) != h for p, h in hashes.items()):
             raise OutputError(f"{folder}: was begun with other versions or inputs: give another --out, or --overwrite")
         return known | hashes
-    outputs.check_folder(folder, overwrite=overwrite, mark=MARK)
+    check_folder(folder, overwrite=overwrite, mark=MARK)
     return hashes
 
 

@@ -14,6 +14,8 @@ from graphloc.chi2 import SIGMAS_95, chi2_95
 from graphloc.frames import Array, rpy_from_rotation
 from graphloc.time import seconds_since
 
+_MOST_APART_S = 1.0  # poses between which the vessel is taken for known
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trajectory:
@@ -66,13 +68,13 @@ class Trajectory:
             cov=None if self.cov is None else self.cov[kept],
         )
 
-    def covers(self, stamps_ns: NDArray[np.int64], max_gap_s: float = 1.0) -> NDArray[np.bool_]:
-        """Return (M,) whether each stamp lies inside the span and between poses at most `max_gap_s` apart."""
+    def covers(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return (M,) whether each stamp lies inside the span and between poses at most a second apart."""
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         right = np.clip(np.searchsorted(self.stamps_ns, stamps, side="left"), 1, len(self) - 1)
         gap = (self.stamps_ns[right] - self.stamps_ns[right - 1]) / 1e9
         inside = (stamps >= self.stamps_ns[0]) & (stamps <= self.stamps_ns[-1])
-        return np.asarray(inside & (gap <= max_gap_s))
+        return np.asarray(inside & (gap <= _MOST_APART_S))
 
     def _around(self, stamps: NDArray[np.int64]) -> slice:
         """Which poses interpolation at these stamps uses."""

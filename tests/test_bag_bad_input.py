@@ -3,6 +3,7 @@
 
 import struct
 from collections import Counter
+from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
+from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
 from graphloc.frontends._clock import longest_increasing
@@ -480,6 +482,14 @@ def test_a_sensor_in_another_epoch_is_reported_and_not_fixed(tmp_path: Path) -> 
     assert "set its time_offset_s to -18.000 instead of -50 (" in line
 
 
+@pytest.mark.parametrize(("late_s", "warns"), [(1.3, False), (5.0, True)])
+def test_stamps_that_are_set_earlier_are_no_clock_that_is_behind(late_s: float, warns: bool, tmp_path: Path) -> None:
+    """A receiver that filters its velocity stamps it 1.3 s late, as `inspect` drafted; the advice was to undo that."""
+    items = still_run(MAKE)
+    recording = read(tmp_path, items, gnss={"topic": "/fix", "time_offset_s": -late_s})
+    assert any("its clock is" in w for w in recording.warnings) == warns
+
+
 @pytest.mark.parametrize(("xyz_m", "far"), [([1.5, 0.0, 0.8], ""), ([150.0, 0.0, 80.0], "170 m")])
 def test_a_mount_in_centimetres_is_said(tmp_path: Path, xyz_m: list[float], far: str) -> None:
     recording = read(tmp_path, still_run(MAKE), gnss={"topic": "/fix", "mount": {"xyz_m": xyz_m}})
@@ -547,6 +557,29 @@ def test_rates_in_degrees_are_refused_at_once(tmp_path: Path, up: tuple[float, f
         one_line(error, "looks like deg/s", "set gyro_unit: deg/s of sensors.imu")
         right = {"topic": "/imu", "accel_unit": unit, "gyro_unit": "deg/s"}
         assert read_recording(path, vessel(gnss=None, imu=right)).imu is not None
+
+
+def carried(scale: float) -> list[Item]:
+    """An IMU that is tilted by up to a radian about all axes within seconds: a camera in the hand, a craft in aerobatics."""
+    rng, items, hz = np.random.default_rng(5), list[Item](), 100
+    t = np.arange(1500) / hz
+    rates = np.column_stack([1.9 * np.sin(2.1 * t + 1.0), 1.7 * np.sin(1.3 * t), 1.5 * np.cos(1.7 * t)])
+    attitude = Rotation.identity()
+    for k, rate in enumerate(rates):
+        at, felt = START_NS + k * S // hz, attitude.inv().apply([0.0, 0.0, 9.81])
+        items.append(("/imu", at, MAKE.imu(at, (felt + rng.normal(0, 1.0, 3)).tolist(), (scale * rate).tolist())))
+        attitude = attitude * Rotation.from_rotvec(rate / hz)
+    return items
+
+
+@pytest.mark.parametrize("refused", [False, True], ids=["rad/s", "deg/s"])
+def test_fast_rates_that_turn_gravity_as_they_say_are_in_radians(refused: bool, tmp_path: Path) -> None:
+    """A camera in the hand was refused, and `inspect` drafted deg/s for it."""
+    path = write_bag(tmp_path / "run", MAKE, carried(180.0 / np.pi if refused else 1.0), "mcap")
+    assert inspect_bag(path).imus[0].gyro_unit == ("deg/s" if refused else "rad/s")
+    with pytest.raises(InputError, match="looks like deg/s") if refused else nullcontext():
+        recording = read_recording(path, vessel(gnss=None))
+        assert not any("deg/s" in w for w in recording.warnings)
 
 
 def test_a_small_boat_in_chop_is_not_refused(tmp_path: Path) -> None:

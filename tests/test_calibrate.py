@@ -16,8 +16,8 @@ from graphloc.eval.calibrate._evidence import Evidence, OffsetEstimate
 from graphloc.eval.calibrate._imu import imu_noise
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
-from graphloc.frontends._assess import Turning
 from graphloc.frontends._time_offsets import heading_time_offset
+from graphloc.frontends._turning import Turning
 from graphloc.frontends.bag import read_recording
 from graphloc.imu_scatter import noise_density
 from graphloc.measurements import GnssVelocity, ImuSeries

@@ -336,6 +336,16 @@ def test_what_no_run_can_do_without_is_reported(tmp_path: Path) -> None:
     assert "IMU" not in said
 
 
+@pytest.mark.parametrize(("topic", "said"), [("/speed_log", True), ("/battery_voltage", False)])
+def test_numbers_that_may_be_a_speed_are_said_to_be_one(topic: str, said: bool, tmp_path: Path) -> None:
+    """Nothing of such a topic was in the text or in the draft."""
+    make = Messages(2)
+    number = make.t["std_msgs/msg/Float64"]
+    more = [(topic, START_NS + k * S // 5, number(data=3.0)) for k in range(200)]
+    found, _, _ = look(tmp_path, sorted([*drive(make), *more], key=lambda item: item[1]), make)
+    assert [topic in w and "kind body_velocity" in w for w in found.warnings] == [True] * said
+
+
 @pytest.mark.parametrize("compass", [True, False])
 def test_a_magnetometer_alone_is_said_to_be_no_compass(compass: bool, tmp_path: Path) -> None:
     make = Messages(2)
@@ -430,3 +440,25 @@ def test_a_velocity_of_the_receiver_tells_how_late_its_noisy_fixes_are(way_s: fl
     assert (found.gnss[0].late_by == "/vel") == told
     assert config.sensors["gnss"].time_offset_s == pytest.approx(-0.4 * told, abs=0.06)
     assert ("the motion of /vel, taken for the same receiver's, -0.4" in text) == told
+
+
+@pytest.mark.parametrize(("over_s", "noise_m"), [(2.0, 0.05), (2.0, 0.2), (0.0, 0.05)])
+def test_a_velocity_that_is_filtered_tells_nothing_of_the_fixes(over_s: float, noise_m: float, tmp_path: Path) -> None:
+    """Plotters average course and speed over seconds, and the place not at all: their fixes were drafted as late as their velocities."""
+    make = Messages(2)
+    plain = [
+        item for item in drive(make, seconds=120, noise_m=noise_m, status=0, sigma_m=1.0) if item[0] != "/wheel/odom"
+    ]
+    exact = [m for topic, _, m in drive(make, seconds=120) if topic == "/fix"]
+    stamps = [at for topic, at, _ in plain if topic == "/fix"]
+    places = DATUM.enu_from_geodetic(
+        *(np.array([getattr(m, k) for m in exact]) for k in ("latitude", "longitude", "altitude"))
+    )
+    speeds = np.gradient(places, 0.2, axis=0)
+    many = round(over_s * 5) + 1
+    averaged = np.array([speeds[max(k - many + 1, 0) : k + 1].mean(axis=0) for k in range(len(speeds))])
+    items = [*plain, *(("/vel", at, make.twist(at, v)) for at, v in zip(stamps, averaged, strict=True))]
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.sensors["gnss"].time_offset_s == 0.0
+    assert config.sensors["gnss_velocity"].time_offset_s == pytest.approx(-over_s / 2.0, abs=0.15)
+    assert ("so late, it is filtered" in text) == bool(over_s)

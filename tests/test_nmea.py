@@ -194,7 +194,7 @@ def test_a_bag_of_sentences_is_read_as_drafted(run: SimulatedRun, bag: Path, tmp
     assert kinds["gnss"] == ("gnss", ("GPGGA",), True)
     assert kinds["compass"] == ("compass", ("HEHDT",), True)
     assert kinds["compass_2"] == ("compass", ("HCHDM",), False)  # two of one mast are not two witnesses
-    assert kinds["gnss_velocity_2"] == ("gnss_velocity", ("GPVTG",), True)
+    assert kinds["gnss_velocity"] == ("gnss_velocity", ("GPVTG",), True)
     assert kinds["body_velocity"] == ("body_velocity", ("VWVHW",), False)
     log = config.sensors["body_velocity"]
     assert isinstance(log, BodyVelocityConfig)
@@ -323,6 +323,119 @@ def test_a_damaged_sentence_is_not_one_without_a_fix(tmp_path: Path) -> None:
     assert [g.statuses for g in seen.gnss] == [{"gbas": 193}]
     assert [t.undecodable for t in seen.topics if t.topic == "/line GNGGA"] == [7]
     assert "/line GNGGA: 7 messages cannot be decoded" in render(seen)
+
+
+def lines_bag(path: Path, bodies: Callable[[int], list[str]], count: int, step_ns: int = S) -> Path:
+    """`bodies(k)`: the sentences of step k, on one line."""
+    make = Messages(2)
+    items = [
+        ("/line", 1_700_000_000 * S + k * step_ns, make.text(sealed(body))) for k in range(count) for body in bodies(k)
+    ]
+    return write_bag(path, make, items)
+
+
+def ahead(k: int, mps: float = 5.0) -> str:
+    """Where a vessel is after k seconds northwards."""
+    return f"{minutes(57.7 + k * mps / 111_400.0, 'NS', 2)},{minutes(11.9, 'EW', 3)}"
+
+
+def test_a_line_that_is_read_is_not_said_to_be_of_no_known_type(tmp_path: Path) -> None:
+    make = Messages(2)
+    make.store.register(get_types_from_msg("std_msgs/Header header\nstring sentence", SENTENCE))
+    items = []
+    for k in range(30):
+        at = 1_700_000_000 * S + k * S
+        said = make.t[SENTENCE](header=make.header(at), sentence=sealed(f"GPGLL,{ahead(k)},120000,A,A"))
+        items.append(("/nmea", at, said))
+    warnings = inspect_bag(write_bag(tmp_path / "run", make, items)).warnings
+    assert any("no whole IMU" in w for w in warnings)
+    assert not any("/nmea" in w for w in warnings)
+
+
+@pytest.mark.parametrize(("lost", "read"), [(5, ("GPGGA",)), (60, ("GPGLL",))])
+def test_a_place_with_a_height_is_taken_before_one_without(lost: int, read: tuple[str, ...], tmp_path: Path) -> None:
+    """A GLL more than GGA was worth more than heights, dilution and quality; far more fixes are."""
+
+    def bodies(k: int) -> list[str]:
+        gga = [f"GPGGA,120000.00,{ahead(k)},1,09,0.9,10.0,M,30.0,M,,"] if k >= lost else []
+        return [f"GPGLL,{ahead(k)},120000,A,A", *gga]
+
+    drafted = tmp_path / "vessel.yaml"
+    drafted.write_text(draft_config(inspect_bag(lines_bag(tmp_path / "run", bodies, 100))))
+    gnss = load_config(drafted, KINDS).sensors["gnss"]
+    assert isinstance(gnss, GnssConfig)
+    assert (gnss.enabled, gnss.nmea) == (True, read)
+
+
+@pytest.mark.parametrize("height_m", [None, 40.0])
+def test_the_curvature_of_the_earth_is_no_height(height_m: float | None, tmp_path: Path) -> None:
+    """After 30 km the tangent plane of the first fix lies 70 m above the sea."""
+
+    def bodies(k: int) -> list[str]:
+        place = ahead(k, mps=100.0)
+        told = f"GPGGA,120000.00,{place},1,09,0.9,{height_m},M,30.0,M,,"
+        return [told if height_m else f"GPGLL,{place},120000,A,A"]
+
+    seen = inspect_bag(lines_bag(tmp_path / "run", bodies, 300))
+    assert seen.gnss[0].height_range_m == pytest.approx(0.0, abs=1e-6)
+    assert "height ranges" not in draft_config(seen)
+    assert "vertical_sigma_m" not in draft_config(seen)
+    assert ("height 0.0 m" in render(seen)) == (height_m is not None)  # of none, no height is said
+    (scatter,) = (line for line in render(seen).split("\n") if "scatter from fix to fix" in line)
+    assert len(scatter.split()) == (9 if height_m else 8)
+
+
+@pytest.mark.parametrize("hz", [1, 10])
+def test_a_receiver_that_changes_its_talker_is_one(hz: int, tmp_path: Path) -> None:
+    """GP where it sees GPS satellites alone, GN with others: of the draft, which named one talker, half of the fixes were left."""
+
+    def bodies(k: int) -> list[str]:
+        talker = "GN" if k // 20 % 2 else "GP"
+        place = ahead(k, 5.0 / hz)
+        return [
+            f"{talker}GGA,120000.00,{place},1,09,0.9,10.0,M,30.0,M,,",
+            f"{talker}RMC,120000.00,A,{place},{5.0 / nmea.KNOT_MPS:.3f},0.0,141123,,,A",
+        ]
+
+    bag, drafted = lines_bag(tmp_path / "run", bodies, 100, S // hz), tmp_path / "vessel.yaml"
+    drafted.write_text(draft_config(inspect_bag(bag)))
+    config = load_config(drafted, KINDS)
+    used = {
+        name: s.nmea for name, s in {**config.of_kind("gnss"), **config.of_kind("gnss_velocity")}.items() if s.enabled
+    }
+    assert used == {"gnss": ("GPGGA", "GNGGA"), "gnss_velocity": ("GPRMC", "GNRMC")}
+    measured = read_recording(bag, config).measurements
+    assert len([m for m in measured if isinstance(m, GnssPosition)]) == 100
+    assert len([m for m in measured if isinstance(m, GnssVelocity)]) == 100
+
+
+@pytest.mark.parametrize("apart_ns", [0, S // 2])
+@pytest.mark.parametrize("every", [1, 5])
+def test_two_receivers_on_a_line_stay_two(every: int, apart_ns: int, tmp_path: Path) -> None:
+    make, items = Messages(2), list[Item]()
+    for k in range(100):
+        at = 1_700_000_000 * S + k * S
+        gga = f"GGA,120000.00,{ahead(k)},1,09,0.9,10.0,M,30.0,M,,"
+        items.append(("/line", at, make.text(sealed("GN" + gga))))
+        if k % every == 0:
+            items.append(("/line", at + apart_ns, make.text(sealed("GP" + gga))))
+    seen = inspect_bag(write_bag(tmp_path / "run", make, items))
+    assert [g.topic for g in seen.gnss] == ["/line GNGGA", "/line GPGGA"]
+
+
+def test_a_sensor_that_hears_nothing_says_so_of_its_own_sentences(tmp_path: Path) -> None:
+    """Most of what is on the line is for others, and no reason."""
+
+    def bodies(k: int) -> list[str]:
+        return [f"GPGLL,{ahead(k)},120000,A,A", "GPGSV,1,1,01,01,40,083,46", "GPVTG,,T,,M,,N,,K,N"]
+
+    sensors = {
+        "gnss": {"kind": "gnss", "topic": "/line", "nmea": ["GLL"]},
+        "gnss_velocity": {"kind": "gnss_velocity", "topic": "/line", "nmea": ["VTG"]},
+    }
+    config = parse_config({"vessel": "boat", "sensors": sensors}, KINDS, "vessel.yaml")
+    warnings = read_recording(lines_bag(tmp_path / "run", bodies, 50), config).warnings
+    assert "gnss_velocity: none of the 150 messages on /line could be used, mostly: VTG: no fix" in warnings
 
 
 def test_messages_of_other_packages_say_the_same(tmp_path: Path) -> None:

@@ -115,10 +115,10 @@ def test_a_start_that_fails_keeps_the_ledger_complete(monkeypatch: pytest.Monkey
     base = base[: at_s(base, 13.0)]
     failures = [RuntimeError("planted")]
 
-    def fails_once(*arguments: Any) -> Any:
+    def fails_once(*arguments: Any, **named: Any) -> Any:
         if failures:
             raise failures.pop()
-        return live_problem(*arguments)
+        return live_problem(*arguments, **named)
 
     monkeypatch.setattr("graphloc.online._tracking.live_problem", fails_once)
     fed = whole(base, online)

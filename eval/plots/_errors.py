@@ -61,18 +61,18 @@ def error_over_time(
     largest_m: dict[str, float] = {}
     for who, estimate, colour in reversed(_named(solution, filters)):  # ours last, on top
         if recording.truth is not None:
-            stamps, error, turned, _, _ = errors(estimate, recording.truth)
-            size = np.hypot(error[:, 0], error[:, 1])
+            off = errors(estimate, recording.truth)
+            size = off.horizontal_m
             width = 2.0 if who == solution.name else 1.3
-            for marks, value in ((position, size), (heading, np.degrees(np.abs(turned)))):
+            for marks, value in ((position, size), (heading, np.degrees(np.abs(off.heading_rad)))):
                 at = peaks(value)
-                s = seconds_since(start, stamps[at])
+                s = seconds_since(start, off.stamps_ns[at])
                 marks.append(Line(name=who, x=s, y=value[at], colour=colour, width=width))
         elif held:
-            stamps, error, _ = held_out_errors(estimate, held, solution.datum, levers_m)
-            size = np.hypot(error[:, 0], error[:, 1])
+            fixes = held_out_errors(estimate, held, solution.datum, levers_m)
+            size = fixes.horizontal_m
             at = peaks(size)
-            where = seconds_since(start, stamps[at])
+            where = seconds_since(start, fixes.stamps_ns[at])
             position.append(Points(name=f"{who}, held-out", x=where, y=size[at], colour=colour))
         else:
             continue
@@ -180,5 +180,6 @@ def coverage(recording: Recording, solution: Solution, filters: Sequence[FilterR
 
 
 def _nees(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], Array] | None:
-    stamps, error, _, there, _ = errors(estimate, truth)
-    return None if there.cov is None else (stamps, squared_over_covariance(error, there.cov))
+    off = errors(estimate, truth)
+    cov = off.estimate.cov
+    return None if cov is None else (off.stamps_ns, squared_over_covariance(off.position_m, cov))

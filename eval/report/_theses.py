@@ -76,10 +76,9 @@ def _gnss_error_m(data: ReportData, truth: Trajectory) -> list[tuple[str, float,
         if fixes:
             lever_m = mount_of(name, data.config.sensors[name], data.recording.mounts)[0]
             try:
-                _, error, _ = held_out_errors(truth, fixes, data.solution.datum, {name: lever_m})
+                off = held_out_errors(truth, fixes, data.solution.datum, {name: lever_m}).horizontal_m
             except NoCommonTimeError:
                 continue
-            off = np.hypot(error[:, 0], error[:, 1])
             found.append((name, float(np.sqrt(np.mean(off**2))), float(off.max())))
     return found
 

@@ -202,8 +202,8 @@ def _errors_of_both(data: ReportData, ours: Trajectory, theirs: Trajectory) -> t
     held = [m for m, both in zip(data.held, ours.covers(at) & theirs.covers(at), strict=True) if both]
     if not held:
         return None
-    first, second = (held_out_errors(t, held, data.solution.datum, data.levers_m)[1] for t in (ours, theirs))
-    return _away(first), _away(second)
+    first, second = (held_out_errors(t, held, data.solution.datum, data.levers_m) for t in (ours, theirs))
+    return first.horizontal_m, second.horizontal_m
 
 
 def _away(error: Array) -> Array:
@@ -218,11 +218,11 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
     """Yield the distance of the online track from the offline one, where there is no truth."""
     if solution is not data.online or data.recording.truth is not None:
         return
-    _, error, turned, there, _ = errors(solution.trajectory, data.solution.trajectory)
-    assert there.cov is not None
-    off = _away(error)
-    placed = float(np.mean(squared_over_covariance(error, there.cov) <= chi2_95(2)))
-    headed = float(np.mean(turned**2 <= chi2_95(1) * there.cov[:, 5, 5]))
+    found = errors(solution.trajectory, data.solution.trajectory)
+    off, cov = found.horizontal_m, found.estimate.cov
+    assert cov is not None
+    placed = float(np.mean(squared_over_covariance(found.position_m, cov) <= chi2_95(2)))
+    headed = float(np.mean(found.heading_rad**2 <= chi2_95(1) * cov[:, 5, 5]))
     short = min(placed, headed) < _HOLDS_OFFLINE
     trust = Trust.NO if placed < _NOT_COVERED else Trust.WITH_CARE if short else Trust.YES
     said = "; honest bounds hold it for 95 % or more, as offline knows more: these are too small" if short else ""

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.frames import Array
 
 _STEP_S = 0.02  # knots of the velocity spline
+_WAVES = 12  # sinusoids that stand for a sea
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +34,15 @@ class Waves:
         return np.asarray(np.sin(angle) @ (self.amplitude * self.omega**derivative))
 
     @staticmethod
-    def jonswap(rng: np.random.Generator, rms: float, peak_s: float, count: int = 12) -> Waves:
+    def jonswap(rng: np.random.Generator, rms: float, peak_s: float) -> Waves:
         """Draw waves whose sum has a standard deviation `rms`, spectrum JONSWAP (gamma 3.3), peak period in s."""
         peak = 2.0 * np.pi / peak_s
-        omega = peak * np.sort(rng.uniform(0.6, 2.2, count))
+        omega = peak * np.sort(rng.uniform(0.6, 2.2, _WAVES))
         width = np.where(omega <= peak, 0.07, 0.09)
         bump = 3.3 ** np.exp(-((omega / peak - 1.0) ** 2) / (2.0 * width**2))
         power = omega**-5.0 * np.exp(-1.25 * (peak / omega) ** 4) * bump
         amplitude = np.sqrt(power / power.sum()) * rms * np.sqrt(2.0)
-        return Waves(amplitude, omega, rng.uniform(0.0, 2.0 * np.pi, count))
+        return Waves(amplitude, omega, rng.uniform(0.0, 2.0 * np.pi, _WAVES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +118,18 @@ def make_motion(
     velocity = CubicSpline(t, v)
     position = velocity.antiderivative()
     position.c[-1] += np.array(start_m) - position(0.0)
+    roll, pitch, heave = waves
     return Motion(
-        velocity, position, yaw, yaw_rate, waves[0], waves[1], waves[2], lean_per_mps2, CubicSpline(t, surge), tide_m
+        velocity=velocity,
+        position=position,
+        yaw=yaw,
+        yaw_rate=yaw_rate,
+        roll=roll,
+        pitch=pitch,
+        heave=heave,
+        lean_per_mps2=lean_per_mps2,
+        speed=CubicSpline(t, surge),
+        tide_m=tide_m,
     )
 
 
@@ -167,12 +178,12 @@ def make_way_motion(
     swing = Waves(*np.zeros((3, 1))) if swing is None else swing
     return make_motion(
         duration_s,
-        speed,
-        lambda s: way.heading(at(s), 1) * speed(s) + swing.at(s, 1),
-        float(way.heading(before) + swing.at(np.zeros(1))[0]),
-        sway_mps,
-        waves,
-        lean_per_mps2,
-        (way.start_m[0] + before * float(np.cos(first)), way.start_m[1] + before * float(np.sin(first))),
-        tide_m,
+        speed_mps=speed,
+        yaw_rate_radps=lambda s: way.heading(at(s), 1) * speed(s) + swing.at(s, 1),
+        yaw0_rad=float(way.heading(before) + swing.at(np.zeros(1))[0]),
+        sway_mps=sway_mps,
+        waves=waves,
+        lean_per_mps2=lean_per_mps2,
+        start_m=(way.start_m[0] + before * float(np.cos(first)), way.start_m[1] + before * float(np.sin(first))),
+        tide_m=tide_m,
     )

@@ -16,6 +16,7 @@ from graphloc.eval.simulate.rig import RigConfig
 from graphloc.frames import Array
 
 _CLEAR_M = 0.4  # from the hull to anything solid
+_LEAN_PER_MPS2 = 0.03  # rad of roll per m/s^2 across the vessel, in a turn
 _FASTEST_MPS = 15.0
 
 
@@ -47,7 +48,7 @@ def open_motion(s: Scenario, rng: np.random.Generator) -> Motion:
     sway, waves = _waves(s, rng)
     still = s.path == "still"
     return make_motion(
-        s.duration_s, speed, rate, rng.uniform(-np.pi, np.pi), sway.at if not still else zero, waves, 0.03
+        s.duration_s, speed, rate, rng.uniform(-np.pi, np.pi), sway.at if not still else zero, waves, _LEAN_PER_MPS2
     )
 
 
@@ -73,7 +74,15 @@ def harbour_motion(s: Scenario, harbour: Harbour, rig: RigConfig, rng: np.random
         wobble, yaw0 = Waves.jonswap(rng, 0.02, 25.0), float(rng.uniform(-np.pi, np.pi))
         start = (float(points[0, 0]), float(points[0, 1]))
         motion = make_motion(
-            s.duration_s, wobble.at, lambda t: 0.3 * wobble.at(t), yaw0, np.zeros_like, waves, 0.03, start, s.tide_m
+            s.duration_s,
+            speed_mps=wobble.at,
+            yaw_rate_radps=lambda t: 0.3 * wobble.at(t),
+            yaw0_rad=yaw0,
+            sway_mps=np.zeros_like,
+            waves=waves,
+            lean_per_mps2=_LEAN_PER_MPS2,
+            start_m=start,
+            tide_m=s.tide_m,
         )
     elif s.duration_s > s.route_s:
         raise ConfigError(
@@ -95,7 +104,7 @@ def _way_motion(
         swing = Waves.jonswap(rng, np.radians(1.0), 15.0)  # no helmsman holds a course to a hair
         shape = _docking if s.path == "dock" else _touring
         slowing = lambda t: shape(t / s.route_s)
-    motion = make_way_motion(s.route_s, way, slowing, sway.at, waves, 0.03, s.tide_m, swing)
+    motion = make_way_motion(s.route_s, way, slowing, sway.at, waves, _LEAN_PER_MPS2, s.tide_m, swing)
     fastest = float(np.abs(motion.speed(np.arange(0.0, s.duration_s, 0.5))).max())
     if fastest > _FASTEST_MPS:
         raise ConfigError(

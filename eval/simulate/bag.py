@@ -30,8 +30,8 @@ from graphloc.eval.simulate.docks import survey, tag_pose
 from graphloc.eval.simulate.lidar import scan
 from graphloc.eval.simulate.rig import RigCamera, RigLidar
 from graphloc.eval.simulate.scene import Scene, scene_of
+from graphloc.folders import fresh_folder
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, PoseFix
-from graphloc.outputs import fresh_folder
 from graphloc.recording import Progress, quiet
 
 _LATENCY_NS = {

@@ -27,6 +27,7 @@ EDGE_BINS, SHORE_BINS = 8, 12
 _EDGE_SIGMA_M, _SHORE_SIGMA_M = 0.25, 0.3
 _CANNY = (50.0, 130.0)
 _RIM_M = 0.75  # a segmented rim is that near to the shore
+_LIKE_WATER = 3.0  # sigmas of the colours of water, within which others are
 _MARGIN_M = 0.5  # the image's own rim is no edge
 
 
@@ -214,7 +215,7 @@ def coarse_patch(fine: Patch) -> Patch:
     )
 
 
-def segment_water(patch: Patch, free: Mask, limit: float = 3.0) -> Mask:
+def segment_water(patch: Patch, free: Mask) -> Mask:
     """Return where water is (rows, columns): cells similar to those that a LiDAR saw as free water, and connected to them.
 
     Robust colour statistics in LAB; a darker colour counts a fifth, so that water in shadow stays water. Blur keeps the rim some
@@ -237,7 +238,7 @@ def segment_water(patch: Patch, free: Mask, limit: float = 3.0) -> Mask:
     off[..., 1:] = (lab[..., 1:] - 128.0) * dimmed[..., None] - (mean[1:] - 128.0)
     off[..., 0] = np.where(off[..., 0] < 0.0, off[..., 0] / 5.0, off[..., 0])
     white = off @ np.linalg.cholesky(np.linalg.inv(cov)).astype(np.float32)
-    like = ((np.square(white).sum(axis=2) < limit**2) & patch.inside).astype(np.uint8)
+    like = ((np.square(white).sum(axis=2) < _LIKE_WATER**2) & patch.inside).astype(np.uint8)
     like = cv2.morphologyEx(cv2.morphologyEx(like, cv2.MORPH_OPEN, _disc(1)), cv2.MORPH_CLOSE, _disc(3))
     _, labels = cv2.connectedComponents(like)
     touched = np.zeros(labels.max() + 1, dtype=bool)

@@ -19,6 +19,7 @@ from graphloc.frames import Array
 _CELL_M = 0.25
 _DRY_M = 0.3  # BL: what is lower is water
 _BOAT_M = 2.0  # boats end there, or a metre above
+_SHORE_M = 2.5  # below that height, returns are of what bounds the water
 _NEAR_M = 1.25  # neighbours that make a line
 _SAME_LINE_RAD, _SAME_LINE_M = np.radians(15.0), 0.3
 _SECTORS = 360
@@ -74,7 +75,7 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
     face = (high - low > 0.25) & (count >= 3)
     at = cells[face]
     direction, share = _lines(at, _NEAR_M)
-    shore, to_land = _first_returns(p[dry], origin[dry], low_limit=2.5)
+    shore, to_land = _first_returns(p[dry], origin[dry])
     return Outline(
         faces_m=at,
         line_rad=direction,
@@ -131,9 +132,9 @@ def _lines(at: Array, near_m: float) -> tuple[Array, Array]:
     return np.asarray(direction), np.asarray(1.0 / np.sqrt(np.bincount(line)[line]))
 
 
-def _first_returns(p: Array, origin: Array, low_limit: float) -> tuple[Array, Array]:
+def _first_returns(p: Array, origin: Array) -> tuple[Array, Array]:
     """Return the nearest object in each direction that rises out of the water, and the direction (rad)."""
-    near = p[:, 2] < low_limit
+    near = p[:, 2] < _SHORE_M
     d = p[near, :2]
     away, angle = np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0])
     sector = np.floor((angle + np.pi) / (2.0 * np.pi) * _SECTORS).astype(int) % _SECTORS

@@ -60,12 +60,10 @@ class VectorMap:
     Attributes:
         segments_m: (S, 2, 2) ends east, north of each straight segment.
         to_land_rad: (S,) direction across the line towards land, from east, counter-clockwise; NaN if unknown.
-        points_left: number of points in the file that are ignored because they are not lines.
     """
 
     segments_m: Array
     to_land_rad: Array
-    points_left: int = 0
 
     def around(self, centre_m: Array, half_m: float) -> VectorMap:
         """Return the segments, whole, that may intersect the square of `half_m` around a point (2,) in world.
@@ -302,7 +300,7 @@ def _segments(found: _Found, p_m: Array, degrees: Array) -> VectorMap:
         raise ValueError("no piece of its lines has a length of up to 50 km: draw them finer, near the run")
     keep = useful & ~_contradicted(ends, left)
     to_land = np.arctan2(step[:, 1], step[:, 0]) + np.where(left == 0.0, np.nan, left * 0.5 * np.pi)
-    return VectorMap(ends[keep], wrap_angle(to_land[keep]), found.points)
+    return VectorMap(ends[keep], wrap_angle(to_land[keep]))
 
 
 def _contradicted(ends: Array, left: Array) -> NDArray[np.bool_]:

@@ -15,6 +15,7 @@ from graphloc import found_tags, outputs
 from graphloc.app._run import Run, levers_m
 from graphloc.eval import metrics, report
 from graphloc.eval.docking import docking_table
+from graphloc.folders import fresh_folder
 from graphloc.measurements import TagSighting
 from graphloc.trajectory import Trajectory
 
@@ -92,7 +93,7 @@ def write(
 ) -> Path:
     """Write the run folder with its report, and its figures as PNG and SVG if asked; return the report's path."""
     data = report_data(run, command)
-    with outputs.fresh_folder(folder, overwrite=overwrite) as fresh:
+    with fresh_folder(folder, overwrite=overwrite, mark=outputs.MARK) as fresh:
         outputs.write_run(
             fresh,
             run.solution,

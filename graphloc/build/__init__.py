@@ -24,16 +24,12 @@ from graphloc.build._chains import (
     without_drift,
 )
 from graphloc.build._graph import Decided, Decisions, Level, Past, StartPrior, build_graph, state_keys
+from graphloc.build._layout import Mounts, company_of, make_problem, mount_of, slow_or_left_out
 from graphloc.build._problem import (
-    Mounts,
     Problem,
     Stream,
     bridged,
-    company_of,
-    make_problem,
-    mount_of,
     noisier_imu,
-    slow_or_left_out,
     with_imu_noise,
     with_noise_scale,
     with_sensor_noise,

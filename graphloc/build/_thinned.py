@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build._attach import constant_keys, nav_state
-from graphloc.build._problem import Problem, Stream, apart_s_of, with_links
+from graphloc.build._layout import apart_s_of
+from graphloc.build._problem import Problem, Stream, with_links
 from graphloc.time import duration_ns
 from graphloc.timeline import Timeline
 

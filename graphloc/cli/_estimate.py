@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from graphloc.cli._progress import progress, status_line
 from graphloc.cli._shared import (
     BagArgument,
     BagOptions,
@@ -19,9 +20,7 @@ from graphloc.cli._shared import (
     LagOption,
     OverwriteOption,
     RunOptions,
-    progress,
     smooth_bags,
-    status_line,
 )
 
 

@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from graphloc.cli._shared import FolderOptions, HoldOutOption, JobsOption, SeedOption, progress
+from graphloc.cli._progress import progress
+from graphloc.cli._shared import FolderOptions, HoldOutOption, JobsOption, SeedOption
 
 
 def ablate(options: FolderOptions, hold_out: HoldOutOption = None, jobs: JobsOption = None) -> None:

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options, progress bars and output that several commands share."""
+"""Options that several commands share, and what these commands do alike."""
 
 from __future__ import annotations
 
 import gc
-import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, Signature, signature
@@ -15,12 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from graphloc.cli._printed import print_run
+from graphloc.cli._progress import progress
 from graphloc.errors import GraphlocError
 
 if TYPE_CHECKING:  # these load gtsam and more, which would delay --help
     from graphloc.app import Run, Scans
     from graphloc.config import VesselConfig
-    from graphloc.eval.report import ReportData
     from graphloc.frontends._part import BagPart
     from graphloc.recording import Progress, Recording
 
@@ -54,103 +54,12 @@ SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Random seed: the
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the numbers as JSON.")]
 
 
-def progress() -> Progress:
-    """Return a progress bar on stderr; it is silent where that is not a terminal."""
-    from tqdm import tqdm
-
-    state: dict[str, tqdm[None]] = {}
-
-    def show(stage: str, done: int, total: int) -> None:
-        for name in [n for n in state if n != stage]:
-            state.pop(name).close()
-        if stage not in state:
-            state[stage] = tqdm(total=total, desc=stage, disable=None, file=sys.stderr, leave=False)
-        state[stage].n = done
-        state[stage].refresh()
-        if done >= total:
-            state.pop(stage).close()
-
-    return show
-
-
-def status_line() -> Callable[[float, float, object, str], None]:
-    """Return a line on stderr that shows the current estimate; it is silent where that is not a terminal."""
-    import time
-
-    from graphloc.estimate import Estimate
-
-    shown_s, live = 0.0, sys.stderr.isatty()
-    begun = time.monotonic()
-
-    def show(at_s: float, whole_s: float, estimate: object, waiting: str) -> None:
-        nonlocal shown_s
-        if not live or (time.monotonic() - shown_s < 0.2 and at_s < whole_s - 0.2):
-            return
-        shown_s = time.monotonic()
-        text = f"{at_s:7.1f} of {whole_s:.0f} s, {at_s / max(shown_s - begun, 1e-3):.1f} x: "
-        if isinstance(estimate, Estimate):
-            since = ", ".join(f"{name} {s:.1f} s" for name, s in estimate.since_agreed_s.items())
-            text += f"{estimate.health}, within {estimate.bound_95_m:.2f} m; agreed: {since}"
-        else:
-            text += f"waiting for {waiting}"
-        sys.stderr.write(f"\r\033[K{text[:118]}")
-        sys.stderr.flush()
-
-    return show
-
-
-def print_run(run: Run, page: Path, as_json: bool) -> None:
-    """Print the numbers, verdict, ledger counts and warnings of a run, then the path of its report."""
-    from graphloc import app as application
-
-    data = application.report_data(run)
-    if as_json:
-        typer.echo(json.dumps(_as_json(run, data), indent=2))
-    else:
-        for line in _as_text(run, data):
-            typer.echo(line)
-        for warning in data.warnings:
-            typer.echo(f"warning: {warning}", err=True)
-        for suggestion in run.calibration.suggestions if run.calibration is not None else ():
-            typer.echo(f"calibration: {suggestion}", err=True)
-    typer.echo(str(page))
-
-
-def _as_json(run: Run, data: ReportData) -> dict[str, object]:
-    from graphloc.eval import report
-
-    tracks = report.verdict(data).tracks
-    result: dict[str, object] = {table.title: table.as_dict() for table in data.tables}
-    result |= {
-        "verdict": {t.name: {"said": t.trust.said, "why": [r.text for r in t.reasons]} for t in tracks},
-        "ledger": run.solution.ledger.counts(),
-        "converged": run.solution.stats.converged,
-        "warnings": data.warnings,
-    }
-    if run.calibration is not None:
-        result["calibration"] = run.calibration.as_dict()
-    return result
-
-
-def _as_text(run: Run, data: ReportData) -> Iterator[str]:
-    from graphloc.eval import report
-
-    yield from (table.as_text() for table in data.tables)
-    if not data.tables:
-        yield data.truth_statement
-    for track in report.verdict(data).tracks:
-        yield f"{track.name}: {track.trust.said}. {track.accuracy}"
-        yield from (f"  {reason.text}" for reason in track.reasons if reason.trust is not report.Trust.YES)
-    for name, counts in run.solution.ledger.counts().items():
-        yield f"  {name}: " + ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
-
-
 def _check_rerun(path: Path, overwrite: bool) -> None:
     """Refuse a rerun recording that could not be written, before the run is solved."""
     from graphloc.errors import OutputError
     from graphloc.eval.rerun_log import make_folder
     from graphloc.extras import need
-    from graphloc.outputs import check_writable
+    from graphloc.folders import check_writable
 
     need("rerun", "rerun")
     if path.is_dir() or (path.exists() and not overwrite):
@@ -203,9 +112,9 @@ class FolderOptions(BagOptions):
         Raises:
             OutputError: it exists, or the disk refuses.
         """
-        from graphloc import outputs
+        from graphloc.folders import check_folder
 
-        outputs.check_folder(self.out, overwrite=self.overwrite, mark=mark)
+        check_folder(self.out, overwrite=self.overwrite, mark=mark)
 
     def write_page(self, page: str, mark: str, write: Callable[[Path, str], None], summary: Sequence[str]) -> None:
         """Write the folder and print a summary of it.
@@ -214,9 +123,9 @@ class FolderOptions(BagOptions):
             page: name of the page. mark: as for `check`; it holds JSON, which is printed for --json.
             write: fills a folder, given the command line. summary: lines to print otherwise.
         """
-        from graphloc import outputs
+        from graphloc.folders import fresh_folder
 
-        with outputs.fresh_folder(self.out, overwrite=self.overwrite, mark=mark) as fresh:
+        with fresh_folder(self.out, overwrite=self.overwrite, mark=mark) as fresh:
             write(fresh, " ".join(sys.argv[1:]))
         if self.as_json:
             typer.echo((self.out / mark).read_text(encoding="utf-8"), nl=False)

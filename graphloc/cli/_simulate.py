@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from graphloc.cli._shared import OutOption, OverwriteOption, RunOptions, SeedOption, progress, smooth_bags
+from graphloc.cli._progress import progress
+from graphloc.cli._shared import OutOption, OverwriteOption, RunOptions, SeedOption, smooth_bags
 
 
 def pairs(changes: list[str]) -> dict[str, str]:
@@ -44,15 +45,15 @@ def simulate(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write a simulated harbour run: bag, vessel.yaml, aerial image, tag survey and ground truth."""
-    from graphloc import outputs
     from graphloc.errors import ConfigError
     from graphloc.eval.simulate import find_scenario
     from graphloc.eval.simulate import simulate as run_simulation
     from graphloc.eval.simulate.bag import TRUTH, write_bag
+    from graphloc.folders import check_folder
 
     if storage not in ("", "mcap", "sqlite3") or (storage and ros == 1):
         raise ConfigError(f"--storage {storage}: choose mcap or sqlite3, and ROS 2")
-    outputs.check_folder(out, overwrite=overwrite, mark=TRUTH)
+    check_folder(out, overwrite=overwrite, mark=TRUTH)
     named = {key: value for key, value in (("harbour", harbour), ("rig", rig)) if value}
     run = run_simulation(find_scenario(scenario, {**named, **pairs(changes or [])}), seed)
     bag, config = write_bag(run, out, ros=ros, storage=storage or "mcap", overwrite=overwrite, progress=progress())

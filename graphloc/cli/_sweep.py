@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from graphloc.cli._shared import HoldOutOption, OutOption, OverwriteOption, Stopped, progress
+from graphloc.cli._progress import progress
+from graphloc.cli._shared import HoldOutOption, OutOption, OverwriteOption, Stopped
 
 if TYPE_CHECKING:
     from graphloc.job import Job

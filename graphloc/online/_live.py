@@ -231,6 +231,7 @@ class LiveProblem:
 def live_problem(
     setup: Setup,
     datum: Datum,
+    *,
     imu: ImuSeries,
     start_ns: int,
     imu_config: Any,
@@ -242,7 +243,8 @@ def live_problem(
     """Return a problem whose first state is at `start_ns`.
 
     Args:
-        imu: the samples known from there on. imu_config: with the noise that they have, up to `noise_scale`. jump_detectors: by sensor; missing ones are added.
+        imu: the samples known from there on. imu_config: with the noise that they have, up to `noise_scale`.
+        jump_detectors: by sensor; missing ones are added.
         slow_known: names of the sensors whose slow error is known at the start.
     """
     config, rows, mounts = setup.config, setup.rows, setup.mounts
@@ -263,9 +265,18 @@ def live_problem(
             slow = without_drift(left_out)
         scatter = Scatter(jumps=slow is not None and slow.jumps)
         streams[name] = LiveStream(
-            number, name, row, block, slow, left_out, row.constants(block), mount, scatter=scatter,
-            jump_detector=detector, jumps=detector.jumps,
-        )  # fmt: skip
+            number=number,
+            name=name,
+            row=row,
+            config=block,
+            slow=slow,
+            left_out=left_out,
+            constants=row.constants(block),
+            mount=mount,
+            scatter=scatter,
+            jump_detector=detector,
+            jumps=detector.jumps,
+        )
     return LiveProblem(
         config=config,
         datum=datum,

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 
 from graphloc import keys, origin
-from graphloc.build import build_graph, company_of, make_problem
+from graphloc.build import Problem, build_graph, company_of, make_problem
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
 from graphloc.ledger import LedgerRow
@@ -121,38 +121,19 @@ def _missing(setup: Setup, recording: Recording, datum: Datum) -> str:
 
 
 def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
+    """Return the start as the batch solver solves it, or what it waits for."""
     config, rows = setup.config, setup.rows
     whole = origin.with_synthetic(recording, config, datum, rows)
     problem = make_problem(whole, config, datum, rows, setup.inertial, company_of(config, rows))
     result = solve_batch(problem)
-    span_s = (problem.timeline.stamps_ns[-1] - problem.timeline.stamps_ns[0]) * 1e-9
+    span_s = _span_s(result)
     if result.noise_scale > LARGEST_NOISE_SCALE and span_s < _LONGEST_WAIT_S:
         return "data in which the IMU and the other sensors agree"
-    if span_s < _CHOICE_WAIT_S:
-        for stream in problem.streams:
-            weights = [result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))]
-            agreeing = sum(weight >= AGREES for weight in weights)
-            doubtful = [m for m in stream.measurements if stream.row.false is not None
-                        and stream.row.false(m, stream.config).probability > _DOUBTFUL]  # fmt: skip
-            if len(doubtful) > 1 and (agreeing < _AGREEING or agreeing < _SHARE * len(weights)):
-                return f"{_AGREEING} measurements of {stream.name} that agree with each other ({agreeing} of {len(weights)} do)"
-    last = keys.pose(len(problem.timeline) - 1)
-    R = result.values.atPose3(last).rotation().matrix()
-    linear_var = world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]
-    sigma = min(float(np.sqrt(max(linear_var, result.heading_var[-1]))), ANY_HEADING_RAD)
-    heading, last_ns = None, int(problem.timeline.stamps_ns[-1])
-    drift_radps = _vertical_bias_sigma(problem.R_body_imu, result)
-    if config.start.heading_deg is not None and not _measured(setup, recording, datum):
-        why = "the heading is a guess: only `start.heading_deg` told it, and the gyroscope has carried it since"
-        heading = UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=sigma, drift_radps=drift_radps)
-    elif result.headings > 1 or sigma > DOUBTFUL_RAD:
-        found = f"the motion so far tells it to {np.degrees(sigma):.0f} deg (1 sigma)"
-        if result.headings > 1:
-            found += f", {result.headings} candidates explain it"
-        if span_s < _LONGEST_WAIT_S:
-            return f"a heading: {found}; turn, add a heading sensor or set `start.heading_deg`"
-        why = f"the heading is a guess: {found}"
-        heading = UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=ANY_HEADING_RAD, drift_radps=drift_radps)
+    if span_s < _CHOICE_WAIT_S and (undecided := _undecided(problem, result)):
+        return undecided
+    heading = _heading(setup, recording, datum, result)
+    if isinstance(heading, str):
+        return heading
     heights = {
         name: origin.height_m(recording, config, sensor.height_m, datum)
         for row in rows
@@ -185,6 +166,45 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         warnings=tuple(noise_warnings(problem, result)),
         rows=tuple(before),
     )
+
+
+def _span_s(result: BatchResult) -> float:
+    stamps_ns = result.problem.timeline.stamps_ns
+    return float((stamps_ns[-1] - stamps_ns[0]) * 1e-9)
+
+
+def _undecided(problem: Problem, result: BatchResult) -> str:
+    """Return which measurements that are likely to be false have yet to agree with each other; empty where none have."""
+    for stream in problem.streams:
+        weights = [result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))]
+        agreeing = sum(weight >= AGREES for weight in weights)
+        doubtful = [m for m in stream.measurements if stream.row.false is not None
+                    and stream.row.false(m, stream.config).probability > _DOUBTFUL]  # fmt: skip
+        if len(doubtful) > 1 and (agreeing < _AGREEING or agreeing < _SHARE * len(weights)):
+            return f"{_AGREEING} measurements of {stream.name} that agree with each other ({agreeing} of {len(weights)} do)"
+    return ""
+
+
+def _heading(setup: Setup, recording: Recording, datum: Datum, result: BatchResult) -> UnmeasuredHeading | str | None:
+    """Return how far the heading may be off; None where sensors or the motion tell it, a text where the start waits for it."""
+    problem = result.problem
+    last = keys.pose(len(problem.timeline) - 1)
+    R = result.values.atPose3(last).rotation().matrix()
+    linear_var = world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]
+    sigma = min(float(np.sqrt(max(linear_var, result.heading_var[-1]))), ANY_HEADING_RAD)
+    last_ns, drift_radps = int(problem.timeline.stamps_ns[-1]), _vertical_bias_sigma(problem.R_body_imu, result)
+    if setup.config.start.heading_deg is not None and not _measured(setup, recording, datum):
+        why = "the heading is a guess: only `start.heading_deg` told it, and the gyroscope has carried it since"
+        return UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=sigma, drift_radps=drift_radps)
+    if not (result.headings > 1 or sigma > DOUBTFUL_RAD):
+        return None
+    found = f"the motion so far tells it to {np.degrees(sigma):.0f} deg (1 sigma)"
+    if result.headings > 1:
+        found += f", {result.headings} candidates explain it"
+    if _span_s(result) < _LONGEST_WAIT_S:
+        return f"a heading: {found}; turn, add a heading sensor or set `start.heading_deg`"
+    why = f"the heading is a guess: {found}"
+    return UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=ANY_HEADING_RAD, drift_radps=drift_radps)
 
 
 def _measured(setup: Setup, recording: Recording, datum: Datum) -> bool:

@@ -93,9 +93,16 @@ class Tracking:
         known = [m for m in samples if m.stamp_ns >= since_ns] or samples[-1:]
         assert persistent.datum is not None
         problem = live_problem(
-            setup, persistent.datum, series_of(known), anchor.stamp_ns, persistent.noise.of(setup.imu), persistent.noise.scale, persistent.motion_model,
-            persistent.jump_detectors, anchor.slow,
-        )  # fmt: skip
+            setup,
+            persistent.datum,
+            imu=series_of(known),
+            start_ns=anchor.stamp_ns,
+            imu_config=persistent.noise.of(setup.imu),
+            noise_scale=persistent.noise.scale,
+            motion_model=persistent.motion_model,
+            jump_detectors=persistent.jump_detectors,
+            slow_known=anchor.slow,
+        )
         if before is not None:
             for name, stream in problem.streams.items():
                 stream.scatter = before.problem.streams[name].scatter

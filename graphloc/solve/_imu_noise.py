@@ -30,7 +30,7 @@ Solved = tuple[Any, Array, Callable[[Array], Array]]
 _DRAWS = 16  # random vectors for the estimate of a trace
 _NOISE_ROUNDS, _LEAST_FREEDOM, _UNLIKELY = 5, 3.0, 1e-4
 _UNLIKELY_IF_SCATTERED = 1e-2  # where the samples themselves say that the noise is larger
-_FEWEST = 200  # samples that show how they scatter
+_FEWEST = 200  # samples that show how they scatter; how surely, ten times as many (`imu_scatter.FEWEST`)
 _MOST_STEP = 3.0  # that a round changes the noise by
 LEAST_TIMES = 1.5
 """The noise must be so many times as large to be taken."""

@@ -79,7 +79,7 @@ def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
         if start.by_motion:
             for candidate in candidates if start.tried else ():
                 # A prior about a heading that was only tried is no information: the candidates may go where the motion takes them.
-                candidate.prior = _start_prior(problem, start, _yaw(candidate.values, 0))
+                candidate.prior = _start_prior(problem, start, _first_yaw(candidate.values))
             told_apart = told_apart and _told(problem, start, candidates[0], until)
         if told_apart or last_window:
             best, heading_var = candidates[0], np.zeros(until + 1)
@@ -143,15 +143,15 @@ def _different(ranked: list[_Candidate]) -> list[_Candidate]:
     """Drop candidates that cost clearly more than the cheapest, or have converged to the heading of a cheaper one."""
     kept: list[_Candidate] = []
     for candidate in ranked:
-        yaw = _yaw(candidate.values, 0)
-        apart = all(abs(wrap_angle(yaw - _yaw(other.values, 0))) > np.radians(15.0) for other in kept)
+        yaw = _first_yaw(candidate.values)
+        apart = all(abs(wrap_angle(yaw - _first_yaw(other.values))) > np.radians(15.0) for other in kept)
         if apart and candidate.cost < ranked[0].cost + _COST_APART + 0.2 * ranked[0].cost:
             kept.append(candidate)
     return kept
 
 
-def _yaw(values: gtsam.Values, k: int) -> float:
-    return float(values.atPose3(keys.pose(k)).rotation().yaw())
+def _first_yaw(values: gtsam.Values) -> float:
+    return float(values.atPose3(keys.pose(0)).rotation().yaw())
 
 
 def _told(problem: Problem, start: Start, best: _Candidate, last: int) -> bool:
@@ -189,7 +189,7 @@ def _held(problem: Problem, start: Start, best: _Candidate, last: int, at: int, 
     cov = np.eye(6) * _FREE**2
     cov[:3, :3] = R.T @ np.diag([_FREE, _FREE, _HELD_RAD]) ** 2 @ R
     held = gtsam.PriorFactorPose3(keys.pose(at), middle, gtsam.noiseModel.Gaussian.Covariance(cov))
-    free = _start_prior(problem, replace(start, yaw_sigma_rad=_FREE), _yaw(values, 0))
+    free = _start_prior(problem, replace(start, yaw_sigma_rad=_FREE), _first_yaw(values))
     candidate = _Candidate(values, free if start.tried else best.prior)
     try:
         _solve_candidate(problem, candidate, last, held)

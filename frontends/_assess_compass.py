@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Assess a compass: whether an orientation is a heading, in which convention, and how far off the course."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array, wrap_angle
+from graphloc.frontends._assess import Courses, sane
+from graphloc.frontends._rejections import Rejection
+from graphloc.frontends._reports import CompassReport, two_antennas
+from graphloc.frontends._streams import TopicData
+from graphloc.frontends._turning import Turning, against_turning, follows_turning
+from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, QUATERNION, yaw_of_x_axis
+from graphloc.time import NS_PER_S
+
+_FEWEST, _FEWEST_COURSES = 10, 20
+_TURNS_DEG, _SAME_DEG = 5.0, 0.2  # how much two headings must turn, and may differ by, to be one
+_STRAIGHT_DEG = 20.0  # courses that turn by less tell no convention
+_BLOCK_S = 30
+_SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
+_RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
+
+
+def compass_report(stream: TopicData, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
+    """Return whether an orientation is a heading, and in which convention; None where there is none."""
+    keep = sane(stream)
+    if len(keep) < _FEWEST or _left_out(stream, stream.rows[keep]):
+        return None
+    stamps_ns, angle = headings(stream)
+    # Drivers of receivers with two antennas fill an Imu with the orientation alone.
+    gnss = not stream.rows[keep, :6].any() if stream.msgtype == IMU else two_antennas(stream.topic)
+    plain: dict[str, Any] = {
+        "topic": stream.topic,
+        "msgtype": stream.msgtype,
+        "unit": unit_of(stream),
+        "two_antennas": gnss,
+    }
+    untold: dict[str, Any] = {"offset_deg": None, "scatter_deg": None, "samples": 0}
+    if len(stamps_ns) < _FEWEST:
+        return CompassReport(**plain, **untold, usable=False, convention="enu", why="its messages give no yaw")
+    by_gyro = {1: "enu", -1: "ned"}.get(against_turning(turning, stamps_ns, angle))
+    heard = 0 if courses is None else int(np.searchsorted(courses.stamps_ns, stamps_ns[[0, -1]]) @ [-1, 1])
+    if courses is None or heard < _FEWEST_COURSES:
+        why = "no GNSS course in motion to check it against" + (", convention from the gyro" if by_gyro else "")
+        if courses is not None and not heard and stream.msgtype in NUMBERS:
+            why = "no GNSS course in motion at the times it was recorded (it has no stamp)"
+        named = stream.msgtype == QUATERNION  # a topic of bare orientations is meant as a compass
+        return CompassReport(**plain, **untold, usable=named, convention=by_gyro or "enu", why=why)
+    origin = int(stream.stamps_ns[keep[0]])
+    fit = _beside_courses(
+        (stamps_ns - origin) / NS_PER_S, angle, (courses.stamps_ns - origin) / NS_PER_S, courses, by_gyro
+    )
+    # Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
+    # an IMU's own orientation follows the gyroscope wherever north is.
+    fits_course = bool(fit.scatter_deg < _SCATTERS_DEG)
+    sideways = (
+        not fits_course
+        and by_gyro is not None
+        and (stream.msgtype != IMU or abs(fit.offset_deg) < _RELATIVE_DEG)
+        and follows_turning(turning, stamps_ns, _in_enu(angle, fit.convention))
+    )
+    return CompassReport(
+        **plain,
+        usable=fits_course or sideways,
+        convention=fit.convention,
+        offset_deg=None if sideways else fit.offset_deg,
+        scatter_deg=fit.scatter_deg,
+        leeway_deg=None if sideways else _wanders_deg(courses.stamps_ns, fit.apart_rad),
+        samples=len(fit.apart_rad),
+        why=_why(fit, by_gyro, fits_course=fits_course, sideways=sideways),
+    )
+
+
+def _left_out(stream: TopicData, rows: Array) -> bool:
+    """Return whether an Imu says that it has no orientation, or always the same one."""
+    if stream.msgtype != IMU:
+        return False
+    return float(np.median(rows[:, 12])) == -1.0 or len(np.unique(_quaternions(stream, rows), axis=0)) < 3
+
+
+def _in_enu(angle: Array, convention: str) -> Array:
+    return angle if convention == "enu" else np.pi / 2.0 - angle
+
+
+class _Fit(NamedTuple):
+    """A heading beside the courses of the fixes.
+
+    Attributes:
+        offset_deg, scatter_deg: heading minus course: its middle, and 1 sigma about it. apart_rad: (M,) the same, of each course.
+        straight: whether the courses turn too little to tell the convention.
+    """
+
+    convention: str
+    offset_deg: float
+    scatter_deg: float
+    apart_rad: Array
+    straight: bool
+
+
+def _beside_courses(t_s: Array, angle: Array, courses_s: Array, courses: Courses, by_gyro: str | None) -> _Fit:
+    """Return how a heading fits the courses, in the convention that the gyroscope tells, or that fits best.
+
+    Args:
+        t_s, angle: (N,) s; (N,) rad, unwrapped. courses_s: (M,), s, of the courses, from the same origin.
+    """
+    measured = np.interp(courses_s, t_s, angle)
+    apart = {convention: _in_enu(measured, convention) - courses.course_rad for convention in ("enu", "ned")}
+    fits = {convention: _middle_deg(off) for convention, off in apart.items()}
+    turned = float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(max(abs(np.exp(1j * courses.course_rad).mean()), 1e-9))))))
+    straight = turned < _STRAIGHT_DEG
+    # On a straight both conventions fit with some offset: the smaller offset is likelier.
+    convention = by_gyro or min(fits, key=lambda c: abs(fits[c][0]) if straight else fits[c][1])
+    return _Fit(convention, *fits[convention], apart[convention], straight)
+
+
+def _why(fit: _Fit, by_gyro: str | None, *, fits_course: bool, sideways: bool) -> str:
+    why = f"yaw minus GNSS course: {fit.offset_deg:+.0f} deg, scatter {fit.scatter_deg:.0f} deg over {len(fit.apart_rad)} courses"
+    if sideways:
+        return f"{why}: a vessel that often goes sideways, since it turns as the gyro does"
+    if not fits_course:
+        return f"{why}: a relative or a disturbed heading, or a vessel that often goes sideways"
+    if by_gyro:
+        return f"{why}; convention from the gyro"
+    return f"{why}, on a nearly straight track: the convention is not certain" if fit.straight else why
+
+
+def unit_of(stream: TopicData) -> str | None:
+    """Return the unit of a stream of bare numbers, if they are headings; None where it is none."""
+    if stream.msgtype not in NUMBERS:
+        return None
+    known = np.abs(stream.rows[np.isfinite(stream.rows)])
+    # Not the largest: a driver may say -999 while it knows none.
+    return "rad" if len(known) and float(np.percentile(known, 95)) < 2.0 * np.pi + 0.1 else "deg"
+
+
+def _quaternions(stream: TopicData, rows: Array) -> Array:
+    if unit := unit_of(stream):
+        angle = np.radians(rows[:, 0]) if unit == "deg" else rows[:, 0]
+        half = np.where(np.abs(angle) <= MOST_TURNS * 2.0 * np.pi, angle, np.nan) / 2.0
+        return np.column_stack([0.0 * half, 0.0 * half, np.sin(half), np.cos(half)])
+    return rows[:, 6:10] if stream.msgtype == IMU else rows[:, :4]
+
+
+def headings(stream: TopicData) -> tuple[NDArray[np.int64], Array]:
+    """Return stamps (N,) and unwrapped yaw (N,), rad, as the messages say it, of those that say one."""
+    keep = sane(stream)
+    yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in _quaternions(stream, stream.rows[keep])]
+    good = np.array([not isinstance(y, Rejection) for y in yaw], dtype=bool)
+    return stream.stamps_ns[keep][good], np.unwrap(np.array([y for y in yaw if not isinstance(y, Rejection)]))
+
+
+def says_the_same(first: TopicData, second: TopicData, *, mirrored: bool) -> bool:
+    """Return whether two headings are one, but for an offset: two devices never agree so closely while the craft turns.
+
+    Args:
+        mirrored: whether one of them grows as the other falls.
+    """
+    (at, a), (there, b) = headings(first), headings(second)
+    if len(at) < 10:
+        return False
+    inside = (there >= at[0]) & (there <= at[-1])
+    there, b = there[inside], b[inside]
+    if len(there) < 10:
+        return False
+    a = np.interp((there - at[0]) / NS_PER_S, (at - at[0]) / NS_PER_S, a)
+    turns, apart = (_middle_deg(v)[1] for v in (b, a + b if mirrored else a - b))
+    return turns > _TURNS_DEG and apart < _SAME_DEG
+
+
+def _middle_deg(angle: Array) -> tuple[float, float]:
+    """Return a robust mean and standard deviation of angles (N,), deg: fixes may jump or be frozen."""
+    mean = float(np.angle(np.exp(1j * angle).mean()))
+    middle = mean + float(np.median(wrap_angle(angle - mean)))
+    scatter = 1.4826 * float(np.median(np.abs(wrap_angle(angle - middle))))
+    return float(np.degrees(wrap_angle(middle))), float(np.degrees(scatter))
+
+
+def _wanders_deg(stamps_ns: NDArray[np.int64], angle: Array) -> float | None:
+    """Return how far the middle of angles (N,), rad, differs from block to block, 1 sigma, deg; None of fewer than three."""
+    block = (stamps_ns - stamps_ns[0]) // (_BLOCK_S * NS_PER_S)
+    own = [angle[block == k] for k in np.unique(block)]
+    middles = np.radians([_middle_deg(part)[0] for part in own if len(part) >= 5])
+    if len(middles) < 3:
+        return None
+    return float(np.degrees(np.std(wrap_angle(middles - middles[0]), ddof=1)))

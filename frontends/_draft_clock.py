@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lines of a drafted `vessel.yaml` on the clock of a sensor: which stamps are taken, and what is added to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from graphloc.frontends._clock import EPOCH_LIMIT_S, MOST_ON_ITS_WAY_S, Clock, behind_s, reference_of
+from graphloc.frontends._reports import GnssReport, Inspection, MountedTopic, TopicReport
+from graphloc.frontends.decode import UNSTAMPED
+
+_OWN_CLOCK_S = 10.0  # no message takes as long
+_FEWEST_STAMPS = 10  # that tell of a clock
+_STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
+_STAMPS = "stamped when measured, or later? estimated with the run; 0 where a receiver's clock stamps"
+_SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clocks are set; poses may take their time
+
+
+def with_clock(block: list[str], inspection: Inspection) -> list[str]:
+    """Return the block of a sensor with lines on its clock, where there is anything to say."""
+    kind, topic = _value(block, "kind"), _value(block, "topic")
+    topics = {t.topic.partition(" ")[0]: t for t in inspection.topics}
+    if topic not in topics:
+        return block
+    own = topics[topic]
+    return [*block, *_stamp_lines(kind, own), *_drift_lines(own), *_offset_lines(kind, topic, topics, inspection)]
+
+
+def _value(block: list[str], key: str) -> str:
+    return next((line.split()[1] for line in block if line.startswith(f"  {key}:")), "")
+
+
+def _stamp_lines(kind: str, own: TopicReport) -> list[str]:
+    """Say where recording times stand for stamps."""
+    if not own.recorded:
+        return []
+    unknown = "" if kind == "gnss" else ", which no bound includes"
+    said = f"guess: its headers hold no stamps, or whole seconds only; recording times are late by as long as a message takes{unknown}"
+    return [f"  stamps: recorded  # {said}"]
+
+
+def _drift_lines(own: TopicReport) -> list[str]:
+    """Say how fast a clock drifts, by the recording times."""
+    ppm = own.drift_ppm
+    if not ppm:
+        return []
+    gained_s = 1e-6 * ppm * (own.span_s or 0.0)
+    said = (
+        f"it {'gains' if ppm > 0.0 else 'loses'} {abs(gained_s):.2f} s on the steadiest clock, by the recording times"
+    )
+    said += "" if ppm > 0.0 else "; 0 if its messages only took ever longer to come"
+    return [f"  clock_drift_ppm: {ppm:.1f}  # guess: {said}"]
+
+
+def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], inspection: Inspection) -> list[str]:
+    """Say what to add to the stamps: where a clock is off by the recording times, or stamps are late by the motion."""
+    clocks = {n: Clock(t.start_ns, t.latency_s[1]) for n, t in topics.items() if t.start_ns is not None and t.latency_s}
+    imu = next((clocks[i.topic] for i in inspection.imus if i.topic in clocks), None)
+    if imu is None or kind not in _SET or topic not in clocks:
+        return []
+    own = (c for n, c in clocks.items() if not topics[n].recorded and topics[n].msgtype not in UNSTAMPED)
+    reference = reference_of(imu, own)
+    told = inspection.gnss if kind == "gnss" else inspection.velocities if kind == "gnss_velocity" else ()
+    found = next((r for r in told if r.topic.partition(" ")[0] == topic and r.late_s), None)
+    late = found.late_s if found else None
+    unstamped = topics[topic].recorded or topics[topic].msgtype in UNSTAMPED
+    offset_s, why, sigma_s = 0.0, [], _ON_ITS_WAY_S if unstamped else _STAMPED_LATE_S
+    behind = behind_s(clocks[topic], imu, reference)
+    if abs(behind) > EPOCH_LIMIT_S:
+        offset_s, sigma_s = offset_s + behind, _ON_ITS_WAY_S
+        clock = "the IMU's" if reference is imu else "one that tells the date"
+        why.append(
+            f"its clock is {'behind' if behind > 0 else 'ahead of'} {clock}, by the recording times; how much longer one "
+            f"message takes than the other is in it{'' if kind == 'gnss' else ', which no bound includes'}"
+        )
+    if late is not None:
+        offset_s, sigma_s = offset_s + late[0], max(late[1], _STAMPED_LATE_S)
+        by = found.late_by if isinstance(found, GnssReport) and found.late_by.partition(" ")[0] != topic else ""
+        whose = f"the motion of {by}, taken for the same receiver's," if by else "its motion"
+        why.append(f"what the IMU feels fits {whose} {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
+        fixes_late = next((r.late_s[0] for r in inspection.gnss if r.late_s), 0.0)
+        if kind == "gnss_velocity" and late[0] < fixes_late - MOST_ON_ITS_WAY_S:
+            why.append(
+                "so late, it is filtered, and its error lasts: a larger default_sigma_mps, or none of it, may be better "
+                "(compare --hold-out)"
+            )
+    lines = [f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else []
+    if kind == "gnss":
+        lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}")
+    return lines
+
+
+def recorded_lines(inspection: Inspection, mounted: tuple[MountedTopic, ...]) -> list[str]:
+    """Say that recording times stand for the stamps of scans or images, where these have none, or are of a clock of their own.
+
+    Recording times are on the clock of the IMU, or on that which its stamps are set by, unless all stamps are of another time.
+    """
+    usual = [t.latency_s[1] for t in inspection.topics if t.latency_s and t.count >= _FEWEST_STAMPS]
+    if all(abs(latency_s) > EPOCH_LIMIT_S for latency_s in usual):
+        return []
+    for item in mounted:
+        if item.latency_s is None or abs(item.latency_s) > _OWN_CLOCK_S:
+            clock = (
+                "have no stamps" if item.latency_s is None else f"are stamped {item.latency_s:+.0f} s before they come"
+            )
+            return [f"  stamps: recorded  # guess: messages of {item.topic} {clock}; late by as long as one takes"]
+    return []

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the craft turned, by its gyroscope, and whether an angle turns with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+from graphloc.frontends._turns import without_line
+from graphloc.time import NS_PER_S
+
+_STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
+_FOLLOWS_DEG, _FOLLOWS = 8.0, 3.0  # most RMS of what a heading and the gyroscope differ by; turns over that
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turning:
+    """How the craft turned: times (N,) s since `origin_ns`, and the integral (N,) of its rate about up, rad."""
+
+    origin_ns: int
+    t_s: Array
+    turned_rad: Array
+
+
+def against_turning(
+    turning: Turning | None, at_ns: NDArray[np.int64], angle: Array, over_s: float = 2.0, clear: float = 0.5
+) -> int:
+    """Return +1 where an angle grows as the craft turns to port, -1 where it falls, 0 where nothing tells.
+
+    Args:
+        at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: time over which changes are compared: a gyro's bias
+            must be small beside them, and the angle's noise average out. clear: correlation that is believed.
+    """
+    at, own, turned = _beside(turning, at_ns, angle)
+    if len(at) < 20:
+        return 0
+    step = max(1, round(over_s / max(float(np.median(np.diff(at))), 1e-3)))
+    a, b = (v[step:] - v[:-step] for v in (own, turned))
+    power = float(np.sqrt((a**2).sum() * (b**2).sum()))
+    together = float((a * b).sum()) / power if power > 0.0 else 0.0
+    return int(np.sign(together)) if abs(together) > clear else 0
+
+
+def follows_turning(turning: Turning | None, at_ns: NDArray[np.int64], yaw: Array) -> bool:
+    """Return whether a heading turns as the gyroscope does, by far more than the two differ.
+
+    In blocks of two minutes, a straight line removed from each: the bias of the gyroscope, and what a heading is off by throughout.
+
+    Args:
+        at_ns: (N,), increasing. yaw: (N,) rad, unwrapped, positive to port.
+    """
+    at, own, turned = _beside(turning, at_ns, yaw)
+    apart, turns = [], []
+    blocks = (at - at[:1]) // _STEADY_S
+    for block in (blocks == k for k in np.unique(blocks)):
+        if block.sum() >= 20:
+            apart.append(without_line((own - turned)[block], at[block]))
+            turns.append(without_line(turned[block], at[block]))
+    if not apart:
+        return False
+    off_deg, turns_deg = (float(np.degrees(np.sqrt(np.mean(np.concatenate(part) ** 2)))) for part in (apart, turns))
+    return off_deg < min(_FOLLOWS_DEG, turns_deg / _FOLLOWS)
+
+
+def _beside(turning: Turning | None, at_ns: NDArray[np.int64], angle: Array) -> tuple[Array, Array, Array]:
+    """Return times (M,), s, of the angles that lie within a turning, these (M,) and the turning (M,) there; empty without one."""
+    if turning is None:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    at = (at_ns - turning.origin_ns) / NS_PER_S
+    inside = (at > turning.t_s[0]) & (at < turning.t_s[-1])
+    return at[inside], angle[inside], np.interp(at[inside], turning.t_s, turning.turned_rad)

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a recording to a problem: states are laid out in time, and each measurement attached to one."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.build._attach import Carry, state_of
+from graphloc.build._chains import without_drift
+from graphloc.build._problem import PositionJumps, Problem, Stream, inertial_factors, preintegrate
+from graphloc.build._usable import silent_sensors, sorted_out, usable_imu
+from graphloc.config import SensorConfig, VesselConfig
+from graphloc.frames import Array, Datum
+from graphloc.graph import InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.measurements import Measurement
+from graphloc.position_jumps import allowed_jump_m, position_jumps
+from graphloc.recording import Recording
+from graphloc.timeline import Timeline, make_timeline
+
+_NO_JUMPS: PositionJumps = np.zeros(0, dtype=np.int64), np.zeros(0)
+Mounts = Mapping[str, tuple[Array, Array]]  # by sensor, from /tf_static: t (3,), R (3, 3) in body
+
+
+def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Array]:
+    """Return the mount of a sensor in body (t (3,), m; R (3, 3)): from /tf_static where configured so."""
+    return mounts.get(name) or (config.mount.t_body_sensor_m, config.mount.R_body_sensor)
+
+
+def company_of(config: VesselConfig, rows: Sequence[Sensor], seen: Container[str] | None = None) -> int:
+    """Return how many sensors (of those in `seen`, if given) can separate each other's slow errors from motion."""
+    able = (name for row in rows if row.company for name in config.of_kind(row.kind))
+    return sum(seen is None or name in seen for name in able)
+
+
+def slow_or_left_out(row: Sensor, config: SensorConfig, company: int) -> tuple[SlowProcess | None, SlowProcess | None]:
+    """Return a sensor's slow state, and the one that is left out instead, as nothing could tell it from motion: one of them, or none.
+
+    Args:
+        company: how many sensors can separate each other's slow errors from motion.
+    """
+    slow = row.slow(config)
+    return (None, slow) if slow is not None and slow.needs_company and company < 2 else (slow, None)
+
+
+def make_problem(
+    recording: Recording,
+    config: VesselConfig,
+    datum: Datum,
+    rows: Sequence[Sensor],
+    inertial: InertialRow,
+    company: int | None = None,
+) -> Problem:
+    """Lay out the timeline, preintegrate, and attach every measurement.
+
+    Args:
+        company: how many sensors can separate each other's slow errors from motion; default: counted in the recording.
+
+    Raises:
+        SolveError: the recording has no usable IMU data.
+    """
+    imu = usable_imu(recording, config, inertial.kind)
+    t_body_imu, R = mount_of(imu.sensor, config.sensors[imu.sensor], recording.mounts)
+
+    def relink(imu_config: Any, noise_scale: float) -> InertialLink:
+        return inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale)
+
+    links = relink(config.sensors[imu.sensor], 1.0)
+    inside, rejected, warnings = sorted_out(recording, config, {row.kind for row in rows}, imu)
+    warnings += [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
+    timeline = make_timeline(int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]), inside, config.timeline)
+    preintegrated = preintegrate(timeline, links)
+    by_sensor: dict[str, list[Measurement]] = {}
+    for m in inside:
+        by_sensor.setdefault(m.sensor, []).append(m)
+    problem = Problem(
+        config=config,
+        datum=datum,
+        timeline=timeline,
+        imu=imu,
+        t_body_imu_m=t_body_imu,
+        R_body_imu=R,
+        relink=relink,
+        links=links,
+        noise_scale=1.0,
+        preintegrated=preintegrated,
+        inertial=inertial_factors(timeline, links, preintegrated),
+        streams=(),
+        rejected=tuple(rejected),
+        warnings=tuple(warnings),
+        silent=silent_sensors(recording, config, by_sensor, imu),
+    )
+    company = company_of(config, rows, by_sensor) if company is None else company
+    return replace(problem, streams=_streams(problem, rows, by_sensor, recording.mounts, company))
+
+
+def _streams(
+    problem: Problem,
+    rows: Sequence[Sensor],
+    by_sensor: Mapping[str, Sequence[Measurement]],
+    mounts: Mounts,
+    company: int,
+) -> tuple[Stream, ...]:
+    """Return the streams of the sensors that have measurements, attached to the states of a problem that has none yet."""
+    by_kind = {row.kind: row for row in rows}
+    alone = sum(by_kind[problem.config.sensors[name].kind].absolute for name in by_sensor) == 1
+    found = []
+    for number, (name, config) in enumerate(problem.config.sensors.items()):
+        if name not in by_sensor:
+            continue
+        row, own = by_kind[config.kind], by_sensor[name]
+        t, R = mount_of(name, config, mounts)
+        slow, left_out, jumps = _slow_and_jumps(row, config, own, problem.datum, company, alone=alone)
+        state, carry = _states_and_carries(own, problem.timeline, problem.links)
+        found.append(
+            Stream(
+                number=number,
+                name=name,
+                row=row,
+                config=config,
+                slow=slow,
+                left_out=left_out,
+                position_jumps=jumps,
+                constants=row.constants(config),
+                mount=gtsam.Pose3(gtsam.Rot3(R), t - problem.t_body_imu_m),
+                measurements=tuple(own),
+                state=state,
+                carry=carry,
+                gyro_radps=problem.links.gyro_at(np.array([m.stamp_ns for m in own])),
+                apart_s=apart_s_of(own),
+            )
+        )
+    return tuple(found)
+
+
+def _slow_and_jumps(
+    row: Sensor, config: SensorConfig, measurements: Sequence[Measurement], datum: Datum, company: int, *, alone: bool
+) -> tuple[SlowProcess | None, SlowProcess | None, PositionJumps]:
+    """Return `slow`, `left_out` and `position_jumps` of a `Stream`; `alone`: one sensor measures position."""
+    slow, left_out = slow_or_left_out(row, config, company)
+    jumps = _NO_JUMPS
+    if alone and slow is None and row.absolute and row.false is None:
+        jumps = _position_jumps(row, measurements, datum, allowed_jump_m(left_out))
+    if left_out is not None and len(jumps[0]):
+        slow, left_out = without_drift(left_out), None
+    return slow, left_out, jumps
+
+
+def _position_jumps(row: Sensor, measurements: Sequence[Measurement], datum: Datum, allowed_m: float) -> PositionJumps:
+    """Return stamps and sizes of the position jumps of the only sensor that measures position."""
+    hints = [(m.stamp_ns, row.hint(m, 0.0, datum)) for m in measurements]
+    told = [(n, hint) for n, hint in hints if np.isfinite(hint.p_world_m[:2]).all()]
+    stamps_ns = np.array([n for n, _ in told], dtype=np.int64)
+    places_m = np.array([hint.p_world_m[:2] for _, hint in told])
+    sigma_m = np.array([hint.p_sigma_m[:2].max() for _, hint in told])
+    return position_jumps(stamps_ns, places_m, sigma_m, allowed_m=allowed_m)
+
+
+def apart_s_of(measurements: Sequence[Measurement]) -> Array:
+    """Return the time since the measurement before, of M measurements (M,), s; inf for the first."""
+    stamps_ns = [m.stamp_ns for m in measurements]
+    return np.concatenate([[np.inf], np.diff(stamps_ns) * 1e-9])[: len(stamps_ns)]
+
+
+def _states_and_carries(
+    measurements: Sequence[Measurement], timeline: Timeline, links: InertialLink
+) -> tuple[NDArray[np.int64], tuple[Carry | None, ...]]:
+    """Return `state` and `carry` of a `Stream`."""
+    zero = gtsam.imuBias.ConstantBias()
+    state, carry, holes = [], [], links.gaps()
+    for m in measurements:
+        floor = timeline.floor(m.stamp_ns)
+        state.append(state_of(m, floor, timeline.nearest(m.stamp_ns), timeline.stamps_ns, holes))
+        at = int(timeline.stamps_ns[floor])
+        carry.append(None if m.stamp_ns <= at else (floor, links.integrate(at, m.stamp_ns, zero)))
+    return np.array(state, dtype=np.int64), tuple(carry)
