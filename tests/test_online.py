@@ -292,8 +292,9 @@ def test_starts_from_fix_and_compass() -> None:
 
 
 def test_starts_from_fixes_alone_once_the_vessel_has_moved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 8.5)  # not ten times: each solves all that there is
-    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
+    # Tried after 5, 10, 17 and 31 s, not every half second and more: each solves all that there is.
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 5.1)
+    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.55)
     run = slowly(
         simulate(
             replace(

@@ -243,7 +243,7 @@ def test_a_run_with_a_jump_that_the_bounds_do_not_cover_is_not_good() -> None:
     ("off_m", "restarts"),
     # 60 and 100 m are no outage to a track that is torn to one fix after another meanwhile: 87 and 148 m off, 15 and 24 m/s, in
     # bounds of half a metre, never called good, and there 8 s after a restart would be. Known, and not mended.
-    [(150.0, True), (100.0, False)],
+    [(300.0, True), (100.0, False)],
 )
 def test_a_jump_is_remembered_through_a_restart_online(off_m: float, restarts: bool) -> None:
     """Off by 150 m it is rejected for 15 s; then it was called good where it was 150 m off."""
