@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphloc.eval.simulate import Scenario, simulate
+from graphloc.eval import simulate as simulation
+from graphloc.eval.simulate import Scenario, find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.graph import Decision
 from graphloc.linear import factors_of
+from tests.slowly import simulate_slowly
 from tests.test_factors import attachment, values_of
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -21,7 +23,15 @@ ELSEWHERE = {"stream_client.py"}  # in test_stream.py; kitti/make_bag.py in test
 HERE = {"compare_in_memory.py", "online_loop.py", "smooth_a_bag.py", "use_a_new_sensor.py"}
 
 
+def lighter(name: str, changes: dict[str, str]) -> Scenario:
+    """The scenario of an example, with fewer measurements."""
+    return find_scenario(name, {**changes, "imu_hz": "50", "gnss_hz": "5", "compass_hz": "2"})
+
+
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str, *arguments: object) -> str:
+    """Run a script, on what it simulates in half the time; return what it prints."""
+    monkeypatch.setattr(simulation, "simulate", simulate_slowly)
+    monkeypatch.setattr(simulation, "find_scenario", lighter)
     monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
     monkeypatch.setattr(sys, "path", [*sys.path])
     runpy.run_path(str(EXAMPLES / name), run_name="__main__")

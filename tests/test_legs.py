@@ -23,20 +23,25 @@ from graphloc.solve._legs import overlap_ns, seams
 
 S = 10**9
 LEG_S = 60.0
-RATE_HZ = 5.0  # of states: half the time
+RATE_HZ, FEW_HZ = 5.0, 2.5  # of states: half the time, a quarter
 LOOPS = Scenario(path="loops", duration_s=130.0, noise="drift", imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0)
 
 
-def in_legs(config: VesselConfig, leg_s: float = LEG_S) -> VesselConfig:
-    timeline = config.timeline.model_copy(update={"rate_hz": RATE_HZ, "leg_s": leg_s})
+def in_legs(config: VesselConfig, leg_s: float, rate_hz: float) -> VesselConfig:
+    timeline = config.timeline.model_copy(update={"rate_hz": rate_hz, "leg_s": leg_s})
     return config.model_copy(update={"timeline": timeline})
 
 
-def solved(run: SimulatedRun, leg_s: float = LEG_S, measurements: tuple[Measurement, ...] | None = None) -> Solution:
+def solved(
+    run: SimulatedRun,
+    leg_s: float = LEG_S,
+    measurements: tuple[Measurement, ...] | None = None,
+    rate_hz: float = FEW_HZ,
+) -> Solution:
     recording = run.recording
     if measurements is not None:
         recording = replace(recording, measurements=measurements)
-    return app.smooth_recording(recording, in_legs(run.config, leg_s)).solution
+    return app.smooth_recording(recording, in_legs(run.config, leg_s, rate_hz)).solution
 
 
 def begin_ns(run: SimulatedRun) -> int:
@@ -51,12 +56,12 @@ def run() -> SimulatedRun:
 
 @pytest.fixture(scope="module")
 def whole(run: SimulatedRun) -> Solution:
-    return solved(run, 1000.0)
+    return solved(run, 1000.0, rate_hz=RATE_HZ)
 
 
 @pytest.fixture(scope="module")
 def legs(run: SimulatedRun) -> Solution:
-    return solved(run)
+    return solved(run, rate_hz=RATE_HZ)
 
 
 def test_legs_are_as_good_as_the_whole(run: SimulatedRun, whole: Solution, legs: Solution) -> None:

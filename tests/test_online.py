@@ -291,14 +291,10 @@ def test_starts_from_fix_and_compass() -> None:
     assert fed.errors_m[0] < 3.0
 
 
-@pytest.fixture
-def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A start that waits is tried twice in half a minute, not thirteen times: each solves all that there is."""
-    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 15.3)
-    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
-
-
-def test_starts_from_fixes_alone_once_the_vessel_has_moved() -> None:
+def test_starts_from_fixes_alone_once_the_vessel_has_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Tried after 5, 10, 17 and 31 s, not every half second and more: each solves all that there is.
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 5.1)
+    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.55)
     run = slowly(
         simulate(
             replace(

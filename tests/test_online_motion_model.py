@@ -95,7 +95,9 @@ def test_without_a_place_it_drifts_as_far_as_a_vessel_can_and_no_farther() -> No
 
     For six of them the IMU is silent, too: along which axes it moved there nobody knows.
     """
-    run = simulate(replace(Scenario(path="loops", noise="drift"), duration_s=115.0, imu_hz=50.0), 3)
+    run = simulate(
+        replace(Scenario(path="loops", noise="drift"), duration_s=115.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3
+    )
     config = with_few_states(run.config, rate_hz=2.5)
     lost_ns = int(run.truth.stamps_ns[0]) + 25 * SECOND
     kept = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < lost_ns)

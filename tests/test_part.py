@@ -281,7 +281,11 @@ def first_of(path: Path) -> int:
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return write_simulated(simulate(Scenario(duration_s=20.0), 3), tmp_path_factory.mktemp("part") / "bag", ros=2)
+    return write_simulated(
+        simulate(Scenario(duration_s=20.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3),
+        tmp_path_factory.mktemp("part") / "bag",
+        ros=2,
+    )
 
 
 def test_smooth_and_replay_a_part(
