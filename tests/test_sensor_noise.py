@@ -168,21 +168,18 @@ def test_a_snapshot_knows_what_sensors_scatter(tmp_path: Path) -> None:
     assert resumed.sensor_noise.times == {"matcher": found.sensor_noise["matcher"], "gnss": {}}
 
 
-def test_what_a_start_finds_is_handed_on() -> None:
+def test_what_a_start_finds_is_handed_on(tmp_path: Path) -> None:
     """Found anew by the window, it came 15 s later; and nothing was said of what the start took."""
     run = stating(matched(2, 8.0), GnssPosition, 0.1)
-    smoother = OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL)
+    smoother = OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, snapshot=tmp_path / "snapshot.json")
     said: list[str] = []
     for m in arrivals(run.recording):
         smoother.feed(m)
         said += [event.text for event in smoother.events()]
     (line,) = (text for text in said if "scatter" in text)
     assert line.startswith("gnss: ")
-    assert smoother._persistent.sensor_noise.times["gnss"]["sigma_scale"] == pytest.approx(10.0, rel=0.3)
-    assert smoother._tracking is not None
-    taken = smoother._tracking.lag.problem.config.sensors["gnss"]
-    assert isinstance(taken, GnssConfig)
-    assert taken.sigma_scale > 7.0
+    found = Snapshot.read(tmp_path / "snapshot.json", "imu").sensor_noise
+    assert found["gnss"] == {"sigma_scale": pytest.approx(10.0, rel=0.3)}
 
 
 def test_floors_are_raised_with_the_factor() -> None:
