@@ -9,6 +9,9 @@ from graphloc.frontends._clock import EPOCH_LIMIT_S, MOST_ON_ITS_WAY_S, Clock, b
 from graphloc.frontends._reports import GnssReport, Inspection, MountedTopic, TopicReport
 from graphloc.frontends.decode import UNSTAMPED
 
+_FILTERED_SIGMA_MPS = (
+    1.0  # of a velocity that is averaged over seconds: its error lasts as long, and would count as white
+)
 _OWN_CLOCK_S = 10.0  # no message takes as long
 _FEWEST_STAMPS = 10  # that tell of a clock
 _STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
@@ -78,13 +81,10 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
         by = found.late_by if isinstance(found, GnssReport) and found.late_by.partition(" ")[0] != topic else ""
         whose = f"the motion of {by}, taken for the same receiver's," if by else "its motion"
         why.append(f"what the IMU feels fits {whose} {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
-        fixes_late = next((r.late_s[0] for r in inspection.gnss if r.late_s), 0.0)
-        if kind == "gnss_velocity" and late[0] < fixes_late - MOST_ON_ITS_WAY_S:
-            why.append(
-                "so late, it is filtered, and its error lasts: a larger default_sigma_mps, or none of it, may be better "
-                "(compare --hold-out)"
-            )
     lines = [f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else []
+    fixes_late_s = next((r.late_s[0] for r in inspection.gnss if r.late_s), 0.0)
+    if kind == "gnss_velocity" and late is not None and late[0] < fixes_late_s - MOST_ON_ITS_WAY_S:
+        lines.append(f"  min_sigma_mps: {_FILTERED_SIGMA_MPS}  # guess: so late, it is filtered, and its error lasts")
     if kind == "gnss":
         lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}")
     return lines

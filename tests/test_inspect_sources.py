@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from graphloc.config import CompassConfig, GnssConfig, VesselConfig, parse_config
+from graphloc.config import CompassConfig, GnssConfig, VelocityConfig, VesselConfig, parse_config
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
@@ -462,3 +462,6 @@ def test_a_velocity_that_is_filtered_tells_nothing_of_the_fixes(over_s: float, n
     assert config.sensors["gnss"].time_offset_s == 0.0
     assert config.sensors["gnss_velocity"].time_offset_s == pytest.approx(-over_s / 2.0, abs=0.15)
     assert ("so late, it is filtered" in text) == bool(over_s)
+    assert config.sensors["gnss_velocity"].min_sigma_mps == (
+        1.0 if over_s else VelocityConfig(topic="/vel").min_sigma_mps
+    )

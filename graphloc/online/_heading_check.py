@@ -147,7 +147,7 @@ class HeadingCheck:
             self.off_rad = found[0]
             self.said = was or (
                 f"the heading is off by about {np.degrees(self.off_rad):.0f} deg, by the IMU's accelerations and the fixes of {self._sensor}: "
-                "check the compass (convention, mount) and the IMU's axes"
+                "check what measures the heading (convention, mount), if anything does, and the IMU's axes"
             )
         elif self._right >= _IN_A_ROW:
             self.said, self.off_rad = "", 0.0
