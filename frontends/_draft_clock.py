@@ -9,9 +9,8 @@ from graphloc.frontends._clock import EPOCH_LIMIT_S, MOST_ON_ITS_WAY_S, Clock, b
 from graphloc.frontends._reports import GnssReport, Inspection, MountedTopic, TopicReport
 from graphloc.frontends.decode import UNSTAMPED
 
-_FILTERED_SIGMA_MPS = (
-    1.0  # of a velocity that is averaged over seconds: its error lasts as long, and would count as white
-)
+# Of a velocity that is averaged over seconds: its error lasts as long, and would count as white.
+_FILTERED_SIGMA_MPS = 1.0
 _OWN_CLOCK_S = 10.0  # no message takes as long
 _FEWEST_STAMPS = 10  # that tell of a clock
 _STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
