@@ -17,7 +17,7 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2.storage_mcap import McapReader
 
 from graphloc.errors import InputError
-from graphloc.frontends._recover import Recovered, as_ros2, recover
+from graphloc.frontends._recover import Recovered, as_ros2, recover, suffix_of
 from graphloc.frontends._unpack import limit_unpacking
 
 log = logging.getLogger(__name__)
@@ -25,6 +25,7 @@ limit_unpacking()
 _PART = re.compile(r"_(\d{1,6})$")  # at the end of a stem: number of a part of a split bag
 _GOES_ON_S = 2.0  # within which a recorder has opened the next part
 _MOST_LOOKED_AT = 20  # files whose number would fit
+_SUFFIXES = (".bag", ".mcap", ".db3")
 HINTS = {
     ".bag": "try `rosbag reindex`",
     ".mcap": "try `mcap recover`",
@@ -74,8 +75,8 @@ class BagOpener:
             raise InputError(f"{path}: no such file or folder")
         if path.is_dir():
             self._open_folder(path)
-        elif path.suffix in (".bag", ".mcap", ".db3"):
-            self._try(path, Reader1 if path.suffix == ".bag" else Reader2)
+        elif suffix_of(path) in _SUFFIXES:
+            self._try(path, Reader1 if suffix_of(path) == ".bag" else Reader2)
         else:
             raise InputError(f"{path}: not a bag: expected .bag, .mcap, .db3, or the folder of a ROS 2 bag")
 
@@ -91,12 +92,12 @@ class BagOpener:
             reason = self.broken.pop()
         else:
             reason = f"{path}: has no metadata.yaml"
-        files = sorted(p for p in path.iterdir() if p.suffix in (".bag", ".mcap", ".db3"))
+        files = sorted(p for p in path.iterdir() if suffix_of(p) in _SUFFIXES)
         before = len(self.opened)
         for file in files:
             self.open(file)
         if len(self.opened) > before:
-            if files[0].suffix != ".bag":
+            if suffix_of(files[0]) != ".bag":
                 self.warnings.append(f"{reason}; its files were read one by one ({HINTS['']})")
         else:
             self.broken.append(f"{reason}; and no readable .bag, .mcap or .db3 file lies in it ({_instead(path)})")
@@ -107,7 +108,7 @@ class BagOpener:
             view = as_ros2(path) if path.is_file() else None
             reader = _open_reader(kind, view or path)
         except Exception as error:  # noqa: BLE001 - rosbags lets struct, assertion, sqlite and codec errors through
-            reason = f"{path}: cannot be read ({text_of(error)}); {HINTS.get(path.suffix, HINTS[''])}"
+            reason = f"{path}: cannot be read ({text_of(error)}); {HINTS.get(suffix_of(path), HINTS[''])}"
             repaired = recover(path) if path.is_file() else None
             if repaired is None or not self._try_recovered(path, kind, repaired):
                 # Only now: the summary alone may be damaged.
@@ -116,7 +117,7 @@ class BagOpener:
                 return False
             self.warnings.append(
                 f"{path}: damaged or cut short ({text_of(error)}): read up to byte {repaired.whole_bytes} "
-                f"of {repaired.file_bytes}; {HINTS[path.suffix]} to repair it"
+                f"of {repaired.file_bytes}; {HINTS[suffix_of(path)]} to repair it"
             )
             return True
         self._append(path, reader)

@@ -106,9 +106,14 @@ class _View(io.RawIOBase):
         super().close()
 
 
+def suffix_of(path: Path) -> str:
+    """Return the suffix of a bag's format: `.bag.active` is what a recorder of ROS 1 leaves that was cut off."""
+    return ".bag" if path.name.endswith(".bag.active") else path.suffix
+
+
 def recover(path: Path) -> Recovered | None:
     """Return a view of the intact part of a damaged file; None if nothing of it is readable."""
-    repair = {".bag": _recover_ros1, ".mcap": _recover_mcap}.get(path.suffix)
+    repair = {".bag": _recover_ros1, ".mcap": _recover_mcap}.get(suffix_of(path))
     if repair is None:
         return None
     try:

@@ -25,6 +25,7 @@ from graphloc.errors import InputError
 from graphloc.frontends._clock import refuse_set_back
 from graphloc.frontends._open import HINTS, BagOpener, Opened, left_beside, text_of
 from graphloc.frontends._part import BagPart, Bags, recording_times
+from graphloc.frontends._recover import suffix_of
 from graphloc.frontends._types import MessageTypes
 from graphloc.recording import Span
 from graphloc.time import duration_ns, seconds_between, utc_text
@@ -201,7 +202,7 @@ class Bag:
         except Exception as error:  # noqa: BLE001 - as above
             self.warnings.append(
                 f"{opened.path}: damaged after {read} messages ({text_of(error)}): the rest was not read; "
-                f"{HINTS.get(opened.path.suffix, HINTS[''])}"
+                f"{HINTS.get(suffix_of(opened.path), HINTS[''])}"
             )
 
     def refuse_set_back(self, topics: Collection[str]) -> None:

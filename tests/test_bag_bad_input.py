@@ -121,6 +121,23 @@ def test_truncated_bag_gives_what_is_whole(tmp_path: Path, kind: str, compressio
     assert ("rosbag reindex" if kind == "ros1" else "mcap recover") in line
 
 
+@pytest.mark.parametrize("given", ["run.bag.active", "."])
+def test_what_a_recorder_leaves_that_was_cut_off_is_read(given: str, tmp_path: Path) -> None:
+    """A file, or the folder that it lies in. Its header tells of no index yet, and nothing but chunks follows."""
+    whole = whole_file("ros1", "")
+    at = whole.index(b"index_pos=") + len(b"index_pos=")
+    left = whole[:at] + bytes(8) + whole[at + 8 : int(0.7 * len(whole))]
+    (tmp_path / "run.bag.active").write_bytes(left)
+    recording = read_recording(tmp_path / given, vessel())
+    assert recording.imu is not None
+    n = len(recording.imu)
+    assert 1000 < n <= 12000
+    np.testing.assert_array_equal(recording.imu.stamps_ns, START_NS + np.arange(n) * (S // 50))
+    assert any(
+        "run.bag.active: damaged or cut short" in line and "rosbag reindex" in line for line in recording.warnings
+    )
+
+
 @pytest.mark.parametrize(("cut", "warned"), [(0, False), (3000, True)])
 def test_an_mcap_file_that_a_tool_has_merged_is_read(cut: int, warned: bool, tmp_path: Path) -> None:
     """Its profile is empty; the messages are those of ROS 2."""
