@@ -490,6 +490,12 @@ def test_stamps_that_are_set_earlier_are_no_clock_that_is_behind(late_s: float, 
     assert any("its clock is" in w for w in recording.warnings) == warns
 
 
+def test_an_imu_whose_stamps_are_set_far_off_is_said(tmp_path: Path) -> None:
+    """A typing error of 5 s in the IMU's offset moves it away from all others: these were taken to be as meant."""
+    recording = read(tmp_path, still_run(MAKE), imu={"topic": "/imu", "time_offset_s": 5.0})
+    assert any("gnss: its clock is 5.000 s behind that of imu" in w for w in recording.warnings)
+
+
 @pytest.mark.parametrize(("xyz_m", "far"), [([1.5, 0.0, 0.8], ""), ([150.0, 0.0, 80.0], "170 m")])
 def test_a_mount_in_centimetres_is_said(tmp_path: Path, xyz_m: list[float], far: str) -> None:
     recording = read(tmp_path, still_run(MAKE), gnss={"topic": "/fix", "mount": {"xyz_m": xyz_m}})
