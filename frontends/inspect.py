@@ -248,7 +248,8 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     """Report the receivers, the best one first."""
     found = [r for s in bag.of_type(*_FIXES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
     longest_s = max((r.spans_s for r in found), default=0.0)
-    most = max((r.fixes for r in found if r.spans_s >= _COVERS * longest_s), default=0)
+    rivals = (r for r in found if r.spans_s >= _COVERS * longest_s and not filtered(r.topic))
+    most = max((r.fixes for r in rivals), default=0)
     found.sort(
         key=lambda r: (
             filtered(r.topic),

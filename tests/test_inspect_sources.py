@@ -13,7 +13,7 @@ from graphloc.config import CompassConfig, GnssConfig, VesselConfig, parse_confi
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.inspect import Inspection
+from graphloc.frontends.inspect import Inspection, render
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag import KINDS
 from tests.test_inspect import DATUM, G, drive, look, rotation_z
@@ -462,3 +462,30 @@ def test_a_velocity_that_is_filtered_tells_nothing_of_the_fixes(over_s: float, n
     assert config.sensors["gnss"].time_offset_s == 0.0
     assert config.sensors["gnss_velocity"].time_offset_s == pytest.approx(-over_s / 2.0, abs=0.15)
     assert ("so late, it is filtered" in text) == bool(over_s)
+
+
+def test_fixes_that_are_none_make_no_receiver_without_heights(tmp_path: Path) -> None:
+    """Before its first fix a receiver may say a place without a height: its heights were not said, though all fixes have one."""
+    make, items = Messages(2), list[Item]()
+    for k in range(100):
+        at, none = START_NS + k * S, k < 60
+        items.append(("/fix", at, make.fix(at, lat=57.7 + 1e-5 * k, height=np.nan if none else 40.0, status=-none)))
+    found, _, _ = look(tmp_path, items, make)
+    assert found.gnss[0].without_height == 0
+    assert ", 40.0 m" in render(found)
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_far_fewer_fixes_are_no_better_beside_a_filter(beside: bool, tmp_path: Path) -> None:
+    """A filter says the place at any rate: beside it, all receivers had few fixes, and heights alone told the best one."""
+    make, items = Messages(2), list[Item]()
+    for k in range(1000):
+        at, lat = START_NS + k * S // 20, 57.7 + 1e-6 * k
+        if k % 2 == 0:
+            items.append(("/flat", at, make.fix(at, lat=lat, height=np.nan)))
+        if k % 20 == 0:
+            items.append(("/high", at, make.fix(at, lat=lat)))
+        if beside:
+            items.append(("/gps/filtered", at, make.fix(at, lat=lat)))
+    found, _, _ = look(tmp_path, items, make)
+    assert found.gnss[0].topic == "/flat"
