@@ -594,7 +594,9 @@ def test_what_tumbles_in_degrees_is_not_in_radians_by_chance() -> None:
     hz, seconds, fitted = 25, 6, 0
     for seed in range(100):
         rng = np.random.default_rng(seed)
-        rates = 4.0 * np.sin(np.arange(hz * seconds)[:, None] / hz * rng.uniform(0.5, 2.0, 3) + rng.uniform(0.0, 6.0, 3))
+        rates = 4.0 * np.sin(
+            np.arange(hz * seconds)[:, None] / hz * rng.uniform(0.5, 2.0, 3) + rng.uniform(0.0, 6.0, 3)
+        )
         attitude, felt = Rotation.identity(), []
         for rate in rates:
             felt.append(attitude.inv().apply([0.0, 0.0, 9.81]) + rng.normal(0.0, 0.5, 3))
