@@ -261,7 +261,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         extent_m=(float(np.ptp(p[:, 0])), float(np.ptp(p[:, 1]))),
         travelled_m=float(np.hypot(chords[:, 0], chords[:, 1]).sum()),
         first=vec(rows[0, :3]),
-        without_height=int(np.isnan(fixes.rows[np.isfinite(fixes.rows[:, :2]).all(axis=1), 2]).sum()),
+        without_height=int(np.isnan(fixes.rows[every[np.isin(fixes.stamps_ns[every], stamps)], 2]).sum()),
         white_m=scatter_m(stamps[~bad], own[:, :2]),
         spans_s=float(stamps[-1] - stamps[0]) / NS_PER_S,
         frozen="".join(frozen_fixes_warning(fixes.topic, stamps, bad)),

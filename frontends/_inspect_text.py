@@ -107,7 +107,7 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
     statuses = ", ".join(f"{n} {s}" for s, n in gnss.statuses.items())
     lat, lon, height = gnss.first
     east_m, north_m = gnss.extent_m
-    flat = gnss.without_height >= gnss.fixes
+    flat = gnss.without_height == gnss.fixes
     lines = [
         f"{gnss.topic}: {statuses}; first fix {lat:.7f}, {lon:.7f}{'' if flat else f', {height:.1f} m'}",
         f"  track {gnss.travelled_m:.0f} m in a box of {east_m:.0f} x {north_m:.0f} m"

@@ -169,8 +169,8 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
             stepped.setdefault(step.said(whose), []).append(r.sensor)
             continue
         now_s = r.config.time_offset_s
-        as_stamped = behind + now_s - reference.config.time_offset_s
-        meant = abs(as_stamped) <= _clock.EPOCH_LIMIT_S and abs(now_s) <= _clock.MOST_LATE_S
+        set_s = now_s - reference.config.time_offset_s
+        meant = abs(behind + set_s) <= _clock.EPOCH_LIMIT_S and abs(set_s) <= _clock.MOST_LATE_S
         if abs(behind) > _clock.EPOCH_LIMIT_S and not meant:
             lines.append(
                 f"{r.sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "

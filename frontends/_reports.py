@@ -113,7 +113,7 @@ class GnssReport:
         spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
             1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
         frozen, stored: warning where it repeats one position while the vessel moves, or one of before the run; '' where it does not.
-        without_height: messages with a place and no height. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
+        without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
 
     topic: str

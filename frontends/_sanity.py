@@ -52,7 +52,7 @@ def turns_gravity(stamps_ns: NDArray[np.int64], accel: Array, gyro_radps: Array)
     """Return whether rates (N, 3) turn the direction of accelerations (N, 3) as rad/s would; in deg/s they turn it by far more.
 
     Gravity stays where it is while the sensor turns. The thrust of a craft or of a hand is in it as well, so that half of the
-    windows may fit by chance; rates of 57 times the size fit in none.
+    windows may fit by chance; rates of 57 times the size fit in none, unless they turn it round and round: then it is anywhere.
     """
     t = (stamps_ns - stamps_ns[0]) / 1e9
     begins = np.unique((t / _GRAVITY_S).astype(np.int64), return_index=True)[1]
@@ -65,7 +65,8 @@ def turns_gravity(stamps_ns: NDArray[np.int64], accel: Array, gyro_radps: Array)
     turned = np.diff(np.add.reduceat(np.cumsum(gyro_radps * steps_s[:, None], axis=0), begins) / counts, axis=0)
     left = np.linalg.norm(up[1:] - Rotation.from_rotvec(-turned).apply(up[:-1]), axis=1)
     moved = np.linalg.norm(np.diff(up, axis=0), axis=1)
-    return float(np.median(left)) < _EXPLAINED * float(np.median(moved))
+    round_and_round = float(np.median(np.linalg.norm(turned, axis=1))) > np.pi
+    return not round_and_round and float(np.median(left)) < _EXPLAINED * float(np.median(moved))
 
 
 def imu_warnings(

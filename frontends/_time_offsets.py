@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
-from graphloc.frontends._clock import MOST_LATE_S
+from graphloc.frontends._clock import MOST_LATE_S, MOST_ON_ITS_WAY_S
 from graphloc.frontends._mount_yaw import FEWEST, HALF_S, MOVES_M, STEP_S, Felt, bent
 from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import without_line
@@ -19,6 +19,7 @@ from graphloc.time import NS_PER_S
 _BLOCK_S = 20.0
 _CLEAR, _LEAST_S = 4.0, 0.02  # sigmas, s
 _APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # how closely is looked; from which it is said
+_CHORD_S = 2.0  # half the time of a chord of fixes, and of a velocity's integral
 
 
 def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[float, float] | None:
@@ -69,6 +70,13 @@ class MotionOffset(NamedTuple):
         apart_s = abs(other.value_s - self.value_s)
         return apart_s > max(_CLEAR * float(np.hypot(self.sigma_s, other.sigma_s)), _LEAST_OF_WAY_S)
 
+    def is_of(self, fixes: MeasuredMotion | None, velocity: MeasuredMotion) -> bool:
+        """Return whether this offset of a receiver's velocity is that of its fixes, too, and not what a filter delays the velocity by."""
+        beside = None if fixes is None else later_than(fixes, velocity)
+        if beside is None or abs(self.value_s) < _CLEAR * beside[1]:
+            return abs(self.value_s) <= MOST_ON_ITS_WAY_S
+        return abs(beside[0]) < 0.5 * abs(self.value_s)
+
 
 def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | None:
     """Return by how much the stamps of a motion are off, by the accelerometer; None if that does not show it.
@@ -107,6 +115,30 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
         return None
     better, value, sigma = max(found)
     return MotionOffset(value, sigma, better > _CLEAR**2 and abs(value) > max(_CLEAR * sigma, _LEAST_OF_WAY_S))
+
+
+def later_than(fixes: MeasuredMotion, velocity: MeasuredMotion) -> tuple[float, float] | None:
+    """Return by how much later than fixes a velocity shows the same motion, s, 1 sigma; None of few windows.
+
+    Chords of the fixes and of the velocity's integral differ by that time, times how much the velocity changes between the ends of the chord.
+    """
+    if fixes.way_m is None or velocity.way_m is None:
+        return None
+    at, there = fixes.t_s, velocity.t_s + (velocity.origin_ns - fixes.origin_ns) / NS_PER_S
+    margin = _CHORD_S + MOST_LATE_S
+    middle = np.arange(max(at[0], there[0]) + margin, min(at[-1], there[-1]) - margin, STEP_S)
+    windows = len(middle) * STEP_S / _CHORD_S
+    if windows < FEWEST:
+        return None
+    _, chord = bent(at, fixes.way_m, middle, _CHORD_S)
+    said, ahead, behind = (bent(there, velocity.way_m, middle + k * STEP_S, _CHORD_S)[1] for k in (0, 1, -1))
+    change = (ahead - behind) / (2.0 * STEP_S)
+    power = float((np.abs(change) ** 2).mean())
+    if power == 0.0:
+        return None
+    value = float((np.conj(change) * (chord - said)).real.mean()) / power
+    left = float((np.abs(chord - said - value * change) ** 2).mean())
+    return value, float(np.sqrt(0.5 * left / (power * windows)))
 
 
 def _felt_along(felt: Felt, middle_s: Array, half_s: float) -> Array:

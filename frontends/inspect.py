@@ -33,14 +33,7 @@ from graphloc.frontends._assess_compass import compass_report, headings, says_th
 from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
-from graphloc.frontends._clock import (
-    FEWEST_STAMPS,
-    GAIN_LIMIT_S,
-    MOST_ON_ITS_WAY_S,
-    refuse_woven,
-    step,
-    usual_latency_s,
-)
+from graphloc.frontends._clock import FEWEST_STAMPS, GAIN_LIMIT_S, refuse_woven, step, usual_latency_s
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
 from graphloc.frontends._reports import (
@@ -194,7 +187,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         source=bag.source,
         topics=_topic_reports(bag),
         imus=tuple(imus),
-        gnss=tuple(_timed_fixes(report, late, velocities, bag.streams) for report in gnss),
+        gnss=tuple(_timed_fixes(report, late, motions, velocities, bag.streams) for report in gnss),
         compasses=compasses,
         odometry=tuple(reports),
         velocities=tuple(replace(report, late_s=_clearly(late.get(report.topic))) for _, report in velocities),
@@ -248,7 +241,8 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     """Report the receivers, the best one first."""
     found = [r for s in bag.of_type(*_FIXES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
     longest_s = max((r.spans_s for r in found), default=0.0)
-    most = max((r.fixes for r in found if r.spans_s >= _COVERS * longest_s), default=0)
+    rivals = (r for r in found if r.spans_s >= _COVERS * longest_s and not filtered(r.topic))
+    most = max((r.fixes for r in rivals), default=0)
     found.sort(
         key=lambda r: (
             filtered(r.topic),
@@ -378,14 +372,17 @@ def _beside_gyro(report: CompassReport, stream: TopicData, best: tuple[ImuReport
 def _timed_fixes(
     gnss: GnssReport,
     late: Mapping[str, MotionOffset | None],
+    motions: Sequence[MeasuredMotion],
     velocities: Sequence[tuple[TopicData, VelocityReport]],
     streams: Mapping[str, TopicData],
 ) -> GnssReport:
     """Return the report with how late the fixes' stamps are: by the fixes, or by a velocity over ground that tells it better.
 
     A receiver measures both at once. One that is recorded at another time after its stamps is taken for another device. Plotters
-    average course and speed over seconds, and not the place: so late, a velocity tells it of the fixes only if these say so as well.
+    average course and speed over seconds, and not the place: a velocity that shows the same motion later than the fixes tells nothing of
+    them.
     """
+    by_topic = {motion.source: motion for motion in motions}
     own_late = late.get(gnss.topic)
     candidates = {gnss.topic: own_late}
     fixes = streams[gnss.topic]
@@ -398,10 +395,8 @@ def _timed_fixes(
         )
         if report.axes in (EAST_AXES, NORTH_AXES) and same and not filtered(stream.topic):
             said = late.get(stream.topic)
-            confirmed = said is not None and (
-                abs(said.value_s) <= MOST_ON_ITS_WAY_S or bool(own_late and own_late.clear)
-            )
-            if said and confirmed and not (own_late and own_late.denies(said)):
+            denied = own_late is not None and said is not None and own_late.denies(said)
+            if said and not denied and said.is_of(by_topic.get(gnss.topic), by_topic[stream.topic]):
                 candidates[stream.topic] = said
     known = {topic: found for topic, found in candidates.items() if found is not None and found.clear}
     by = min(known, key=lambda topic: known[topic].sigma_s, default="")

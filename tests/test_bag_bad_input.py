@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
 from graphloc.frontends._clock import longest_increasing
+from graphloc.frontends._sanity import turns_gravity
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import LedgerRow, Outcome
@@ -507,6 +508,12 @@ def test_stamps_that_are_set_earlier_are_no_clock_that_is_behind(late_s: float, 
     assert any("its clock is" in w for w in recording.warnings) == warns
 
 
+def test_an_imu_whose_stamps_are_set_far_off_is_said(tmp_path: Path) -> None:
+    """A typing error of 5 s in the IMU's offset moves it away from all others: these were taken to be as meant."""
+    recording = read(tmp_path, still_run(MAKE), imu={"topic": "/imu", "time_offset_s": 5.0})
+    assert any("gnss: its clock is 5.000 s behind that of imu" in w for w in recording.warnings)
+
+
 @pytest.mark.parametrize(("xyz_m", "far"), [([1.5, 0.0, 0.8], ""), ([150.0, 0.0, 80.0], "170 m")])
 def test_a_mount_in_centimetres_is_said(tmp_path: Path, xyz_m: list[float], far: str) -> None:
     recording = read(tmp_path, still_run(MAKE), gnss={"topic": "/fix", "mount": {"xyz_m": xyz_m}})
@@ -597,6 +604,24 @@ def test_fast_rates_that_turn_gravity_as_they_say_are_in_radians(refused: bool, 
     with pytest.raises(InputError, match="looks like deg/s") if refused else nullcontext():
         recording = read_recording(path, vessel(gnss=None))
         assert not any("deg/s" in w for w in recording.warnings)
+
+
+def test_what_tumbles_in_degrees_is_not_in_radians_by_chance() -> None:
+    """Rates 57 times the size turn gravity anywhere: of few windows, one craft in twenty fitted."""
+    hz, seconds, fitted = 25, 6, 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        rates = 4.0 * np.sin(
+            np.arange(hz * seconds)[:, None] / hz * rng.uniform(0.5, 2.0, 3) + rng.uniform(0.0, 6.0, 3)
+        )
+        attitude, felt = Rotation.identity(), []
+        for rate in rates:
+            felt.append(attitude.inv().apply([0.0, 0.0, 9.81]) + rng.normal(0.0, 0.5, 3))
+            attitude = attitude * Rotation.from_rotvec(rate / hz)
+        stamps = np.arange(len(rates)) * S // hz
+        fitted += turns_gravity(stamps, np.array(felt), np.degrees(rates))
+        assert turns_gravity(stamps, np.array(felt), rates)
+    assert fitted == 0
 
 
 def test_a_small_boat_in_chop_is_not_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from graphloc.config import CompassConfig, GnssConfig, VelocityConfig, VesselCon
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.inspect import Inspection
+from graphloc.frontends.inspect import Inspection, render
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag import KINDS
 from tests.test_inspect import DATUM, G, drive, look, rotation_z
@@ -419,10 +419,12 @@ def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path
     assert config.sensors["gnss"].stamp_sigma_s >= 0.05  # what is left is estimated with the run
 
 
-@pytest.mark.parametrize("way_s", [0.02, 0.4])
-def test_a_velocity_of_the_receiver_tells_how_late_its_noisy_fixes_are(way_s: float, tmp_path: Path) -> None:
-    """Both are stamped 0.4 s late. One that is recorded much later after its stamps is taken for another device's."""
-    make, late_ns, rng = Messages(2), round(0.4 * S), np.random.default_rng(4)
+@pytest.mark.parametrize(("late_s", "way_s", "noise_m"), [(0.4, 0.02, 1.0), (0.4, 0.4, 1.0), (0.8, 0.02, 1.5)])
+def test_a_velocity_of_the_receiver_tells_how_late_its_noisy_fixes_are(
+    late_s: float, way_s: float, noise_m: float, tmp_path: Path
+) -> None:
+    """Both are stamped late. One that is recorded much later after its stamps is taken for another device's."""
+    make, late_ns, rng = Messages(2), round(late_s * S), np.random.default_rng(4)
     plain = [item for item in drive(make, seconds=120, status=0, sigma_m=1.0) if item[0] in ("/imu", "/fix")]
     fixes = [m for topic, _, m in plain if topic == "/fix"]
     stamps = np.array([at for topic, at, _ in plain if topic == "/fix"])
@@ -430,7 +432,7 @@ def test_a_velocity_of_the_receiver_tells_how_late_its_noisy_fixes_are(way_s: fl
         *(np.array([getattr(m, k) for m in fixes]) for k in ("latitude", "longitude", "altitude"))
     )
     speeds = np.gradient(places, 0.2, axis=0) + 0.05 * rng.normal(size=places.shape)
-    lla = DATUM.geodetic_from_enu(places + rng.normal(size=places.shape))
+    lla = DATUM.geodetic_from_enu(places + noise_m * rng.normal(size=places.shape))
     items = [item for item in plain if item[0] == "/imu"]
     for at, place, v in zip((stamps + late_ns).tolist(), lla, speeds, strict=True):
         items.append(("/fix", at, make.fix(at, place[0], place[1], place[2], 0, np.eye(3).ravel())))
@@ -438,11 +440,11 @@ def test_a_velocity_of_the_receiver_tells_how_late_its_noisy_fixes_are(way_s: fl
     found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     told = way_s < 0.1
     assert (found.gnss[0].late_by == "/vel") == told
-    assert config.sensors["gnss"].time_offset_s == pytest.approx(-0.4 * told, abs=0.06)
-    assert ("the motion of /vel, taken for the same receiver's, -0.4" in text) == told
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(-late_s * told, abs=0.06)
+    assert ("the motion of /vel, taken for the same receiver's, -0." in text) == told
 
 
-@pytest.mark.parametrize(("over_s", "noise_m"), [(2.0, 0.05), (2.0, 0.2), (0.0, 0.05)])
+@pytest.mark.parametrize(("over_s", "noise_m"), [(2.0, 0.05), (2.0, 0.2), (1.0, 0.05), (1.0, 0.5), (0.0, 0.05)])
 def test_a_velocity_that_is_filtered_tells_nothing_of_the_fixes(over_s: float, noise_m: float, tmp_path: Path) -> None:
     """Plotters average course and speed over seconds, and the place not at all: their fixes were drafted as late as their velocities."""
     make = Messages(2)
@@ -461,7 +463,34 @@ def test_a_velocity_that_is_filtered_tells_nothing_of_the_fixes(over_s: float, n
     _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     assert config.sensors["gnss"].time_offset_s == 0.0
     assert config.sensors["gnss_velocity"].time_offset_s == pytest.approx(-over_s / 2.0, abs=0.15)
-    assert ("so late, it is filtered" in text) == bool(over_s)
+    assert ("so late, it is filtered" in text) == (over_s > 1.2)
     assert config.sensors["gnss_velocity"].min_sigma_mps == (
-        1.0 if over_s else VelocityConfig(topic="/vel").min_sigma_mps
+        1.0 if over_s > 1.2 else VelocityConfig(topic="/vel").min_sigma_mps
     )
+
+
+def test_fixes_that_are_none_make_no_receiver_without_heights(tmp_path: Path) -> None:
+    """Before its first fix a receiver may say a place without a height: its heights were not said, though all fixes have one."""
+    make, items = Messages(2), list[Item]()
+    for k in range(100):
+        at, none = START_NS + k * S, k < 60
+        items.append(("/fix", at, make.fix(at, lat=57.7 + 1e-5 * k, height=np.nan if none else 40.0, status=-none)))
+    found, _, _ = look(tmp_path, items, make)
+    assert found.gnss[0].without_height == 0
+    assert ", 40.0 m" in render(found)
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_far_fewer_fixes_are_no_better_beside_a_filter(beside: bool, tmp_path: Path) -> None:
+    """A filter says the place at any rate: beside it, all receivers had few fixes, and heights alone told the best one."""
+    make, items = Messages(2), list[Item]()
+    for k in range(1000):
+        at, lat = START_NS + k * S // 20, 57.7 + 1e-6 * k
+        if k % 2 == 0:
+            items.append(("/flat", at, make.fix(at, lat=lat, height=np.nan)))
+        if k % 20 == 0:
+            items.append(("/high", at, make.fix(at, lat=lat)))
+        if beside:
+            items.append(("/gps/filtered", at, make.fix(at, lat=lat)))
+    found, _, _ = look(tmp_path, items, make)
+    assert found.gnss[0].topic == "/flat"

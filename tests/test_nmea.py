@@ -423,6 +423,20 @@ def test_two_receivers_on_a_line_stay_two(every: int, apart_ns: int, tmp_path: P
     assert [g.topic for g in seen.gnss] == ["/line GNGGA", "/line GPGGA"]
 
 
+def test_two_receivers_that_are_recorded_to_the_second_stay_two(tmp_path: Path) -> None:
+    """At 5 Hz most of their messages were recorded at one time, and so within no part of a step of each other: they were joined."""
+
+    def bodies(k: int) -> list[str]:
+        gga = f"GGA,120000.00,{ahead(k // 5)},1,09,0.9,10.0,M,30.0,M,,"
+        return ["GN" + gga, "GP" + gga]
+
+    make, items = Messages(2), list[Item]()
+    for k in range(200):
+        items += [("/line", 1_700_000_000 * S + k // 5 * S, make.text(sealed(body))) for body in bodies(k)]
+    seen = inspect_bag(write_bag(tmp_path / "run", make, items))
+    assert [g.topic for g in seen.gnss] == ["/line GNGGA", "/line GPGGA"]
+
+
 def test_a_sensor_that_hears_nothing_says_so_of_its_own_sentences(tmp_path: Path) -> None:
     """Most of what is on the line is for others, and no reason."""
 

@@ -266,6 +266,14 @@ def test_online_noise_that_stays_keeps_its_factor() -> None:
     assert noise.times == {"gnss": {"sigma_scale": pytest.approx(3.0, rel=0.2)}}
 
 
+def test_online_noise_of_far_more_than_stated_is_found_step_by_step() -> None:
+    """Fixes of 1.5 m that state 2 cm: a look finds twenty times at most, and what was found once was all there was."""
+    noise = SensorNoise()
+    said = Fixes(np.random.default_rng(3).normal(0.0, 1.5, (3000, 2))).seen_by(noise)
+    assert len(said) == 2
+    assert noise.times == {"gnss": {"sigma_scale": pytest.approx(75.0, rel=0.2)}}
+
+
 def test_online_noise_is_seen_after_the_clock_was_set_back() -> None:
     """By the stamps before, nothing was newer until the clock had caught up, and the IMU was blamed meanwhile."""
     rng = np.random.default_rng(3)

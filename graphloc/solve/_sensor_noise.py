@@ -118,8 +118,9 @@ def _likeliest(steps: Sequence[Sequence[Array]], now: Sequence[float]) -> list[f
         now: factor of each key.
     """
     right, other = np.zeros((1, len(steps[0][0]))), np.zeros(len(steps[0][0]))  # (factors of each key, M), (M,)
-    for change, stated, error in steps:
-        own = np.array([_log_densities(change, times**2 * stated) for times in _FACTORS])
+    tried = [_factors(times) for times in now]
+    for (change, stated, error), factors in zip(steps, tried, strict=True):
+        own = np.array([_log_densities(change, times**2 * stated) for times in factors])
         false = [_log_densities(change, stated + size**2 * error) for size in _ERRORS]
         right = right[..., None, :] + own
         best = max(false, key=lambda wide: float(_log_likelihoods(own[0], wide)))
@@ -128,12 +129,18 @@ def _likeliest(steps: Sequence[Sequence[Array]], now: Sequence[float]) -> list[f
     likely = _log_likelihoods(right[0], other)
     at = tuple(int(k) for k in np.unravel_index(int(np.argmax(likely)), likely.shape))
     found = []
-    for axis, (k, times) in enumerate(zip(at, now, strict=True)):
-        as_now = (*at[:axis], int(np.argmin(np.abs(np.log(_FACTORS / times)))), *at[axis + 1 :])
+    for axis, (k, times, factors) in enumerate(zip(at, now, tried, strict=True)):
+        as_now = (*at[:axis], int(np.argmin(np.abs(np.log(factors / times)))), *at[axis + 1 :])
         # Two steps in a row have a residual in common, so each counts half.
         clear = 0.5 * (likely[at] - likely[as_now]) > _SURE
-        found.append(times if not clear else float(_FACTORS[k]) if _FACTORS[k] > _LEAST_TIMES else 1.0)
+        found.append(times if not clear else float(factors[k]) if factors[k] > _LEAST_TIMES else 1.0)
     return found
+
+
+def _factors(now: float) -> Array:
+    """Return the factors that are tried, in steps of the same ratio: from none up to as many times what it is now."""
+    more = int(np.ceil(np.log(now) / np.log(_FACTORS[1])))
+    return np.asarray(_FACTORS[1] ** np.arange(len(_FACTORS) + more))
 
 
 def _log_likelihoods(right: Array, other: Array) -> Array:
