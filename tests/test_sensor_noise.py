@@ -23,6 +23,7 @@ from graphloc.measurements import GnssPosition, Measurement, PoseFix
 from graphloc.online import OnlineSmoother
 from graphloc.online._noise import ImuNoise
 from graphloc.online._persistent import PersistentState
+from graphloc.online._scatter import Scatter
 from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.replay import arrivals, replay
@@ -127,6 +128,24 @@ def test_online_matches_that_state_a_third_are_taken_as_they_scatter_from_then_o
     off = (track.p_world_m[k] - run.truth.at(track.stamps_ns[k]).p_world_m)[:, :2]
     nees = np.mean([e @ np.linalg.solve(P[:2, :2], e) for e, P in zip(off, track.cov[k], strict=True)])
     assert nees < 4.0
+
+
+def test_online_the_kernel_of_fixes_is_found_anew_by_their_new_sigma(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Handed on, the scatter by the sigma before counted beside the factor, and the kernel was 2.4 times too wide."""
+    noted = set[Scatter]()
+
+    def note(scatter: Scatter, stamp_ns: int, residual: Array) -> None:
+        if len(residual) == 3:
+            noted.add(scatter)
+        as_ever(scatter, stamp_ns, residual)
+
+    as_ever = Scatter.note
+    monkeypatch.setattr(Scatter, "note", note)
+    run = stating(matched(3), GnssPosition, 0.5)  # too little for the start to see
+    events = replay(run.recording, run.config).solution.stats.events
+    rebuilt = [line for line in events if "gnss: its measurements scatter" in line and "rebuilt" in line]
+    assert len(rebuilt) >= 1
+    assert len(noted) == 1 + len(rebuilt)
 
 
 def test_fixes_that_state_a_tenth_of_their_noise_are_taken_as_they_scatter() -> None:

@@ -105,7 +105,9 @@ class Tracking:
         )
         if before is not None:
             for name, stream in problem.streams.items():
-                stream.scatter = before.problem.streams[name].scatter
+                was = before.problem.streams[name]
+                if stream.config == was.config:  # else its residuals were normalised to other sigmas
+                    stream.scatter = was.scatter
         lag = Lag(problem, anchor, setup.lag_s, guess)
         if before is not None:
             lag.inherit(before)
