@@ -8,6 +8,7 @@ at once.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Collection
 from typing import Any, NamedTuple
@@ -134,11 +135,15 @@ def why_in_doubt(sensor: str) -> str:
 
 
 class PositionJump(NamedTuple):
-    """A jump between two fixes: their stamps (ns), and its size (m)."""
+    """A jump: the stamp (ns) of the first fix after it, and by how much it is off those before, east and north (m)."""
 
-    before_ns: int
     after_ns: int
-    size_m: float
+    east_m: float
+    north_m: float
+
+    @property
+    def size_m(self) -> float:
+        return math.hypot(self.east_m, self.north_m)
 
 
 class JumpDetector:
@@ -165,14 +170,15 @@ class JumpDetector:
         if len(self._seen) < _FEWEST:
             return none
         stamps_ns, sigmas_m = np.array([at for at, _, _ in self._seen]), np.array([s for _, _, s in self._seen])
-        at_ns, off_m = position_jumps(stamps_ns, np.array([p for _, p, _ in self._seen]), sigmas_m, allowed_m=allowed_m)
+        places_m = np.array([p for _, p, _ in self._seen])
+        at_ns, off_m = position_jumps(stamps_ns, places_m, sigmas_m, allowed_m=allowed_m)
         until_ns = min(stamps_ns[-3], stamp_ns - int(_BURST_S * NS_PER_S))  # a later one may yet be a burst
         new = (at_ns > self._judged_ns) & (at_ns <= until_ns)
         self._judged_ns = max(int(until_ns), self._judged_ns)
         if not new.any():
             return none
-        before_ns = stamps_ns[np.searchsorted(stamps_ns, at_ns[new]) - 1]
-        self.jumps += tuple(map(PositionJump, before_ns.tolist(), at_ns[new].tolist(), off_m[new].tolist()))
+        off = _parts(np.diff(places_m, axis=0))[np.searchsorted(stamps_ns, at_ns[new]) - 2]
+        self.jumps += tuple(map(PositionJump, at_ns[new].tolist(), *off.T.tolist()))
         again = self.doubtful(stamp_ns)
         self._last_ns = int(at_ns[new][-1])
         return none if again else (at_ns[new], off_m[new])

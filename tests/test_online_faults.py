@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from graphloc.config import GnssConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import Links
@@ -319,6 +320,33 @@ def test_a_receiver_alone_that_jumps_is_not_followed() -> None:
     assert not [e for e in fed.events if "restarts" in e]
     assert max(np.linalg.norm(e.v_world_mps) for e in fed.estimates) < 8.0  # the vessel goes 4 m/s
     assert fed.recovered_s(end) < 5.0
+
+
+@pytest.mark.parametrize("begin_s", [12.6, 13.1])  # early and late in the slow node of one second
+def test_a_receiver_of_centimetres_that_jumps_is_not_followed_at_all(begin_s: float) -> None:
+    """10 m for 7 s, of an RTK receiver: the IMU tells it within centimetres, at either end, wherever in a slow node it comes."""
+    rtk = replace(bl_scenario(1, "clean"), duration_s=24.0, path="loops", imu_hz=50.0, gnss_hz=5.0, gnss_sigma_m=0.02)
+    run = slowly(simulate(rtk, 1), 5.0)
+    gnss = run.config.sensors["gnss"]
+    assert isinstance(gnss, GnssConfig)
+    slow_error = gnss.slow_error.model_copy(update={"horizontal_sigma_m": 0.03, "vertical_sigma_m": 0.06})
+    alone = {
+        "imu": run.config.sensors["imu"],
+        "gnss": gnss.model_copy(update={"slow_error": slow_error, "stamp_sigma_s": 0.05}),
+        "compass": run.config.sensors["compass"],
+    }
+    run = replace(run, config=run.config.model_copy(update={"sensors": alone}))
+    base = [a for a in arrivals_of(run) if a.m.sensor in alone]
+    begin, end = base[at_s(base, begin_s)].true_ns, base[at_s(base, begin_s + 7.0)].true_ns
+    jumped = [
+        replace(a, m=replace(a.m, position=a.m.position._replace(latitude_deg=a.m.position.latitude_deg + 10.0 / 111e3)))
+        if isinstance(a.m, GnssPosition) and begin < a.true_ns < end
+        else a
+        for a in base
+    ]  # fmt: skip
+    fed = finish(online := smoother(run), feed(online, run, jumped))
+    assert len([e for e in fed.events if "position jump" in e and "rebuilt" in e]) == 2
+    assert max(fed.errors_m) < 0.5
 
 
 def test_odometry_continues_when_the_clock_is_set_back() -> None:

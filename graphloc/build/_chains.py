@@ -50,12 +50,20 @@ def slow_begin(slow: SlowProcess, key: int, known: Array, *, jumps: bool = True)
 
 
 def slow_step(
-    slow: SlowProcess, key: int, following: int, dt_s: float, *, jumps: bool = True, jump_m: float = 0.0
+    slow: SlowProcess,
+    key: int,
+    following: int,
+    dt_s: float,
+    *,
+    jumps: bool = True,
+    jump_m: float = 0.0,
+    expected: Array | None = None,
 ) -> Iterator[Any]:
     """Yield the factors of the step to the next node, `dt_s` later.
 
     Args:
         jumps: whether steps have a robust loss. jump_m: size of a position jump seen in this step: it, or the vessel, has moved so far.
+        expected: (k,) the step, where it is known besides.
     """
     constant = slow.constant
     # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
@@ -65,7 +73,7 @@ def slow_step(
     model: Any = gtsam.noiseModel.Diagonal.Sigmas(step)
     if slow.jumps and jumps and jump_m == 0.0:
         model = _with_tails(model, JUMP.scale)
-    yield gtsam.BetweenFactorVector(key, following, np.zeros(len(step)), model)
+    yield gtsam.BetweenFactorVector(key, following, np.zeros(len(step)) if expected is None else expected, model)
     yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps)
 
 

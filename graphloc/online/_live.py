@@ -64,10 +64,15 @@ class Tape(Generic[T]):
 
 
 class LiveTimeline:
-    """States on a regular grid from `start_ns` on, and the slow nodes among them."""
+    """States on a regular grid from `start_ns` on, and the slow nodes among them.
 
-    def __init__(self, config: TimelineConfig, start_ns: int) -> None:
-        self._start_ns = start_ns
+    Args:
+        jumps_ns: stamps of the first fixes after position jumps. A slow node begins at the state of each: the fixes of a node
+            share their slow error, those before and after a jump do not.
+    """
+
+    def __init__(self, config: TimelineConfig, start_ns: int, jumps_ns: Collection[int] = ()) -> None:
+        self._start_ns, self._jumps_ns = start_ns, jumps_ns
         self._period_ns, self._slow_ns = duration_ns(1.0 / config.rate_hz), duration_ns(config.slow_period_s)
         self.stamps_ns: Tape[int] = Tape()
         self.slow_of: Tape[int] = Tape()
@@ -105,7 +110,8 @@ class LiveTimeline:
 
     def append(self, stamp_ns: int) -> None:
         step = (stamp_ns - self._start_ns) // self._slow_ns
-        if step != self._slow_step:
+        since_ns, until_ns = self.attached_until_ns(stamp_ns - self._period_ns), self.attached_until_ns(stamp_ns)
+        if step != self._slow_step or any(since_ns < at_ns <= until_ns for at_ns in self._jumps_ns):
             self.slow_stamps_ns.append(stamp_ns)
             self._slow_step = step
         self.stamps_ns.append(stamp_ns)
@@ -115,6 +121,10 @@ class LiveTimeline:
         self.stamps_ns.forget(before)
         self.slow_of.forget(before)
         self.slow_stamps_ns.forget(self.slow_of[before])
+
+    def attached_until_ns(self, stamp_ns: int) -> int:
+        """Return the stamp of the last measurement that would attach to a state at a stamp, by `nearest`."""
+        return stamp_ns + self._period_ns // 2
 
     def nearest(self, stamp_ns: int) -> int:
         """Return the number of the state nearest to a stamp."""
@@ -183,9 +193,14 @@ class LiveStream:
         for tape in (self.measurements, self.state, self.carry, self.gyro_radps, self.apart_s):
             tape.forget(before)
 
-    def jump_m(self, begin_ns: int, end_ns: int) -> float:
-        """Return the size of the largest jump that its slow error may have made between two stamps, m; 0: none."""
-        return max((j.size_m for j in self.jumps if j.before_ns < end_ns and j.after_ns >= begin_ns), default=0.0)
+    def jumped(self, after_ns: int, until_ns: int) -> tuple[float, Array | None]:
+        """Return the size (m) of the largest jump in an interval (stamps, ns), and what slow error (k,) all of them make; 0, None: no jump."""
+        found = [j for j in self.jumps if after_ns < j.after_ns <= until_ns]
+        if self.slow is None or not found or not self.slow.far:
+            return 0.0, None
+        far, step = self.slow.far_axes, np.zeros(len(self.slow.axes))
+        step[far] = np.sum([(j.east_m, j.north_m) for j in found], axis=0) / self.slow.scale[far]
+        return max(j.size_m for j in found), step
 
 
 @dataclass(slots=True, eq=False)
@@ -277,10 +292,11 @@ def live_problem(
             jump_detector=detector,
             jumps=detector.jumps,
         )
+    jumps_ns = [jump.after_ns for stream in streams.values() if stream.left_out is not None for jump in stream.jumps]
     return LiveProblem(
         config=config,
         datum=datum,
-        timeline=LiveTimeline(config.timeline, start_ns),
+        timeline=LiveTimeline(config.timeline, start_ns, jumps_ns),
         t_body_imu_m=t,
         R_body_imu=R,
         links=setup.inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale),

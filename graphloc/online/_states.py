@@ -189,15 +189,20 @@ class States:
             if stream.slow is None:
                 continue
             key, following = (keys.slow(stream.number, n) for n in (j, j + 1))
-            window.guess(following, window.values.atVector(key), t)
-            stamps_ns = self._problem.timeline.slow_stamps_ns
-            jump_m = stream.jump_m(stamps_ns[j], stamps_ns[j + 1])
-            window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m))
+            jump_m, step = self._jumped(stream, j, j + 1)
+            # Begun at the other level, it would be drawn back to the usual one by the prior that closes the chain, and the pose with it.
+            window.guess(following, window.values.atVector(key) + (0.0 if step is None else step), t)
+            window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m, expected=step))
             if stream.name in self._ends:
                 window.remove(self._ends[stream.name])
             ends = list(slow_end(stream.slow, following))
             if ends:
                 self._ends[stream.name] = window.add(ends)
+
+    def _jumped(self, stream: LiveStream, j: int, later: int) -> tuple[float, Array | None]:
+        """Return the size (m) of the jumps from slow node j to a later one, and their slow error (k,), as `LiveStream.jumped`."""
+        timeline = self._problem.timeline
+        return stream.jumped(*(timeline.attached_until_ns(timeline.slow_stamps_ns[n]) for n in (j, later)))
 
     def reintegrate(self, stale: Collection[int]) -> None:
         """Integrate again the IMU steps that begin at these states, and stage their factors: samples in them came late."""
@@ -243,7 +248,8 @@ class States:
             P = propagated_covariance(
                 P, newest, at.T_world_body.rotation().matrix(), (to_ns - from_ns) * 1e-9, pim.preintMeasCov()
             )
-            if stream.slow is not None and size > 6 and (jump_m := stream.jump_m(from_ns, to_ns)):
+            jump_m, _ = self._jumped(stream, timeline.slow_of[base], timeline.slow_of[k])
+            if stream.slow is not None and size > 6 and jump_m > 0.0:
                 P[6:, 6:] += np.diag(np.where(stream.slow.far_axes, jump_m**2, 0.0))
         return prediction_of(residual, at, P, newest.velocity_cov)
 
