@@ -143,6 +143,7 @@ class PositionJump(NamedTuple):
 
     @property
     def size_m(self) -> float:
+        """Its length, m."""
         return math.hypot(self.east_m, self.north_m)
 
 
