@@ -30,6 +30,8 @@ _EVEN = 1.5  # steps in time that differ by more than this factor are not compar
 _IN_BOUNDS = 1.5  # sigmas of the slow error that the bounds include: jumps up to there need no word
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
 _KEPT = 200
+_SAME, _SAME_SIGMAS = 0.25, 3.0  # off a prediction by the same: within this share and so many sigmas
+_IMU_OFF_MPS2 = 2.0  # by how much an IMU may be wrong: gravity where it is tilted by 12 deg
 
 MEAN_S = 30.0
 """Mean duration of a jump, s."""
@@ -134,6 +136,10 @@ def why_in_doubt(sensor: str) -> str:
     return f"position jump of {sensor}, and no other sensor measures position"
 
 
+def _none() -> tuple[NDArray[np.int64], Array]:
+    return np.zeros(0, dtype=np.int64), np.zeros(0)
+
+
 class PositionJump(NamedTuple):
     """A jump: the stamp (ns) of the first fix after it, and by how much it is off those before, east and north (m)."""
 
@@ -147,8 +153,18 @@ class PositionJump(NamedTuple):
         return math.hypot(self.east_m, self.north_m)
 
 
+class OffPrediction(NamedTuple):
+    """By how much (2,), m, a fix is off its prediction, and whether it certainly is."""
+
+    off_m: Array
+    certain: bool
+
+
 class JumpDetector:
-    """The same for one receiver online: a jump is detected a second later, after three fixes at least.
+    """The same for one receiver online: a jump is detected a second later, from its fixes, or by what the IMU predicts.
+
+    The fixes alone do not show a jump among steps of its size: noise, or a vessel that goes metres between two of them. What is
+    off the prediction by the same for a second has jumped: that of an IMU which is wrong grows.
 
     Attributes:
         jumps: those detected since the estimate started.
@@ -159,30 +175,73 @@ class JumpDetector:
         self._seen: deque[tuple[int, Array, float]] = deque(maxlen=_KEPT)
         self._judged_ns = 0
         self._last_ns: int | None = None
+        self._before: tuple[int, Array] | None = None  # by how much the fix before was off its prediction
+        self._off: list[tuple[int, Array]] = []  # the fixes since the beginning of what may be a jump, likewise
+
+    @property
+    def suspicious(self) -> bool:
+        """Whether the last fix is the beginning of a jump, or of a burst of outliers: which one shows within seconds."""
+        return bool(self._off)
 
     def note(
-        self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed_m: float
+        self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed_m: float, off: OffPrediction | None = None
     ) -> tuple[NDArray[np.int64], Array]:
-        """Take in a fix; ignore a late one. Return new jumps as `position_jumps` does; while in doubt, no further ones."""
-        none = np.zeros(0, dtype=np.int64), np.zeros(0)
+        """Take in a fix; ignore a late one. Return new jumps as `position_jumps` does; while in doubt, no further ones.
+
+        Args:
+            off: how it lies to its prediction; None: nothing predicts it.
+        """
         if self._seen and stamp_ns <= self._seen[-1][0]:
-            return none
+            return _none()
         self._seen.append((stamp_ns, np.array(place_m), sigma_m))
+        jumped = self._by_prediction(stamp_ns, off, sigma_m, allowed_m)
+        return self._by_steps(stamp_ns, allowed_m) if jumped is None else self._found([jumped], stamp_ns)
+
+    def _by_prediction(
+        self, stamp_ns: int, off: OffPrediction | None, sigma_m: float, allowed_m: float
+    ) -> PositionJump | None:
+        """Return a jump that is certain by now: at once, fixes were off their predictions, and have been by the same for a second."""
+        before, self._before = self._before, None if off is None else (stamp_ns, off.off_m)
+        if off is None or before is None or not off.certain:
+            self._off = []
+            return None
+        off_m, dt_s = off.off_m, (stamp_ns - before[0]) / NS_PER_S
+        if self._off:
+            mean_m = np.mean([m for _, m in self._off], axis=0)
+            if np.linalg.norm(off_m - mean_m) > _SAME * np.linalg.norm(mean_m) + _SAME_SIGMAS * sigma_m:
+                self._off = []
+        least_m = max(allowed_m, _JUMP_M, _IMU_OFF_MPS2 * dt_s**2 / 2.0)
+        if self._off or np.linalg.norm(off_m - before[1]) > least_m:
+            self._off.append((stamp_ns, off_m))
+        if not self._off or stamp_ns - self._off[0][0] < _BURST_S * NS_PER_S:
+            return None
+        begun_ns, (east_m, north_m) = self._off[0][0], np.mean([m for _, m in self._off], axis=0)
+        self._off, self._before = [], None
+        return PositionJump(begun_ns, float(east_m), float(north_m))
+
+    def _by_steps(self, stamp_ns: int, allowed_m: float) -> tuple[NDArray[np.int64], Array]:
         if len(self._seen) < _FEWEST:
-            return none
+            return _none()
         stamps_ns, sigmas_m = np.array([at for at, _, _ in self._seen]), np.array([s for _, _, s in self._seen])
         places_m = np.array([p for _, p, _ in self._seen])
-        at_ns, off_m = position_jumps(stamps_ns, places_m, sigmas_m, allowed_m=allowed_m)
+        at_ns, _ = position_jumps(stamps_ns, places_m, sigmas_m, allowed_m=allowed_m)
         until_ns = min(stamps_ns[-3], stamp_ns - int(_BURST_S * NS_PER_S))  # a later one may yet be a burst
         new = (at_ns > self._judged_ns) & (at_ns <= until_ns)
         self._judged_ns = max(int(until_ns), self._judged_ns)
+        known_ns = [jump.after_ns for jump in self.jumps]
+        new &= ~(np.abs(np.subtract.outer(at_ns, known_ns)) <= _BURST_S * NS_PER_S).any(axis=1)
         if not new.any():
-            return none
+            return _none()
         off = _parts(np.diff(places_m, axis=0))[np.searchsorted(stamps_ns, at_ns[new]) - 2]
-        self.jumps += tuple(map(PositionJump, at_ns[new].tolist(), *off.T.tolist()))
+        return self._found(list(map(PositionJump, at_ns[new].tolist(), *off.T.tolist())), stamp_ns)
+
+    def _found(self, jumps: list[PositionJump], stamp_ns: int) -> tuple[NDArray[np.int64], Array]:
+        self.jumps += tuple(jumps)
         again = self.doubtful(stamp_ns)
-        self._last_ns = int(at_ns[new][-1])
-        return none if again else (at_ns[new], off_m[new])
+        self._last_ns = jumps[-1].after_ns
+        if again:
+            return _none()
+        return np.array([jump.after_ns for jump in jumps], dtype=np.int64), np.array([jump.size_m for jump in jumps])
 
     def doubtful(self, stamp_ns: int) -> bool:
         """Return whether there was a jump within the last `LASTS_S`."""

@@ -20,7 +20,7 @@ from graphloc.graph import Residual
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
 from graphloc.online import OnlineSmoother
 from graphloc.online import _start as online_start
-from graphloc.position_jumps import JumpDetector, jump_warnings, position_jumps
+from graphloc.position_jumps import JumpDetector, OffPrediction, PositionJump, jump_warnings, position_jumps
 from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
 from graphloc.solution import Health
@@ -190,6 +190,27 @@ def test_emergency_braking_of_a_car_is_no_jump(hz: float) -> None:
     way = np.outer(np.cumsum(speed)[told] * 0.001, [1.0, 0.0])
     way += np.random.default_rng(0).normal(0.0, 0.005, way.shape)
     assert not len(position_jumps(told * 1_000_000, way, np.full(len(told), 0.005), allowed_m=0.0)[0])
+
+
+def test_what_is_off_its_prediction_by_the_same_for_a_second_has_jumped() -> None:
+    """Each step of such fixes is within the noise. An IMU that is wrong, a burst, and what the bounds include are no jumps."""
+    t = np.arange(0.0, 20.0, 0.25)
+    since, noise_m = t >= 10.0, np.random.default_rng(1).normal(0.0, 0.5, (len(t), 2))
+    places_m = np.outer(t, [5.0, 0.0]) + noise_m
+    level = np.outer(since, [4.0, -3.0])
+
+    def found(off_m: Array) -> list[PositionJump]:
+        watch = JumpDetector()
+        for at_s, place_m, error_m in zip(t.tolist(), places_m + off_m, off_m, strict=True):
+            known_m = np.sum([(j.east_m, j.north_m) for j in watch.jumps] or [(0.0, 0.0)], axis=0)
+            off = OffPrediction(error_m - known_m, certain=bool(np.hypot(*(error_m - known_m)) > 2.0))
+            watch.note(round(at_s * 1e9), place_m, 0.5, allowed_m=3.0, off=off)
+        return list(watch.jumps)
+
+    assert found(level) == [pytest.approx(PositionJump(10_000_000_000, 4.0, -3.0))]
+    assert found(np.outer(0.75 * np.clip(t - 10.0, 0.0, 6.0) ** 2, [0.8, -0.6])) == []
+    assert found(level * (t < 11.0)[:, None]) == []
+    assert found(level * 0.5) == []
 
 
 def test_a_jump_is_detected_online_and_reported_once() -> None:

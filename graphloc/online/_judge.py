@@ -86,7 +86,7 @@ class Judge:
         if (away_m := min(r.size_m or 0.0 for r in residuals)) > _FAR_M:
             self._agreement.note(stream, m, None)
             raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
-        if self.receivers.frozen(stream, m, at, residuals[0]):
+        if self.receivers.reject(stream, m, at, residuals[0]):
             self._entries.add(Entry(stream, i, Verdict.false(residuals[0], at)))
         elif stream.row.false is None:
             verdict, widened = self._by_kernel(stream, i, at, residuals[0], fresh=True)

@@ -15,7 +15,9 @@ from graphloc.online._entries import Entries
 from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import States
-from graphloc.position_jumps import allowed_jump_m, jump_warnings, largest_sigma, only_position_sensor
+from graphloc.position_jumps import OffPrediction, allowed_jump_m, jump_warnings, largest_sigma, only_position_sensor
+
+_CERTAIN = 8.0  # sigmas off a prediction
 
 
 class ReceiverChecks:
@@ -29,10 +31,11 @@ class ReceiverChecks:
         self._problem, self._states, self._entries, self._agreement = problem, states, entries, agreement
         self._jump_warnings: list[str] = []
 
-    def frozen(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> bool:
-        """Return whether a measurement comes from a frozen receiver.
+    def reject(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> bool:
+        """Return whether a measurement comes from a frozen receiver, or may be the beginning of a jump: in time either is certain.
 
-        When that is first found, the fixes since the receiver froze are taken out of the window as well.
+        When the former is first found, the fixes since the receiver froze are taken out of the window as well. A jump that is found has
+        the window rebuilt, and these fixes with it.
         """
         if stream.row.false is not None or not stream.row.absolute:
             return False
@@ -40,10 +43,10 @@ class ReceiverChecks:
         if not np.isfinite(told_m).all():
             return False
         sigma_m = largest_sigma(residual.cov - _walked(residual, at))
-        self._check_jump(stream, m.stamp_ns, told_m, sigma_m)
+        estimated_m = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2]
+        self._check_jump(stream, m.stamp_ns, told_m, sigma_m, self._off(stream, at, residual, told_m - estimated_m))
         detector, newest, at_s = stream.frozen_detector, self._states.newest, self._problem.timeline.seconds(m.stamp_ns)
         before = detector.frozen
-        estimated_m = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2]
         sigma_mps = largest_sigma(newest.velocity_cov)
         detector.note(at_s, told_m, estimated_m, sigma_m, newest.velocity[:2], sigma_mps)
         if detector.frozen and not before:
@@ -51,12 +54,33 @@ class ReceiverChecks:
             self._reject_since(stream, min(at_s - WINDOW_S, detector.stands_s))
         if detector.for_long(at_s):
             self._agreement.note(stream, m, None)
-        return detector.frozen
+        return detector.frozen or stream.jump_detector.suspicious
 
-    def _check_jump(self, stream: LiveStream, stamp_ns: int, told_m: Array, sigma_m: float) -> None:
+    def _off(self, stream: LiveStream, at: Attachment, residual: Residual, off_m: Array) -> OffPrediction | None:
+        """Return how the newest fix lies to its prediction; None where the receiver's slow error is switched off.
+
+        Args:
+            off_m: (2,) of the fix from the estimated place, slow error aside.
+        """
+        if stream.left_out is None:
+            return None
+        if stream.slow is not None and at.slow_value is not None and stream.slow.far:
+            far = stream.slow.far_axes
+            off_m = off_m - at.slow_value[far] * stream.slow.scale[far]
+        certain = residual.nis() > _CERTAIN**2
+        if certain:
+            predicted = self._states.prediction(stream, at, stream.state[len(stream.measurements) - 1], residual).cov
+            certain = bool(predicted.any()) and residual.nis(predicted) > _CERTAIN**2
+        return OffPrediction(off_m, certain)
+
+    def _check_jump(
+        self, stream: LiveStream, stamp_ns: int, told_m: Array, sigma_m: float, off: OffPrediction | None
+    ) -> None:
         if only_position_sensor(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
             allowed = stream.left_out is not None
-            found = stream.jump_detector.note(stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(stream.left_out))
+            found = stream.jump_detector.note(
+                stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(stream.left_out), off=off
+            )
             self._jump_warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
 
     def _reject_since(self, stream: LiveStream, since_s: float) -> None:
