@@ -30,8 +30,10 @@ _EVEN = 1.5  # steps in time that differ by more than this factor are not compar
 _IN_BOUNDS = 1.5  # sigmas of the slow error that the bounds include: jumps up to there need no word
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
 _KEPT = 200
+_CERTAIN_SIGMAS = 8.0  # off a prediction
 _SAME, _SAME_SIGMAS = 0.25, 3.0  # off a prediction by the same: within this share and so many sigmas
-_IMU_OFF_MPS2 = 2.0  # by how much an IMU may be wrong: gravity where it is tilted by 12 deg
+_ENDS = 10.0  # odds that a jump is over
+_IMU_OFF_MPS2 = 1.0  # by how much an IMU may be wrong: gravity where it is tilted by 6 deg
 
 MEAN_S = 30.0
 """Mean duration of a jump, s."""
@@ -154,10 +156,11 @@ class PositionJump(NamedTuple):
 
 
 class OffPrediction(NamedTuple):
-    """By how much (2,), m, a fix is off its prediction, and whether it certainly is."""
+    """By how much (2,), m, a fix is off its prediction, how many sigmas that is, and how many it would be were the slow error over."""
 
     off_m: Array
-    certain: bool
+    sigmas: float
+    sigmas_without: float
 
 
 class JumpDetector:
@@ -202,7 +205,7 @@ class JumpDetector:
     ) -> PositionJump | None:
         """Return a jump that is certain by now: at once, fixes were off their predictions, and have been by the same for a second."""
         before, self._before = self._before, None if off is None else (stamp_ns, off.off_m)
-        if off is None or before is None or not off.certain:
+        if off is None or before is None:
             self._off = []
             return None
         off_m, dt_s = off.off_m, (stamp_ns - before[0]) / NS_PER_S
@@ -210,14 +213,17 @@ class JumpDetector:
             mean_m = np.mean([m for _, m in self._off], axis=0)
             if np.linalg.norm(off_m - mean_m) > _SAME * np.linalg.norm(mean_m) + _SAME_SIGMAS * sigma_m:
                 self._off = []
+        # No IMU is wrong by just what the slow error is. The odds that it is over: of the fix, and of a jump to end in this time.
+        ends = off.sigmas**2 - off.sigmas_without**2 > 2.0 * (math.log(_ENDS) - math.log(math.expm1(dt_s / MEAN_S)))
         least_m = max(allowed_m, _JUMP_M, _IMU_OFF_MPS2 * dt_s**2 / 2.0)
-        if self._off or np.linalg.norm(off_m - before[1]) > least_m:
+        jumps = off.sigmas > _CERTAIN_SIGMAS and np.linalg.norm(off_m - before[1]) > least_m
+        if self._off or ends or jumps:
             self._off.append((stamp_ns, off_m))
         if not self._off or stamp_ns - self._off[0][0] < _BURST_S * NS_PER_S:
             return None
-        begun_ns, (east_m, north_m) = self._off[0][0], np.mean([m for _, m in self._off], axis=0)
-        self._off, self._before = [], None
-        return PositionJump(begun_ns, float(east_m), float(north_m))
+        begun_ns, jump_m = self._off[0][0], np.mean([m for _, m in self._off], axis=0)
+        self._off, self._before = [], (stamp_ns, off_m - jump_m)  # from now on it is predicted
+        return PositionJump(begun_ns, *jump_m.tolist())
 
     def _by_steps(self, stamp_ns: int, allowed_m: float) -> tuple[NDArray[np.int64], Array]:
         if len(self._seen) < _FEWEST:

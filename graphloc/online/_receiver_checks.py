@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphloc import gauss
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Residual
 from graphloc.measurements import Measurement
@@ -15,9 +16,15 @@ from graphloc.online._entries import Entries
 from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import States
-from graphloc.position_jumps import OffPrediction, allowed_jump_m, jump_warnings, largest_sigma, only_position_sensor
+from graphloc.position_jumps import (
+    OffPrediction,
+    allowed_jump_m,
+    jump_warnings,
+    largest_sigma,
+    only_position_sensor,
+)
 
-_CERTAIN = 8.0  # sigmas off a prediction
+_FITS = 3.0  # sigmas of a fix alone
 
 
 class ReceiverChecks:
@@ -64,14 +71,18 @@ class ReceiverChecks:
         """
         if stream.left_out is None:
             return None
-        if stream.slow is not None and at.slow_value is not None and stream.slow.far:
+        without = residual.raw
+        if stream.slow is not None and at.slow_value is not None and residual.slow_jacobian is not None:
             far = stream.slow.far_axes
             off_m = off_m - at.slow_value[far] * stream.slow.scale[far]
-        certain = residual.nis() > _CERTAIN**2
-        if certain:
-            predicted = self._states.prediction(stream, at, stream.state[len(stream.measurements) - 1], residual).cov
-            certain = bool(predicted.any()) and residual.nis(predicted) > _CERTAIN**2
-        return OffPrediction(off_m, certain)
+            without = without - residual.slow_jacobian() @ np.where(far, at.slow_value, 0.0)
+        if residual.nis() <= _FITS**2:  # the prediction takes time
+            return OffPrediction(off_m, 0.0, 0.0)
+        predicted = self._states.prediction(stream, at, stream.state[len(stream.measurements) - 1], residual).cov
+        if not predicted.any():
+            return None
+        squares = residual.nis(predicted), gauss.square(without, residual.cov + predicted)
+        return OffPrediction(off_m, *np.sqrt(squares).tolist())
 
     def _check_jump(
         self, stream: LiveStream, stamp_ns: int, told_m: Array, sigma_m: float, off: OffPrediction | None
