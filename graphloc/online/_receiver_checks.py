@@ -16,13 +16,7 @@ from graphloc.online._entries import Entries
 from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import States
-from graphloc.position_jumps import (
-    OffPrediction,
-    allowed_jump_m,
-    jump_warnings,
-    largest_sigma,
-    only_position_sensor,
-)
+from graphloc.position_jumps import OffPrediction, allowed_jump_m, jump_warnings, largest_sigma, only_position_sensor
 
 _FITS = 3.0  # sigmas of a fix alone
 
