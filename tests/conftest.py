@@ -14,8 +14,8 @@ gc.set_threshold(100_000, 20, 100)  # looking again and again through runs that 
 
 @pytest.fixture
 def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An online start that waits is tried twice in half a minute, not thirteen times: each solves all that there is."""
+    """An online start that waits for half a minute is tried at its end, not thirteen times: each solves all that there is."""
     from graphloc.online import _waiting
 
-    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 15.3)
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 30.2)
     monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)

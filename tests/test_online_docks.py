@@ -16,7 +16,9 @@ from graphloc.measurements import TagSighting
 from graphloc.online import OnlineSmoother
 from graphloc.online._anchor import without_prior
 from graphloc.online._lag import Lag
+from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
+from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory
 from tests import tagfactory
 from tests.slowly import with_few_states
@@ -33,6 +35,20 @@ def docking(compass_hz: str = "4") -> SimulatedRun:
     return replace(run, recording=replace(run.recording, measurements=kept), config=config)
 
 
+@cache
+def recorded() -> Recording:
+    """The docking with its tide."""
+    run = docking()
+    return app.with_synthetic(run.recording, run.config, app.choose_datum(run.recording, run.config))
+
+
+@cache
+def followed() -> Solution:
+    """The docking as the online mode follows it."""
+    run = docking()
+    return replay(recorded(), run.config, datum=app.choose_datum(run.recording, run.config)).solution
+
+
 def sigmas_m(track: Trajectory, k: int) -> Array:
     assert track.cov is not None
     return np.asarray(np.sqrt(np.diagonal(track.cov[k])[:3]))
@@ -41,11 +57,8 @@ def sigmas_m(track: Trajectory, k: int) -> Array:
 def test_the_last_pose_is_known_as_well_as_to_the_batch_and_no_better() -> None:
     """At the end both know the same; on the way it is never lost, and the IMU is not blamed."""
     run = docking()
-    datum = app.choose_datum(run.recording, run.config)
-    recording = app.with_synthetic(run.recording, run.config, datum)
-    offline = app.solve(recording, run.config, datum).trajectory
-    replayed = replay(recording, run.config, datum=datum).solution
-    online = replayed.trajectory
+    datum, replayed = app.choose_datum(run.recording, run.config), followed()
+    offline, online = app.solve(recorded(), run.config, datum).trajectory, replayed.trajectory
     k = int(np.searchsorted(offline.stamps_ns, online.stamps_ns[-1]))
     assert sigmas_m(online, -1) == pytest.approx(sigmas_m(offline, k), rel=0.05)
     assert (np.abs(online.p_world_m[-1] - offline.p_world_m[k]) < 0.5 * sigmas_m(offline, k)).all()
@@ -57,17 +70,13 @@ def test_the_last_pose_is_known_as_well_as_to_the_batch_and_no_better() -> None:
 
 def test_what_is_seen_in_a_hole_of_the_imu_leads_nowhere() -> None:
     """It tells of the state before: written as news of the nearest, it was news again each time, and the track 56 m off."""
-    run = docking()
-    imu, recording = (
-        run.recording.imu,
-        app.with_synthetic(run.recording, run.config, app.choose_datum(run.recording, run.config)),
-    )
+    run, recording = docking(), recorded()
+    imu = recording.imu
     assert imu is not None
     since_s = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
     heard = (since_s < 15.3) | (since_s >= 17.3)
-    replayed = replay(
-        replace(recording, imu=imu.where(heard)), run.config, datum=app.choose_datum(recording, run.config)
-    ).solution
+    holed = replace(recording, imu=imu.where(heard))
+    replayed = replay(holed, run.config, datum=app.choose_datum(recording, run.config)).solution
     track = replayed.trajectory
     off_m = np.linalg.norm(track.p_world_m - run.truth.at(track.stamps_ns).p_world_m, axis=1)
     assert off_m.max() < 1.5
@@ -104,28 +113,26 @@ def test_a_step_uphill_is_no_noise_of_the_imu() -> None:
 def test_a_rebuild_does_not_make_it_surer(monkeypatch: pytest.MonkeyPatch) -> None:
     """What closes the chains of dock and tide is no news a second time."""
     run = docking()
-    recording = app.with_synthetic(run.recording, run.config, app.choose_datum(run.recording, run.config))
-    whole = Lag.commit
+    whole, track, breaks = Lag.commit, followed().trajectory, True
 
     def once(self: Lag) -> None:
         monkeypatch.setattr(Lag, "commit", whole)
         raise RuntimeError("planted")
 
-    ends, said = [], []
-    for breaks in (False, True):
-        online = OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, mounts=recording.mounts)
-        for m in arrivals(recording):
-            estimate = online.feed(m)
-            since_s = (m.stamp_ns - run.truth.stamps_ns[0]) * 1e-9
-            if breaks and since_s > 38.0:
-                monkeypatch.setattr(Lag, "commit", once)
-                breaks = False
-            if estimate is not None and since_s > 40.0:
-                ends.append(np.sqrt(np.diagonal(estimate.cov)[:3]))
-                break
-        said = [event.text for event in online.events()]
-    assert any("rebuilt" in line for line in said)
-    assert ends[1] == pytest.approx(ends[0], rel=0.1)
+    online = OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, mounts=recorded().mounts)
+    for m in arrivals(recorded()):
+        estimate = online.feed(m)
+        since_s = (m.stamp_ns - run.truth.stamps_ns[0]) * 1e-9
+        if breaks and since_s > 38.0:
+            monkeypatch.setattr(Lag, "commit", once)
+            breaks = False
+        if estimate is not None and since_s > 40.0:
+            break
+    assert any("rebuilt" in event.text for event in online.events())
+    assert estimate is not None
+    k = int(np.searchsorted(track.stamps_ns, estimate.stamp_ns))
+    assert track.stamps_ns[k] == estimate.stamp_ns
+    assert np.sqrt(np.diagonal(estimate.cov)[:3]) == pytest.approx(sigmas_m(track, k), rel=0.1)
 
 
 def test_a_prior_that_is_taken_out_was_never_there() -> None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,7 +28,8 @@ from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.replay import arrivals, replay
 from graphloc.solve._sensor_noise import Pair, Step, times_stated
-from tests.slowly import slowly
+from tests.faults import Fed, arrivals_of, feed
+from tests.slowly import simulate_slowly, slowly
 from tests.test_factors import attachment
 
 SECOND = 1_000_000_000
@@ -49,11 +50,27 @@ def stating(run: SimulatedRun, kind: type[Measurement], share: float) -> Simulat
     return replace(run, recording=recording)
 
 
-def matched(seed: int, duration_s: float = 40.0) -> SimulatedRun:
+def matched(seed: int, duration_s: float = 40.0, rate_hz: float = 5.0) -> SimulatedRun:
     """BL's case 1 with matches of 0.3 m, 40 % of them false, and GNSS that drifts."""
-    return slowly(
-        simulate(replace(bl_scenario(1, "drift"), duration_s=duration_s, pose_hz=4.0, imu_hz=50.0, gnss_hz=5.0), seed)
-    )
+    scenario = replace(bl_scenario(1, "drift"), duration_s=duration_s, pose_hz=4.0, imu_hz=50.0, gnss_hz=5.0)
+    return simulate_slowly(scenario, seed, rate_hz)
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A run whose matches state a third of their noise, what the online mode made of it, and the last snapshot."""
+
+    run: SimulatedRun
+    fed: Fed
+    snapshot: Snapshot
+
+
+@pytest.fixture(scope="module")
+def followed(tmp_path_factory: pytest.TempPathFactory) -> Followed:
+    run = stating(matched(2), PoseFix, 1 / 3)
+    path = tmp_path_factory.mktemp("followed") / "snapshot.json"
+    fed = feed(OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, snapshot=path), run, arrivals_of(run))
+    return Followed(run, fed, Snapshot.read(path, "imu"))
 
 
 def pairs_of(residuals: Array, sigma: float, false_sigma: float = 5.0, key: str = "sigma_scale") -> list[Pair]:
@@ -116,17 +133,15 @@ def test_matches_that_state_a_third_of_their_noise_are_taken_as_they_scatter() -
     )  # what is right of them
 
 
-def test_online_matches_that_state_a_third_are_taken_as_they_scatter_from_then_on() -> None:
-    run = stating(matched(2), PoseFix, 1 / 3)
-    solution = replay(run.recording, run.config).solution
-    told = [line for line in solution.stats.events if "matcher: its measurements scatter more" in line]
+def test_online_matches_that_state_a_third_are_taken_as_they_scatter_from_then_on(followed: Followed) -> None:
+    told = [line for line in followed.fed.events if "matcher: its measurements scatter more" in line]
     assert 1 <= len(told) <= 2
-    assert not [line for line in solution.stats.events if "IMU" in line]
-    track = solution.trajectory
-    k = np.flatnonzero(track.stamps_ns > run.truth.stamps_ns[0] + 25 * SECOND)
-    assert track.cov is not None
-    off = (track.p_world_m[k] - run.truth.at(track.stamps_ns[k]).p_world_m)[:, :2]
-    nees = np.mean([e @ np.linalg.solve(P[:2, :2], e) for e, P in zip(off, track.cov[k], strict=True)])
+    assert not [line for line in followed.fed.events if "IMU" in line]
+    truth = followed.run.truth
+    late = [e for e in followed.fed.estimates if e.stamp_ns > truth.stamps_ns[0] + 25 * SECOND]
+    assert len(late) > 50
+    off = np.array([e.p_world_m for e in late]) - truth.at(np.array([e.stamp_ns for e in late])).p_world_m
+    nees = np.mean([d @ np.linalg.solve(e.cov[:2, :2], d) for d, e in zip(off[:, :2], late, strict=True)])
     assert nees < 4.0
 
 
@@ -141,7 +156,7 @@ def test_online_the_kernel_of_fixes_is_found_anew_by_their_new_sigma(monkeypatch
 
     as_ever = Scatter.note
     monkeypatch.setattr(Scatter, "note", note)
-    run = stating(matched(3), GnssPosition, 0.5)  # too little for the start to see
+    run = stating(matched(3, rate_hz=2.5), GnssPosition, 0.5)  # too little for the start to see
     events = replay(run.recording, run.config).solution.stats.events
     rebuilt = [line for line in events if "gnss: its measurements scatter" in line and "rebuilt" in line]
     assert len(rebuilt) >= 1
@@ -171,13 +186,8 @@ def test_a_pose_has_a_factor_on_lengths_and_one_on_angles() -> None:
     np.testing.assert_allclose(np.diagonal(wider.cov) / np.diagonal(plain.cov), [4.0, 4.0, 9.0])
 
 
-def test_a_snapshot_knows_what_sensors_scatter(tmp_path: Path) -> None:
-    run = stating(matched(2), PoseFix, 1 / 3)
-    path = tmp_path / "snapshot.json"
-    smoother = OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, snapshot=path)
-    for m in arrivals(run.recording):
-        smoother.feed(m)
-    found = Snapshot.read(path, "imu")
+def test_a_snapshot_knows_what_sensors_scatter(followed: Followed) -> None:
+    run, found = followed.run, followed.snapshot
     assert found.sensor_noise["matcher"]["sigma_scale"] > 1.5
     sensors = {"matcher": run.config.sensors["matcher"], "gnss": run.config.sensors["gnss"]}
     strange = replace(

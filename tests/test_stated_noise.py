@@ -57,7 +57,7 @@ def noisy_headings(seed: int) -> SimulatedRun:
         )
 
     recording = replace(run.recording, measurements=tuple(told(m) for m in run.recording.measurements))
-    return slowly(replace(run, recording=recording))
+    return slowly(replace(run, recording=recording), 2.5)
 
 
 @pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
@@ -85,7 +85,7 @@ def test_matches_that_state_a_tenth_of_their_noise_do_not_throw_the_start() -> N
         return replace(m, modes=tuple(replace(mode, cov=0.01 * mode.cov) for mode in m.modes))
 
     recording = replace(run.recording, measurements=tuple(told(m) for m in run.recording.measurements))
-    run = slowly(replace(run, recording=recording))
+    run = slowly(replace(run, recording=recording), 2.5)
     solution = app.smooth_recording(run.recording, run.config).solution
     assert compare_to_truth(solution.trajectory, run.truth).position_rmse_m < 0.6
     assert solution.stats.iterations < 200
@@ -117,7 +117,7 @@ def shaken(seed: int, duration_s: float = 30.0) -> SimulatedRun:
         bl_scenario(1, "drift", false_fraction=0.0), duration_s=duration_s, pose_hz=4.0, pose_sigma_m=0.05,
         accel_noise_ug_per_sqrt_hz=2000.0, gyro_noise_mdps_per_sqrt_hz=40.0,
     )  # fmt: skip
-    return slowly(simulate(scenario, seed))
+    return slowly(simulate(scenario, seed), 2.5)
 
 
 def by_data_sheet(run: SimulatedRun, **changed: object) -> VesselConfig:
