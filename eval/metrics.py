@@ -19,6 +19,7 @@ from graphloc.eval.formatting import number
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.recording import SpeedSeries
+from graphloc.solution import SlowEstimate
 from graphloc.trajectory import Trajectory
 
 Levers = Mapping[str, Array]
@@ -168,6 +169,7 @@ class HeldOutMetrics:
     """Errors of the predicted antenna position against held-out fixes.
 
     `outage_drift_m`: RMS over the gaps of the largest error in each; None if the fixes do not form several gaps.
+    `fix_rmse_m`: horizontal RMSE of the fixes as they are predicted, with the receiver's slow error; None: the estimate has none.
     """
 
     horizontal_rmse_m: float
@@ -175,17 +177,23 @@ class HeldOutMetrics:
     horizontal_max_m: float
     error_3d_rmse_m: float | None
     outage_drift_m: float | None
+    fix_rmse_m: float | None
     fixes: int
     matched: float
 
 
 def held_out_errors(
-    estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers
+    estimate: Trajectory,
+    held: Sequence[GnssPosition],
+    datum: Datum,
+    levers_m: Levers,
+    slow: Mapping[str, SlowEstimate] | None = None,
 ) -> PositionErrors:
     """Return the errors of the predicted antenna position at held-out fixes.
 
     Args:
         levers_m: antenna of each receiver in body, (3,) m.
+        slow: the slow errors that the estimate has found; then those of the predicted fix, which is off by the receiver's.
 
     Raises:
         NoCommonTimeError: the estimate covers none of the fixes.
@@ -199,16 +207,24 @@ def held_out_errors(
     there = estimate.at(moments)
     levers = np.array([levers_m[m.sensor] for m in held])[covered]
     antenna = there.p_world_m[index] + np.einsum("nij,nj->ni", there.R_world_body[index], levers)
+    for name, error in (slow or {}).items():
+        own = np.array([m.sensor == name for m in held])[covered]
+        for axis in range(3 if own.any() else 0):
+            antenna[own, axis] += np.interp(stamps[covered][own], error.stamps_ns, error.value[:, axis])
     return PositionErrors(stamps_ns=stamps[covered], position_m=antenna - fixes[covered], covered=float(covered.mean()))
 
 
 def compare_to_held_out(
-    estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers
+    estimate: Trajectory,
+    held: Sequence[GnssPosition],
+    datum: Datum,
+    levers_m: Levers,
+    slow: Mapping[str, SlowEstimate] | None = None,
 ) -> HeldOutMetrics:
     """Return the errors of an estimate against held-out fixes.
 
     Args:
-        levers_m: antenna of each receiver in body, (3,) m.
+        levers_m: antenna of each receiver in body, (3,) m. slow: the slow errors that the estimate has found, if any.
 
     Raises:
         NoCommonTimeError: the estimate covers none of the fixes.
@@ -220,12 +236,15 @@ def compare_to_held_out(
     usual = np.median(steps) if len(steps) else 1
     gap = np.cumsum(np.concatenate([[0], np.diff(stamps) > 2.5 * max(usual, 1)]))
     largest = np.array([horizontal[gap == g].max() for g in range(gap[-1] + 1)])
+    found = slow is not None and any(m.sensor in slow for m in held)
+    predicted = held_out_errors(estimate, held, datum, levers_m, slow).horizontal_m if found else None
     return HeldOutMetrics(
         horizontal_rmse_m=_rms(horizontal),
         horizontal_p95_m=float(np.percentile(horizontal, 95)),
         horizontal_max_m=float(horizontal.max()),
         error_3d_rmse_m=None if estimate.planar or not solid else _rms(np.linalg.norm(off.position_m, axis=1)),
         outage_drift_m=_rms(largest) if len(largest) > 1 else None,
+        fix_rmse_m=None if predicted is None else _rms(predicted),
         fixes=len(stamps),
         matched=off.covered,
     )
@@ -277,9 +296,15 @@ def truth_table(estimates: _Named, truth: Trajectory) -> Table:
     return _table("Against truth", rows, "position: horizontal; interpolated to the truth's stamps, not aligned")
 
 
-def held_out_table(estimates: _Named, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers) -> Table:
-    """Return a table with a row per estimate, against held-out fixes; `levers_m` as for `held_out_errors`."""
-    rows = [(name, compare_to_held_out(t, held, datum, levers_m)) for name, t in estimates]
+def held_out_table(
+    estimates: _Named,
+    held: Sequence[GnssPosition],
+    datum: Datum,
+    levers_m: Levers,
+    slow: Mapping[str, Mapping[str, SlowEstimate]],
+) -> Table:
+    """Return a table with a row per estimate, against held-out fixes; `levers_m` and `slow` of each as for `held_out_errors`."""
+    rows = [(name, compare_to_held_out(t, held, datum, levers_m, slow.get(name))) for name, t in estimates]
     return _table("Against held-out fixes", rows, "the fixes' own noise is part of the error")
 
 

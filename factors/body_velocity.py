@@ -7,7 +7,8 @@ v: velocity of body in world at the state; dv: its change until the measurement,
 north, a first-order Gauss-Markov process (over ground: none); R: body in world; omega: body rate from the gyroscope, bias
 removed; l: sensor in body; Q: the sensor's axes in body; S: selects the measured axes; s: scale error, a constant of the run.
 With a = R^T (v + dv - c), the derivatives of u are Q^T R^T by v, -Q^T R^T by c, and Q^T [a]_x by the body tangent theta of
-R <- R Exp(theta). Not handled: slip of wheels, other than as outliers; scales that differ between axes.
+R <- R Exp(theta): of x that is zero where u is along it, and only y tells the heading to first order. Not handled: slip of
+wheels, other than as outliers; scales that differ between axes.
 """
 
 from __future__ import annotations

@@ -8,7 +8,10 @@ from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 
+import numpy as np
+
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SlowErrorConfig
+from graphloc.frontends._assess_wander import WANDER_S
 from graphloc.frontends._draft_clock import recorded_lines, with_clock
 from graphloc.frontends._fixes import NOTHING_M, RTK_SIGMA_M, SCATTERS
 from graphloc.frontends._reports import (
@@ -42,6 +45,7 @@ _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off:
 _FILTERED = (
     "by its name a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 )
+_FASTER = 2.0  # times as fast as by default, from which a slow error is drafted as fast as it is
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
 
@@ -238,10 +242,29 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     else:
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3) if wanders else None
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
-        more = f"vertical_sigma_m: {vertical:.1f}" if vertical else ""
+        keys = [*([f"vertical_sigma_m: {vertical:.1f}"] if vertical else []), *_wandering(gnss)]
+        more = ", ".join(keys)
         fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
-        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{fixed}")
+        wander = f"; by the wheels it changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s" if _wandering(gnss) else ""
+        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{wander}{fixed}")
     return lines
+
+
+def _wandering(gnss: GnssReport) -> list[str]:
+    """Return the keys of a slow error that changes as fast as wheels show, where that is faster than by default.
+
+    Otherwise wheels contradict the fixes, and what gives way is the heading.
+    """
+    default = SlowErrorConfig()
+    if gnss.wander_m is None:
+        return []
+    # A Gauss-Markov process changes by 2 s^2 (1 - exp(-t / T)) in t.
+    share = gnss.wander_m**2 / (2.0 * default.horizontal_sigma_m**2)
+    if share < 1.0 - np.exp(-_FASTER * WANDER_S / default.time_constant_s):
+        return []
+    most = 1.0 - np.exp(-1.0)  # larger changes are those of a larger error, not of a faster one
+    sigma = [f"horizontal_sigma_m: {gnss.wander_m / np.sqrt(2.0 * most):.1f}"] if share > most else []
+    return [*sigma, f"time_constant_s: {-WANDER_S / np.log1p(-min(share, most)):.0f}"]
 
 
 def _scatter_lines(gnss: GnssReport) -> list[str]:
@@ -330,8 +353,8 @@ def _wheels_block(name: str, item: OdometryReport) -> list[str]:
     turned = ["  mount: {rpy_deg: [0.0, 0.0, 180.0]}  # guess: its sign looks wrong"] if item.reverse else []
     return [
         f"{name}:", "  kind: body_velocity", f"  topic: {item.topic}",
-        "  enabled: false  # guess: true to fuse it, if held-out fixes come out no worse; then delete check_speed_topic",
-        "  axes: [x]  # guess: [x, y] for wheels that do not slip sideways",
+        "  enabled: false  # guess: true to fuse it, if held-out fixes are predicted no worse (fix_rmse_m); then delete check_speed_topic",
+        "  axes: [x, y]  # guess: wheels do not slip sideways; x alone tells the heading by its cosine only, and may not converge",
         *turned,
     ]  # fmt: skip
 

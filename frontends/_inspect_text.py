@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from graphloc.frontends._assess_wander import WANDER_S
 from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, OdometryReport, TopicReport
 from graphloc.time import utc_text
 
@@ -127,4 +128,6 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         lines.append(
             f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m[: 2 if flat else 3])} m"
         )
+    if gnss.wander_m is not None:
+        lines.append(f"  error changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s along the way, by the wheels")
     return lines

@@ -32,6 +32,7 @@ from graphloc.frontends._assess import (
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
 from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turning_of
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
+from graphloc.frontends._assess_wander import wander_m
 from graphloc.frontends._assess_world import in_map_grid, world_of
 from graphloc.frontends._clock import FEWEST_STAMPS, GAIN_LIMIT_S, refuse_woven, step, usual_latency_s
 from graphloc.frontends._draft import draft_config
@@ -187,7 +188,9 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         source=bag.source,
         topics=_topic_reports(bag),
         imus=tuple(imus),
-        gnss=tuple(_timed_fixes(report, late, motions, velocities, bag.streams) for report in gnss),
+        gnss=tuple(
+            _beside_wheels(_timed_fixes(report, late, motions, velocities, bag.streams), bag, wheels) for report in gnss
+        ),
         compasses=compasses,
         odometry=tuple(reports),
         velocities=tuple(replace(report, late_s=_clearly(late.get(report.topic))) for _, report in velocities),
@@ -401,6 +404,16 @@ def _timed_fixes(
     known = {topic: found for topic, found in candidates.items() if found is not None and found.clear}
     by = min(known, key=lambda topic: known[topic].sigma_s, default="")
     return replace(gnss, late_s=_clearly(known.get(by)), late_by=by)
+
+
+def _beside_wheels(gnss: GnssReport, bag: _Contents, wheels: Sequence[TopicData]) -> GnssReport:
+    """Return the report with how fast the fixes' error changes, by the first wheels that are no filter's output."""
+    rolling = next((s for s in wheels if not filtered(s.topic)), None)
+    if rolling is None:
+        return gnss
+    stamps, p_m, _ = track(bag.aligned[gnss.topic])
+    scatter_m = max(gnss.scatter_m[:2]) if gnss.scatter_m else 0.0
+    return replace(gnss, wander_m=wander_m(rolling, stamps, p_m, scatter_m))
 
 
 def _clearly(offset: MotionOffset | None) -> tuple[float, float] | None:

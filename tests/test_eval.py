@@ -20,6 +20,7 @@ from graphloc.eval.simulate._voyage import open_motion
 from graphloc.frames import Datum, Geodetic
 from graphloc.measurements import GnssPosition, GnssVelocity, PoseFix
 from graphloc.recording import SpeedSeries
+from graphloc.solution import SlowEstimate
 from graphloc.trajectory import Trajectory
 
 
@@ -153,6 +154,39 @@ def test_held_out_numbers_by_hand() -> None:
     assert numbers.outage_drift_m == pytest.approx(np.sqrt((1.0 + 9.0) / 2.0), abs=1e-6)
     assert numbers.horizontal_rmse_m == pytest.approx(np.sqrt((7 * 1.0 + 4 * 9.0) / 11.0), abs=1e-6)
     assert numbers.horizontal_max_m == pytest.approx(3.0, abs=1e-6)
+
+
+def test_a_track_apart_from_a_drifting_receiver_predicts_its_fixes() -> None:
+    """Fixes drift from 0 to 5.9 m north; the track does not, and the estimated error (a node every 10 s) is 1 m east of that drift."""
+    stamps = np.arange(0, 60 * 10**9, 10**9, dtype=np.int64)
+    datum = Datum(Geodetic(57.7, 11.9, 40.0))
+    north = 0.1 * np.arange(60)
+    track = Trajectory(
+        stamps_ns=stamps,
+        p_world_m=np.zeros((60, 3)),
+        R_world_body=np.tile(np.eye(3), (60, 1, 1)),
+        v_world_mps=np.zeros((60, 3)),
+    )
+    held = tuple(
+        GnssPosition(
+            stamp_ns=int(stamps[k]), sensor="gnss", seq=k, cov_enu_m2=np.eye(3),
+            position=Geodetic(*datum.geodetic_from_enu(np.array([0.0, north[k], 0.0]))[0]),
+        )
+        for k in (20, 30, 40)
+    )  # fmt: skip
+    nodes = stamps[::10]
+    drift = SlowEstimate(
+        name="GNSS error", axes=("east", "north", "up"), units=("m", "m", "m"), stamps_ns=nodes,
+        value=np.column_stack([np.ones(6), north[::10], np.zeros(6)]), sigma=np.ones((6, 3)),
+    )  # fmt: skip
+    levers = {"gnss": np.zeros(3)}
+    off = np.sqrt((2.0**2 + 3.0**2 + 4.0**2) / 3.0)
+    for slow, predicted in (({"gnss": drift}, 1.0), ({"log": drift}, None), ({}, None), (None, None)):
+        numbers = metrics.compare_to_held_out(track, held, datum, levers, slow)
+        assert numbers.horizontal_rmse_m == pytest.approx(off, abs=1e-6)
+        assert numbers.fix_rmse_m == (None if predicted is None else pytest.approx(predicted, abs=1e-6))
+    table = metrics.held_out_table([("ours", track), ("theirs", track)], held, datum, levers, {"ours": {"gnss": drift}})
+    assert [row["fix_rmse_m"] for row in table.as_dict().values()] == [pytest.approx(1.0, abs=1e-6), None]
 
 
 def test_forward_speed_by_hand() -> None:

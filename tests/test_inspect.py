@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from graphloc.config import CompassConfig, ImuConfig, VesselConfig, load_config
+from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuConfig, VesselConfig, load_config
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._assess_velocity import axes_of
 from graphloc.frontends._source import Bag, RawMessage
@@ -662,6 +662,12 @@ def test_husky(tmp_path: Path) -> None:
     assert found.gnss[0].statuses == {"sbas": 989}
     assert found.gnss[0].height_range_m > 30.0
     assert config.check_speed_topic == "/husky_velocity_controller/odom"
+    receiver, wheels = config.sensors["gnss"], config.sensors["wheels"]
+    assert isinstance(wheels, BodyVelocityConfig)
+    assert wheels.axes == ("x", "y")
+    assert isinstance(receiver, GnssConfig)
+    # Against the wheels the fixes go back by 2 m at 54 s, and 5 m to the side from 30 to 40 s.
+    assert 10.0 < receiver.slow_error.time_constant_s < 80.0
     assert "compass" not in config.sensors  # its yaw drifts by tens of degrees against the course
     recording = read_recording(HUSKY, config)
     assert recording.message_count == 11865 + 989 + 3952

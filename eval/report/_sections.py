@@ -26,7 +26,8 @@ _CLASS = {Trust.YES: "", Trust.WITH_CARE: "care", Trust.NO: "no"}
 _KEY = (
     ("position_rmse_m", "RMSE, m", 2), ("horizontal_rmse_m", "RMSE, m", 2), ("position_p95_m", "95 %, m", 2),
     ("horizontal_p95_m", "95 %, m", 2), ("position_max_m", "worst, m", 2), ("horizontal_max_m", "worst, m", 2),
-    ("outage_drift_m", "drift in gaps, m", 2), ("heading_rmse_deg", "heading RMSE, °", 2),
+    ("outage_drift_m", "drift in gaps, m", 2), ("fix_rmse_m", "RMSE of predicted fixes, m", 2),
+    ("heading_rmse_deg", "heading RMSE, °", 2),
 )  # fmt: skip
 _SHARES = (("coverage_95", "in 95 % bounds"), ("matched", "covered"))
 _WIDE = ("95 %, m", "worst, m", "covered")  # a phone does without

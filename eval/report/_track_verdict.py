@@ -179,7 +179,7 @@ def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
     for filtered in data.filters:
         if filtered.name == (data.online.name if data.online else ""):
             continue
-        both = _errors_of_both(data, solution.trajectory, filtered.trajectory)
+        both = _errors_of_both(data, solution, filtered.trajectory)
         if both is not None and _rms(both[0]) > _WORSE * _rms(both[1]):
             ours, theirs = both
             yield Reason(
@@ -189,9 +189,12 @@ def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
             )
 
 
-def _errors_of_both(data: ReportData, ours: Trajectory, theirs: Trajectory) -> tuple[Array, Array] | None:
-    """Return the horizontal errors (M,), m, of two tracks at the stamps that both cover; None if there are none."""
-    truth = data.recording.truth
+def _errors_of_both(data: ReportData, solution: Solution, theirs: Trajectory) -> tuple[Array, Array] | None:
+    """Return the horizontal errors (M,), m, of a solution and of another track at the stamps that both cover; None if there are none.
+
+    Of held-out fixes as each predicts them: a filter that follows a drifting receiver is no better for it.
+    """
+    truth, ours = data.recording.truth, solution.trajectory
     if truth is not None:
         stamps = truth.stamps_ns[ours.covers(truth.stamps_ns) & theirs.covers(truth.stamps_ns)]
         if not len(stamps):
@@ -202,7 +205,8 @@ def _errors_of_both(data: ReportData, ours: Trajectory, theirs: Trajectory) -> t
     held = [m for m, both in zip(data.held, ours.covers(at) & theirs.covers(at), strict=True) if both]
     if not held:
         return None
-    first, second = (held_out_errors(t, held, data.solution.datum, data.levers_m) for t in (ours, theirs))
+    first = held_out_errors(ours, held, data.solution.datum, data.levers_m, solution.slow)
+    second = held_out_errors(theirs, held, data.solution.datum, data.levers_m)
     return first.horizontal_m, second.horizontal_m
 
 

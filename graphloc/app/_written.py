@@ -28,7 +28,8 @@ def tables(run: Run) -> tuple[metrics.Table, ...]:
         found.append(metrics.truth_table(estimates, run.recording.truth))
         found += _docking_tables(run, estimates, run.recording.truth)
     if run.held:
-        found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, levers_m(run)))
+        slow = {s.name: s.slow for s in (run.solution, run.online) if s is not None}
+        found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, levers_m(run), slow))
     if run.recording.check_speed is not None:
         found.append(metrics.speed_table(estimates, run.recording.check_speed))
     whys = [f"{f.name}: {f.why}." for f in run.filters if f.why]

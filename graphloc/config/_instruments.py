@@ -191,8 +191,8 @@ class BodyVelocityConfig(SensorConfig):
     kind: Literal["body_velocity"] = "body_velocity"
     """Which row of the sensor table reads this block."""
     axes: SpeedAxes = ("x",)
-    """Axes of the sensor along which it measures; of a number and of VHW x alone. Wheels that do not slip sideways: [x, y];
-    a Doppler log: [x, y, z]."""
+    """Axes of the sensor along which it measures; of a number and of VHW x alone. Wheels: [x, y], where the mount is a place that
+    does not slip sideways (the rear axle of a car); x alone tells an error of the heading by its cosine only. A Doppler log: [x, y, z]."""
     through: Literal["ground", "water"] = "ground"
     """What it moves over or through. Water has a current, which is estimated."""
     unit: Literal["m/s", "km/h", "knots"] = "m/s"

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How fast the error of fixes changes: by the lengths of their chords against those of the wheels' odometry."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+from graphloc.frontends._assess import sane
+from graphloc.frontends._streams import TopicData
+from graphloc.time import NS_PER_S
+
+WANDER_S = 10.0
+"""Time from one end of a chord to the other, s."""
+_LEAST_M = 3.0  # of a shorter chord the length is mostly error
+_SHORTEST_S = 100.0  # of motion: ten chords that do not overlap
+_SLIP = 0.03  # of a chord: so much may be the wheels'
+
+
+def wander_m(wheels: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float) -> float | None:
+    """Return by how much the error of fixes changes along the way in `WANDER_S`, m, 1 sigma; None where that is not told.
+
+    Of lengths, so that no heading is needed, by the poses of the odometry itself, which drift little in so short a time. Their scale is
+    the median's; and jumps, of which there are few, hardly count.
+
+    Args:
+        wheels: odometry. stamps_ns: (N,) of the fixes. p_m: (N, 3), east, north, up. scatter_m: noise of each, 1 sigma of an axis.
+    """
+    keep = sane(wheels)
+    keep = keep[np.isfinite(wheels.rows[keep, :2]).all(axis=1)] if len(keep) else keep
+    inside = (stamps_ns >= wheels.stamps_ns[keep[0]]) & (stamps_ns <= wheels.stamps_ns[keep[-1]]) if len(keep) else []
+    if np.count_nonzero(inside) < 2:
+        return None
+    begin_ns = int(wheels.stamps_ns[keep[0]])
+    at = (wheels.stamps_ns[keep] - begin_ns) / NS_PER_S
+    t, p = (stamps_ns[inside] - begin_ns) / NS_PER_S, p_m[inside, :2]
+    rolled = np.column_stack([np.interp(t, at, wheels.rows[keep, axis]) for axis in (0, 1)])
+    end = np.searchsorted(t, t + WANDER_S)
+    begin = np.flatnonzero(end < len(t))
+    begin = begin[t[end[begin]] - t[begin] < 1.5 * WANDER_S]  # not across an outage
+    end = end[begin]
+    fixed, chord = (np.hypot(*(way[end] - way[begin]).T) for way in (p, rolled))
+    moved = chord > _LEAST_M
+    if np.count_nonzero(moved) * float(np.median(np.diff(t))) < _SHORTEST_S:
+        return None
+    fixed, chord = fixed[moved], chord[moved]
+    off = fixed - np.median(fixed / chord) * chord
+    sigma = 1.4826 * float(np.median(np.abs(off - np.median(off))))
+    if sigma < _SLIP * float(np.median(chord)):
+        return None
+    return float(np.sqrt(max(sigma**2 - 2.0 * scatter_m**2, 0.0)))
