@@ -30,7 +30,7 @@ _EVEN = 1.5  # steps in time that differ by more than this factor are not compar
 _IN_BOUNDS = 1.5  # sigmas of the slow error that the bounds include: jumps up to there need no word
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
 _KEPT = 200
-_CERTAIN_SIGMAS = 8.0  # off a prediction
+_FITS_SIGMAS, _CERTAIN_SIGMAS = 5.0, 8.0  # off a prediction
 _SAME, _SAME_SIGMAS = 0.25, 3.0  # off a prediction by the same: within this share and so many sigmas
 _ENDS = 10.0  # odds that a jump is over
 _IMU_OFF_MPS2 = 1.0  # by how much an IMU may be wrong: gravity where it is tilted by 6 deg
@@ -178,8 +178,8 @@ class JumpDetector:
         self._seen: deque[tuple[int, Array, float]] = deque(maxlen=_KEPT)
         self._judged_ns = 0
         self._last_ns: int | None = None
-        self._before: tuple[int, Array] | None = None  # by how much the fix before was off its prediction
-        self._off: list[tuple[int, Array]] = []  # the fixes since the beginning of what may be a jump, likewise
+        self._before: tuple[int, OffPrediction] | None = None  # the last fix
+        self._off: list[tuple[int, Array]] = []  # the fixes since the beginning of what may be a jump
 
     @property
     def suspicious(self) -> bool:
@@ -204,7 +204,7 @@ class JumpDetector:
         self, stamp_ns: int, off: OffPrediction | None, sigma_m: float, allowed_m: float
     ) -> PositionJump | None:
         """Return a jump that is certain by now: at once, fixes were off their predictions, and have been by the same for a second."""
-        before, self._before = self._before, None if off is None else (stamp_ns, off.off_m)
+        before, self._before = self._before, None if off is None else (stamp_ns, off)
         if off is None or before is None:
             self._off = []
             return None
@@ -216,13 +216,14 @@ class JumpDetector:
         # No IMU is wrong by just what the slow error is. The odds that it is over: of the fix, and of a jump to end in this time.
         ends = off.sigmas**2 - off.sigmas_without**2 > 2.0 * (math.log(_ENDS) - math.log(math.expm1(dt_s / MEAN_S)))
         least_m = max(allowed_m, _JUMP_M, _IMU_OFF_MPS2 * dt_s**2 / 2.0)
-        jumps = off.sigmas > _CERTAIN_SIGMAS and np.linalg.norm(off_m - before[1]) > least_m
+        # After a fix that was off and used, the estimate is on its way there, and a right one is off, too.
+        jumps = before[1].sigmas < _FITS_SIGMAS and off.sigmas > _CERTAIN_SIGMAS and np.linalg.norm(off_m) > least_m
         if self._off or ends or jumps:
             self._off.append((stamp_ns, off_m))
         if not self._off or stamp_ns - self._off[0][0] < _BURST_S * NS_PER_S:
             return None
         begun_ns, jump_m = self._off[0][0], np.mean([m for _, m in self._off], axis=0)
-        self._off, self._before = [], (stamp_ns, off_m - jump_m)  # from now on it is predicted
+        self._off, self._before = [], (stamp_ns, OffPrediction(off_m - jump_m, 0.0, 0.0))  # from now on it is predicted
         return PositionJump(begun_ns, *jump_m.tolist())
 
     def _by_steps(self, stamp_ns: int, allowed_m: float) -> tuple[NDArray[np.int64], Array]:
