@@ -322,19 +322,10 @@ def test_a_receiver_alone_that_jumps_is_not_followed() -> None:
     assert fed.recovered_s(end) < 5.0
 
 
-@pytest.mark.parametrize(
-    ("hz", "sigma_m", "slow_m", "jump_m", "begin_s", "bound_m"),
-    [
-        (5.0, 0.02, 0.03, 10.0, 12.6, 0.5),  # early and late in the slow node of a second
-        (5.0, 0.02, 0.03, 10.0, 13.1, 0.5),
-        (5.0, 0.45, 2.0, 7.0, 13.1, 2.0),  # hidden in the noise of single fixes
-        (0.55, 0.1, 2.0, 7.0, 13.1, 2.0),  # and in what a vessel may go between two
-    ],
-)
-def test_a_receiver_alone_whose_jump_the_imu_shows(
-    hz: float, sigma_m: float, slow_m: float, jump_m: float, begin_s: float, bound_m: float
-) -> None:
-    """It is followed at neither end."""
+def jumping(
+    hz: float, sigma_m: float, slow_m: float, jump_m: float, begin_s: float
+) -> tuple[SimulatedRun, Arrivals, int, int]:
+    """A receiver alone, with IMU and compass, that jumps for 9 s: the run, what arrives, and when the jump begins and ends."""
     scenario = replace(bl_scenario(1, "clean"), duration_s=28.0, path="loops", imu_hz=50.0, gnss_hz=hz, gnss_sigma_m=sigma_m)  # fmt: skip
     run = slowly(simulate(scenario, 1), max(hz, RATE_HZ))
     gnss = run.config.sensors["gnss"]
@@ -354,9 +345,39 @@ def test_a_receiver_alone_whose_jump_the_imu_shows(
         else a
         for a in base
     ]  # fmt: skip
+    return run, jumped, begin, end
+
+
+@pytest.mark.parametrize(
+    ("hz", "sigma_m", "slow_m", "jump_m", "begin_s", "bound_m"),
+    [
+        (5.0, 0.02, 0.03, 10.0, 12.6, 0.5),  # early and late in the slow node of a second
+        (5.0, 0.02, 0.03, 10.0, 13.1, 0.5),
+        (5.0, 0.45, 2.0, 7.0, 13.1, 2.0),  # hidden in the noise of single fixes
+        (0.55, 0.1, 2.0, 7.0, 13.1, 2.0),  # and in what a vessel may go between two
+    ],
+)
+def test_a_receiver_alone_whose_jump_the_imu_shows(
+    hz: float, sigma_m: float, slow_m: float, jump_m: float, begin_s: float, bound_m: float
+) -> None:
+    """It is followed at neither end."""
+    run, jumped, _, _ = jumping(hz, sigma_m, slow_m, jump_m, begin_s)
     fed = finish(online := smoother(run), feed(online, run, jumped))
     assert len([e for e in fed.events if "position jump" in e and "rebuilt" in e]) == 2
     assert max(fed.errors_m) < bound_m
+
+
+def test_no_window_begins_where_a_jump_was_not_known_yet() -> None:
+    """Estimates from between a jump and its detection have the slow error of before it: a rebuild 9 s later was 8 m off."""
+    run, jumped, begin, _ = jumping(5.0, 0.45, 2.0, 7.0, 13.1)
+    online = smoother(run)
+    n = next(k for k, a in enumerate(jumped) if a.true_ns > begin + 1_800_000_000)
+    fed = feed(online, run, jumped[:n])
+    assert [e for e in fed.events if "position jump" in e and "rebuilt" in e]
+    assert online._tracking is not None  # noqa: SLF001
+    stamps_ns = [anchor.stamp_ns for anchor in online._tracking._recent.anchors]  # noqa: SLF001
+    assert [at for at in stamps_ns if at < begin]
+    assert not [at for at in stamps_ns if begin < at < begin + 1_000_000_000]
 
 
 def test_odometry_continues_when_the_clock_is_set_back() -> None:

@@ -54,6 +54,11 @@ class Recent:
         self._came = kept
         return True
 
+    def forget_anchors(self, since_ns: int) -> None:
+        """Forget the anchors from a stamp on, but for the oldest: they have turned out to be wrong."""
+        while len(self.anchors) > 1 and self.anchors[-1].stamp_ns >= since_ns:
+            self.anchors.pop()
+
     def __iter__(self) -> Iterator[Measurement]:
         """All measurements, in order of arrival."""
         return iter(self._came)

@@ -355,6 +355,10 @@ class Tracking:
                 for m in again:
                     ledger.drop(m, Outcome.REJECTED, f"left out: {why}")
                 recent.anchors = deque([anchor])
+            streams, known = self.lag.problem.streams, failed.problem.streams
+            jumps = [j.after_ns for name, s in streams.items() for j in s.jumps if j not in known[name].jumps]
+            if jumps:  # at the anchors since, its slow error was that before it
+                recent.forget_anchors(min(jumps))
             self._settle_rows(failed, again)
             age_s = (self.lag.newest.stamp_ns - anchor.stamp_ns) * 1e-9
             return f"{why}: the window was rebuilt from {age_s:.1f} s before"
