@@ -125,7 +125,7 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
     config, rows = setup.config, setup.rows
     whole = origin.with_synthetic(recording, config, datum, rows)
     problem = make_problem(whole, config, datum, rows, setup.inertial, company_of(config, rows))
-    result = solve_batch(problem)
+    result = solve_batch(problem, newest=True)
     span_s = _span_s(result)
     if result.noise_scale > LARGEST_NOISE_SCALE and span_s < _LONGEST_WAIT_S:
         return "data in which the IMU and the other sensors agree"

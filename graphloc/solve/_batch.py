@@ -79,14 +79,17 @@ def noise_step(ratio: float) -> float:
     return float(np.clip(np.sqrt(ratio), 1.5, 3.0))
 
 
-def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
+def solve_batch(problem: Problem, progress: Progress = quiet, *, newest: bool = False) -> BatchResult:
     """Solve a whole run.
+
+    Args:
+        newest: `heading_var` is asked for at the last state alone.
 
     Raises:
         SolveError: it could not be started, or the linear algebra failed.
     """
     start, few = align(problem), thinned(problem)
-    grown, prior, known, iterations, headings, few_var = solve_start(few.problem, start, progress)
+    grown, prior, known, iterations, headings, few_var = solve_start(few.problem, start, progress, newest=newest)
     heading_var = np.interp(problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1], few_var)
     begun = int(few.states[known])
     iterations += grow(few.problem, grown, prior, known, progress)
@@ -109,7 +112,9 @@ def solve_batch(problem: Problem, progress: Progress = quiet) -> BatchResult:
         if noisier is None:
             break
         if start.by_motion and ratio < CONTRADICTION:
-            return solve_batch(noisier, progress)  # which headings the motion excludes was found with the smaller noise
+            return solve_batch(
+                noisier, progress, newest=newest
+            )  # which headings the motion excludes was found with the smaller noise
         problem = bridged(noisier, estimate)
         few = thinned(problem)
         if ratio >= CONTRADICTION:

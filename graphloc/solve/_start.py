@@ -10,6 +10,7 @@ costs of all headings say.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -54,8 +55,12 @@ class Begun(NamedTuple):
     heading_var: Array
 
 
-def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
-    """Try each candidate on the first window; look further while several explain it; keep the cheapest."""
+def solve_start(problem: Problem, start: Start, progress: Progress, *, newest: bool = False) -> Begun:
+    """Try each candidate on the first window; look further while several explain it; keep the cheapest.
+
+    Args:
+        newest: `heading_var` is asked for at the last state alone; it is that of all.
+    """
     seconds, iterations, until = max(start.window_s, _placed_s(problem)), 0, 0
     longest_s = _LONGEST_UNTOLD_S if start.by_motion else _LONGEST_S
     candidates = [_candidate(problem, start, yaw) for yaw in start.yaws_rad]
@@ -80,11 +85,18 @@ def solve_start(problem: Problem, start: Start, progress: Progress) -> Begun:
             for candidate in candidates if start.tried else ():
                 # A prior about a heading that was only tried is no information: the candidates may go where the motion takes them.
                 candidate.prior = _start_prior(problem, start, _first_yaw(candidate.values))
-            told_apart = told_apart and _told(problem, start, candidates[0], until)
+        best, beside = candidates[0], list[float]()
+        if start.by_motion and told_apart:
+            beside = _costs_beside(problem, start, best, until)
+            told_apart = beside[-1] > _excluded(best)
         if told_apart or last_window:
-            best, heading_var = candidates[0], np.zeros(until + 1)
+            heading_var = np.zeros(until + 1)
             if start.by_motion:
-                heading_var = _heading_var(problem, start, best, until, told=told_apart)
+                heading_var[:] = 0.0 if told_apart else _var_at(problem, start, best, until, until, beside)
+                if not newest:
+                    stamps = problem.timeline.stamps_ns[: until + 1]
+                    ends = _var_at(problem, start, best, until, 0), heading_var[-1]
+                    heading_var = np.interp(stamps, stamps[[0, -1]], ends)
             return Begun(best.values, best.prior, until, iterations, len(candidates), heading_var)
         seconds *= 1.6
 
@@ -154,26 +166,29 @@ def _first_yaw(values: gtsam.Values) -> float:
     return float(values.atPose3(keys.pose(0)).rotation().yaw())
 
 
-def _told(problem: Problem, start: Start, best: _Candidate, last: int) -> bool:
-    """Whether the motion excludes, at state `last`, the headings beside the best one."""
-    most = best.cost + _COST_APART * best.excess
-    return all(_held(problem, start, best, last, last, by_rad).cost > most for by_rad in _OTHERS_RAD[:2].tolist())
+def _excluded(best: _Candidate) -> float:
+    """Return the cost above which a heading is excluded."""
+    return best.cost + _COST_APART * best.excess
 
 
-def _heading_var(problem: Problem, start: Start, best: _Candidate, last: int, *, told: bool) -> Array:
-    """Return the variance (last + 1,), rad^2, of the heading of each state: at both ends by `_var_at`, linear in between.
+def _costs_beside(problem: Problem, start: Start, best: _Candidate, last: int) -> list[float]:
+    """Return the costs of the headings at state `last` beside the best one, up to the first that the motion does not exclude."""
+    costs: list[float] = []
+    for by_rad in _OTHERS_RAD[:2].tolist():
+        costs.append(_held(problem, start, best, last, last, by_rad).cost)
+        if costs[-1] <= _excluded(best):
+            break
+    return costs
+
+
+def _var_at(problem: Problem, start: Start, best: _Candidate, last: int, at: int, known: Sequence[float] = ()) -> float:
+    """Return the variance, rad^2, of the heading of a state, from how much others cost: about 0 where these cost much more.
 
     Args:
-        told: at the last state others are excluded (`_told`).
+        known: costs of the first of the others.
     """
-    ends = [_var_at(problem, start, best, last, 0), 0.0 if told else _var_at(problem, start, best, last, last)]
-    stamps = problem.timeline.stamps_ns[: last + 1]
-    return np.interp(stamps, stamps[[0, -1]], ends)
-
-
-def _var_at(problem: Problem, start: Start, best: _Candidate, last: int, at: int) -> float:
-    """Return the variance, rad^2, of the heading of a state, from how much others cost: about 0 where these cost much more."""
-    cost = np.array([_held(problem, start, best, last, at, by_rad).cost for by_rad in _OTHERS_RAD.tolist()])
+    others = [_held(problem, start, best, last, at, by_rad).cost for by_rad in _OTHERS_RAD[len(known) :].tolist()]
+    cost = np.array([*known, *others])
     weight = _WIDTHS_RAD * np.exp(-np.maximum(cost - best.cost, 0.0) / best.excess)
     return float(weight @ _OTHERS_RAD**2 / (_WIDTHS_RAD[0] + weight.sum()))
 
