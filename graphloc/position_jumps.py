@@ -213,8 +213,10 @@ class JumpDetector:
             mean_m = np.mean([m for _, m in self._off], axis=0)
             if np.linalg.norm(off_m - mean_m) > _SAME * np.linalg.norm(mean_m) + _SAME_SIGMAS * sigma_m:
                 self._off = []
-        # No IMU is wrong by just what the slow error is. The odds that it is over: of the fix, and of a jump to end in this time.
-        ends = off.sigmas**2 - off.sigmas_without**2 > 2.0 * (math.log(_ENDS) - math.log(math.expm1(dt_s / MEAN_S)))
+        # No IMU is wrong by just what the slow error is. The odds that it is over: of the fix, and of a jump to end in this time. The
+        # latter are even at most: where no jump is going on, or the prediction tells nothing, a silence does not end one.
+        odds = math.expm1(min(dt_s / MEAN_S, math.log(2.0)))
+        ends = off.sigmas**2 - off.sigmas_without**2 > 2.0 * (math.log(_ENDS) - math.log(odds))
         least_m = max(allowed_m, _JUMP_M, _IMU_OFF_MPS2 * dt_s**2 / 2.0)
         # After a fix that was off and used, the estimate is on its way there, and a right one is off, too.
         jumps = before[1].sigmas < _FITS_SIGMAS and off.sigmas > _CERTAIN_SIGMAS and np.linalg.norm(off_m) > least_m

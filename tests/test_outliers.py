@@ -221,6 +221,17 @@ def test_what_is_off_its_prediction_by_the_same_for_a_second_has_jumped() -> Non
     assert found(0.4 * seldom, 12) == []
 
 
+@pytest.mark.parametrize("silent_s", [20.0, 80.0, 86400.0])
+def test_a_silence_of_the_receiver_is_no_jump(silent_s: float) -> None:
+    """The first fixes after it agree with a prediction that has become uncertain."""
+    watch = JumpDetector()
+    for t in [*range(20), *(19.0 + silent_s + np.arange(5.0))]:
+        off = OffPrediction(np.array([0.3, 0.2]), 0.0, 0.0)
+        watch.note(round(t * 1e9), np.array([2.0 * t, 0.0]), 0.5, allowed_m=3.0, off=off)
+        assert not watch.suspicious
+    assert watch.jumps == ()
+
+
 def test_a_jump_is_detected_online_and_reported_once() -> None:
     t = RTK_S
     watch, said = JumpDetector(), []
