@@ -181,10 +181,16 @@ class JumpDetector:
         self._before: tuple[int, OffPrediction] | None = None  # the last fix
         self._off: list[tuple[int, Array]] = []  # the fixes since the beginning of what may be a jump
 
-    @property
-    def suspicious(self) -> bool:
-        """Whether the last fix is the beginning of a jump, or of a burst of outliers: which one shows within seconds."""
-        return bool(self._off)
+    def suspects(self, stamp_ns: int) -> bool:
+        """Return whether a fix may be of a jump, or of a burst of outliers, that has begun: which one shows within seconds.
+
+        Those before it are none, though they come late, or once more as the window is rebuilt.
+        """
+        return bool(self._off) and stamp_ns >= self._off[0][0]
+
+    def forget(self) -> None:
+        """Forget the jumps, and what may be one: it was off an estimate that is given up."""
+        self.jumps, self._off, self._before = (), [], None
 
     def note(
         self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed_m: float, off: OffPrediction | None = None

@@ -228,7 +228,7 @@ def test_a_silence_of_the_receiver_is_no_jump(silent_s: float) -> None:
     for t in [*range(20), *(19.0 + silent_s + np.arange(5.0))]:
         off = OffPrediction(np.array([0.3, 0.2]), 0.0, 0.0)
         watch.note(round(t * 1e9), np.array([2.0 * t, 0.0]), 0.5, allowed_m=3.0, off=off)
-        assert not watch.suspicious
+        assert not watch.suspects(round(t * 1e9))
     assert watch.jumps == ()
 
 

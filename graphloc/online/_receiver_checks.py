@@ -55,15 +55,17 @@ class ReceiverChecks:
             self._reject_since(stream, min(at_s - WINDOW_S, detector.stands_s))
         if detector.for_long(at_s):
             self._agreement.note(stream, m, None)
-        return detector.frozen or stream.jump_detector.suspicious
+        return detector.frozen or stream.jump_detector.suspects(m.stamp_ns)
 
     def _off(self, stream: LiveStream, at: Attachment, residual: Residual, off_m: Array) -> OffPrediction | None:
-        """Return how the newest fix lies to its prediction; None where the receiver's slow error is switched off.
+        """Return how the newest fix lies to its prediction; None where the receiver's slow error is switched off, or cannot jump.
+
+        And until the window is rebuilt with a jump that was found: it predicts fixes as of before the jump.
 
         Args:
             off_m: (2,) of the fix from the estimated place, slow error aside.
         """
-        if stream.left_out is None:
+        if stream.left_out is None or not stream.left_out.jumps or stream.jump_detector.jumps != stream.jumps:
             return None
         without = residual.raw
         if stream.slow is not None and at.slow_value is not None and residual.slow_jacobian is not None:
