@@ -378,9 +378,9 @@ def test_a_jump_is_found_among_many_fixes_to_a_state() -> None:
 
 def test_a_window_that_is_rebuilt_amid_a_suspicion_has_the_fixes_before_it() -> None:
     """Where it turns out to be a burst of outliers, they come in no second time."""
-    run, jumped, begin, _ = jumping(5.0, 0.45, 2.0, 7.0, 13.1)
-    online = smoother(run)
-    feed(online, run, jumped[: next(k for k, a in enumerate(jumped) if a.true_ns > begin + 600_000_000)])
+    run, jumped, begin, end = jumping(5.0, 0.45, 2.0, 7.0, 13.1)
+    online, now = smoother(run), next(k for k, a in enumerate(jumped) if a.true_ns > begin + 600_000_000)
+    fed = feed(online, run, jumped[:now])
     assert online._tracking is not None  # noqa: SLF001
     assert online._tracking.lag.problem.streams["gnss"].jump_detector.suspects(online._tracking.lag.newest.stamp_ns)  # noqa: SLF001
     online._rebuild("planted")  # noqa: SLF001
@@ -388,6 +388,11 @@ def test_a_window_that_is_rebuilt_amid_a_suspicion_has_the_fixes_before_it() -> 
     own = lag._entries.of(lag.problem.streams["gnss"])  # noqa: SLF001
     assert len(own) > 30
     assert all((e.verdict.decision is None) == (e.measurement.stamp_ns > begin) for e in own)
+    rest = [a for a in jumped[now:] if not isinstance(a.m, GnssPosition) or a.true_ns >= end]
+    fed = finish(online, feed(online, run, rest, fed))
+    out = [row for row in fed.rows if row.sensor == "gnss" and row.outcome is Outcome.REJECTED and row.nis is not None]
+    assert [begin < row.stamp_ns < begin + 600_000_000 for row in out] == [True] * len(out)
+    assert {row.reason for row in out} == {"off what the IMU predicts: an outlier, or a position jump too short to tell"}
 
 
 def test_fixes_of_a_receiver_that_is_said_not_to_jump_are_used_after_a_jump() -> None:
