@@ -170,7 +170,7 @@ class JumpDetector:
     off the prediction by the same for a second has jumped: that of an IMU which is wrong grows.
 
     Attributes:
-        jumps: those detected since the estimate started.
+        jumps: the last of those detected since the estimate started.
     """
 
     def __init__(self) -> None:
@@ -217,7 +217,9 @@ class JumpDetector:
         off_m, dt_s = off.off_m, (stamp_ns - before[0]) / NS_PER_S
         if self._off:
             mean_m = np.mean([m for _, m in self._off], axis=0)
-            if np.linalg.norm(off_m - mean_m) > _SAME * np.linalg.norm(mean_m) + _SAME_SIGMAS * sigma_m:
+            most_m = _SAME * np.linalg.norm(mean_m) + _SAME_SIGMAS * sigma_m
+            # Nor is it the same where it fits better: off the other way than its largest sigma, an outlier is off by less than that.
+            if np.linalg.norm(off_m - mean_m) > min(most_m, float(np.linalg.norm(off_m))):
                 self._off = []
         # No IMU is wrong by just what the slow error is. The odds that it is over: of the fix, and of a jump to end in this time. The
         # latter are even at most: where no jump is going on, or the prediction tells nothing, a silence does not end one.
@@ -251,7 +253,7 @@ class JumpDetector:
         return self._found(list(map(PositionJump, at_ns[new].tolist(), *off.T.tolist())), stamp_ns)
 
     def _found(self, jumps: list[PositionJump], stamp_ns: int) -> tuple[NDArray[np.int64], Array]:
-        self.jumps += tuple(jumps)
+        self.jumps = (*self.jumps, *jumps)[-_KEPT:]
         again = self.doubtful(stamp_ns)
         self._last_ns = jumps[-1].after_ns
         if again:
