@@ -170,7 +170,7 @@ class JumpDetector:
     off the prediction by the same for a second has jumped: that of an IMU which is wrong grows.
 
     Attributes:
-        jumps: those detected since the estimate started.
+        jumps: the last of those detected since the estimate started.
     """
 
     def __init__(self) -> None:
@@ -181,10 +181,16 @@ class JumpDetector:
         self._before: tuple[int, OffPrediction] | None = None  # the last fix
         self._off: list[tuple[int, Array]] = []  # the fixes since the beginning of what may be a jump
 
-    @property
-    def suspicious(self) -> bool:
-        """Whether the last fix is the beginning of a jump, or of a burst of outliers: which one shows within seconds."""
-        return bool(self._off)
+    def suspects(self, stamp_ns: int) -> bool:
+        """Return whether a fix may be of a jump, or of a burst of outliers, that has begun: which one shows within seconds.
+
+        Those before it are none, though they come late, or once more as the window is rebuilt.
+        """
+        return bool(self._off) and stamp_ns >= self._off[0][0]
+
+    def forget(self) -> None:
+        """Forget the jumps, and what may be one: it was off an estimate that is given up."""
+        self.jumps, self._off, self._before = (), [], None
 
     def note(
         self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed_m: float, off: OffPrediction | None = None
@@ -211,10 +217,14 @@ class JumpDetector:
         off_m, dt_s = off.off_m, (stamp_ns - before[0]) / NS_PER_S
         if self._off:
             mean_m = np.mean([m for _, m in self._off], axis=0)
-            if np.linalg.norm(off_m - mean_m) > _SAME * np.linalg.norm(mean_m) + _SAME_SIGMAS * sigma_m:
+            most_m = _SAME * np.linalg.norm(mean_m) + _SAME_SIGMAS * sigma_m
+            # Nor is it the same where it fits better: off the other way than its largest sigma, an outlier is off by less than that.
+            if np.linalg.norm(off_m - mean_m) > min(most_m, float(np.linalg.norm(off_m))):
                 self._off = []
-        # No IMU is wrong by just what the slow error is. The odds that it is over: of the fix, and of a jump to end in this time.
-        ends = off.sigmas**2 - off.sigmas_without**2 > 2.0 * (math.log(_ENDS) - math.log(math.expm1(dt_s / MEAN_S)))
+        # No IMU is wrong by just what the slow error is. The odds that it is over: of the fix, and of a jump to end in this time. The
+        # latter are even at most: where no jump is going on, or the prediction tells nothing, a silence does not end one.
+        odds = math.expm1(min(dt_s / MEAN_S, math.log(2.0)))
+        ends = off.sigmas**2 - off.sigmas_without**2 > 2.0 * (math.log(_ENDS) - math.log(odds))
         least_m = max(allowed_m, _JUMP_M, _IMU_OFF_MPS2 * dt_s**2 / 2.0)
         # After a fix that was off and used, the estimate is on its way there, and a right one is off, too.
         jumps = before[1].sigmas < _FITS_SIGMAS and off.sigmas > _CERTAIN_SIGMAS and np.linalg.norm(off_m) > least_m
@@ -243,7 +253,7 @@ class JumpDetector:
         return self._found(list(map(PositionJump, at_ns[new].tolist(), *off.T.tolist())), stamp_ns)
 
     def _found(self, jumps: list[PositionJump], stamp_ns: int) -> tuple[NDArray[np.int64], Array]:
-        self.jumps += tuple(jumps)
+        self.jumps = (*self.jumps, *jumps)[-_KEPT:]
         again = self.doubtful(stamp_ns)
         self._last_ns = jumps[-1].after_ns
         if again:

@@ -367,6 +367,46 @@ def test_a_receiver_alone_whose_jump_the_imu_shows(
     assert max(fed.errors_m) < bound_m
 
 
+def test_a_jump_is_found_among_many_fixes_to_a_state() -> None:
+    """Those between its detection and the rebuild were off as well: all fixes of the window were held out, and it was lost."""
+    run, jumped, _, _ = jumping(20.0, 0.45, 2.0, 7.0, 13.1)
+    run = slowly(run, 5.0)
+    fed = finish(online := smoother(run), feed(online, run, jumped))
+    assert len([e for e in fed.events if "position jump" in e and "rebuilt" in e]) == 2
+    assert max(fed.errors_m) < 2.0
+
+
+def test_a_window_that_is_rebuilt_amid_a_suspicion_has_the_fixes_before_it() -> None:
+    """Where it turns out to be a burst of outliers, they come in no second time."""
+    run, jumped, begin, end = jumping(5.0, 0.45, 2.0, 7.0, 13.1)
+    online, now = smoother(run), next(k for k, a in enumerate(jumped) if a.true_ns > begin + 600_000_000)
+    fed = feed(online, run, jumped[:now])
+    assert online._tracking is not None  # noqa: SLF001
+    assert online._tracking.lag.problem.streams["gnss"].jump_detector.suspects(online._tracking.lag.newest.stamp_ns)  # noqa: SLF001
+    online._rebuild("planted")  # noqa: SLF001
+    lag = online._tracking.lag  # noqa: SLF001
+    own = lag._entries.of(lag.problem.streams["gnss"])  # noqa: SLF001
+    assert len(own) > 30
+    assert all((e.verdict.decision is None) == (e.measurement.stamp_ns > begin) for e in own)
+    rest = [a for a in jumped[now:] if not isinstance(a.m, GnssPosition) or a.true_ns >= end]
+    fed = finish(online, feed(online, run, rest, fed))
+    out = [row for row in fed.rows if row.sensor == "gnss" and row.outcome is Outcome.REJECTED and row.nis is not None]
+    assert [begin < row.stamp_ns < begin + 600_000_000 for row in out] == [True] * len(out)
+    assert {row.reason for row in out} == {"off what the IMU predicts: an outlier, or a position jump too short to tell"}
+
+
+def test_fixes_of_a_receiver_that_is_said_not_to_jump_are_used_after_a_jump() -> None:
+    run, jumped, _, end = jumping(5.0, 0.02, 0.03, 10.0, 12.6)
+    gnss = run.config.sensors["gnss"]
+    assert isinstance(gnss, GnssConfig)
+    steady = gnss.model_copy(update={"slow_error": gnss.slow_error.model_copy(update={"jumps": False})})
+    run = replace(run, config=run.config.model_copy(update={"sensors": {**run.config.sensors, "gnss": steady}}))
+    fed = finish(online := smoother(run), feed(online, run, jumped))
+    assert [e for e in fed.events if "position jump" in e and "rebuilt" in e]
+    assert not [row for row in fed.rows if "could not be used" in row.reason]
+    assert [row for row in fed.rows if row.sensor == "gnss" and row.stamp_ns > end and row.outcome is Outcome.USED]
+
+
 def test_no_window_begins_where_a_jump_was_not_known_yet() -> None:
     """Estimates from between a jump and its detection have the slow error of before it: a rebuild 9 s later was 8 m off."""
     run, jumped, begin, _ = jumping(5.0, 0.45, 2.0, 7.0, 13.1)

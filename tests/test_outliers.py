@@ -221,6 +221,39 @@ def test_what_is_off_its_prediction_by_the_same_for_a_second_has_jumped() -> Non
     assert found(0.4 * seldom, 12) == []
 
 
+def test_a_single_fix_that_is_off_is_no_jump_whatever_its_larger_sigma() -> None:
+    """5 m off to the east, where its sigma is 0.2 m; to the north 2 m. Those after it fit."""
+    watch = JumpDetector()
+    for k in range(40):
+        off_m = np.array([5.0, 0.0]) if k == 20 else np.zeros(2)
+        place_m, sigmas = off_m + np.array([1.0 * k, 0.0]), 25.0 * (k == 20)
+        watch.note(k * 200_000_000 + 1, place_m, 2.0, allowed_m=3.0, off=OffPrediction(off_m, sigmas, sigmas))
+        assert watch.suspects(k * 200_000_000 + 1) == (k == 20)
+    assert watch.jumps == ()
+
+
+def test_of_many_jumps_the_last_are_kept() -> None:
+    """A receiver that jumps every three seconds, from each new level."""
+    watch = JumpDetector()
+    for k in range(1100):
+        off_m = np.array([10.0, 0.0]) if k % 5 > 1 else np.zeros(2)
+        off = OffPrediction(off_m, float(off_m[0]), float(off_m[0]))
+        watch.note(k * 600_000_000 + 1, np.zeros(2), 0.5, allowed_m=3.0, off=off)
+    assert len(watch.jumps) == 200
+    assert watch.jumps[-1].after_ns > 1090 * 600_000_000
+
+
+@pytest.mark.parametrize("silent_s", [20.0, 80.0, 86400.0])
+def test_a_silence_of_the_receiver_is_no_jump(silent_s: float) -> None:
+    """The first fixes after it agree with a prediction that has become uncertain."""
+    watch = JumpDetector()
+    for t in [*range(20), *(19.0 + silent_s + np.arange(5.0))]:
+        off = OffPrediction(np.array([0.3, 0.2]), 0.0, 0.0)
+        watch.note(round(t * 1e9), np.array([2.0 * t, 0.0]), 0.5, allowed_m=3.0, off=off)
+        assert not watch.suspects(round(t * 1e9))
+    assert watch.jumps == ()
+
+
 def test_a_jump_is_detected_online_and_reported_once() -> None:
     t = RTK_S
     watch, said = JumpDetector(), []

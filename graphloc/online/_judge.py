@@ -86,8 +86,8 @@ class Judge:
         if (away_m := min(r.size_m or 0.0 for r in residuals)) > _FAR_M:
             self._agreement.note(stream, m, None)
             raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
-        if self.receivers.reject(stream, m, at, residuals[0]):
-            self._entries.add(Entry(stream, i, Verdict.false(residuals[0], at)))
+        if why := self.receivers.reject(stream, m, at, residuals[0]):
+            self._entries.add(Entry(stream, i, Verdict.false(residuals[0], at, why)))
         elif stream.row.false is None:
             verdict, widened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
             # Behind a widened kernel it is used, but whether it agrees shows only when it is judged again.

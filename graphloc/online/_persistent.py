@@ -102,7 +102,7 @@ class PersistentState:
     def forget_jumps(self) -> None:
         """Forget position jumps: an estimate that restarts takes a receiver's level as it is."""
         for detector in self.jump_detectors.values():
-            detector.jumps = ()
+            detector.forget()
 
     def forget_clock(self, stamp_ns: int) -> None:
         """Forget stamps of a clock that was set back; `stamp_ns`: by the clock as it is now."""

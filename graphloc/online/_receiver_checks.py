@@ -19,6 +19,8 @@ from graphloc.online._states import States
 from graphloc.position_jumps import OffPrediction, allowed_jump_m, jump_warnings, largest_sigma, only_position_sensor
 
 _FITS = 3.0  # sigmas of a fix alone
+_FROZEN = "frozen receiver: it repeats one position while the vessel moves"
+_OFF = "off what the IMU predicts: an outlier, or a position jump too short to tell"
 
 
 class ReceiverChecks:
@@ -32,17 +34,17 @@ class ReceiverChecks:
         self._problem, self._states, self._entries, self._agreement = problem, states, entries, agreement
         self._jump_warnings: list[str] = []
 
-    def reject(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> bool:
-        """Return whether a measurement comes from a frozen receiver, or may be the beginning of a jump: in time either is certain.
+    def reject(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> str:
+        """Return why a measurement is left out; empty: it is not. It is of a frozen receiver, or may be the beginning of a jump.
 
         When the former is first found, the fixes since the receiver froze are taken out of the window as well. A jump that is found has
         the window rebuilt, and these fixes with it.
         """
         if stream.row.false is not None or not stream.row.absolute:
-            return False
+            return ""
         told_m = stream.row.hint(m, 0.0, self._problem.datum).p_world_m[:2]
         if not np.isfinite(told_m).all():
-            return False
+            return ""
         sigma_m = largest_sigma(residual.cov - _walked(residual, at))
         estimated_m = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2]
         self._check_jump(stream, m.stamp_ns, told_m, sigma_m, self._off(stream, at, residual, told_m - estimated_m))
@@ -55,15 +57,19 @@ class ReceiverChecks:
             self._reject_since(stream, min(at_s - WINDOW_S, detector.stands_s))
         if detector.for_long(at_s):
             self._agreement.note(stream, m, None)
-        return detector.frozen or stream.jump_detector.suspicious
+        if detector.frozen:
+            return _FROZEN
+        return _OFF if stream.jump_detector.suspects(m.stamp_ns) else ""
 
     def _off(self, stream: LiveStream, at: Attachment, residual: Residual, off_m: Array) -> OffPrediction | None:
-        """Return how the newest fix lies to its prediction; None where the receiver's slow error is switched off.
+        """Return how the newest fix lies to its prediction; None where the receiver's slow error is switched off, or cannot jump.
+
+        And until the window is rebuilt with a jump that was found: it predicts fixes as of before the jump.
 
         Args:
             off_m: (2,) of the fix from the estimated place, slow error aside.
         """
-        if stream.left_out is None:
+        if stream.left_out is None or not stream.left_out.jumps or stream.jump_detector.jumps != stream.jumps:
             return None
         without = residual.raw
         if stream.slow is not None and at.slow_value is not None and residual.slow_jacobian is not None:
@@ -92,7 +98,7 @@ class ReceiverChecks:
         """Take the fixes since a time (s of the timeline) out of the graph: they pulled the estimate along."""
         for entry in self._entries.of(stream):
             if self._problem.timeline.seconds(entry.measurement.stamp_ns) >= since_s:
-                self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0))
+                self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0, reason=_FROZEN))
 
     def jump_warnings(self) -> list[str]:
         """Return a line on each receiver whose position has jumped since this was last asked."""

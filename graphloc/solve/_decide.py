@@ -63,6 +63,7 @@ class Verdict:
         mode_probability: of the chosen mode among the modes.
         residual: of the chosen mode, at the attachment `at`.
         settled: pass over the whole run from which on this mode was the chosen one.
+        reason: why it was left out, where it was not judged by itself.
     """
 
     decision: Decision | None
@@ -72,11 +73,12 @@ class Verdict:
     mode: int
     at: Attachment
     settled: int = 0
+    reason: str = ""
 
     @classmethod
-    def false(cls, residual: Residual, at: Attachment) -> Verdict:
+    def false(cls, residual: Residual, at: Attachment, reason: str = "") -> Verdict:
         """Return the verdict that a measurement is false, or not judged yet: it is left out."""
-        return cls(None, 0.0, 1.0, residual, 0, at)
+        return cls(None, 0.0, 1.0, residual, 0, at, reason=reason)
 
     @property
     def expected_cost(self) -> float:

@@ -34,8 +34,8 @@ def row_of(stream: Judged, m: Measurement, topic: str, verdict: Verdict) -> Ledg
     nis, dof = residual.nis(), len(residual.raw)
     if weight >= AGREES:
         outcome, reason = Outcome.USED, ""
-    elif stream.row.false is None and verdict.decision is None:
-        outcome, reason = Outcome.REJECTED, "frozen receiver: it repeats one position while the vessel moves"
+    elif verdict.reason:
+        outcome, reason = Outcome.REJECTED, verdict.reason
     elif stream.row.false is not None and weight < _FALSE:
         outcome, reason = Outcome.REJECTED, "judged false: no mode agrees with the rest"
     else:
