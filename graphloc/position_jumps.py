@@ -217,7 +217,7 @@ class JumpDetector:
         off_m, dt_s = off.off_m, (stamp_ns - before[0]) / NS_PER_S
         if self._off:
             mean_m = np.mean([m for _, m in self._off], axis=0)
-            most_m = _SAME * np.linalg.norm(mean_m) + _SAME_SIGMAS * sigma_m
+            most_m = float(_SAME * np.linalg.norm(mean_m) + _SAME_SIGMAS * sigma_m)
             # Nor is it the same where it fits better: off the other way than its largest sigma, an outlier is off by less than that.
             if np.linalg.norm(off_m - mean_m) > min(most_m, float(np.linalg.norm(off_m))):
                 self._off = []
