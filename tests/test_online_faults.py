@@ -392,7 +392,9 @@ def test_a_window_that_is_rebuilt_amid_a_suspicion_has_the_fixes_before_it() -> 
     fed = finish(online, feed(online, run, rest, fed))
     out = [row for row in fed.rows if row.sensor == "gnss" and row.outcome is Outcome.REJECTED and row.nis is not None]
     assert [begin < row.stamp_ns < begin + 600_000_000 for row in out] == [True] * len(out)
-    assert {row.reason for row in out} == {"off what the IMU predicts: an outlier, or a position jump too short to tell"}
+    assert {row.reason for row in out} == {
+        "off what the IMU predicts: an outlier, or a position jump too short to tell"
+    }
 
 
 def test_fixes_of_a_receiver_that_is_said_not_to_jump_are_used_after_a_jump() -> None:
