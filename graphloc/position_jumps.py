@@ -217,9 +217,9 @@ class JumpDetector:
         off_m, dt_s = off.off_m, (stamp_ns - before[0]) / NS_PER_S
         if self._off:
             mean_m = np.mean([m for _, m in self._off], axis=0)
-            most_m = float(_SAME * np.linalg.norm(mean_m) + _SAME_SIGMAS * sigma_m)
-            # Nor is it the same where it fits better: off the other way than its largest sigma, an outlier is off by less than that.
-            if np.linalg.norm(off_m - mean_m) > min(most_m, float(np.linalg.norm(off_m))):
+            most_m = _SAME * float(np.linalg.norm(mean_m)) + _SAME_SIGMAS * sigma_m
+            # By the larger sigma of a fix alone, those that fit would be off by the same as an outlier across it.
+            if float(np.linalg.norm(off_m - mean_m)) > min(most_m, float(np.linalg.norm(off_m))):
                 self._off = []
         # No IMU is wrong by just what the slow error is. The odds that it is over: of the fix, and of a jump to end in this time. The
         # latter are even at most: where no jump is going on, or the prediction tells nothing, a silence does not end one.
