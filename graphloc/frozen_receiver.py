@@ -24,11 +24,12 @@ from graphloc.time import NS_PER_S
 
 WHY = "frozen receiver or driver: it repeats one position while the vessel moves"
 # A stretch of one position; a driver that repeats fixes does so for less (`frontends/_fixes.py`).
-_HELD_S, _FEWEST = 2.5, 3
+HELD_S, _FEWEST = 2.5, 3
 _NOISE_M = 0.5  # how far the fixes of one position may scatter
-_BEFORE_S = 3.0  # before the stretch: the fixes in it give the speed
+BEFORE_S = 3.0  # before the stretch: the fixes in it give the speed
 _SIGMAS = 3.0
-_UNDER_WAY_MPS, _JUMP_M, _SHARE = 0.5, 2.0, 0.5  # speed before; the jump after, and its share of the way at that speed
+UNDER_WAY_MPS = 0.5
+_JUMP_M, _SHARE = 2.0, 0.5  # the jump after, and its share of the way at the speed before
 # A vessel cannot stop between two fixes from more than this speed and deceleration; nor does one set off faster.
 _STOPS_MPS, _BRAKES_MPS2 = 1.5, 3.0
 
@@ -45,9 +46,17 @@ def frozen_fixes(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Arr
     t_s = (stamps_ns - stamps_ns[0]) / NS_PER_S
     firsts = np.concatenate([[0], np.flatnonzero((lat_lon_deg[1:] != lat_lon_deg[:-1]).any(axis=1)) + 1])
     for first, after in zip(firsts, [*firsts[1:], len(bad)], strict=True):
-        if after - first >= _FEWEST and t_s[after - 1] - t_s[first] >= _HELD_S:
+        if after - first >= _FEWEST and t_s[after - 1] - t_s[first] >= HELD_S:
             bad[first + 1 : after] = _is_frozen(t_s[: after + 1], places_m[: after + 1], int(first), int(after))
     return bad | _frozen_but_for_noise(t_s, places_m, bad)
+
+
+def under_way(t_s: Array, places_m: Array) -> float | None:
+    """Return the speed (m/s) over fixes at times (N,), s, and places (N, 2), m; None where the vessel may have been at rest."""
+    if len(t_s) < _FEWEST:
+        return None
+    speed, sigma = _speed(t_s, places_m)
+    return speed if speed - _SIGMAS * sigma > UNDER_WAY_MPS else None
 
 
 def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -57,8 +66,8 @@ def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_])
     where the position jumps to.
     """
     bad = np.zeros(len(t_s), dtype=bool)
-    held = np.searchsorted(t_s, t_s + _HELD_S)  # the first that is so much later
-    before = np.searchsorted(t_s, t_s - _BEFORE_S)
+    held = np.searchsorted(t_s, t_s + HELD_S)  # the first that is so much later
+    before = np.searchsorted(t_s, t_s - BEFORE_S)
     there = held[held < len(t_s)]
     stays = np.linalg.norm(places_m[there] - places_m[: len(there)], axis=1) < 2.0 * _NOISE_M
     first = 0
@@ -72,9 +81,10 @@ def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_])
         elif after <= held[first]:  # it was under way
             first += 1
         elif (
-            _stopped_at_once(t_s, places_m, first, _UNDER_WAY_MPS)
+            _stopped_at_once(t_s, places_m, first, UNDER_WAY_MPS)
             and _jumps_on(t_s, places_m, first, after)
-            and _under_way(t_s, places_m, np.arange(after, np.searchsorted(t_s, t_s[after] + _BEFORE_S))) is not None
+            and _under_way_over(t_s, places_m, np.arange(after, np.searchsorted(t_s, t_s[after] + BEFORE_S)))
+            is not None
         ):
             bad[first + 1 : after] = True
             first = after
@@ -101,14 +111,14 @@ def _is_frozen(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     if after < len(t_s):
         silent_s = t_s[after] - t_s[after - 1]
         jump_m = float(np.linalg.norm(places_m[after] - places_m[first]))
-        if silent_s < _HELD_S or jump_m > _set_off_m(silent_s):
+        if silent_s < HELD_S or jump_m > _set_off_m(silent_s):
             return _jumps_on(t_s, places_m, first, after)
     return _stopped_at_once(t_s, places_m, first, _STOPS_MPS)
 
 
 def _jumps_on(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     """Whether the vessel was under way, and the position then jumps on by a good part of the distance made meanwhile."""
-    speed = _under_way(t_s, places_m, np.append(_before(t_s, first), first))
+    speed = _under_way_over(t_s, places_m, np.append(_before(t_s, first), first))
     if speed is None:
         return False
     least_m = max(_JUMP_M, _set_off_m(t_s[after] - t_s[after - 1]), _SHARE * speed * (t_s[after] - t_s[first]))
@@ -120,12 +130,8 @@ def _set_off_m(silent_s: float) -> float:
     return _BRAKES_MPS2 * silent_s**2 / 2.0
 
 
-def _under_way(t_s: Array, places_m: Array, of: NDArray[np.int64]) -> float | None:
-    """Speed (m/s) over these fixes; None where the vessel may have been at rest."""
-    if len(of) < _FEWEST:
-        return None
-    speed, sigma = _speed(t_s[of], places_m[of])
-    return speed if speed - _SIGMAS * sigma > _UNDER_WAY_MPS else None
+def _under_way_over(t_s: Array, places_m: Array, of: NDArray[np.int64]) -> float | None:
+    return under_way(t_s[of], places_m[of])
 
 
 def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) -> bool:
@@ -142,7 +148,7 @@ def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) 
 
 def _before(t_s: Array, first: int) -> NDArray[np.int64]:
     """The fixes before this one that give the speed."""
-    return np.arange(*np.searchsorted(t_s, [t_s[first] - _BEFORE_S, t_s[first]]))
+    return np.arange(*np.searchsorted(t_s, [t_s[first] - BEFORE_S, t_s[first]]))
 
 
 def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:

@@ -192,6 +192,12 @@ class JumpDetector:
         """Forget the jumps, and what may be one: it was off an estimate that is given up."""
         self.jumps, self._off, self._before = (), [], None
 
+    def forget_since(self, stamp_ns: int) -> None:
+        """Forget the fixes since a stamp, and the jumps found in them: they are none of a receiver that goes along."""
+        self._seen = deque((kept for kept in self._seen if kept[0] < stamp_ns), maxlen=_KEPT)
+        self.jumps = tuple(jump for jump in self.jumps if jump.after_ns < stamp_ns)
+        self._off, self._before = [], None
+
     def note(
         self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed_m: float, off: OffPrediction | None = None
     ) -> tuple[NDArray[np.int64], Array]:

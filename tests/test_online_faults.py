@@ -323,10 +323,10 @@ def test_a_receiver_alone_that_jumps_is_not_followed() -> None:
 
 
 def jumping(
-    hz: float, sigma_m: float, slow_m: float, jump_m: float, begin_s: float
+    hz: float, sigma_m: float, slow_m: float, jump_m: float, begin_s: float, lasts_s: float = 9.0
 ) -> tuple[SimulatedRun, Arrivals, int, int]:
-    """A receiver alone, with IMU and compass, that jumps for 9 s: the run, what arrives, and when the jump begins and ends."""
-    scenario = replace(bl_scenario(1, "clean"), duration_s=28.0, path="loops", imu_hz=50.0, gnss_hz=hz, gnss_sigma_m=sigma_m)  # fmt: skip
+    """A receiver alone, with IMU and compass, that jumps: the run, what arrives, and when the jump begins and ends."""
+    scenario = replace(bl_scenario(1, "clean"), duration_s=lasts_s + 19.0, path="loops", imu_hz=50.0, gnss_hz=hz, gnss_sigma_m=sigma_m)  # fmt: skip
     run = slowly(simulate(scenario, 1), max(hz, RATE_HZ))
     gnss = run.config.sensors["gnss"]
     assert isinstance(gnss, GnssConfig)
@@ -338,7 +338,7 @@ def jumping(
     }
     run = replace(run, config=run.config.model_copy(update={"sensors": alone}))
     base = [a for a in arrivals_of(run) if a.m.sensor in alone]
-    begin, end = base[at_s(base, begin_s)].true_ns, base[at_s(base, begin_s + 9.0)].true_ns
+    begin, end = base[at_s(base, begin_s)].true_ns, base[at_s(base, begin_s + lasts_s)].true_ns
     jumped = [
         replace(a, m=replace(a.m, position=a.m.position._replace(latitude_deg=a.m.position.latitude_deg + jump_m / 111e3)))
         if isinstance(a.m, GnssPosition) and begin < a.true_ns < end
@@ -365,6 +365,52 @@ def test_a_receiver_alone_whose_jump_the_imu_shows(
     fed = finish(online := smoother(run), feed(online, run, jumped))
     assert len([e for e in fed.events if "position jump" in e and "rebuilt" in e]) == 2
     assert max(fed.errors_m) < bound_m
+
+
+def hung(hz: float, lasts_s: float) -> tuple[SimulatedRun, Arrivals, int, int]:
+    """As `jumping`, but the receiver repeats one fix instead."""
+    run, base, begin, end = jumping(hz, 0.45, 2.0, 0.0, 13.1, lasts_s)
+    held = next(a.m.position for a in base if isinstance(a.m, GnssPosition) and a.true_ns >= begin)
+    repeated = [
+        replace(a, m=replace(a.m, position=held)) if isinstance(a.m, GnssPosition) and begin <= a.true_ns < end else a
+        for a in base
+    ]
+    return run, repeated, begin, end
+
+
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+def test_a_receiver_alone_that_repeats_a_fix_is_not_followed_nor_where_it_goes_on(hz: float) -> None:
+    """It was followed for 33 m, and its going on then taken for a jump: 62 m off."""
+    run, repeated, begin, end = hung(hz, 12.0)
+    fed = finish(online := smoother(run), feed(online, run, repeated))
+    off_m, t_s = np.array(fed.errors_m), (np.array(fed.true_ns) - begin) * 1e-9
+    sigma_m = np.sqrt([np.trace(e.cov[:2, :2]) for e in fed.estimates])
+    assert (off_m < 2.5 * sigma_m).all()
+    assert off_m[t_s < 4.0].max() < 2.0
+    assert off_m[t_s > 14.0].max() < 2.0
+    assert not [e for e in fed.events if "position jump" in e or "restarts" in e]
+    out = [
+        row
+        for row in fed.rows
+        if row.sensor == "gnss" and row.outcome is Outcome.REJECTED and "the run ended" not in row.reason
+    ]
+    assert all(begin < row.stamp_ns < end for row in out)
+    assert len(out) >= 12.0 * hz - 2.0
+    assert {row.reason for row in out} == {
+        "it repeats the fix before it while the vessel moves", "frozen receiver: it repeats one position while the vessel moves"
+    }  # fmt: skip
+
+
+def test_a_window_that_is_rebuilt_holds_repeated_fixes_out() -> None:
+    run, repeated, begin, _ = hung(5.0, 12.0)
+    online = smoother(run)
+    feed(online, run, repeated[: next(k for k, a in enumerate(repeated) if a.true_ns > begin + 5_000_000_000)])
+    online._rebuild("planted")  # noqa: SLF001
+    assert online._tracking is not None  # noqa: SLF001
+    lag = online._tracking.lag  # noqa: SLF001
+    own = lag._entries.of(lag.problem.streams["gnss"])  # noqa: SLF001
+    assert sum(e.measurement.stamp_ns > begin + 200_000_000 for e in own) > 20
+    assert all((e.verdict.decision is None) == (e.measurement.stamp_ns > begin + 200_000_000) for e in own)
 
 
 def test_a_jump_is_found_among_many_fixes_to_a_state() -> None:

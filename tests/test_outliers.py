@@ -232,6 +232,42 @@ def test_a_single_fix_that_is_off_is_no_jump_whatever_its_larger_sigma() -> None
     assert watch.jumps == ()
 
 
+@pytest.mark.parametrize("last_m", [0.0, 8.0])
+def test_a_restart_takes_the_level_of_the_fixes_as_it_is(last_m: float) -> None:
+    """It forgets the jump to it, what may be another, and the fix that the next one would be off after."""
+    watch = JumpDetector()
+
+    def note(k: int, place: float, off: float) -> bool:
+        off_m, sigmas = np.array([off, 0.0]), 4.0 * off
+        off_prediction = OffPrediction(off_m, sigmas, sigmas)
+        watch.note(k * 250_000_000, np.array([k / 4.0 + place, 0.0]), 5.0, allowed_m=3.0, off=off_prediction)
+        return watch.suspects(k * 250_000_000)
+
+    for k in range(39):  # 8 m off from the 20th on, which is known after a second
+        note(k, 8.0 * (k >= 20), 8.0 * (20 <= k < 25))
+    assert len(watch.jumps) == 1
+    assert note(39, 8.0 + last_m, last_m) == (last_m > 0.0)
+    watch.forget()
+    assert not watch.jumps
+    assert not watch.suspects(9_750_000_000)
+    assert not note(40, 16.0, 8.0)
+
+
+@pytest.mark.parametrize("forgets", [True, False])
+def test_a_receiver_that_goes_on_after_it_was_frozen_has_not_jumped(*, forgets: bool) -> None:
+    watch, noise = JumpDetector(), np.random.default_rng(1).normal(0.0, 0.1, (100, 2))
+    for k, t in enumerate(np.arange(0.0, 20.0, 0.2).tolist()):
+        if 10.0 < t < 14.0:
+            place_m = np.array([40.0, 0.0])
+        else:
+            place_m = np.array([4.0 * t, 0.0]) + noise[k]
+        if forgets and t == pytest.approx(13.6):
+            watch.forget_since(10_100_000_000)
+        if not forgets or not 13.5 < t < 14.0:
+            watch.note(round(t * 1e9), place_m, 0.1, allowed_m=3.0)
+    assert (watch.jumps == ()) == forgets
+
+
 def test_of_many_jumps_the_last_are_kept() -> None:
     """A receiver that jumps every three seconds, from each new level."""
     watch = JumpDetector()

@@ -203,8 +203,8 @@ class Lag:
 
     @property
     def frozen_receivers(self) -> set[str]:
-        """Names of the receivers that are frozen (see `_frozen_receiver.py`)."""
-        return {name for name, stream in self.problem.streams.items() if stream.frozen_detector.frozen}
+        """Names of the receivers that are frozen (see `_frozen_receiver.py`, `_repeated_fix.py`)."""
+        return {name for name, stream in self.problem.streams.items() if stream.frozen}
 
     def jump_warnings(self) -> list[str]:
         """Return a warning on each position jump since this was last called (see `position_jumps.py`)."""

@@ -21,6 +21,7 @@ from graphloc.graph import Constant, InertialLink, Sensor, SlowProcess
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._frozen_receiver import FrozenReceiverDetector
 from graphloc.online._motion_model import MotionModel
+from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._scatter import Scatter
 from graphloc.online._setup import Setup
 from graphloc.position_jumps import JumpDetector, PositionJump
@@ -165,8 +166,14 @@ class LiveStream:
     by_stamp: list[tuple[int, int]] = field(default_factory=list)
     scatter: Scatter = field(default_factory=Scatter)
     frozen_detector: FrozenReceiverDetector = field(default_factory=FrozenReceiverDetector)
+    repeated_fix_detector: RepeatedFixDetector = field(default_factory=RepeatedFixDetector)
     jump_detector: JumpDetector = field(default_factory=JumpDetector)
     jumps: tuple[PositionJump, ...] = ()
+
+    @property
+    def frozen(self) -> bool:
+        """Whether it is a receiver that repeats one position while the vessel moves."""
+        return self.frozen_detector.frozen or self.repeated_fix_detector.frozen
 
     @property
     def noisier(self) -> float:
@@ -253,13 +260,14 @@ def live_problem(
     noise_scale: float,
     motion_model: MotionModel,
     jump_detectors: MutableMapping[str, JumpDetector],
+    repeated_fix_detectors: MutableMapping[str, RepeatedFixDetector],
     slow_known: Collection[str],
 ) -> LiveProblem:
     """Return a problem whose first state is at `start_ns`.
 
     Args:
         imu: the samples known from there on. imu_config: with the noise that they have, up to `noise_scale`.
-        jump_detectors: by sensor; missing ones are added.
+        jump_detectors, repeated_fix_detectors: by sensor; missing ones are added.
         slow_known: names of the sensors whose slow error is known at the start.
     """
     config, rows, mounts = setup.config, setup.rows, setup.mounts
@@ -290,6 +298,7 @@ def live_problem(
             mount=mount,
             scatter=scatter,
             jump_detector=detector,
+            repeated_fix_detector=repeated_fix_detectors.setdefault(name, RepeatedFixDetector()),
             jumps=detector.jumps,
         )
     jumps_ns = [jump.after_ns for stream in streams.values() if stream.left_out is not None for jump in stream.jumps]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of each position receiver before its fixes are judged: is it frozen, does its position jump?"""
+"""Checks of each position receiver before its fixes are judged: does it repeat a fix, is it frozen, does its position jump?"""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import States
 from graphloc.position_jumps import OffPrediction, allowed_jump_m, jump_warnings, largest_sigma, only_position_sensor
+from graphloc.time import NS_PER_S
 
 _FITS = 3.0  # sigmas of a fix alone
 _FROZEN = "frozen receiver: it repeats one position while the vessel moves"
+_OLD = "it repeats the fix before it while the vessel moves"
 _OFF = "off what the IMU predicts: an outlier, or a position jump too short to tell"
 
 
@@ -35,31 +37,45 @@ class ReceiverChecks:
         self._jump_warnings: list[str] = []
 
     def reject(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> str:
-        """Return why a measurement is left out; empty: it is not. It is of a frozen receiver, or may be the beginning of a jump.
+        """Return why a measurement is left out; empty: it is not.
 
-        When the former is first found, the fixes since the receiver froze are taken out of the window as well. A jump that is found has
-        the window rebuilt, and these fixes with it.
+        It repeats an old fix, is of a frozen receiver, or may be the beginning of a jump. A jump that is found has the window rebuilt, and
+        the fixes since its beginning with it.
         """
         if stream.row.false is not None or not stream.row.absolute:
             return ""
         told_m = stream.row.hint(m, 0.0, self._problem.datum).p_world_m[:2]
         if not np.isfinite(told_m).all():
             return ""
+        if self._repeats(stream, m, at, told_m):
+            return _FROZEN if stream.repeated_fix_detector.frozen else _OLD
         sigma_m = largest_sigma(residual.cov - _walked(residual, at))
         estimated_m = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2]
+        if self._is_frozen(stream, m, told_m, estimated_m, sigma_m):
+            return _FROZEN
         self._check_jump(stream, m.stamp_ns, told_m, sigma_m, self._off(stream, at, residual, told_m - estimated_m))
+        return _OFF if stream.jump_detector.suspects(m.stamp_ns) else ""
+
+    def _repeats(self, stream: LiveStream, m: Measurement, at: Attachment, told_m: Array) -> bool:
+        newest, detector = self._states.newest, stream.repeated_fix_detector
+        # The antenna swings in waves, and the vessel may turn about it.
+        speed_mps = min(float(np.linalg.norm(v[:2])) for v in (newest.velocity, at.sensor_velocity_mps()))
+        detector.note(m.stamp_ns, told_m, speed_mps, largest_sigma(newest.velocity_cov))
+        return detector.is_old(m.stamp_ns, told_m)
+
+    def _is_frozen(self, stream: LiveStream, m: Measurement, told_m: Array, estimated_m: Array, sigma_m: float) -> bool:
+        """When it is first found, the fixes since the receiver froze are taken out of the window as well."""
         detector, newest, at_s = stream.frozen_detector, self._states.newest, self._problem.timeline.seconds(m.stamp_ns)
         before = detector.frozen
-        sigma_mps = largest_sigma(newest.velocity_cov)
-        detector.note(at_s, told_m, estimated_m, sigma_m, newest.velocity[:2], sigma_mps)
+        detector.note(at_s, told_m, estimated_m, sigma_m, newest.velocity[:2], largest_sigma(newest.velocity_cov))
         if detector.frozen and not before:
             self._agreement.forget_refused()
-            self._reject_since(stream, min(at_s - WINDOW_S, detector.stands_s))
+            since_s = min(at_s - WINDOW_S, detector.stands_s)
+            self._reject_since(stream, since_s)
+            stream.jump_detector.forget_since(m.stamp_ns - int((at_s - since_s) * NS_PER_S))
         if detector.for_long(at_s):
             self._agreement.note(stream, m, None)
-        if detector.frozen:
-            return _FROZEN
-        return _OFF if stream.jump_detector.suspects(m.stamp_ns) else ""
+        return detector.frozen
 
     def _off(self, stream: LiveStream, at: Attachment, residual: Residual, off_m: Array) -> OffPrediction | None:
         """Return how the newest fix lies to its prediction; None where the receiver's slow error is switched off, or cannot jump.

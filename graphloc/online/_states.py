@@ -23,7 +23,6 @@ from graphloc.online._motion_model import UNSURE_MPS, Moving
 from graphloc.online._window import Held, Window
 from graphloc.solve._prediction import Prediction, prediction_of
 
-_BACK = 0.25  # share of a jump: one that leaves less of a slow error ends it
 _HOLE_S = 1.0  # an IMU gap that the motion model is not applied across
 _AWAY_M = 2e3  # no vessel moves so far between two states, even across the longest IMU gap that is bridged
 
@@ -192,9 +191,6 @@ class States:
             key, following = (keys.slow(stream.number, n) for n in (j, j + 1))
             value = window.values.atVector(key)
             jump_m, step = self._jumped(stream, j, j + 1)
-            if step is not None and np.linalg.norm((value + step)[step != 0.0]) < _BACK * np.linalg.norm(step):
-                # What is left is the error of the position since the jump, and none of the receiver's.
-                step = np.where(step != 0.0, -value, 0.0)
             # Begun at the other level, it would be drawn back to the usual one by the prior that closes the chain, and the pose with it.
             window.guess(following, value + (0.0 if step is None else step), t)
             window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m, expected=step))

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A receiver, or its driver, that repeats a fix while the vessel moves, bit for bit or but for centimetres: what it repeats is old.
+
+At rest a receiver may rightly do so, and where it holds its position at low speed: the vessel must have been under way by the
+fixes before, and still be by the estimate. A receiver whose frozen position scatters by more: `_frozen_receiver.py`. Offline:
+`graphloc/frozen_receiver.py`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from graphloc.frames import Array
+from graphloc.frozen_receiver import BEFORE_S, HELD_S, UNDER_WAY_MPS, under_way
+from graphloc.time import NS_PER_S
+
+_SAME_M, _AWAY_M = 0.2, 1.0  # of one place; how far the vessel has gone by then, unless a fix equals the one before
+_SIGMAS, _SHARE = (
+    2.0,
+    0.5,
+)  # of the estimated speed, above rest; of the speed by the fixes: below that the vessel brakes
+_KEPT = 200
+
+
+class RepeatedFixDetector:
+    """The detector of one receiver. It outlives the window: a rebuild takes in the same fixes once more.
+
+    Attributes:
+        frozen: it has repeated one place for seconds, and does so until another comes.
+    """
+
+    def __init__(self) -> None:
+        self.frozen = False
+        self._places: deque[tuple[int, Array]] = deque(
+            maxlen=_KEPT
+        )  # different ones, with the stamps (ns) that they begin at
+        self._last_ns, self._last_m = 0, np.full(2, np.nan)
+        self._since_ns: int | None = None  # stamp of the first of the repetitions that are old
+        self._old: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)  # first and last stamp, place
+
+    def note(self, stamp_ns: int, told_m: Array, speed_mps: float, sigma_mps: float) -> None:
+        """Take in a fix; one that is late is ignored.
+
+        Args:
+            told_m: (2,) in world. speed_mps, sigma_mps: horizontal, of vessel and antenna, as estimated.
+        """
+        if self._places and stamp_ns <= self._last_ns:
+            return
+        equal = np.array_equal(told_m, self._last_m)
+        self._last_ns, self._last_m = stamp_ns, np.array(told_m)
+        if not self._places or not _same(told_m, self._places[-1][1]):
+            self.frozen, self._since_ns = False, None
+            self._places.append((stamp_ns, np.array(told_m)))
+            while stamp_ns - self._places[0][0] > BEFORE_S * NS_PER_S:
+                self._places.popleft()
+        elif self._is_old(stamp_ns, equal, speed_mps, sigma_mps):
+            if self._since_ns is None:
+                self._since_ns = stamp_ns
+            else:
+                self._old.pop()
+            self._old.append((self._since_ns, stamp_ns, self._places[-1][1]))
+            self.frozen |= stamp_ns - self._since_ns >= HELD_S * NS_PER_S
+        else:
+            self._since_ns = None
+
+    def _is_old(self, stamp_ns: int, equal: bool, speed_mps: float, sigma_mps: float) -> bool:
+        if self.frozen:
+            return True
+        if not equal and speed_mps * (stamp_ns - self._places[-1][0]) < _AWAY_M * NS_PER_S:
+            return False
+        before_mps = self._speed_before_mps()
+        if before_mps is None or speed_mps < _SHARE * before_mps:
+            return False
+        # While its fixes are left out the speed becomes uncertain: that is no evidence of rest.
+        return self._since_ns is not None or speed_mps - _SIGMAS * sigma_mps > UNDER_WAY_MPS
+
+    def _speed_before_mps(self) -> float | None:
+        """The speed by the different places up to the one that is repeated; None: it may have been at rest."""
+        t_s = np.array([(at_ns - self._places[0][0]) / NS_PER_S for at_ns, _ in self._places])
+        return under_way(t_s, np.array([place for _, place in self._places]))
+
+    def is_old(self, stamp_ns: int, told_m: Array) -> bool:
+        """Return whether a fix that has been taken in, or comes late, is such a repetition."""
+        return any(a <= stamp_ns <= b and _same(told_m, place) for a, b, place in self._old)
+
+
+def _same(a_m: Array, b_m: Array) -> bool:
+    return float(np.linalg.norm(a_m - b_m)) <= _SAME_M
