@@ -24,12 +24,13 @@ from graphloc.time import NS_PER_S
 
 WHY = "frozen receiver or driver: it repeats one position while the vessel moves"
 # A stretch of one position; a driver that repeats fixes does so for less (`frontends/_fixes.py`).
-HELD_S, _FEWEST = 2.5, 3
+HELD_S, FEWEST = 2.5, 3
 _NOISE_M = 0.5  # how far the fixes of one position may scatter
 BEFORE_S = 3.0  # before the stretch: the fixes in it give the speed
 _SIGMAS = 3.0
 UNDER_WAY_MPS = 0.5
 _JUMP_M, _SHARE = 2.0, 0.5  # the jump after, and its share of the way at the speed before
+_FAR_M = 20.0  # a jump that needs no such share: the vessel may have turned back meanwhile
 # A vessel cannot stop between two fixes from more than this speed and deceleration; nor does one set off faster.
 _STOPS_MPS, _BRAKES_MPS2 = 1.5, 3.0
 
@@ -46,14 +47,14 @@ def frozen_fixes(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Arr
     t_s = (stamps_ns - stamps_ns[0]) / NS_PER_S
     firsts = np.concatenate([[0], np.flatnonzero((lat_lon_deg[1:] != lat_lon_deg[:-1]).any(axis=1)) + 1])
     for first, after in zip(firsts, [*firsts[1:], len(bad)], strict=True):
-        if after - first >= _FEWEST and t_s[after - 1] - t_s[first] >= HELD_S:
+        if after - first >= FEWEST and t_s[after - 1] - t_s[first] >= HELD_S:
             bad[first + 1 : after] = _is_frozen(t_s[: after + 1], places_m[: after + 1], int(first), int(after))
     return bad | _frozen_but_for_noise(t_s, places_m, bad)
 
 
 def under_way(t_s: Array, places_m: Array) -> float | None:
     """Return the speed (m/s) over fixes at times (N,), s, and places (N, 2), m; None where the vessel may have been at rest."""
-    if len(t_s) < _FEWEST:
+    if len(t_s) < FEWEST:
         return None
     speed, sigma = _speed(t_s, places_m)
     return speed if speed - _SIGMAS * sigma > UNDER_WAY_MPS else None
@@ -72,7 +73,7 @@ def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_])
     stays = np.linalg.norm(places_m[there] - places_m[: len(there)], axis=1) < 2.0 * _NOISE_M
     first = 0
     while first < len(there):
-        if not stays[first] or held[first] - first < _FEWEST:
+        if not stays[first] or held[first] - first < FEWEST:
             first += 1
             continue
         after = _gone(places_m, first, int(held[first]))
@@ -121,8 +122,17 @@ def _jumps_on(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     speed = _under_way_over(t_s, places_m, np.append(_before(t_s, first), first))
     if speed is None:
         return False
-    least_m = max(_JUMP_M, _set_off_m(t_s[after] - t_s[after - 1]), _SHARE * speed * (t_s[after] - t_s[first]))
-    return bool(float(np.linalg.norm(places_m[after] - places_m[first])) > least_m)
+    jump_m = float(np.linalg.norm(places_m[after] - places_m[first]))
+    return goes_on(jump_m, speed, t_s[after] - t_s[first], t_s[after] - t_s[after - 1])
+
+
+def goes_on(jump_m: float, speed_mps: float, held_s: float, silent_s: float) -> bool:
+    """Return whether a position jumps on after it was repeated, as a frozen one does.
+
+    Args:
+        speed_mps: before it was repeated. held_s: until now. silent_s: since it was repeated last.
+    """
+    return jump_m > max(_JUMP_M, _set_off_m(silent_s), min(_SHARE * speed_mps * held_s, _FAR_M))
 
 
 def _set_off_m(silent_s: float) -> float:

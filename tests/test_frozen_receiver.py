@@ -61,6 +61,25 @@ def test_all_but_the_first_fix_of_a_frozen_receiver_are_rejected(
     assert len(found) == round((held_s[1] - held_s[0]) * hz) - 1
 
 
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+def test_one_whose_vessel_has_turned_back_meanwhile_is_frozen(hz: float) -> None:
+    """Where it goes on, 60 m away, is less than half of the way at the speed before."""
+    found = judged(lambda t: 10.0 * (np.minimum(t, 38.0) - np.maximum(t - 38.0, 0.0)), (20.0, 50.0), hz, 0.1)
+    assert len(found) == round(30.0 * hz) - 1
+
+
+@pytest.mark.parametrize(("hz", "noise_m"), [(1.0, 0.02), (5.0, 0.1)])
+def test_one_that_freezes_in_a_turn_is_frozen(hz: float, noise_m: float) -> None:
+    """At 6 m/s on a circle of 12 m: its fixes are no line. It goes on at the other side."""
+    t = np.arange(0.0, 60.0, 1.0 / hz)
+    told = np.where((t >= 20.0) & (t < 26.0), 20.0, t)
+    places = 12.0 * np.column_stack([np.cos(told / 2.0), np.sin(told / 2.0)])
+    noise = noise_m * np.random.default_rng(3).normal(size=places.shape)
+    noise[told == 20.0] = noise[np.argmax(told == 20.0)]
+    bad = frozen_fixes(START_NS + np.round(t * S).astype(np.int64), places + noise, places + noise)
+    assert np.array_equal(np.flatnonzero(bad), np.flatnonzero((t > 20.0) & (t < 26.0)))
+
+
 @pytest.mark.parametrize(
     ("way", "held_s", "hz"),
     [

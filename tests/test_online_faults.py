@@ -24,6 +24,7 @@ from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseF
 from graphloc.online import OnlineSmoother
 from graphloc.online._agreement import Agreement
 from graphloc.online._live import live_problem
+from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._window import Window
 from tests.faults import FAULTS, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
 from tests.slowly import slowly
@@ -399,6 +400,21 @@ def test_a_receiver_alone_that_repeats_a_fix_is_not_followed_nor_where_it_goes_o
     assert {row.reason for row in out} == {
         "it repeats the fix before it while the vessel moves", "frozen receiver: it repeats one position while the vessel moves"
     }  # fmt: skip
+
+
+def test_fixes_that_turn_out_to_have_been_repeated_are_taken_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the estimate does not tell that the vessel moves, its going on does; it was taken for a jump, and the vessel 160 s behind."""
+    monkeypatch.setattr(RepeatedFixDetector, "_is_old", lambda *_, **__: False)
+    run, repeated, begin, end = hung(5.0, 4.0)
+    fed = finish(online := smoother(run), feed(online, run, repeated))
+    off_m, t_s = np.array(fed.errors_m), (np.array(fed.true_ns) - end) * 1e-9
+    assert off_m.max() > 5.0
+    assert off_m[t_s > 2.0].max() < 2.0
+    assert [e for e in fed.events if "frozen receiver" in e and "until now" in e]
+    assert not [e for e in fed.events if "position jump" in e or "restarts" in e]
+    out = [row for row in fed.rows if row.sensor == "gnss" and "frozen" in row.reason]
+    assert len(out) >= 4.0 * 5.0 - 2.0
+    assert all(begin < row.stamp_ns < end for row in out)
 
 
 def test_a_window_that_is_rebuilt_holds_repeated_fixes_out() -> None:

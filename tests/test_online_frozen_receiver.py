@@ -151,6 +151,25 @@ def test_a_speed_that_is_hardly_known_makes_no_fix_old_and_its_growth_none_young
         assert detector.is_old(round(t * 1e9), place_m(t)) == (t > 20.0)
 
 
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+def test_a_position_that_jumps_on_was_frozen_though_the_estimate_was_held_back(hz: float) -> None:
+    """By its own speed: the fixes had drawn the estimate to rest. One that goes on from where it stood was at rest."""
+    for goes_on in (True, False):
+        detector, since, fixes = RepeatedFixDetector(), [], []
+        for t in np.arange(0.0, 40.0, 1.0 / hz).tolist():
+            on = max(t - 30.0, 0.0) if not goes_on else t - 20.0 if t >= 30.0 else 0.0
+            fixes.append((round(t * 1e9), V * (min(t, 20.0) + on)))
+            since.append(detector.note(*fixes[-1], 0.0, 0.2))
+        found = [at_ns for at_ns in since if at_ns is not None]
+        old = [at_ns for at_ns, place in fixes if detector.is_old(at_ns, place)]
+        if goes_on:
+            assert since[round(30.0 * hz)] is not None
+            assert len(found) == 1
+            assert old == [at_ns for at_ns, _ in fixes if 20.0 < at_ns * 1e-9 < 30.0]
+        else:
+            assert found == old == []
+
+
 def test_a_swing_at_rest_does_not_make_a_receiver_frozen() -> None:
     """It has repeated its position for long by then: only repetitions while the vessel moves count."""
     old, frozen = old_at(lambda t: V * min(t, 20.0), lambda t: 2.2 if t <= 20.0 or 30.0 < t < 30.5 else 0.0)

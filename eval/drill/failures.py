@@ -94,6 +94,7 @@ def script(recording: Recording) -> tuple[tuple[Failure, ...], tuple[tuple[str, 
         no_gnss,
         _timed("GNSS drift of 3 m", 60.0, partial(_drift, rmse_m=3.0)),
         _timed("GNSS jump of 10 m", 10.0, partial(_jump, size_m=10.0)),
+        _timed("GNSS frozen", 30.0, _frozen),
     )
     offer(
         no_compass,
@@ -185,6 +186,19 @@ def _jump(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gener
     return _moved_fixes(
         recording, begin_ns, end_ns, lambda t: np.tile(size_m * np.array([np.cos(angle), np.sin(angle)]), (len(t), 1))
     )
+
+
+def _frozen(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator) -> Struck:
+    """Repeat what each receiver said last, under new stamps, as a driver does whose receiver hangs."""
+    last: dict[tuple[str, type[Measurement]], Measurement] = {}
+    held: dict[int, Measurement] = {}
+    for m in sorted(recording.measurements, key=lambda m: m.stamp_ns):
+        if isinstance(m, _GNSS):
+            if _during(m, begin_ns, end_ns) and (m.sensor, type(m)) in last:
+                held[id(m)] = last[m.sensor, type(m)]
+            else:
+                last[m.sensor, type(m)] = m
+    return _changed(recording, lambda m: replace(held[id(m)], stamp_ns=m.stamp_ns, seq=m.seq) if id(m) in held else m)
 
 
 def _turned(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Generator, *, off_deg: float) -> Struck:

@@ -206,9 +206,9 @@ class Lag:
         """Names of the receivers that are frozen (see `_frozen_receiver.py`, `_repeated_fix.py`)."""
         return {name for name, stream in self.problem.streams.items() if stream.frozen}
 
-    def jump_warnings(self) -> list[str]:
-        """Return a warning on each position jump since this was last called (see `position_jumps.py`)."""
-        return self._judge.receivers.jump_warnings()
+    def receiver_warnings(self) -> list[str]:
+        """Return what `ReceiverChecks` newly found."""
+        return self._judge.receivers.warnings()
 
     def noisier_warnings(self) -> list[str]:
         """Return a warning on each sensor that newly scatters by far more than it states."""

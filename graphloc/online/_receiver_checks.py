@@ -34,7 +34,7 @@ class ReceiverChecks:
 
     def __init__(self, problem: LiveProblem, states: States, entries: Entries, agreement: Agreement) -> None:
         self._problem, self._states, self._entries, self._agreement = problem, states, entries, agreement
-        self._jump_warnings: list[str] = []
+        self._warnings: list[str] = []
 
     def reject(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> str:
         """Return why a measurement is left out; empty: it is not.
@@ -60,7 +60,10 @@ class ReceiverChecks:
         newest, detector = self._states.newest, stream.repeated_fix_detector
         # The antenna swings in waves, and the vessel may turn about it.
         speed_mps = min(float(np.linalg.norm(v[:2])) for v in (newest.velocity, at.sensor_velocity_mps()))
-        detector.note(m.stamp_ns, told_m, speed_mps, largest_sigma(newest.velocity_cov))
+        since_ns = detector.note(m.stamp_ns, told_m, speed_mps, largest_sigma(newest.velocity_cov))
+        if since_ns is not None:
+            self._reject_since(stream, since_ns, m.stamp_ns)
+            self._warnings.append(f"{stream.name}: {_FROZEN}: for {(m.stamp_ns - since_ns) / NS_PER_S:.1f} s until now")
         return detector.is_old(m.stamp_ns, told_m)
 
     def _is_frozen(self, stream: LiveStream, m: Measurement, told_m: Array, estimated_m: Array, sigma_m: float) -> bool:
@@ -69,10 +72,8 @@ class ReceiverChecks:
         before = detector.frozen
         detector.note(at_s, told_m, estimated_m, sigma_m, newest.velocity[:2], largest_sigma(newest.velocity_cov))
         if detector.frozen and not before:
-            self._agreement.forget_refused()
             since_s = min(at_s - WINDOW_S, detector.stands_s)
-            self._reject_since(stream, since_s)
-            stream.jump_detector.forget_since(m.stamp_ns - int((at_s - since_s) * NS_PER_S))
+            self._reject_since(stream, m.stamp_ns - int((at_s - since_s) * NS_PER_S), m.stamp_ns)
         if detector.for_long(at_s):
             self._agreement.note(stream, m, None)
         return detector.frozen
@@ -108,17 +109,19 @@ class ReceiverChecks:
             found = stream.jump_detector.note(
                 stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(stream.left_out), off=off
             )
-            self._jump_warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
+            self._warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
 
-    def _reject_since(self, stream: LiveStream, since_s: float) -> None:
-        """Take the fixes since a time (s of the timeline) out of the graph: they pulled the estimate along."""
+    def _reject_since(self, stream: LiveStream, since_ns: int, until_ns: int) -> None:
+        """Take the fixes of an interval out of the graph: they pulled the estimate along."""
+        self._agreement.forget_refused()
+        stream.jump_detector.forget_since(since_ns)
         for entry in self._entries.of(stream):
-            if self._problem.timeline.seconds(entry.measurement.stamp_ns) >= since_s:
+            if since_ns <= entry.measurement.stamp_ns < until_ns:
                 self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0, reason=_FROZEN))
 
-    def jump_warnings(self) -> list[str]:
-        """Return a line on each receiver whose position has jumped since this was last asked."""
-        warnings, self._jump_warnings = self._jump_warnings, []
+    def warnings(self) -> list[str]:
+        """Return a line on each receiver whose position has jumped, or turned out to have been frozen, since this was last asked."""
+        warnings, self._warnings = self._warnings, []
         return warnings
 
 

@@ -2,7 +2,7 @@
 """A receiver, or its driver, that repeats a fix while the vessel moves, bit for bit or but for centimetres: what it repeats is old.
 
 At rest a receiver may rightly do so, and where it holds its position at low speed: the vessel must have been under way by the
-fixes before, and still be by the estimate. A receiver whose frozen position scatters by more: `_frozen_receiver.py`. Offline:
+fixes before, and still be by the estimate; or, in hindsight, the position jumps on. A receiver whose frozen position scatters by more: `_frozen_receiver.py`. Offline:
 `graphloc/frozen_receiver.py`.
 """
 
@@ -13,14 +13,12 @@ from collections import deque
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.frozen_receiver import BEFORE_S, HELD_S, UNDER_WAY_MPS, under_way
+from graphloc.frozen_receiver import BEFORE_S, FEWEST, HELD_S, UNDER_WAY_MPS, goes_on, under_way
 from graphloc.time import NS_PER_S
 
 _SAME_M, _AWAY_M = 0.2, 1.0  # of one place; how far the vessel has gone by then, unless a fix equals the one before
-_SIGMAS, _SHARE = (
-    2.0,
-    0.5,
-)  # of the estimated speed, above rest; of the speed by the fixes: below that the vessel brakes
+_SIGMAS = 3.0  # of the estimated speed
+_SHARE = 0.5  # of the speed by the fixes before: below that the vessel brakes
 _KEPT = 200
 
 
@@ -35,27 +33,32 @@ class RepeatedFixDetector:
         self.frozen = False
         self._places: deque[tuple[int, Array]] = deque(
             maxlen=_KEPT
-        )  # different ones, with the stamps (ns) that they begin at
-        self._last_ns, self._last_m = 0, np.full(2, np.nan)
+        )  # the last different ones, with the stamps (ns) that they begin at
+        self._last: tuple[int, Array] | None = None
+        self._equal_ns, self._equal = 0, 0  # stamp of the first of the fixes that equal the last one, and their number
         self._since_ns: int | None = None  # stamp of the first of the repetitions that are old
         self._old: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)  # first and last stamp, place
 
-    def note(self, stamp_ns: int, told_m: Array, speed_mps: float, sigma_mps: float) -> None:
+    def note(self, stamp_ns: int, told_m: Array, speed_mps: float, sigma_mps: float) -> int | None:
         """Take in a fix; one that is late is ignored.
 
         Args:
             told_m: (2,) in world. speed_mps, sigma_mps: horizontal, of vessel and antenna, as estimated.
+
+        Returns:
+            The stamp (ns) of the first of the fixes that turn out to have been old, where this one goes on from them.
         """
-        if self._places and stamp_ns <= self._last_ns:
-            return
-        equal = np.array_equal(told_m, self._last_m)
-        self._last_ns, self._last_m = stamp_ns, np.array(told_m)
-        if not self._places or not _same(told_m, self._places[-1][1]):
-            self.frozen, self._since_ns = False, None
-            self._places.append((stamp_ns, np.array(told_m)))
-            while stamp_ns - self._places[0][0] > BEFORE_S * NS_PER_S:
-                self._places.popleft()
-        elif self._is_old(stamp_ns, equal, speed_mps, sigma_mps):
+        last, turned_out = self._last, None
+        if last is not None and stamp_ns <= last[0]:
+            return None
+        self._last = (stamp_ns, np.array(told_m))
+        equals = last is not None and np.array_equal(told_m, last[1])
+        if last is None or not _same(told_m, self._places[-1][1]):
+            if last is not None and self._since_ns is None and self._went_on(stamp_ns, told_m, last):
+                turned_out = self._equal_ns + 1
+                self._old.append((turned_out, *last))
+            self._begin(stamp_ns, told_m)
+        elif self._is_old(stamp_ns, speed_mps, sigma_mps, equals=equals):
             if self._since_ns is None:
                 self._since_ns = stamp_ns
             else:
@@ -64,17 +67,33 @@ class RepeatedFixDetector:
             self.frozen |= stamp_ns - self._since_ns >= HELD_S * NS_PER_S
         else:
             self._since_ns = None
+        self._equal_ns, self._equal = (self._equal_ns, self._equal + 1) if equals else (stamp_ns, 1)
+        return turned_out
 
-    def _is_old(self, stamp_ns: int, equal: bool, speed_mps: float, sigma_mps: float) -> bool:
+    def _begin(self, stamp_ns: int, told_m: Array) -> None:
+        self.frozen, self._since_ns = False, None
+        self._places.append((stamp_ns, np.array(told_m)))
+        while stamp_ns - self._places[0][0] > BEFORE_S * NS_PER_S:
+            self._places.popleft()
+
+    def _is_old(self, stamp_ns: int, speed_mps: float, sigma_mps: float, *, equals: bool) -> bool:
         if self.frozen:
             return True
-        if not equal and speed_mps * (stamp_ns - self._places[-1][0]) < _AWAY_M * NS_PER_S:
+        if not equals and speed_mps * (stamp_ns - self._places[-1][0]) < _AWAY_M * NS_PER_S:
             return False
         before_mps = self._speed_before_mps()
-        if before_mps is None or speed_mps < _SHARE * before_mps:
+        if before_mps is None or speed_mps < max(UNDER_WAY_MPS, _SHARE * before_mps):
             return False
         # While its fixes are left out the speed becomes uncertain: that is no evidence of rest.
-        return self._since_ns is not None or speed_mps - _SIGMAS * sigma_mps > UNDER_WAY_MPS
+        return self._since_ns is not None or speed_mps > _SIGMAS * sigma_mps
+
+    def _went_on(self, stamp_ns: int, told_m: Array, last: tuple[int, Array]) -> bool:
+        """Whether a position jumps on that was repeated bit for bit, as `frozen_fixes` would tell of the whole run."""
+        if self._equal < FEWEST or last[0] - self._equal_ns < HELD_S * NS_PER_S:
+            return False
+        before_mps, jump_m = self._speed_before_mps(), float(np.linalg.norm(told_m - last[1]))
+        held_s, silent_s = ((stamp_ns - at_ns) / NS_PER_S for at_ns in (self._equal_ns, last[0]))
+        return before_mps is not None and goes_on(jump_m, before_mps, held_s, silent_s)
 
     def _speed_before_mps(self) -> float | None:
         """The speed by the different places up to the one that is repeated; None: it may have been at rest."""

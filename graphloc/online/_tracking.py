@@ -303,7 +303,7 @@ class Tracking:
         self._persistent.frozen = now
         frozen = [Event(f"{name}: {_FROZEN}") for name in sorted(now - was)]
         thawed = [Event(f"{name}: {_NO_LONGER_FROZEN}", warns=False) for name in sorted(was - now)]
-        return [*heading, *frozen, *thawed, *map(Event, [*self.lag.jump_warnings(), *self.lag.noisier_warnings()])]
+        return [*heading, *frozen, *thawed, *map(Event, [*self.lag.receiver_warnings(), *self.lag.noisier_warnings()])]
 
     def _heading_news(self) -> list[Event]:
         """Follow a heading that no sensor measures; return that it is a guess by now, or is none any more."""
