@@ -11,6 +11,8 @@ gone there from rest), the vessel stopped from one fix to the next, faster than 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +20,13 @@ from numpy.typing import NDArray
 from graphloc.frames import Array, Datum
 from graphloc.frozen_imu import stretches
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import GnssPosition, world_from_fixes
+from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
 
+_M = TypeVar("_M", bound=Measurement)
 WHY = "frozen receiver or driver: it repeats one position while the vessel moves"
+WHY_VELOCITY = "frozen receiver or driver: it repeats one velocity bit for bit"
 # A stretch of one position; a driver that repeats fixes does so for less (`frontends/_fixes.py`).
 HELD_S, FEWEST = 2.5, 3
 _NOISE_M = 0.5  # how far the fixes of one position may scatter
@@ -31,6 +35,8 @@ _SIGMAS = 3.0
 UNDER_WAY_MPS = 0.5
 _JUMP_M, _SHARE = 2.0, 0.5  # the jump after, and its share of the way at the speed before
 _FAR_M = 20.0  # a jump that needs no such share: the vessel may have turned back meanwhile
+# Of a velocity: share of the values that are not repeated, else it is rounded; repetitions that are too many; at rest it may.
+MOSTLY, MANY, REST_MPS = 0.9, 5, 0.1
 # A vessel cannot stop between two fixes from more than this speed and deceleration; nor does one set off faster.
 _STOPS_MPS, _BRAKES_MPS2 = 1.5, 3.0
 
@@ -170,6 +176,26 @@ def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:
     return float(np.linalg.norm(v)), float(np.sqrt((left**2).sum() / max(2 * len(t_s) - 4, 1) / square))
 
 
+def frozen_velocities(stamps_ns: NDArray[np.int64], v_mps: Array) -> NDArray[np.bool_]:
+    """Return (N,) which velocities of one receiver, in order of time, are repetitions of a frozen one.
+
+    While a vessel moves no measured velocity stays the same for seconds, unless it is rounded; at rest it may.
+
+    Args:
+        stamps_ns: (N,). v_mps: (N, 3), as received.
+    """
+    bad = np.zeros(len(stamps_ns), dtype=bool)
+    if not len(bad):
+        return bad
+    firsts = np.concatenate([[0], np.flatnonzero((v_mps[1:] != v_mps[:-1]).any(axis=1)) + 1, [len(bad)]])
+    if np.mean(np.diff(firsts) == 1) < MOSTLY:
+        return bad
+    for first, after in pairwise(firsts.tolist()):
+        long = after - first >= MANY and stamps_ns[after - 1] - stamps_ns[first] >= HELD_S * NS_PER_S
+        bad[first + 1 : after] = long and float(np.linalg.norm(v_mps[first])) > REST_MPS
+    return bad
+
+
 def frozen_fixes_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> list[str]:
     """Return a line on what `frozen_fixes` found."""
     if not bad.any():
@@ -178,24 +204,46 @@ def frozen_fixes_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray
 
 
 def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording, list[str]]:
-    """Return a recording without the fixes of frozen receivers (they get ledger rows), and a warning on each such receiver."""
-    of: dict[str, list[GnssPosition]] = {}
-    for m in recording.measurements:
-        if isinstance(m, GnssPosition):
-            of.setdefault(m.sensor, []).append(m)
-    gone: dict[int, GnssPosition] = {}
+    """Return a recording without what frozen receivers repeat (it gets ledger rows), and a warning on each such receiver."""
+    gone: dict[int, str] = {}
     said = []
-    for sensor, fixes in of.items():
-        stamps_ns = np.array([m.stamp_ns for m in fixes], dtype=np.int64)
-        bad = frozen_fixes(stamps_ns, np.array([m.position[:2] for m in fixes]), world_from_fixes(fixes, datum)[:, :2])
-        gone |= {m.seq: m for m, b in zip(fixes, bad, strict=True) if b}
+    hung = np.zeros(
+        (0, 2), dtype=np.int64
+    )  # first and last stamp of velocities that are repeated, of a vessel under way
+    for sensor, velocities in _by_sensor(recording, GnssVelocity).items():
+        stamps_ns, v_mps = np.array([m.stamp_ns for m in velocities]), np.array([m.v_world_mps for m in velocities])
+        bad = frozen_velocities(stamps_ns, v_mps)
+        ends = np.flatnonzero(np.diff(np.pad(bad & (np.linalg.norm(v_mps, axis=1) > UNDER_WAY_MPS), 1).astype(int)))
+        hung = np.vstack([hung, np.column_stack([stamps_ns[ends[::2]], stamps_ns[ends[1::2] - 1]])])
+        gone |= {m.seq: WHY_VELOCITY for m, b in zip(velocities, bad, strict=True) if b}
+        if bad.any():
+            said.append(
+                f"{sensor}: for {stretches(stamps_ns, bad)} {WHY_VELOCITY}; {int(bad.sum())} velocities rejected"
+            )
+    for sensor, fixes in _by_sensor(recording, GnssPosition).items():
+        stamps_ns, lat_lon = np.array([m.stamp_ns for m in fixes]), np.array([m.position[:2] for m in fixes])
+        bad = frozen_fixes(stamps_ns, lat_lon, world_from_fixes(fixes, datum)[:, :2])
+        # One receiver, or its driver, says both.
+        meanwhile = np.any((stamps_ns[:, None] >= hung[:, 0]) & (stamps_ns[:, None] <= hung[:, 1]), axis=1)
+        bad[1:] |= np.all(lat_lon[1:] == lat_lon[:-1], axis=1) & meanwhile[1:]
+        gone |= {m.seq: WHY for m, b in zip(fixes, bad, strict=True) if b}
         said += frozen_fixes_warning(sensor, stamps_ns, bad)
-    rows = [
+    if not gone:
+        return recording, said
+    rows = tuple(
         LedgerRow(
             seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=recording.topics.get(m.sensor, ""), outcome=Outcome.REJECTED,
-            reason=WHY,
+            reason=gone[m.seq],
         )
-        for m in gone.values()
-    ]  # fmt: skip
+        for m in recording.measurements if m.seq in gone
+    )  # fmt: skip
     left = tuple(m for m in recording.measurements if m.seq not in gone)
-    return (replace(recording, measurements=left, rows=(*recording.rows, *rows)) if gone else recording), said
+    return replace(recording, measurements=left, rows=(*recording.rows, *rows)), said
+
+
+def _by_sensor(recording: Recording, kind: type[_M]) -> dict[str, list[_M]]:
+    found: dict[str, list[_M]] = {}
+    for m in recording.measurements:
+        if isinstance(m, kind):
+            found.setdefault(m.sensor, []).append(m)
+    return found

@@ -124,6 +124,17 @@ def test_a_jump_moves_fixes_by_ten_metres_and_not_their_height(recording: Record
     assert np.abs(heights).max() < 1e-3
 
 
+def test_a_frozen_receiver_repeats_what_it_said_last_under_new_stamps(recording: Recording) -> None:
+    hangs = struck(recording, "GNSS frozen, 30 s")
+    before, after = ([m for m in r.measurements if isinstance(m, GnssPosition)] for r in (recording, hangs))
+    assert [(m.stamp_ns, m.seq) for m in after] == [(m.stamp_ns, m.seq) for m in before]
+    begin = begin_ns(recording)
+    during = np.array([begin <= m.stamp_ns < begin + 30 * S for m in before])
+    last = before[int(np.argmax(during)) - 1]
+    assert {m.position for m, now in zip(after, during, strict=True) if now} == {last.position}
+    assert all(a.position == b.position for a, b, now in zip(after, before, during, strict=True) if not now)
+
+
 def test_a_drift_grows_and_fades(recording: Recording) -> None:
     changed = pairs(recording, struck(recording, "GNSS drift of 3 m, 60 s"))
     size = np.hypot(*np.array([moved_m(a, b) for a, b in changed]).T)
@@ -199,7 +210,13 @@ def test_late_matches_come_late_and_say_when_they_are_of(recording: Recording) -
 def test_only_what_the_sensors_permit_is_drilled(recording: Recording) -> None:
     fixes = tuple(m for m in recording.measurements if isinstance(m, GnssPosition))
     found, left = script(replace(recording, measurements=fixes))
-    assert {f.family for f in found} == {"GNSS outage", "GNSS drift of 3 m", "GNSS jump of 10 m", "IMU gap"}
+    assert {f.family for f in found} == {
+        "GNSS outage",
+        "GNSS drift of 3 m",
+        "GNSS jump of 10 m",
+        "GNSS frozen",
+        "IMU gap",
+    }
     said = dict(left)
     assert "no compass" in said["compass silent"]
     assert "no tags" in said["tags flipped"]

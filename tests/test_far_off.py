@@ -13,14 +13,17 @@ import pytest
 from graphloc import app
 from graphloc.build import closing_variance, slow_begin, slow_end, slow_step
 from graphloc.config import GnssConfig, VelocityConfig, VesselConfig
+from graphloc.eval.drill.failures import script
 from graphloc.eval.metrics import TruthMetrics, compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors.gnss import slow
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
+from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, PoseFix
 from graphloc.recording import Recording
 from graphloc.replay import replay
+from graphloc.time import NS_PER_S
 from tests.slowly import with_few_states
 
 PLACE, FIRST = 10_000, 0
@@ -151,6 +154,26 @@ def test_fixes_and_velocities_do_not_follow_a_jump(begin_s: float, end_s: float)
         assert off.position_rmse_m < 2.5
         assert off.coverage_95 is not None
         assert off.coverage_95 > 0.95
+
+
+def test_a_driver_that_hangs_says_nothing_new() -> None:
+    """It repeats positions and velocities for 30 s, and goes on near where it hung: the track followed the velocities, 80 to 110 m off."""
+    run, recording, config = jumped(0.0, 0.0, 4, length_s=70.0)
+    assert recording.imu is not None
+    begin_ns = int(recording.imu.stamps_ns[0]) + 25 * NS_PER_S
+    hangs = next(f for f in script(recording)[0] if f.name == "GNSS frozen, 30 s").on(recording, begin_ns, 0).recording
+    for found, most_m in (
+        (app.smooth_recording(hangs, config).solution, 1.5),
+        (replay(hangs, config).solution, 15.0),  # of dead reckoning
+    ):
+        off: TruthMetrics = compare_to_truth(found.trajectory, run.truth)
+        assert off.position_max_m < most_m
+        assert off.coverage_95 is not None
+        assert off.coverage_95 > 0.95
+        hung = [row for row in found.ledger if begin_ns + NS_PER_S < row.stamp_ns < begin_ns + 29 * NS_PER_S]
+        said = {(row.sensor, row.outcome) for row in hung if row.sensor in ("gnss", "velocity")}
+        assert said == {("gnss", Outcome.REJECTED), ("velocity", Outcome.REJECTED)}
+        assert sorted(row.seq for row in found.ledger) == list(range(hangs.message_count))
 
 
 @pytest.mark.parametrize(("end_s", "right"), [(14.0, True), (35.0, False)])

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from graphloc import app
 from graphloc.eval.simulate import Scenario
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.inspect import inspect_bag, render
-from graphloc.frozen_receiver import frozen_fixes
+from graphloc.frozen_receiver import frozen_fixes, frozen_velocities
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, PoseFix
+from graphloc.online._repeated_fix import RepeatedFixDetector
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.slowly import simulate_slowly
 
@@ -188,6 +190,43 @@ def test_a_frozen_receiver_is_as_good_as_a_silent_one() -> None:
     assert {r.topic for r in rows} == {run.recording.topics["gnss"]}
     (line,) = (w for w in solution.stats.warnings if "frozen" in w)
     assert f"; {len(rows)} fixes rejected" in line
+
+
+def velocities(hz: float, held_s: tuple[float, float], *, rounded_mps: float = 0.0, moving: bool = True) -> tuple[Array, NDArray[np.int64], Array]:  # fmt: skip
+    """Times (N,), stamps (N,) and velocities (N, 3) of a receiver that repeats one for a while: if not moving, 0."""
+    t = np.arange(0.0, 60.0, 1.0 / hz)
+    v = np.array([2.0, 1.0, 0.0]) + 0.03 * np.random.default_rng(2).normal(size=(len(t), 3))
+    if rounded_mps:
+        v = np.round(v / rounded_mps) * rounded_mps
+    held = (t >= held_s[0]) & (t < held_s[1])
+    v[held] = v[np.argmax(held)] * moving
+    return t, START_NS + np.round(t * S).astype(np.int64), v
+
+
+@pytest.mark.parametrize("hz", [2.0, 10.0])
+def test_a_velocity_that_stays_the_same_for_seconds_is_frozen(hz: float) -> None:
+    t, stamps_ns, v = velocities(hz, (20.0, 50.0))
+    assert t[frozen_velocities(stamps_ns, v)] == pytest.approx(t[(t > 20.0) & (t < 50.0)])
+    online, old = RepeatedFixDetector(), []
+    for stamp_ns, v_mps in zip(stamps_ns.tolist(), v, strict=True):
+        online.note_velocity(stamp_ns, v_mps)
+        old.append(online.is_old(stamp_ns, v_mps))
+    assert t[old] == pytest.approx(t[(t > 20.0 + 3.5 / hz) & (t < 50.0)])  # from the fifth on
+    again = [online.is_old(stamp_ns, v_mps) for stamp_ns, v_mps in zip(stamps_ns.tolist(), v, strict=True)]
+    assert t[again] == pytest.approx(t[(t > 20.0) & (t < 50.0)])
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        velocities(5.0, (20.0, 22.0)),  # a driver that repeats
+        velocities(5.0, (20.0, 50.0), moving=False),
+        velocities(5.0, (20.0, 50.0), rounded_mps=0.1),  # as in NMEA: it is often the same
+    ],
+)
+def test_a_velocity_that_may_stay_the_same_is_believed(said: tuple[Array, NDArray[np.int64], Array]) -> None:
+    _, stamps_ns, v = said
+    assert not frozen_velocities(stamps_ns, v).any()
 
 
 def test_inspect_reports_a_frozen_receiver(tmp_path: Path) -> None:
