@@ -60,6 +60,69 @@ def _jump(size_m: float) -> Change:
     return change
 
 
+def _velocity(craft: Craft, items: list[Item]) -> list[Item]:
+    """A velocity from the receiver, beside its fixes."""
+    t = craft.times(craft.odd.gnss_hz, 0.05)
+    v = craft.motion.pose(t)[2] + 0.05 * craft.rng.normal(size=(len(t), 3))
+    return items + [
+        ("/gnss/vel", log_ns, craft.make.twist(stamp(at), v_mps, np.diag([0.0025] * 3 + [1.0] * 3).ravel(), "map"))
+        for log_ns, at, v_mps in zip(craft.recorded(t, 0.02), t, v, strict=True)
+    ]
+
+
+def _hangs(craft: Craft, items: list[Item]) -> list[Item]:
+    """From 45 s on, for 20 s, the receiver repeats what it said last."""
+    last: dict[str, Any] = {}
+    for name, log_ns, m in sorted(items, key=lambda item: item[1]):
+        if name not in ("/gnss/fix", "/gnss/vel"):
+            continue
+        if stamp(45.0) < log_ns < stamp(65.0):
+            for field in ("latitude", "longitude", "altitude") if name == "/gnss/fix" else ("twist",):
+                setattr(m, field, getattr(last[name], field))
+        last[name] = m
+    return items
+
+
+def _hang_both(craft: Craft, items: list[Item]) -> list[Item]:
+    return _hangs(craft, _velocity(craft, items))
+
+
+def _thrice(craft: Craft, items: list[Item]) -> list[Item]:
+    """A driver that says each fix three times, under stamps of its own."""
+    again = [(log_ns, m, k) for name, log_ns, m in items if name == "/gnss/fix" for k in (1, 2)]
+    return items + [
+        (
+            "/gnss/fix",
+            log_ns + k * 66_000_000,
+            craft.make.fix(
+                m.header.stamp.sec * 10**9 + m.header.stamp.nanosec + k * 66_000_000, m.latitude, m.longitude, m.altitude,
+                craft.odd.status, m.position_covariance, m.position_covariance_type,
+            ),
+        )
+        for log_ns, m, k in again
+    ]  # fmt: skip
+
+
+def _held_at_rest(craft: Craft, items: list[Item]) -> list[Item]:
+    """A receiver that holds its position while the craft is slower than 0.5 m/s."""
+    last = None
+    for name, log_ns, m in items:
+        if name == "/gnss/fix":
+            slow = float(np.linalg.norm(craft.motion.pose(np.array([(log_ns - stamp(0.0)) * 1e-9]))[2])) < 0.5
+            if slow and last is not None:
+                m.latitude, m.longitude, m.altitude = last
+            last = m.latitude, m.longitude, m.altitude
+    return items
+
+
+def _rounded(_craft: Craft, items: list[Item]) -> list[Item]:
+    """Positions to five decimals: a metre."""
+    for name, _, m in items:
+        if name == "/gnss/fix":
+            m.latitude, m.longitude = round(m.latitude, 5), round(m.longitude, 5)
+    return items
+
+
 def _no_covariance(_craft: Craft, items: list[Item]) -> list[Item]:
     for name, _, m in items:
         if name == "/gnss/fix":
@@ -143,6 +206,14 @@ CASES: dict[str, Odd] = {
     "RTK jump of 0.5 m": Odd(change=_jump(0.5), **_RTK),
     "RTK jump of 10 m": Odd(change=_jump(10.0), **_RTK),
     "RTK jump of 100 m": Odd(change=_jump(100.0), **_RTK),
+    "receiver hangs for 20 s, car": Odd(change=_hangs),
+    "receiver hangs for 20 s, ferry, compass": Odd(craft="ferry", compass=True, change=_hangs),
+    "receiver hangs for 20 s, robot that stands": Odd(craft="robot", change=_hangs),
+    "receiver hangs for 20 s, velocity too, boat": Odd(craft="boat", change=_hang_both),
+    "each fix three times": Odd(change=_thrice),
+    "position held at rest": Odd(change=_held_at_rest),
+    "position held at rest, boat": Odd(craft="boat", compass=True, change=_held_at_rest),
+    "positions to a metre": Odd(craft="robot", change=_rounded),
     "positions in UTM alone": Odd(change=_utm, draft=("grid: ''",), edit=("grid: ''", "grid: EPSG:32632")),
 }  # fmt: skip
 

@@ -37,6 +37,8 @@ _JUMP_M, _SHARE = 2.0, 0.5  # the jump after, and its share of the way at the sp
 _FAR_M = 20.0  # a jump that needs no such share: the vessel may have turned back meanwhile
 # Of a velocity: share of the values that are not repeated, else it is rounded; repetitions that are too many; at rest it may.
 MOSTLY, MANY, REST_MPS = 0.9, 5, 0.1
+# For so long, and so often, a receiver that scatters has done so at rest.
+REST_S, SEEN = 5.0, 2
 # A vessel cannot stop between two fixes from more than this speed and deceleration; nor does one set off faster.
 _STOPS_MPS, _BRAKES_MPS2 = 1.5, 3.0
 
@@ -51,10 +53,14 @@ def frozen_fixes(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Arr
     if not len(bad):
         return bad
     t_s = (stamps_ns - stamps_ns[0]) / NS_PER_S
-    firsts = np.concatenate([[0], np.flatnonzero((lat_lon_deg[1:] != lat_lon_deg[:-1]).any(axis=1)) + 1])
+    changes = (lat_lon_deg[1:] != lat_lon_deg[:-1]).any(axis=1)
+    firsts = np.concatenate([[0], np.flatnonzero(changes) + 1])
+    scatters = _scatters_at_rest(t_s, places_m, np.append(True, changes))
     for first, after in zip(firsts, [*firsts[1:], len(bad)], strict=True):
         if after - first >= FEWEST and t_s[after - 1] - t_s[first] >= HELD_S:
-            bad[first + 1 : after] = _is_frozen(t_s[: after + 1], places_m[: after + 1], int(first), int(after))
+            bad[first + 1 : after] = _is_frozen(
+                t_s[: after + 1], places_m[: after + 1], int(first), int(after), scatters=scatters
+            )
     return bad | _frozen_but_for_noise(t_s, places_m, bad)
 
 
@@ -101,6 +107,22 @@ def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_])
     return bad
 
 
+def _scatters_at_rest(t_s: Array, places_m: Array, changes: NDArray[np.bool_]) -> bool:
+    """Whether the receiver has been at rest for a while without repeating a position; `changes` (N,): it is not that of the fix before."""
+    seen, first = 0, 0
+    while seen < SEEN and first < len(t_s):
+        after = int(np.searchsorted(t_s, t_s[first] + REST_S, side="right"))
+        whole = after < len(t_s) and bool(changes[first + 1 : after].all())
+        seen += whole and stands(t_s[first:after], places_m[first:after])
+        first = max(int(np.searchsorted(t_s, t_s[first] + REST_S / 2.0)), first + 1)
+    return seen >= SEEN
+
+
+def stands(t_s: Array, places_m: Array) -> bool:
+    """Return whether fixes at times (N,), s, and places (N, 2), m, are of a vessel at rest."""
+    return len(t_s) >= MANY and _speed(t_s, places_m)[0] < REST_MPS
+
+
 def _gone(places_m: Array, first: int, held: int) -> int:
     """Return the first fix farther than noise from the mean of [first, held); the number of fixes where there is none."""
     middle, long = places_m[first:held].mean(axis=0), held - first
@@ -113,13 +135,18 @@ def _gone(places_m: Array, first: int, held: int) -> int:
         long *= 2
 
 
-def _is_frozen(t_s: Array, places_m: Array, first: int, after: int) -> bool:
-    """Whether the stretch of one position from `first` on is frozen; at `after` the position changes, or the run has ended."""
+def _is_frozen(t_s: Array, places_m: Array, first: int, after: int, *, scatters: bool) -> bool:
+    """Whether the stretch of one position from `first` on is frozen; at `after` the position changes, or the run has ended.
+
+    Args:
+        scatters: the receiver does so at rest: then it does not repeat a position there.
+    """
     if after < len(t_s):
         silent_s = t_s[after] - t_s[after - 1]
         jump_m = float(np.linalg.norm(places_m[after] - places_m[first]))
         if silent_s < HELD_S or jump_m > _set_off_m(silent_s):
-            return _jumps_on(t_s, places_m, first, after)
+            set_off_m = max(_JUMP_M, _set_off_m(silent_s))
+            return (scatters and jump_m > set_off_m) or _jumps_on(t_s, places_m, first, after)
     return _stopped_at_once(t_s, places_m, first, _STOPS_MPS)
 
 

@@ -70,6 +70,29 @@ def test_one_whose_vessel_has_turned_back_meanwhile_is_frozen(hz: float) -> None
     assert len(found) == round(30.0 * hz) - 1
 
 
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+@pytest.mark.parametrize("scatters", [True, False])
+def test_one_that_scatters_at_rest_does_not_repeat_there(hz: float, *, scatters: bool) -> None:
+    """A slow ferry: at 0.6 m/s its fixes do not tell that it is under way. Its receiver may hold where it does so at rest."""
+
+    def way(t: Array) -> Array:
+        return 0.6 * np.maximum(t - 15.0, 0.0)
+
+    t, lat_lon, p = said(way, (40.0, 52.0), hz, 0.3)
+    if not scatters:
+        lat_lon[t < 15.0] = lat_lon[0]
+        p[t < 15.0] = p[0]
+    stamps_ns = START_NS + np.round(t * S).astype(np.int64)
+    frozen = t[(t > 40.0) & (t < 52.0)] if scatters else []
+    assert t[frozen_fixes(stamps_ns, lat_lon, p)] == pytest.approx(frozen)
+    for speed_mps in (0.0, 0.6):  # the fixes have drawn the estimate to rest, or not
+        online = RepeatedFixDetector()
+        for stamp_ns, place in zip(stamps_ns.tolist(), p, strict=True):
+            online.note(stamp_ns, place, speed_mps * bool(stamp_ns > stamps_ns[0] + 16 * S), 0.15)
+        old = [online.is_old(stamp_ns, place) for stamp_ns, place in zip(stamps_ns.tolist(), p, strict=True)]
+        assert t[old] == pytest.approx(frozen)
+
+
 @pytest.mark.parametrize(("hz", "noise_m"), [(1.0, 0.02), (5.0, 0.1)])
 def test_one_that_freezes_in_a_turn_is_frozen(hz: float, noise_m: float) -> None:
     """At 6 m/s on a circle of 12 m: its fixes are no line. It goes on at the other side."""

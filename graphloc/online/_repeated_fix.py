@@ -13,7 +13,20 @@ from collections import deque
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.frozen_receiver import BEFORE_S, FEWEST, HELD_S, MANY, MOSTLY, REST_MPS, UNDER_WAY_MPS, goes_on, under_way
+from graphloc.frozen_receiver import (
+    BEFORE_S,
+    FEWEST,
+    HELD_S,
+    MANY,
+    MOSTLY,
+    REST_MPS,
+    REST_S,
+    SEEN,
+    UNDER_WAY_MPS,
+    goes_on,
+    stands,
+    under_way,
+)
 from graphloc.time import NS_PER_S
 
 _SAME_M, _AWAY_M = 0.2, 1.0  # of one place; how far the vessel has gone by then, unless a fix equals the one before
@@ -35,6 +48,10 @@ class RepeatedFixDetector:
         self._places: deque[tuple[int, Array]] = deque(
             maxlen=_KEPT
         )  # the last different ones, with the stamps (ns) that they begin at
+        self._rest: deque[tuple[int, Array]] = deque(maxlen=_KEPT)  # fixes of some seconds, none repeated
+        self._seen = (
+            0  # how often such fixes were at rest: then the receiver scatters there, and does not repeat a position
+        )
         self._last: tuple[int, Array] | None = None
         self._equal_ns, self._equal = 0, 0  # stamp of the first of the fixes that equal the last one, and their number
         self._runs = self._singles = 0  # of equal velocities; those that are not repeated
@@ -55,6 +72,7 @@ class RepeatedFixDetector:
             return None
         self._last = (stamp_ns, np.array(told_m))
         equals = last is not None and np.array_equal(told_m, last[1])
+        self._note_rest(stamp_ns, told_m, equals=equals)
         if last is None or not _same(told_m, self._places[-1][1]):
             if last is not None and self._since_ns is None and self._went_on(stamp_ns, told_m, last):
                 turned_out = self._equal_ns + 1
@@ -72,6 +90,17 @@ class RepeatedFixDetector:
         self._equal_ns, self._equal = (self._equal_ns, self._equal + 1) if equals else (stamp_ns, 1)
         return turned_out
 
+    def _note_rest(self, stamp_ns: int, told_m: Array, *, equals: bool) -> None:
+        if equals:
+            self._rest.clear()
+        self._rest.append((stamp_ns, np.array(told_m)))
+        if self._seen >= SEEN or stamp_ns - self._rest[0][0] < REST_S * NS_PER_S:
+            return
+        t_s = np.array([(at_ns - self._rest[0][0]) / NS_PER_S for at_ns, _ in self._rest])
+        self._seen += stands(t_s, np.array([place for _, place in self._rest]))
+        while stamp_ns - self._rest[0][0] > REST_S / 2.0 * NS_PER_S:
+            self._rest.popleft()
+
     def _begin(self, stamp_ns: int, told_m: Array) -> None:
         self.frozen, self._since_ns = False, None
         self._places.append((stamp_ns, np.array(told_m)))
@@ -84,6 +113,8 @@ class RepeatedFixDetector:
         if not equals and speed_mps * (stamp_ns - self._places[-1][0]) < _AWAY_M * NS_PER_S:
             return False
         before_mps = self._speed_before_mps()
+        if self._seen >= SEEN and equals:
+            before_mps = before_mps or 0.0
         if before_mps is None or speed_mps < max(UNDER_WAY_MPS, _SHARE * before_mps):
             return False
         # While its fixes are left out the speed becomes uncertain: that is no evidence of rest.
@@ -95,6 +126,8 @@ class RepeatedFixDetector:
             return False
         before_mps, jump_m = self._speed_before_mps(), float(np.linalg.norm(told_m - last[1]))
         held_s, silent_s = ((stamp_ns - at_ns) / NS_PER_S for at_ns in (self._equal_ns, last[0]))
+        if self._seen >= SEEN:
+            before_mps = 0.0
         return before_mps is not None and goes_on(jump_m, before_mps, held_s, silent_s)
 
     def _speed_before_mps(self) -> float | None:
