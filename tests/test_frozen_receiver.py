@@ -83,7 +83,7 @@ def test_one_that_scatters_at_rest_does_not_repeat_there(hz: float, *, scatters:
         lat_lon[t < 15.0] = lat_lon[0]
         p[t < 15.0] = p[0]
     stamps_ns = START_NS + np.round(t * S).astype(np.int64)
-    frozen = t[(t > 40.0) & (t < 52.0)] if scatters else []
+    frozen = t[(t > 40.0) & (t < 52.0) & scatters]
     assert t[frozen_fixes(stamps_ns, lat_lon, p)] == pytest.approx(frozen)
     for speed_mps in (0.0, 0.6):  # the fixes have drawn the estimate to rest, or not
         online = RepeatedFixDetector()
