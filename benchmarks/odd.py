@@ -70,21 +70,25 @@ def _velocity(craft: Craft, items: list[Item]) -> list[Item]:
     ]
 
 
-def _hangs(craft: Craft, items: list[Item]) -> list[Item]:
-    """From 45 s on, for 20 s, the receiver repeats what it said last."""
-    last: dict[str, Any] = {}
-    for name, log_ns, m in sorted(items, key=lambda item: item[1]):
-        if name not in ("/gnss/fix", "/gnss/vel"):
-            continue
-        if stamp(45.0) < log_ns < stamp(65.0):
-            for field in ("latitude", "longitude", "altitude") if name == "/gnss/fix" else ("twist",):
-                setattr(m, field, getattr(last[name], field))
-        last[name] = m
-    return items
+_SAYS = {"/gnss/fix": ("latitude", "longitude", "altitude"), "/gnss/vel": ("twist",), "/compass": ("quaternion",)}
 
 
-def _hang_both(craft: Craft, items: list[Item]) -> list[Item]:
-    return _hangs(craft, _velocity(craft, items))
+def _hang(*topics: str) -> Change:
+    """From 45 s on, for 20 s, these repeat what they said last."""
+
+    def change(craft: Craft, items: list[Item]) -> list[Item]:
+        items = _velocity(craft, items) if "/gnss/vel" in topics else items
+        last: dict[str, Any] = {}
+        for name, log_ns, m in sorted(items, key=lambda item: item[1]):
+            if name not in topics:
+                continue
+            if stamp(45.0) < log_ns < stamp(65.0):
+                for field in _SAYS[name]:
+                    setattr(m, field, getattr(last[name], field))
+            last[name] = m
+        return items
+
+    return change
 
 
 def _thrice(craft: Craft, items: list[Item]) -> list[Item]:
@@ -206,10 +210,12 @@ CASES: dict[str, Odd] = {
     "RTK jump of 0.5 m": Odd(change=_jump(0.5), **_RTK),
     "RTK jump of 10 m": Odd(change=_jump(10.0), **_RTK),
     "RTK jump of 100 m": Odd(change=_jump(100.0), **_RTK),
-    "receiver hangs for 20 s, car": Odd(change=_hangs),
-    "receiver hangs for 20 s, ferry, compass": Odd(craft="ferry", compass=True, change=_hangs),
-    "receiver hangs for 20 s, robot that stands": Odd(craft="robot", change=_hangs),
-    "receiver hangs for 20 s, velocity too, boat": Odd(craft="boat", change=_hang_both),
+    "receiver hangs for 20 s, car": Odd(change=_hang("/gnss/fix")),
+    "receiver hangs for 20 s, ferry, compass": Odd(craft="ferry", compass=True, change=_hang("/gnss/fix")),
+    "receiver hangs for 20 s, robot that stands": Odd(craft="robot", change=_hang("/gnss/fix")),
+    "receiver hangs for 20 s, velocity too, boat": Odd(craft="boat", change=_hang("/gnss/fix", "/gnss/vel")),
+    "compass hangs for 20 s, boat": Odd(craft="boat", compass=True, change=_hang("/compass")),
+    "compass hangs for 20 s, car": Odd(compass=True, change=_hang("/compass")),
     "each fix three times": Odd(change=_thrice),
     "position held at rest": Odd(change=_held_at_rest),
     "position held at rest, boat": Odd(craft="boat", compass=True, change=_held_at_rest),
