@@ -102,9 +102,8 @@ _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visua
 _MOST_NAMED = 6
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _FEWEST = 20  # places of a track
-_COVERS = (
-    0.8  # of the run, from which a receiver is there throughout; of the fixes, from which it says as much as another
-)
+# Of the run, from which a receiver is there throughout; of the fixes, from which it says as much as another.
+_COVERS = 0.8
 
 
 class _First(NamedTuple):

@@ -112,9 +112,8 @@ def solve_batch(problem: Problem, progress: Progress = quiet, *, newest: bool = 
         if noisier is None:
             break
         if start.by_motion and ratio < CONTRADICTION:
-            return solve_batch(
-                noisier, progress, newest=newest
-            )  # which headings the motion excludes was found with the smaller noise
+            # Which headings the motion excludes was found with the smaller noise.
+            return solve_batch(noisier, progress, newest=newest)
         problem = bridged(noisier, estimate)
         few = thinned(problem)
         if ratio >= CONTRADICTION:
