@@ -62,7 +62,7 @@ def under_way(t_s: Array, places_m: Array) -> float | None:
     """Return the speed (m/s) over fixes at times (N,), s, and places (N, 2), m; None where the vessel may have been at rest."""
     if len(t_s) < FEWEST:
         return None
-    speed, sigma = _speed(t_s, places_m)
+    speed, sigma = speed_of(t_s, places_m)
     return speed if speed - _SIGMAS * sigma > UNDER_WAY_MPS else None
 
 
@@ -157,7 +157,7 @@ def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) 
         return False
     way = np.append(before, first)
     later = way[len(way) // 2 :]  # one that brakes is slower there, and its way is no line
-    (speed, sigma), (last, noise) = (_speed(t_s[of], places_m[of]) for of in (way, later))
+    (speed, sigma), (last, noise) = (speed_of(t_s[of], places_m[of]) for of in (way, later))
     step_s = t_s[first] - t_s[before[-1]]
     return bool(min(speed, last) - _SIGMAS * max(sigma, noise) > least_mps + _BRAKES_MPS2 * step_s)
 
@@ -167,8 +167,8 @@ def _before(t_s: Array, first: int) -> NDArray[np.int64]:
     return np.arange(*np.searchsorted(t_s, [t_s[first] - BEFORE_S, t_s[first]]))
 
 
-def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:
-    """Speed (m/s) of a straight line through places (N, 2), and its sigma from the residuals."""
+def speed_of(t_s: Array, places_m: Array) -> tuple[float, float]:
+    """Return the speed (m/s) of a straight line through places (N, 2), m, at times (N,), s, and its sigma from the residuals."""
     dt = t_s - t_s.mean()
     square = max(float(dt @ dt), 1e-9)
     v = dt @ (places_m - places_m.mean(axis=0)) / square
