@@ -4,8 +4,8 @@
 Detected over a whole run before it is solved: with few other sensors the graph would follow the frozen position by a false
 tilt and bias. At rest a receiver may rightly repeat one position for minutes, so the vessel must have been under way. Then
 either the next different position is a jump away, or, where there is no next one (or one so late that the vessel may have
-gone there from rest), the vessel stopped from one fix to the next, faster than it can brake. Online:
-`online/_frozen_receiver.py`.
+gone there from rest, or so far that it may have turned back meanwhile), the vessel stopped from one fix to the next, faster than it
+can brake. Online: `online/_frozen_receiver.py`, `online/_repeated_fix.py`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ BEFORE_S = 3.0  # before the stretch: the fixes in it give the speed
 _SIGMAS = 3.0
 UNDER_WAY_MPS = 0.5
 _JUMP_M, _SHARE = 2.0, 0.5  # the jump after, and its share of the way at the speed before
-_FAR_M = 20.0  # a jump that needs no such share: the vessel may have turned back meanwhile
+_FAR_M = 20.0  # a jump that is no sign of rest: the vessel may have turned back meanwhile, or multipath jumps from there
 # Of a velocity: share of the values that are not repeated, else it is rounded; repetitions that are too many; at rest it may.
 MOSTLY, MANY, REST_MPS = 0.9, 5, 0.1
 # A vessel cannot stop between two fixes from more than this speed and deceleration; nor does one set off faster.
@@ -116,10 +116,12 @@ def _gone(places_m: Array, first: int, held: int) -> int:
 def _is_frozen(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     """Whether the stretch of one position from `first` on is frozen; at `after` the position changes, or the run has ended."""
     if after < len(t_s):
+        if _jumps_on(t_s, places_m, first, after):
+            return True
         silent_s = t_s[after] - t_s[after - 1]
         jump_m = float(np.linalg.norm(places_m[after] - places_m[first]))
-        if silent_s < HELD_S or jump_m > _set_off_m(silent_s):
-            return _jumps_on(t_s, places_m, first, after)
+        if jump_m <= _FAR_M and (silent_s < HELD_S or jump_m > _set_off_m(silent_s)):
+            return False
     return _stopped_at_once(t_s, places_m, first, _STOPS_MPS)
 
 
@@ -138,7 +140,7 @@ def goes_on(jump_m: float, speed_mps: float, held_s: float, silent_s: float) -> 
     Args:
         speed_mps: before it was repeated. held_s: until now. silent_s: since it was repeated last.
     """
-    return jump_m > max(_JUMP_M, _set_off_m(silent_s), min(_SHARE * speed_mps * held_s, _FAR_M))
+    return jump_m > max(_JUMP_M, _set_off_m(silent_s), _SHARE * speed_mps * held_s)
 
 
 def _set_off_m(silent_s: float) -> float:

@@ -89,6 +89,8 @@ def test_one_that_freezes_in_a_turn_is_frozen(hz: float, noise_m: float) -> None
         (lambda t: 2.0 * (np.minimum(t, 20.0) + np.maximum(t - 40.0, 0.0)), (20.5, 40.0), 5.0),  # and goes on
         (lambda t: 0.0 * t, (10.0, 60.0), 1.0),
         (lambda t: 12.0 * (t > 40.0), (10.0, 40.0), 1.0),  # at rest, and then multipath jumps
+        (lambda t: rests(2.0, t) + 21.0 * (t >= 58.0), (20.0, 58.0), 1.0),
+        (lambda t: rests(3.0, t) + 25.0 * (t >= 50.0), (20.0, 50.0), 5.0),
         (lambda t: 10.0 * np.minimum(t, 20.0) - 1.5 * np.clip(t - 17.0, 0.0, 3.0) ** 2, (20.0, 60.0), 1.0),  # brakes
         (lambda t: 12.0 * np.minimum(t, 20.0) - 2.0 * np.clip(t - 17.0, 0.0, 3.0) ** 2, (20.0, 60.0), 5.0),
         (lambda t: np.minimum(t, 20.0), (20.2, 60.0), 5.0),  # a robot at 1 m/s stops at once
