@@ -4,8 +4,8 @@
 Detected over a whole run before it is solved: with few other sensors the graph would follow the frozen position by a false
 tilt and bias. At rest a receiver may rightly repeat one position for minutes, so the vessel must have been under way. Then
 either the next different position is a jump away, or, where there is no next one (or one so late that the vessel may have
-gone there from rest), the vessel stopped from one fix to the next, faster than it can brake. Online:
-`online/_frozen_receiver.py`.
+gone there from rest, or so far that it may have turned back meanwhile), the vessel stopped from one fix to the next, faster than it
+can brake. Online: `online/_frozen_receiver.py`, `online/_repeated_fix.py`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ BEFORE_S = 3.0  # before the stretch: the fixes in it give the speed
 _SIGMAS = 3.0
 UNDER_WAY_MPS = 0.5
 _JUMP_M, _SHARE = 2.0, 0.5  # the jump after, and its share of the way at the speed before
-_FAR_M = 20.0  # a jump that needs no such share: the vessel may have turned back meanwhile
+_FAR_M = (
+    20.0  # a jump that is no sign of rest: the vessel may have turned back meanwhile, or multipath jumps from there
+)
 # Of a velocity: share of the values that are not repeated, else it is rounded; repetitions that are too many; at rest it may.
 MOSTLY, MANY, REST_MPS = 0.9, 5, 0.1
 # For so long, and so often, a receiver that scatters has done so at rest.
@@ -55,11 +57,11 @@ def frozen_fixes(stamps_ns: NDArray[np.int64], lat_lon_deg: Array, places_m: Arr
     t_s = (stamps_ns - stamps_ns[0]) / NS_PER_S
     changes = (lat_lon_deg[1:] != lat_lon_deg[:-1]).any(axis=1)
     firsts = np.concatenate([[0], np.flatnonzero(changes) + 1])
-    scatters = _scatters_at_rest(t_s, places_m, np.append(True, changes))
+    scatters_from = _scatters_from(t_s, places_m, np.append(True, changes))
     for first, after in zip(firsts, [*firsts[1:], len(bad)], strict=True):
         if after - first >= FEWEST and t_s[after - 1] - t_s[first] >= HELD_S:
             bad[first + 1 : after] = _is_frozen(
-                t_s[: after + 1], places_m[: after + 1], int(first), int(after), scatters=scatters
+                t_s[: after + 1], places_m[: after + 1], int(first), int(after), scatters=first >= scatters_from
             )
     return bad | _frozen_but_for_noise(t_s, places_m, bad)
 
@@ -68,7 +70,7 @@ def under_way(t_s: Array, places_m: Array) -> float | None:
     """Return the speed (m/s) over fixes at times (N,), s, and places (N, 2), m; None where the vessel may have been at rest."""
     if len(t_s) < FEWEST:
         return None
-    speed, sigma = _speed(t_s, places_m)
+    speed, sigma = speed_of(t_s, places_m)
     return speed if speed - _SIGMAS * sigma > UNDER_WAY_MPS else None
 
 
@@ -107,20 +109,29 @@ def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_])
     return bad
 
 
-def _scatters_at_rest(t_s: Array, places_m: Array, changes: NDArray[np.bool_]) -> bool:
-    """Whether the receiver has been at rest for a while without repeating a position; `changes` (N,): it is not that of the fix before."""
+def _scatters_from(t_s: Array, places_m: Array, changes: NDArray[np.bool_]) -> int:
+    """Return from which fix on the receiver is known to scatter at rest: it has been there for a while without repeating a position.
+
+    Args:
+        changes: (N,), whether a position is not that of the fix before.
+    """
     seen, first = 0, 0
-    while seen < SEEN and first < len(t_s):
+    while first < len(t_s):
         after = int(np.searchsorted(t_s, t_s[first] + REST_S, side="right"))
-        whole = after < len(t_s) and bool(changes[first + 1 : after].all())
-        seen += whole and stands(t_s[first:after], places_m[first:after])
+        seen += (
+            bool(changes[first + 1 : after].all())
+            and after < len(t_s)
+            and stands(t_s[first:after], places_m[first:after])
+        )
+        if seen >= SEEN:
+            return after
         first = max(int(np.searchsorted(t_s, t_s[first] + REST_S / 2.0)), first + 1)
-    return seen >= SEEN
+    return len(t_s)
 
 
 def stands(t_s: Array, places_m: Array) -> bool:
     """Return whether fixes at times (N,), s, and places (N, 2), m, are of a vessel at rest."""
-    return len(t_s) >= MANY and _speed(t_s, places_m)[0] < REST_MPS
+    return len(t_s) >= MANY and speed_of(t_s, places_m)[0] < REST_MPS
 
 
 def _gone(places_m: Array, first: int, held: int) -> int:
@@ -144,9 +155,12 @@ def _is_frozen(t_s: Array, places_m: Array, first: int, after: int, *, scatters:
     if after < len(t_s):
         silent_s = t_s[after] - t_s[after - 1]
         jump_m = float(np.linalg.norm(places_m[after] - places_m[first]))
-        if silent_s < HELD_S or jump_m > _set_off_m(silent_s):
-            set_off_m = max(_JUMP_M, _set_off_m(silent_s))
-            return (scatters and jump_m > set_off_m) or _jumps_on(t_s, places_m, first, after)
+        if scatters and jump_m > max(_JUMP_M, _set_off_m(silent_s)):
+            return True
+        if _jumps_on(t_s, places_m, first, after):
+            return True
+        if jump_m <= _FAR_M and (silent_s < HELD_S or jump_m > _set_off_m(silent_s)):
+            return False
     return _stopped_at_once(t_s, places_m, first, _STOPS_MPS)
 
 
@@ -165,7 +179,7 @@ def goes_on(jump_m: float, speed_mps: float, held_s: float, silent_s: float) -> 
     Args:
         speed_mps: before it was repeated. held_s: until now. silent_s: since it was repeated last.
     """
-    return jump_m > max(_JUMP_M, _set_off_m(silent_s), min(_SHARE * speed_mps * held_s, _FAR_M))
+    return jump_m > max(_JUMP_M, _set_off_m(silent_s), _SHARE * speed_mps * held_s)
 
 
 def _set_off_m(silent_s: float) -> float:
@@ -184,7 +198,7 @@ def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) 
         return False
     way = np.append(before, first)
     later = way[len(way) // 2 :]  # one that brakes is slower there, and its way is no line
-    (speed, sigma), (last, noise) = (_speed(t_s[of], places_m[of]) for of in (way, later))
+    (speed, sigma), (last, noise) = (speed_of(t_s[of], places_m[of]) for of in (way, later))
     step_s = t_s[first] - t_s[before[-1]]
     return bool(min(speed, last) - _SIGMAS * max(sigma, noise) > least_mps + _BRAKES_MPS2 * step_s)
 
@@ -194,8 +208,8 @@ def _before(t_s: Array, first: int) -> NDArray[np.int64]:
     return np.arange(*np.searchsorted(t_s, [t_s[first] - BEFORE_S, t_s[first]]))
 
 
-def _speed(t_s: Array, places_m: Array) -> tuple[float, float]:
-    """Speed (m/s) of a straight line through places (N, 2), and its sigma from the residuals."""
+def speed_of(t_s: Array, places_m: Array) -> tuple[float, float]:
+    """Return the speed (m/s) of a straight line through places (N, 2), m, at times (N,), s, and its sigma from the residuals."""
     dt = t_s - t_s.mean()
     square = max(float(dt @ dt), 1e-9)
     v = dt @ (places_m - places_m.mean(axis=0)) / square

@@ -88,7 +88,7 @@ def test_one_that_scatters_at_rest_does_not_repeat_there(hz: float, *, scatters:
     for speed_mps in (0.0, 0.6):  # the fixes have drawn the estimate to rest, or not
         online = RepeatedFixDetector()
         for stamp_ns, place in zip(stamps_ns.tolist(), p, strict=True):
-            online.note(stamp_ns, place, speed_mps * bool(stamp_ns > stamps_ns[0] + 16 * S), 0.15)
+            online.note(stamp_ns, place, np.array([speed_mps * bool(stamp_ns > stamps_ns[0] + 16 * S), 0.0]), 0.15)
         old = [online.is_old(stamp_ns, place) for stamp_ns, place in zip(stamps_ns.tolist(), p, strict=True)]
         assert t[old] == pytest.approx(frozen)
 
@@ -112,6 +112,8 @@ def test_one_that_freezes_in_a_turn_is_frozen(hz: float, noise_m: float) -> None
         (lambda t: 2.0 * (np.minimum(t, 20.0) + np.maximum(t - 40.0, 0.0)), (20.5, 40.0), 5.0),  # and goes on
         (lambda t: 0.0 * t, (10.0, 60.0), 1.0),
         (lambda t: 12.0 * (t > 40.0), (10.0, 40.0), 1.0),  # at rest, and then multipath jumps
+        (lambda t: rests(2.0, t) + 21.0 * (t >= 58.0), (20.0, 58.0), 1.0),
+        (lambda t: rests(3.0, t) + 25.0 * (t >= 50.0), (20.0, 50.0), 5.0),
         (lambda t: 10.0 * np.minimum(t, 20.0) - 1.5 * np.clip(t - 17.0, 0.0, 3.0) ** 2, (20.0, 60.0), 1.0),  # brakes
         (lambda t: 12.0 * np.minimum(t, 20.0) - 2.0 * np.clip(t - 17.0, 0.0, 3.0) ** 2, (20.0, 60.0), 5.0),
         (lambda t: np.minimum(t, 20.0), (20.2, 60.0), 5.0),  # a robot at 1 m/s stops at once

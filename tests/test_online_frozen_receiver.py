@@ -32,6 +32,7 @@ def frozen_at(off_m: Off, v_mps: Array, *, hz: float = 5.0, sigma_m: float = 0.2
 
 
 V = np.array([2.0, 1.0])
+AHEAD = np.array([1.0, 0.0])
 
 
 @pytest.mark.parametrize("hz", [1.0, 5.0, 20.0])
@@ -99,11 +100,11 @@ def test_at_the_start_it_may_be_the_estimate_that_is_wrong() -> None:
     assert frozen_at(lambda t, n: 0.2 * n - V * t * (t < 8.0), V, until_s=16.0) == []
 
 
-def old_at(place_m: Callable[[float], Array], speed_mps: Callable[[float], float], *, hz: float = 5.0, until_s: float = 40.0, sigma_mps: float = 0.2) -> tuple[list[float], list[float]]:  # fmt: skip
+def old_at(place_m: Callable[[float], Array], v_mps: Callable[[float], Array], *, hz: float = 5.0, until_s: float = 40.0, sigma_mps: float = 0.2) -> tuple[list[float], list[float]]:  # fmt: skip
     """Times (s) of fixes that are old, and those at which the receiver is judged frozen."""
     detector, old, frozen = RepeatedFixDetector(), [], []
     for t in np.arange(0.0, until_s, 1.0 / hz).tolist():
-        detector.note(round(t * 1e9), place_m(t), speed_mps(t), sigma_mps)
+        detector.note(round(t * 1e9), place_m(t), v_mps(t), sigma_mps)
         old += [t] if detector.is_old(round(t * 1e9), place_m(t)) else []
         frozen += [t] if detector.frozen else []
     return old, frozen
@@ -117,7 +118,7 @@ def test_a_fix_that_is_repeated_under_way_is_old_until_another_comes(hz: float, 
     noise = {round(t, 6): noise_m * rng.standard_normal(2) for t in np.arange(0.0, 40.0, 1.0 / hz).tolist()}
     held = 20.0
     old, frozen = old_at(
-        lambda t: V * (held if held < t < 30.0 else t) + noise[round(t, 6)] * (t >= held), lambda t: 2.2, hz=hz
+        lambda t: V * (held if held < t < 30.0 else t) + noise[round(t, 6)] * (t >= held), lambda t: 2.2 * AHEAD, hz=hz
     )
     assert held + wait_s - 0.1 < old[0] < held + wait_s + 1.01 / hz  # a place is that of the first fix within 0.2 m
     assert 30.0 - 1.01 / hz < old[-1] < 30.0
@@ -137,17 +138,37 @@ def test_a_position_that_is_held_at_rest_or_below_a_speed_is_believed(hz: float)
         braked_s = min(max(t - 20.0, 0.0), 2.5)
         return np.array([3.0 * min(t, 22.5) - braked_s**2 / 2.0, 0.0])
 
-    assert old_at(place_m, lambda t: true_mps(t - 0.2), hz=hz) == ([], [])
+    assert old_at(place_m, lambda t: true_mps(t - 0.2) * AHEAD, hz=hz) == ([], [])
+
+
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+@pytest.mark.parametrize("off_deg", [20.0, 45.0, 90.0])
+def test_at_rest_a_wrong_heading_that_keeps_a_speed_in_the_estimate_makes_no_fix_old(off_deg: float, hz: float) -> None:
+    """It brakes from 3 m/s by 1 m/s^2, which the estimate takes for another direction. A vessel 60 s at rest was put 43 m off by 20 deg."""
+    off = np.radians(off_deg)
+    turned = np.array([[np.cos(off), -np.sin(off)], [np.sin(off), np.cos(off)]])
+
+    def braked_mps(t: float) -> float:
+        return min(max(t - 20.0, 0.0), 3.0)
+
+    def place_m(t: float) -> Array:
+        return (3.0 * min(t, 23.0) - braked_mps(t) ** 2 / 2.0) * AHEAD
+
+    def v_mps(t: float) -> Array:
+        return np.asarray(3.0 * AHEAD - turned @ AHEAD * braked_mps(t))
+
+    assert np.linalg.norm(v_mps(30.0)) > 1.0
+    assert old_at(place_m, v_mps, hz=hz) == ([], [])
 
 
 def test_a_speed_that_is_hardly_known_makes_no_fix_old_and_its_growth_none_young() -> None:
     def place_m(t: float) -> Array:
         return V * min(t, 20.0)
 
-    assert old_at(place_m, lambda t: 2.2, sigma_mps=1.0) == ([], [])
+    assert old_at(place_m, lambda t: 2.2 * AHEAD, sigma_mps=1.0) == ([], [])
     detector = RepeatedFixDetector()
     for t in np.arange(0.0, 40.0, 0.2).tolist():
-        detector.note(round(t * 1e9), place_m(t), 2.2, 0.2 + 0.5 * max(t - 20.0, 0.0))
+        detector.note(round(t * 1e9), place_m(t), 2.2 * AHEAD, 0.2 + 0.5 * max(t - 20.0, 0.0))
         assert detector.is_old(round(t * 1e9), place_m(t)) == (t > 20.0)
 
 
@@ -159,7 +180,7 @@ def test_a_position_that_jumps_on_was_frozen_though_the_estimate_was_held_back(h
         for t in np.arange(0.0, 40.0, 1.0 / hz).tolist():
             on = max(t - 30.0, 0.0) if not goes_on else t - 20.0 if t >= 30.0 else 0.0
             fixes.append((round(t * 1e9), V * (min(t, 20.0) + on)))
-            since.append(detector.note(*fixes[-1], 0.0, 0.2))
+            since.append(detector.note(*fixes[-1], np.zeros(2), 0.2))
         found = [at_ns for at_ns in since if at_ns is not None]
         old = [at_ns for at_ns, place in fixes if detector.is_old(at_ns, place)]
         if goes_on:
@@ -172,7 +193,7 @@ def test_a_position_that_jumps_on_was_frozen_though_the_estimate_was_held_back(h
 
 def test_a_swing_at_rest_does_not_make_a_receiver_frozen() -> None:
     """It has repeated its position for long by then: only repetitions while the vessel moves count."""
-    old, frozen = old_at(lambda t: V * min(t, 20.0), lambda t: 2.2 if t <= 20.0 or 30.0 < t < 30.5 else 0.0)
+    old, frozen = old_at(lambda t: V * min(t, 20.0), lambda t: 2.2 * AHEAD * (t <= 20.0 or 30.0 < t < 30.5))
     assert frozen == []
     assert all(30.0 < t < 30.5 for t in old)
 

@@ -63,8 +63,9 @@ class ReceiverChecks:
     def _repeats(self, stream: LiveStream, m: Measurement, at: Attachment, told_m: Array) -> bool:
         newest, detector = self._states.newest, stream.repeated_fix_detector
         # The antenna swings in waves, and the vessel may turn about it.
-        speed_mps = min(float(np.linalg.norm(v[:2])) for v in (newest.velocity, at.sensor_velocity_mps()))
-        since_ns = detector.note(m.stamp_ns, told_m, speed_mps, largest_sigma(newest.velocity_cov))
+        slower_mps = min(newest.velocity, at.sensor_velocity_mps(), key=lambda v: float(np.linalg.norm(v[:2])))
+        v_mps = np.asarray(at.T_world_body.rotation().matrix().T @ slower_mps)[:2]
+        since_ns = detector.note(m.stamp_ns, told_m, v_mps, largest_sigma(newest.velocity_cov))
         if since_ns is not None:
             self._reject_since(stream, since_ns, m.stamp_ns)
             self._warnings.append(f"{stream.name}: {_FROZEN}: for {(m.stamp_ns - since_ns) / NS_PER_S:.1f} s until now")

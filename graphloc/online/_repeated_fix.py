@@ -2,7 +2,10 @@
 """A receiver, or its driver, that repeats a fix while the vessel moves, bit for bit or but for centimetres: what it repeats is old.
 
 At rest a receiver may rightly do so, and where it holds its position at low speed: the vessel must have been under way by the
-fixes before, and still be by the estimate; or, in hindsight, the position jumps on. A receiver whose frozen position scatters by more: `_frozen_receiver.py`. Offline:
+fixes before, and still be by the estimate; or, in hindsight, the position jumps on. Where the heading is wrong by an angle a, a
+vessel that has braked from v keeps 2 v sin(a / 2) in the estimate, but only v (1 - cos a) along v: what counts is the velocity along
+the fastest just before, and by the last of the fixes before the vessel must not have been much slower. None of this is asked of a
+receiver that has scattered at rest. One whose frozen position scatters by more: `_frozen_receiver.py`. Offline:
 `graphloc/frozen_receiver.py`.
 """
 
@@ -24,6 +27,7 @@ from graphloc.frozen_receiver import (
     SEEN,
     UNDER_WAY_MPS,
     goes_on,
+    speed_of,
     stands,
     under_way,
 )
@@ -31,7 +35,7 @@ from graphloc.time import NS_PER_S
 
 _SAME_M, _AWAY_M = 0.2, 1.0  # of one place; how far the vessel has gone by then, unless a fix equals the one before
 _SIGMAS = 3.0  # of the estimated speed
-_SHARE = 0.5  # of the speed by the fixes before: below that the vessel brakes
+_SHARE = 0.5  # of the speed before, by the fixes and as estimated: below that the vessel brakes
 _RUNS = 20  # velocities after which it is known whether they are rounded
 _KEPT = 200
 
@@ -45,24 +49,22 @@ class RepeatedFixDetector:
 
     def __init__(self) -> None:
         self.frozen = False
-        self._places: deque[tuple[int, Array]] = deque(
-            maxlen=_KEPT
-        )  # the last different ones, with the stamps (ns) that they begin at
+        # The last different ones: stamp (ns) that each begins at, place, and the estimated velocity there.
+        self._places: deque[tuple[int, Array, Array]] = deque(maxlen=_KEPT)
         self._rest: deque[tuple[int, Array]] = deque(maxlen=_KEPT)  # fixes of some seconds, none repeated
-        self._seen = (
-            0  # how often such fixes were at rest: then the receiver scatters there, and does not repeat a position
-        )
+        # How often such fixes were at rest: then the receiver scatters there, and does not repeat a position.
+        self._seen = 0
         self._last: tuple[int, Array] | None = None
         self._equal_ns, self._equal = 0, 0  # stamp of the first of the fixes that equal the last one, and their number
         self._runs = self._singles = 0  # of equal velocities; those that are not repeated
         self._since_ns: int | None = None  # stamp of the first of the repetitions that are old
         self._old: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)  # first and last stamp, place
 
-    def note(self, stamp_ns: int, told_m: Array, speed_mps: float, sigma_mps: float) -> int | None:
+    def note(self, stamp_ns: int, told_m: Array, v_mps: Array, sigma_mps: float) -> int | None:
         """Take in a fix; one that is late is ignored.
 
         Args:
-            told_m: (2,) in world. speed_mps, sigma_mps: horizontal, of vessel and antenna, as estimated.
+            told_m: (2,) in world. v_mps: (2,) in body, of the vessel or its antenna, as estimated; with its sigma.
 
         Returns:
             The stamp (ns) of the first of the fixes that turn out to have been old, where this one goes on from them.
@@ -77,8 +79,8 @@ class RepeatedFixDetector:
             if last is not None and self._since_ns is None and self._went_on(stamp_ns, told_m, last):
                 turned_out = self._equal_ns + 1
                 self._old.append((turned_out, *last))
-            self._begin(stamp_ns, told_m)
-        elif self._is_old(stamp_ns, speed_mps, sigma_mps, equals=equals):
+            self._begin(stamp_ns, told_m, v_mps)
+        elif self._is_old(stamp_ns, v_mps, sigma_mps, equals=equals):
             if self._since_ns is None:
                 self._since_ns = stamp_ns
             else:
@@ -101,21 +103,27 @@ class RepeatedFixDetector:
         while stamp_ns - self._rest[0][0] > REST_S / 2.0 * NS_PER_S:
             self._rest.popleft()
 
-    def _begin(self, stamp_ns: int, told_m: Array) -> None:
+    def _begin(self, stamp_ns: int, told_m: Array, v_mps: Array) -> None:
         self.frozen, self._since_ns = False, None
-        self._places.append((stamp_ns, np.array(told_m)))
+        self._places.append((stamp_ns, np.array(told_m), np.array(v_mps)))
         while stamp_ns - self._places[0][0] > BEFORE_S * NS_PER_S:
             self._places.popleft()
 
-    def _is_old(self, stamp_ns: int, speed_mps: float, sigma_mps: float, *, equals: bool) -> bool:
+    def _is_old(self, stamp_ns: int, v_mps: Array, sigma_mps: float, *, equals: bool) -> bool:
         if self.frozen:
             return True
+        fastest = max((v for _, _, v in self._places), key=np.linalg.norm)
+        fastest_mps = float(np.linalg.norm(fastest))
+        speed_mps = float(v_mps @ fastest) / max(fastest_mps, 1e-9)
         if not equals and speed_mps * (stamp_ns - self._places[-1][0]) < _AWAY_M * NS_PER_S:
             return False
-        before_mps = self._speed_before_mps()
-        if self._seen >= SEEN and equals:
-            before_mps = before_mps or 0.0
-        if before_mps is None or speed_mps < max(UNDER_WAY_MPS, _SHARE * before_mps):
+        least_mps = UNDER_WAY_MPS
+        if not (equals and self._seen >= SEEN):  # it may hold its position at rest
+            before_mps = self._speed_before_mps()
+            if before_mps is None or self._slowed_down(float(np.linalg.norm(v_mps))):
+                return False
+            least_mps = max(least_mps, _SHARE * max(before_mps, fastest_mps))
+        if speed_mps < least_mps:
             return False
         # While its fixes are left out the speed becomes uncertain: that is no evidence of rest.
         return self._since_ns is not None or speed_mps > _SIGMAS * sigma_mps
@@ -132,8 +140,14 @@ class RepeatedFixDetector:
 
     def _speed_before_mps(self) -> float | None:
         """The speed by the different places up to the one that is repeated; None: it may have been at rest."""
-        t_s = np.array([(at_ns - self._places[0][0]) / NS_PER_S for at_ns, _ in self._places])
-        return under_way(t_s, np.array([place for _, place in self._places]))
+        t_s = np.array([(at_ns - self._places[0][0]) / NS_PER_S for at_ns, _, _ in self._places])
+        return under_way(t_s, np.array([place for _, place, _ in self._places]))
+
+    def _slowed_down(self, estimated_mps: float) -> bool:
+        """Whether by the later half of the different places the vessel was slower than the estimate has it now: the latter missed that."""
+        later = list(self._places)[len(self._places) // 2 :]
+        t_s = np.array([(at_ns - later[0][0]) / NS_PER_S for at_ns, _, _ in later])
+        return speed_of(t_s, np.array([place for _, place, _ in later]))[0] < _SHARE * estimated_mps
 
     def note_velocity(self, stamp_ns: int, v_mps: Array) -> None:
         """Take in a velocity (3,) in world; one that is late is ignored. What is measured hardly ever stays the same, unless it is rounded."""
