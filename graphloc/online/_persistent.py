@@ -102,8 +102,9 @@ class PersistentState:
             unmodelled=None if self.unmodelled is None else self.unmodelled.cov,
         )
 
-    def forget_jumps(self) -> None:
-        """Forget position jumps: an estimate that restarts takes a receiver's level as it is."""
+    def forget_receivers(self) -> None:
+        """Forget position jumps and repeated fixes, which are by the estimate: one that restarts takes a receiver as it is."""
+        self.repeated_fix_detectors = {}
         for detector in self.jump_detectors.values():
             detector.forget()
 
