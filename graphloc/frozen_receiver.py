@@ -34,7 +34,7 @@ BEFORE_S = 3.0  # before the stretch: the fixes in it give the speed
 _SIGMAS = 3.0
 UNDER_WAY_MPS = 0.5
 _JUMP_M, _SHARE = 2.0, 0.5  # the jump after, and its share of the way at the speed before
-_FAR_M = 20.0  # a jump that is no sign of rest: the vessel may have turned back meanwhile, or multipath jumps from there
+_FAR_M = 20.0  # a jump that may be of a vessel that has turned back meanwhile, or multipath at rest
 # Of a velocity: share of the values that are not repeated, else it is rounded; repetitions that are too many; at rest it may.
 MOSTLY, MANY, REST_MPS = 0.9, 5, 0.1
 # A vessel cannot stop between two fixes from more than this speed and deceleration; nor does one set off faster.
@@ -209,9 +209,8 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
     """Return a recording without what frozen receivers repeat (it gets ledger rows), and a warning on each such receiver."""
     gone: dict[int, str] = {}
     said = []
-    hung = np.zeros(
-        (0, 2), dtype=np.int64
-    )  # first and last stamp of velocities that are repeated, of a vessel under way
+    # First and last stamps of velocities that are repeated, of a vessel under way.
+    hung = np.zeros((0, 2), dtype=np.int64)
     for sensor, velocities in _by_sensor(recording, GnssVelocity).items():
         stamps_ns, v_mps = np.array([m.stamp_ns for m in velocities]), np.array([m.v_world_mps for m in velocities])
         bad = frozen_velocities(stamps_ns, v_mps)

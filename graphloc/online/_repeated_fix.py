@@ -14,7 +14,18 @@ from collections import deque
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.frozen_receiver import BEFORE_S, FEWEST, HELD_S, MANY, MOSTLY, REST_MPS, UNDER_WAY_MPS, goes_on, speed_of, under_way
+from graphloc.frozen_receiver import (
+    BEFORE_S,
+    FEWEST,
+    HELD_S,
+    MANY,
+    MOSTLY,
+    REST_MPS,
+    UNDER_WAY_MPS,
+    goes_on,
+    speed_of,
+    under_way,
+)
 from graphloc.time import NS_PER_S
 
 _SAME_M, _AWAY_M = 0.2, 1.0  # of one place; how far the vessel has gone by then, unless a fix equals the one before
