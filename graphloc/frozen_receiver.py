@@ -34,9 +34,7 @@ BEFORE_S = 3.0  # before the stretch: the fixes in it give the speed
 _SIGMAS = 3.0
 UNDER_WAY_MPS = 0.5
 _JUMP_M, _SHARE = 2.0, 0.5  # the jump after, and its share of the way at the speed before
-_FAR_M = (
-    20.0  # a jump that is no sign of rest: the vessel may have turned back meanwhile, or multipath jumps from there
-)
+_FAR_M = 20.0  # a jump that may be of a vessel that has turned back meanwhile, or multipath at rest
 # Of a velocity: share of the values that are not repeated, else it is rounded; repetitions that are too many; at rest it may.
 MOSTLY, MANY, REST_MPS = 0.9, 5, 0.1
 # For so long, and so often, a receiver that scatters has done so at rest.
@@ -98,7 +96,7 @@ def _frozen_but_for_noise(t_s: Array, places_m: Array, known: NDArray[np.bool_])
         elif (
             _stopped_at_once(t_s, places_m, first, UNDER_WAY_MPS)
             and _jumps_on(t_s, places_m, first, after)
-            and _under_way_over(t_s, places_m, np.arange(after, np.searchsorted(t_s, t_s[after] + BEFORE_S)))
+            and under_way(*(of[after : np.searchsorted(t_s, t_s[after] + BEFORE_S)] for of in (t_s, places_m)))
             is not None
         ):
             bad[first + 1 : after] = True
@@ -166,7 +164,8 @@ def _is_frozen(t_s: Array, places_m: Array, first: int, after: int, *, scatters:
 
 def _jumps_on(t_s: Array, places_m: Array, first: int, after: int) -> bool:
     """Whether the vessel was under way, and the position then jumps on by a good part of the distance made meanwhile."""
-    speed = _under_way_over(t_s, places_m, np.append(_before(t_s, first), first))
+    before = np.append(_before(t_s, first), first)
+    speed = under_way(t_s[before], places_m[before])
     if speed is None:
         return False
     jump_m = float(np.linalg.norm(places_m[after] - places_m[first]))
@@ -185,10 +184,6 @@ def goes_on(jump_m: float, speed_mps: float, held_s: float, silent_s: float) -> 
 def _set_off_m(silent_s: float) -> float:
     """How far (m) the vessel may have gone from rest during a silence of the receiver."""
     return _BRAKES_MPS2 * silent_s**2 / 2.0
-
-
-def _under_way_over(t_s: Array, places_m: Array, of: NDArray[np.int64]) -> float | None:
-    return under_way(t_s[of], places_m[of])
 
 
 def _stopped_at_once(t_s: Array, places_m: Array, first: int, least_mps: float) -> bool:
@@ -248,9 +243,8 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
     """Return a recording without what frozen receivers repeat (it gets ledger rows), and a warning on each such receiver."""
     gone: dict[int, str] = {}
     said = []
-    hung = np.zeros(
-        (0, 2), dtype=np.int64
-    )  # first and last stamp of velocities that are repeated, of a vessel under way
+    # First and last stamps of velocities that are repeated, of a vessel under way.
+    hung = np.zeros((0, 2), dtype=np.int64)
     for sensor, velocities in _by_sensor(recording, GnssVelocity).items():
         stamps_ns, v_mps = np.array([m.stamp_ns for m in velocities]), np.array([m.v_world_mps for m in velocities])
         bad = frozen_velocities(stamps_ns, v_mps)

@@ -196,6 +196,8 @@ class JumpDetector:
         """Forget the fixes since a stamp, and the jumps found in them: they are none of a receiver that goes along."""
         self._seen = deque((kept for kept in self._seen if kept[0] < stamp_ns), maxlen=_KEPT)
         self.jumps = tuple(jump for jump in self.jumps if jump.after_ns < stamp_ns)
+        if self._last_ns is not None and self._last_ns >= stamp_ns:
+            self._last_ns = self.jumps[-1].after_ns if self.jumps else None
         self._off, self._before = [], None
 
     def note(

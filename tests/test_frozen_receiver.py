@@ -17,6 +17,7 @@ from graphloc.frozen_receiver import frozen_fixes, frozen_velocities
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, PoseFix
 from graphloc.online._repeated_fix import RepeatedFixDetector
+from graphloc.online._repeated_velocity import RepeatedVelocityDetector
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.slowly import simulate_slowly
 
@@ -232,9 +233,9 @@ def velocities(hz: float, held_s: tuple[float, float], *, rounded_mps: float = 0
 def test_a_velocity_that_stays_the_same_for_seconds_is_frozen(hz: float) -> None:
     t, stamps_ns, v = velocities(hz, (20.0, 50.0))
     assert t[frozen_velocities(stamps_ns, v)] == pytest.approx(t[(t > 20.0) & (t < 50.0)])
-    online, old = RepeatedFixDetector(), []
+    online, old = RepeatedVelocityDetector(), []
     for stamp_ns, v_mps in zip(stamps_ns.tolist(), v, strict=True):
-        online.note_velocity(stamp_ns, v_mps)
+        online.note(stamp_ns, v_mps)
         old.append(online.is_old(stamp_ns, v_mps))
     assert t[old] == pytest.approx(t[(t > 20.0 + 3.5 / hz) & (t < 50.0)])  # from the fifth on
     again = [online.is_old(stamp_ns, v_mps) for stamp_ns, v_mps in zip(stamps_ns.tolist(), v, strict=True)]

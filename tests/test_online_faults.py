@@ -429,6 +429,23 @@ def test_a_window_that_is_rebuilt_holds_repeated_fixes_out() -> None:
     assert all((e.verdict.decision is None) == (e.measurement.stamp_ns > begin + 200_000_000) for e in own)
 
 
+def test_an_estimate_that_restarts_takes_a_receiver_that_repeats_a_fix_as_it_is() -> None:
+    """That it moved said the estimate that was given up; while it is at rest, and the receiver holds its position, nothing would tell."""
+    run, repeated, begin, end = hung(5.0, 12.0)
+    online = smoother(run)
+    feed(online, run, repeated[: next(k for k, a in enumerate(repeated) if a.true_ns > begin + 5_000_000_000)])
+    assert online._tracking is not None  # noqa: SLF001
+    assert online._tracking.lag.frozen_receivers == {"gnss"}  # noqa: SLF001
+    online._restart("planted")  # noqa: SLF001
+    feed(online, run, [a for a in repeated if begin + 5_000_000_000 < a.true_ns < end])
+    assert online._tracking is not None  # noqa: SLF001
+    lag = online._tracking.lag  # noqa: SLF001
+    assert not lag.frozen_receivers
+    own = lag._entries.of(lag.problem.streams["gnss"])  # noqa: SLF001
+    assert len(own) > 5
+    assert all(e.verdict.decision is not None for e in own)
+
+
 def test_a_jump_is_found_among_many_fixes_to_a_state() -> None:
     """Those between its detection and the rebuild were off as well: all fixes of the window were held out, and it was lost."""
     run, jumped, _, _ = jumping(20.0, 0.45, 2.0, 7.0, 13.1)

@@ -195,6 +195,7 @@ def test_a_swing_at_rest_does_not_make_a_receiver_frozen() -> None:
     """It has repeated its position for long by then: only repetitions while the vessel moves count."""
     old, frozen = old_at(lambda t: V * min(t, 20.0), lambda t: 2.2 * AHEAD * (t <= 20.0 or 30.0 < t < 30.5))
     assert frozen == []
+    assert old
     assert all(30.0 < t < 30.5 for t in old)
 
 

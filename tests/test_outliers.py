@@ -268,6 +268,20 @@ def test_a_receiver_that_goes_on_after_it_was_frozen_has_not_jumped(*, forgets: 
     assert (watch.jumps == ()) == forgets
 
 
+def test_a_jump_that_turns_out_to_be_of_a_frozen_receiver_is_in_doubt_no_longer() -> None:
+    """It was taken out, but the estimate was held to be in doubt for it, and the next jump not told, for 200 s."""
+    watch, noise = JumpDetector(), np.random.default_rng(1).normal(0.0, 0.1, (100, 2))
+    found = []
+    for k in range(100):
+        place_m = np.array([0.8 * k + 8.0 * (k >= 30) + 8.0 * (k >= 70), 0.0]) + noise[k]
+        found += watch.note(k * 200_000_000, place_m, 0.1, allowed_m=3.0)[0].tolist()
+        if k == 50:
+            assert watch.doubtful(k * 200_000_000)
+            watch.forget_since(4_000_000_000)
+            assert not watch.doubtful(k * 200_000_000)
+    assert found == [30 * 200_000_000, 70 * 200_000_000]
+
+
 def test_of_many_jumps_the_last_are_kept() -> None:
     """A receiver that jumps every three seconds, from each new level."""
     watch = JumpDetector()

@@ -22,6 +22,7 @@ from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._frozen_receiver import FrozenReceiverDetector
 from graphloc.online._motion_model import MotionModel
 from graphloc.online._repeated_fix import RepeatedFixDetector
+from graphloc.online._repeated_velocity import RepeatedVelocityDetector
 from graphloc.online._scatter import Scatter
 from graphloc.online._setup import Setup
 from graphloc.position_jumps import JumpDetector, PositionJump
@@ -140,6 +141,14 @@ class LiveTimeline:
 
 
 @dataclass(slots=True, eq=False)
+class Repeats:
+    """Detectors of what a receiver repeats: of its fixes, or of its velocities."""
+
+    fix: RepeatedFixDetector = field(default_factory=RepeatedFixDetector)
+    velocity: RepeatedVelocityDetector = field(default_factory=RepeatedVelocityDetector)
+
+
+@dataclass(slots=True, eq=False)
 class LiveStream:
     """The measurements of one sensor in order of arrival (offline: `graphloc.build.Stream`), and its detectors.
 
@@ -166,14 +175,14 @@ class LiveStream:
     by_stamp: list[tuple[int, int]] = field(default_factory=list)
     scatter: Scatter = field(default_factory=Scatter)
     frozen_detector: FrozenReceiverDetector = field(default_factory=FrozenReceiverDetector)
-    repeated_fix_detector: RepeatedFixDetector = field(default_factory=RepeatedFixDetector)
+    repeats: Repeats = field(default_factory=Repeats)
     jump_detector: JumpDetector = field(default_factory=JumpDetector)
     jumps: tuple[PositionJump, ...] = ()
 
     @property
     def frozen(self) -> bool:
         """Whether it is a receiver that repeats one position while the vessel moves."""
-        return self.frozen_detector.frozen or self.repeated_fix_detector.frozen
+        return self.frozen_detector.frozen or self.repeats.fix.frozen
 
     @property
     def noisier(self) -> float:
@@ -260,14 +269,14 @@ def live_problem(
     noise_scale: float,
     motion_model: MotionModel,
     jump_detectors: MutableMapping[str, JumpDetector],
-    repeated_fix_detectors: MutableMapping[str, RepeatedFixDetector],
+    repeats: MutableMapping[str, Repeats],
     slow_known: Collection[str],
 ) -> LiveProblem:
     """Return a problem whose first state is at `start_ns`.
 
     Args:
         imu: the samples known from there on. imu_config: with the noise that they have, up to `noise_scale`.
-        jump_detectors, repeated_fix_detectors: by sensor; missing ones are added.
+        jump_detectors, repeats: by sensor; missing ones are added.
         slow_known: names of the sensors whose slow error is known at the start.
     """
     config, rows, mounts = setup.config, setup.rows, setup.mounts
@@ -298,7 +307,7 @@ def live_problem(
             mount=mount,
             scatter=scatter,
             jump_detector=detector,
-            repeated_fix_detector=repeated_fix_detectors.setdefault(name, RepeatedFixDetector()),
+            repeats=repeats.setdefault(name, Repeats()),
             jumps=detector.jumps,
         )
     jumps_ns = [jump.after_ns for stream in streams.values() if stream.left_out is not None for jump in stream.jumps]

@@ -12,10 +12,10 @@ from graphloc.frames import Datum
 from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
 from graphloc.online._heading_check import HeadingCheck
+from graphloc.online._live import Repeats
 from graphloc.online._motion_model import MotionModel
 from graphloc.online._noise import ImuNoise
 from graphloc.online._odometry import Odometry
-from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
@@ -36,7 +36,7 @@ class PersistentState:
         odometry: the `odom` frame; None before the first start.
         motion_model: motion model. heading_check: whether the heading fits the motion.
         jump_detectors: detectors of position jumps, by sensor: a restart does not make a level right.
-        repeated_fix_detectors: detectors of fixes that are repeated, by sensor.
+        repeats: detectors of what a receiver repeats, by sensor.
         frozen: receivers that were last reported as frozen.
         unmodelled: what slow errors that are left out do to the newest state; None where none is left out.
     """
@@ -51,7 +51,7 @@ class PersistentState:
     motion_model: MotionModel = field(default_factory=MotionModel)
     heading_check: HeadingCheck = field(default_factory=HeadingCheck)
     jump_detectors: dict[str, JumpDetector] = field(default_factory=dict)
-    repeated_fix_detectors: dict[str, RepeatedFixDetector] = field(default_factory=dict)
+    repeats: dict[str, Repeats] = field(default_factory=dict)
     frozen: set[str] = field(default_factory=set)
     unmodelled: UnmodelledError | None = None
 
@@ -102,14 +102,15 @@ class PersistentState:
             unmodelled=None if self.unmodelled is None else self.unmodelled.cov,
         )
 
-    def forget_jumps(self) -> None:
-        """Forget position jumps: an estimate that restarts takes a receiver's level as it is."""
+    def forget_receivers(self) -> None:
+        """Forget position jumps and repeated fixes, which are by the estimate: one that restarts takes a receiver as it is."""
+        self.repeats = {}
         for detector in self.jump_detectors.values():
             detector.forget()
 
     def forget_clock(self, stamp_ns: int) -> None:
         """Forget stamps of a clock that was set back; `stamp_ns`: by the clock as it is now."""
-        self.agreed_ns, self.jump_detectors, self.repeated_fix_detectors = {}, {}, {}
+        self.agreed_ns, self.jump_detectors, self.repeats = {}, {}, {}
         self.sensor_noise.forget_clock()
         if self.odometry is not None:
             self.odometry.stamp_ns = stamp_ns

@@ -11,7 +11,7 @@ from graphloc import gauss
 from graphloc.frames import Array
 from graphloc.frozen_receiver import WHY_VELOCITY
 from graphloc.graph import Attachment, Residual
-from graphloc.measurements import GnssVelocity, Measurement
+from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
 from graphloc.online._entries import Entries
 from graphloc.online._frozen_receiver import WINDOW_S
@@ -43,16 +43,17 @@ class ReceiverChecks:
         It repeats an old fix, is of a frozen receiver, or may be the beginning of a jump. A jump that is found has the window rebuilt, and
         the fixes since its beginning with it.
         """
-        if isinstance(m, GnssVelocity):
-            stream.repeated_fix_detector.note_velocity(m.stamp_ns, m.v_world_mps)
-            return WHY_VELOCITY if stream.repeated_fix_detector.is_old(m.stamp_ns, m.v_world_mps) else ""
-        if stream.row.false is not None or not stream.row.absolute:
+        if stream.row.false is not None:
             return ""
-        told_m = stream.row.hint(m, 0.0, self._problem.datum).p_world_m[:2]
-        if not np.isfinite(told_m).all():
+        hint = stream.row.hint(m, 0.0, self._problem.datum)
+        if np.isfinite(hint.v_world_mps).all():
+            stream.repeats.velocity.note(m.stamp_ns, hint.v_world_mps)
+            return WHY_VELOCITY if stream.repeats.velocity.is_old(m.stamp_ns, hint.v_world_mps) else ""
+        told_m = hint.p_world_m[:2]
+        if not stream.row.absolute or not np.isfinite(told_m).all():
             return ""
         if self._repeats(stream, m, at, told_m):
-            return _FROZEN if stream.repeated_fix_detector.frozen else _OLD
+            return _FROZEN if stream.repeats.fix.frozen else _OLD
         sigma_m = largest_sigma(residual.cov - _walked(residual, at))
         estimated_m = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2]
         if self._is_frozen(stream, m, told_m, estimated_m, sigma_m):
@@ -61,7 +62,7 @@ class ReceiverChecks:
         return _OFF if stream.jump_detector.suspects(m.stamp_ns) else ""
 
     def _repeats(self, stream: LiveStream, m: Measurement, at: Attachment, told_m: Array) -> bool:
-        newest, detector = self._states.newest, stream.repeated_fix_detector
+        newest, detector = self._states.newest, stream.repeats.fix
         # The antenna swings in waves, and the vessel may turn about it.
         slower_mps = min(newest.velocity, at.sensor_velocity_mps(), key=lambda v: float(np.linalg.norm(v[:2])))
         v_mps = np.asarray(at.T_world_body.rotation().matrix().T @ slower_mps)[:2]

@@ -20,9 +20,6 @@ from graphloc.frozen_receiver import (
     BEFORE_S,
     FEWEST,
     HELD_S,
-    MANY,
-    MOSTLY,
-    REST_MPS,
     REST_S,
     SEEN,
     UNDER_WAY_MPS,
@@ -36,7 +33,6 @@ from graphloc.time import NS_PER_S
 _SAME_M, _AWAY_M = 0.2, 1.0  # of one place; how far the vessel has gone by then, unless a fix equals the one before
 _SIGMAS = 3.0  # of the estimated speed
 _SHARE = 0.5  # of the speed before, by the fixes and as estimated: below that the vessel brakes
-_RUNS = 20  # velocities after which it is known whether they are rounded
 _KEPT = 200
 
 
@@ -56,7 +52,6 @@ class RepeatedFixDetector:
         self._seen = 0
         self._last: tuple[int, Array] | None = None
         self._equal_ns, self._equal = 0, 0  # stamp of the first of the fixes that equal the last one, and their number
-        self._runs = self._singles = 0  # of equal velocities; those that are not repeated
         self._since_ns: int | None = None  # stamp of the first of the repetitions that are old
         self._old: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)  # first and last stamp, place
 
@@ -148,22 +143,6 @@ class RepeatedFixDetector:
         later = list(self._places)[len(self._places) // 2 :]
         t_s = np.array([(at_ns - later[0][0]) / NS_PER_S for at_ns, _, _ in later])
         return speed_of(t_s, np.array([place for _, place, _ in later]))[0] < _SHARE * estimated_mps
-
-    def note_velocity(self, stamp_ns: int, v_mps: Array) -> None:
-        """Take in a velocity (3,) in world; one that is late is ignored. What is measured hardly ever stays the same, unless it is rounded."""
-        if self._last is not None and stamp_ns <= self._last[0]:
-            return
-        if self._last is None or not np.array_equal(v_mps, self._last[1]):
-            self._runs += 1
-            self._singles += self._equal == 1
-            self._equal_ns, self._equal = stamp_ns, 0
-        self._last, self._equal = (stamp_ns, np.array(v_mps)), self._equal + 1
-        if self._equal < MANY or self._runs < _RUNS or self._singles < MOSTLY * (self._runs - 1):
-            return
-        if float(np.linalg.norm(v_mps)) > REST_MPS:
-            if self._equal > MANY:
-                self._old.pop()
-            self._old.append((self._equal_ns + 1, *self._last))
 
     def is_old(self, stamp_ns: int, told_m: Array) -> bool:
         """Return whether a fix that has been taken in, or comes late, is such a repetition."""

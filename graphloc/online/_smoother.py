@@ -280,7 +280,7 @@ class OnlineSmoother:
     def _wait(self, why: str) -> None:
         """Give up the estimate, and wait for a start."""
         self._tracking, self._tried_ns = None, 0
-        self._persistent.forget_jumps()
+        self._persistent.forget_receivers()
         self._waiting.begin(why)
         self._ledger.close()
         self._intake.restart([])

@@ -101,7 +101,7 @@ class Tracking:
             noise_scale=persistent.noise.scale,
             motion_model=persistent.motion_model,
             jump_detectors=persistent.jump_detectors,
-            repeated_fix_detectors=persistent.repeated_fix_detectors,
+            repeats=persistent.repeats,
             slow_known=anchor.slow,
         )
         if before is not None:
