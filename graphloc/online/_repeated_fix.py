@@ -88,10 +88,12 @@ class RepeatedFixDetector:
         return turned_out
 
     def _note_rest(self, stamp_ns: int, told_m: Array, *, equals: bool) -> None:
+        if self._seen >= SEEN:
+            return
         if equals:
             self._rest.clear()
         self._rest.append((stamp_ns, np.array(told_m)))
-        if self._seen >= SEEN or stamp_ns - self._rest[0][0] < REST_S * NS_PER_S:
+        if stamp_ns - self._rest[0][0] < REST_S * NS_PER_S:
             return
         t_s = np.array([(at_ns - self._rest[0][0]) / NS_PER_S for at_ns, _ in self._rest])
         self._seen += stands(t_s, np.array([place for _, place in self._rest]))
