@@ -129,10 +129,9 @@ class RepeatedFixDetector:
         """Whether a position jumps on that was repeated bit for bit, as `frozen_fixes` would tell of the whole run."""
         if self._equal < FEWEST or last[0] - self._equal_ns < HELD_S * NS_PER_S:
             return False
-        before_mps, jump_m = self._speed_before_mps(), float(np.linalg.norm(told_m - last[1]))
+        before_mps = 0.0 if self._seen >= SEEN else self._speed_before_mps()
+        jump_m = float(np.linalg.norm(told_m - last[1]))
         held_s, silent_s = ((stamp_ns - at_ns) / NS_PER_S for at_ns in (self._equal_ns, last[0]))
-        if self._seen >= SEEN:
-            before_mps = 0.0
         return before_mps is not None and goes_on(jump_m, before_mps, held_s, silent_s)
 
     def _speed_before_mps(self) -> float | None:

@@ -189,10 +189,9 @@ class States:
             if stream.slow is None:
                 continue
             key, following = (keys.slow(stream.number, n) for n in (j, j + 1))
-            value = window.values.atVector(key)
             jump_m, step = self._jumped(stream, j, j + 1)
             # Begun at the other level, it would be drawn back to the usual one by the prior that closes the chain, and the pose with it.
-            window.guess(following, value + (0.0 if step is None else step), t)
+            window.guess(following, window.values.atVector(key) + (0.0 if step is None else step), t)
             window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m, expected=step))
             if stream.name in self._ends:
                 window.remove(self._ends[stream.name])
