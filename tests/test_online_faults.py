@@ -417,10 +417,12 @@ def test_fixes_that_turn_out_to_have_been_repeated_are_taken_out(monkeypatch: py
     assert all(begin < row.stamp_ns < end for row in out)
 
 
-def test_a_window_that_is_rebuilt_holds_repeated_fixes_out() -> None:
+@pytest.mark.parametrize("after_s", [5.0, 11.5])
+def test_a_window_that_is_rebuilt_holds_repeated_fixes_out(after_s: float) -> None:
+    """Also where it begins among them, and has none from before."""
     run, repeated, begin, _ = hung(5.0, 12.0)
     online = smoother(run)
-    feed(online, run, repeated[: next(k for k, a in enumerate(repeated) if a.true_ns > begin + 5_000_000_000)])
+    feed(online, run, repeated[: next(k for k, a in enumerate(repeated) if a.true_ns > begin + after_s * 1e9)])
     online._rebuild("planted")  # noqa: SLF001
     assert online._tracking is not None  # noqa: SLF001
     lag = online._tracking.lag  # noqa: SLF001
