@@ -14,7 +14,7 @@ VOCABULARY = {
     "errors", "time", "chi2", "gauss", "frames", "measurements", "ledger", "trajectory", "config", "recording", "offsets", "solution", "estimate", "plain", "blocks", "frozen_imu", "imu_scatter", "frozen_receiver", "position_jumps", "survey", "berths", "extras", "thinning", "white_noise", "folders", "_config_docs",
 }  # fmt: skip
 DOOR = {"__main__", "app", "cli", "drills", "found_tags", "gather", "replay", "stream", "job", "sweep", "ablations"}
-GRAPH = {"graph", "linear", "keys", "timeline", "build", "solve", "online", "origin", "outputs"}
+GRAPH = {"graph", "linear", "motion_model", "keys", "timeline", "build", "solve", "online", "origin", "outputs"}
 _AT_THE_DOOR = {f"graphloc.{name}" for name in ("app", "cli", "gather", "replay", "stream", "job", "sweep")}
 FORBIDDEN = {
     "vocabulary": {"graphloc.factors", "graphloc.frontends", "graphloc.eval", "gtsam"},

@@ -33,6 +33,7 @@ from graphloc.build._problem import (
     with_imu_noise,
     with_noise_scale,
     with_sensor_noise,
+    with_usual_motion,
 )
 from graphloc.build._thinned import Thinned, thinned
 
@@ -75,5 +76,6 @@ __all__ = [
     "with_imu_noise",
     "with_noise_scale",
     "with_sensor_noise",
+    "with_usual_motion",
     "without_drift",
 ]

@@ -129,6 +129,9 @@ def build_graph(
     nodes = nodes_of(problem, first, last)
     for j in nodes[:-1]:
         graph.add(bias_step(problem.links, j, _node_dt_s(problem, j)))
+    if problem.usual_motion is not None:
+        for factor in problem.usual_motion.factors(problem.timeline, values, nodes, first):
+            graph.add(factor)
     if isinstance(prior, Past):
         graph.push_back(prior.factors)
     else:

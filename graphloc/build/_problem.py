@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build._attach import Carry, nav_state
+from graphloc.build._usual_motion import UsualMotion, usual_motion
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, Going, InertialLink, Sensor, SlowProcess
@@ -76,6 +77,7 @@ class Problem:
             share them.
         rejected: ledger rows of measurements that the graph cannot take.
         silent: clauses on why sensors have no measurement here.
+        usual_motion: where the motion model is used; None before there is an estimate, and where nothing needs it.
     """
 
     config: VesselConfig
@@ -93,6 +95,7 @@ class Problem:
     rejected: tuple[LedgerRow, ...]
     warnings: tuple[str, ...] = field(default=())
     silent: str = ""
+    usual_motion: UsualMotion | None = None
 
 
 def preintegrate(timeline: Timeline, links: InertialLink) -> tuple[Any, ...]:
@@ -156,3 +159,10 @@ def bridged(problem: Problem, values: gtsam.Values) -> Problem:
             preintegrated[k] = problem.links.integrate(a, b, zero, going)
             inertial[k] = problem.links.factor(k, int(timeline.slow_of[k]), preintegrated[k])
     return replace(problem, preintegrated=tuple(preintegrated), inertial=tuple(inertial))
+
+
+def with_usual_motion(problem: Problem, values: gtsam.Values) -> Problem:
+    """Return the problem with the motion model where no sensor measures position or velocity for a while, learned from `values`."""
+    aided = sorted(m.stamp_ns for stream in problem.streams if stream.row.company for m in stream.measurements)
+    found = usual_motion(problem.timeline, values, np.array(aided, dtype=np.int64), problem.links.gaps())
+    return replace(problem, usual_motion=found)

@@ -19,8 +19,8 @@ from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, Sensor, SlowProcess
 from graphloc.measurements import ImuSeries, Measurement
+from graphloc.motion_model import MotionModel
 from graphloc.online._frozen_receiver import FrozenReceiverDetector
-from graphloc.online._motion_model import MotionModel
 from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._repeated_velocity import RepeatedVelocityDetector
 from graphloc.online._scatter import Scatter

@@ -10,10 +10,10 @@ from typing import Any
 from graphloc.config import SIGMA_SCALES
 from graphloc.frames import Datum
 from graphloc.measurements import ImuSample
+from graphloc.motion_model import MotionModel
 from graphloc.online._anchor import Anchor
 from graphloc.online._heading_check import HeadingCheck
 from graphloc.online._live import Repeats
-from graphloc.online._motion_model import MotionModel
 from graphloc.online._noise import ImuNoise
 from graphloc.online._odometry import Odometry
 from graphloc.online._sensor_noise import SensorNoise

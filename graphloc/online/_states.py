@@ -16,10 +16,10 @@ from graphloc.build import bias_step, closing_variance, nav_state, slow_begin, s
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Going, Residual
+from graphloc.motion_model import UNSURE_MPS, Moving
 from graphloc.online._anchor import Anchor, without_prior
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
-from graphloc.online._motion_model import UNSURE_MPS, Moving
 from graphloc.online._window import Held, Window
 from graphloc.solve._prediction import Prediction, prediction_of
 

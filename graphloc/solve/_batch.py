@@ -10,6 +10,7 @@
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
 6. A Bayes tree of the last graph gives the covariances of every state.
 
+Where no sensor measures position or velocity for a while, 3 to 6 have the motion model (`graphloc.motion_model`).
 Sensors that scatter more than they state are taken as they scatter, and 3 and 4 repeated.
 Where the IMU contradicts the other sensors, its noise is scaled up, and 3 and 4 are repeated, beginning with gentle losses.
 """
@@ -22,7 +23,16 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from graphloc.build import Problem, StartPrior, Thinned, bridged, thinned, with_noise_scale, with_sensor_noise
+from graphloc.build import (
+    Problem,
+    StartPrior,
+    Thinned,
+    bridged,
+    thinned,
+    with_noise_scale,
+    with_sensor_noise,
+    with_usual_motion,
+)
 from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
@@ -98,6 +108,8 @@ def solve_batch(problem: Problem, progress: Progress = quiet, *, newest: bool = 
     passes, estimate = 0, few.filled(problem, grown)
     if problem.links.gaps():
         problem = bridged(problem, estimate)
+    problem = with_usual_motion(problem, estimate)
+    if problem.usual_motion is not None or problem.links.gaps():
         few = thinned(problem)
     for attempt in range(_MAX_NOISE_ROUNDS):
         problem, few, settled = _as_they_scatter(problem, few, estimate, prior, progress)
@@ -113,7 +125,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet, *, newest: bool = 
             break
         if start.by_motion and ratio < CONTRADICTION:
             # Which headings the motion excludes was found with the smaller noise.
-            return solve_batch(noisier, progress, newest=newest)
+            return solve_batch(replace(noisier, usual_motion=None), progress, newest=newest)
         problem = bridged(noisier, estimate)
         few = thinned(problem)
         if ratio >= CONTRADICTION:

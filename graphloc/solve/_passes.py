@@ -163,6 +163,8 @@ def expected_cost(problem: Problem, verdicts: Verdicts, last: int = -1) -> float
     n, m = len(slow_of[:last]) + 1, int(slow_of[last]) + 1
     expected = sum(v.expected_cost for v in verdicts.values())
     expected += 9.0 * (n - 1) + 6.0 * (m - 1) + 15.0 - 9.0 * n - 6.0 * m
+    if problem.usual_motion is not None:
+        expected += 2.0 * sum(j < m - 1 for j in problem.usual_motion.nodes)
     for stream in problem.streams:
         if stream.slow is not None:
             expected += m * int((~stream.slow.constant).sum())  # a constant's steps are as many as its nodes

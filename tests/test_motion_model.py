@@ -1,22 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
 """What bounds a track that nothing but the IMU tells: the vessel moves as it usually does."""
 
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from unittest.mock import patch
 
 import gtsam
 import numpy as np
 import pytest
 
+from graphloc import app, keys
+from graphloc.build._usual_motion import UsualMotion, usual_motion
+from graphloc.config import TimelineConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array
 from graphloc.measurements import CompassHeading
-from graphloc.online._motion_model import MotionModel, Moving
+from graphloc.motion_model import MotionModel, Moving
+from graphloc.recording import Recording
 from graphloc.replay import replay
-from graphloc.trajectory import bounds_95
+from graphloc.timeline import make_timeline
+from graphloc.trajectory import Trajectory, bounds_95
 from tests.slowly import with_few_states
 
 SECOND = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A recording whose end, from a stamp on (ns), has no place in it."""
+
+    recording: Recording
+    config: VesselConfig
+    truth: Trajectory
+    since_ns: int
 
 
 def taught(v_body_mps: Array) -> MotionModel:
@@ -90,33 +106,96 @@ def test_a_vessel_that_stops_is_believed_and_does_not_begin_to_slide() -> None:
     )
 
 
-def test_without_a_place_it_drifts_as_far_as_a_vessel_can_and_no_farther() -> None:
-    """Ninety seconds of compass and IMU alone: from the tilt, the IMU alone would be off by hundreds of metres.
-
-    For six of them the IMU is silent, too: along which axes it moved there nobody knows.
-    """
+@pytest.fixture(scope="module")
+def lost() -> Lost:
+    """The last 90 s have compass and IMU alone. For six of them the IMU is silent, too: along which axes it moved there nobody knows."""
     run = simulate(
         replace(Scenario(path="loops", noise="drift"), duration_s=115.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3
     )
-    config = with_few_states(run.config, rate_hz=2.5)
     lost_ns = int(run.truth.stamps_ns[0]) + 25 * SECOND
     kept = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < lost_ns)
     imu = run.recording.imu
     assert imu is not None
     imu = imu.where((imu.stamps_ns < lost_ns + 60 * SECOND) | (imu.stamps_ns > lost_ns + 66 * SECOND))
+    recording = replace(run.recording, imu=imu, measurements=kept)
+    return Lost(recording, with_few_states(run.config, rate_hz=2.5), run.truth, lost_ns)
+
+
+def assert_drifts_as_a_vessel_can(track: Trajectory, lost: Lost) -> None:
+    """As far as a vessel can drift and no farther: from the tilt, the IMU alone would be off by hundreds of metres."""
+    assert track.cov is not None
+    off_m = np.hypot(*(track.p_world_m - lost.truth.at(track.stamps_ns).p_world_m)[:, :2].T)
+    since = track.stamps_ns >= lost.since_ns
+    true = lost.truth.at(track.stamps_ns[since]).p_world_m
+    way_m = float(np.hypot(*np.diff(true[:, :2], axis=0).T).sum())
+    assert off_m[since].max() < 0.3 * way_m
+    assert (off_m < bounds_95(track.cov)[:, 0])[since].mean() > 0.9
+
+
+def test_without_a_place_it_drifts_as_far_as_a_vessel_can_and_no_farther(lost: Lost) -> None:
     steps: list[int] = []
     with patch.object(MotionModel, "step", autospec=True, side_effect=counted(steps)):
-        track = replay(replace(run.recording, imu=imu, measurements=kept), config).solution.trajectory
-    assert track.cov is not None
-    off_m = np.hypot(*(track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[:, :2].T)
-    lost = track.stamps_ns >= lost_ns
-    true = run.truth.at(track.stamps_ns[lost]).p_world_m
-    way_m = float(np.hypot(*np.diff(true[:, :2], axis=0).T).sum())
-    assert off_m[lost].max() < 0.3 * way_m
-    assert (off_m < bounds_95(track.cov)[:, 0])[lost].mean() > 0.9
+        track = replay(lost.recording, lost.config).solution.trajectory
+    assert_drifts_as_a_vessel_can(track, lost)
     assert 60 < len(steps) < 95  # while the velocity is unsure: of 90 s, 6 are a hole
     assert np.diff(steps).min() >= 2, "a step a second at most, of states that come at 2.5 Hz"
     assert max(np.diff(steps)) * 0.4 > 6.0, "none in the hole"
+
+
+def test_offline_too(lost: Lost) -> None:
+    assert_drifts_as_a_vessel_can(app.smooth_recording(lost.recording, lost.config).solution.trajectory, lost)
+
+
+TIMELINE = make_timeline(0, 60 * SECOND, [], TimelineConfig(rate_hz=2.0))
+
+
+def where_unaided(aided_s: Iterable[float], hole_s: tuple[float, float] = (0.0, 0.0)) -> UsualMotion | None:
+    """A minute to port at 3 m/s, heading 1 rad, measured at some times (s), the IMU silent in between others."""
+    values = gtsam.Values()
+    for k in range(len(TIMELINE)):
+        values.insert(keys.pose(k), gtsam.Pose3(gtsam.Rot3.Yaw(1.0), np.zeros(3)))
+        values.insert(keys.velocity(k), np.array([-3.0 * np.sin(1.0), 3.0 * np.cos(1.0), 0.0]))
+    aided_ns = (np.array(list(aided_s)) * SECOND).astype(np.int64)
+    first, last = (int(t * SECOND) for t in hole_s)
+    return usual_motion(TIMELINE, values, aided_ns, [(first, last)] if last else [])
+
+
+def test_offline_steps_are_where_nothing_measures_motion_for_over_ten_seconds() -> None:
+    """Between two measurements, before the first and after the last; none in a hole of the IMU."""
+    assert where_unaided(np.arange(0.0, 60.0, 9.5)) is None
+    between = where_unaided([*range(21), *range(40, 61)])
+    assert between is not None
+    assert between.nodes == frozenset(range(20, 40))
+    ends = where_unaided(range(15, 46), hole_s=(50.0, 53.0))
+    assert ends is not None
+    assert ends.nodes == frozenset(range(15)) | frozenset(range(45, 60)) - {50, 51, 52}
+
+
+def test_offline_the_model_is_taught_where_motion_is_measured() -> None:
+    found = where_unaided([*range(21), *range(40, 61)])
+    assert found is not None
+    standing = found.model.process(np.zeros(2), 1e6)[1]
+    guess, measured_s = 2.0**2, 20.0 + 20.0
+    assert standing[1] == pytest.approx(1.0 + 3.0**2 + (guess - 3.0**2) * 10.0 / (10.0 + measured_s), rel=0.1)
+    assert standing[0] == pytest.approx(1.0 + guess * 10.0 / (10.0 + measured_s), rel=0.1)
+
+
+def test_a_step_is_in_the_graphs_that_have_both_its_states() -> None:
+    found = where_unaided(range(31))
+    assert found is not None
+    values = gtsam.Values()
+    for k in range(len(TIMELINE)):
+        values.insert(keys.pose(k), gtsam.Pose3())
+        values.insert(keys.velocity(k), np.zeros(3))
+    state = int(np.searchsorted(TIMELINE.slow_of, 40))
+    held = [f.keys() for f in found.factors(TIMELINE, values, range(40, 43), state)]
+    pairs = [
+        (int(np.searchsorted(TIMELINE.slow_of, j)), int(np.searchsorted(TIMELINE.slow_of, j + 1))) for j in (40, 41)
+    ]
+    assert held == [[keys.velocity(a), keys.velocity(b)] for a, b in pairs for _axis in range(2)]
+    assert (
+        len(found.factors(TIMELINE, values, range(40, 43), state + 1)) == 2
+    )  # the first node began before the stretch
 
 
 def counted(steps: list[int]):  # type: ignore[no-untyped-def]

@@ -26,7 +26,6 @@ from graphloc.linear import Term, linear_update
 UNSURE_MPS = 0.2  # sigma of the velocity: above it the model is applied, below it the model is learned
 _SPEED_MPS, _CHANGE_MPS, _OVER_S = 1.0, 0.5, 10.0  # what any vessel may do, beside what was learned
 _GUESS = (2.0, 1.0)  # m/s: usual speed and change before any is learned; counts as 10 s of data
-_REMEMBERED_S = 300.0
 _QUICKEST = 0.95  # share of the velocity that may be forgotten within 10 s
 _KERNEL = KernelConfig(kind="cauchy", scale=2.0)  # casting off or stopping is unusual: there the IMU prevails
 
@@ -40,9 +39,14 @@ class Moving(NamedTuple):
 
 
 class MotionModel:
-    """Usual speeds and changes of speed along the body's horizontal axes, forward first."""
+    """Usual speeds and changes of speed along the body's horizontal axes, forward first.
 
-    def __init__(self) -> None:
+    Args:
+        remembered_s: over how long they are averaged.
+    """
+
+    def __init__(self, remembered_s: float = 300.0) -> None:
+        self._remembered_s = remembered_s
         self._speed, self._change = np.full(2, _GUESS[0] ** 2), np.full(2, _GUESS[1] ** 2)  # mean squares
         self._speed_s = self._change_s = _OVER_S  # of data so far
         self._recent: list[tuple[int, Array]] = []
@@ -52,10 +56,10 @@ class MotionModel:
         self._recent = [r for r in self._recent if 0 < stamp_ns - r[0] < 1.5e9 * _OVER_S]
         if self._recent:
             dt_s = (stamp_ns - self._recent[-1][0]) * 1e-9
-            self._speed_s = min(self._speed_s + dt_s, _REMEMBERED_S)
+            self._speed_s = min(self._speed_s + dt_s, self._remembered_s)
             self._speed += dt_s / self._speed_s * (v_body_mps**2 - self._speed)
             if before := [v for stamp, v in self._recent if stamp_ns - stamp >= _OVER_S * 1e9]:
-                self._change_s = min(self._change_s + dt_s, _REMEMBERED_S)
+                self._change_s = min(self._change_s + dt_s, self._remembered_s)
                 self._change += dt_s / self._change_s * ((v_body_mps - before[-1]) ** 2 - self._change)
         self._recent.append((stamp_ns, v_body_mps))
 

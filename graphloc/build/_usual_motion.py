@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion model, where no sensor measures position or velocity for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc import keys
+from graphloc.frames import Array
+from graphloc.motion_model import MotionModel, Moving
+from graphloc.timeline import Timeline
+
+_UNAIDED_S = 10.0  # the IMU alone is far better than the model for less
+Span = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UsualMotion:
+    """What the vessel usually does, and the slow nodes from which to the next one it is assumed to do so."""
+
+    model: MotionModel
+    nodes: frozenset[int]
+
+    def factors(self, timeline: Timeline, values: gtsam.Values, nodes: Sequence[int], first: int) -> list[Any]:
+        """Return the factors of the steps between nodes of a stretch whose first state is `first`."""
+        factors: list[Any] = []
+        for j in nodes[:-1]:
+            a, b = (int(k) for k in np.searchsorted(timeline.slow_of, [j, j + 1]))
+            if j in self.nodes and a >= first:
+                dt_s = float(timeline.stamps_ns[b] - timeline.stamps_ns[a]) * 1e-9
+                factors += self.model.step(_moving(values, a), _moving(values, b), dt_s)
+        return factors
+
+
+def usual_motion(
+    timeline: Timeline, values: gtsam.Values, aided_ns: NDArray[np.int64], holes: Sequence[Span]
+) -> UsualMotion | None:
+    """Learn what the vessel usually does from where its motion is measured; None where it always is.
+
+    Args:
+        aided_ns: (K,) stamps of measurements of position or velocity, in order. holes: of the IMU, across which the rotation is
+            unknown, and so are the axes that the model is about.
+    """
+    ends = np.concatenate([timeline.stamps_ns[:1], aided_ns, timeline.stamps_ns[-1:]])
+    long = np.flatnonzero(np.diff(ends) > _UNAIDED_S * 1e9)
+    if not len(long):
+        return None
+    spans = list(zip(ends[long].tolist(), ends[long + 1].tolist(), strict=True))
+    model, nodes = MotionModel(remembered_s=np.inf), set()
+    node_ns = timeline.slow_stamps_ns
+    for j in range(len(node_ns) - 1):
+        here_ns, next_ns = int(node_ns[j]), int(node_ns[j + 1])
+        if not any(a <= here_ns and next_ns <= b for a, b in spans):
+            moving = _moving(values, int(np.searchsorted(timeline.slow_of, j)))
+            model.learn(here_ns, (moving.R.T @ moving.v_mps)[:2])
+        elif not any(a < next_ns and b > here_ns for a, b in holes):
+            nodes.add(j)
+    return UsualMotion(model, frozenset(nodes))
+
+
+def _moving(values: gtsam.Values, k: int) -> Moving:
+    key = keys.velocity(k)
+    v_mps: Array = values.atVector(key)
+    return Moving(key, v_mps, values.atPose3(keys.pose(k)).rotation().matrix())
