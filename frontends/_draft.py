@@ -57,7 +57,7 @@ def draft_config(inspection: Inspection) -> str:
         "# Look at each line marked 'guess'. All keys and their defaults: docs/configuration.md.",
         f"vessel: {json.dumps(name)}",
         f"body_frame: {inspection.body_frame}"
-        + ("" if inspection.body_frame == "base_link" else "  # guess: the body, by /tf_static"),
+        + ("" if inspection.body_frame == "base_link" else "  # guess: the body, by tf"),
         _datum_line(inspection),
         "sensors:" if inspection.usable else "sensors: {}  # nothing in this bag can be used",
     ]
@@ -100,7 +100,10 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     if inspection.lidars:
         yield [*_aerial_block(inspection.lidars), *recorded_lines(inspection, inspection.lidars)]
     if inspection.cameras:
-        yield [*_tags_block(inspection.cameras), *recorded_lines(inspection, inspection.cameras)]
+        cameras = tuple(camera for camera in inspection.cameras if not camera.like)
+        yield [*_tags_block(cameras), *recorded_lines(inspection, cameras)]
+    for camera in (c for c in inspection.cameras if c.like):
+        yield [f"# {camera.topic}: left out; the same camera as {camera.like}, whose tags would count twice"]
     fixes, poses = inspection.gnss or in_a_grid, any(item.role == "pose" for item in inspection.odometry)
     if fixes or poses or inspection.lidars:
         alone = "" if fixes else "; nothing else tells the height, unless z of a pose is used (axes)"
@@ -139,7 +142,7 @@ def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
         lines.append(f"    {_numbered('lidar', k)}:")
         lines.append(f"      topic: {lidar.topic}")
         if lidar.tf_frame is not None:
-            lines.append(f"      mount: {{tf_frame: {json.dumps(lidar.tf_frame)}}}  # from /tf_static")
+            lines.append(f"      mount: {{tf_frame: {json.dumps(lidar.tf_frame)}}}  # from tf")
         else:
             lines.append(
                 f"      mount: {{xyz_m: [0.0, 0.0, 0.0]}}  # guess: where '{lidar.frame_id}' sits is not in the bag; measure it"
@@ -161,12 +164,13 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
         lines.append(f"    {_numbered('camera', k)}:")
         lines.append(f"      topic: {camera.topic}")
         if camera.info_topic:
-            lines.append(f"      info_topic: {camera.info_topic}")
+            why = f"  # guess: {camera.info_why}, as none lies beside it" if camera.info_why else ""
+            lines.append(f"      info_topic: {camera.info_topic}{why}")
         else:
             lines.append("      info_topic: ''  # guess: there is no CameraInfo beside it; name its topic")
         if camera.tf_frame is not None:
             lines.append(
-                f"      mount: {{tf_frame: {json.dumps(camera.tf_frame)}}}  # from /tf_static; it must be the optical frame"
+                f"      mount: {{tf_frame: {json.dumps(camera.tf_frame)}}}  # from tf; it must be the optical frame"
             )
         else:
             lines.append(
@@ -231,7 +235,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(f"  enabled: false  # guess: {why}")
     else:
         lines += _filtered_lines(gnss.topic)
-    lines.append(_antenna_line(gnss.tf_frame, "from /tf_static"))
+    lines.append(_antenna_line(gnss.tf_frame, "from tf"))
     lines += _scatter_lines(gnss)
     lines += _rtk_lines(gnss)
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
@@ -339,7 +343,7 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
 def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
     turned = ", rpy_deg: [0.0, 0.0, 180.0]" if twist.reverse else ""
     frame = f"tf_frame: {json.dumps(twist.tf_frame)}" if twist.tf_frame else f"xyz_m: [0.0, 0.0, 0.0]{turned}"
-    known = "from /tf_static" if twist.tf_frame else "guess: where it sits is not in the bag; measure it"
+    known = "from tf" if twist.tf_frame else "guess: where it sits is not in the bag; measure it"
     water = through_water(twist.topic)
     fuse = "true to fuse it" if water else "true to fuse it, through: water for a speed log"
     return [
@@ -369,7 +373,7 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, o
     if twist.axes == NORTH_AXES:
         lines.append("  convention: ned  # guess: by the GNSS track")
     frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
-    evidence = "from /tf_static" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
+    evidence = "from tf" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
     return [*lines, _antenna_line(frame, evidence)]
 
 

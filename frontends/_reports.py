@@ -65,7 +65,7 @@ class TopicReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MountGuess:
-    """Rotation of a sensor in body, deg, or the frame of /tf_static that knows it; and the evidence."""
+    """Rotation of a sensor in body, deg, or its frame where tf knows it; and the evidence."""
 
     rpy_deg: Vec
     tf_frame: str | None
@@ -212,8 +212,9 @@ class MountedTopic:
     """A topic of clouds or images: the frame of its first message.
 
     Attributes:
-        tf_frame: the same where /tf_static leads to it, else None. info_topic: a camera's CameraInfo where one lies beside
-            it, else ''. listed: it holds what a detector found, not images.
+        tf_frame: the same where tf leads to it, else None. info_topic: a camera's CameraInfo, else ''; info_why: what tells
+            that, where it does not lie beside it. listed: it holds what a detector found, not images. like: a topic that shows the
+            same camera's images, else ''.
         latency_s: recording time minus header stamp of its first message, s; None where that has no stamp.
     """
 
@@ -221,7 +222,9 @@ class MountedTopic:
     frame_id: str
     tf_frame: str | None
     info_topic: str = ""
+    info_why: str = ""
     listed: bool = False
+    like: str = ""
     latency_s: float | None = 0.0
 
 

@@ -58,7 +58,7 @@ from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, motion_time_offset
 from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
-from graphloc.frontends._unused import unused_magnetometers, unused_numbers, unused_topics
+from graphloc.frontends._unused import unread_lidars, unread_tags, unused_magnetometers, unused_numbers, unused_topics
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import (
     GPS_FIXES,
@@ -76,7 +76,7 @@ from graphloc.frontends.decode import (
     header_stamp_ns,
 )
 from graphloc.frontends.tags.listed import LISTS
-from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic
+from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic, is_rectified
 from graphloc.frozen_receiver import frozen_fixes
 from graphloc.measurements import CompassHeading
 from graphloc.time import NS_PER_S, seconds_between
@@ -120,7 +120,7 @@ class _Contents:
     Attributes:
         source: its name, for messages. topics: by name, from its index.
         streams: by topic, as recorded. aligned: those with messages, on one clock.
-        tree: of /tf_static. lidars, cameras: by topic.
+        tree: of tf. lidars, cameras, infos (their CameraInfos): by topic.
     """
 
     source: str
@@ -130,6 +130,7 @@ class _Contents:
     tree: StaticTree
     lidars: Mapping[str, _First]
     cameras: Mapping[str, _First]
+    infos: Mapping[str, _First]
     warnings: tuple[str, ...]
 
     def of_type(self, *msgtypes: str) -> list[TopicData]:
@@ -137,7 +138,7 @@ class _Contents:
         return [stream for stream in self.aligned.values() if stream.msgtype in msgtypes]
 
     def tf_frame(self, stream: TopicData) -> str | None:
-        """Return the frame of a stream where /tf_static connects it with the body."""
+        """Return the frame of a stream where tf connects it with the body."""
         frame = stream.frame_id
         return frame if self.tree.resolve(self.tree.body(), frame) and frame in self.tree.frames else None
 
@@ -194,7 +195,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         odometry=tuple(reports),
         velocities=tuple(replace(report, late_s=_clearly(late.get(report.topic))) for _, report in velocities),
         lidars=_mounted(bag, bag.lidars),
-        cameras=tuple(_camera(bag, camera) for camera in _mounted(bag, bag.cameras)),
+        cameras=_cameras(bag),
         tf_frames=tree.frames,
         body_frame=body,
         warnings=(
@@ -203,6 +204,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             *_steps(bag),
             *unused_topics(list(bag.streams.values()), used),
             *_lacking(bag, imus, gnss, reports),
+            *([] if bag.lidars else unread_lidars(bag.topics.values())),
+            *([] if bag.cameras else unread_tags(bag.topics.values())),
             *unused_numbers(t for t in bag.topics.values() if t.topic not in bag.streams),
             *([] if any(c.usable for c in compasses) else unused_magnetometers(bag.topics.values())),
         ),
@@ -216,6 +219,9 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
         streams, tree = read_streams(bag)
         lidars = _firsts_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
         cameras = _firsts_of(bag, _pictures(bag))
+        infos = _firsts_of(
+            bag, [t.topic for t in topics.values() if INFO in t.msgtypes and t.messages] if cameras else []
+        )
         source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
     streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
     for stream in streams:
@@ -224,7 +230,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
     return _Contents(
         source=source, topics=topics, streams={s.topic: s for s in streams},
         aligned={s.topic: s for s in on_one_clock([s for s in streams if len(s)])},
-        tree=tree, lidars=lidars, cameras=cameras, warnings=warnings,
+        tree=tree, lidars=lidars, cameras=cameras, infos=infos, warnings=warnings,
     )  # fmt: skip
 
 
@@ -433,12 +439,36 @@ def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic
     )
 
 
+def _cameras(bag: _Contents) -> tuple[MountedTopic, ...]:
+    """Return the topics of images and of tag lists; one that shows the same camera's images as another names it in `like`.
+
+    Of a camera, images come first, whose noise the detector measures, before those that were resampled, and lists.
+    """
+    cameras = [_camera(bag, camera) for camera in _mounted(bag, bag.cameras)]
+    first: dict[tuple[str, str], str] = {}
+    for camera in sorted(cameras, key=lambda c: (c.listed, is_rectified(c.topic))):
+        if camera.frame_id and camera.info_topic:
+            first.setdefault((camera.frame_id, camera.info_topic), camera.topic)
+    like = [first.get((c.frame_id, c.info_topic), c.topic) for c in cameras]
+    return tuple(replace(c, like=t if t != c.topic else "") for c, t in zip(cameras, like, strict=True))
+
+
 def _camera(bag: _Contents, camera: MountedTopic) -> MountedTopic:
-    """Add the topic of the CameraInfo, if there is one, and whether the topic lists tags instead of images."""
-    beside = camera_info_topic(camera.topic)
-    has_info = beside in bag.topics and INFO in bag.topics[beside].msgtypes
+    """Add the topic of the CameraInfo, if one can be told, and whether the topic lists tags instead of images.
+
+    It lies beside images. That of a list of tags is the one with its frame, as detectors copy headers; or, of a single
+    camera, the only one.
+    """
     listed = bool(set(LISTS) & set(bag.topics[camera.topic].msgtypes))
-    return replace(camera, info_topic=beside if has_info else "", listed=listed)
+    beside = camera_info_topic(camera.topic)
+    if beside in bag.topics and INFO in bag.topics[beside].msgtypes:
+        return replace(camera, info_topic=beside, listed=listed)
+    alike = [topic for topic, info in bag.infos.items() if info.frame == camera.frame_id]
+    found = alike or (list(bag.infos) if len(bag.cameras) == 1 else [])
+    if len(found) != 1:
+        return replace(camera, listed=listed)
+    why = "the one of its frame" if alike else "the only one"
+    return replace(camera, info_topic=found[0], info_why=why, listed=listed)
 
 
 def _pictures(bag: Bag) -> list[str]:
@@ -461,7 +491,7 @@ def _firsts_of(bag: Bag, topics: Sequence[str]) -> dict[str, _First]:
                 msg: Any = bag.decode(raw)
                 stamp_ns = header_stamp_ns(msg)
                 latency_s = None if stamp_ns is None else seconds_between(stamp_ns, raw.log_ns)
-                found[topic] = _First(str(msg.header.frame_id), latency_s)
+                found[topic] = _First(str(msg.header.frame_id).lstrip("/"), latency_s)
                 break
             except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; a later one will do
                 continue

@@ -495,3 +495,20 @@ def test_far_fewer_fixes_are_no_better_beside_a_filter(beside: bool, tmp_path: P
             items.append(("/gps/filtered", at, make.fix(at, lat=lat)))
     found, _, _ = look(tmp_path, items, make)
     assert found.gnss[0].topic == "/flat"
+
+
+@pytest.mark.parametrize(
+    ("msgtype", "said"),
+    [
+        ("livox_ros_driver2/msg/CustomMsg", "livox_ros_driver2/CustomMsg is not read; scans are read as sensor_msgs/PointCloud2"),
+        ("velodyne_msgs/msg/VelodyneScan", "velodyne_msgs/VelodyneScan is not read"),
+        ("isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray", "is not read; tags are found in images"),
+    ],
+)  # fmt: skip
+def test_scans_and_tags_in_other_types_are_named(msgtype: str, said: str, tmp_path: Path) -> None:
+    """Nothing was said of them in a bag with an IMU and fixes: their sensors would seem to be missing."""
+    make = Messages(2)
+    make.store.register(get_types_from_msg("std_msgs/Header header\nuint8[] data", msgtype))
+    packet = make.t[msgtype](header=make.header(START_NS), data=np.zeros(4, np.uint8))
+    found, _, _ = look(tmp_path, [*drive(make, seconds=20), ("/odd", START_NS + 20 * S, packet)], make)
+    assert [w for w in found.warnings if w.startswith("/odd: ") and said in w]

@@ -2,6 +2,7 @@
 """Detections that bags hold already: through bags of every kind, corners against a print whose corners are known."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ from graphloc.frontends._source import Bag
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.frontends.tags.listed import LISTS, ListedTag, read_list
 from tests.bagfactory import START_NS, Messages, still_run, write_bag
+from tests.tagimages import image, info
 
 CORNERS, POSES = "apriltag_msgs/msg/AprilTagDetectionArray", "apriltag_ros/msg/AprilTagDetectionArray"
 # As christianrauch/apriltag_msgs and AprilRobotics/apriltag_ros have them.
@@ -274,3 +276,34 @@ def test_a_draft_allows_for_the_edges_of_another_detector(tmp_path: Path) -> Non
     tags = load_config(tmp_path / "vessel.yaml", KINDS).sensors["tags"]
     assert isinstance(tags, AprilTagConfig)
     assert tags.edge_sigma_px == 0.3
+
+
+def test_a_draft_finds_the_camera_info_of_a_list(tmp_path: Path) -> None:
+    """It lies beside images; a list has it under any name: that with its frame, or of a single camera the only one.
+
+    A list beside the images that it was made of is left out: each tag would count twice.
+    """
+    make = maker(CORNERS)
+
+    def of(msg: Any, frame: str) -> Any:
+        return replace(msg, header=make.header(START_NS, frame))
+
+    def drafted(name: str, *some: tuple[str, Any]) -> str:
+        items = [*still_run(make), *((topic, START_NS, msg) for topic, msg in some)]
+        return draft_config(inspect_bag(write_bag(tmp_path / name, make, items)))
+
+    listed = ("/detections", of(listing(make, CORNERS, with_corners(make, np.eye(4, 2))), "/left"))
+    left, right = ("/left/info", of(info(make), "left")), ("/right/camera_info", of(info(make), "right"))
+    assert "info_topic: /left/info  # guess: the one of its frame" in drafted("frame", listed, right, left)
+    assert "info_topic: /right/camera_info  # guess: the only one" in drafted("one", listed, right)
+    assert "info_topic: ''  # guess" in drafted("none", listed)
+    shot = ("/left/image_raw", of(image(make, np.zeros((8, 8), np.uint8)), "left"))
+    both = drafted("both", listed, left, right, shot)
+    assert "  # /detections: left out; the same camera as /left/image_raw" in both
+    assert "edge_sigma_px" not in both
+    (tmp_path / "vessel.yaml").write_text(both)
+    tags = load_config(tmp_path / "vessel.yaml", KINDS).sensors["tags"]
+    assert isinstance(tags, AprilTagConfig)
+    assert [(c.topic, c.info_topic) for c in tags.cameras.values()] == [("/left/image_raw", "/left/info")]
+    two = drafted("two", listed, right, ("/right/image_raw", of(shot[1], "right")))
+    assert "info_topic: ''  # guess" in two  # it is the other camera's
