@@ -134,7 +134,7 @@ def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
         "  enabled: false  # guess: true once there is a map: `image`, `vector`, or both",
         "  image: ''  # an aerial image of the place: GeoTIFF, MBTiles, or a folder of tiles",
         "  vector: ''  # GeoJSON of quays and piers",
-        "  hull_m: []  # guess: corners of the vessel's outline, [forward, port], m: points inside are its own",
+        "  hull_m: []  # guess: corners of the vessel's outline, [forward, port], m: points inside are its own; 'smooth' suggests some",
         "  waterline_m: 0.0  # guess: height of the waterline in the body frame, m",
         "  lidars:",
     ]

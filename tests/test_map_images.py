@@ -20,7 +20,7 @@ from graphloc.frontends.aerial.maps import Map
 from graphloc.frontends.aerial.scan import Outline
 from tests.mapfactory import BRIGHT, DARK, NEW_YORK, SWEDEN, Bytes, around, check, colours, drawn, framed, utm, write
 
-SEEN = Outline(*np.empty((8, 0)))
+SEEN = Outline(*np.empty((9, 0)))
 
 
 @pytest.mark.parametrize(
