@@ -45,6 +45,9 @@ _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off:
 _FILTERED = (
     "by its name a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 )
+_MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
+_TURN_S = 0.1
+_MOST_PARTS = 100  # of a submap
 _FASTER = 2.0  # times as fast as by default, from which a slow error is drafted as fast as it is
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
@@ -97,15 +100,15 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     for item in (o for o in inspection.odometry if o.role == "other" and o not in in_a_grid):
         instead = ": take the receiver's NavSatFix" if inspection.gnss and item.grid else ""
         yield [f"# {item.topic}: left out, {item.world}{instead}"]
-    if inspection.lidars:
-        yield [*_aerial_block(inspection.lidars), *recorded_lines(inspection, inspection.lidars)]
-    if inspection.cameras:
-        cameras = tuple(camera for camera in inspection.cameras if not camera.like)
+    lidars, cameras = (tuple(m for m in every if not m.left_out) for every in (inspection.lidars, inspection.cameras))
+    if lidars:
+        yield [*_aerial_block(lidars, _clouds_hz(inspection, lidars)), *recorded_lines(inspection, lidars)]
+    if cameras:
         yield [*_tags_block(cameras), *recorded_lines(inspection, cameras)]
-    for camera in (c for c in inspection.cameras if c.like):
-        yield [f"# {camera.topic}: left out; the same camera as {camera.like}, whose tags would count twice"]
+    for other in (m for m in (*inspection.lidars, *inspection.cameras) if m.left_out):
+        yield [f"# {other.topic}: left out; {other.left_out}"]
     fixes, poses = inspection.gnss or in_a_grid, any(item.role == "pose" for item in inspection.odometry)
-    if fixes or poses or inspection.lidars:
+    if fixes or poses or lidars:
         alone = "" if fixes else "; nothing else tells the height, unless z of a pose is used (axes)"
         yield ["height:", f"  enabled: false  # guess: true for a vessel that floats{alone}"]
 
@@ -127,7 +130,14 @@ def _grid_block(name: str, item: OdometryReport, *, enabled: bool) -> list[str]:
     ]
 
 
-def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
+def _clouds_hz(inspection: Inspection, lidars: tuple[MountedTopic, ...]) -> float:
+    """Return how many clouds a second come of the busiest LiDAR, over the run."""
+    span_s = max((t.span_s for t in inspection.topics if t.span_s is not None), default=0.0)
+    counts = {t.topic: t.count for t in inspection.topics}
+    return max(counts[lidar.topic] for lidar in lidars) / span_s if span_s > 0.0 else 0.0
+
+
+def _aerial_block(lidars: tuple[MountedTopic, ...], clouds_hz: float) -> list[str]:
     lines = [
         "aerial:",
         "  kind: aerial",
@@ -136,8 +146,11 @@ def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
         "  vector: ''  # GeoJSON of quays and piers",
         "  hull_m: []  # guess: corners of the vessel's outline, [forward, port], m: points inside are its own; 'smooth' suggests some",
         "  waterline_m: 0.0  # guess: height of the waterline in the body frame, m",
-        "  lidars:",
     ]
+    if clouds_hz > _MOST_TURNS_HZ:
+        parts = min(round(_TURN_S * clouds_hz), _MOST_PARTS)
+        lines.append(f"  submap: {parts}  # guess: {clouds_hz:.0f} clouds a second are parts of turns")
+    lines.append("  lidars:")
     for k, lidar in enumerate(lidars):
         lines.append(f"    {_numbered('lidar', k)}:")
         lines.append(f"      topic: {lidar.topic}")

@@ -34,7 +34,11 @@ def render(inspection: Inspection) -> str:
         ("images", "apriltag", inspection.cameras, "a survey of tags"),
     ):
         if mounted:
-            lines += ["", *(f"{m.topic}: {counts[m.topic]} {'lists of tags' if m.listed else what}" for m in mounted)]
+            lines.append("")
+            for m in mounted:
+                counted = f"{m.topic}: {counts[m.topic]} {'lists of tags' if m.listed else what}"
+                lines.append(f"{counted}; left out, {m.left_out}" if m.left_out else counted)
+        if any(not m.left_out for m in mounted):
             lines.append(f"  read by a sensor of kind {kind}, which the draft has switched off until there is {need}")
     if inspection.tf_frames:
         lines += ["", f"frames in tf: {', '.join(inspection.tf_frames)}"]

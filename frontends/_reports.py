@@ -213,8 +213,8 @@ class MountedTopic:
 
     Attributes:
         tf_frame: the same where tf leads to it, else None. info_topic: a camera's CameraInfo, else ''; info_why: what tells
-            that, where it does not lie beside it. listed: it holds what a detector found, not images. like: a topic that shows the
-            same camera's images, else ''.
+            that, where it does not lie beside it. listed: it holds what a detector found, not images. left_out: why it is not
+            drafted, else ''.
         latency_s: recording time minus header stamp of its first message, s; None where that has no stamp.
     """
 
@@ -224,7 +224,7 @@ class MountedTopic:
     info_topic: str = ""
     info_why: str = ""
     listed: bool = False
-    like: str = ""
+    left_out: str = ""
     latency_s: float | None = 0.0
 
 

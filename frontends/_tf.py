@@ -19,7 +19,7 @@ from graphloc.frontends._source import TF_MOVING, TF_STATIC, RawMessage
 from graphloc.frontends.decode import TF, is_unit
 
 # Names of the body frame, likeliest first.
-_WORLD_NAMES = ("map", "odom", "world", "earth", "utm")
+WORLD_NAMES = ("map", "odom", "world", "earth", "utm", "camera_init")  # the last by LOAM
 _BODY_NAMES = ("base_link", "base_footprint", "body", "base", "vessel", "vehicle", "boat")
 
 _FARTHEST_M = 1e4
@@ -122,7 +122,7 @@ class StaticTree:
 
     def body(self) -> str:
         """Return the body frame: by its usual names, else the root of most frames, else `base_link`."""
-        roots = [f for f in self._edges if f not in self._children and f not in _WORLD_NAMES]
+        roots = [f for f in self._edges if f not in self._children and f not in WORLD_NAMES]
         roots.sort(key=lambda root: -sum(self.resolve(root, frame) is not None for frame in self._edges))
         return next((name for name in (*_BODY_NAMES, *roots) if name in self._edges), _BODY_NAMES[0])
 

@@ -54,7 +54,7 @@ from graphloc.frontends._reports import (
 )
 from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import TopicData, read_streams
-from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._tf import WORLD_NAMES, StaticTree
 from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, motion_time_offset
 from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
@@ -99,6 +99,9 @@ __all__ = [
 _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MOST_TRIED = 200  # messages of a topic that cannot be decoded
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
+# Clouds that were made of another one; those of depth cameras and radars.
+_DERIVED = re.compile(r"filter|crop|voxel|sampl|ground|cluster|segment|obstacle|register|skew|second", re.IGNORECASE)
+_NO_LIDAR = re.compile(r"depth|radar|stereo", re.IGNORECASE)
 _MOST_NAMED = 6
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _FEWEST = 20  # places of a track
@@ -194,7 +197,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         compasses=compasses,
         odometry=tuple(reports),
         velocities=tuple(replace(report, late_s=_clearly(late.get(report.topic))) for _, report in velocities),
-        lidars=_mounted(bag, bag.lidars),
+        lidars=_lidars(bag),
         cameras=_cameras(bag),
         tf_frames=tree.frames,
         body_frame=body,
@@ -440,7 +443,7 @@ def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic
 
 
 def _cameras(bag: _Contents) -> tuple[MountedTopic, ...]:
-    """Return the topics of images and of tag lists; one that shows the same camera's images as another names it in `like`.
+    """Return the topics of images and of tag lists; of those that show the same camera's images one is to be read.
 
     Of a camera, images come first, whose noise the detector measures, before those that were resampled, and lists.
     """
@@ -449,8 +452,30 @@ def _cameras(bag: _Contents) -> tuple[MountedTopic, ...]:
     for camera in sorted(cameras, key=lambda c: (c.listed, is_rectified(c.topic))):
         if camera.frame_id and camera.info_topic:
             first.setdefault((camera.frame_id, camera.info_topic), camera.topic)
-    like = [first.get((c.frame_id, c.info_topic), c.topic) for c in cameras]
-    return tuple(replace(c, like=t if t != c.topic else "") for c, t in zip(cameras, like, strict=True))
+    used = [first.get((c.frame_id, c.info_topic), c.topic) for c in cameras]
+    return tuple(
+        c if topic == c.topic else replace(c, left_out=f"the same camera as {topic}, whose tags would count twice")
+        for c, topic in zip(cameras, used, strict=True)
+    )
+
+
+def _lidars(bag: _Contents) -> tuple[MountedTopic, ...]:
+    """Return the topics of clouds; of those in one LiDAR's frame one is to be read, and none that a program placed in the world."""
+    lidars, body = _mounted(bag, bag.lidars), bag.tree.body()
+    first: dict[str, str] = {}
+    for lidar in sorted(lidars, key=lambda m: (bool(_DERIVED.search(m.topic)), len(m.topic))):
+        if lidar.frame_id not in ("", body):  # clouds of several LiDARs may have been moved there
+            first.setdefault(lidar.frame_id, lidar.topic)
+
+    def why_not(lidar: MountedTopic) -> str:
+        if lidar.frame_id in WORLD_NAMES:
+            return f"in the frame '{lidar.frame_id}', where a program placed it: no LiDAR's own axes"
+        if _NO_LIDAR.search(lidar.topic):
+            return "by its name of no LiDAR; its range and noise are others"
+        other = first.get(lidar.frame_id, lidar.topic)
+        return "" if other == lidar.topic else f"in the same frame as {other}: its points would count twice"
+
+    return tuple(replace(lidar, left_out=why_not(lidar)) for lidar in lidars)
 
 
 def _camera(bag: _Contents, camera: MountedTopic) -> MountedTopic:

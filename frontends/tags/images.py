@@ -92,7 +92,7 @@ def _compressed(data: Grey) -> Grey:
         pixels = None
     if pixels is None:
         raise ValueError("compressed data cannot be decoded")
-    return _eight_bits(pixels) if pixels.dtype == np.uint16 else np.asarray(pixels, dtype=np.uint8)
+    return _eight_bits(pixels.astype(np.uint16)) if pixels.dtype == np.uint16 else np.asarray(pixels, dtype=np.uint8)
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
