@@ -181,7 +181,15 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
             lines.append(f"      info_topic: {camera.info_topic}{why}")
         else:
             lines.append("      info_topic: ''  # guess: there is no CameraInfo beside it; name its topic")
-        if camera.tf_frame is not None:
+        if camera.optical is not None:
+            xyz, rpy = (
+                ", ".join(f"{round(x, n) + 0.0:.{n}f}" for x in v) for v, n in zip(camera.optical, (3, 1), strict=True)
+            )
+            lines.append(
+                f"      mount: {{xyz_m: [{xyz}], rpy_deg: [{rpy}]}}  # guess: by tf '{camera.tf_frame}' would look at the sky: taken "
+                "for one with x ahead, z up; this is its optical frame"
+            )
+        elif camera.tf_frame is not None:
             lines.append(
                 f"      mount: {{tf_frame: {json.dumps(camera.tf_frame)}}}  # from tf; it must be the optical frame"
             )

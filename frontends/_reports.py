@@ -214,7 +214,8 @@ class MountedTopic:
     Attributes:
         tf_frame: the same where tf leads to it, else None. info_topic: a camera's CameraInfo, else ''; info_why: what tells
             that, where it does not lie beside it. listed: it holds what a detector found, not images. left_out: why it is not
-            drafted, else ''.
+            drafted, else ''. optical: mount of a camera's optical frame, xyz (m) and roll, pitch, yaw (deg), where tf's frame of it
+            is another one.
         latency_s: recording time minus header stamp of its first message, s; None where that has no stamp.
     """
 
@@ -225,6 +226,7 @@ class MountedTopic:
     info_why: str = ""
     listed: bool = False
     left_out: str = ""
+    optical: tuple[Vec, Vec] | None = None
     latency_s: float | None = 0.0
 
 

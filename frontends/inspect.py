@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.config import GnssConfig
-from graphloc.frames import Array, wrap_angle
+from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import (
     Courses,
     MeasuredMotion,
@@ -27,6 +27,7 @@ from graphloc.frontends._assess import (
     sane,
     topic_report,
     track,
+    vec,
     without_drift,
 )
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
@@ -102,6 +103,8 @@ _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visua
 # Clouds that were made of another one; those of depth cameras and radars.
 _DERIVED = re.compile(r"filter|crop|voxel|sampl|ground|cluster|segment|obstacle|register|skew|second", re.IGNORECASE)
 _NO_LIDAR = re.compile(r"depth|radar|stereo", re.IGNORECASE)
+_LOOKS_AHEAD_DEG = np.array([-90.0, 0.0, -90.0])  # of an optical frame
+_SKY = 0.7  # upward part of an optical axis, from which no tag is seen
 _MOST_NAMED = 6
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _FEWEST = 20  # places of a track
@@ -484,6 +487,7 @@ def _camera(bag: _Contents, camera: MountedTopic) -> MountedTopic:
     It lies beside images. That of a list of tags is the one with its frame, as detectors copy headers; or, of a single
     camera, the only one.
     """
+    camera = replace(camera, optical=_optical(bag, camera))
     listed = bool(set(LISTS) & set(bag.topics[camera.topic].msgtypes))
     beside = camera_info_topic(camera.topic)
     if beside in bag.topics and INFO in bag.topics[beside].msgtypes:
@@ -494,6 +498,15 @@ def _camera(bag: _Contents, camera: MountedTopic) -> MountedTopic:
         return replace(camera, listed=listed)
     why = "the one of its frame" if alike else "the only one"
     return replace(camera, info_topic=found[0], info_why=why, listed=listed)
+
+
+def _optical(bag: _Contents, camera: MountedTopic) -> tuple[Vec, Vec] | None:
+    """Return the mount of a camera's optical frame where tf's frame of it has x ahead and z up: drivers name `camera_link`."""
+    pose = bag.tree.resolve(bag.tree.body(), camera.tf_frame) if camera.tf_frame else None
+    if pose is None or pose[1][2, 2] < _SKY:
+        return None
+    turned = rpy_from_rotation(pose[1] @ rotation_from_rpy_deg(_LOOKS_AHEAD_DEG))
+    return vec(pose[0]), vec(np.degrees(turned))
 
 
 def _pictures(bag: Bag) -> list[str]:

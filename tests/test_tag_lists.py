@@ -307,3 +307,34 @@ def test_a_draft_finds_the_camera_info_of_a_list(tmp_path: Path) -> None:
     assert [(c.topic, c.info_topic) for c in tags.cameras.values()] == [("/left/image_raw", "/left/info")]
     two = drafted("two", listed, right, ("/right/image_raw", of(shot[1], "right")))
     assert "info_topic: ''  # guess" in two  # it is the other camera's
+
+
+def test_a_draft_finds_the_optical_frame_of_a_camera_link(tmp_path: Path) -> None:
+    """Drivers stamp images with a frame that has x ahead and z up: as an optical frame it would look at the sky.
+
+    Here it is turned 90 deg to port and 10 deg down: (1, 0, 0) of the link, z of the optical frame, is (0, cos, -sin) in body.
+    """
+    make = maker(CORNERS)
+    q = Rotation.from_euler("ZYX", [90.0, 10.0, 0.0], degrees=True)
+    for name, turn in (("link", q), ("optical", q * Rotation.from_euler("ZYX", [-90.0, 0.0, -90.0], degrees=True))):
+        static = make.transforms([("base_link", "camera", (1.0, 2.0, 3.0), turn.as_quat())])
+        items = [
+            ("/tf_static", START_NS, static),
+            *((t, START_NS, m(make)) for t, m in (("/c/camera_info", info), ("/c/image", blank))),
+        ]
+        (tmp_path / f"{name}.yaml").write_text(
+            draft_config(inspect_bag(write_bag(tmp_path / name, make, [*items, *still_run(make)])))
+        )
+        tags = load_config(tmp_path / f"{name}.yaml", KINDS).sensors["tags"]
+        assert isinstance(tags, AprilTagConfig)
+        mount = tags.cameras["camera"].mount
+        assert mount.tf_frame == ("camera" if name == "optical" else None)
+        if name == "link":
+            np.testing.assert_allclose(mount.t_body_sensor_m, [1.0, 2.0, 3.0])
+            ahead = [0.0, np.cos(np.radians(10.0)), -np.sin(np.radians(10.0))]
+            np.testing.assert_allclose(mount.R_body_sensor[:, 2], ahead, atol=1e-9)
+            np.testing.assert_allclose(mount.R_body_sensor[:, 0], [1.0, 0.0, 0.0], atol=1e-9)  # to the right of it
+
+
+def blank(make: Messages) -> Any:
+    return image(make, np.zeros((8, 8), np.uint8))
