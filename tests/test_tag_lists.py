@@ -317,7 +317,7 @@ def test_a_draft_finds_the_optical_frame_of_a_camera_link(tmp_path: Path) -> Non
     make = maker(CORNERS)
     q = Rotation.from_euler("ZYX", [90.0, 10.0, 0.0], degrees=True)
     for name, turn in (("link", q), ("optical", q * Rotation.from_euler("ZYX", [-90.0, 0.0, -90.0], degrees=True))):
-        static = make.transforms([("base_link", "camera", (1.0, 2.0, 3.0), turn.as_quat())])
+        static = make.transforms([("base_link", "camera", (1.0, 2.0, 3.0), turn.as_quat().tolist())])
         items = [
             ("/tf_static", START_NS, static),
             *((t, START_NS, m(make)) for t, m in (("/c/camera_info", info), ("/c/image", blank))),
