@@ -346,6 +346,7 @@ def test_tags_that_face_the_other_way_in_the_survey_are_named() -> None:
     """`facing_deg` as the direction in which one looks at them: their sightings were laid to a camera that looks elsewhere."""
 
     def turned(tag: TagConfig) -> TagConfig:
+        assert tag.rpy_deg is not None
         roll, pitch, yaw = tag.rpy_deg
         return tag.model_copy(update={"rpy_deg": (roll, pitch, yaw + 180.0)})
 
