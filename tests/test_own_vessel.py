@@ -31,6 +31,17 @@ def test_the_vessel_herself_is_told_from_a_quay_that_she_goes_along() -> None:
     assert line.endswith("at least hull_m: [[-3, -1.5], [3, -1.5], [3, 1.5], [-3, 1.5]]")
 
 
+def test_points_under_the_water_tell_a_wrong_waterline() -> None:
+    """Of a mast 2 m up whose mount was left at 0: water at -2 m. Waves, and mirror images of walls in calm water, are none."""
+    water = np.array(
+        [(x, y, 0.04 * np.sin(x + k)) for k, y in enumerate((-6.0, 5.0)) for x in np.arange(-9.0, 9.0, 0.05)]
+    )
+    mirrored = QUAY[: len(water) // 30] * (1.0, 1.0, -1.0) - (0.0, 0.0, 1.0)
+    assert not said(0.0, np.vstack([DECK, water, mirrored]), HULL)
+    (line,) = said(0.0, np.vstack([DECK, water, QUAY]) - (0.0, 0.0, 2.0), HULL)
+    assert line.startswith("points lie 2.0 m under the water and deeper: waterline_m, or the height of a LiDAR's mount")
+
+
 @pytest.mark.parametrize("way_m", [0.0, 15.0])
 def test_nothing_is_known_of_a_vessel_that_hardly_moves(way_m: float) -> None:
     assert not said(way_m, DECK)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points that stay with the vessel from scan to scan: she herself, where `hull_m` does not hold her.
+"""Points that stay with the vessel from scan to scan: she herself, where `hull_m` does not hold her. Points under the water.
 
-They are the first returns in their direction, so that a match hides behind them: without `hull_m` no scan of a launch with a LiDAR
+The former are the first returns in their direction, so that a match hides behind them: without `hull_m` no scan of a launch with a LiDAR
 on its mast matched, and the reason given was that no pose stands out.
 """
 
@@ -27,6 +27,7 @@ _CLOSE_M = (
 )
 _GAP_M = 1.5
 _FEWEST_CELLS = 8
+_UNDER_M = 1.0  # nothing is hit there; waves, a tilt and the mirror images of walls in calm water aside
 
 
 class Staying:
@@ -41,14 +42,27 @@ class Staying:
         self._known_m = np.array([*hull_m, *(t[:2] for t in lidars_m)]).reshape(-1, 2)
         self._held: Counter[tuple[int, int]] = Counter()
         self._places: list[Array] = []
+        self._lowest_m: list[float] = []
 
     def take(self, found: Outline, place_m: Array) -> None:
         """Count a scan's points outside the hull; `place_m` (2,) of the vessel in world."""
         near = found.columns_m[np.hypot(*found.columns_m.T) < _AWAY_M]
         self._held.update({(int(x), int(y)) for x, y in np.unique(np.floor(near / _CELL_M), axis=0)})
         self._places.append(place_m)
+        self._lowest_m += [found.lowest_m] if np.isfinite(found.lowest_m) else []
 
     def said(self) -> list[str]:
+        """Return lines on points under the water, and on those that stay with the vessel."""
+        return [*self._under_water(), *self._staying()]
+
+    def _under_water(self) -> list[str]:
+        lowest_m = float(np.median(self._lowest_m)) if len(self._lowest_m) >= _FEWEST_SCANS else 0.0
+        if lowest_m > -_UNDER_M:
+            return []
+        wrong = "waterline_m, or the height of a LiDAR's mount, is wrong by about that"
+        return [f"points lie {-lowest_m:.1f} m under the water and deeper: {wrong}"]
+
+    def _staying(self) -> list[str]:
         """Return a line that names the rectangle which stays with the vessel, if there is one: what her LiDARs see of her."""
         scans = len(self._places)
         if scans < _FEWEST_SCANS or np.ptp(self._places, axis=0).max() < _MOVED_M:

@@ -45,7 +45,8 @@ class Outline:
         faces_m: (M, 2) cells of faces. line_rad: (M,) direction of the line through each. tall: (M,) 1 if higher than a boat,
             else 0. face_share: (M,) weight of each. shore_m: (K, 2) first objects behind water. to_land_rad: (K,) direction
             away from the sensor. shore_share: (K,) weight of each. water_m: (L, 2) points seen as free water.
-        columns_m: (J, 2) where anything rises out of the water.
+        columns_m: (J, 2) where anything rises out of the water. lowest_m: height over the waterline below which a twentieth of
+            the points lies; NaN of none.
     """
 
     faces_m: Array
@@ -57,6 +58,7 @@ class Outline:
     shore_share: Array
     water_m: Array
     columns_m: Array
+    lowest_m: float = float("nan")
 
     @property
     def evidence(self) -> float:
@@ -88,6 +90,7 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
         shore_share=_lines(shore, 2.0 * _NEAR_M)[1],
         water_m=_free_water(shore, p[~dry]),
         columns_m=cells,
+        lowest_m=float(np.quantile(p[:, 2], 0.05)) if len(p) else float("nan"),
     )
 
 
