@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the survey of tags, and the mounts and clocks of cameras, by a solved run.
 
-It finds tags at another position, wrong sizes, and late images.
+It finds tags at another position, those that face another way, wrong sizes, and late images.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import VesselConfig
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
-from graphloc.measurements import TagSighting
+from graphloc.measurements import GnssPosition, TagSighting, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 
@@ -33,6 +33,9 @@ _LATE_S, _LATE_EXPLAINS = 0.03, 0.3
 _TURNED_DEG, _STEADY = 6.0, 0.5
 # All tags of a camera elsewhere together.
 _TOGETHER_M = 5.0
+# Share of the sightings of a tag in which the vessel is behind its plane, by more than a fix is off; and by how much more than the
+# camera's lever arm she may be farther from it than it looks: else it is not the facing that is wrong, but the place.
+_BEHIND, _BEHIND_M, _PLACE_M = 0.5, 3.0, 5.0
 
 Key = tuple[str, tuple[str, int]]  # of a tag: its sensor; its family and id
 
@@ -48,6 +51,9 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
     cameras = {(m.sensor, m.camera) for m in sightings}
     found = {camera: mount_off(solution, *camera).as_matrix() for camera in cameras}
     sightings = [replace(m, R_body_camera=found[m.sensor, m.camera] @ m.R_body_camera) for m in sightings]
+    behind = _seen_from_behind(sightings, recording, config, solution)
+    if behind:  # then nothing else that tags say can be judged, mounts included
+        return behind
     turned = _turned_mounts(sightings, rows, solution)
     if turned:  # then nothing else that tags say can be judged
         return turned
@@ -70,6 +76,38 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
         *said_of_mounts,
         *_late(sightings, solution),
         *(f"{sensor}: {surveys[sensor].called(*tag)}: {line}" for (sensor, tag), line in said.items()),
+    ]
+
+
+def _seen_from_behind(
+    sightings: list[TagSighting], recording: Recording, config: VesselConfig, solution: Solution
+) -> list[str]:
+    """Return a line for each sensor with tags that face away from where the fixes have the vessel when she sees them.
+
+    The track tells nothing of that: it may follow the tags, to the other side of the quay.
+    """
+    fixes = sorted((m for m in recording.measurements if isinstance(m, GnssPosition)), key=lambda m: m.stamp_ns)
+    if len(fixes) < _FEWEST:
+        return []
+    stamps, places = np.array([m.stamp_ns for m in fixes]), world_from_fixes(fixes, solution.datum)[:, :2]
+    seen: dict[Key, list[bool]] = defaultdict(list)
+    for m in sightings:
+        nearest = int(np.argmin(np.abs(stamps - m.stamp_ns)))
+        for tag, corners in zip(m.tags, m.points_m.reshape(-1, 4, 3), strict=True):
+            away = places[nearest] - corners.mean(axis=0)[:2]
+            out = np.cross(corners[1] - corners[0], corners[0] - corners[3])[:2]  # right x up
+            farther_m = abs(float(np.linalg.norm(away)) - float(np.linalg.norm(_in_camera(m))))
+            as_far = farther_m < float(np.linalg.norm(m.t_body_camera_m)) + _PLACE_M
+            before_m = float(away @ out) / max(float(np.linalg.norm(out)), 1e-9)
+            seen[m.sensor, tag].append(as_far and before_m < -_BEHIND_M)
+    behind: dict[str, list[str]] = defaultdict(list)
+    for (sensor, tag), own in sorted(seen.items()):
+        if len(own) >= _FEWEST and np.mean(own) >= _BEHIND:
+            behind[sensor].append(config.of_kind("apriltag")[sensor].surveyed.called(*tag))
+    return [
+        f"{sensor}: {', '.join(tags)}: by the fixes they are seen from behind, where no print is: facing_deg (or rpy_deg) is the "
+        "other way round"
+        for sensor, tags in behind.items()
     ]
 
 

@@ -42,7 +42,7 @@ def samples_of(imu: TopicData) -> tuple[NDArray[np.intp], list[str]]:
 def mount_guess(
     imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion], tree: StaticTree, body: str
 ) -> MountGuess:
-    """Return the IMU's mount in body: from /tf_static, else levelled by gravity and aligned with the motion.
+    """Return the IMU's mount in body: from tf, else levelled by gravity and aligned with the motion.
 
     Args:
         accel, gyro: (N, 3) m/s^2, (N, 3) rad/s, of usable samples.
@@ -58,7 +58,7 @@ def mount_guess(
             body_axes = accel @ pose[1].T, gyro @ pose[1].T
             turned = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], *body_axes, motions)
             note = f"; but {turned.said}: check it" if turned is not None and turned.astray else ""
-        return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"from /tf_static{note}")
+        return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"from tf{note}")
     if size < 0.5 * STANDARD_GRAVITY_MPS2:
         return _turned(imu, accel, gyro, motions, np.eye(3), "no gravity to find the level from: taken as level")
     axis = up / size
@@ -194,11 +194,13 @@ def _righted(
     up = np.asarray(pose[1]) @ np.median(accel, axis=0)
     upside_down = float(up[2]) < np.cos(np.radians(_UPSIDE_DOWN_DEG)) * float(np.linalg.norm(up))
     if sense < 0:
-        why = f"{against}: the mount in /tf_static is upside down, or its axes are left-handed; check both"
+        why = f"{against}: the mount in tf is upside down, or its axes are left-handed; check both"
         return replace(report, why=(*report.why, why))
     if upside_down and report.gravity == "included":
-        why = "with the mount in /tf_static its gyro turns as the fixes do, but gravity points down: accelerations look inverted"
-        mount = replace(report.mount, evidence="from /tf_static")
+        why = (
+            "with the mount in tf its gyro turns as the fixes do, but gravity points down: accelerations look inverted"
+        )
+        mount = replace(report.mount, evidence="from tf")
         return replace(report, gravity="inverted", mount=mount, why=(*report.why, why))
     return report
 

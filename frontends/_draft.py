@@ -45,6 +45,9 @@ _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off:
 _FILTERED = (
     "by its name a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 )
+_MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
+_TURN_S = 0.1
+_MOST_PARTS = 100  # of a submap
 _FASTER = 2.0  # times as fast as by default, from which a slow error is drafted as fast as it is
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
@@ -57,7 +60,7 @@ def draft_config(inspection: Inspection) -> str:
         "# Look at each line marked 'guess'. All keys and their defaults: docs/configuration.md.",
         f"vessel: {json.dumps(name)}",
         f"body_frame: {inspection.body_frame}"
-        + ("" if inspection.body_frame == "base_link" else "  # guess: the body, by /tf_static"),
+        + ("" if inspection.body_frame == "base_link" else "  # guess: the body, by tf"),
         _datum_line(inspection),
         "sensors:" if inspection.usable else "sensors: {}  # nothing in this bag can be used",
     ]
@@ -97,12 +100,15 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     for item in (o for o in inspection.odometry if o.role == "other" and o not in in_a_grid):
         instead = ": take the receiver's NavSatFix" if inspection.gnss and item.grid else ""
         yield [f"# {item.topic}: left out, {item.world}{instead}"]
-    if inspection.lidars:
-        yield [*_aerial_block(inspection.lidars), *recorded_lines(inspection, inspection.lidars)]
-    if inspection.cameras:
-        yield [*_tags_block(inspection.cameras), *recorded_lines(inspection, inspection.cameras)]
+    lidars, cameras = (tuple(m for m in every if not m.left_out) for every in (inspection.lidars, inspection.cameras))
+    if lidars:
+        yield [*_aerial_block(lidars, _clouds_hz(inspection, lidars)), *recorded_lines(inspection, lidars)]
+    if cameras:
+        yield [*_tags_block(cameras), *recorded_lines(inspection, cameras)]
+    for other in (m for m in (*inspection.lidars, *inspection.cameras) if m.left_out):
+        yield [f"# {other.topic}: left out; {other.left_out}"]
     fixes, poses = inspection.gnss or in_a_grid, any(item.role == "pose" for item in inspection.odometry)
-    if fixes or poses or inspection.lidars:
+    if fixes or poses or lidars:
         alone = "" if fixes else "; nothing else tells the height, unless z of a pose is used (axes)"
         yield ["height:", f"  enabled: false  # guess: true for a vessel that floats{alone}"]
 
@@ -124,22 +130,32 @@ def _grid_block(name: str, item: OdometryReport, *, enabled: bool) -> list[str]:
     ]
 
 
-def _aerial_block(lidars: tuple[MountedTopic, ...]) -> list[str]:
+def _clouds_hz(inspection: Inspection, lidars: tuple[MountedTopic, ...]) -> float:
+    """Return how many clouds a second come of the busiest LiDAR, over the run."""
+    span_s = max((t.span_s for t in inspection.topics if t.span_s is not None), default=0.0)
+    counts = {t.topic: t.count for t in inspection.topics}
+    return max(counts[lidar.topic] for lidar in lidars) / span_s if span_s > 0.0 else 0.0
+
+
+def _aerial_block(lidars: tuple[MountedTopic, ...], clouds_hz: float) -> list[str]:
     lines = [
         "aerial:",
         "  kind: aerial",
         "  enabled: false  # guess: true once there is a map: `image`, `vector`, or both",
         "  image: ''  # an aerial image of the place: GeoTIFF, MBTiles, or a folder of tiles",
         "  vector: ''  # GeoJSON of quays and piers",
-        "  hull_m: []  # guess: corners of the vessel's outline, [forward, port], m: points inside are its own",
+        "  hull_m: []  # guess: corners of the vessel's outline, [forward, port], m: points inside are its own; 'smooth' suggests some",
         "  waterline_m: 0.0  # guess: height of the waterline in the body frame, m",
-        "  lidars:",
     ]
+    if clouds_hz > _MOST_TURNS_HZ:
+        parts = min(round(_TURN_S * clouds_hz), _MOST_PARTS)
+        lines.append(f"  submap: {parts}  # guess: {clouds_hz:.0f} clouds a second are parts of turns")
+    lines.append("  lidars:")
     for k, lidar in enumerate(lidars):
         lines.append(f"    {_numbered('lidar', k)}:")
         lines.append(f"      topic: {lidar.topic}")
         if lidar.tf_frame is not None:
-            lines.append(f"      mount: {{tf_frame: {json.dumps(lidar.tf_frame)}}}  # from /tf_static")
+            lines.append(f"      mount: {{tf_frame: {json.dumps(lidar.tf_frame)}}}  # from tf")
         else:
             lines.append(
                 f"      mount: {{xyz_m: [0.0, 0.0, 0.0]}}  # guess: where '{lidar.frame_id}' sits is not in the bag; measure it"
@@ -161,12 +177,21 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
         lines.append(f"    {_numbered('camera', k)}:")
         lines.append(f"      topic: {camera.topic}")
         if camera.info_topic:
-            lines.append(f"      info_topic: {camera.info_topic}")
+            why = f"  # guess: {camera.info_why}, as none lies beside it" if camera.info_why else ""
+            lines.append(f"      info_topic: {camera.info_topic}{why}")
         else:
             lines.append("      info_topic: ''  # guess: there is no CameraInfo beside it; name its topic")
-        if camera.tf_frame is not None:
+        if camera.optical is not None:
+            xyz, rpy = (
+                ", ".join(f"{round(x, n) + 0.0:.{n}f}" for x in v) for v, n in zip(camera.optical, (3, 1), strict=True)
+            )
             lines.append(
-                f"      mount: {{tf_frame: {json.dumps(camera.tf_frame)}}}  # from /tf_static; it must be the optical frame"
+                f"      mount: {{xyz_m: [{xyz}], rpy_deg: [{rpy}]}}  # guess: by tf '{camera.tf_frame}' would look at the sky: taken "
+                "for one with x ahead, z up; this is its optical frame"
+            )
+        elif camera.tf_frame is not None:
+            lines.append(
+                f"      mount: {{tf_frame: {json.dumps(camera.tf_frame)}}}  # from tf; it must be the optical frame"
             )
         else:
             lines.append(
@@ -231,7 +256,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(f"  enabled: false  # guess: {why}")
     else:
         lines += _filtered_lines(gnss.topic)
-    lines.append(_antenna_line(gnss.tf_frame, "from /tf_static"))
+    lines.append(_antenna_line(gnss.tf_frame, "from tf"))
     lines += _scatter_lines(gnss)
     lines += _rtk_lines(gnss)
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
@@ -339,7 +364,7 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
 def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
     turned = ", rpy_deg: [0.0, 0.0, 180.0]" if twist.reverse else ""
     frame = f"tf_frame: {json.dumps(twist.tf_frame)}" if twist.tf_frame else f"xyz_m: [0.0, 0.0, 0.0]{turned}"
-    known = "from /tf_static" if twist.tf_frame else "guess: where it sits is not in the bag; measure it"
+    known = "from tf" if twist.tf_frame else "guess: where it sits is not in the bag; measure it"
     water = through_water(twist.topic)
     fuse = "true to fuse it" if water else "true to fuse it, through: water for a speed log"
     return [
@@ -369,7 +394,7 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, o
     if twist.axes == NORTH_AXES:
         lines.append("  convention: ned  # guess: by the GNSS track")
     frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
-    evidence = "from /tf_static" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
+    evidence = "from tf" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
     return [*lines, _antenna_line(frame, evidence)]
 
 

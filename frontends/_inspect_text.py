@@ -34,10 +34,14 @@ def render(inspection: Inspection) -> str:
         ("images", "apriltag", inspection.cameras, "a survey of tags"),
     ):
         if mounted:
-            lines += ["", *(f"{m.topic}: {counts[m.topic]} {what}" for m in mounted)]
+            lines.append("")
+            for m in mounted:
+                counted = f"{m.topic}: {counts[m.topic]} {'lists of tags' if m.listed else what}"
+                lines.append(f"{counted}; left out, {m.left_out}" if m.left_out else counted)
+        if any(not m.left_out for m in mounted):
             lines.append(f"  read by a sensor of kind {kind}, which the draft has switched off until there is {need}")
     if inspection.tf_frames:
-        lines += ["", f"frames in /tf_static: {', '.join(inspection.tf_frames)}"]
+        lines += ["", f"frames in tf: {', '.join(inspection.tf_frames)}"]
     lines += [f"warning: {w}" for w in inspection.warnings]
     return "\n".join(lines)
 
@@ -121,7 +125,7 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         lines.append(f"  {source} east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
     if gnss.tf_frame is None:
         lines.append(
-            "  no /tf_static tells where its antenna sits: drafted at 0, 0, 0; measure it: the track is off by that distance, and no "
+            "  no tf tells where its antenna sits: drafted at 0, 0, 0; measure it: the track is off by that distance, and no "
             "bound includes it"
         )
     if gnss.scatter_m is not None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from graphloc.blocks import MountConfig
 from graphloc.frames import Array
 from graphloc.frontends._sanity import lever_warning
-from graphloc.frontends._source import TF_STATIC, Bag
+from graphloc.frontends._source import TF_MOVING, TF_STATIC, Bag
 from graphloc.frontends._tf import StaticTree
 
 
@@ -27,12 +27,16 @@ def mounts_of(
     """
     tree = StaticTree()
     if any(mount.tf_frame for mount in mounts.values()):
-        for raw in bag.messages({TF_STATIC}):
+        for raw in bag.messages({TF_STATIC, TF_MOVING}):
+            if raw.topic == TF_MOVING:
+                tree.offer(raw, bag.decode)
+                continue
             try:
                 msg = bag.decode(raw)
             except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
                 msg = None
             tree.take(raw.msgtype, msg)
+    tree.settle()
     if tree.damage:
         bag.warnings.append(f"{bag.name}: {tree.damage}; {block} have their mounts from the rest")
     found = {

@@ -11,7 +11,7 @@ from graphloc.frontends._clock import corrected_ns
 from graphloc.frontends._readings import Readings
 from graphloc.frontends._references import Reference
 from graphloc.frontends._rejections import Rejection, malformed
-from graphloc.frontends._source import LATEST_NS, TF_STATIC, Bag, RawMessage, TopicSummary
+from graphloc.frontends._source import LATEST_NS, TF_MOVING, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.decode import NO_STAMP, Decoded, decoder_of, header_stamp_ns, stamp_ns_of
 from graphloc.ledger import RECORDED_AT, LedgerRow, Outcome
@@ -40,8 +40,8 @@ class Reader:
         for item in beside:
             self._references.setdefault(item.topic, []).append(item)
         self._wanted = set(self._sensors) | set(self._references)
-        if tree is not None and TF_STATIC in topics:
-            self._wanted.add(TF_STATIC)
+        if tree is not None:
+            self._wanted |= {TF_STATIC, TF_MOVING} & set(topics)
         self._rows: list[LedgerRow] = []
         self._seq = 0
 
@@ -51,9 +51,14 @@ class Reader:
         read: Counter[str] = Counter()
         for done, raw in enumerate(self._bag.messages(self._wanted), start=1):
             read[raw.topic] += 1
-            self._take(raw)
+            if raw.topic == TF_MOVING and self._tree is not None:
+                self._tree.offer(raw, self._bag.decode)
+            else:
+                self._take(raw)
             if progress is not None and done % _REPORT_EVERY == 0:
                 progress("reading", done, max(total, done))
+        if self._tree is not None:
+            self._tree.settle()
         if progress is not None:
             progress("reading", total, total)
         return self._rows + self._topic_rows(read)
@@ -127,6 +132,8 @@ class Reader:
             if topic == TF_STATIC and self._tree is not None:
                 add(topic, read[topic] - self._tree.broken, Outcome.READ, "read for mounts")
                 add(topic, self._tree.broken, Outcome.MALFORMED, "cannot be decoded")
+            if topic == TF_MOVING and self._tree is not None:
+                add(topic, read[topic], Outcome.READ, "read for mounts")
             missing = summary.messages - read[topic]
             add(topic, missing, Outcome.MALFORMED, "announced by the bag's index, but cannot be read")
         return rows

@@ -65,7 +65,7 @@ class TopicReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MountGuess:
-    """Rotation of a sensor in body, deg, or the frame of /tf_static that knows it; and the evidence."""
+    """Rotation of a sensor in body, deg, or its frame where tf knows it; and the evidence."""
 
     rpy_deg: Vec
     tf_frame: str | None
@@ -212,8 +212,10 @@ class MountedTopic:
     """A topic of clouds or images: the frame of its first message.
 
     Attributes:
-        tf_frame: the same where /tf_static leads to it, else None. info_topic: a camera's CameraInfo where one lies beside
-            it, else ''. listed: it holds what a detector found, not images.
+        tf_frame: the same where tf leads to it, else None. info_topic: a camera's CameraInfo, else ''; info_why: what tells
+            that, where it does not lie beside it. listed: it holds what a detector found, not images. left_out: why it is not
+            drafted, else ''. optical: mount of a camera's optical frame, xyz (m) and roll, pitch, yaw (deg), where tf's frame of it
+            is another one.
         latency_s: recording time minus header stamp of its first message, s; None where that has no stamp.
     """
 
@@ -221,7 +223,10 @@ class MountedTopic:
     frame_id: str
     tf_frame: str | None
     info_topic: str = ""
+    info_why: str = ""
     listed: bool = False
+    left_out: str = ""
+    optical: tuple[Vec, Vec] | None = None
     latency_s: float | None = 0.0
 
 

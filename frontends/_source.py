@@ -33,7 +33,7 @@ from graphloc.time import duration_ns, seconds_between, utc_text
 log = logging.getLogger(__name__)
 LATEST_NS = 2**62 - 1
 """The last time that is worked with (year 2116): a difference of differences still fits 64 bits."""
-TF_STATIC = "/tf_static"
+TF_STATIC, TF_MOVING = "/tf_static", "/tf"
 
 
 class RawMessage(NamedTuple):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends._source import TF_STATIC, Bag, RawMessage
+from graphloc.frontends._source import TF_MOVING, TF_STATIC, Bag, RawMessage
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.decode import (
     GPS_FIXES,
@@ -248,8 +248,11 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
     }
     tree = StaticTree()
     mixed = {t.topic for t in bag.topics.values() if len(t.msgtypes) == 1 and t.msgtypes[0] in NMEA}
-    wanted = set(streams) | mixed | ({TF_STATIC} & set(bag.topics))
+    wanted = set(streams) | mixed | ({TF_STATIC, TF_MOVING} & set(bag.topics))
     for raw in bag.messages(wanted) if wanted else ():
+        if raw.topic == TF_MOVING:
+            tree.offer(raw, bag.decode)
+            continue
         msg: Any = None
         try:
             msg = bag.decode(raw)
@@ -266,6 +269,7 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
             if raw.msgtype not in UNSTAMPED:
                 stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
             stream.add(stamp_ns or 0, raw.log_ns, row, raw.file, raw.elapsed_ns)
+    tree.settle()
     _join_talkers(streams)
     for name in [
         name for name, stream in streams.items() if name.endswith(_COURSE) and _told_elsewhere(stream, streams)

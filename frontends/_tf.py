@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mounts from `/tf_static`: the chain of transforms from body to a sensor's frame."""
+"""Mounts from `/tf_static`: the chain of transforms from body to a sensor's frame.
+
+Of `/tf` those count that never change: ROS 1's `static_transform_publisher` of the package `tf` repeats them there.
+"""
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -11,14 +15,18 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
 from graphloc.frames import Array
-from graphloc.frontends._source import TF_STATIC
+from graphloc.frontends._source import TF_MOVING, TF_STATIC, RawMessage
 from graphloc.frontends.decode import TF, is_unit
 
 # Names of the body frame, likeliest first.
-_WORLD_NAMES = ("map", "odom", "world", "earth", "utm")
+WORLD_NAMES = ("map", "odom", "world", "earth", "utm", "camera_init")  # the last by LOAM
 _BODY_NAMES = ("base_link", "base_footprint", "body", "base", "vessel", "vehicle", "boat")
 
 _FARTHEST_M = 1e4
+_OLD_TF = "tf/msg/tfMessage"  # of ROS 1 before tf2
+_DENSE = 1000  # messages of /tf; after n times as many, one in n is read: an hour may hold a million
+_GOLDEN = 0.6180339887498949  # its multiples leave no gap, whatever order frames are published in
+_SAME = 1e-6  # m, and of a quaternion: what is repeated is the same to the last digit
 
 Pose = tuple[Array, Array]  # t (3,), R (3, 3): T_parent_child
 
@@ -34,17 +42,49 @@ class StaticTree:
         self._edges: dict[str, dict[str, Pose]] = {}
         self._children: set[str] = set()
         self._unusable: set[str] = set()
+        self._repeated: dict[str, tuple[str, Pose, int]] = {}  # of /tf, by child: parent, pose, how often
+        self._moving: set[str] = set()
+        self._offered = 0
         self.broken = 0
 
     def take(self, msgtype: str, msg: Any) -> None:
         """Take a message of `/tf_static`; None if it could not be decoded. Other types are ignored."""
         whole = msg is not None
-        if whole and msgtype == TF:
+        if whole and msgtype in (TF, _OLD_TF):
             try:
                 self.add(msg)
             except Exception:  # noqa: BLE001 - by the bag's own definition anything may stand in it
                 whole = False
         self.broken += not whole
+
+    def offer(self, raw: RawMessage, decode: Callable[[RawMessage], object]) -> None:
+        """Take a message of `/tf`, or leave it out where very many come. What cannot be decoded comes again."""
+        due = self._offered * _GOLDEN % 1.0 < _DENSE / max(_DENSE, self._offered)
+        self._offered += 1
+        if not due or raw.msgtype not in (TF, _OLD_TF):
+            return
+        try:
+            found = list(self._poses(decode(raw)))
+        except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
+            return
+        for parent, child, pose in found:
+            if child not in self._moving and pose is not None:
+                self._compare(parent, child, pose)
+
+    def _compare(self, parent: str, child: str, pose: Pose) -> None:
+        """Count a transform of /tf that is the same as before; one that changes is no mount."""
+        before, same, count = self._repeated.get(child, (parent, pose, 0))
+        if before != parent or max(np.abs(x - y).max() for x, y in zip(same, pose, strict=True)) > _SAME:
+            self._moving.add(child)
+            del self._repeated[child]
+        else:
+            self._repeated[child] = (parent, same, count + 1)
+
+    def settle(self) -> None:
+        """Join what `/tf` repeats, once all of it was offered, where `/tf_static` does not have it."""
+        for child, (parent, pose, count) in self._repeated.items():
+            if count > 1 and child not in self._children:
+                self._join(parent, child, pose)
 
     @property
     def damage(self) -> str:
@@ -53,17 +93,27 @@ class StaticTree:
 
     def add(self, msg: Any) -> None:
         """Add the transforms of a `tf2_msgs/TFMessage`; a later one replaces an earlier one of the same frames."""
+        for parent, child, pose in self._poses(msg):
+            if pose is None:
+                self._unusable.add(child)
+            else:
+                self._join(parent, child, pose)
+
+    def _join(self, parent: str, child: str, pose: Pose) -> None:
+        p, R = pose
+        self._children.add(child)
+        self._edges.setdefault(parent, {})[child] = pose
+        self._edges.setdefault(child, {})[parent] = (-R.T @ p, R.T)
+
+    @staticmethod
+    def _poses(msg: Any) -> Iterator[tuple[str, str, Pose | None]]:
+        """Yield parent, child and T_parent_child of a message; None where no pose stands there."""
         for stamped in msg.transforms:
             parent, child = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
             t, q = stamped.transform.translation, stamped.transform.rotation
             quaternion, p = np.array([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z])
-            if not (is_unit(quaternion) and (np.abs(p) < _FARTHEST_M).all()):
-                self._unusable.add(child)
-                continue
-            R = np.asarray(Rotation.from_quat(quaternion).as_matrix())
-            self._children.add(child)
-            self._edges.setdefault(parent, {})[child] = (p, R)
-            self._edges.setdefault(child, {})[parent] = (-R.T @ p, R.T)
+            usable = is_unit(quaternion) and (np.abs(p) < _FARTHEST_M).all()
+            yield parent, child, (p, np.asarray(Rotation.from_quat(quaternion).as_matrix())) if usable else None
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -72,7 +122,7 @@ class StaticTree:
 
     def body(self) -> str:
         """Return the body frame: by its usual names, else the root of most frames, else `base_link`."""
-        roots = [f for f in self._edges if f not in self._children and f not in _WORLD_NAMES]
+        roots = [f for f in self._edges if f not in self._children and f not in WORLD_NAMES]
         roots.sort(key=lambda root: -sum(self.resolve(root, frame) is not None for frame in self._edges))
         return next((name for name in (*_BODY_NAMES, *roots) if name in self._edges), _BODY_NAMES[0])
 
@@ -103,6 +153,8 @@ class StaticTree:
                 known += (
                     f"; without a pose, as NaN or no unit quaternion stands there: {', '.join(sorted(self._unusable))}"
                 )
+            if self._moving:
+                known += f"; changing on {TF_MOVING}: {', '.join(sorted(self._moving))}"
             if self.broken:
                 known += f"; messages that cannot be decoded: {self.broken}"  # one may have held what is missing
             raise InputError(

@@ -16,6 +16,9 @@ from graphloc.frontends.decode import GPS_FIXES, IMU, NAV_SAT_FIX, NUMBERS
 
 _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
+# Packets and clouds in a maker's own types, and scans of a plane; lists of tags other than `LISTS`.
+_LIDAR = re.compile(r"LaserScan|livox|velodyne|ouster|pandar|hesai|rslidar|robosense|lidar", re.IGNORECASE)
+_TAGS = re.compile(r"april|aruco|fiducial|CompressedVideo|FFMPEGPacket|theora", re.IGNORECASE)
 _SPEED = re.compile(r"speed|stw|sog|knots|velocity", re.IGNORECASE)
 
 
@@ -47,6 +50,30 @@ def unused_magnetometers(topics: Iterable[TopicSummary]) -> list[str]:
         for t in topics
         if _MAGNETIC in t.msgtypes and t.messages
     ]
+
+
+def unread_lidars(topics: Iterable[TopicSummary]) -> list[str]:
+    """Return a line for each topic of a bag without a `PointCloud2` that holds scans in another type."""
+    return [
+        f"{t.topic}: {_either(t)} is not read; scans are read as sensor_msgs/PointCloud2, which its driver, or a "
+        "converter, makes of it"
+        for t in topics
+        if t.messages and any(_LIDAR.search(kind) for kind in t.msgtypes)
+    ]
+
+
+def unread_tags(topics: Iterable[TopicSummary]) -> list[str]:
+    """Return a line for each topic of a bag without images or known lists that holds tags, or video, in another type."""
+    return [
+        f"{t.topic}: {_either(t)} is not read; tags are found in images (sensor_msgs/Image, CompressedImage), or read "
+        "as apriltag_msgs/AprilTagDetectionArray"
+        for t in topics
+        if t.messages and any(_TAGS.search(kind) for kind in t.msgtypes)
+    ]
+
+
+def _either(topic: TopicSummary) -> str:
+    return " or ".join(kind.replace("/msg/", "/") for kind in topic.msgtypes)
 
 
 def unused_numbers(topics: Iterable[TopicSummary]) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.config import GnssConfig
-from graphloc.frames import Array, wrap_angle
+from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import (
     Courses,
     MeasuredMotion,
@@ -27,6 +27,7 @@ from graphloc.frontends._assess import (
     sane,
     topic_report,
     track,
+    vec,
     without_drift,
 )
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
@@ -54,11 +55,11 @@ from graphloc.frontends._reports import (
 )
 from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import TopicData, read_streams
-from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._tf import WORLD_NAMES, StaticTree
 from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, motion_time_offset
 from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
-from graphloc.frontends._unused import unused_magnetometers, unused_numbers, unused_topics
+from graphloc.frontends._unused import unread_lidars, unread_tags, unused_magnetometers, unused_numbers, unused_topics
 from graphloc.frontends.aerial.cloud import CLOUD
 from graphloc.frontends.decode import (
     GPS_FIXES,
@@ -76,7 +77,7 @@ from graphloc.frontends.decode import (
     header_stamp_ns,
 )
 from graphloc.frontends.tags.listed import LISTS
-from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic
+from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic, is_rectified
 from graphloc.frozen_receiver import frozen_fixes
 from graphloc.measurements import CompassHeading
 from graphloc.time import NS_PER_S, seconds_between
@@ -99,6 +100,11 @@ __all__ = [
 _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MOST_TRIED = 200  # messages of a topic that cannot be decoded
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
+# Clouds that were made of another one; those of depth cameras and radars.
+_DERIVED = re.compile(r"filter|crop|voxel|sampl|ground|cluster|segment|obstacle|register|skew|second", re.IGNORECASE)
+_NO_LIDAR = re.compile(r"depth|radar|stereo", re.IGNORECASE)
+_LOOKS_AHEAD_DEG = np.array([-90.0, 0.0, -90.0])  # of an optical frame
+_SKY = 0.7  # upward part of an optical axis, from which no tag is seen
 _MOST_NAMED = 6
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _FEWEST = 20  # places of a track
@@ -120,7 +126,7 @@ class _Contents:
     Attributes:
         source: its name, for messages. topics: by name, from its index.
         streams: by topic, as recorded. aligned: those with messages, on one clock.
-        tree: of /tf_static. lidars, cameras: by topic.
+        tree: of tf. lidars, cameras, infos (their CameraInfos): by topic.
     """
 
     source: str
@@ -130,6 +136,7 @@ class _Contents:
     tree: StaticTree
     lidars: Mapping[str, _First]
     cameras: Mapping[str, _First]
+    infos: Mapping[str, _First]
     warnings: tuple[str, ...]
 
     def of_type(self, *msgtypes: str) -> list[TopicData]:
@@ -137,7 +144,7 @@ class _Contents:
         return [stream for stream in self.aligned.values() if stream.msgtype in msgtypes]
 
     def tf_frame(self, stream: TopicData) -> str | None:
-        """Return the frame of a stream where /tf_static connects it with the body."""
+        """Return the frame of a stream where tf connects it with the body."""
         frame = stream.frame_id
         return frame if self.tree.resolve(self.tree.body(), frame) and frame in self.tree.frames else None
 
@@ -193,8 +200,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         compasses=compasses,
         odometry=tuple(reports),
         velocities=tuple(replace(report, late_s=_clearly(late.get(report.topic))) for _, report in velocities),
-        lidars=_mounted(bag, bag.lidars),
-        cameras=tuple(_camera(bag, camera) for camera in _mounted(bag, bag.cameras)),
+        lidars=_lidars(bag),
+        cameras=_cameras(bag),
         tf_frames=tree.frames,
         body_frame=body,
         warnings=(
@@ -203,6 +210,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
             *_steps(bag),
             *unused_topics(list(bag.streams.values()), used),
             *_lacking(bag, imus, gnss, reports),
+            *([] if bag.lidars else unread_lidars(bag.topics.values())),
+            *([] if bag.cameras else unread_tags(bag.topics.values())),
             *unused_numbers(t for t in bag.topics.values() if t.topic not in bag.streams),
             *([] if any(c.usable for c in compasses) else unused_magnetometers(bag.topics.values())),
         ),
@@ -216,6 +225,9 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
         streams, tree = read_streams(bag)
         lidars = _firsts_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
         cameras = _firsts_of(bag, _pictures(bag))
+        infos = _firsts_of(
+            bag, [t.topic for t in topics.values() if INFO in t.msgtypes and t.messages] if cameras else []
+        )
         source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
     streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
     for stream in streams:
@@ -224,7 +236,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
     return _Contents(
         source=source, topics=topics, streams={s.topic: s for s in streams},
         aligned={s.topic: s for s in on_one_clock([s for s in streams if len(s)])},
-        tree=tree, lidars=lidars, cameras=cameras, warnings=warnings,
+        tree=tree, lidars=lidars, cameras=cameras, infos=infos, warnings=warnings,
     )  # fmt: skip
 
 
@@ -433,12 +445,68 @@ def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic
     )
 
 
+def _cameras(bag: _Contents) -> tuple[MountedTopic, ...]:
+    """Return the topics of images and of tag lists; of those that show the same camera's images one is to be read.
+
+    Of a camera, images come first, whose noise the detector measures, before those that were resampled, and lists.
+    """
+    cameras = [_camera(bag, camera) for camera in _mounted(bag, bag.cameras)]
+    first: dict[tuple[str, str], str] = {}
+    for camera in sorted(cameras, key=lambda c: (c.listed, is_rectified(c.topic))):
+        if camera.frame_id and camera.info_topic:
+            first.setdefault((camera.frame_id, camera.info_topic), camera.topic)
+    used = [first.get((c.frame_id, c.info_topic), c.topic) for c in cameras]
+    return tuple(
+        c if topic == c.topic else replace(c, left_out=f"the same camera as {topic}, whose tags would count twice")
+        for c, topic in zip(cameras, used, strict=True)
+    )
+
+
+def _lidars(bag: _Contents) -> tuple[MountedTopic, ...]:
+    """Return the topics of clouds; of those in one LiDAR's frame one is to be read, and none that a program placed in the world."""
+    lidars, body = _mounted(bag, bag.lidars), bag.tree.body()
+    first: dict[str, str] = {}
+    for lidar in sorted(lidars, key=lambda m: (bool(_DERIVED.search(m.topic)), len(m.topic))):
+        if lidar.frame_id not in ("", body):  # clouds of several LiDARs may have been moved there
+            first.setdefault(lidar.frame_id, lidar.topic)
+
+    def why_not(lidar: MountedTopic) -> str:
+        if lidar.frame_id in WORLD_NAMES:
+            return f"in the frame '{lidar.frame_id}', where a program placed it: no LiDAR's own axes"
+        if _NO_LIDAR.search(lidar.topic):
+            return "by its name of no LiDAR; its range and noise are others"
+        other = first.get(lidar.frame_id, lidar.topic)
+        return "" if other == lidar.topic else f"in the same frame as {other}: its points would count twice"
+
+    return tuple(replace(lidar, left_out=why_not(lidar)) for lidar in lidars)
+
+
 def _camera(bag: _Contents, camera: MountedTopic) -> MountedTopic:
-    """Add the topic of the CameraInfo, if there is one, and whether the topic lists tags instead of images."""
-    beside = camera_info_topic(camera.topic)
-    has_info = beside in bag.topics and INFO in bag.topics[beside].msgtypes
+    """Add the topic of the CameraInfo, if one can be told, and whether the topic lists tags instead of images.
+
+    It lies beside images. That of a list of tags is the one with its frame, as detectors copy headers; or, of a single
+    camera, the only one.
+    """
+    camera = replace(camera, optical=_optical(bag, camera))
     listed = bool(set(LISTS) & set(bag.topics[camera.topic].msgtypes))
-    return replace(camera, info_topic=beside if has_info else "", listed=listed)
+    beside = camera_info_topic(camera.topic)
+    if beside in bag.topics and INFO in bag.topics[beside].msgtypes:
+        return replace(camera, info_topic=beside, listed=listed)
+    alike = [topic for topic, info in bag.infos.items() if info.frame == camera.frame_id]
+    found = alike or (list(bag.infos) if len(bag.cameras) == 1 else [])
+    if len(found) != 1:
+        return replace(camera, listed=listed)
+    why = "the one of its frame" if alike else "the only one"
+    return replace(camera, info_topic=found[0], info_why=why, listed=listed)
+
+
+def _optical(bag: _Contents, camera: MountedTopic) -> tuple[Vec, Vec] | None:
+    """Return the mount of a camera's optical frame where tf's frame of it has x ahead and z up: drivers name `camera_link`."""
+    pose = bag.tree.resolve(bag.tree.body(), camera.tf_frame) if camera.tf_frame else None
+    if pose is None or pose[1][2, 2] < _SKY:
+        return None
+    turned = rpy_from_rotation(pose[1] @ rotation_from_rpy_deg(_LOOKS_AHEAD_DEG))
+    return vec(pose[0]), vec(np.degrees(turned))
 
 
 def _pictures(bag: Bag) -> list[str]:
@@ -461,7 +529,7 @@ def _firsts_of(bag: Bag, topics: Sequence[str]) -> dict[str, _First]:
                 msg: Any = bag.decode(raw)
                 stamp_ns = header_stamp_ns(msg)
                 latency_s = None if stamp_ns is None else seconds_between(stamp_ns, raw.log_ns)
-                found[topic] = _First(str(msg.header.frame_id), latency_s)
+                found[topic] = _First(str(msg.header.frame_id).lstrip("/"), latency_s)
                 break
             except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; a later one will do
                 continue

@@ -57,7 +57,7 @@ class MountConfig(Block):
     rpy_deg: Triple = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw of the sensor in body, deg; R = Rz(yaw) Ry(pitch) Rx(roll)."""
     tf_frame: str | None = None
-    """Take the mount from `/tf_static` instead: name of the sensor's frame there."""
+    """Take the mount from `/tf_static` instead, or from `/tf` where it never changes: name of the sensor's frame there."""
 
     @property
     def t_body_sensor_m(self) -> Array:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -30,6 +31,7 @@ from graphloc.frontends.aerial.match import Mode
 from graphloc.frontends.aerial.scan import LevelCloud, outline
 from graphloc.frontends.aerial.scans import Matched
 from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.gather._matches import few_matches
 from graphloc.recording import Recording
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import S
@@ -193,6 +195,28 @@ def test_lines_alone_and_bl_can_be_matched_to(bag: Path, tmp_path: Path) -> None
     ):
         match, true = matched_alone(bag, **changes)
         assert np.hypot(*(match.modes[0].pose[:2] - true - off)) < 0.25
+
+
+def test_a_hull_that_was_left_out_is_named(bag: Path) -> None:
+    """Her own points were the first returns, and no line said so. The simulator's hull is 14.3 m by 4.2 m."""
+    for hull_m, expected in ((None, 0), ((), 1)):
+        said: list[str] = []
+        changes = {} if hull_m is None else {"hull_m": hull_m}
+        sensor, track = aerial(bag, every_m=0.0, **changes)
+        list(matching(bag, track, sensor, warn=said.append))
+        assert len(said) == expected
+    box = np.array(json.loads(said[0].partition("at least hull_m: ")[2]))
+    assert (box >= (-7.5, -2.6)).all()
+    assert (box <= (7.8, 2.6)).all()
+    assert (np.ptp(box, axis=0) > (10.0, 3.0)).all()  # as far as her LiDARs see her
+
+
+@pytest.mark.parametrize(("matched", "doubted"), [(0, ""), (5, "; the 5 others may well be false"), (20, "")])
+def test_few_matches_among_many_scans_are_doubted(matched: int, doubted: str) -> None:
+    """A LiDAR upside down in the configuration: 5 of 49 scans matched, all false, and drew the track 5 m along."""
+    (line,) = few_matches("aerial", Counter({"no pose in the window stands out": 33, "too few to match": 11}), matched)
+    assert line.startswith("aerial: 44 scans gave no match, 33 of them: no pose in the window stands out")
+    assert line.endswith(f"`graphloc match` shows one{doubted}")
 
 
 @pytest.mark.usefixtures("unseen")

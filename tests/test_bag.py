@@ -337,6 +337,39 @@ def test_the_body_may_hang_below_another_frame(tmp_path: Path) -> None:
     np.testing.assert_allclose(R @ [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], atol=1e-12)
 
 
+def test_mounts_that_tf_repeats(tmp_path: Path) -> None:
+    """ROS 1's publisher of the package `tf` repeats fixed transforms on /tf; among them one that turns, and the vessel's own.
+
+    3000 messages each, so that not all are read. What /tf_static says of `mast` counts, whatever /tf repeats.
+    """
+    make, half = Messages(2), np.sqrt(0.5)
+    items = still_run(make, seconds=10.0)
+    fixed = ("base_link", "gps", (1.0, 2.0, 3.0), (0.0, 0.0, half, half))
+    for k in range(3000):
+        at = START_NS + k * S // 300
+        turn = (0.0, 0.0, np.sin(1e-4 * k), np.cos(1e-4 * k))
+        items += [
+            ("/tf", at, make.transforms([("odom", "base_link", (0.01 * k, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))])),
+            ("/tf", at + 1, make.transforms([fixed, ("base_link", "mast", (9.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))])),
+            ("/tf", at + 2, make.transforms([("base_link", "radar", (0.0, 0.0, 4.0), turn)])),
+        ]
+    static = make.transforms([("base_link", "mast", (4.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))])
+    path = write_bag(tmp_path / "run", make, [("/tf_static", START_NS, static), *sorted(items, key=lambda i: i[1])])
+
+    def read(frame: str) -> Recording:
+        return read_recording(path, vessel(gnss={"topic": "/fix", "mount": {"tf_frame": frame}}))
+
+    recording = read("gps")
+    t, R = recording.mounts["gnss"]
+    np.testing.assert_allclose(t, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(R @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)
+    assert ("/tf", 9000, "read for mounts") in {(r.topic, r.count, r.reason) for r in recording.rows}
+    assert recording.message_count == accounted(recording)
+    np.testing.assert_allclose(read("mast").mounts["gnss"][0], [4.0, 0.0, 0.0])
+    with pytest.raises(InputError, match=r"no chain from 'base_link' to 'radar'.*; changing on /tf: base_link, radar"):
+        read("radar")
+
+
 @pytest.mark.parametrize("twist", [(0.0, -1.0, 0.0), (0.0, 0.0, 0.0)], ids=["in body", "left at zero"])
 def test_velocity_of_the_truth(tmp_path: Path, twist: tuple[float, float, float]) -> None:
     """East at 1 m/s with the bow north: to starboard, so -y in body."""

@@ -66,6 +66,20 @@ def test_sixteen_bits_in_either_order(encoding: str, big: int, kind: str) -> Non
     assert np.abs(grey(encoding, deep, big=big) - 255.0 * LEVELS / LEVELS.max()).max() <= 1
 
 
+@pytest.mark.parametrize(("big", "kind"), [(0, "<u2"), (1, ">u2")])
+@pytest.mark.parametrize(("encoding", "data"), [("rgb16", RGB), ("16UC3", RGB[..., ::-1])])
+def test_sixteen_bits_of_colours(encoding: str, data: Any, big: int, kind: str) -> None:
+    found = grey(encoding, (data.astype(np.uint16) * 16).astype(kind), big=big)
+    assert np.abs(found - 255.0 / RGB.max() * GREY_OF_RGB).max() <= 1
+
+
+def test_a_bayer_pattern_of_sixteen_bits() -> None:
+    mosaic = np.full((16, 16), 20 * 16, dtype=np.uint16)
+    mosaic[::2, ::2] = 255 * 16  # a red wall: 0.299 x 255 + 0.701 x 20
+    found = grey("bayer_rggb16", mosaic, width=16, height=16)
+    assert np.abs(found[4:-4, 4:-4] - 90.3).max() <= 2
+
+
 @pytest.mark.parametrize(
     ("encoding", "at"),
     [("bayer_rggb8", (0, 0)), ("bayer_grbg8", (0, 1)), ("bayer_gbrg8", (1, 0)), ("bayer_bggr8", (1, 1))],
@@ -91,6 +105,12 @@ def test_compressed() -> None:
     assert np.abs(compressed(cv2.imencode(".jpg", smooth)[1]).astype(int) - smooth).max() <= 6
     colour = cv2.imencode(".png", np.dstack([smooth] * 3))[1]
     assert compressed(colour).shape == smooth.shape
+
+
+def test_compressed_sixteen_bits() -> None:
+    """Of a camera of twelve bits, whose upper byte alone has sixteen levels: no tag was found in them, and ids were blamed."""
+    deep = cv2.imencode(".png", LEVELS.astype(np.uint16) * 16)[1]
+    assert np.abs(compressed(deep) - 255.0 * LEVELS / LEVELS.max()).max() <= 1
 
 
 def png_header(width: int, height: int) -> bytes:

@@ -279,11 +279,13 @@ def test_stamps_gaps_and_latency(tmp_path: Path) -> None:
     assert (camera.count, camera.rate_hz) == (1, None)
 
 
-def test_tf_static_beats_guessing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("topic", ["/tf_static", "/tf"])  # on the latter repeated: static_transform_publisher of ROS 1
+def test_tf_static_beats_guessing(topic: str, tmp_path: Path) -> None:
     make = Messages(2)
     half = np.sqrt(0.5)
     edges = [("base_link", "imu_link", (0, 0, 1), (0, 0, half, half)), ("base_link", "gps", (1, 2, 3), (0, 0, 0, 1))]
-    items = [("/tf_static", START_NS, make.transforms(edges)), *drive(make, rotation_z(90.0), seconds=30)]
+    repeated = [(topic, START_NS + k, make.transforms(edges)) for k in range(2)]
+    items = [*repeated, *drive(make, rotation_z(90.0), seconds=30)]
     found, config, _ = look(tmp_path, items, make)
     assert found.imus[0].mount.tf_frame == config.sensors["imu"].mount.tf_frame == "imu_link"
     recording = read_recording(tmp_path / "run", config)

@@ -9,11 +9,20 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from graphloc.config import CompassConfig, GnssConfig, VelocityConfig, VesselConfig, parse_config
+from graphloc import factors
+from graphloc.config import (
+    AerialConfig,
+    CompassConfig,
+    GnssConfig,
+    VelocityConfig,
+    VesselConfig,
+    load_config,
+    parse_config,
+)
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.inspect import Inspection, render
+from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag import KINDS
 from tests.test_inspect import DATUM, G, drive, look, rotation_z
@@ -495,3 +504,65 @@ def test_far_fewer_fixes_are_no_better_beside_a_filter(beside: bool, tmp_path: P
             items.append(("/gps/filtered", at, make.fix(at, lat=lat)))
     found, _, _ = look(tmp_path, items, make)
     assert found.gnss[0].topic == "/flat"
+
+
+@pytest.mark.parametrize(
+    ("msgtype", "said"),
+    [
+        ("livox_ros_driver2/msg/CustomMsg", "livox_ros_driver2/CustomMsg is not read; scans are read as sensor_msgs/PointCloud2"),
+        ("velodyne_msgs/msg/VelodyneScan", "velodyne_msgs/VelodyneScan is not read"),
+        ("isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray", "is not read; tags are found in images"),
+    ],
+)  # fmt: skip
+def test_scans_and_tags_in_other_types_are_named(msgtype: str, said: str, tmp_path: Path) -> None:
+    """Nothing was said of them in a bag with an IMU and fixes: their sensors would seem to be missing."""
+    make = Messages(2)
+    make.store.register(get_types_from_msg("std_msgs/Header header\nuint8[] data", msgtype))
+    packet = make.t[msgtype](header=make.header(START_NS), data=np.zeros(4, np.uint8))
+    found, _, _ = look(tmp_path, [*drive(make, seconds=20), ("/odd", START_NS + 20 * S, packet)], make)
+    assert [w for w in found.warnings if w.startswith("/odd: ") and said in w]
+
+
+def cloud(make: Messages, stamp_ns: int, frame: str) -> Any:
+    """An empty `PointCloud2`."""
+    return make.t["sensor_msgs/msg/PointCloud2"](
+        header=make.header(stamp_ns, frame), height=1, width=0, fields=[], is_bigendian=False, point_step=12, row_step=0,
+        data=np.zeros(0, np.uint8), is_dense=True,
+    )  # fmt: skip
+
+
+def aerial_of(tmp_path: Path, items: list[Item], make: Messages) -> tuple[Inspection, str, AerialConfig]:
+    """Inspection, draft, and its aerial block."""
+    found = inspect_bag(write_bag(tmp_path / "run", make, sorted(items, key=lambda item: item[1]), "mcap"))
+    text = draft_config(found)
+    (tmp_path / "vessel.yaml").write_text(text)
+    aerial = load_config(tmp_path / "vessel.yaml", factors.KINDS).sensors["aerial"]
+    assert isinstance(aerial, AerialConfig)
+    return found, text, aerial
+
+
+def test_clouds_that_are_no_scans_of_their_own_are_left_out(tmp_path: Path) -> None:
+    """What was made of a scan counts it twice; what a program placed in the world is in no LiDAR's axes."""
+    make, drafted = Messages(2), {"/bow": "bow", "/stern/points": "stern", "/left": "base_link", "/right": "base_link"}
+    others = {
+        "/bow/filtered": "bow",
+        "/stern/points_raw": "stern",
+        "/cloud_registered": "camera_init",
+        "/camera/depth/points": "d",
+    }
+    items = [(topic, START_NS + S, cloud(make, START_NS + S, frame)) for topic, frame in (drafted | others).items()]
+    found, text, aerial = aerial_of(tmp_path, [*drive(make, seconds=20), *items], make)
+    assert sorted(lidar.topic for lidar in aerial.lidars.values()) == ["/bow", "/left", "/right", "/stern/points"]
+    assert "# /bow/filtered: left out; in the same frame as /bow" in text
+    assert "# /cloud_registered: left out; in the frame 'camera_init'" in text
+    assert "# /camera/depth/points: left out; by its name of no LiDAR" in text
+    assert "/bow/filtered: 1 scans; left out" in render(found)
+
+
+@pytest.mark.parametrize(("rate_hz", "submap"), [(20, 1), (80, 8)])
+def test_clouds_that_are_parts_of_turns_are_put_together(rate_hz: int, submap: int, tmp_path: Path) -> None:
+    """A driver that publishes each packet: alone, they are 'a scan of water alone' or 'too few to match'."""
+    make = Messages(2)
+    stamps = [START_NS + k * S // rate_hz for k in range(20 * rate_hz)]
+    items = [*drive(make, seconds=20), *(("/points", t + 1, cloud(make, t, "mast")) for t in stamps)]
+    assert aerial_of(tmp_path, items, make)[2].submap == submap

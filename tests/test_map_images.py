@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 from numpy.typing import NDArray
+from pyproj import CRS
 
 from graphloc.config import AerialConfig
 from graphloc.errors import InputError
@@ -20,7 +21,7 @@ from graphloc.frontends.aerial.maps import Map
 from graphloc.frontends.aerial.scan import Outline
 from tests.mapfactory import BRIGHT, DARK, NEW_YORK, SWEDEN, Bytes, around, check, colours, drawn, framed, utm, write
 
-SEEN = Outline(*np.empty((8, 0)))
+SEEN = Outline(*np.empty((9, 0)))
 
 
 @pytest.mark.parametrize(
@@ -172,8 +173,27 @@ def test_images_without_a_place_say_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "world.pgw").write_text("\n".join(str(transform[k]) for k in (0, 3, 1, 4, 2, 5)))
     assert "gdal_translate -a_srs EPSG:<its code> world.png" in said(world)
     local = 'LOCAL_CS["site",UNIT["metre",1]]'
-    assert "its CRS cannot be used" in said(write(tmp_path / "local.tif", bands, crs=local, transform=transform))
+    assert "its CRS (site) is tied to no place on Earth" in said(
+        write(tmp_path / "local.tif", bands, crs=local, transform=transform)
+    )
     assert "not an image" in said(tmp_path / "absent.tif")
+
+
+def test_the_crs_may_lie_beside_a_world_file(tmp_path: Path) -> None:
+    """A .prj in ESRI's dialect, as agencies deliver it with .jgw: the image lies where its GeoTIFF does."""
+    transform, width, height = framed(32633, 0.5)
+    bands = colours(drawn(32633, transform, width, height))
+    whole = write(tmp_path / "whole.tif", bands, crs="EPSG:32633", transform=transform)
+    with pytest.warns(rasterio.errors.NotGeoreferencedWarning):
+        world = write(tmp_path / "world.png", bands, driver="PNG")
+    (tmp_path / "world.png.aux.xml").unlink(missing_ok=True)
+    corner = transform @ rasterio.Affine.translation(0.5, 0.5)  # a world file counts from the middle of a pixel
+    (tmp_path / "world.pgw").write_text("\n".join(str(corner[k]) for k in (0, 3, 1, 4, 2, 5)))
+    (tmp_path / "world.prj").write_text(CRS.from_epsg(32633).to_wkt("WKT1_ESRI"))
+    assert (around(world).pixels == around(whole).pixels).all()
+    (tmp_path / "world.prj").write_text("WGS 84, zone 33")
+    with pytest.raises(InputError, match="its CRS cannot be used"):
+        AerialImage(world, Datum(SWEDEN))
 
 
 def test_a_loose_tie_to_wgs_84_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -2,6 +2,7 @@
 """Detections that bags hold already: through bags of every kind, corners against a print whose corners are known."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ from graphloc.frontends._source import Bag
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.frontends.tags.listed import LISTS, ListedTag, read_list
 from tests.bagfactory import START_NS, Messages, still_run, write_bag
+from tests.tagimages import image, info
 
 CORNERS, POSES = "apriltag_msgs/msg/AprilTagDetectionArray", "apriltag_ros/msg/AprilTagDetectionArray"
 # As christianrauch/apriltag_msgs and AprilRobotics/apriltag_ros have them.
@@ -274,3 +276,65 @@ def test_a_draft_allows_for_the_edges_of_another_detector(tmp_path: Path) -> Non
     tags = load_config(tmp_path / "vessel.yaml", KINDS).sensors["tags"]
     assert isinstance(tags, AprilTagConfig)
     assert tags.edge_sigma_px == 0.3
+
+
+def test_a_draft_finds_the_camera_info_of_a_list(tmp_path: Path) -> None:
+    """It lies beside images; a list has it under any name: that with its frame, or of a single camera the only one.
+
+    A list beside the images that it was made of is left out: each tag would count twice.
+    """
+    make = maker(CORNERS)
+
+    def of(msg: Any, frame: str) -> Any:
+        return replace(msg, header=make.header(START_NS, frame))
+
+    def drafted(name: str, *some: tuple[str, Any]) -> str:
+        items = [*still_run(make), *((topic, START_NS, msg) for topic, msg in some)]
+        return draft_config(inspect_bag(write_bag(tmp_path / name, make, items)))
+
+    listed = ("/detections", of(listing(make, CORNERS, with_corners(make, np.eye(4, 2))), "/left"))
+    left, right = ("/left/info", of(info(make), "left")), ("/right/camera_info", of(info(make), "right"))
+    assert "info_topic: /left/info  # guess: the one of its frame" in drafted("frame", listed, right, left)
+    assert "info_topic: /right/camera_info  # guess: the only one" in drafted("one", listed, right)
+    assert "info_topic: ''  # guess" in drafted("none", listed)
+    shot = ("/left/image_raw", of(image(make, np.zeros((8, 8), np.uint8)), "left"))
+    both = drafted("both", listed, left, right, shot)
+    assert "  # /detections: left out; the same camera as /left/image_raw" in both
+    assert "edge_sigma_px" not in both
+    (tmp_path / "vessel.yaml").write_text(both)
+    tags = load_config(tmp_path / "vessel.yaml", KINDS).sensors["tags"]
+    assert isinstance(tags, AprilTagConfig)
+    assert [(c.topic, c.info_topic) for c in tags.cameras.values()] == [("/left/image_raw", "/left/info")]
+    two = drafted("two", listed, right, ("/right/image_raw", of(shot[1], "right")))
+    assert "info_topic: ''  # guess" in two  # it is the other camera's
+
+
+def test_a_draft_finds_the_optical_frame_of_a_camera_link(tmp_path: Path) -> None:
+    """Drivers stamp images with a frame that has x ahead and z up: as an optical frame it would look at the sky.
+
+    Here it is turned 90 deg to port and 10 deg down: (1, 0, 0) of the link, z of the optical frame, is (0, cos, -sin) in body.
+    """
+    make = maker(CORNERS)
+    q = Rotation.from_euler("ZYX", [90.0, 10.0, 0.0], degrees=True)
+    for name, turn in (("link", q), ("optical", q * Rotation.from_euler("ZYX", [-90.0, 0.0, -90.0], degrees=True))):
+        static = make.transforms([("base_link", "camera", (1.0, 2.0, 3.0), turn.as_quat().tolist())])
+        items = [
+            ("/tf_static", START_NS, static),
+            *((t, START_NS, m(make)) for t, m in (("/c/camera_info", info), ("/c/image", blank))),
+        ]
+        (tmp_path / f"{name}.yaml").write_text(
+            draft_config(inspect_bag(write_bag(tmp_path / name, make, [*items, *still_run(make)])))
+        )
+        tags = load_config(tmp_path / f"{name}.yaml", KINDS).sensors["tags"]
+        assert isinstance(tags, AprilTagConfig)
+        mount = tags.cameras["camera"].mount
+        assert mount.tf_frame == ("camera" if name == "optical" else None)
+        if name == "link":
+            np.testing.assert_allclose(mount.t_body_sensor_m, [1.0, 2.0, 3.0])
+            ahead = [0.0, np.cos(np.radians(10.0)), -np.sin(np.radians(10.0))]
+            np.testing.assert_allclose(mount.R_body_sensor[:, 2], ahead, atol=1e-9)
+            np.testing.assert_allclose(mount.R_body_sensor[:, 0], [1.0, 0.0, 0.0], atol=1e-9)  # to the right of it
+
+
+def blank(make: Messages) -> Any:
+    return image(make, np.zeros((8, 8), np.uint8))

@@ -342,6 +342,19 @@ def test_a_tag_that_misleads_the_run_is_named() -> None:
     assert docked.number("position_p95_0_to_5_m") < 0.12
 
 
+def test_tags_that_face_the_other_way_in_the_survey_are_named() -> None:
+    """`facing_deg` as the direction in which one looks at them: their sightings were laid to a camera that looks elsewhere."""
+
+    def turned(tag: TagConfig) -> TagConfig:
+        assert tag.rpy_deg is not None
+        roll, pitch, yaw = tag.rpy_deg
+        return tag.model_copy(update={"rpy_deg": (roll, pitch, yaw + 180.0)})
+
+    said = dock(tag=turned, lasts_s=40.0).said
+    assert "tag 226, tag 227, tag 228: by the fixes they are seen from behind" in said
+    assert "elsewhere than its mount says" not in said
+
+
 def test_one_tag_of_another_size_is_named() -> None:
     """0.162 m, the default of a well-known example, where 0.412 m hangs; one id in two families is two tags.
 

@@ -260,6 +260,21 @@ def test_the_ledger_adds_up(tmp_path: Path) -> None:
     assert [m.stamp_ns for m in recording.measurements] == sorted(m.stamp_ns for m in recording.measurements)
 
 
+def test_images_that_cannot_be_used_are_no_tags_that_are_missing(tmp_path: Path) -> None:
+    """Of another size than their CameraInfo's, ids and family are not what to check; without a tag they are."""
+    make, shown = Messages(2), picture((7, MIDDLE))
+    plain = np.full((HEIGHT, WIDTH), 90, dtype=np.uint8)
+    none = "tags: none of 2 images or detection messages shows a tag of the survey: "
+    for name, pixels, why in (
+        ("cut", shown[:100], "the reason follows"),
+        ("plain", plain, "check ids and family there"),
+    ):
+        (tmp_path / name).mkdir()
+        msgs = [(INFO, info(make)), *((IMAGE, image(make, pixels, START_NS + k * S)) for k in (1, 2))]
+        recording, _ = recorded(tmp_path / name, make, tags(), *msgs)
+        assert [line for line in recording.warnings if line.startswith(none)] == [f"{none}{why}"]
+
+
 @pytest.mark.parametrize(("misread", "warned"), [(1, False), (2, False), (3, True), (4, True)])
 def test_a_limit_that_refuses_is_reported_where_it_refuses_most(tmp_path: Path, misread: int, warned: bool) -> None:
     """Of four lists with a tag, and two without: that a tag is misread now and then is what the limit is there for."""

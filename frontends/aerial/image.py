@@ -32,6 +32,7 @@ Mask = NDArray[np.bool_]
 _NET_M = 8.0
 _LOOSE_M = 1.5  # a tie to WGS 84 that is less sure than that is worth a word; those of ETRS 89 say 1 m
 _SAMPLES, _SAMPLE_PX = 8, 128
+_WKT_CHARS = 100_000
 _PALETTE_PX = 300_000_000  # read at once of an image with a palette, which cannot be read coarser
 
 log = logging.getLogger(__name__)
@@ -60,7 +61,7 @@ class Patch:
 class AerialImage:
     """A georeferenced image.
 
-    - A file that GDAL reads: GeoTIFF, JPEG 2000, VRT, PNG with world file and CRS, ..., of any CRS, rotated or not.
+    - A file that GDAL reads: GeoTIFF, JPEG 2000, VRT, PNG with world file and CRS (.prj), ..., of any CRS, rotated or not.
     - An MBTiles file with jpg, png or webp tiles: its deepest zoom level.
     - A folder of tiles z/x/y.png, jpg or webp: its deepest zoom level, see `tiles.describe_tiles`.
 
@@ -88,19 +89,25 @@ class AerialImage:
         except rasterio.errors.RasterioError as error:
             raise InputError(f"{path}: not an image that GDAL can read ({_line(error)})") from None
         source = self._source
-        why_not = _why_not(source, path)
+        wkt = source.crs.to_wkt() if source.crs is not None else _beside(path)
+        why_not = _why_not(source, path, has_crs=bool(wkt))
         if why_not:
             raise InputError(f"{path}: {why_not}")
         lon, lat = datum.origin.longitude_deg, datum.origin.latitude_deg
         lon -= 360.0 if lon > 180.0 else 0.0  # a datum may say 190 deg, PROJ's areas may not
         try:
-            crs = CRS.from_wkt(source.crs.to_wkt())
+            crs = CRS.from_wkt(wkt)
             here = AreaOfInterest(lon, lat, lon, lat)  # which tie to WGS 84 is best depends on where
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # that a better tie needs a grid: said below
-                self._to_image = TransformerGroup(4326, crs, always_xy=True, area_of_interest=here).transformers[0]
-        except (ProjError, IndexError) as error:
+                ties = TransformerGroup(4326, crs, always_xy=True, area_of_interest=here).transformers
+        except ProjError as error:
             raise InputError(f"{path}: its CRS cannot be used ({_line(error)})") from None
+        if not ties:
+            raise InputError(
+                f"{path}: its CRS ({crs.name}) is tied to no place on Earth: gdal_translate -a_srs EPSG:<code>"
+            )
+        self._to_image = ties[0]
         if self._to_image.accuracy > _LOOSE_M:
             log.warning("%s: its CRS (%s) is tied to WGS 84 to %g m only", path, crs.name, self._to_image.accuracy)
         bands = {c: k for k, c in zip(source.indexes, source.colorinterp, strict=True)}
@@ -224,7 +231,15 @@ def _palette_of(source: Any) -> Pixels:
     return colours
 
 
-def _why_not(source: Any, path: Path) -> str:
+def _beside(path: Path) -> str:
+    """Return the CRS (WKT) in the .prj beside an image, where agencies put it with a world file; empty if there is none."""
+    try:
+        return path.with_suffix(".prj").read_text(encoding="utf-8")[:_WKT_CHARS]
+    except (OSError, ValueError):
+        return ""
+
+
+def _why_not(source: Any, path: Path, *, has_crs: bool) -> str:
     """Return why an image cannot be used, by its bands or georeference; empty if it can."""
     sizes = {n for shape in source.block_shapes for n in shape} if source.driver in ("MBTiles", "WMS") else set()
     if any(not 64 <= n <= 4096 for n in sizes):  # a tile of 1 kB may say that it has 30000 x 30000 pixels
@@ -233,7 +248,7 @@ def _why_not(source: Any, path: Path) -> str:
     if not kinds or any("complex" in k for k in kinds):
         return "no picture in it: name one raster layer, with gdal_translate, as GeoTIFF"
     placed = not source.transform.is_identity
-    if placed and source.crs is None:
+    if placed and not has_crs:
         return (
             f"has no CRS, only a transform (a world file?): gdal_translate -a_srs EPSG:<its code> {path.name} out.tif"
         )

@@ -45,6 +45,8 @@ class Outline:
         faces_m: (M, 2) cells of faces. line_rad: (M,) direction of the line through each. tall: (M,) 1 if higher than a boat,
             else 0. face_share: (M,) weight of each. shore_m: (K, 2) first objects behind water. to_land_rad: (K,) direction
             away from the sensor. shore_share: (K,) weight of each. water_m: (L, 2) points seen as free water.
+        columns_m: (J, 2) where anything rises out of the water. lowest_m: height over the waterline below which a twentieth of
+            the points lies; NaN of none.
     """
 
     faces_m: Array
@@ -55,6 +57,8 @@ class Outline:
     to_land_rad: Array
     shore_share: Array
     water_m: Array
+    columns_m: Array
+    lowest_m: float = float("nan")
 
     @property
     def evidence(self) -> float:
@@ -85,6 +89,8 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
         to_land_rad=to_land,
         shore_share=_lines(shore, 2.0 * _NEAR_M)[1],
         water_m=_free_water(shore, p[~dry]),
+        columns_m=cells,
+        lowest_m=float(np.quantile(p[:, 2], 0.05)) if len(p) else float("nan"),
     )
 
 

@@ -18,6 +18,7 @@ from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, decode_cloud
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn, outside
+from graphloc.frontends.aerial.own import Staying
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
 from graphloc.trajectory import Trajectory
 
@@ -57,7 +58,8 @@ def match_bag(
     """Match the scans of a bag around a track, at the configured interval, or only the one nearest to `at_ns`.
 
     Args:
-        folder: base of relative paths of maps. warn: is called with each damage of the bag.
+        folder: base of relative paths of maps. warn: is called with each damage of the bag, and of points that stay with the
+            vessel.
 
     Raises:
         InputError: no LiDAR, a missing topic, a mount without a chain of transforms, or an unusable map.
@@ -66,8 +68,15 @@ def match_bag(
         feed = ScanFeed(bag, config, body_frame)
         matcher = LiveMatcher(config, folder, datum, feed.mounts)
         if at_ns is None:
-            answers = (matcher.offer(turn, track, growing=False) for turn in feed)
-            yield from (answer for answer in answers if isinstance(answer, Matched))
+            staying = Staying(config.hull_m or (), (t for t, _ in feed.mounts.values()))
+            for turn in feed:
+                answer = matcher.offer(turn, track, growing=False)
+                if isinstance(answer, Matched):
+                    if answer.match is not None:
+                        staying.take(answer.match.found, answer.match.prior.pose[:2])
+                    yield answer
+            for line in staying.said():
+                warn(f"aerial: {line}")
         elif turns := _nearest(feed, config.submap, track, at_ns):
             yield matcher.match(turns, track)
         for line in bag.warnings:

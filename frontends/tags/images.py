@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 Grey = NDArray[np.uint8]
 _MOST_PIXELS = 100_000_000
-# Bytes of a pixel, and what makes it grey; None: it is.
+# Numbers of a pixel, and what makes it grey; None: it is. Those of 16 bits have 16 for 8 in their names.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
-    "mono8": (1, None), "8UC1": (1, None), "mono16": (2, None), "16UC1": (2, None),
+    "mono8": (1, None), "8UC1": (1, None),
     "rgb8": (3, cv2.COLOR_RGB2GRAY), "bgr8": (3, cv2.COLOR_BGR2GRAY), "8UC3": (3, cv2.COLOR_BGR2GRAY),
     "rgba8": (4, cv2.COLOR_RGBA2GRAY), "bgra8": (4, cv2.COLOR_BGRA2GRAY), "8UC4": (4, cv2.COLOR_BGRA2GRAY),
     # OpenCV names a Bayer pattern by its second row's second and third pixel, ROS by the first of all.
@@ -49,25 +49,31 @@ def _checked(width: int, height: int) -> None:
 
 def _raw(msg: Any) -> Grey:
     width, height, step = int(msg.width), int(msg.height), int(msg.step)
-    if msg.encoding not in _ENCODINGS:
+    deep = msg.encoding.startswith("16") or msg.encoding.endswith("16")
+    shallow = msg.encoding.replace("16", "8") if deep else msg.encoding
+    if shallow not in _ENCODINGS:
         raise ValueError(f"encoding {msg.encoding!r} is not known")
     _checked(width, height)
-    size, to_grey = _ENCODINGS[msg.encoding]
+    numbers, to_grey = _ENCODINGS[shallow]
+    size = numbers * (2 if deep else 1)
     if step < width * size:
         raise ValueError(f"step {step} is less than {width} pixels of {msg.encoding}")
     data = np.asarray(msg.data, dtype=np.uint8)
     if data.size < height * step:
         raise ValueError(f"{data.size} bytes of data where {height} rows of {step} were announced")
     rows = data[: height * step].reshape(height, step)[:, : width * size]
-    if msg.encoding in ("mono16", "16UC1"):
-        deep = np.ascontiguousarray(rows).view(">u2" if msg.is_bigendian else "<u2")
-        return np.asarray(
-            cv2.convertScaleAbs(deep.astype(np.float32), alpha=255.0 / max(int(deep.max()), 255)), dtype=np.uint8
-        )
-    pixels = np.ascontiguousarray(rows if size == 1 else rows.reshape(height, width, size))
+    if deep:
+        rows = _eight_bits(np.ascontiguousarray(rows).view(">u2" if msg.is_bigendian else "<u2"))
+    pixels = np.ascontiguousarray(rows if numbers == 1 else rows.reshape(height, width, numbers))
     if to_grey is None:
         return pixels
     return np.asarray(cv2.cvtColor(pixels, to_grey), dtype=np.uint8)
+
+
+def _eight_bits(pixels: NDArray[np.uint16]) -> Grey:
+    """Return pixels scaled to the brightest: cameras of 10 to 14 bits leave the upper ones empty."""
+    scale = 255.0 / max(int(pixels.max()), 255)
+    return np.asarray(cv2.convertScaleAbs(pixels.astype(np.float32), alpha=scale), dtype=np.uint8)
 
 
 def _compressed(data: Grey) -> Grey:
@@ -81,12 +87,12 @@ def _compressed(data: Grey) -> Grey:
     else:
         raise ValueError("compressed data is neither JPEG nor PNG")
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         pixels = None
     if pixels is None:
         raise ValueError("compressed data cannot be decoded")
-    return np.asarray(pixels, dtype=np.uint8)
+    return _eight_bits(pixels.astype(np.uint16)) if pixels.dtype == np.uint16 else np.asarray(pixels, dtype=np.uint8)
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:

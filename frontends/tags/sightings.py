@@ -142,6 +142,11 @@ def camera_info_topic(topic: str) -> str:
     return f"{topic.removesuffix('/compressed').rsplit('/', 1)[0]}/camera_info"
 
 
+def is_rectified(topic: str) -> bool:
+    """Return whether a topic of images has distortion removed, by its name (`image_rect`, `image_rect_color`)."""
+    return "rect" in topic.removesuffix("/compressed").rsplit("/", 1)[-1]
+
+
 def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callable[[str], None]) -> CameraModel | None:
     """Return the camera's calibration, from the first message of its CameraInfo in the whole bag."""
     topic = config.info_topic
@@ -155,7 +160,7 @@ def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callabl
         raise InputError(f"{where}: there is none; set `info_topic`; such topics: {', '.join(fitting) or 'none'}")
     rectified = config.rectified
     if rectified is None:
-        rectified = listed or "rect" in config.topic.removesuffix("/compressed").rsplit("/", 1)[-1]
+        rectified = listed or is_rectified(config.topic)
     first: Any = None
     for raw in bag.messages({topic}, whole=True):
         try:
@@ -297,4 +302,4 @@ def _in_survey(tags: Sequence[TagConfig], number: int, family: str) -> TagConfig
     return fitting[0] if len(fitting) == 1 else None
 
 
-__all__ = ["IMAGES", "INFO", "Seen", "camera_info_topic", "sightings_of_bag"]
+__all__ = ["IMAGES", "INFO", "Seen", "camera_info_topic", "is_rectified", "sightings_of_bag"]

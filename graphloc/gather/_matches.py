@@ -16,6 +16,8 @@ from graphloc.gather._gathering import Gathering
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 
+_MISLED = 0.25
+
 
 @dataclass(frozen=True, slots=True)
 class Scans:
@@ -44,22 +46,27 @@ def with_matches(
     for name, sensor in config.of_kind("aerial").items():
         gathered.sensor(name, dict.fromkeys((lidar.topic for lidar in sensor.lidars.values()), f"read by {name}"))
         found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=gathered.said.append)
+        matched = 0
         for item in found:
             if item.match is not None and gallery is not None:
                 gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
             if item.match is not None and item.match.modes:
+                matched += 1
                 gathered.take(item.match.fix(item.stamp_ns, name, item.news, sensor.axes))
             else:
                 gathered.refuse(name, item.stamp_ns, item.why_not)
             progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)
         progress("matching", span_s, span_s)
-        gathered.said += _few_matches(name, gathered.refused(name))
+        gathered.said += few_matches(name, gathered.refused(name), matched)
     return gathered.recording()
 
 
-def _few_matches(sensor: str, reasons: Counter[str]) -> list[str]:
-    """Say so where most scans of a sensor gave no match."""
+def few_matches(sensor: str, reasons: Counter[str], matched: int) -> list[str]:
+    """Say so where scans of a sensor gave no match; where most did not, what hinders them may have misled the others."""
     if reasons.total() < 5:
         return []
     ((most, count),) = reasons.most_common(1)
-    return [f"{sensor}: {reasons.total()} scans gave no match, {count} of them: {most}; `graphloc match` shows one"]
+    others = f"; the {matched} others may well be false" if 0 < matched < _MISLED * reasons.total() else ""
+    return [
+        f"{sensor}: {reasons.total()} scans gave no match, {count} of them: {most}; `graphloc match` shows one{others}"
+    ]

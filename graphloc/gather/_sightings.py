@@ -67,7 +67,8 @@ def with_sightings(recording: Recording, config: VesselConfig, bags: Bags, progr
         gathered.sensor(name, dict.fromkeys(infos, f"read by {name} for its lens") | dict.fromkeys(cameras, read))
         if total and without == total:
             gathered.said.append(
-                f"{name}: none of {total} images or detection messages shows a tag of the survey: check ids and family there"
+                f"{name}: none of {total} images or detection messages shows a tag of the survey: "
+                + ("the reason follows" if reasons and not shown["tags"] else "check ids and family there")
             )
         if shown["doubtful"] > _DOUBTFUL * shown["tags"]:  # else a limit does what it is there for
             gathered.said.append(
