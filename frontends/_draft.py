@@ -467,6 +467,7 @@ def _beside(odometry: tuple[OdometryReport, ...]) -> list[str]:
     for k, item in enumerate(sorted(truths, key=lambda o: o.origin is None)):
         off = "# " if k or item.origin is None else ""
         lines.append(f"{off}truth_topic: {item.topic}  # guess: {item.why}; {item.world}; for comparison, never fused")
-    for k, item in enumerate(o for o in odometry if o.role == "check_speed"):
+    speeds = [o for o in odometry if o.role == "check_speed"]
+    for k, item in enumerate(sorted(speeds, key=lambda o: filtered(o.topic))):
         lines.append(f"{'# ' if k else ''}check_speed_topic: {item.topic}  # guess: {item.why}; compared, never fused")
     return lines

@@ -214,6 +214,18 @@ def test_odometry_in_east_and_north_is_no_speed_along_the_craft(tmp_path: Path) 
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
 
 
+def test_wheels_check_the_speed_rather_than_a_filter_that_had_the_fixes(tmp_path: Path) -> None:
+    """`/ekf/odometry_map` comes before `/wheel/odom` by its name, and was said to look like wheel odometry."""
+    make = Messages(2)
+    items = drive(make)
+    items += [("/ekf/odometry_map", at, m) for topic, at, m in items if topic == "/wheel/odom"]
+    found, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.check_speed_topic == "/wheel/odom"
+    why = {item.topic: item.why for item in found.odometry}
+    assert "looks like wheel odometry" in why["/wheel/odom"]
+    assert "a filter's output" in why["/ekf/odometry_map"]
+
+
 @pytest.mark.parametrize(("noise_deg", "both"), [(0.0, False), (1.0, True)], ids=["the same", "another device"])
 def test_a_heading_that_is_reported_twice_counts_once(noise_deg: float, both: bool, tmp_path: Path) -> None:
     """MAVROS says its heading in `imu/data` and, clockwise from north and without a stamp, in `compass_hdg`."""
@@ -229,6 +241,24 @@ def test_a_heading_that_is_reported_twice_counts_once(noise_deg: float, both: bo
     used = {s.topic for s in config.of_kind("compass").values() if s.enabled}
     assert used == {"/compass", "/attitude", *(["/hdg"] if both else [])}
     assert ("it repeats /attitude" in text) is not both
+
+
+@pytest.mark.parametrize("late_s", [0.07, 0.3])
+def test_a_heading_that_is_reported_twice_counts_once_however_late(late_s: float, tmp_path: Path) -> None:
+    """`compass_hdg` has no stamp, and its recording time is late: in a turn it seemed another device's by some degrees."""
+    make = Messages(2)
+    rng = np.random.default_rng(1)
+    items: list[Item] = []
+    for item in drive(make, seconds=60):
+        items.append(item)
+        if item[0] == "/compass":
+            q = item[2].quaternion
+            heading = float(np.degrees(2.0 * np.arctan2(q.z, q.w)) % 360.0)  # of `drive`: clockwise from north
+            at = item[1] + round((late_s + 0.004 * abs(rng.normal())) * S)
+            items.append(("/hdg", at, make.t["std_msgs/msg/Float64"](data=heading)))
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert {s.topic for s in config.of_kind("compass").values() if s.enabled} == {"/compass"}
+    assert "it repeats /compass" in text
 
 
 def test_a_covariance_that_is_a_placeholder_is_told_from_one(tmp_path: Path) -> None:
