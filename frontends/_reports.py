@@ -153,6 +153,8 @@ class CompassReport:
         like: an orientation that says the same, of the same device, else ''.
         wander_deg: how far its error wanders beside the gyroscope, 1 sigma for a minute; None where that does not tell.
         two_antennas: whether a GNSS receiver says it, by its sentence, its topic, or as an Imu with an orientation alone.
+        late_s: what should be added to its stamps by the gyroscope, s, and 1 sigma; None where that does not tell. What is said above is
+            of corrected stamps.
     """
 
     topic: str
@@ -168,6 +170,7 @@ class CompassReport:
     leeway_deg: float | None = None
     wander_deg: float | None = None
     two_antennas: bool = False
+    late_s: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -291,9 +291,25 @@ def _compass_reports(bag: _Contents, imus: Sequence[ImuReport], courses: Courses
     """Report every orientation that may be a heading; see `_without_echoes` for their order."""
     turning = turning_of(bag.aligned[imus[0].topic], imus[0], bag.tree, bag.tree.body()) if imus else None
     candidates = bag.of_type(QUATERNION, IMU, *NUMBERS)
-    found = _without_echoes([(r, s) for s in candidates if (r := compass_report(s, courses, turning))])
+    found = _without_echoes([pair for s in candidates if (pair := _timed_compass(s, courses, turning))])
     best = (imus[0], bag.aligned[imus[0].topic]) if imus else None
-    return tuple(_beside_gyro(_timed(r, s, bag.streams[s.topic], turning), s, best) for r, s in found)
+    return tuple(_beside_gyro(report, stream, best) for report, stream in found)
+
+
+def _timed_compass(
+    stream: TopicData, courses: Courses | None, turning: Turning | None
+) -> tuple[CompassReport, TopicData] | None:
+    """Report an orientation, its stamps corrected by what the gyroscope shows, and return it so; None where it is no heading."""
+    report = compass_report(stream, courses, turning)
+    if report is None or turning is None or not report.usable:
+        return None if report is None else (report, stream)
+    stamps, angle = headings(stream)
+    late_s = heading_time_offset(turning, stamps, angle if report.convention == "enu" else -angle)
+    if late_s is None:
+        return report, stream
+    timed = stream.later(round(late_s[0] * NS_PER_S))
+    again = compass_report(timed, courses, turning)
+    return (report, stream) if again is None or not again.usable else (replace(again, late_s=late_s), timed)
 
 
 def _steps(bag: _Contents) -> list[str]:
@@ -339,19 +355,6 @@ def _without_echoes(compasses: Sequence[tuple[CompassReport, TopicData]]) -> lis
             distinct += [(report, stream)] if report.usable else []
         found.append((report, stream))
     return found
-
-
-def _timed(report: CompassReport, stream: TopicData, recorded: TopicData, turning: Turning | None) -> CompassReport:
-    """Add the time offset that the gyroscope shows, relative to the stamps as recorded."""
-    if turning is None or not report.usable:
-        return report
-    stamps, angle = headings(stream)
-    found = heading_time_offset(turning, stamps, angle if report.convention == "enu" else -angle)
-    if found is None:
-        return report
-    value, sigma = found
-    value += float(stream.stamps_ns[0] - recorded.stamps_ns[0]) / NS_PER_S
-    return replace(report, why=f"{report.why}; by the gyro, time_offset_s should be {value:.3f} +- {sigma:.3f}")
 
 
 def _beside_gyro(report: CompassReport, stream: TopicData, best: tuple[ImuReport, TopicData] | None) -> CompassReport:

@@ -261,6 +261,34 @@ def test_a_heading_that_is_reported_twice_counts_once_however_late(late_s: float
     assert "it repeats /compass" in text
 
 
+@pytest.mark.parametrize("late_s", [0.4, 1.0])
+@pytest.mark.parametrize("own_clock_s", [0.0, 3600.0], ids=["one clock", "a clock of its own"])
+def test_a_late_compass_is_drafted_with_its_time_offset(late_s: float, own_clock_s: float, tmp_path: Path) -> None:
+    """It was said in a comment only, and as drafted the heading was wrong by what the craft turned meanwhile."""
+    make = Messages(2)
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 90.0, 0.02)
+    rate = 0.25 * np.sin(0.5 * t) + 0.15 * np.sin(1.3 * t)
+    yaw = np.concatenate([[0.0], np.cumsum(rate[:-1]) * 0.02])
+    way = np.cumsum(3.0 * np.exp(1j * yaw)) * 0.02
+    lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0 * t]))
+    items: list[Item] = []
+    for k in range(len(t)):
+        at = START_NS + k * S // 50
+        items.append(("/imu", at, make.imu(at, (0.0, 3.0 * rate[k], G), (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
+        if k % 10 == 0:
+            half = 0.5 * (yaw[k] + np.radians(0.5) * rng.normal())
+            late = at + round(late_s * S)
+            compass = make.compass(late - round(own_clock_s * S), (0.0, 0.0, np.sin(half), np.cos(half)))
+            items += [("/fix", at, make.fix(at, *lla[k])), ("/compass", late, compass)]
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    compass = config.sensors["compass"]
+    assert compass.time_offset_s == pytest.approx(own_clock_s - late_s, abs=0.02)
+    assert "its turns fit the gyro's" in text
+    # Late, it seemed to wander by degrees.
+    assert compass.wander_sigma_deg == CompassConfig().wander_sigma_deg
+
+
 def test_a_covariance_that_is_a_placeholder_is_told_from_one(tmp_path: Path) -> None:
     """Drivers that know none write 99999 m^2: such fixes would tell next to nothing."""
     _, config, _ = look(tmp_path, drive(Messages(2), status=0, sigma_m=316.0), Messages(2))
