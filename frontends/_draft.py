@@ -243,10 +243,14 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3) if wanders else None
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
         keys = [*([f"vertical_sigma_m: {vertical:.1f}"] if vertical else []), *_wandering(gnss)]
+        apart = ""
+        if gnss.differs and not any(key.startswith("horizontal") for key in keys):
+            keys = [f"horizontal_sigma_m: {gnss.apart_m:.1f}", *keys]
+            apart = f"; so far it and {gnss.apart_from} wander against each other"
         more = ", ".join(keys)
         fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
         wander = f"; by the wheels it changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s" if _wandering(gnss) else ""
-        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{wander}{fixed}")
+        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{wander}{apart}{fixed}")
     return lines
 
 

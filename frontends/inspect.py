@@ -31,6 +31,7 @@ from graphloc.frontends._assess import (
 )
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
 from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turning_of
+from graphloc.frontends._assess_receivers import apart_m, apart_warning, height_wanders_m
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_wander import wander_m
 from graphloc.frontends._assess_world import in_map_grid, world_of
@@ -100,6 +101,7 @@ _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MOST_TRIED = 200  # messages of a topic that cannot be decoded
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
 _MOST_NAMED = 6
+_SAME_M = 0.05  # by which two topics of one receiver wander against each other at most
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _FEWEST = 20  # places of a track
 # Of the run, from which a receiver is there throughout; of the fixes, from which it says as much as another.
@@ -200,6 +202,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         warnings=(
             *bag.warnings,
             *(said for report in gnss for said in (report.stored, report.frozen) if said),
+            *(apart_warning(report) for report in gnss[:1] if report.differs),
             *_steps(bag),
             *unused_topics(list(bag.streams.values()), used),
             *_lacking(bag, imus, gnss, reports),
@@ -243,27 +246,47 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     """Report the receivers, the best one first."""
     found = [r for s in bag.of_type(*_FIXES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
     longest_s = max((r.spans_s for r in found), default=0.0)
-    rivals = (r for r in found if r.spans_s >= _COVERS * longest_s and not filtered(r.topic))
+    rivals = [r for r in found if r.spans_s >= _COVERS * longest_s and not filtered(r.topic)]
     most = max((r.fixes for r in rivals), default=0)
+    level_m = min((m for r in rivals if (m := height_wanders_m(r)) is not None), default=0.0)
     found.sort(
         key=lambda r: (
             filtered(r.topic),
             r.spans_s < _COVERS * longest_s,
             r.slow_error,
-            _octave(r),
+            _octave(r, level_m if r in rivals else math.inf),
             r.fixes < _COVERS * most,
             r.without_height == r.fixes,
             -r.fixes,
             r.without_height,
         )
     )
-    return found
+    return [_beside_others(report, rivals, bag) for report in found]
 
 
-def _octave(gnss: GnssReport) -> int:
-    """Return how large the fixes' error is by what they claim, or scatter by, in powers of two: closer ones are taken for equal."""
+def _octave(gnss: GnssReport, level_m: float) -> int:
+    """Return how large the fixes' error is by what they claim, or scatter or drift by, in powers of two: closer ones are taken for equal.
+
+    Args:
+        level_m: by how much the heights of that receiver wander whose heights wander least, 1 sigma. All ride on one craft: what others
+            wander by beyond it is their drift, and the horizontal one is half of the vertical.
+    """
     claimed = gnss.reported_sigma_m[:2] if gnss.reported_sigma_m else (GnssConfig().default_horizontal_sigma_m,)
-    return round(math.log2(max(*claimed, *(gnss.scatter_m or ())[:2], 1e-3)))
+    drift_m = 0.5 * math.sqrt(max((height_wanders_m(gnss) or 0.0) ** 2 - level_m**2, 0.0))
+    return round(math.log2(max(*claimed, *(gnss.scatter_m or ())[:2], drift_m, 1e-3)))
+
+
+def _beside_others(gnss: GnssReport, rivals: Sequence[GnssReport], bag: _Contents) -> GnssReport:
+    """Return the report with by how much it and the other receiver that it agrees with best wander against each other."""
+    apart = {
+        other.topic: m
+        for other in rivals
+        if other.topic != gnss.topic
+        and (m := apart_m(gnss, other, bag.aligned[gnss.topic], bag.aligned[other.topic])) is not None
+        and m > _SAME_M
+    }
+    nearest = min(apart, key=lambda topic: apart[topic], default="")
+    return replace(gnss, apart_m=apart[nearest], apart_from=nearest) if nearest else gnss
 
 
 def _odometry_reports(

@@ -289,6 +289,59 @@ def test_a_late_compass_is_drafted_with_its_time_offset(late_s: float, own_clock
     assert compass.wander_sigma_deg == CompassConfig().wander_sigma_deg
 
 
+def two_receivers(
+    make: Messages, error_m: Callable[[Array, Array], Array], *, claims_m: float, height: bool
+) -> list[Item]:
+    """`drive` with fixes that scatter by 0.3 m and claim 1 m, and another receiver's, off by `error_m`, (N, 3) of times and yaws (N,)."""
+    items, rng = drive(make, status=0, sigma_m=1.0, seconds=120, noise_m=0.3), np.random.default_rng(4)
+    fixes = [(at, m) for topic, at, m in items if topic == "/fix"]
+    yaw = np.pi / 2.0 - np.array(
+        [2.0 * np.arctan2(m.quaternion.z, m.quaternion.w) for t, _, m in items if t == "/compass"]
+    )
+    t = np.array([(at - START_NS) / S for at, _ in fixes])
+    places = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for _, m in fixes]).T)
+    lla = DATUM.geodetic_from_enu(places + error_m(t, yaw) + 0.3 * rng.normal(size=places.shape))
+    for (at, _), (lat, lon, up) in zip(fixes, lla, strict=True):
+        cov = (claims_m**2 * np.eye(3)).ravel()
+        items.append(("/cheap/fix", at, make.fix(at, lat, lon, up if height else np.nan, 0, cov)))
+    return sorted(items, key=lambda item: item[1])
+
+
+def drift(t: Array, _yaw: Array) -> Array:
+    """Of 4 m, 1 sigma of a horizontal axis, that changes within 20 s; 8 m in height."""
+    rng, keep = np.random.default_rng(6), np.exp(-float(t[1] - t[0]) / 20.0)
+    error = np.zeros((len(t), 3))
+    for k in range(1, len(t)):
+        error[k] = keep * error[k - 1] + np.sqrt(1.0 - keep**2) * rng.normal(size=3)
+    return np.asarray(error / error.std(axis=0) * [4.0, 4.0, 8.0])
+
+
+def test_of_two_receivers_the_one_whose_height_drifts_is_not_used(tmp_path: Path) -> None:
+    """It claimed half of what the other did, was used, and its drift of 4 m went into the track without a word."""
+    make = Messages(2)
+    _, config, _ = look(tmp_path, two_receivers(make, drift, claims_m=0.5, height=True), make)
+    assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
+
+
+def test_what_two_receivers_differ_by_is_in_the_slow_error(tmp_path: Path) -> None:
+    """Without its height nothing tells which of the two drifts."""
+    make = Messages(2)
+    found, config, _ = look(tmp_path, two_receivers(make, drift, claims_m=0.5, height=False), make)
+    (used,) = [s for s in config.of_kind("gnss").values() if s.enabled]
+    assert used.topic == "/cheap/fix"
+    assert used.slow_error.horizontal_sigma_m == pytest.approx(4.0, rel=0.35)
+    assert any("wander against each other" in line for line in found.warnings)
+
+
+def test_two_antennas_on_a_ship_do_not_wander_against_each_other(tmp_path: Path) -> None:
+    """30 m apart, the way from one to the other turns with her."""
+    make = Messages(2)
+    antenna = lambda _t, yaw: 30.0 * np.column_stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw])
+    found, config, _ = look(tmp_path, two_receivers(make, antenna, claims_m=1.0, height=True), make)
+    assert not any("wander against each other" in line for line in found.warnings)
+    assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
+
+
 def test_a_covariance_that_is_a_placeholder_is_told_from_one(tmp_path: Path) -> None:
     """Drivers that know none write 99999 m^2: such fixes would tell next to nothing."""
     _, config, _ = look(tmp_path, drive(Messages(2), status=0, sigma_m=316.0), Messages(2))
