@@ -203,7 +203,9 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
         lines.append(f"  mount: {{tf_frame: {json.dumps(mount.tf_frame)}}}  # {mount.evidence}")
     else:
         rpy = ", ".join(f"{a:.1f}" for a in mount.rpy_deg)
-        lines.append(f"  mount: {{xyz_m: [0.0, 0.0, 0.0], rpy_deg: [{rpy}]}}  # guess: {mount.evidence}; xyz unknown")
+        xyz = ", ".join(f"{a:.3f}" for a in mount.xyz_m) if mount.xyz_m else "0.0, 0.0, 0.0"
+        whose = "xyz as there" if mount.xyz_m else "xyz unknown"
+        lines.append(f"  mount: {{xyz_m: [{xyz}], rpy_deg: [{rpy}]}}  # guess: {mount.evidence}; {whose}")
     lines += _noise_lines(imu)
     return lines
 

@@ -67,11 +67,12 @@ class TopicReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MountGuess:
-    """Rotation of a sensor in body, deg, or the frame of /tf_static that knows it; and the evidence."""
+    """Rotation of a sensor in body, deg, or the frame of /tf_static that knows it; and the evidence. `xyz_m`: its place, where known."""
 
     rpy_deg: Vec
     tf_frame: str | None
     evidence: str
+    xyz_m: Vec | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,7 +16,7 @@ from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import Inspection, render
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag import KINDS
-from tests.test_inspect import DATUM, G, drive, look, rotation_z
+from tests.test_inspect import DATUM, ROLL_90, G, drive, look, rotation_z
 
 WAVE_S, WAVE_RAD = 3.0, 0.03
 
@@ -78,13 +78,30 @@ def test_an_imu_that_sits_askew_is_not_taken_for_straight(tmp_path: Path) -> Non
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 40.0), abs=2.0)
 
 
-def test_a_mount_in_tf_static_that_the_motion_denies_is_reported(tmp_path: Path) -> None:
+@pytest.mark.parametrize("yaw_deg", [40.0, 180.0])
+def test_a_mount_in_tf_static_that_the_motion_denies_is_reported(yaw_deg: float, tmp_path: Path) -> None:
     make = Messages(2)
     transforms = make.transforms([("base_link", "imu_link", (0, 0, 0), (0, 0, 0, 1))])
-    items = [("/tf_static", START_NS, transforms), *drive(make, rotation_z(90.0))]
+    items = [("/tf_static", START_NS, transforms), *drive(make, rotation_z(yaw_deg))]
     found, _, text = look(tmp_path, items, make)
     assert found.imus[0].mount.tf_frame == "imu_link"
-    assert "but what it feels fits how /wheel/odom moves only turned by +9" in text
+    assert "but what it feels fits how /wheel/odom moves only turned by " in text
+
+
+AXES = {"a quarter turn": rotation_z(90.0), "upside down": np.diag([1.0, -1.0, -1.0]), "on its side": ROLL_90}
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_axes_that_tf_static_does_not_know_are_drafted_as_measured(axes: str, tmp_path: Path) -> None:
+    """A driver that publishes in axes of its own, under the frame of the URDF: as drafted, the heading was off by a quarter turn."""
+    make = Messages(2)
+    transforms = make.transforms([("base_link", "imu_link", (0.3, 0.1, 0.4), (0, 0, 0, 1))])
+    _, config, text = look(tmp_path, [("/tf_static", START_NS, transforms), *drive(make, AXES[axes])], make)
+    mount = config.sensors["imu"].mount
+    assert mount.tf_frame is None
+    np.testing.assert_allclose(mount.R_body_sensor, AXES[axes], atol=0.02)
+    assert mount.xyz_m == (0.3, 0.1, 0.4)
+    assert "guess: not as in /tf_static" in text
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 90.0])
