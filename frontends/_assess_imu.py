@@ -31,6 +31,7 @@ _UPSIDE_DOWN_DEG = 150.0
 _QUIET_S = 2
 # Off body z, from which gravity is said to be; about a quarter turn, by which it, or the motion, overrules /tf_static, and how coherent.
 _TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
+_SLIGHTLY_DEG = 3.0  # off a quarter turn, from which it is said
 _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, or an antenna far ahead, make less
 
 
@@ -140,7 +141,14 @@ def _mount_yaw(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[Meas
     quarter = 90.0 * round(found.yaw_deg / 90.0)
     askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
     yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter))))
-    return yaw, f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
+    said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
+    off_deg = abs(found.yaw_deg - quarter)
+    if not askew and off_deg > max(_SLIGHTLY_DEG, 4.0 * found.sigma_deg):
+        said += (
+            f", taken as {yaw:.0f}, since leeway makes a few degrees: on wheels set {found.yaw_deg:.0f}, or the heading is off by "
+            f"{off_deg:.0f} deg, which no bound includes"
+        )
+    return yaw, said
 
 
 def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning:

@@ -78,6 +78,15 @@ def test_an_imu_that_sits_askew_is_not_taken_for_straight(tmp_path: Path) -> Non
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 40.0), abs=2.0)
 
 
+@pytest.mark.parametrize(("yaw_deg", "said"), [(0.0, False), (-84.0, True)])
+def test_an_imu_that_sits_a_little_askew_is_said(yaw_deg: float, said: bool, tmp_path: Path) -> None:
+    """Drafted as a quarter turn, since leeway would look alike; nothing said that the heading is off by the rest."""
+    make = Messages(2)
+    _, config, text = look(tmp_path, drive(make, rotation_z(yaw_deg), seconds=90), make)
+    assert config.sensors["imu"].mount.rpy_deg[2] == pytest.approx(90.0 * round(yaw_deg / 90.0))
+    assert ("on wheels set -84, or the heading is off by 6 deg" in text) == said
+
+
 @pytest.mark.parametrize("yaw_deg", [40.0, 180.0])
 def test_a_mount_in_tf_static_that_the_motion_denies_is_reported(yaw_deg: float, tmp_path: Path) -> None:
     make = Messages(2)
