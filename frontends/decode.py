@@ -62,6 +62,7 @@ TF = "tf2_msgs/msg/TFMessage"
 NO_STAMP = "`stamps: recorded` of that sensor takes the recording time instead"
 
 _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
+_STATUS_UNKNOWN = -2
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # of NavSatStatus, by quality of GGA: differential, RTK
 _RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # horizontal, vertical, at a dilution of 1: fixed, float
@@ -155,8 +156,11 @@ def yaw_of_x_axis(x: float, y: float, z: float, w: float) -> float | Rejection:
 
 
 def nav_sat_status(status: int) -> int:
-    """Return the status of a NavSatFix or GPSFix as in NavSatFix: differential (18) and WAAS (33) become `sbas`."""
-    return 1 if status in (18, 33) else status
+    """Return the status of a NavSatFix or GPSFix as in NavSatFix: differential (18) and WAAS (33) become `sbas`.
+
+    -2 (`STATUS_UNKNOWN` of ROS 2 Jazzy, and there the default) is left by drivers that do not fill it in: a place is a fix.
+    """
+    return {18: 1, 33: 1, _STATUS_UNKNOWN: 0}.get(status, status)
 
 
 def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -> Decoded:
