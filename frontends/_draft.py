@@ -28,6 +28,7 @@ from graphloc.frontends._reports import (
     filtered,
     through_water,
 )
+from graphloc.frontends._streams import COURSE
 from graphloc.frontends._turns import WANDERS_DEG
 from graphloc.frontends.decode import IMU, VECTOR
 
@@ -178,7 +179,7 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
 
 def _topic_lines(topic: str) -> list[str]:
     """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
-    name, *sentence = topic.split(" ")[:2]
+    name, *sentence = topic.removesuffix(COURSE).split(" ")
     return [f"  topic: {name}", *(f"  nmea: [{', '.join(said.split('+'))}]" for said in sentence)]
 
 
