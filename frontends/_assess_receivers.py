@@ -65,5 +65,5 @@ def apart_warning(gnss: GnssReport) -> str:
     """Return a line on a receiver that differs from another one."""
     return (
         f"{gnss.topic} and {gnss.apart_from} wander against each other by {gnss.apart_m:.1f} m (1 sigma of an axis): one of them is worse "
-        "than it says; the draft's slow_error covers it; smooth with either one enabled, and the report's warnings tell which fits the IMU"
+        "than it says; the draft's slow_error covers it; compare runs with either one enabled"
     )
