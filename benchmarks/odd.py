@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 from _odd_bags import DATUM, START_NS, Change, Craft, Item, Odd, stamp, written
 from _rows import Row, row
+from _vessels import gauss_markov
 from pyproj import Transformer
+from scipy.spatial.transform import Rotation
 
 from graphloc import app
 from graphloc.errors import GraphlocError
@@ -144,6 +146,55 @@ def _second_receiver(craft: Craft, items: list[Item]) -> list[Item]:
     ]
 
 
+def _second_drifts(craft: Craft, items: list[Item]) -> list[Item]:
+    """A receiver that claims half of what the other does, and drifts by metres within a minute."""
+    t = craft.times(5.0, 0.06)
+    error = gauss_markov(craft.rng, t, 4.0, 40.0, 3) + 0.3 * craft.rng.normal(size=(len(t), 3))
+    places = DATUM.geodetic_from_enu(craft.motion.pose(t)[0] + error * [1.0, 1.0, 1.5])
+    cov = 0.25 * np.diag([1.0, 1.0, 4.0]).ravel()
+    return items + [
+        ("/gnss2/fix", log_ns, craft.make.fix(stamp(at), *place, 0, cov, 2, frame="gnss2"))
+        for log_ns, at, place in zip(craft.recorded(t), t, places, strict=True)
+    ]
+
+
+def _late_compass(late_s: float) -> Change:
+    """Headings that are stamped and recorded late."""
+
+    def change(craft: Craft, items: list[Item]) -> list[Item]:
+        late_ns, said = round(late_s * 1e9), []
+        for name, log_ns, m in items:
+            if name == "/compass":
+                m.header = craft.make.header(m.header.stamp.sec * 10**9 + m.header.stamp.nanosec + late_ns)
+            said.append((name, log_ns + late_ns * (name == "/compass"), m))
+        return said
+
+    return change
+
+
+def _mavros(craft: Craft, items: list[Item]) -> list[Item]:
+    """What MAVROS says of an autopilot: its IMU with an attitude, the heading again without a stamp, fixes and its filter's places."""
+    names = {"/imu/data": "/mavros/imu/data", "/gnss/fix": "/mavros/global_position/raw/fix"}
+    items = [(names.get(name, name), log_ns, m) for name, log_ns, m in items]
+    own = [m for name, _, m in items if name == "/mavros/imu/data"]
+    t = np.array([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec - START_NS for m in own]) * 1e-9
+    R = craft.motion.pose(t)[1]
+    off = np.radians(4.0 + gauss_markov(craft.rng, t, 1.5, 60.0, 1))
+    turned = Rotation.from_euler("z", off) * Rotation.from_matrix(R)
+    for m, q in zip(own, turned.as_quat(), strict=True):
+        m.orientation, m.orientation_covariance = craft.make.quat(q), np.eye(3).ravel()
+    at = craft.times(10.0, 0.03)
+    yaw = np.interp(at, t, np.unwrap(turned.as_euler("ZYX")[:, 0]))
+    float64 = craft.make.t["std_msgs/msg/Float64"]
+    heading = [float64(data=round(float(90.0 - np.degrees(y)) % 360.0, 2)) for y in yaw]
+    filtered = DATUM.geodetic_from_enu(craft.motion.pose(at)[0] + gauss_markov(craft.rng, at, 0.8, 60.0, 3))
+    fixes = [craft.make.fix(stamp(s), *place, 0, np.eye(3).ravel(), 1) for s, place in zip(at, filtered, strict=True)]
+    for topic, said, latency_s in (("compass_hdg", heading, 0.06), ("global", fixes, 0.02)):
+        logs = craft.recorded(at, latency_s)
+        items += [(f"/mavros/global_position/{topic}", log_ns, m) for log_ns, m in zip(logs, said, strict=True)]
+    return items
+
+
 def _utm(craft: Craft, items: list[Item]) -> list[Item]:
     """Odometry of a receiver in UTM, zone 32 north, instead of fixes."""
     t = craft.times(5.0, 0.03)
@@ -220,6 +271,12 @@ CASES: dict[str, Odd] = {
     "position held at rest": Odd(change=_held_at_rest),
     "position held at rest, boat": Odd(craft="boat", compass=True, change=_held_at_rest),
     "positions to a metre": Odd(craft="robot", change=_rounded),
+    "MAVROS, IMU at 25 Hz": Odd(
+        craft="boat", imu_hz=25.0, change=_mavros,
+        draft=(r"raw/fix\n    mount", r"(?s)compass_hdg\n    convention[^\n]*\n    unit[^\n]*\n    enabled: false"),
+    ),
+    "compass 1 s late, car": Odd(compass=True, change=_late_compass(1.0), draft=(r"time_offset_s: -(1.0[0-4]|0.9[6-9])",)),
+    "second receiver drifts, claims less": Odd(change=_second_drifts, draft=(r"topic: /gnss/fix\n    mount",)),
     "positions in UTM alone": Odd(change=_utm, draft=("grid: ''",), edit=("grid: ''", "grid: EPSG:32632")),
 }  # fmt: skip
 

@@ -19,6 +19,8 @@ from graphloc.time import NS_PER_S
 
 _FEWEST, _FEWEST_COURSES = 10, 20
 _TURNS_DEG, _SAME_DEG = 5.0, 0.2  # how much two headings must turn, and may differ by, to be one
+_DELAYS_S = np.arange(-50, 51) / 100.0  # of one heading against another that is the same
+_MOST_COMPARED = 5000  # headings of a long run
 _STRAIGHT_DEG = 20.0  # courses that turn by less tell no convention
 _BLOCK_S = 30
 _SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
@@ -154,7 +156,9 @@ def headings(stream: TopicData) -> tuple[NDArray[np.int64], Array]:
 
 
 def says_the_same(first: TopicData, second: TopicData, *, mirrored: bool) -> bool:
-    """Return whether two headings are one, but for an offset: two devices never agree so closely while the craft turns.
+    """Return whether two headings are one, but for an offset and a delay: two devices never agree so closely while the craft turns.
+
+    One of a type without a stamp is late by as long as its messages take, and a driver may stamp what it sends on its own.
 
     Args:
         mirrored: whether one of them grows as the other falls.
@@ -166,9 +170,14 @@ def says_the_same(first: TopicData, second: TopicData, *, mirrored: bool) -> boo
     there, b = there[inside], b[inside]
     if len(there) < 10:
         return False
-    a = np.interp((there - at[0]) / NS_PER_S, (at - at[0]) / NS_PER_S, a)
-    turns, apart = (_middle_deg(v)[1] for v in (b, a + b if mirrored else a - b))
-    return turns > _TURNS_DEG and apart < _SAME_DEG
+    few = slice(None, None, max(1, len(there) // _MOST_COMPARED))
+    t, at_s, b = (there[few] - at[0]) / NS_PER_S, (at - at[0]) / NS_PER_S, b[few]
+
+    def apart_deg(late_s: float) -> float:
+        beside = np.interp(t - late_s, at_s, a)
+        return _middle_deg(beside + b if mirrored else beside - b)[1]
+
+    return _middle_deg(b)[1] > _TURNS_DEG and min(map(apart_deg, _DELAYS_S)) < _SAME_DEG
 
 
 def _middle_deg(angle: Array) -> tuple[float, float]:

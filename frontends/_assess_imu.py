@@ -29,6 +29,9 @@ from graphloc.white_noise import white_noise
 _COURSE_S, _COURSE_CLEAR = 12.0, 0.6
 _UPSIDE_DOWN_DEG = 150.0
 _QUIET_S = 2
+# Off body z, from which gravity is said to be; about a quarter turn, by which it, or the motion, overrules tf, and how coherent.
+_TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
+_SLIGHTLY_DEG = 3.0  # off a quarter turn, from which it is said
 _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, or an antenna far ahead, make less
 
 
@@ -44,21 +47,35 @@ def mount_guess(
 ) -> MountGuess:
     """Return the IMU's mount in body: from tf, else levelled by gravity and aligned with the motion.
 
+    Drivers publish in axes of their own under the frame of the URDF. Gravity or the motion overrules the latter where it is off by a
+    quarter turn; half a turn about the vertical may be a craft that goes astern.
+
     Args:
         accel, gyro: (N, 3) m/s^2, (N, 3) rad/s, of usable samples.
     """
+    pose = tree.resolve(body, imu.frame_id) if imu.frame_id in tree.frames else None
+    if pose is None:
+        return _measured_mount(imu, accel, gyro, motions)
+    tilt_deg = _tilt_deg(pose[1], accel)
+    if abs(tilt_deg - 90.0) < _QUARTER_DEG:
+        return _in_place_of(pose, tilt_deg, _measured_mount(imu, accel, gyro, motions))
+    note = "" if tilt_deg < _TILTED_DEG else f"; but then gravity is {tilt_deg:.0f} deg off body z: check it"
+    if not note and motions:
+        body_axes = accel @ pose[1].T, gyro @ pose[1].T
+        turned = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], *body_axes, motions)
+        if turned is not None and turned.astray:
+            if abs(abs(turned.yaw_deg) - 90.0) < _QUARTER_DEG and turned.coherence > _OVERRULES:
+                said = f"not as in tf, since {turned.said}: right there only of a craft that goes sideways throughout"
+                return replace(_turned(imu, accel, gyro, motions, pose[1], said), xyz_m=vec(pose[0]))
+            note = f"; but {turned.said}: check it"
+    rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
+    return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"from tf{note}")
+
+
+def _measured_mount(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion]) -> MountGuess:
+    """Return the mount that gravity levels and the motion turns."""
     up = np.median(accel, axis=0)
     size = float(np.linalg.norm(up))
-    pose = tree.resolve(body, imu.frame_id) if imu.frame_id in tree.frames else None
-    if pose is not None:
-        rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
-        tilt = float(np.degrees(np.arccos(np.clip((pose[1] @ up)[2] / max(size, 1e-9), -1.0, 1.0))))
-        note = "" if size < 2.0 or tilt < 20.0 else f"; but then gravity is {tilt:.0f} deg off body z: check it"
-        if not note and motions:
-            body_axes = accel @ pose[1].T, gyro @ pose[1].T
-            turned = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], *body_axes, motions)
-            note = f"; but {turned.said}: check it" if turned is not None and turned.astray else ""
-        return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"from tf{note}")
     if size < 0.5 * STANDARD_GRAVITY_MPS2:
         return _turned(imu, accel, gyro, motions, np.eye(3), "no gravity to find the level from: taken as level")
     axis = up / size
@@ -72,6 +89,19 @@ def mount_guess(
         f"gravity is on {name} of the sensor" if aligned else f"gravity is {np.round(axis, 2).tolist()} in the sensor"
     )
     return _turned(imu, accel, gyro, motions, level, said)
+
+
+def _tilt_deg(R_body_imu: Array, accel: Array) -> float:
+    """Return by how much gravity, by accelerations (N, 3), is off body z with a mount; 0 where it was removed."""
+    up = np.median(accel, axis=0)
+    size = float(np.linalg.norm(up))
+    return float(np.degrees(np.arccos(np.clip((R_body_imu @ up)[2] / size, -1.0, 1.0)))) if size > 2.0 else 0.0
+
+
+def _in_place_of(pose: tuple[Array, Array], tilt_deg: float, mount: MountGuess) -> MountGuess:
+    """Return a measured mount instead of that in tf, whose place it keeps."""
+    why = f"not as in tf, by which gravity is {tilt_deg:.0f} deg off body z; {mount.evidence}"
+    return replace(mount, xyz_m=vec(pose[0]), evidence=why)
 
 
 def _turned(
@@ -111,7 +141,14 @@ def _mount_yaw(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[Meas
     quarter = 90.0 * round(found.yaw_deg / 90.0)
     askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
     yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter))))
-    return yaw, f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
+    said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
+    off_deg = abs(found.yaw_deg - quarter)
+    if not askew and off_deg > max(_SLIGHTLY_DEG, 4.0 * found.sigma_deg):
+        said += (
+            f", taken as {yaw:.0f}, since leeway makes a few degrees: on wheels set {found.yaw_deg:.0f}, or the heading is off by "
+            f"{off_deg:.0f} deg, which no bound includes"
+        )
+    return yaw, said
 
 
 def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning:
@@ -169,7 +206,7 @@ def _righted(
     """Return the report with accelerations of the opposite sign, if only that fits the courses.
 
     Levelled by accelerations of the wrong sign, the sensor is upside down and its gyroscope turns the wrong way. If the mount is from
-    /tf_static, the gyroscope turns correctly, and gravity points down.
+    tf, the gyroscope turns correctly, and gravity points down.
 
     Args:
         samples: acceleration (N, 3) m/s^2 and rate (N, 3) rad/s of usable samples.
@@ -193,6 +230,10 @@ def _righted(
         return report
     up = np.asarray(pose[1]) @ np.median(accel, axis=0)
     upside_down = float(up[2]) < np.cos(np.radians(_UPSIDE_DOWN_DEG)) * float(np.linalg.norm(up))
+    if sense < 0 and upside_down and report.gravity == "included":
+        measured = _measured_mount(imu, accel, gyro, motions)
+        mount = _in_place_of(pose, _tilt_deg(pose[1], accel), measured)
+        return replace(report, mount=mount, why=(*report.why, f"{against}: the mount in tf is upside down"))
     if sense < 0:
         why = f"{against}: the mount in tf is upside down, or its axes are left-handed; check both"
         return replace(report, why=(*report.why, why))

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane, summed, track
 from graphloc.frontends._assess_world import World
-from graphloc.frontends._reports import BODY_AXES, EAST_AXES, NORTH_AXES, OdometryReport, VelocityReport, through_water
+from graphloc.frontends._reports import (
+    BODY_AXES,
+    EAST_AXES,
+    NORTH_AXES,
+    OdometryReport,
+    VelocityReport,
+    filtered,
+    through_water,
+)
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import ODOMETRY, VECTOR
 from graphloc.time import NS_PER_S
@@ -102,7 +110,12 @@ def odometry_report(
         role, why = "pose", "it reports poses and no speed"
     else:
         axes, fit = axes_of(stream, stamps_ns, p_m, scatter_m)
-        role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: looks like wheel odometry"
+        whose = (
+            "a filter's output by its name, no check by other means"
+            if filtered(stream.topic)
+            else "looks like wheel odometry"
+        )
+        role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: {whose}"
         reverse = _astern(rows[:, 7])
         why = f"{why}; {_REVERSED}" if reverse else why
         if axes not in (None, BODY_AXES):

@@ -28,6 +28,7 @@ from graphloc.frontends._reports import (
     filtered,
     through_water,
 )
+from graphloc.frontends._streams import COURSE
 from graphloc.frontends._turns import WANDERS_DEG
 from graphloc.frontends.decode import IMU, VECTOR
 
@@ -203,7 +204,7 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
 
 def _topic_lines(topic: str) -> list[str]:
     """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
-    name, *sentence = topic.split(" ")[:2]
+    name, *sentence = topic.removesuffix(COURSE).split(" ")
     return [f"  topic: {name}", *(f"  nmea: [{', '.join(said.split('+'))}]" for said in sentence)]
 
 
@@ -228,7 +229,9 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
         lines.append(f"  mount: {{tf_frame: {json.dumps(mount.tf_frame)}}}  # {mount.evidence}")
     else:
         rpy = ", ".join(f"{a:.1f}" for a in mount.rpy_deg)
-        lines.append(f"  mount: {{xyz_m: [0.0, 0.0, 0.0], rpy_deg: [{rpy}]}}  # guess: {mount.evidence}; xyz unknown")
+        xyz = ", ".join(f"{a:.3f}" for a in mount.xyz_m) if mount.xyz_m else "0.0, 0.0, 0.0"
+        whose = "xyz as there" if mount.xyz_m else "xyz unknown"
+        lines.append(f"  mount: {{xyz_m: [{xyz}], rpy_deg: [{rpy}]}}  # guess: {mount.evidence}; {whose}")
     lines += _noise_lines(imu)
     return lines
 
@@ -268,10 +271,14 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3) if wanders else None
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
         keys = [*([f"vertical_sigma_m: {vertical:.1f}"] if vertical else []), *_wandering(gnss)]
+        apart = ""
+        if gnss.differs and not any(key.startswith("horizontal") for key in keys):
+            keys = [f"horizontal_sigma_m: {gnss.apart_m:.1f}", *keys]
+            apart = f"; so far it and {gnss.apart_from} wander against each other"
         more = ", ".join(keys)
         fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
         wander = f"; by the wheels it changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s" if _wandering(gnss) else ""
-        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{wander}{fixed}")
+        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{wander}{apart}{fixed}")
     return lines
 
 
@@ -492,6 +499,7 @@ def _beside(odometry: tuple[OdometryReport, ...]) -> list[str]:
     for k, item in enumerate(sorted(truths, key=lambda o: o.origin is None)):
         off = "# " if k or item.origin is None else ""
         lines.append(f"{off}truth_topic: {item.topic}  # guess: {item.why}; {item.world}; for comparison, never fused")
-    for k, item in enumerate(o for o in odometry if o.role == "check_speed"):
+    speeds = [o for o in odometry if o.role == "check_speed"]
+    for k, item in enumerate(sorted(speeds, key=lambda o: filtered(o.topic))):
         lines.append(f"{'# ' if k else ''}check_speed_topic: {item.topic}  # guess: {item.why}; compared, never fused")
     return lines

@@ -3,10 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from graphloc.frontends._clock import EPOCH_LIMIT_S, MOST_ON_ITS_WAY_S, Clock, behind_s, reference_of
-from graphloc.frontends._reports import GnssReport, Inspection, MountedTopic, TopicReport
+from graphloc.frontends._reports import (
+    CompassReport,
+    GnssReport,
+    Inspection,
+    MountedTopic,
+    TopicReport,
+    VelocityReport,
+)
 from graphloc.frontends.decode import UNSTAMPED
 
 # Of a velocity that is averaged over seconds: its error lasts as long, and would count as white.
@@ -62,8 +69,12 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
         return []
     own = (c for n, c in clocks.items() if not topics[n].recorded and topics[n].msgtype not in UNSTAMPED)
     reference = reference_of(imu, own)
-    told = inspection.gnss if kind == "gnss" else inspection.velocities if kind == "gnss_velocity" else ()
-    found = next((r for r in told if r.topic.partition(" ")[0] == topic and r.late_s), None)
+    told: dict[str, Sequence[GnssReport | VelocityReport | CompassReport]] = {
+        "gnss": inspection.gnss,
+        "gnss_velocity": inspection.velocities,
+        "compass": inspection.compasses,
+    }
+    found = next((r for r in told.get(kind, ()) if r.topic.partition(" ")[0] == topic and r.late_s), None)
     late = found.late_s if found else None
     unstamped = topics[topic].recorded or topics[topic].msgtype in UNSTAMPED
     offset_s, why, sigma_s = 0.0, [], _ON_ITS_WAY_S if unstamped else _STAMPED_LATE_S
@@ -79,7 +90,8 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
         offset_s, sigma_s = offset_s + late[0], max(late[1], _STAMPED_LATE_S)
         by = found.late_by if isinstance(found, GnssReport) and found.late_by.partition(" ")[0] != topic else ""
         whose = f"the motion of {by}, taken for the same receiver's," if by else "its motion"
-        why.append(f"what the IMU feels fits {whose} {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
+        fits = "its turns fit the gyro's" if kind == "compass" else f"what the IMU feels fits {whose}"
+        why.append(f"{fits} {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
     lines = [f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else []
     fixes_late_s = next((r.late_s[0] for r in inspection.gnss if r.late_s), 0.0)
     if kind == "gnss_velocity" and late is not None and late[0] < fixes_late_s - MOST_ON_ITS_WAY_S:

@@ -24,6 +24,8 @@ def render(inspection: Inspection) -> str:
     for compass in inspection.compasses:
         verdict = f"fits as a compass ({compass.convention})" if compass.usable else "not usable as a compass"
         lines += ["", f"{compass.topic}: {verdict}", f"  {compass.why}"]
+        if compass.late_s:
+            lines.append("  its turns fit the gyro's {:+.2f} +- {:.2f} s from its stamps".format(*compass.late_s))
     for twist in inspection.velocities:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:

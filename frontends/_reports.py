@@ -7,6 +7,7 @@ import re
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from graphloc.config import SlowErrorConfig
 from graphloc.frontends.nmea import SPEEDS
 from graphloc.plain import plain
 
@@ -15,6 +16,7 @@ Vec = tuple[float, float, float]
 # HDT and THS of a GNSS receiver; topics of ublox_gps, septentrio_gnss_driver, mavros and their like.
 _TWO_ANTENNAS = re.compile(r"[ +]G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
+_DIFFERS = 1.5  # times the default of a slow error
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
 
 
@@ -65,11 +67,12 @@ class TopicReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MountGuess:
-    """Rotation of a sensor in body, deg, or its frame where tf knows it; and the evidence."""
+    """Rotation of a sensor in body, deg, or the frame of tf that knows it; and the evidence. `xyz_m`: its place, where known."""
 
     rpy_deg: Vec
     tf_frame: str | None
     evidence: str
+    xyz_m: Vec | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,6 +117,7 @@ class GnssReport:
             1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
         frozen, stored: warning where it repeats one position while the vessel moves, or one of before the run; '' where it does not.
         wander_m: by how much their error changes along the way in `WANDER_S`, by wheels, 1 sigma; None where these do not tell.
+        apart_m: by how much it and `apart_from`, the receiver it agrees with best, wander against each other, 1 sigma of an axis.
         without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
 
@@ -139,6 +143,13 @@ class GnssReport:
     spans_s: float = 0.0
     late_s: tuple[float, float] | None = None
     late_by: str = ""
+    apart_m: float = 0.0
+    apart_from: str = ""
+
+    @property
+    def differs(self) -> bool:
+        """Whether its slow error, or that of the other receiver, is clearly larger than taken by default."""
+        return self.slow_error and self.apart_m > _DIFFERS * SlowErrorConfig().horizontal_sigma_m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,6 +164,8 @@ class CompassReport:
         like: an orientation that says the same, of the same device, else ''.
         wander_deg: how far its error wanders beside the gyroscope, 1 sigma for a minute; None where that does not tell.
         two_antennas: whether a GNSS receiver says it, by its sentence, its topic, or as an Imu with an orientation alone.
+        late_s: what should be added to its stamps by the gyroscope, s, and 1 sigma; None where that does not tell. What is said above is
+            of corrected stamps.
     """
 
     topic: str
@@ -168,6 +181,7 @@ class CompassReport:
     leeway_deg: float | None = None
     wander_deg: float | None = None
     two_antennas: bool = False
+    late_s: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

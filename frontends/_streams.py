@@ -32,6 +32,7 @@ from graphloc.frontends.decode import (
     TWIST,
     UNSTAMPED,
     VECTOR,
+    gps_fix_velocity_mps,
     nav_sat_status,
     nmea_sigmas_m,
     stamp_ns_of,
@@ -128,7 +129,8 @@ SENTENCES: dict[str, tuple[str, Callable[[str, str], Row | None]]] = {
 }
 _SATELLITES = re.compile("(G[A-Z]|BD)[A-Z]{3}")  # a talker that names what a receiver sees
 _BESIDE, _BY_CHANCE = 0.75, 0.2  # steps: a sentence said at the same time; the share of those that one receiver may say
-_COURSE = " (course, speed)"  # at the end of the name of a stream: what RMC says beside a place
+COURSE = " (course, speed)"
+"""At the end of the name of a stream: what RMC, or a GPSFix, says beside a place."""
 
 
 _MOST = 1e12
@@ -239,7 +241,7 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
 
     An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type; 'TOPIC GPGGA+GNGGA' of a
     receiver that changes its talker. RMC gives another one of velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no
-    VTG is on the line.
+    VTG is on the line; so does a GPSFix.
     """
     streams = {
         t.topic: TopicData(t.topic, t.msgtypes[0])
@@ -272,7 +274,7 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
     tree.settle()
     _join_talkers(streams)
     for name in [
-        name for name, stream in streams.items() if name.endswith(_COURSE) and _told_elsewhere(stream, streams)
+        name for name, stream in streams.items() if name.endswith(COURSE) and _told_elsewhere(stream, streams)
     ]:
         del streams[name]
     for stream in streams.values():
@@ -294,7 +296,7 @@ def _join_talkers(streams: dict[str, TopicData]) -> None:
     for (line, said), several in alike.items():
         if len(several) < 2 or not _take_turns([s.logs_ns for s in several]):
             continue
-        sentence = said.removesuffix(_COURSE)
+        sentence = said.removesuffix(COURSE)
         talkers = "+".join(s.topic.removeprefix(f"{line} ")[:2] + sentence for s in several)
         joined = f"{line} {talkers}{said.removeprefix(sentence)}"
         place = list(streams).index(several[0].topic)
@@ -322,14 +324,21 @@ def _take_turns(logs_ns: Sequence[NDArray[np.int64]]) -> bool:
 
 
 def _told_elsewhere(stream: TopicData, streams: Mapping[str, TopicData]) -> bool:
-    """Whether velocities of RMC say nothing, or what VTG on the same line says as well."""
+    """Whether velocities of RMC or a GPSFix say nothing, or what VTG on the same line says as well."""
     line = stream.topic.partition(" ")[0]
     vtg = any(name.startswith(f"{line} ") and name.endswith("VTG") for name in streams)
-    return vtg or not np.isfinite(stream.rows).any()
+    return vtg or not np.nan_to_num(stream.rows).any()
 
 
 def _plain(raw: RawMessage, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:
-    return [(streams[raw.topic], ROWS[raw.msgtype](msg))] if raw.topic in streams else []
+    if raw.topic not in streams:
+        return []
+    said: list[tuple[TopicData, Row | None]] = [(streams[raw.topic], ROWS[raw.msgtype](msg))]
+    if raw.msgtype in GPS_FIXES:
+        v, name = gps_fix_velocity_mps(msg), raw.topic + COURSE
+        row = (np.nan, np.nan, np.nan) if isinstance(v, Rejection) else (*v[:2], v[2] if np.isfinite(v[2]) else 0.0)
+        said.append((streams.setdefault(name, TopicData(name, TWIST)), row))
+    return said
 
 
 def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:
@@ -342,5 +351,5 @@ def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tupl
             name = f"{topic} {talker}{kind}"
             said.append((streams.setdefault(name, TopicData(name, msgtype)), row_of(text, talker + kind)))
         if kind == "RMC" and (row := _nmea_velocity(text, talker + kind)) is not None:
-            said.append((streams.setdefault(name + _COURSE, TopicData(name + _COURSE, TWIST)), row))
+            said.append((streams.setdefault(name + COURSE, TopicData(name + COURSE, TWIST)), row))
     return said

@@ -19,19 +19,34 @@ from graphloc.time import NS_PER_S
 _BLOCK_S = 20.0
 _CLEAR, _LEAST_S = 4.0, 0.02  # sigmas, s
 _APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # how closely is looked; from which it is said
+_STEPS = 3  # to an offset of a second in the sharpest turns
 _CHORD_S = 2.0  # half the time of a chord of fixes, and of a velocity's integral
 
 
 def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[float, float] | None:
     """Return what should be added to the stamps of headings, s, and its sigma; None if the gyroscope does not show it.
 
-    If stamps are off by dt, heading minus integrated rate w is w dt. Within twenty seconds gyro bias, compass offset and magnetic
-    deviation hardly change, so a straight line per block removes them.
+    If stamps are off by dt, heading minus integrated rate w is w dt, as long as w hardly changes within dt: hence repeated from where
+    the last step led. Within twenty seconds gyro bias, compass offset and magnetic deviation hardly change, so a straight line per
+    block removes them.
 
     Args:
         turning: integrated rate. stamps_ns: (N,), increasing. angle: (N,) rad, counter-clockwise, unwrapped.
     """
-    at = (stamps_ns - turning.origin_ns) / NS_PER_S
+    at_s = (stamps_ns - turning.origin_ns) / NS_PER_S
+    value_s, sigma_s = 0.0, 0.0
+    for _ in range(_STEPS):
+        step = _heading_step(turning, at_s + value_s, angle)
+        if step is None:
+            return None
+        value_s, sigma_s = value_s + step[0], step[1]
+        if abs(value_s) > MOST_LATE_S:
+            return None
+    return (value_s, sigma_s) if abs(value_s) > max(_CLEAR * sigma_s, _LEAST_S) else None
+
+
+def _heading_step(turning: Turning, at: Array, angle: Array) -> tuple[float, float] | None:
+    """Return what should be added to times (N,) of headings, s since the turning's origin, to first order, and its sigma."""
     inside = (at > turning.t_s[0] + 1.0) & (at < turning.t_s[-1] - 1.0)
     at, angle = at[inside], angle[inside]
     if len(at) < 50:
@@ -53,9 +68,7 @@ def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: A
         return None
     value = float(up.sum() / down.sum())
     without = (up.sum() - up) / (down.sum() - down)
-    sigma = float(np.sqrt((len(up) - 1) / len(up) * ((without - without.mean()) ** 2).sum()))
-    clear = abs(value) > max(_CLEAR * sigma, _LEAST_S)
-    return (value, sigma) if clear else None
+    return value, float(np.sqrt((len(up) - 1) / len(up) * ((without - without.mean()) ** 2).sum()))
 
 
 class MotionOffset(NamedTuple):

@@ -153,6 +153,9 @@ def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | No
     turn (scale) and rate (delay) are removed. If the rest diffuses, its mean square step grows by q t from some seconds to half a
     minute, on top of white noise. For a first-order Gauss-Markov process, q = 2 sigma^2 / tau.
 
+    What is removed takes part of the wander along, in a run of 90 s two thirds of it, which is known and made up for; below
+    `WANDERS_DEG` it is not: in waves the gyroscope's turn is off by as much.
+
     Args:
         headings: of one compass, converted as configured.
     """
@@ -177,8 +180,44 @@ def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | No
     apart, design = np.concatenate([columns[:, 4] for _, columns in blocks]), np.hstack([lines, common])
     left = np.split(apart - design @ np.linalg.lstsq(design, apart, rcond=1e-6)[0], np.cumsum(parts)[:-1])
     soon, late = (_squared_steps(blocks, left, round(lag_s / _CELL_S)) for lag_s in _LAGS_S)
-    diffusion = max(late - soon, 0.0) / (_LAGS_S[1] - _LAGS_S[0])
-    return float(np.degrees(np.sqrt(0.5 * diffusion * _MINUTE_S)))
+    grown = max(late - soon, 0.0)
+    wander = float(np.degrees(np.sqrt(0.5 * grown / (_LAGS_S[1] - _LAGS_S[0]) * _MINUTE_S)))
+    if wander < WANDERS_DEG:
+        return wander
+    cells = [own for own, _ in blocks]
+    by_steps = grown / _grown_of_unit(cells, _left_of_unit(cells, design))
+    # No wander scatters by less about a line than it should; what swings evenly only looks as if much had been taken off.
+    off_line = apart - lines @ np.linalg.lstsq(lines, apart, rcond=1e-6)[0]
+    left_of_unit = np.concatenate([cov.diagonal() for cov in _left_of_unit(cells, lines)])
+    by_spread = float((off_line**2).mean() / left_of_unit.mean())
+    return max(wander, float(np.degrees(np.sqrt(min(by_steps, by_spread)))))
+
+
+def _left_of_unit(cells: Sequence[NDArray[np.intp]], design: Array) -> list[Array]:
+    """Return the covariance (n, n) of each block that a wander of 1 rad in a minute has left once `design` is removed from it.
+
+    The residuals r = M e of errors e with covariance C, M = I - Q Q^T, have the covariance M C M; of C only blocks are not 0.
+
+    Args:
+        cells: (n,) of each block. design: (N, k); Q is an orthonormal base of it.
+    """
+    left, size, _ = np.linalg.svd(design, full_matrices=False)
+    base = np.split(left[:, size > 1e-6 * size[0]], np.cumsum([len(own) for own in cells])[:-1])
+    C = [np.exp(-_CELL_S / _MINUTE_S * np.abs(own[:, None] - own)) for own in cells]
+    middle = sum(q.T @ c @ q for q, c in zip(base, C, strict=True))
+    halves = [q @ (q.T @ c) for q, c in zip(base, C, strict=True)]
+    return [c - half - half.T + q @ middle @ q.T for q, c, half in zip(base, C, halves, strict=True)]
+
+
+def _grown_of_unit(cells: Sequence[NDArray[np.intp]], covs: Sequence[Array]) -> float:
+    """Return by how much the mean square step of residuals with such covariances grows from the shorter lag to the longer one."""
+    soon: list[Array] = []
+    late: list[Array] = []
+    for own, cov in zip(cells, covs, strict=True):
+        for lag_s, found in zip(_LAGS_S, (soon, late), strict=True):
+            i, j = np.nonzero(own - own[:, None] == round(lag_s / _CELL_S))
+            found.append(cov[i, i] + cov[j, j] - 2.0 * cov[i, j])
+    return max(float(np.concatenate(late).mean() - np.concatenate(soon).mean()), 1e-6)
 
 
 def wander_warning(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading], config: CompassConfig) -> list[str]:

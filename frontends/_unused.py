@@ -98,8 +98,13 @@ def _why_unused(stream: TopicData) -> str:
         "have a stamp that repeats, runs backwards or is far from the recording time": len(stream) - len(rows),
     }
     if stream.msgtype in _FIXES:
-        without = int((rows[:, 3] < 0).sum())
-        counts |= {"say 'no fix'": without, "lie at 0, 0 or are NaN": len(rows) - without}
+        fix = rows[:, 3] >= 0
+        beyond = int((fix & (np.abs(rows[:, 0]) > 90.0)).sum())
+        counts |= {
+            "say 'no fix'": int((~fix).sum()),
+            "have a latitude beyond 90 deg": beyond,
+            "lie at 0, 0 or are NaN": int(fix.sum()) - beyond,
+        }
     else:
         finite = int(np.isfinite(rows[:, :6]).all(axis=1).sum())
         counts |= {"hold an acceleration or a rate that is NaN": len(rows) - finite, "are too few": finite}

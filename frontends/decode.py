@@ -62,6 +62,7 @@ TF = "tf2_msgs/msg/TFMessage"
 NO_STAMP = "`stamps: recorded` of that sensor takes the recording time instead"
 
 _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
+_STATUS_UNKNOWN = -2
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # of NavSatStatus, by quality of GGA: differential, RTK
 _RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # horizontal, vertical, at a dilution of 1: fixed, float
@@ -155,8 +156,11 @@ def yaw_of_x_axis(x: float, y: float, z: float, w: float) -> float | Rejection:
 
 
 def nav_sat_status(status: int) -> int:
-    """Return the status of a NavSatFix or GPSFix as in NavSatFix: differential (18) and WAAS (33) become `sbas`."""
-    return 1 if status in (18, 33) else status
+    """Return the status of a NavSatFix or GPSFix as in NavSatFix: differential (18) and WAAS (33) become `sbas`.
+
+    -2 (`STATUS_UNKNOWN` of ROS 2 Jazzy, and there the default) is left by drivers that do not fill it in: a place is a fix.
+    """
+    return {18: 1, 33: 1, _STATUS_UNKNOWN: 0}.get(status, status)
 
 
 def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -> Decoded:
@@ -348,6 +352,29 @@ def _velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Veloc
     return _moving((*v, 0.0), np.diag([0.0, 0.0, _NO_CLIMB_MPS2]), stamp_ns, seq, sensor, config)
 
 
+def gps_fix_velocity_mps(msg: Any) -> tuple[float, float, float] | Rejection:
+    """Return the velocity of a GPSFix over ground, east, north, up, m/s: its speed, its track clockwise from true north, its climb.
+
+    NaN where it tells no climb. Its errors are left out: drivers disagree on what they mean.
+    """
+    if nav_sat_status(int(msg.status.status)) < 0:
+        return rejected("no fix (STATUS_NO_FIX)")
+    speed, track, climb = float(msg.speed), float(msg.track), float(msg.climb)
+    if not isfinite(speed) or (speed > nmea.SLOW_MPS and not isfinite(track)):
+        return rejected(f"no {'track' if isfinite(speed) else 'speed'}")
+    angle = np.radians(track if isfinite(track) else 0.0)
+    return float(speed * np.sin(angle)), float(speed * np.cos(angle)), climb
+
+
+def _velocity_gps_fix(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
+    v = gps_fix_velocity_mps(msg)
+    if isinstance(v, Rejection):
+        return v
+    climbs = isfinite(v[2])
+    cov = np.diag([0.0, 0.0, 0.0 if climbs else _NO_CLIMB_MPS2])
+    return _moving((*v[:2], v[2] if climbs else 0.0), cov, stamp_ns, seq, sensor, config)
+
+
 def _moving(
     v_mps: tuple[float, float, float], cov: Array, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig
 ) -> Decoded:
@@ -454,6 +481,7 @@ DECODERS: dict[tuple[str, str], Decoder] = {
     ("gnss_velocity", TWIST): _velocity,
     ("gnss_velocity", PLAIN_TWIST): _velocity,
     ("gnss_velocity", VECTOR): _velocity_vector,
+    **{("gnss_velocity", msgtype): _velocity_gps_fix for msgtype in GPS_FIXES},
     **{("gnss_velocity", msgtype): _velocity_nmea for msgtype in NMEA},
     ("body_velocity", ODOMETRY): _body_velocity,
     ("body_velocity", TWIST): _body_velocity,

@@ -32,6 +32,7 @@ from graphloc.frontends._assess import (
 )
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
 from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turning_of
+from graphloc.frontends._assess_receivers import apart_m, apart_warning, height_wanders_m
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_wander import wander_m
 from graphloc.frontends._assess_world import in_map_grid, world_of
@@ -106,6 +107,7 @@ _NO_LIDAR = re.compile(r"depth|radar|stereo", re.IGNORECASE)
 _LOOKS_AHEAD_DEG = np.array([-90.0, 0.0, -90.0])  # of an optical frame
 _SKY = 0.7  # upward part of an optical axis, from which no tag is seen
 _MOST_NAMED = 6
+_SAME_M = 0.05  # by which two topics of one receiver wander against each other at most
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _FEWEST = 20  # places of a track
 # Of the run, from which a receiver is there throughout; of the fixes, from which it says as much as another.
@@ -207,6 +209,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         warnings=(
             *bag.warnings,
             *(said for report in gnss for said in (report.stored, report.frozen) if said),
+            *(apart_warning(report) for report in gnss[:1] if report.differs),
             *_steps(bag),
             *unused_topics(list(bag.streams.values()), used),
             *_lacking(bag, imus, gnss, reports),
@@ -255,27 +258,47 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     """Report the receivers, the best one first."""
     found = [r for s in bag.of_type(*_FIXES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
     longest_s = max((r.spans_s for r in found), default=0.0)
-    rivals = (r for r in found if r.spans_s >= _COVERS * longest_s and not filtered(r.topic))
+    rivals = [r for r in found if r.spans_s >= _COVERS * longest_s and not filtered(r.topic)]
     most = max((r.fixes for r in rivals), default=0)
+    level_m = min((m for r in rivals if (m := height_wanders_m(r)) is not None), default=0.0)
     found.sort(
         key=lambda r: (
             filtered(r.topic),
             r.spans_s < _COVERS * longest_s,
             r.slow_error,
-            _octave(r),
+            _octave(r, level_m if r in rivals else math.inf),
             r.fixes < _COVERS * most,
             r.without_height == r.fixes,
             -r.fixes,
             r.without_height,
         )
     )
-    return found
+    return [_beside_others(report, rivals, bag) for report in found]
 
 
-def _octave(gnss: GnssReport) -> int:
-    """Return how large the fixes' error is by what they claim, or scatter by, in powers of two: closer ones are taken for equal."""
+def _octave(gnss: GnssReport, level_m: float) -> int:
+    """Return how large the fixes' error is by what they claim, or scatter or drift by, in powers of two: closer ones are taken for equal.
+
+    Args:
+        level_m: by how much the heights of that receiver wander whose heights wander least, 1 sigma. All ride on one craft: what others
+            wander by beyond it is their drift, and the horizontal one is half of the vertical.
+    """
     claimed = gnss.reported_sigma_m[:2] if gnss.reported_sigma_m else (GnssConfig().default_horizontal_sigma_m,)
-    return round(math.log2(max(*claimed, *(gnss.scatter_m or ())[:2], 1e-3)))
+    drift_m = 0.5 * math.sqrt(max((height_wanders_m(gnss) or 0.0) ** 2 - level_m**2, 0.0))
+    return round(math.log2(max(*claimed, *(gnss.scatter_m or ())[:2], drift_m, 1e-3)))
+
+
+def _beside_others(gnss: GnssReport, rivals: Sequence[GnssReport], bag: _Contents) -> GnssReport:
+    """Return the report with by how much it and the other receiver that it agrees with best wander against each other."""
+    apart = {
+        other.topic: m
+        for other in rivals
+        if other.topic != gnss.topic
+        and (m := apart_m(gnss, other, bag.aligned[gnss.topic], bag.aligned[other.topic])) is not None
+        and m > _SAME_M
+    }
+    nearest = min(apart, key=lambda topic: apart[topic], default="")
+    return replace(gnss, apart_m=apart[nearest], apart_from=nearest) if nearest else gnss
 
 
 def _odometry_reports(
@@ -303,9 +326,25 @@ def _compass_reports(bag: _Contents, imus: Sequence[ImuReport], courses: Courses
     """Report every orientation that may be a heading; see `_without_echoes` for their order."""
     turning = turning_of(bag.aligned[imus[0].topic], imus[0], bag.tree, bag.tree.body()) if imus else None
     candidates = bag.of_type(QUATERNION, IMU, *NUMBERS)
-    found = _without_echoes([(r, s) for s in candidates if (r := compass_report(s, courses, turning))])
+    found = _without_echoes([pair for s in candidates if (pair := _timed_compass(s, courses, turning))])
     best = (imus[0], bag.aligned[imus[0].topic]) if imus else None
-    return tuple(_beside_gyro(_timed(r, s, bag.streams[s.topic], turning), s, best) for r, s in found)
+    return tuple(_beside_gyro(report, stream, best) for report, stream in found)
+
+
+def _timed_compass(
+    stream: TopicData, courses: Courses | None, turning: Turning | None
+) -> tuple[CompassReport, TopicData] | None:
+    """Report an orientation, its stamps corrected by what the gyroscope shows, and return it so; None where it is no heading."""
+    report = compass_report(stream, courses, turning)
+    if report is None or turning is None or not report.usable:
+        return None if report is None else (report, stream)
+    stamps, angle = headings(stream)
+    late_s = heading_time_offset(turning, stamps, angle if report.convention == "enu" else -angle)
+    if late_s is None:
+        return report, stream
+    timed = stream.later(round(late_s[0] * NS_PER_S))
+    again = compass_report(timed, courses, turning)
+    return (report, stream) if again is None or not again.usable else (replace(again, late_s=late_s), timed)
 
 
 def _steps(bag: _Contents) -> list[str]:
@@ -351,19 +390,6 @@ def _without_echoes(compasses: Sequence[tuple[CompassReport, TopicData]]) -> lis
             distinct += [(report, stream)] if report.usable else []
         found.append((report, stream))
     return found
-
-
-def _timed(report: CompassReport, stream: TopicData, recorded: TopicData, turning: Turning | None) -> CompassReport:
-    """Add the time offset that the gyroscope shows, relative to the stamps as recorded."""
-    if turning is None or not report.usable:
-        return report
-    stamps, angle = headings(stream)
-    found = heading_time_offset(turning, stamps, angle if report.convention == "enu" else -angle)
-    if found is None:
-        return report
-    value, sigma = found
-    value += float(stream.stamps_ns[0] - recorded.stamps_ns[0]) / NS_PER_S
-    return replace(report, why=f"{report.why}; by the gyro, time_offset_s should be {value:.3f} +- {sigma:.3f}")
 
 
 def _beside_gyro(report: CompassReport, stream: TopicData, best: tuple[ImuReport, TopicData] | None) -> CompassReport:

@@ -27,7 +27,8 @@ _UNREADABLE = (
     ValueError, TypeError, KeyError, IndexError, AttributeError,
 )  # fmt: skip
 KNOT_MPS, KM_PER_H_MPS = 1852.0 / 3600.0, 1.0 / 3.6
-_SLOW_MPS = 0.1  # below it a receiver may leave the course out
+SLOW_MPS = 0.1
+"""Below it a receiver may leave the course out."""
 # Quality of a fix as GGA has it, from the mode letters of GNS, RMC and GLL.
 _QUALITIES = {"N": 0, "A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
 _NOT_MEASURED = {0: "no fix", 6: "dead reckoned by the receiver", 7: "typed in by hand", 8: "simulated by the receiver"}
@@ -104,7 +105,7 @@ def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Re
         speed, course = KNOT_MPS * _number(said, "spd"), _number(said, "cog")
     else:
         speed, course = _speed_mps(said, "sogn", "sogk"), _number(said, "cogt")
-    if not isfinite(speed) or (speed > _SLOW_MPS and not isfinite(course)):
+    if not isfinite(speed) or (speed > SLOW_MPS and not isfinite(course)):
         return rejected(f"{said.msgID}: no {'course' if isfinite(speed) else 'speed'}")
     east = radians(course if isfinite(course) else 0.0)
     return speed * sin(east), speed * cos(east)

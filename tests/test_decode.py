@@ -83,6 +83,14 @@ def test_fixes_that_are_none() -> None:
     assert isinstance(decode(MAKE.fix(T, status=2), GnssConfig(min_status="gbas")), GnssPosition)
 
 
+def test_a_status_that_the_driver_leaves_out_is_a_fix() -> None:
+    """-2 in ROS 2 Jazzy, where it is the default: all fixes of such a driver were rejected as none."""
+    assert isinstance(decode(MAKE.fix(T, status=-2), GnssConfig()), GnssPosition)
+    refused(MAKE.fix(T, status=-2), GnssConfig(min_status="sbas"), Outcome.REJECTED, "min_status")
+    refused(MAKE.fix(T, lat=np.nan, status=-2), GnssConfig(), Outcome.MALFORMED, "NaN")
+    refused(MAKE.fix(T, lat=0, lon=0, status=-2), GnssConfig(), Outcome.REJECTED, "0, 0")
+
+
 @pytest.mark.parametrize(
     ("convention", "in_message_deg", "yaw_deg"),
     [("enu", 30.0, 30.0), ("ned", 0.0, 90.0), ("ned", 90.0, 0.0), ("ned", 45.0, 45.0), ("ned", -100.0, -170.0)],

@@ -587,11 +587,14 @@ def test_a_heading_receiver_that_publishes_an_imu_message_is_not_frozen(
     assert all("neither accelerations nor rates" in w for w in said)
 
 
-@pytest.mark.parametrize(("status", "said"), [(-1, "say 'no fix'"), (0, "lie at 0, 0")])
-def test_topics_that_give_nothing_are_reported(status: int, said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("status", "lat", "said"),
+    [(-1, 0.0, "say 'no fix'"), (0, 0.0, "lie at 0, 0"), (0, 57.7e7, "have a latitude beyond 90 deg")],
+)
+def test_topics_that_give_nothing_are_reported(status: int, lat: float, said: str, tmp_path: Path) -> None:
     make = Messages(2)
     items: list[Item] = [
-        ("/fix", START_NS + k * S, make.fix(START_NS + k * S, 0.0, 0.0, status=status)) for k in range(20)
+        ("/fix", START_NS + k * S, make.fix(START_NS + k * S, lat, 0.0, status=status)) for k in range(20)
     ]
     found, config, _ = look(tmp_path, items, make)
     assert "gnss" not in config.sensors

@@ -25,7 +25,7 @@ from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag import KINDS
-from tests.test_inspect import DATUM, G, drive, look, rotation_z
+from tests.test_inspect import DATUM, ROLL_90, G, drive, look, rotation_z
 
 WAVE_S, WAVE_RAD = 3.0, 0.03
 
@@ -87,13 +87,39 @@ def test_an_imu_that_sits_askew_is_not_taken_for_straight(tmp_path: Path) -> Non
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 40.0), abs=2.0)
 
 
-def test_a_mount_in_tf_static_that_the_motion_denies_is_reported(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("yaw_deg", "said"), [(0.0, False), (-84.0, True)])
+def test_an_imu_that_sits_a_little_askew_is_said(yaw_deg: float, said: bool, tmp_path: Path) -> None:
+    """Drafted as a quarter turn, since leeway would look alike; nothing said that the heading is off by the rest."""
+    make = Messages(2)
+    _, config, text = look(tmp_path, drive(make, rotation_z(yaw_deg), seconds=90), make)
+    assert config.sensors["imu"].mount.rpy_deg[2] == pytest.approx(90.0 * round(yaw_deg / 90.0))
+    assert ("on wheels set -84, or the heading is off by 6 deg" in text) == said
+
+
+@pytest.mark.parametrize("yaw_deg", [40.0, 180.0])
+def test_a_mount_in_tf_static_that_the_motion_denies_is_reported(yaw_deg: float, tmp_path: Path) -> None:
     make = Messages(2)
     transforms = make.transforms([("base_link", "imu_link", (0, 0, 0), (0, 0, 0, 1))])
-    items = [("/tf_static", START_NS, transforms), *drive(make, rotation_z(90.0))]
+    items = [("/tf_static", START_NS, transforms), *drive(make, rotation_z(yaw_deg))]
     found, _, text = look(tmp_path, items, make)
     assert found.imus[0].mount.tf_frame == "imu_link"
-    assert "but what it feels fits how /wheel/odom moves only turned by +9" in text
+    assert "but what it feels fits how /wheel/odom moves only turned by " in text
+
+
+AXES = {"a quarter turn": rotation_z(90.0), "upside down": np.diag([1.0, -1.0, -1.0]), "on its side": ROLL_90}
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_axes_that_tf_static_does_not_know_are_drafted_as_measured(axes: str, tmp_path: Path) -> None:
+    """A driver that publishes in axes of its own, under the frame of the URDF: as drafted, the heading was off by a quarter turn."""
+    make = Messages(2)
+    transforms = make.transforms([("base_link", "imu_link", (0.3, 0.1, 0.4), (0, 0, 0, 1))])
+    _, config, text = look(tmp_path, [("/tf_static", START_NS, transforms), *drive(make, AXES[axes])], make)
+    mount = config.sensors["imu"].mount
+    assert mount.tf_frame is None
+    np.testing.assert_allclose(mount.R_body_sensor, AXES[axes], atol=0.02)
+    assert mount.xyz_m == (0.3, 0.1, 0.4)
+    assert "guess: not as in tf" in text
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 90.0])
@@ -223,6 +249,18 @@ def test_odometry_in_east_and_north_is_no_speed_along_the_craft(tmp_path: Path) 
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
 
 
+def test_wheels_check_the_speed_rather_than_a_filter_that_had_the_fixes(tmp_path: Path) -> None:
+    """`/ekf/odometry_map` comes before `/wheel/odom` by its name, and was said to look like wheel odometry."""
+    make = Messages(2)
+    items = drive(make)
+    items += [("/ekf/odometry_map", at, m) for topic, at, m in items if topic == "/wheel/odom"]
+    found, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.check_speed_topic == "/wheel/odom"
+    why = {item.topic: item.why for item in found.odometry}
+    assert "looks like wheel odometry" in why["/wheel/odom"]
+    assert "a filter's output" in why["/ekf/odometry_map"]
+
+
 @pytest.mark.parametrize(("noise_deg", "both"), [(0.0, False), (1.0, True)], ids=["the same", "another device"])
 def test_a_heading_that_is_reported_twice_counts_once(noise_deg: float, both: bool, tmp_path: Path) -> None:
     """MAVROS says its heading in `imu/data` and, clockwise from north and without a stamp, in `compass_hdg`."""
@@ -238,6 +276,105 @@ def test_a_heading_that_is_reported_twice_counts_once(noise_deg: float, both: bo
     used = {s.topic for s in config.of_kind("compass").values() if s.enabled}
     assert used == {"/compass", "/attitude", *(["/hdg"] if both else [])}
     assert ("it repeats /attitude" in text) is not both
+
+
+@pytest.mark.parametrize("late_s", [0.07, 0.3])
+def test_a_heading_that_is_reported_twice_counts_once_however_late(late_s: float, tmp_path: Path) -> None:
+    """`compass_hdg` has no stamp, and its recording time is late: in a turn it seemed another device's by some degrees."""
+    make = Messages(2)
+    rng = np.random.default_rng(1)
+    items: list[Item] = []
+    for item in drive(make, seconds=60):
+        items.append(item)
+        if item[0] == "/compass":
+            q = item[2].quaternion
+            heading = float(np.degrees(2.0 * np.arctan2(q.z, q.w)) % 360.0)  # of `drive`: clockwise from north
+            at = item[1] + round((late_s + 0.004 * abs(rng.normal())) * S)
+            items.append(("/hdg", at, make.t["std_msgs/msg/Float64"](data=heading)))
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert {s.topic for s in config.of_kind("compass").values() if s.enabled} == {"/compass"}
+    assert "it repeats /compass" in text
+
+
+@pytest.mark.parametrize("late_s", [0.4, 1.0])
+@pytest.mark.parametrize("own_clock_s", [0.0, 3600.0], ids=["one clock", "a clock of its own"])
+def test_a_late_compass_is_drafted_with_its_time_offset(late_s: float, own_clock_s: float, tmp_path: Path) -> None:
+    """It was said in a comment only, and as drafted the heading was wrong by what the craft turned meanwhile."""
+    make = Messages(2)
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 90.0, 0.02)
+    rate = 0.25 * np.sin(0.5 * t) + 0.15 * np.sin(1.3 * t)
+    yaw = np.concatenate([[0.0], np.cumsum(rate[:-1]) * 0.02])
+    way = np.cumsum(3.0 * np.exp(1j * yaw)) * 0.02
+    lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0 * t]))
+    items: list[Item] = []
+    for k in range(len(t)):
+        at = START_NS + k * S // 50
+        items.append(("/imu", at, make.imu(at, (0.0, 3.0 * rate[k], G), (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
+        if k % 10 == 0:
+            half = 0.5 * (yaw[k] + np.radians(0.5) * rng.normal())
+            late = at + round(late_s * S)
+            compass = make.compass(late - round(own_clock_s * S), (0.0, 0.0, np.sin(half), np.cos(half)))
+            items += [("/fix", at, make.fix(at, *lla[k])), ("/compass", late, compass)]
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    compass = config.sensors["compass"]
+    assert compass.time_offset_s == pytest.approx(own_clock_s - late_s, abs=0.02)
+    assert "its turns fit the gyro's" in text
+    # Late, it seemed to wander by degrees.
+    assert compass.wander_sigma_deg == CompassConfig().wander_sigma_deg
+
+
+def two_receivers(
+    make: Messages, error_m: Callable[[Array, Array], Array], *, claims_m: float, height: bool
+) -> list[Item]:
+    """`drive` with fixes that scatter by 0.3 m and claim 1 m, and another receiver's, off by `error_m`, (N, 3) of times and yaws (N,)."""
+    items, rng = drive(make, status=0, sigma_m=1.0, seconds=120, noise_m=0.3), np.random.default_rng(4)
+    fixes = [(at, m) for topic, at, m in items if topic == "/fix"]
+    yaw = np.pi / 2.0 - np.array(
+        [2.0 * np.arctan2(m.quaternion.z, m.quaternion.w) for t, _, m in items if t == "/compass"]
+    )
+    t = np.array([(at - START_NS) / S for at, _ in fixes])
+    places = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for _, m in fixes]).T)
+    lla = DATUM.geodetic_from_enu(places + error_m(t, yaw) + 0.3 * rng.normal(size=places.shape))
+    for (at, _), (lat, lon, up) in zip(fixes, lla, strict=True):
+        cov = (claims_m**2 * np.eye(3)).ravel()
+        items.append(("/cheap/fix", at, make.fix(at, lat, lon, up if height else np.nan, 0, cov)))
+    return sorted(items, key=lambda item: item[1])
+
+
+def drift(t: Array, _yaw: Array) -> Array:
+    """Of 4 m, 1 sigma of a horizontal axis, that changes within 20 s; 8 m in height."""
+    rng, keep = np.random.default_rng(6), np.exp(-float(t[1] - t[0]) / 20.0)
+    error = np.zeros((len(t), 3))
+    for k in range(1, len(t)):
+        error[k] = keep * error[k - 1] + np.sqrt(1.0 - keep**2) * rng.normal(size=3)
+    return np.asarray(error / error.std(axis=0) * [4.0, 4.0, 8.0])
+
+
+def test_of_two_receivers_the_one_whose_height_drifts_is_not_used(tmp_path: Path) -> None:
+    """It claimed half of what the other did, was used, and its drift of 4 m went into the track without a word."""
+    make = Messages(2)
+    _, config, _ = look(tmp_path, two_receivers(make, drift, claims_m=0.5, height=True), make)
+    assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
+
+
+def test_what_two_receivers_differ_by_is_in_the_slow_error(tmp_path: Path) -> None:
+    """Without its height nothing tells which of the two drifts."""
+    make = Messages(2)
+    found, config, _ = look(tmp_path, two_receivers(make, drift, claims_m=0.5, height=False), make)
+    (used,) = [s for s in config.of_kind("gnss").values() if s.enabled]
+    assert used.topic == "/cheap/fix"
+    assert used.slow_error.horizontal_sigma_m == pytest.approx(4.0, rel=0.35)
+    assert any("wander against each other" in line for line in found.warnings)
+
+
+def test_two_antennas_on_a_ship_do_not_wander_against_each_other(tmp_path: Path) -> None:
+    """30 m apart, the way from one to the other turns with her."""
+    make = Messages(2)
+    antenna = lambda _t, yaw: 30.0 * np.column_stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw])
+    found, config, _ = look(tmp_path, two_receivers(make, antenna, claims_m=1.0, height=True), make)
+    assert not any("wander against each other" in line for line in found.warnings)
+    assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
 
 
 def test_a_covariance_that_is_a_placeholder_is_told_from_one(tmp_path: Path) -> None:

@@ -14,7 +14,15 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from graphloc.app import smooth_recording
-from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, VesselConfig, load_config, parse_config
+from graphloc.config import (
+    BodyVelocityConfig,
+    CompassConfig,
+    GnssConfig,
+    VelocityConfig,
+    VesselConfig,
+    load_config,
+    parse_config,
+)
 from graphloc.errors import ConfigError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
@@ -24,11 +32,12 @@ from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import OTHER_TYPES
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.decode import TWIST
+from graphloc.frontends.decode import DECODERS, TWIST
 from graphloc.frontends.inspect import draft_config, inspect_bag, render
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
 from tests.bagfactory import Item, Messages, S, write_bag
+from tests.test_inspect import DATUM, drive, look
 
 SENTENCE = "nmea_msgs/msg/Sentence"
 
@@ -452,16 +461,57 @@ def test_a_sensor_that_hears_nothing_says_so_of_its_own_sentences(tmp_path: Path
     assert "gnss_velocity: none of the 150 messages on /line could be used, mostly: VTG: no fix" in warnings
 
 
+def gps_fix(make: Messages, stamp_ns: int, lat: float, lon: float, *, status: int = 0, **told: float) -> Any:
+    """A `gps_msgs/GPSFix` at 40 m with sigmas of 0.5, 0.5, 1 m; `told`: other fields, 0 where not given."""
+    if "gps_msgs/msg/GPSFix" not in make.t:
+        make.store.register(get_types_from_msg(OTHER_TYPES["gps_msgs/msg/GPSFix"], "gps_msgs/msg/GPSFix"))
+    numbers = {n: 0.0 for n in ("track", "speed", "climb", "pitch", "roll", "dip", "time", "gdop", "pdop", "hdop", "vdop", "tdop", "err", "err_horz", "err_vert", "err_track", "err_speed", "err_climb", "err_time", "err_pitch", "err_roll", "err_dip")}  # fmt: skip
+    lists = {n: np.zeros(0, dtype=np.int32) for n in ("satellite_used_prn", "satellite_visible_prn", "satellite_visible_z", "satellite_visible_azimuth", "satellite_visible_snr")}  # fmt: skip
+    header = make.header(stamp_ns)
+    state = make.t["gps_msgs/msg/GPSStatus"](header=header, satellites_used=0, satellites_visible=0, status=status, motion_source=0, orientation_source=0, position_source=0, **lists)  # fmt: skip
+    return make.t["gps_msgs/msg/GPSFix"](header=header, status=state, latitude=lat, longitude=lon, altitude=40.0, position_covariance=np.diag([0.25, 0.25, 1.0]).ravel(), position_covariance_type=2, **(numbers | told))  # fmt: skip
+
+
+def test_the_course_and_speed_of_a_gps_fix_are_a_velocity(tmp_path: Path) -> None:
+    """gpsd_client and others say it nowhere else, and it was left out: nothing told the receiver's drift from motion."""
+    make = Messages(2)
+    drawn = drive(make, status=0, sigma_m=1.0, seconds=60)
+    fixes = [(at, m) for topic, at, m in drawn if topic == "/fix"]
+    p = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for _, m in fixes]).T)
+    v = np.gradient(p, 0.2, axis=0)
+    said = [item for item in drawn if item[0] == "/imu"]
+    for (at, fix), (east, north, _) in zip(fixes, v, strict=True):
+        speed = float(np.hypot(east, north))
+        track = float(np.degrees(np.arctan2(east, north)) % 360.0) if speed > 0.05 else float("nan")
+        told: dict[str, Any] = {"speed": speed, "track": track, "climb": float("nan")}
+        said.append(("/gps", at, gps_fix(make, at, fix.latitude, fix.longitude, **told)))
+    said.sort(key=lambda item: item[1])
+    _, config, text = look(tmp_path, said, make)
+    (velocity,) = config.of_kind("gnss_velocity").values()
+    assert (velocity.topic, velocity.enabled) == ("/gps", True)
+    assert "east, north, up" in text
+    recording = read_recording(tmp_path / "run", config)
+    read = [m for m in recording.measurements if isinstance(m, GnssVelocity)]
+    assert len(read) == len(fixes)
+    np.testing.assert_allclose([m.v_world_mps[:2] for m in read], v[:, :2], atol=0.05)
+    assert all(m.cov_m2ps2[2, 2] > 1e5 for m in read)  # no climb
+
+
+def test_a_gps_fix_without_a_speed_tells_no_velocity() -> None:
+    make, nan = Messages(2), float("nan")
+    for speed, track, status, why in ((nan, 0.0, 0, "no speed"), (3.0, nan, 0, "no track"), (3.0, 0.0, -1, "no fix")):
+        fix = gps_fix(make, S, 57.7, 11.9, speed=speed, track=track, status=status)
+        found = DECODERS["gnss_velocity", "gps_msgs/msg/GPSFix"](fix, S, 0, "v", VelocityConfig())
+        assert isinstance(found, Rejection)
+        assert why in found.reason
+
+
 def test_messages_of_other_packages_say_the_same(tmp_path: Path) -> None:
     """A GPSFix with WAAS, a velocity as a bare vector, a pose without a covariance."""
     make, items = Messages(2), []
-    make.store.register(get_types_from_msg(OTHER_TYPES["gps_msgs/msg/GPSFix"], "gps_msgs/msg/GPSFix"))
     for k in range(40):
         stamp = 1_700_000_000 * S + k * S // 5
-        none = {n: 0.0 for n in ("track", "speed", "climb", "pitch", "roll", "dip", "time", "gdop", "pdop", "hdop", "vdop", "tdop", "err", "err_horz", "err_vert", "err_track", "err_speed", "err_climb", "err_time", "err_pitch", "err_roll", "err_dip")}  # fmt: skip
-        lists = {n: np.zeros(0, dtype=np.int32) for n in ("satellite_used_prn", "satellite_visible_prn", "satellite_visible_z", "satellite_visible_azimuth", "satellite_visible_snr")}  # fmt: skip
-        status = make.t["gps_msgs/msg/GPSStatus"](header=make.header(stamp), satellites_used=0, satellites_visible=0, status=33, motion_source=0, orientation_source=0, position_source=0, **lists)  # fmt: skip
-        fix = make.t["gps_msgs/msg/GPSFix"](header=make.header(stamp), status=status, latitude=57.7, longitude=11.9 + 1e-5 * k, altitude=40.0, position_covariance=np.diag([0.25, 0.25, 1.0]).ravel(), position_covariance_type=2, **none)  # fmt: skip
+        fix = gps_fix(make, stamp, 57.7, 11.9 + 1e-5 * k, status=33)
         items += [
             ("/gps", stamp, fix),
             ("/vel", stamp, make.t["geometry_msgs/msg/Vector3Stamped"](header=make.header(stamp), vector=make.vector((3.0, 0.0, 0.0)))),

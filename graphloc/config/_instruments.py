@@ -168,12 +168,12 @@ class CompassConfig(SensorConfig):
 
 
 class VelocityConfig(SensorConfig):
-    """GNSS velocity over ground (`geometry_msgs/TwistWithCovarianceStamped`, `TwistStamped`, `Vector3Stamped`, NMEA as `gnss`)."""
+    """GNSS velocity over ground (`geometry_msgs/TwistWithCovarianceStamped`, `TwistStamped`, `Vector3Stamped`, NMEA and GPSFix as `gnss`)."""
 
     kind: Literal["gnss_velocity"] = "gnss_velocity"
     """The sensor kind."""
     convention: Literal["enu", "ned"] = "enu"
-    """Axes of the message: `enu` east, north, up; `ned` north, east, down. Of NMEA they are known."""
+    """Axes of the message: `enu` east, north, up; `ned` north, east, down. Of NMEA and GPSFix they are known."""
     min_sigma_mps: Positive = 0.03
     """Floor of the velocity sigma, m/s."""
     default_sigma_mps: Positive = 0.3
