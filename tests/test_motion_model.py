@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 
 from graphloc import app, keys
+from graphloc.build import make_problem
 from graphloc.build._usual_motion import UsualMotion, usual_motion
 from graphloc.config import TimelineConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
 from graphloc.measurements import CompassHeading
 from graphloc.motion_model import MotionModel, Moving
 from graphloc.recording import Recording
 from graphloc.replay import replay
+from graphloc.solve._passes import expected_cost
 from graphloc.timeline import make_timeline
 from graphloc.trajectory import Trajectory, bounds_95
 from tests.slowly import with_few_states
@@ -196,6 +199,17 @@ def test_a_step_is_in_the_graphs_that_have_both_its_states() -> None:
     assert (
         len(found.factors(TIMELINE, values, range(40, 43), state + 1)) == 2
     )  # the first node began before the stretch
+
+
+def test_a_step_is_expected_to_cost_what_its_two_axes_do(lost: Lost) -> None:
+    """Those alone whose states are both in the stretch that the cost is of."""
+    datum = app.choose_datum(lost.recording, lost.config)
+    problem = make_problem(lost.recording, lost.config, datum, SENSORS, INERTIAL)
+    last = len(problem.timeline) - 1
+    stepped = replace(problem, usual_motion=UsualMotion(MotionModel(), frozenset({5, 6, 7})))
+    for until, steps in ((last, 3), (int(np.searchsorted(problem.timeline.slow_of, 7)), 2)):
+        more = expected_cost(stepped, {}, until) - expected_cost(problem, {}, until)
+        assert more == pytest.approx(2.0 * steps)
 
 
 def counted(steps: list[int]):  # type: ignore[no-untyped-def]
