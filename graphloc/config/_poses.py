@@ -83,6 +83,9 @@ class AerialConfig(AnyPoseConfig):
     """GeoJSON of lines and polygons of quays, piers and shores; path as for `image`."""
     image_sigma_m: NonNegative = 0.3
     """Misregistration of the image as a whole, east and north, 1 sigma, m."""
+    mount_sigma_deg: NonNegative = 1.0
+    """Yaw error of all matches alike (mounts of the LiDARs, rotation of the image), 1 sigma, deg; it is estimated. A mount
+    measured by hand is off by a degree or two. 0: taken as given."""
     lidars: dict[str, LidarConfig] = Field(default_factory=dict)
     """The LiDARs by name."""
     hull_m: tuple[tuple[Finite, Finite], ...] = ()
