@@ -502,7 +502,11 @@ def _lidars(bag: _Contents) -> tuple[MountedTopic, ...]:
         if _NO_LIDAR.search(lidar.topic):
             return "by its name of no LiDAR; its range and noise are others"
         other = first.get(lidar.frame_id, lidar.topic)
-        return "" if other == lidar.topic else f"in the same frame as {other}: its points would count twice, or it needs a mount of its own"
+        return (
+            ""
+            if other == lidar.topic
+            else f"in the same frame as {other}: its points would count twice, or it needs a mount of its own"
+        )
 
     return tuple(replace(lidar, left_out=why_not(lidar)) for lidar in lidars)
 
