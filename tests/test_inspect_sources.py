@@ -388,15 +388,19 @@ def test_a_gap_of_one_receiver_is_no_wander(silent: str, tmp_path: Path) -> None
     assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
 
 
-def test_a_height_that_is_a_constant_tells_nothing_of_the_others(tmp_path: Path) -> None:
-    """Of a driver that fills in 0: hills that the better receiver shows were taken for its drift, and it was switched off."""
+@pytest.mark.parametrize("keeps", [1.0, 0.985], ids=["a constant", "smoothed"])
+def test_hills_that_another_receiver_does_not_show_are_no_drift(keeps: float, tmp_path: Path) -> None:
+    """Of a driver that fills in 0, or a filter over 13 s: the better receiver's hills were taken for its drift, and it was switched off."""
     make = Messages(2)
-    items = two_receivers(make, lambda t, _yaw: np.zeros((len(t), 3)), claims_m=4.0, height=True)
+    items = two_receivers(make, lambda t, _yaw: np.zeros((len(t), 3)), claims_m=2.0, height=True)
+    height = 0.0
     for topic, at, m in items:
+        hill = 20.0 * np.sin((at - START_NS) / S / 15.0)
         if topic == "/fix":
-            m.altitude += 20.0 * np.sin((at - START_NS) / S / 20.0)
+            m.altitude += hill
         elif topic == "/cheap/fix":
-            m.altitude = 0.0
+            height = keeps * height + (1.0 - keeps) * hill
+            m.altitude = height
     _, config, _ = look(tmp_path, items, make)
     assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
 
