@@ -36,6 +36,8 @@ _TOGETHER_M = 5.0
 # Share of the sightings of a tag in which the vessel is behind its plane, by more than a fix is off; and by how much more than the
 # camera's lever arm she may be farther from it than it looks: else it is not the facing that is wrong, but the place.
 _BEHIND, _BEHIND_M, _PLACE_M = 0.5, 3.0, 5.0
+# Share of what her distance and that which it looks scatter by in sum, up to which their difference scatters.
+_ALONG = 0.5
 
 Key = tuple[str, tuple[str, int]]  # of a tag: its sensor; its family and id
 
@@ -90,25 +92,40 @@ def _seen_from_behind(
     if len(fixes) < _FEWEST:
         return []
     stamps, places = np.array([m.stamp_ns for m in fixes]), world_from_fixes(fixes, solution.datum)[:, :2]
-    seen: dict[Key, list[bool]] = defaultdict(list)
+    seen: dict[Key, list[tuple[float, float, bool]]] = defaultdict(list)
     for m in sightings:
         nearest = int(np.argmin(np.abs(stamps - m.stamp_ns)))
         for tag, corners in zip(m.tags, m.points_m.reshape(-1, 4, 3), strict=True):
             away = places[nearest] - corners.mean(axis=0)[:2]
             out = np.cross(corners[1] - corners[0], corners[0] - corners[3])[:2]  # right x up
-            farther_m = abs(float(np.linalg.norm(away)) - float(np.linalg.norm(_in_camera(m))))
-            as_far = farther_m < float(np.linalg.norm(m.t_body_camera_m)) + _PLACE_M
             before_m = float(away @ out) / max(float(np.linalg.norm(out)), 1e-9)
-            seen[m.sensor, tag].append(as_far and before_m < -_BEHIND_M)
+            away_m, looks_m = float(np.linalg.norm(away)), float(np.linalg.norm(_in_camera(m)))
+            as_far = abs(away_m - looks_m) < float(np.linalg.norm(m.t_body_camera_m)) + _PLACE_M
+            seen[m.sensor, tag].append((away_m, looks_m, as_far and before_m < -_BEHIND_M))
     behind: dict[str, list[str]] = defaultdict(list)
     for (sensor, tag), own in sorted(seen.items()):
-        if len(own) >= _FEWEST and np.mean(own) >= _BEHIND:
+        if len(own) >= _FEWEST and _faces_away(np.array(own)):
             behind[sensor].append(config.of_kind("apriltag")[sensor].surveyed.called(*tag))
     return [
         f"{sensor}: {', '.join(tags)}: by the fixes they are seen from behind, where no print is: facing_deg (or rpy_deg) is the "
         "other way round"
         for sensor, tags in behind.items()
     ]
+
+
+def _faces_away(seen: Array) -> bool:
+    """Return whether a tag faces away from where it is seen: the farther off it looks, the farther is the vessel, behind its plane.
+
+    Behind a tag whose place is wrong, or by fixes that are, she comes nearer to it as it looks farther off.
+
+    Args:
+        seen: (N, 3) how far she is from it, and how far it looks, m; whether she is clearly behind its plane, and about as far.
+    """
+    behind = seen[:, 2] > 0.0
+    if behind.mean() < _BEHIND:
+        return False
+    away_m, looks_m, _ = seen[behind].T
+    return float(np.std(away_m - looks_m)) < _ALONG * float(np.std(away_m + looks_m))
 
 
 def _key(m: TagSighting) -> Key:

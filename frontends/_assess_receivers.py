@@ -6,8 +6,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from graphloc.frames import Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._assess import track
 from graphloc.frontends._clock import MOST_LATE_S
 from graphloc.frontends._reports import GnssReport
@@ -16,9 +17,8 @@ from graphloc.time import NS_PER_S
 
 _FEWEST, _LAG_S = 20, 0.1
 _NEVER_NEAR = 0.5  # of the RMS distance; of errors alone the 5 % point is 0.23 of it (Rayleigh)
-_RAYLEIGH = (
-    1.53  # sigma of an axis over that of the distance, where both errors are as large as the way between the antennas
-)
+_GAP = 3.0  # times the usual interval, from which nothing is known of the way in between
+_WITHOUT = 0.1  # share of fixes without a height, from which the others tell no range
 _NORMAL_90 = 3.29  # sigmas from the 5 % point to the 95 % point
 
 
@@ -32,12 +32,12 @@ def apart_m(first: GnssReport, second: GnssReport, fixes: TopicData, others: Top
     """
     at, _, rows = track(fixes)
     there, _, other_rows = track(others)
-    if not len(at) or not len(there):
+    if min(len(at), len(there)) < _FEWEST:
         return None
     datum = Datum(Geodetic(*rows[0, :3]))
     p, q = (datum.enu_from_geodetic(*part[:, :3].T)[:, :2] for part in (rows, other_rows))
     t, other_t = (at - at[0]) / NS_PER_S, (there - at[0]) / NS_PER_S
-    inside = (t > other_t[0] + MOST_LATE_S) & (t < other_t[-1] - MOST_LATE_S)
+    inside = _steadily(t, other_t)
     if inside.sum() < _FEWEST:
         return None
     t, p = t[inside], p[inside]
@@ -54,9 +54,22 @@ def apart_m(first: GnssReport, second: GnssReport, fixes: TopicData, others: Top
     return math.sqrt(max(variance - white, 0.0))
 
 
+def _steadily(t: Array, other_t: Array) -> NDArray[np.bool_]:
+    """Return at which times t (N,), late or early by `MOST_LATE_S` at most, a receiver has fixes at other_t (K,) without a gap, s."""
+    steps = np.diff(other_t)
+    gaps_before = np.concatenate([[0], np.cumsum(steps > _GAP * float(np.median(steps)))])  # each fix
+    last = len(other_t) - 1
+    first, then = (np.searchsorted(other_t, t + late_s) for late_s in (-MOST_LATE_S, MOST_LATE_S))
+    steadily = gaps_before[np.maximum(first - 1, 0)] == gaps_before[np.minimum(then, last)]
+    return np.asarray(steadily & (first > 0) & (then <= last))
+
+
 def height_wanders_m(gnss: GnssReport) -> float | None:
-    """Return how far the height wanders, 1 sigma, m, white noise left out: hills, and what the receiver drifts by; None without."""
-    if gnss.scatter_m is None or gnss.without_height == gnss.fixes:
+    """Return how far the height wanders, 1 sigma, m, white noise left out: hills, and what the receiver drifts by.
+
+    None where it tells no height, or a constant, as drivers do that fill in a plane.
+    """
+    if gnss.scatter_m is None or gnss.without_height > _WITHOUT * gnss.fixes or gnss.height_range_m == 0.0:
         return None
     return math.sqrt(max((gnss.height_range_m / _NORMAL_90) ** 2 - gnss.scatter_m[2] ** 2, 0.0))
 

@@ -254,7 +254,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         why = (
             _FILTERED
             if filtered(gnss.topic)
-            else "one receiver is used: RTK throughout, else the most accurate by its claims, of equal ones that with heights, then with most fixes"
+            else "one receiver is used: RTK throughout, else the most accurate by its claims and the drift of its height, of equal ones that with heights, then with most fixes"
         )
         lines.append(f"  enabled: false  # guess: {why}")
     else:

@@ -81,9 +81,12 @@ class StaticTree:
             self._repeated[child] = (parent, same, count + 1)
 
     def settle(self) -> None:
-        """Join what `/tf` repeats, once all of it was offered, where `/tf_static` does not have it."""
+        """Join what `/tf` repeats, once all of it was offered, where `/tf_static` does not have it.
+
+        Where the vessel lies still, its place in the world is repeated as well.
+        """
         for child, (parent, pose, count) in self._repeated.items():
-            if count > 1 and child not in self._children:
+            if count > 1 and child not in self._children and parent.rpartition("/")[2] not in WORLD_NAMES:
                 self._join(parent, child, pose)
 
     @property

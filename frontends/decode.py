@@ -355,7 +355,8 @@ def _velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Veloc
 def gps_fix_velocity_mps(msg: Any) -> tuple[float, float, float] | Rejection:
     """Return the velocity of a GPSFix over ground, east, north, up, m/s: its speed, its track clockwise from true north, its climb.
 
-    NaN where it tells no climb. Its errors are left out: drivers disagree on what they mean.
+    NaN where it tells no climb: a receiver measures none to be exactly 0, but drivers of NMEA leave it at that. Its errors are left out:
+    drivers disagree on what they mean.
     """
     if nav_sat_status(int(msg.status.status)) < 0:
         return rejected("no fix (STATUS_NO_FIX)")
@@ -363,7 +364,7 @@ def gps_fix_velocity_mps(msg: Any) -> tuple[float, float, float] | Rejection:
     if not isfinite(speed) or (speed > nmea.SLOW_MPS and not isfinite(track)):
         return rejected(f"no {'track' if isfinite(speed) else 'speed'}")
     angle = np.radians(track if isfinite(track) else 0.0)
-    return float(speed * np.sin(angle)), float(speed * np.cos(angle)), climb
+    return float(speed * np.sin(angle)), float(speed * np.cos(angle)), climb or np.nan
 
 
 def _velocity_gps_fix(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:

@@ -107,6 +107,7 @@ _NO_LIDAR = re.compile(r"depth|radar|stereo", re.IGNORECASE)
 _LOOKS_AHEAD_DEG = np.array([-90.0, 0.0, -90.0])  # of an optical frame
 _SKY = 0.7  # upward part of an optical axis, from which no tag is seen
 _MOST_NAMED = 6
+_FAR_BEYOND = 3.0  # times as far as another one's height wanders
 _SAME_M = 0.05  # by which two topics of one receiver wander against each other at most
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 _FEWEST = 20  # places of a track
@@ -281,10 +282,12 @@ def _octave(gnss: GnssReport, level_m: float) -> int:
 
     Args:
         level_m: by how much the heights of that receiver wander whose heights wander least, 1 sigma. All ride on one craft: what others
-            wander by beyond it is their drift, and the horizontal one is half of the vertical.
+            wander by far beyond it is their drift, and the horizontal one is half of the vertical. Up to that it may be hills, which
+            receivers smooth.
     """
     claimed = gnss.reported_sigma_m[:2] if gnss.reported_sigma_m else (GnssConfig().default_horizontal_sigma_m,)
-    drift_m = 0.5 * math.sqrt(max((height_wanders_m(gnss) or 0.0) ** 2 - level_m**2, 0.0))
+    wanders_m = height_wanders_m(gnss) or 0.0
+    drift_m = 0.5 * wanders_m if wanders_m > _FAR_BEYOND * level_m else 0.0
     return round(math.log2(max(*claimed, *(gnss.scatter_m or ())[:2], drift_m, 1e-3)))
 
 
@@ -502,7 +505,11 @@ def _lidars(bag: _Contents) -> tuple[MountedTopic, ...]:
         if _NO_LIDAR.search(lidar.topic):
             return "by its name of no LiDAR; its range and noise are others"
         other = first.get(lidar.frame_id, lidar.topic)
-        return "" if other == lidar.topic else f"in the same frame as {other}: its points would count twice"
+        return (
+            ""
+            if other == lidar.topic
+            else f"in the same frame as {other}: its points would count twice, or it needs a mount of its own"
+        )
 
     return tuple(replace(lidar, left_out=why_not(lidar)) for lidar in lidars)
 

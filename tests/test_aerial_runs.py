@@ -219,6 +219,12 @@ def test_few_matches_among_many_scans_are_doubted(matched: int, doubted: str) ->
     assert line.endswith(f"`graphloc match` shows one{doubted}")
 
 
+def test_few_matches_after_a_way_over_open_water_are_not_doubted() -> None:
+    """A scan of water alone speaks against nothing: most of a voyage that ends in a harbour has no other ones."""
+    (line,) = few_matches("aerial", Counter({"a scan of water alone": 90, "no pose in the window stands out": 10}), 20)
+    assert line.endswith("`graphloc match` shows one")
+
+
 @pytest.mark.usefixtures("unseen")
 def test_a_broken_scan_is_a_row_of_the_ledger(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, count = scans.decode_cloud, iter(range(10**6))

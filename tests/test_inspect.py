@@ -279,6 +279,19 @@ def test_stamps_gaps_and_latency(tmp_path: Path) -> None:
     assert (camera.count, camera.rate_hz) == (1, None)
 
 
+def test_the_place_of_a_vessel_that_lies_still_is_no_mount(tmp_path: Path) -> None:
+    """Of frames with a namespace the world was taken for the body, and the antenna's lever arm was the way from the world's origin."""
+    make, level = Messages(2), (0, 0, 0, 1)
+    edges = [
+        ("usv/map", "usv/odom", (5, 5, 0), level), ("usv/odom", "usv/hull", (1, 2, 0), level),
+        ("usv/hull", "gps", (1, 2, 3), level), ("usv/hull", "imu_link", (0, 0, 1), level),
+    ]  # fmt: skip
+    items = [*(("/tf", START_NS + k, make.transforms(edges)) for k in range(2)), *drive(make, seconds=10)]
+    _, config, _ = look(tmp_path, items, make)
+    assert config.body_frame == "usv/hull"
+    np.testing.assert_allclose(read_recording(tmp_path / "run", config).mounts["gnss"][0], [1.0, 2.0, 3.0])
+
+
 @pytest.mark.parametrize("topic", ["/tf_static", "/tf"])  # on the latter repeated: static_transform_publisher of ROS 1
 def test_tf_static_beats_guessing(topic: str, tmp_path: Path) -> None:
     make = Messages(2)

@@ -377,6 +377,34 @@ def test_two_antennas_on_a_ship_do_not_wander_against_each_other(tmp_path: Path)
     assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
 
 
+@pytest.mark.parametrize("silent", ["/fix", "/cheap/fix"])
+def test_a_gap_of_one_receiver_is_no_wander(silent: str, tmp_path: Path) -> None:
+    """The way that the other one went meanwhile was taken for it: metres of slow error were drafted for receivers that agree."""
+    make = Messages(2)
+    items = two_receivers(make, lambda t, _yaw: np.zeros((len(t), 3)), claims_m=1.0, height=True)
+    kept = [item for item in items if item[0] != silent or not 40 * S < item[1] - START_NS < 80 * S]
+    found, config, _ = look(tmp_path, kept, make)
+    assert not any("wander against each other" in line for line in found.warnings)
+    assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
+
+
+@pytest.mark.parametrize("keeps", [1.0, 0.985], ids=["a constant", "smoothed"])
+def test_hills_that_another_receiver_does_not_show_are_no_drift(keeps: float, tmp_path: Path) -> None:
+    """Of a driver that fills in 0, or a filter over 13 s: the better receiver's hills were taken for its drift, and it was switched off."""
+    make = Messages(2)
+    items = two_receivers(make, lambda t, _yaw: np.zeros((len(t), 3)), claims_m=2.0, height=True)
+    height = 0.0
+    for topic, at, m in items:
+        hill = 20.0 * np.sin((at - START_NS) / S / 15.0)
+        if topic == "/fix":
+            m.altitude += hill
+        elif topic == "/cheap/fix":
+            height = keeps * height + (1.0 - keeps) * hill
+            m.altitude = height
+    _, config, _ = look(tmp_path, items, make)
+    assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
+
+
 def test_a_covariance_that_is_a_placeholder_is_told_from_one(tmp_path: Path) -> None:
     """Drivers that know none write 99999 m^2: such fixes would tell next to nothing."""
     _, config, _ = look(tmp_path, drive(Messages(2), status=0, sigma_m=316.0), Messages(2))

@@ -506,6 +506,17 @@ def test_a_gps_fix_without_a_speed_tells_no_velocity() -> None:
         assert why in found.reason
 
 
+def test_a_climb_that_the_driver_leaves_at_0_is_none() -> None:
+    """On a hill it held the height back, with a sigma of 0.3 m/s."""
+    make = Messages(2)
+    for climb, told in ((0.0, False), (0.2, True)):
+        fix = gps_fix(make, S, 57.7, 11.9, speed=3.0, track=90.0, climb=climb)
+        found = DECODERS["gnss_velocity", "gps_msgs/msg/GPSFix"](fix, S, 0, "v", VelocityConfig())
+        assert isinstance(found, GnssVelocity)
+        assert found.v_world_mps == pytest.approx((3.0, 0.0, climb))
+        assert (found.cov_m2ps2[2, 2] < 1.0) == told
+
+
 def test_messages_of_other_packages_say_the_same(tmp_path: Path) -> None:
     """A GPSFix with WAAS, a velocity as a bare vector, a pose without a covariance."""
     make, items = Messages(2), []

@@ -55,3 +55,11 @@ def test_what_stays_outside_of_the_hull() -> None:
     (line,) = said(40.0, np.vstack([DECK, ring]), HULL)
     assert "points outside hull_m stay with the vessel" in line
     assert "upside down" in line
+
+
+@pytest.mark.parametrize("hull", [None, HULL], ids=["no hull", "hull"])
+def test_a_wall_close_by_may_be_what_stays(hull: Array | None) -> None:
+    """Of a lock: it holds points in each place beside her in every scan, as she does."""
+    wall = np.array([(x, 2.5, z) for x in np.arange(-20.0, 20.0, 0.2) for z in (0.5, 1.0)])
+    (line,) = said(40.0, np.vstack([DECK, wall]), hull)
+    assert "a wall that she went along" in line

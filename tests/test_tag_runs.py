@@ -355,6 +355,22 @@ def test_tags_that_face_the_other_way_in_the_survey_are_named() -> None:
     assert "elsewhere than its mount says" not in said
 
 
+def test_a_quay_that_is_off_is_not_taken_for_tags_that_face_the_other_way() -> None:
+    """By 13 m towards the water, seen at the berth alone: by the fixes the vessel is behind it, about as far as it looks."""
+
+    def moved(tag: TagConfig) -> TagConfig:
+        assert tag.rpy_deg is not None
+        assert tag.xyz_m is not None
+        out = Rotation.from_euler("ZYX", tag.rpy_deg[::-1], degrees=True).as_matrix()[:, 2]
+        return tag.model_copy(update={"xyz_m": tuple(np.array(tag.xyz_m) + 13.0 * out)})
+
+    first_ns = int(voyage("fixed", lasts_s=60.0).truth.stamps_ns[0])
+    near = lambda m: m if not isinstance(m, TagSighting) or m.stamp_ns > first_ns + 40 * S else None
+    said = dock(tag=moved, change=near, lasts_s=60.0).said
+    assert "gnss has a constant offset of 14" in said
+    assert "from behind" not in said
+
+
 def test_one_tag_of_another_size_is_named() -> None:
     """0.162 m, the default of a well-known example, where 0.412 m hangs; one id in two families is two tags.
 

@@ -22,6 +22,8 @@ _CONTRAST = (-3.46, 0.096)  # log-odds of windows with the truth to those withou
 _MOST_WITHIN = 0.95  # priors may be wrong, however sure
 _LEAST_PLACES = 30
 _MODES = 5
+NO_POSE = "no pose in the window stands out"
+"""Why a scan has no match: it fits nowhere better than by chance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +107,7 @@ class Matcher:
         score = log_likelihood_of(found, layers, grid)
         trust = _trust(score, _within(prior.sigma, np.array([half_m, half_m, np.radians(half_deg)])))
         modes, none = modes_of(score, grid, _NONE_LOG, 1.0 - trust, _MODES)
-        why_not = "" if modes else "no pose in the window stands out"
+        why_not = "" if modes else NO_POSE
         return Match(prior, found, layers, grid, score, tuple(modes), none, why_not)
 
 

@@ -26,6 +26,7 @@ _CLOSE_M = (
     3.0  # to a LiDAR, or a corner of the hull: she begins there; a quay that she goes along stays as well, farther off
 )
 _GAP_M = 1.5
+_WALL = "a wall that she went along all the time"  # of a lock or canal, nearer than what is told from her
 _FEWEST_CELLS = 8
 _UNDER_M = 1.0  # nothing is hit there; waves, a tilt and the mirror images of walls in calm water aside
 
@@ -76,10 +77,10 @@ class Staying:
         seen = f"in {scans} scans points"
         if not self._hull:
             return [
-                f"hull_m is empty, and {seen} stay with the vessel: herself; give her outline, at least hull_m: {box}"
+                f"hull_m is empty, and {seen} stay with the vessel: herself, unless {_WALL}; give her outline, at least hull_m: {box}"
             ]
         water = "water, by a waterline_m that is too low or a LiDAR's mount upside down"
-        return [f"{seen} outside hull_m stay with the vessel, within {box}: herself, or {water}"]
+        return [f"{seen} outside hull_m stay with the vessel, within {box}: herself, {water}, or {_WALL}"]
 
     def _hanging_together(self, cells_m: Array) -> Array:
         """Return the cells (N, 2) that hang together with some close to what is known of the vessel."""

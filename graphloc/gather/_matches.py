@@ -12,11 +12,12 @@ from graphloc.eval.match_picture import Gallery
 from graphloc.frames import Datum
 from graphloc.frontends._part import Bags
 from graphloc.frontends.aerial import match_bag
+from graphloc.frontends.aerial.matcher import NO_POSE
 from graphloc.gather._gathering import Gathering
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 
-_MISLED = 0.25
+_MISLED = 0.25  # matches to scans that fit nowhere, below which the former are doubted
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +63,11 @@ def with_matches(
 
 
 def few_matches(sensor: str, reasons: Counter[str], matched: int) -> list[str]:
-    """Say so where scans of a sensor gave no match; where most did not, what hinders them may have misled the others."""
+    """Say so where scans of a sensor gave no match; where most fit nowhere, what hinders them may have misled the others."""
     if reasons.total() < 5:
         return []
     ((most, count),) = reasons.most_common(1)
-    others = f"; the {matched} others may well be false" if 0 < matched < _MISLED * reasons.total() else ""
+    others = f"; the {matched} others may well be false" if 0 < matched < _MISLED * reasons[NO_POSE] else ""
     return [
         f"{sensor}: {reasons.total()} scans gave no match, {count} of them: {most}; `graphloc match` shows one{others}"
     ]
