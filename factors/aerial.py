@@ -19,7 +19,6 @@ from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
 from graphloc.measurements import PoseFix, PoseMode
 
-
 _AXES = ("x", "y", "yaw")
 
 
