@@ -45,7 +45,9 @@ from tests.mapfactory import picture
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("aerial") / "sim"
-    write_bag(simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "16"}), 3), folder, ros=2)
+    write_bag(
+        simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "16", "lidar_hz": "4"}), 3), folder, ros=2
+    )
     return folder
 
 
@@ -56,7 +58,7 @@ def test_from_a_bag_to_the_graph(bag: Path, tmp_path: Path) -> None:
     run = app.smooth_recording(recording, vessel, scans=scans)
     counts = run.solution.ledger.counts()
     matches = sum(counts["aerial"].values())
-    assert 9 <= matches <= 15  # one a second, none where the vessel has moved less than half a metre
+    assert 9 <= matches <= 16  # one a second, none where the vessel has moved less than half a metre
     assert counts["aerial"]["used"] > 0.9 * matches
     assert sum(sum(c.values()) for c in counts.values()) == recording.message_count + matches
     assert 1 <= len(run.pictures) <= 3

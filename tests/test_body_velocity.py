@@ -136,7 +136,7 @@ def test_a_log_holds_the_track_while_gnss_is_silent() -> None:
     """Causal, through water that flows at 0.3, -0.2 m/s with a log that reads 2 % too much: neither is told."""
     largest: dict[float, list[float]] = {0.0: [], 5.0: []}
     squares: list[float] = []
-    for seed in (11, 12):
+    for seed in (11,):
         for hz, found in largest.items():
             run = silent(seed, hz)
             track = replay(run.recording, run.config).solution.trajectory

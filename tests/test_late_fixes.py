@@ -82,8 +82,7 @@ def test_the_jacobians_are_those_of_the_residual() -> None:
         np.testing.assert_allclose(np.linalg.cholesky(residual.cov) @ column, change, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("mode", [offline, online], ids=["offline", "online"])
-@pytest.mark.parametrize("slow", [False, True], ids=["white", "slow"])
+@pytest.mark.parametrize(("mode", "slow"), [(offline, False), (online, True)], ids=["offline", "online-slow"])
 def test_late_fixes_are_found_out(mode: object, slow: bool) -> None:
     assert callable(mode)
     believed, estimated = mode(late(0.0, slow=slow)), mode(late(0.1, slow=slow))

@@ -22,9 +22,9 @@ from graphloc.solution import Solution
 from graphloc.solve._legs import overlap_ns, seams
 
 S = 10**9
-LEG_S = 60.0
-RATE_HZ, FEW_HZ = 5.0, 2.5  # of states: half the time, a quarter
-LOOPS = Scenario(path="loops", duration_s=130.0, noise="drift", imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0)
+LEG_S = 45.0
+RATE_HZ = 2.5  # of states: a quarter of the time
+LOOPS = Scenario(path="loops", duration_s=100.0, noise="drift", imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0)
 
 
 def in_legs(config: VesselConfig, leg_s: float, rate_hz: float) -> VesselConfig:
@@ -36,7 +36,7 @@ def solved(
     run: SimulatedRun,
     leg_s: float = LEG_S,
     measurements: tuple[Measurement, ...] | None = None,
-    rate_hz: float = FEW_HZ,
+    rate_hz: float = RATE_HZ,
 ) -> Solution:
     recording = run.recording
     if measurements is not None:
@@ -56,12 +56,12 @@ def run() -> SimulatedRun:
 
 @pytest.fixture(scope="module")
 def whole(run: SimulatedRun) -> Solution:
-    return solved(run, 1000.0, rate_hz=RATE_HZ)
+    return solved(run, 1000.0)
 
 
 @pytest.fixture(scope="module")
 def legs(run: SimulatedRun) -> Solution:
-    return solved(run, rate_hz=RATE_HZ)
+    return solved(run)
 
 
 def test_legs_are_as_good_as_the_whole(run: SimulatedRun, whole: Solution, legs: Solution) -> None:
@@ -111,7 +111,7 @@ def test_seams_keep_away_from_an_outage(run: SimulatedRun) -> None:
     absolute = {m.sensor for m in recording.measurements if not isinstance(m, CompassHeading)}
     assert seams(recording, 1000.0, absolute) == []
     usual = seams(recording, LEG_S, absolute)
-    assert [s - first for s in usual] == pytest.approx([130 * S / 3, 260 * S / 3], abs=S)
+    assert [s - first for s in usual] == pytest.approx([100 * S / 3, 200 * S / 3], abs=S)
     gone = (usual[0] - 14 * S, usual[0] + 10 * S)
     kept = tuple(m for m in recording.measurements if m.sensor not in absolute or not gone[0] < m.stamp_ns < gone[1])
     away = seams(replace(recording, measurements=kept), LEG_S, absolute)
@@ -129,11 +129,11 @@ def test_a_heading_that_no_sensor_tells_is_handed_on(run: SimulatedRun, monkeypa
 
     monkeypatch.setattr(graphloc.solve, "make_problem", noted)
     fixes = tuple(m for m in run.recording.measurements if isinstance(m, GnssPosition))
-    solved(run, measurements=fixes)
-    where = seams(replace(run.recording, measurements=fixes), LEG_S, {"gnss"})
+    solved(run, 60.0, fixes)
+    where = seams(replace(run.recording, measurements=fixes), 60.0, {"gnss"})
     assert asked[0] is None
     for seam, heading_deg in zip(where, asked[1:], strict=True):
-        true = run.truth.at(np.array([seam - overlap_ns(LEG_S)]))
+        true = run.truth.at(np.array([seam - overlap_ns(60.0)]))
         assert heading_deg == pytest.approx(float(heading_deg_from_yaw(true.yaw_rad)[0]), abs=6.0)
 
 

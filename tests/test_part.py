@@ -344,7 +344,8 @@ def test_scans_of_a_part_are_matched_and_no_others(tmp_path: Path, monkeypatch: 
     assert sum(row.count for row in scans) == len(inside)
     decoded = decoded_from_now_on(monkeypatch)
     run = app.smooth_recording(recording, loaded, scans=where)
-    assert decoded == inside
+    assert decoded[: len(inside)] == inside
+    assert set(decoded) == set(inside)  # once, or twice where the first track leaves much open
     assert len(inside) == 8
     stamps = [m.stamp_ns for m in run.recording.measurements if m.sensor == "aerial"]
     assert len(stamps) > 5

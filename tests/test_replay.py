@@ -40,7 +40,9 @@ def whole(run: SimulatedRun) -> Replayed:
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("replay") / "sim"
-    write_bag(simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "16"}), 3), folder, ros=2)
+    write_bag(
+        simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "16", "lidar_hz": "2"}), 3), folder, ros=2
+    )
     return folder
 
 

@@ -35,7 +35,7 @@ def data() -> ReportData:
         config=run.config,
         filters=run.filters,
         held=(),
-        levers_m={},
+        levers_m=app.levers_m(run),
         tables=app.tables(run),
         truth_statement="Truth: /truth",
     )

@@ -148,7 +148,7 @@ def test_an_imu_that_is_noisier_than_its_data_sheet_is_believed_less() -> None:
 
 def test_online_an_imu_that_is_noisier_than_its_data_sheet_is_believed_less() -> None:
     """Twenty seconds after the start: what the window holds is more probable with the noise that the samples have."""
-    run = shaken(2, 45.0)
+    run = shaken(2, 38.0)
     solved = [replay(run.recording, by_data_sheet(run, adapt_noise=adapt)).solution for adapt in (False, True)]
     late_ns = run.truth.stamps_ns[0] + 25 * SECOND
     nees = []

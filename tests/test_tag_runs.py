@@ -350,7 +350,7 @@ def test_tags_that_face_the_other_way_in_the_survey_are_named() -> None:
         roll, pitch, yaw = tag.rpy_deg
         return tag.model_copy(update={"rpy_deg": (roll, pitch, yaw + 180.0)})
 
-    said = dock(tag=turned, lasts_s=40.0).said
+    said = dock(tag=turned, lasts_s=40.0, rate_hz=1.0).said
     assert "tag 226, tag 227, tag 228: by the fixes they are seen from behind" in said
     assert "elsewhere than its mount says" not in said
 

@@ -64,14 +64,14 @@ def squares(solved: Solution, run: SimulatedRun) -> tuple[Array, Array]:
 
 
 def test_a_drifting_receiver_is_in_the_bounds_of_heading_and_velocity() -> None:
-    """Three draws of the drift that the configuration states: the mean square is that of the covariance, 1."""
+    """Two draws of the drift that the configuration states: the mean square is that of the covariance, 1."""
     found = []
-    for seed in range(3):
+    for seed in range(2):
         run, recording, config = drifting(seed, 1.0)
         config = with_few_states(config)
         found.append(squares(app.smooth_recording(recording, config).solution, run))
     heading, velocity = np.mean([h.mean() for h, _ in found]), np.mean([v.mean() for _, v in found])
-    assert 0.3 < heading < 2.2  # of some six degrees of freedom
+    assert 0.3 < heading < 2.2  # of some four degrees of freedom
     assert 0.6 < velocity < 1.2
 
 
@@ -80,7 +80,7 @@ def test_online_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 15.3)  # each try solves all that there is
     monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
     found = []
-    for seed in range(3):
+    for seed in range(2):
         run, recording, config = drifting(seed, 0.5)
         found.append(squares(app.replay_recording(recording, with_few_states(config)).solution, run))
     heading, velocity = np.mean([h.mean() for h, _ in found]), np.mean([v.mean() for _, v in found])

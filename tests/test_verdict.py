@@ -225,3 +225,18 @@ def test_what_would_end_it_is_reported_of_the_cause() -> None:
     assert "second position sensor" in cure(*health_of(np.diag([4.0, 4.0, 1.0, 1e-4, 1e-4, 1e-4]), {"gnss": 1.0}))
     assert "warnings" in cure(*health_of(known, {"gnss": 1.0}, "the measurements contradict each other"))
     assert "start.heading_deg" in cure(Health.LOST, HealthReason("in whatever words", Cause.GUESSED_HEADING))
+
+
+@pytest.mark.parametrize(
+    ("off_m", "share", "trust"), [(30.0, 1.0, Trust.NO), (30.0, 0.4, Trust.YES), (12.0, 1.0, Trust.YES)]
+)
+def test_a_track_that_most_fixes_contradict_is_not_relied_on(
+    data: ReportData, off_m: float, share: float, trust: Trust
+) -> None:
+    """30 m for 40 % of the run is a jump; 12 m all the time may be a harbour's."""
+    solution = replace(data.solution, trajectory=moved(data.solution.trajectory, share, off_m))
+    (offline, _) = verdict(replace(data, solution=solution)).tracks
+    assert offline.trust is trust
+    said = [r.text for r in offline.reasons if r.text.startswith("Half of the fixes of gnss are ")]
+    assert len(said) == (trust is Trust.NO)
+    assert all(float(line.split()[7]) == pytest.approx(off_m, abs=2.0) for line in said)

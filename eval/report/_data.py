@@ -22,7 +22,7 @@ class ReportData:
 
     Attributes:
         solution: of the run. online: of the online mode on the same measurements, if it was compared.
-        held: fixes that were held out. levers_m: their antennas in body, (3,) m, by receiver.
+        held: fixes that were held out. levers_m: antenna of each receiver in body, (3,) m.
         tables: the metrics. truth_statement: what these were measured against.
         pictures: captions and JPEGs of matches. underlay: the aerial image under the map.
         calibration: suggestions of an offline run. command: the command line.

@@ -17,6 +17,7 @@ from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_c
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
 from graphloc.frames import Array
+from graphloc.measurements import GnssPosition
 from graphloc.solution import Health, Solution
 from graphloc.trajectory import Trajectory, bounds_95
 
@@ -27,6 +28,10 @@ _TOO_SURE = 4.0  # NEES: errors are 1.4 times what the covariance says
 # Of the time in which online's 95 % bounds hold the offline position: that one is better informed, so honest ones do for 95 %.
 _HOLDS_OFFLINE = 0.9
 _PLACES = ("gnss", "pose", "aerial")
+_APART_M, _APART_SIGMAS = (
+    20.0,
+    5.0,
+)  # of a receiver from the track, beyond any multipath that lasts; and of its slow error
 _WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
 
 
@@ -85,8 +90,8 @@ def track_verdict(data: ReportData, solution: Solution) -> TrackVerdict:
         solution: one of `data.solutions`.
     """
     reasons = (
-        *_bounds(data, solution), *_late(data, solution), *_levers(data, solution), *_beside(data, solution), *_from_offline(data, solution),
-        *_compared(data, solution), *_solved(data, solution),
+        *_bounds(data, solution), *_far_from_fixes(data, solution), *_late(data, solution), *_levers(data, solution),
+        *_beside(data, solution), *_from_offline(data, solution), *_compared(data, solution), *_solved(data, solution),
     )  # fmt: skip
     return TrackVerdict(name=solution.name, accuracy=_accuracy(data, solution.name), reasons=reasons)
 
@@ -124,6 +129,28 @@ def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
         )
         text = f"Its heading bounds ({bound_deg:.2f} deg, median) held the truth for {percent(headed)} of the time{off}{why}."
         yield Reason(trust=trust, text=text)
+
+
+def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """Yield receivers that most of the run contradicts: they are false, or what the track follows instead.
+
+    A fix that is off by more, or a jump for a while, is what the graph is for; a survey or an image in a wrong place looks like
+    a receiver that is wrong all the time.
+    """
+    track = solution.trajectory
+    for name, sensor in data.config.of_kind("gnss").items():
+        fixes = [m for m in data.recording.measurements if isinstance(m, GnssPosition) and m.sensor == name]
+        kept = track.covers(np.array([m.stamp_ns for m in fixes], dtype=np.int64))
+        if not kept.any():
+            continue
+        off_m = held_out_errors(track, fixes, solution.datum, data.levers_m).horizontal_m
+        half_m = float(np.median(off_m))
+        if half_m > max(_APART_M, _APART_SIGMAS * sensor.slow_error.horizontal_sigma_m):
+            yield Reason(
+                trust=Trust.NO,
+                text=f"Half of the fixes of {name} are {half_m:.0f} m or more away from it: these are wrong, or what the track follows "
+                "instead (a survey, an image, the datum); this run does not tell which.",
+            )
 
 
 def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:

@@ -73,6 +73,5 @@ def made_comparable(run: Run) -> Run:
 
 
 def levers_m(run: Run) -> dict[str, Array]:
-    """Return the antenna of each receiver that fixes were held out of, in body."""
-    names = dict.fromkeys(m.sensor for m in run.held)
-    return {name: mount_of(name, run.config.sensors[name], run.recording.mounts)[0] for name in names}
+    """Return the antenna of each receiver in body, (3,) m."""
+    return {name: mount_of(name, sensor, run.recording.mounts)[0] for name, sensor in run.config.of_kind("gnss").items()}
