@@ -112,9 +112,9 @@ def _place(
     place: tuple[float, float, float], status: int, horizontal_m: float, vertical_m: float
 ) -> SaidPlace | Rejection:
     """Return a fix whose sigmas may be unknown (0, NaN)."""
+    if horizontal_m >= _MOST_M:
+        return rejected(f"no fix by its accuracy ({horizontal_m:.0f} m)")
     horizontal, vertical = _known(horizontal_m), _known(vertical_m)
-    if horizontal >= _MOST_M:
-        return rejected(f"no fix by its accuracy ({horizontal:.0f} m)")
     known = horizontal >= _FEWEST_M
     # The height may be worse: of a receiver that holds it, a kilometre.
     return SaidPlace(*place, status, horizontal if known else 0.0, vertical if vertical >= _FEWEST_M else 0.0)
@@ -304,7 +304,8 @@ def _oem7_velocity_stamp_ns(msg: Any, log_ns: int) -> int | None:
     """Return the header's stamp, less the age of the velocity."""
     stamp_ns = int(msg.header.stamp.sec) * NS_PER_S + int(msg.header.stamp.nanosec)
     age_s = float(msg.latency)
-    return stamp_ns - round((age_s if 0.0 < age_s < 1.0 else 0.0) * NS_PER_S) if stamp_ns > 0 else None
+    stamp_ns -= round((age_s if 0.0 < age_s < 1.0 else 0.0) * NS_PER_S)
+    return stamp_ns if stamp_ns > 0 else None
 
 
 # Septentrio.
@@ -357,6 +358,7 @@ def _sbf_heading(msg: Any) -> SaidHeading | Rejection:
 
 _PX4_STATUS = {2: 0, 3: 0, 4: 1, 5: 2, 6: 2}
 _PX4_2D, _PX4_NO_ACCEL = 2, 0x7FFFFFFF
+_LATEST_US = 4 * 10**15  # year 2096: nanoseconds in 64 bits
 
 
 def _px4_imu(msg: Any) -> SaidInertial | Rejection:
@@ -395,7 +397,7 @@ def _px4_stamp_ns(msg: Any, _log_ns: int) -> int | None:
     at_us, sampled_us = int(msg.timestamp), int(getattr(msg, "timestamp_sample", 0))
     if 0 <= at_us - sampled_us < 1_000_000:
         at_us = sampled_us
-    return 1000 * at_us or None
+    return 1000 * at_us if 0 < at_us < _LATEST_US else None
 
 
 _GPS = (Part("gnss", _px4_place), Part("gnss_velocity", _px4_velocity), Part("compass", _px4_heading))

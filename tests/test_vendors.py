@@ -12,11 +12,14 @@ import pytest
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig
 from graphloc.frames import wrap_angle
+from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._rejections import Rejection
+from graphloc.frontends._reports import EAST_AXES, NORTH_AXES
+from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import MessageTypes
 from graphloc.frontends._vendor_types import VENDOR_TYPES
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.decode import DECODERS, ImuReading, stamp_ns_of
+from graphloc.frontends.decode import DECODERS, TWIST, ImuReading, stamp_ns_of
 from graphloc.frontends.vendors import VENDORS
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity
 from tests.bagfactory import START_NS, Item, Messages, S
@@ -155,6 +158,7 @@ INVALID: list[tuple[str, str, dict[str, Any], str]] = [
     ("gnss", UBX + "NavPVT", {"fix_type": 1}, "no fix"),
     ("gnss", UBX + "NavPVT", {"h_acc": 0xFFFFFFFF}, "by its accuracy"),
     ("gnss", OEM7 + "BESTPOS", {"sol_status": {"status": 6}}, "status 6"),
+    ("gnss", OEM7 + "BESTPOS", {"lat_stdev": float("inf")}, "by its accuracy"),
     ("gnss", OEM7 + "BESTPOS", {"pos_type": {"type": 19}}, "propagated"),
     ("gnss", SBF + "PVTGeodetic", {"error": 1}, "error 1"),
     ("gnss", SBF + "PVTGeodetic", {"mode": 3}, "set, not measured"),
@@ -272,7 +276,8 @@ def test_stamps_of_px4_are_when_it_was_sampled_and_those_of_bestvel_lack_its_age
     gps, imu = PX4 + "SensorGps", PX4 + "SensorCombined"
     assert stamp_ns_of(said(ROS2, gps, timestamp=5_000_000, timestamp_sample=4_900_000), gps, 7) == 4_900_000_000
     assert stamp_ns_of(said(ROS2, gps, timestamp=5_000_000), gps, 7) == 5 * S
-    assert stamp_ns_of(said(ROS2, imu, timestamp=0), imu, 7) is None
+    for none in (0, 2**63):
+        assert stamp_ns_of(said(ROS2, imu, timestamp=none), imu, 7) is None
     vel = said(ROS2, OEM7 + "BESTVEL", header=ROS2.header(START_NS), latency=0.25)
     assert stamp_ns_of(vel, OEM7 + "BESTVEL", 7) == START_NS - S // 4
     assert stamp_ns_of(vel, OEM7 + "BESTVEL", 7, recorded=True) == 7
@@ -302,13 +307,13 @@ def test_a_bag_without_definitions_is_read_in_each_version(msgtype: str, version
 Say = Callable[[Messages, int, Any, Any, float], list[Item]]
 
 
-def _sbg(make: Messages, at: int, fix: Any, v: Any, heading_deg: float) -> list[Item]:
+def _sbg(make: Messages, at: int, fix: Any, v: Any, heading_deg: float, off_deg: float) -> list[Item]:
     header = make.header(at)
     sigmas = make.vector((0.02, 0.02, 0.04))
     pos = said(make, SBG + "SbgGpsPos", header=header, status={"type": 7}, latitude=fix.latitude, longitude=fix.longitude, altitude=fix.altitude, position_accuracy=sigmas)  # fmt: skip
     vel = said(make, SBG + "SbgGpsVel", header=header, status={"vel_type": 2}, vel=make.vector((v[1], v[0], -v[2])), vel_acc=sigmas)  # fmt: skip
     hdt = said(make, SBG + "SbgGpsHdt", header=header, true_heading=heading_deg, true_heading_acc=0.25)
-    own = said(make, SBG + "SbgEkfEuler", header=header, status={"heading_valid": True}, angle=make.vector((0, 0, np.radians(heading_deg + np.sin(at / S)))))  # fmt: skip
+    own = said(make, SBG + "SbgEkfEuler", header=header, status={"heading_valid": True}, angle=make.vector((0, 0, np.radians(heading_deg + off_deg * np.sin(at / S)))))  # fmt: skip
     return [("/sbg/gps_pos", at, pos), ("/sbg/gps_vel", at, vel), ("/sbg/gps_hdt", at, hdt), ("/sbg/ekf_euler", at, own)]  # fmt: skip
 
 
@@ -344,9 +349,11 @@ def _spoken(make: Messages, say: Say, *, beside: bool = False) -> list[Item]:
     return sorted(items, key=lambda item: item[1])
 
 
-def test_sbg_says_north_first_and_its_filter_is_no_second_compass(tmp_path: Path) -> None:
+@pytest.mark.parametrize("off_deg", [1.0, 0.0], ids=["wanders", "says the same"])
+def test_sbg_says_north_first_and_its_filter_is_no_second_compass(off_deg: float, tmp_path: Path) -> None:
     make = Messages(2)
-    found, config, _ = look(tmp_path, _spoken(make, _sbg), make)
+    say: Say = lambda *about: _sbg(*about, off_deg)
+    found, config, _ = look(tmp_path, _spoken(make, say), make)
     assert [t.msgtype for t in found.topics if t.topic == "/sbg/gps_pos"] == [SBG + "SbgGpsPos"]
     assert not found.gnss[0].slow_error  # RTK
     (velocity,) = config.of_kind("gnss_velocity").values()
@@ -388,6 +395,13 @@ def test_a_receiver_that_says_it_twice_counts_once_and_axes_are_known(tmp_path: 
     assert (compass.topic, compass.enabled, compass.convention) == ("/oem7/heading2", True, "enu")
     assert compass.deviation_sigma_deg == 0.0  # two antennas, though its topic does not say so
     assert "known by its type" in found.compasses[0].why
+
+
+@pytest.mark.parametrize(("msgtype", "axes"), [(OEM7 + "BESTVEL", EAST_AXES), (SBG + "SbgGpsVel", NORTH_AXES)])
+def test_without_a_track_a_velocity_has_the_axes_of_its_type(msgtype: str, axes: str) -> None:
+    """And no other: what looks like speeds along the vessel is one over ground all the same."""
+    stream = TopicData("/vel", TWIST, part=VENDORS[msgtype][0])
+    assert velocity_report(stream, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None).axes == axes
 
 
 def test_a_message_of_another_version_is_malformed_and_no_crash() -> None:
