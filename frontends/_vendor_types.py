@@ -159,6 +159,26 @@ VENDOR_TYPES: dict[str, tuple[str, ...]] = {
             "uint8[4] reserved3; uint32 flags"
         ),
     ),
+    "ublox_ubx_msgs/msg/UBXNavPVT": (
+        _definition(
+            f"{_HEADER}; uint32 itow; uint16 year; uint8 month; uint8 day; uint8 hour; uint8 min; uint8 sec; "
+            f"{_flags('valid_date valid_time fully_resolved valid_mag')}; uint32 t_acc; int32 nano; GpsFix gps_fix; bool gnss_fix_ok; "
+            f"bool diff_soln; PSMPVT psm; bool head_veh_valid; CarrSoln carr_soln; {_flags('confirmed_avail confirmed_date confirmed_time')}; "
+            "uint8 num_sv; int32 lon; int32 lat; int32 height; int32 hmsl; uint32 h_acc; uint32 v_acc; int32 vel_n; int32 vel_e; int32 vel_d; "
+            "int32 g_speed; int32 head_mot; uint32 s_acc; uint32 head_acc; uint16 p_dop; bool invalid_llh; int32 head_veh; int16 mag_dec; "
+            "uint16 mag_acc",
+            ublox_ubx_msgs__GpsFix="uint8 fix_type", ublox_ubx_msgs__PSMPVT="uint8 state", ublox_ubx_msgs__CarrSoln="uint8 status",
+        ),
+    ),
+    "ublox_ubx_msgs/msg/UBXNavRelPosNED": (
+        _definition(
+            f"{_HEADER}; uint8 version; uint16 ref_station_id; uint32 itow; int32 rel_pos_n; int32 rel_pos_e; int32 rel_pos_d; "
+            "int32 rel_pos_length; int32 rel_pos_heading; int8 rel_pos_hp_n; int8 rel_pos_hp_e; int8 rel_pos_hp_d; int8 rel_pos_hp_length; "
+            f"uint32 acc_n; uint32 acc_e; uint32 acc_d; uint32 acc_length; uint32 acc_heading; {_flags('gnss_fix_ok diff_soln rel_pos_valid')}; "
+            f"CarrSoln carr_soln; {_flags('is_moving ref_pos_miss ref_obs_miss rel_pos_heading_valid rel_pos_normalized')}",
+            ublox_ubx_msgs__CarrSoln="uint8 status",
+        ),
+    ),
     **dict.fromkeys(("novatel_oem7_msgs/msg/BESTPOS", "novatel_oem7_msgs/msg/BESTGNSSPOS"), (_OEM7_PLACE,)),
     **dict.fromkeys(("novatel_oem7_msgs/msg/BESTVEL", "novatel_oem7_msgs/msg/BESTGNSSVEL"), (_OEM7_VELOCITY,)),
     "novatel_oem7_msgs/msg/HEADING2": (

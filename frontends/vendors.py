@@ -205,29 +205,38 @@ def _sbg_filtered_heading(msg: Any) -> SaidHeading | Rejection:
     return _angle(degrees(float(msg.angle.z)), degrees(float(msg.accuracy.z)))
 
 
-# u-blox: ROS 1 names fields as the manual does, ROS 2 in lower case.
+# u-blox: `ublox_msgs` with the manual's names of fields in ROS 1, in lower case in ROS 2, and `ublox_ubx_msgs` with flags of their own.
 
-_UBX_FIX_OK, _UBX_DIFFERENTIAL, _UBX_CARRIER = 1, 2, 0xC0
+_UBX_FIX_OK, _UBX_DIFFERENTIAL = 1, 2
 _UBX_TIME_VALID = 3
 _UBX_2D, _UBX_FIXES = 2, (2, 3, 4)
-# Of a relative position: that it is valid, its carrier solution, that the base moves, that its heading is valid.
-_UBX_RELATIVE, _UBX_SOLUTION, _UBX_FIXED, _UBX_MOVING, _UBX_HEADING = 0x05, 0x18, 0x10, 0x20, 0x100
+_UBX_VALID, _UBX_MOVING, _UBX_HEADING = 0x05, 0x20, 0x100  # of a relative position; that its base moves; of its heading
+_UBX_FIXED = 2  # ambiguities; 1: float
+
+
+def _ubx_fix(msg: Any) -> tuple[int, bool]:
+    """Type of fix, and whether it is good enough."""
+    if hasattr(msg, "gps_fix"):
+        return int(msg.gps_fix.fix_type), bool(msg.gnss_fix_ok) and not msg.invalid_llh
+    return int(_any(msg, "fix_type", "fixType")), bool(msg.flags & _UBX_FIX_OK)
+
+
+def _ubx_status(msg: Any) -> int:
+    if hasattr(msg, "carr_soln"):
+        return 2 if msg.carr_soln.status else int(msg.diff_soln)
+    return 2 if msg.flags >> 6 & 3 else int(bool(msg.flags & _UBX_DIFFERENTIAL))
 
 
 def _ubx_trouble(msg: Any) -> Rejection | None:
-    fix, flags = int(_any(msg, "fix_type", "fixType")), int(msg.flags)
-    if fix in _UBX_FIXES and flags & _UBX_FIX_OK:
-        return None
-    return rejected(f"no fix (fix type {fix}, gnssFixOK {flags & _UBX_FIX_OK})")
+    fix, good = _ubx_fix(msg)
+    return None if good and fix in _UBX_FIXES else rejected(f"no fix (fix type {fix}, gnssFixOK {int(good)})")
 
 
 def _ubx_place(msg: Any) -> SaidPlace | Rejection:
     if trouble := _ubx_trouble(msg):
         return trouble
-    flat = int(_any(msg, "fix_type", "fixType")) == _UBX_2D
-    status = 2 if msg.flags & _UBX_CARRIER else int(bool(msg.flags & _UBX_DIFFERENTIAL))
-    place = 1e-7 * msg.lat, 1e-7 * msg.lon, float("nan") if flat else 1e-3 * msg.height
-    return _place(place, status, 1e-3 * _any(msg, "h_acc", "hAcc"), 1e-3 * _any(msg, "v_acc", "vAcc"))
+    place = 1e-7 * msg.lat, 1e-7 * msg.lon, float("nan") if _ubx_fix(msg)[0] == _UBX_2D else 1e-3 * msg.height
+    return _place(place, _ubx_status(msg), 1e-3 * _any(msg, "h_acc", "hAcc"), 1e-3 * _any(msg, "v_acc", "vAcc"))
 
 
 def _ubx_velocity(msg: Any) -> SaidVelocity | Rejection:
@@ -241,15 +250,20 @@ def _ubx_velocity(msg: Any) -> SaidVelocity | Rejection:
 
 
 def _ubx_heading(msg: Any) -> SaidHeading | Rejection:
-    flags = int(msg.flags)
-    if not flags & _UBX_MOVING:
+    if hasattr(msg, "is_moving"):
+        moving, solution = bool(msg.is_moving), int(msg.carr_soln.status)
+        valid = bool(msg.gnss_fix_ok and msg.rel_pos_valid and msg.rel_pos_heading_valid)
+    else:
+        moving, solution = bool(msg.flags & _UBX_MOVING), msg.flags >> 3 & 3
+        valid = msg.flags & _UBX_VALID == _UBX_VALID and bool(msg.flags & _UBX_HEADING)
+    if not moving:
         return rejected("the base does not move: the direction to it is no heading")
-    if flags & _UBX_RELATIVE != _UBX_RELATIVE or not flags & _UBX_HEADING:
+    if not valid:
         return rejected("no heading (relPosHeadingValid 0)")
-    if flags & _UBX_SOLUTION != _UBX_FIXED:
+    if solution != _UBX_FIXED:
         return rejected("a heading with float ambiguities")
-    heading_deg, sigma_deg = (1e-5 * _any(msg, *n) for n in (("rel_pos_heading", "relPosHeading"), ("acc_heading", "accHeading")))  # fmt: skip
-    return _bearing(heading_deg, sigma_deg)
+    angle, sigma = _any(msg, "rel_pos_heading", "relPosHeading"), _any(msg, "acc_heading", "accHeading")
+    return _bearing(1e-5 * angle, 1e-5 * sigma)
 
 
 def _ubx_stamp_ns(msg: Any, log_ns: int) -> int:
@@ -411,9 +425,9 @@ VENDORS: dict[str, tuple[Part, ...]] = {
     ),
     "sbg_driver/msg/SbgEkfEuler": (Part("compass", _sbg_filtered_heading, told=False, antennas=False),),
     **dict.fromkeys(
-        ("ublox_msgs/msg/NavPVT", "ublox_msgs/msg/NavPVT7"), (Part("gnss", _ubx_place), Part("gnss_velocity", _ubx_velocity)),
+        ("ublox_msgs/msg/NavPVT", "ublox_msgs/msg/NavPVT7", "ublox_ubx_msgs/msg/UBXNavPVT"), (Part("gnss", _ubx_place), Part("gnss_velocity", _ubx_velocity)),
     ),
-    "ublox_msgs/msg/NavRELPOSNED9": (Part("compass", _ubx_heading),),
+    **dict.fromkeys(("ublox_msgs/msg/NavRELPOSNED9", "ublox_ubx_msgs/msg/UBXNavRelPosNED"), (Part("compass", _ubx_heading),)),
     **dict.fromkeys(("novatel_oem7_msgs/msg/BESTPOS", "novatel_oem7_msgs/msg/BESTGNSSPOS"), (Part("gnss", _oem7_place),)),
     **dict.fromkeys(
         ("novatel_oem7_msgs/msg/BESTVEL", "novatel_oem7_msgs/msg/BESTGNSSVEL"), (Part("gnss_velocity", _oem7_velocity),)

@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,8 +31,8 @@ ROS2 = Messages(2)
 CONFIGS: dict[str, Any] = {
     "imu": ImuConfig(), "gnss": GnssConfig(), "compass": CompassConfig(sigma_deg=7.0), "gnss_velocity": VelocityConfig(),
 }  # fmt: skip
-SBG, UBX, OEM7, SBF, PX4 = (
-    f"{package}/msg/" for package in ("sbg_driver", "ublox_msgs", "novatel_oem7_msgs", "septentrio_gnss_driver", "px4_msgs")
+SBG, UBX, DGNSS, OEM7, SBF, PX4 = (
+    f"{package}/msg/" for package in ("sbg_driver", "ublox_msgs", "ublox_ubx_msgs", "novatel_oem7_msgs", "septentrio_gnss_driver", "px4_msgs")
 )  # fmt: skip
 
 
@@ -52,6 +53,10 @@ PLACES: dict[str, dict[str, Any]] = {
     UBX + "NavPVT": {
         "fix_type": 3, "flags": 1 | 0x80, "lat": 575_000_000, "lon": -112_500_000, "height": 41_500, "h_msl": 6_500, "h_acc": 500, "v_acc": 2_000,
     },
+    DGNSS + "UBXNavPVT": {
+        "gps_fix": {"fix_type": 3}, "gnss_fix_ok": True, "carr_soln": {"status": 2}, "lat": 575_000_000, "lon": -112_500_000,
+        "height": 41_500, "hmsl": 6_500, "h_acc": 500, "v_acc": 2_000,
+    },
     OEM7 + "BESTPOS": {
         "pos_type": {"type": 50}, "lat": 57.5, "lon": -11.25, "hgt": 6.5, "undulation": 35.0, "lat_stdev": 0.5, "lon_stdev": 0.25, "hgt_stdev": 2.0,
     },
@@ -71,6 +76,7 @@ VELOCITIES: dict[str, tuple[dict[str, Any], float]] = {
     SBG + "SbgGpsVel": ({"status": {"vel_type": 2}, "vel": vector(3.0, -1.0, 0.5), "vel_acc": vector(0.25, 0.125, 0.25)}, 0.25),
     SBG + "SbgEkfNav": ({"status": {"velocity_valid": True}, "velocity": vector(3.0, -1.0, 0.5), "velocity_accuracy": vector(0.25, 0.25, 0.25)}, 0.25),
     UBX + "NavPVT": ({"fix_type": 3, "flags": 1, "vel_n": 3000, "vel_e": -1000, "vel_d": 500, "s_acc": 250}, 0.25),
+    DGNSS + "UBXNavPVT": ({"gps_fix": {"fix_type": 3}, "gnss_fix_ok": True, "vel_n": 3000, "vel_e": -1000, "vel_d": 500, "s_acc": 250}, 0.25),
     OEM7 + "BESTVEL": ({"vel_type": {"type": 8}, "hor_speed": 10.0**0.5, "trk_gnd": 341.565051177078, "ver_speed": -0.5}, 0.3),
     SBF + "PVTGeodetic": ({"mode": 1, "vn": 3.0, "ve": -1.0, "vu": -0.5}, 0.3),
     PX4 + "SensorGps": ({"fix_type": 3, "vel_ned_valid": True, "vel_n_m_s": 3.0, "vel_e_m_s": -1.0, "vel_d_m_s": 0.5, "s_variance_m_s": 0.25}, 0.25),
@@ -80,11 +86,15 @@ HEADINGS: dict[str, tuple[dict[str, Any], float]] = {
     SBG + "SbgGpsHdt": ({"status": 64, "true_heading": 300.0, "true_heading_acc": 0.5}, 0.5),
     SBG + "SbgEkfEuler": ({"status": {"heading_valid": True}, "angle": vector(0, 0, np.radians(-60.0)), "accuracy": vector(0, 0, np.radians(0.5))}, 0.5),
     UBX + "NavRELPOSNED9": ({"flags": 1 | 4 | 16 | 32 | 256, "rel_pos_heading": 30_000_000, "acc_heading": 50_000}, 0.5),
+    DGNSS + "UBXNavRelPosNED": (
+        {"gnss_fix_ok": True, "rel_pos_valid": True, "rel_pos_heading_valid": True, "is_moving": True, "carr_soln": {"status": 2}, "rel_pos_heading": 30_000_000, "acc_heading": 50_000},
+        0.5,
+    ),
     OEM7 + "HEADING2": ({"pos_type": {"type": 50}, "heading": 300.0, "heading_stdev": 0.5}, 0.5),
     SBF + "AttEuler": ({"mode": 2, "heading": 300.0}, 7.0),
     PX4 + "SensorGps": ({"fix_type": 3, "heading": np.radians(-60.0), "heading_accuracy": np.radians(0.5)}, 0.5),
 }  # fmt: skip
-KNOWN_AXES = (UBX, OEM7, PX4)
+KNOWN_AXES = (UBX, DGNSS, OEM7, PX4)
 
 
 def read(kind: str, msgtype: str, fields: dict[str, Any], *, make: Messages = ROS2, **config: Any) -> Any:
@@ -174,6 +184,12 @@ INVALID: list[tuple[str, str, dict[str, Any], str]] = [
     ("compass", UBX + "NavRELPOSNED9", {"flags": 1 | 4 | 16 | 256}, "base does not move"),
     ("compass", UBX + "NavRELPOSNED9", {"flags": 1 | 4 | 16 | 32}, "relPosHeadingValid"),
     ("compass", UBX + "NavRELPOSNED9", {"flags": 1 | 4 | 8 | 32 | 256}, "float"),
+    ("gnss", DGNSS + "UBXNavPVT", {"gnss_fix_ok": False}, "no fix"),
+    ("gnss", DGNSS + "UBXNavPVT", {"invalid_llh": True}, "no fix"),
+    ("gnss_velocity", DGNSS + "UBXNavPVT", {"gps_fix": {"fix_type": 5}}, "no fix"),
+    ("compass", DGNSS + "UBXNavRelPosNED", {"is_moving": False}, "base does not move"),
+    ("compass", DGNSS + "UBXNavRelPosNED", {"rel_pos_heading_valid": False}, "relPosHeadingValid"),
+    ("compass", DGNSS + "UBXNavRelPosNED", {"carr_soln": {"status": 1}}, "float"),
     ("compass", OEM7 + "HEADING2", {"pos_type": {"type": 34}}, "float"),
     ("compass", SBF + "AttEuler", {"mode": 1}, "float"),
     ("compass", SBF + "AttEuler", {"error": 1}, "error 1"),
@@ -196,6 +212,7 @@ def test_what_a_message_says_of_itself_is_believed(kind: str, msgtype: str, chan
     ("msgtype", "flat"),
     [
         (UBX + "NavPVT", {"fix_type": 2}),
+        (DGNSS + "UBXNavPVT", {"gps_fix": {"fix_type": 2}}),
         (SBF + "PVTGeodetic", {"mode": 4 | 0x80}),
         (PX4 + "SensorGps", {"fix_type": 2}),
     ],
@@ -209,6 +226,7 @@ def test_a_flat_fix_has_no_height(msgtype: str, flat: dict[str, Any]) -> None:
     [
         (SBG + "SbgGpsPos", {"status": {"type": 2}}, 0), (SBG + "SbgGpsPos", {"status": {"type": 4}}, 1), (SBG + "SbgGpsPos", {}, 2),
         (UBX + "NavPVT", {"flags": 1}, 0), (UBX + "NavPVT", {"flags": 3}, 1), (UBX + "NavPVT", {"flags": 0x41}, 2),
+        (DGNSS + "UBXNavPVT", {"carr_soln": {}}, 0), (DGNSS + "UBXNavPVT", {"carr_soln": {}, "diff_soln": True}, 1), (DGNSS + "UBXNavPVT", {}, 2),
         (OEM7 + "BESTPOS", {"pos_type": {"type": 16}}, 0), (OEM7 + "BESTPOS", {"pos_type": {"type": 18}}, 1), (OEM7 + "BESTPOS", {}, 2),
         (SBF + "PVTGeodetic", {"mode": 1}, 0), (SBF + "PVTGeodetic", {"mode": 6}, 1), (SBF + "PVTGeodetic", {"mode": 5}, 2),
         (PX4 + "SensorGps", {"fix_type": 3}, 0), (PX4 + "SensorGps", {"fix_type": 4}, 1), (PX4 + "SensorGps", {}, 2),
@@ -352,7 +370,7 @@ def _spoken(make: Messages, say: Say, *, beside: bool = False) -> list[Item]:
 @pytest.mark.parametrize("off_deg", [1.0, 0.0], ids=["wanders", "says the same"])
 def test_sbg_says_north_first_and_its_filter_is_no_second_compass(off_deg: float, tmp_path: Path) -> None:
     make = Messages(2)
-    say: Say = lambda *about: _sbg(*about, off_deg)
+    say: Say = partial(_sbg, off_deg=off_deg)
     found, config, _ = look(tmp_path, _spoken(make, say), make)
     assert [t.msgtype for t in found.topics if t.topic == "/sbg/gps_pos"] == [SBG + "SbgGpsPos"]
     assert not found.gnss[0].slow_error  # RTK
