@@ -22,7 +22,8 @@ def _flags(names: str) -> str:
 
 
 _SBG_IMU = _flags(
-    "imu_com imu_status imu_accel_x imu_accel_y imu_accel_z imu_gyro_x imu_gyro_y imu_gyro_z imu_accels_in_range imu_gyros_in_range"
+    "imu_com imu_status imu_accel_x imu_accel_y imu_accel_z imu_gyro_x imu_gyro_y imu_gyro_z imu_accels_in_range imu_gyros_in_range "
+    "imu_gyros_use_high_scale"  # not in all versions; what follows is aligned so that it may lack
 )
 _SBG_SIGNALS = "gps_l1_used gps_l2_used gps_l5_used glo_l1_used glo_l2_used"
 _SBG_MORE_SIGNALS = (
@@ -118,6 +119,13 @@ VENDOR_TYPES: dict[str, tuple[str, ...]] = {
             sbg_driver__SbgImuStatus=_SBG_IMU,
         ),
     ),
+    "sbg_driver/msg/SbgImuShort": (
+        _definition(
+            f"{_HEADER}; uint32 time_stamp; SbgImuStatus imu_status; geometry_msgs/Vector3 delta_velocity; geometry_msgs/Vector3 delta_angle; "
+            "int16 temperature",
+            sbg_driver__SbgImuStatus=_SBG_IMU,
+        ),
+    ),
     "sbg_driver/msg/SbgGpsPos": tuple(
         _sbg_place(_SBG_FIX + status)
         for status in (_SBG_WATCH + _flags(_SBG_MORE_SIGNALS), _SBG_WATCH + _flags(_SBG_SIGNALS), _flags(_SBG_SIGNALS))
@@ -142,13 +150,16 @@ VENDOR_TYPES: dict[str, tuple[str, ...]] = {
         )
         for status in _SBG_FILTERS
     ),
-    "sbg_driver/msg/SbgEkfEuler": tuple(
-        _definition(
-            f"{_HEADER}; uint32 time_stamp; geometry_msgs/Vector3 angle; geometry_msgs/Vector3 accuracy; SbgEkfStatus status",
-            sbg_driver__SbgEkfStatus=status,
+    **{
+        f"sbg_driver/msg/{name}": tuple(
+            _definition(
+                f"{_HEADER}; uint32 time_stamp; geometry_msgs/{turned}; geometry_msgs/Vector3 accuracy; SbgEkfStatus status",
+                sbg_driver__SbgEkfStatus=status,
+            )
+            for status in _SBG_FILTERS
         )
-        for status in _SBG_FILTERS
-    ),
+        for name, turned in (("SbgEkfEuler", "Vector3 angle"), ("SbgEkfQuat", "Quaternion quaternion"))
+    },
     "ublox_msgs/msg/NavPVT": (_definition(f"{_UBX_PVT}; int32 head_veh; int16 mag_dec; uint16 mag_acc"),),
     "ublox_msgs/msg/NavPVT7": (_definition(_UBX_PVT),),
     "ublox_msgs/msg/NavRELPOSNED9": (

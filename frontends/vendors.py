@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import UTC, datetime
-from math import cos, degrees, isfinite, pi, radians, sin
+from math import atan2, cos, degrees, isfinite, pi, radians, sin
 from typing import Any, NamedTuple
 
 from graphloc.frontends._clock import NO_DATE_NS
@@ -140,14 +140,25 @@ def _angle(angle_deg: float, sigma_deg: float) -> SaidHeading | Rejection:
 _SBG_STATUS = {1: 0, 2: 0, 3: 1, 4: 1, 5: 1, 6: 2, 7: 2, 8: 1, 9: 1}
 _SBG_NONE = {0: "none", 10: "a position that was set, not measured"}
 _SBG_CRITICAL, _SBG_SPOOFED = 4, 4
+_SBG_PER_MPS2, _SBG_PER_RADPS = 1_048_576.0, (67_108_864.0, 12_304_174.0)  # counts, in either range of the gyroscope
 _SBG_COMPUTED = 0x3F  # bits of a status that are 0 of a computed solution
 
 
+def _sbg_imu_trouble(msg: Any) -> Rejection | None:
+    failed = [name for name in ("imu_com", "imu_status") if not getattr(msg.imu_status, name)]
+    return rejected(f"the IMU says that it does not work ({', '.join(failed)} false)") if failed else None
+
+
 def _sbg_imu(msg: Any) -> SaidInertial | Rejection:
-    failed = [name for name in ("imu_com", "imu_status") if not getattr(msg.imu_status, name, True)]
-    if failed:
-        return rejected(f"the IMU says that it does not work ({', '.join(failed)} false)")
-    return SaidInertial(_xyz(msg.accel), _xyz(msg.gyro))
+    return _sbg_imu_trouble(msg) or SaidInertial(_xyz(msg.accel), _xyz(msg.gyro))
+
+
+def _sbg_imu_short(msg: Any) -> SaidInertial | Rejection:
+    if trouble := _sbg_imu_trouble(msg):
+        return trouble
+    (ax, ay, az), (wx, wy, wz) = _xyz(msg.delta_velocity), _xyz(msg.delta_angle)
+    a, w = _SBG_PER_MPS2, _SBG_PER_RADPS[bool(getattr(msg.imu_status, "imu_gyros_use_high_scale", False))]
+    return SaidInertial((ax / a, ay / a, az / a), (wx / w, wy / w, wz / w))
 
 
 def _sbg_where(msg: Any) -> tuple[float, float, float]:
@@ -202,7 +213,12 @@ def _sbg_filtered_velocity(msg: Any) -> SaidVelocity | Rejection:
 def _sbg_filtered_heading(msg: Any) -> SaidHeading | Rejection:
     if not msg.status.heading_valid:
         return rejected("the filter says that its heading is not valid")
-    return _angle(degrees(float(msg.angle.z)), degrees(float(msg.accuracy.z)))
+    if hasattr(msg, "quaternion"):
+        q = msg.quaternion
+        yaw = atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+    else:
+        yaw = float(msg.angle.z)
+    return _angle(degrees(yaw), degrees(float(msg.accuracy.z)))
 
 
 # u-blox: `ublox_msgs` with the manual's names of fields in ROS 1, in lower case in ROS 2, and `ublox_ubx_msgs` with flags of their own.
@@ -417,13 +433,17 @@ def _px4_stamp_ns(msg: Any, _log_ns: int) -> int | None:
 _GPS = (Part("gnss", _px4_place), Part("gnss_velocity", _px4_velocity), Part("compass", _px4_heading))
 VENDORS: dict[str, tuple[Part, ...]] = {
     "sbg_driver/msg/SbgImuData": (Part("imu", _sbg_imu),),
+    "sbg_driver/msg/SbgImuShort": (Part("imu", _sbg_imu_short),),
     "sbg_driver/msg/SbgGpsPos": (Part("gnss", _sbg_place),),
     "sbg_driver/msg/SbgGpsVel": (Part("gnss_velocity", _sbg_velocity, told=False),),
     "sbg_driver/msg/SbgGpsHdt": (Part("compass", _sbg_heading, told=False),),
     "sbg_driver/msg/SbgEkfNav": (
         Part("gnss", _sbg_filtered_place), Part("gnss_velocity", _sbg_filtered_velocity, told=False),
     ),
-    "sbg_driver/msg/SbgEkfEuler": (Part("compass", _sbg_filtered_heading, told=False, antennas=False),),
+    **dict.fromkeys(
+        ("sbg_driver/msg/SbgEkfEuler", "sbg_driver/msg/SbgEkfQuat"),
+        (Part("compass", _sbg_filtered_heading, told=False, antennas=False),),
+    ),
     **dict.fromkeys(
         ("ublox_msgs/msg/NavPVT", "ublox_msgs/msg/NavPVT7", "ublox_ubx_msgs/msg/UBXNavPVT"), (Part("gnss", _ubx_place), Part("gnss_velocity", _ubx_velocity)),
     ),

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
+from scipy.spatial.transform import Rotation
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig
 from graphloc.frames import wrap_angle
@@ -85,6 +87,10 @@ VELOCITIES: dict[str, tuple[dict[str, Any], float]] = {
 HEADINGS: dict[str, tuple[dict[str, Any], float]] = {
     SBG + "SbgGpsHdt": ({"status": 64, "true_heading": 300.0, "true_heading_acc": 0.5}, 0.5),
     SBG + "SbgEkfEuler": ({"status": {"heading_valid": True}, "angle": vector(0, 0, np.radians(-60.0)), "accuracy": vector(0, 0, np.radians(0.5))}, 0.5),
+    SBG + "SbgEkfQuat": (
+        {"status": {"heading_valid": True}, "quaternion": ROS2.quat(Rotation.from_euler("ZYX", (-60.0, 20.0, -10.0), degrees=True).as_quat()), "accuracy": vector(0, 0, np.radians(0.5))},
+        0.5,
+    ),
     UBX + "NavRELPOSNED9": ({"flags": 1 | 4 | 16 | 32 | 256, "rel_pos_heading": 30_000_000, "acc_heading": 50_000}, 0.5),
     DGNSS + "UBXNavRelPosNED": (
         {"gnss_fix_ok": True, "rel_pos_valid": True, "rel_pos_heading_valid": True, "is_moving": True, "carr_soln": {"status": 2}, "rel_pos_heading": 30_000_000, "acc_heading": 50_000},
@@ -150,13 +156,21 @@ def test_a_heading_is_turned_to_a_yaw(msgtype: str) -> None:
 
 def test_an_imu_keeps_its_axes() -> None:
     sbg = {"imu_status": {"imu_com": True, "imu_status": True}, "accel": vector(1.0, 2.0, -9.5), "gyro": vector(0.25, 0.5, -0.125)}  # fmt: skip
+    short = {"imu_status": sbg["imu_status"], "delta_velocity": vector(2.0**20, 2.0**21, -9.5 * 2.0**20), "delta_angle": vector(2.0**24, 2.0**25, -(2.0**23))}  # fmt: skip
     px4 = {"accelerometer_m_s2": (1.0, 2.0, -9.5), "gyro_rad": (0.25, 0.5, -0.125)}
-    for msgtype, fields in ((SBG + "SbgImuData", sbg), (PX4 + "SensorCombined", px4)):
+    for msgtype, fields in ((SBG + "SbgImuData", sbg), (SBG + "SbgImuShort", short), (PX4 + "SensorCombined", px4)):
         assert read("imu", msgtype, fields) == ImuReading((1.0, 2.0, -9.5), (0.25, 0.5, -0.125))
+    # Counts of a range of 10 000 deg/s in 31 bits.
+    fast = {
+        "imu_status": {**short["imu_status"], "imu_gyros_use_high_scale": True},
+        "delta_angle": vector(0, 0, 2**31 - 1),
+    }
+    assert np.degrees(read("imu", SBG + "SbgImuShort", fast).gyro_radps[2]) == pytest.approx(10_000.0, rel=1e-6)
 
 
 INVALID: list[tuple[str, str, dict[str, Any], str]] = [
     ("imu", SBG + "SbgImuData", {"imu_status": {"imu_com": False, "imu_status": True}}, "imu_com"),
+    ("imu", SBG + "SbgImuShort", {"imu_status": {"imu_com": True, "imu_status": False}}, "imu_status"),
     ("imu", PX4 + "SensorCombined", {"accelerometer_timestamp_relative": 0x7FFFFFFF}, "absent"),
     ("gnss", SBG + "SbgGpsPos", {"status": {"status": 1, "type": 7}}, "status 1"),
     ("gnss", SBG + "SbgGpsPos", {"status": {"type": 0}}, "none"),
@@ -299,6 +313,25 @@ def test_stamps_of_px4_are_when_it_was_sampled_and_those_of_bestvel_lack_its_age
     vel = said(ROS2, OEM7 + "BESTVEL", header=ROS2.header(START_NS), latency=0.25)
     assert stamp_ns_of(vel, OEM7 + "BESTVEL", 7) == START_NS - S // 4
     assert stamp_ns_of(vel, OEM7 + "BESTVEL", 7, recorded=True) == 7
+
+
+def test_a_flag_that_older_versions_lack_changes_nothing() -> None:
+    """What follows a bag's flags of the IMU lies where it would lie with one more."""
+    new = VENDOR_TYPES[SBG + "SbgImuData"][0]
+    old = new.replace("bool imu_gyros_use_high_scale\n", "")
+    assert old != new
+    for frame in ("", "a", "abcd", "imu_link"):
+        make = Messages(2)
+        make.store.register(get_types_from_msg(old, SBG + "SbgImuData"))
+        fields = {
+            "imu_status": {"imu_com": True, "imu_status": True},
+            "accel": vector(1, 2, 3),
+            "gyro": vector(4, 5, 6),
+        }
+        msg = said(make, SBG + "SbgImuData", header=make.header(START_NS, frame), **fields)
+        raw = bytes(make.store.serialize_cdr(msg, SBG + "SbgImuData"))
+        back: Any = MessageTypes("bag", [], [], ros1=False).decode(raw, SBG + "SbgImuData")
+        assert (back.accel.x, back.accel.z, back.gyro.x, back.gyro.z) == (1.0, 3.0, 4.0, 6.0)
 
 
 VERSIONS = [(t, k) for t, versions in VENDOR_TYPES.items() for k in range(len(versions)) if len(versions) > 1]
