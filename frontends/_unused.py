@@ -103,7 +103,7 @@ def _why_unused(stream: TopicData) -> str:
         counts |= {
             "say 'no fix'": int((~fix).sum()),
             "have a latitude beyond 90 deg": beyond,
-            "lie at 0, 0 or are NaN": int(fix.sum()) - beyond,
+            "lie at 0, 0, are NaN or beyond 180 deg": int(fix.sum()) - beyond,
         }
     else:
         finite = int(np.isfinite(rows[:, :6]).all(axis=1).sum())

@@ -88,7 +88,7 @@ HEADINGS: dict[str, tuple[dict[str, Any], float]] = {
     SBG + "SbgGpsHdt": ({"status": 64, "true_heading": 300.0, "true_heading_acc": 0.5}, 0.5),
     SBG + "SbgEkfEuler": ({"status": {"heading_valid": True}, "angle": vector(0, 0, np.radians(-60.0)), "accuracy": vector(0, 0, np.radians(0.5))}, 0.5),
     SBG + "SbgEkfQuat": (
-        {"status": {"heading_valid": True}, "quaternion": ROS2.quat(Rotation.from_euler("ZYX", (-60.0, 20.0, -10.0), degrees=True).as_quat()), "accuracy": vector(0, 0, np.radians(0.5))},
+        {"status": {"heading_valid": True}, "quaternion": ROS2.quat(Rotation.from_euler("ZYX", (-60.0, 20.0, -10.0), degrees=True).as_quat().tolist()), "accuracy": vector(0, 0, np.radians(0.5))},
         0.5,
     ),
     UBX + "NavRELPOSNED9": ({"flags": 1 | 4 | 16 | 32 | 256, "rel_pos_heading": 30_000_000, "acc_heading": 50_000}, 0.5),
