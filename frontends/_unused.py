@@ -107,5 +107,6 @@ def _why_unused(stream: TopicData) -> str:
         }
     else:
         finite = int(np.isfinite(rows[:, :6]).all(axis=1).sum())
-        counts |= {"hold an acceleration or a rate that is NaN": len(rows) - finite, "are too few": finite}
+        broken = " or say that the IMU does not work" if stream.part else ""
+        counts |= {f"hold an acceleration or a rate that is NaN{broken}": len(rows) - finite, "are too few": finite}
     return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
