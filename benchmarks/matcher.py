@@ -28,14 +28,12 @@ from graphloc.eval import ekf
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
-from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import wrap_angle
 from graphloc.frontends.aerial.bl import BLMatcher
 from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
 from graphloc.frontends.aerial.scan import LevelCloud
 from graphloc.gather import with_matches
-from graphloc.solve import smooth
 
 _SEEDS, _VIEWS = range(100, 106), 8
 # Routes that each figure is of, and its bound on success with one scan.
@@ -228,13 +226,13 @@ def _run(job: tuple[str, int]) -> _Errors:
 
         alone = app.smooth_recording(recording, config)
         datum = app.choose_datum(recording, config)
-        matched = with_matches(alone.recording, config, datum, alone.solution, scans)
-        ours = smooth(matched, config, datum, rows=SENSORS, inertial=INERTIAL)
+        with_scans = app.smooth_recording(recording, config, scans=scans)
+        matched, ours = with_scans.recording, with_scans.solution
         filter_bl = None
         if seed == 0:
             sensors["aerial"] = sensors["aerial"].model_copy(update={"matcher": "bl", "every_m": 0.0})
             theirs = config.model_copy(update={"sensors": sensors})
-            by_bl = with_matches(alone.recording, theirs, datum, alone.solution, scans)
+            by_bl = with_matches(alone.recording, theirs, datum, alone.solution, scans).recording
             filter_bl = off(ekf.run_bl(by_bl, theirs, datum, told).trajectory)
         return _Errors(
             off(ours.trajectory), off(ours.trajectory, shown), off(alone.solution.trajectory),

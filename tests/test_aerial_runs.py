@@ -17,6 +17,7 @@ import pytest
 import rasterio
 
 from graphloc import app
+from graphloc.app import _estimate
 from graphloc.config import AerialConfig, LidarConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.eval.metrics import compare_to_truth
@@ -31,8 +32,10 @@ from graphloc.frontends.aerial.match import Mode
 from graphloc.frontends.aerial.scan import LevelCloud, outline
 from graphloc.frontends.aerial.scans import Matched
 from graphloc.frontends.inspect import draft_config, inspect_bag
-from graphloc.gather._matches import few_matches
+from graphloc.gather import _matches, with_matches
+from graphloc.gather._matches import Matches, few_matches
 from graphloc.recording import Recording
+from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import S
 from tests.commands import called
@@ -166,6 +169,45 @@ def test_matches_are_spent_where_they_inform(bag: Path) -> None:
     # The same scans, were the vessel lying still.
     moored = replace(track, p_world_m=np.zeros_like(track.p_world_m) + track.p_world_m[0])
     assert [len(matched(bag, moored, aerial(bag, every_m=4.0, still_s=s)[0])) for s in (6.0, 1000.0)] == [3, 1]
+
+
+@pytest.mark.parametrize(("window", "cut_off"), [({}, False), ({"window_m": 3.0}, True), ({"window_deg": 5.0}, True)])
+def test_a_window_that_three_sigmas_exceed_is_told(window: dict[str, float], cut_off: bool, bag: Path) -> None:
+    """The prior is good to 1 m and 1.8 deg."""
+    assert matched_alone(bag, **window)[0].cut_off is cut_off
+
+
+@pytest.mark.parametrize(("few", "cut_off"), [(2, False), (3, True)])
+def test_a_tenth_of_the_windows_may_be_too_small(
+    few: int, cut_off: bool, bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    match, _ = matched_alone(bag)
+    found = [Matched(k * S, replace(match, cut_off=k < few), "") for k in range(20)]
+    monkeypatch.setattr(_matches, "match_bag", lambda *_, **__: found)
+    recording, vessel = loaded(bag)
+    datum = app.choose_datum(recording, vessel)
+    solution = app.solve(recording, vessel, datum)
+    assert with_matches(recording, vessel, datum, solution, app.Scans((bag / "run",), bag)).cut_off is cut_off
+
+
+@pytest.mark.parametrize("cut_off", [False, True])
+def test_where_windows_were_too_small_scans_are_matched_around_the_second_track(
+    cut_off: bool, bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a compass the heading is open by tens of degrees: of a window of 5, most scans stayed refused."""
+    recording, vessel = loaded(bag)
+    fixes = tuple(m for m in recording.measurements if m.sensor == "gnss")
+    short, around = replace(recording, measurements=fixes), list[Solution]()
+
+    def faked(given: Recording, _config: VesselConfig, _datum: Datum, solution: Solution, *_: object) -> Matches:
+        assert sum(m.sensor == "gnss" for m in given.measurements) == len(fixes)  # whatever was found before
+        around.append(solution)
+        return Matches(replace(given, measurements=fixes[: 10 + len(around)]), cut_off)
+
+    monkeypatch.setattr(_estimate, "with_matches", faked)
+    run = app.smooth_recording(short, vessel, scans=app.Scans((bag / "run",), bag))
+    used = [len([row for row in s.ledger if row.sensor == "gnss"]) for s in (*around, run.solution)]
+    assert used == ([len(fixes), 11, 12] if cut_off else [len(fixes), 11])
 
 
 def test_scans_are_laid_together(bag: Path) -> None:

@@ -70,7 +70,8 @@ def smooth_recording(
 ) -> Run:
     """Smooth a recording; hold fixes out and run the filters beside it if asked.
 
-    With `scans` and an aerial sensor the run is smoothed, its scans are matched around that, and it is smoothed again.
+    With `scans` and an aerial sensor the run is smoothed, its scans are matched around that, and it is smoothed again. Where the
+    first track left more open than the search windows hold, scans are matched once more, around the second.
     """
     held: tuple[GnssPosition, ...] = ()
     if hold_out is not None:
@@ -81,7 +82,11 @@ def smooth_recording(
     solution = solve(recording, config, datum, probe=None if matched else calibrate.PROBE, progress=progress)
     gallery = Gallery()
     if scans is not None and matched:
-        recording = with_matches(recording, config, datum, solution, scans, progress, gallery)
+        found = with_matches(recording, config, datum, solution, scans, progress, gallery)
+        if found.cut_off:
+            solution, gallery = solve(found.recording, config, datum, progress=progress), Gallery()
+            found = with_matches(recording, config, datum, solution, scans, progress, gallery)
+        recording = found.recording
         solution = solve(recording, config, datum, probe=calibrate.PROBE, progress=progress)
     filters: tuple[ekf.FilterResult, ...] = ()
     online, never = None, ""

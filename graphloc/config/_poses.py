@@ -110,7 +110,7 @@ class AerialConfig(AnyPoseConfig):
     """Time after which a match is made although the vessel has not moved by `every_m`, s."""
     window_m: Annotated[Positive, Field(le=50.0)] = 6.5
     """Largest half width of the search window, at most 50 m; smaller if 3 sigma of the estimate is."""
-    window_deg: Annotated[Positive, Field(le=30.0)] = 5.0
+    window_deg: Annotated[Positive, Field(le=30.0)] = 30.0
     """The same for the heading, at most 30 deg."""
     reach_m: Annotated[Positive, Field(le=300.0)] = 100.0
     """Points beyond this range are not used; at most 300 m."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from graphloc.config import VesselConfig
 from graphloc.eval.match_picture import Gallery
@@ -18,6 +19,7 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 
 _MISLED = 0.25  # matches to scans that fit nowhere, below which the former are doubted
+_CUT_OFF = 0.1  # share of scans whose search windows were too small, above which they are matched once more
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +30,13 @@ class Scans:
     folder: Path
 
 
+class Matches(NamedTuple):
+    """A recording with its matches; `cut_off`: many of the windows were too small for what the solution left open."""
+
+    recording: Recording
+    cut_off: bool
+
+
 def with_matches(
     recording: Recording,
     config: VesselConfig,
@@ -36,7 +45,7 @@ def with_matches(
     scans: Scans,
     progress: Progress = quiet,
     gallery: Gallery | None = None,
-) -> Recording:
+) -> Matches:
     """Add the matches of every aerial sensor, made around a solution; a scan that gave none is a row of the ledger.
 
     Raises:
@@ -44,13 +53,16 @@ def with_matches(
     """
     gathered, track = Gathering(recording), solution.trajectory
     span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
+    tried = cut_off = 0
     for name, sensor in config.of_kind("aerial").items():
         gathered.sensor(name, dict.fromkeys((lidar.topic for lidar in sensor.lidars.values()), f"read by {name}"))
         found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=gathered.said.append)
         matched = 0
         for item in found:
-            if item.match is not None and gallery is not None:
-                gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
+            if item.match is not None:
+                tried, cut_off = tried + 1, cut_off + item.match.cut_off
+                if gallery is not None:
+                    gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
             if item.match is not None and item.match.modes:
                 matched += 1
                 gathered.take(item.match.fix(item.stamp_ns, name, item.news, sensor.axes))
@@ -59,7 +71,7 @@ def with_matches(
             progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)
         progress("matching", span_s, span_s)
         gathered.said += few_matches(name, gathered.refused(name), matched)
-    return gathered.recording()
+    return Matches(gathered.recording(), cut_off > _CUT_OFF * tried)
 
 
 def few_matches(sensor: str, reasons: Counter[str], matched: int) -> list[str]:
