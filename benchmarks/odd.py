@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import _makers
 import numpy as np
 from _odd_bags import DATUM, START_NS, Change, Craft, Item, Odd, stamp, written
 from _rows import Row, row
@@ -274,6 +275,23 @@ CASES: dict[str, Odd] = {
     "MAVROS, IMU at 25 Hz": Odd(
         craft="boat", imu_hz=25.0, change=_mavros,
         draft=(r"raw/fix\n    mount", r"(?s)compass_hdg\n    convention[^\n]*\n    unit[^\n]*\n    enabled: false"),
+    ),
+    "SBG's own messages": Odd(
+        craft="boat", imu_rpy_deg=(180.0, 0.0, 0.0), change=_makers.sbg(),
+        draft=(
+            r"gps_hdt\n    convention: ned", r"gps_vel[^\n]*\n    convention: ned", r"(?s)ekf_euler\n    convention[^\n]*\n    enabled: false",
+            r"rpy_deg: \[0.0, 0.0, -?90.0\]",
+        ), **_RTK,
+    ),
+    "SBG's own messages, ENU, ROS 1": Odd(
+        craft="ferry", kind="ros1", imu_rpy_deg=(0.0, 0.0, -90.0), change=_makers.sbg(enu=True),
+        draft=("gps_hdt\n    convention: enu", r"gps_vel[^\n]*\n    mount", r"0.0, 0.0, -90.0\]\}  # guess: gravity"), **_RTK,
+    ),
+    "PX4's own messages": Odd(
+        craft="boat", kind="sqlite3", imu_rpy_deg=(180.0, 0.0, 0.0), change=_makers.px4, draft=("kind: gnss_velocity",)
+    ),
+    "u-blox's own messages beside its fixes, ROS 1": Odd(
+        craft="boat", kind="ros1", change=_makers.ublox, draft=("(?s)kind: gnss\n.*kind: gnss\n.*enabled: false", "navrelposned"),
     ),
     "compass 1 s late, car": Odd(compass=True, change=_late_compass(1.0), draft=(r"time_offset_s: -(1.0[0-4]|0.9[6-9])",)),
     "second receiver drifts, claims less": Odd(change=_second_drifts, draft=(r"topic: /gnss/fix\n    mount",)),

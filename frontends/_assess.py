@@ -168,7 +168,7 @@ def _placed(fixes: TopicData) -> tuple[NDArray[np.intp], Array]:
     good = (
         np.isfinite(rows[:, :2]).all(axis=1) & ~np.isinf(rows[:, 2]) & (rows[:, 3] >= 0) & (np.abs(rows[:, 0]) <= 90.0)
     )
-    good &= (rows[:, 0] != 0.0) | (rows[:, 1] != 0.0)
+    good &= ((rows[:, 0] != 0.0) | (rows[:, 1] != 0.0)) & (rows[:, 1] >= -180.0) & (rows[:, 1] <= 360.0)
     keep, rows = keep[good], rows[good]
     flat = np.isnan(rows[:, 2])
     rows[flat, 2] = 0.0 if flat.all() else np.median(rows[~flat, 2])

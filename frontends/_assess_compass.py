@@ -35,6 +35,10 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
     stamps_ns, angle = headings(stream)
     # Drivers of receivers with two antennas fill an Imu with the orientation alone.
     gnss = not stream.rows[keep, :6].any() if stream.msgtype == IMU else two_antennas(stream.topic)
+    part = stream.part
+    gnss = gnss if part is None else part.antennas
+    told = "enu" if part is not None and part.told else None
+    default = "enu" if part is None or part.told else "ned"
     plain: dict[str, Any] = {
         "topic": stream.topic,
         "msgtype": stream.msgtype,
@@ -43,18 +47,20 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
     }
     untold: dict[str, Any] = {"offset_deg": None, "scatter_deg": None, "samples": 0}
     if len(stamps_ns) < _FEWEST:
-        return CompassReport(**plain, **untold, usable=False, convention="enu", why="its messages give no yaw")
+        return CompassReport(**plain, **untold, usable=False, convention=default, why="its messages give no yaw")
     by_gyro = {1: "enu", -1: "ned"}.get(against_turning(turning, stamps_ns, angle))
     heard = 0 if courses is None else int(np.searchsorted(courses.stamps_ns, stamps_ns[[0, -1]]) @ [-1, 1])
     if courses is None or heard < _FEWEST_COURSES:
-        why = "no GNSS course in motion to check it against" + (", convention from the gyro" if by_gyro else "")
+        why = "no GNSS course in motion to check it against" + (
+            ", convention from the gyro" if by_gyro and not told else ""
+        )
         if courses is not None and not heard and stream.msgtype in NUMBERS:
             why = "no GNSS course in motion at the times it was recorded (it has no stamp)"
         named = stream.msgtype == QUATERNION  # a topic of bare orientations is meant as a compass
-        return CompassReport(**plain, **untold, usable=named, convention=by_gyro or "enu", why=why)
+        return CompassReport(**plain, **untold, usable=named, convention=told or by_gyro or default, why=why)
     origin = int(stream.stamps_ns[keep[0]])
     fit = _beside_courses(
-        (stamps_ns - origin) / NS_PER_S, angle, (courses.stamps_ns - origin) / NS_PER_S, courses, by_gyro
+        (stamps_ns - origin) / NS_PER_S, angle, (courses.stamps_ns - origin) / NS_PER_S, courses, told or by_gyro
     )
     # Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
     # an IMU's own orientation follows the gyroscope wherever north is.
@@ -73,7 +79,7 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
         scatter_deg=fit.scatter_deg,
         leeway_deg=None if sideways else _wanders_deg(courses.stamps_ns, fit.apart_rad),
         samples=len(fit.apart_rad),
-        why=_why(fit, by_gyro, fits_course=fits_course, sideways=sideways),
+        why=_why(fit, by_gyro, told=told is not None, fits_course=fits_course, sideways=sideways),
     )
 
 
@@ -119,12 +125,14 @@ def _beside_courses(t_s: Array, angle: Array, courses_s: Array, courses: Courses
     return _Fit(convention, *fits[convention], apart[convention], straight)
 
 
-def _why(fit: _Fit, by_gyro: str | None, *, fits_course: bool, sideways: bool) -> str:
+def _why(fit: _Fit, by_gyro: str | None, *, told: bool, fits_course: bool, sideways: bool) -> str:
     why = f"yaw minus GNSS course: {fit.offset_deg:+.0f} deg, scatter {fit.scatter_deg:.0f} deg over {len(fit.apart_rad)} courses"
     if sideways:
         return f"{why}: a vessel that often goes sideways, since it turns as the gyro does"
     if not fits_course:
         return f"{why}: a relative or a disturbed heading, or a vessel that often goes sideways"
+    if told:
+        return f"{why}; convention known by its type"
     if by_gyro:
         return f"{why}; convention from the gyro"
     return f"{why}, on a nearly straight track: the convention is not certain" if fit.straight else why

@@ -76,6 +76,10 @@ def velocity_report(
 ) -> VelocityReport:
     """Return the axes of a twist or vector: of `tf_frame`, if /tf_static has its frame; else as `axes_of`."""
     axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
+    if stream.part is not None and stream.part.told:
+        axes, why = EAST_AXES, f"known by its type; {why}"
+    elif stream.part is not None and axes not in (EAST_AXES, NORTH_AXES):
+        axes, why = NORTH_AXES, f"as its driver writes it by default; {why}"
     if through_water(stream.topic):
         axes, why = BODY_AXES, f"a speed through the water; {why}"
     rows = stream.rows[sane(stream)]

@@ -35,6 +35,7 @@ FEWEST_STAMPS = 100
 
 _TENTHS = 10  # of a run
 _EVEN = 0.15  # of the gain, that a clock may be off an even one
+_MOST_DRIFT = 0.1  # of time: beyond, it is none, and the configuration takes none
 _SET_BACK_S = 0.5
 _STEADY = 0.95  # share of messages that are near one of the two levels of a step
 _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
@@ -85,7 +86,8 @@ def gain(stamps_ns: Stamps, logs_ns: Stamps) -> Gain:
         return Gain(gained_s, 0.0)
     slope, at_start = np.polyfit(t_s, ahead_s, 1)
     uneven_s = float(np.abs(ahead_s - at_start - slope * t_s).max())
-    return Gain(gained_s, 0.0 if uneven_s > _EVEN * abs(gained_s) else float(slope) * 1e6)
+    stands = abs(slope) > _MOST_DRIFT  # or nearly so
+    return Gain(gained_s, 0.0 if stands or uneven_s > _EVEN * abs(gained_s) else float(slope) * 1e6)
 
 
 class ClockStep(NamedTuple):

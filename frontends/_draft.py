@@ -28,7 +28,7 @@ from graphloc.frontends._reports import (
     filtered,
     through_water,
 )
-from graphloc.frontends._streams import COURSE
+from graphloc.frontends._streams import COURSE, HEADING
 from graphloc.frontends._turns import WANDERS_DEG
 from graphloc.frontends.decode import IMU, VECTOR
 
@@ -78,11 +78,16 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         yield _gnss_block(_numbered("gnss", k), gnss, enabled=k == 0)
     for k, item in enumerate(_in_a_grid(inspection)):
         yield _grid_block(_numbered("gnss", k), item, enabled=k == 0)
-    compasses = sorted((c for c in inspection.compasses if c.usable), key=lambda c: c.topic.endswith(_MAGNETIC))
+    compasses = sorted(
+        (c for c in inspection.compasses if c.usable), key=lambda c: (filtered(c.topic), c.topic.endswith(_MAGNETIC))
+    )
     seen: set[str] = set()
     for k, compass in enumerate(compasses):
         name = compass.topic.partition(" ")[0]
-        yield _compass_block(_numbered("compass", k), compass, again=name in seen)
+        off = "another heading of the same topic is used, a true one before a magnetic one" if name in seen else ""
+        if k and filtered(compass.topic):
+            off = "by its name a filter's output, which the other heading may be in already"
+        yield _compass_block(_numbered("compass", k), compass, off)
         seen.add(name)
     for compass in (c for c in inspection.compasses if not c.usable):
         yield [f"# orientation of {compass.topic}: left out as a compass; {compass.why}"]
@@ -204,7 +209,7 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
 
 def _topic_lines(topic: str) -> list[str]:
     """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
-    name, *sentence = topic.removesuffix(COURSE).split(" ")
+    name, *sentence = topic.removesuffix(COURSE).removesuffix(HEADING).split(" ")
     return [f"  topic: {name}", *(f"  nmea: [{', '.join(said.split('+'))}]" for said in sentence)]
 
 
@@ -415,7 +420,7 @@ def _filtered_lines(topic: str) -> list[str]:
     return [f"  # guess: {_FILTERED}"] if filtered(topic) else []
 
 
-def _compass_block(name: str, compass: CompassReport, *, again: bool) -> list[str]:
+def _compass_block(name: str, compass: CompassReport, off: str) -> list[str]:
     lines = [
         f"{name}:",
         "  kind: compass",
@@ -426,13 +431,11 @@ def _compass_block(name: str, compass: CompassReport, *, again: bool) -> list[st
         lines.append(f"  unit: {compass.unit}  # guess: by the size of its numbers")
     if compass.like:
         lines.append(f"  enabled: false  # guess: it repeats {compass.like}, and must not count twice")
-    elif again:
-        lines.append(
-            "  enabled: false  # guess: another heading of the same topic is used, a true one before a magnetic one"
-        )
+    elif off:
+        lines.append(f"  enabled: false  # guess: {off}")
     lines += _mount_lines(compass)
     lines += _error_lines(compass)
-    if compass.msgtype == IMU and not compass.two_antennas:
+    if (compass.msgtype == IMU or filtered(compass.topic)) and not compass.two_antennas:
         lines.append("  use_reported_sigma: false  # guess: drivers' orientation covariances are seldom measured")
     return lines
 

@@ -37,6 +37,7 @@ from graphloc.frontends.decode import (
     nmea_sigmas_m,
     stamp_ns_of,
 )
+from graphloc.frontends.vendors import VENDORS, Part, Said, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
 from graphloc.ledger import Outcome
 from graphloc.time import NS_PER_S
 
@@ -129,8 +130,28 @@ SENTENCES: dict[str, tuple[str, Callable[[str, str], Row | None]]] = {
 }
 _SATELLITES = re.compile("(G[A-Z]|BD)[A-Z]{3}")  # a talker that names what a receiver sees
 _BESIDE, _BY_CHANCE = 0.75, 0.2  # steps: a sentence said at the same time; the share of those that one receiver may say
-COURSE = " (course, speed)"
-"""At the end of the name of a stream: what RMC, or a GPSFix, says beside a place."""
+COURSE, HEADING = " (course, speed)", " (heading)"
+"""At the end of the name of a stream: what RMC, a GPSFix, or a maker's message, says beside a place."""
+# Of what makers' messages say: the message type that says the same, and a row without a value.
+_LIKE: dict[str, tuple[str, Row]] = {
+    "imu": (IMU, (*[np.nan] * 6, *[0.0] * 4, 0.0, 0.0, -1.0)),
+    "gnss": (NAV_SAT_FIX, (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)),
+    "gnss_velocity": (TWIST, (np.nan, np.nan, np.nan)),
+    "compass": (QUATERNION, (0.0, 0.0, np.nan, np.nan)),
+}
+
+
+def _said_row(said: Said) -> Row:
+    match said:
+        case SaidInertial():
+            return (*said.accel_mps2, *said.gyro_radps, *_LIKE["imu"][1][6:])
+        case SaidPlace():
+            h, v = said.horizontal_m**2, said.vertical_m**2
+            return (*said[:3], said.status, 2.0 * (h > 0.0), h, h, v)
+        case SaidVelocity():
+            return said.v_mps
+        case SaidHeading():
+            return (0.0, 0.0, float(np.sin(said.angle_rad / 2.0)), float(np.cos(said.angle_rad / 2.0)))
 
 
 _MOST = 1e12
@@ -141,6 +162,7 @@ class TopicData:
     """Columns of one topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`).
 
     recorded: whether the stamps are recording times, because the headers hold none, or whole seconds only.
+    part: what it is of a maker's message; None of other messages.
     drift_ppm: by how much the clock ran fast; what it gained is taken off the stamps. elapsed: (N,) ns from the beginning of the bag.
     """
 
@@ -151,6 +173,7 @@ class TopicData:
     no_stamp: int = 0
     recorded: bool = False
     drift_ppm: float = 0.0
+    part: Part | None = None
     _stamps: list[int] = field(default_factory=list)
     _logs: list[int] = field(default_factory=list)
     tuples: list[tuple[float, ...]] = field(default_factory=list)
@@ -237,17 +260,21 @@ class TopicData:
 
 
 def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
-    """Read all topics of the types in `ROWS`, and the static transforms.
+    """Read all topics of the types in `ROWS` and `VENDORS`, and the static transforms.
 
     An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type; 'TOPIC GPGGA+GNGGA' of a
     receiver that changes its talker. RMC gives another one of velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no
-    VTG is on the line; so does a GPSFix.
+    VTG is on the line; so does a GPSFix. A maker's message gives a stream of the equivalent type for each thing that it says.
     """
     streams = {
         t.topic: TopicData(t.topic, t.msgtypes[0])
         for t in bag.topics.values()
         if len(t.msgtypes) == 1 and t.msgtypes[0] in ROWS and (t.msgtypes[0] not in NUMBERS or _HEADING.search(t.topic))
     }
+    for t in bag.topics.values():
+        if len(t.msgtypes) == 1 and t.msgtypes[0] in VENDORS:
+            for name, part in _parts(t.topic, t.msgtypes[0]):
+                streams[name] = TopicData(name, _LIKE[part.kind][0], part=part)
     tree = StaticTree()
     mixed = {t.topic for t in bag.topics.values() if len(t.msgtypes) == 1 and t.msgtypes[0] in NMEA}
     wanted = set(streams) | mixed | ({TF_STATIC, TF_MOVING} & set(bag.topics))
@@ -269,12 +296,15 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
                 continue
             stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns)
             if raw.msgtype not in UNSTAMPED:
-                stream.frame_id = stream.frame_id or str(msg.header.frame_id).lstrip("/")
+                header = getattr(msg, "header", None)
+                stream.frame_id = stream.frame_id or str(getattr(header, "frame_id", "")).lstrip("/")
             stream.add(stamp_ns or 0, raw.log_ns, row, raw.file, raw.elapsed_ns)
     tree.settle()
     _join_talkers(streams)
     for name in [
-        name for name, stream in streams.items() if name.endswith(COURSE) and _told_elsewhere(stream, streams)
+        name
+        for name, stream in streams.items()
+        if name.endswith((COURSE, HEADING)) and _told_elsewhere(stream, streams)
     ]:
         del streams[name]
     for stream in streams.values():
@@ -324,7 +354,7 @@ def _take_turns(logs_ns: Sequence[NDArray[np.int64]]) -> bool:
 
 
 def _told_elsewhere(stream: TopicData, streams: Mapping[str, TopicData]) -> bool:
-    """Whether velocities of RMC or a GPSFix say nothing, or what VTG on the same line says as well."""
+    """Whether what is said beside a place is nothing, or what VTG on the same line says as well."""
     line = stream.topic.partition(" ")[0]
     vtg = any(name.startswith(f"{line} ") and name.endswith("VTG") for name in streams)
     return vtg or not np.nan_to_num(stream.rows).any()
@@ -333,12 +363,27 @@ def _told_elsewhere(stream: TopicData, streams: Mapping[str, TopicData]) -> bool
 def _plain(raw: RawMessage, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:
     if raw.topic not in streams:
         return []
+    if raw.msgtype in VENDORS:
+        return [(streams[name], _part_row(part, msg)) for name, part in _parts(raw.topic, raw.msgtype)]
     said: list[tuple[TopicData, Row | None]] = [(streams[raw.topic], ROWS[raw.msgtype](msg))]
     if raw.msgtype in GPS_FIXES:
         v, name = gps_fix_velocity_mps(msg), raw.topic + COURSE
         row = (np.nan, np.nan, np.nan) if isinstance(v, Rejection) else (*v[:2], v[2] if np.isfinite(v[2]) else 0.0)
         said.append((streams.setdefault(name, TopicData(name, TWIST)), row))
     return said
+
+
+def _parts(topic: str, msgtype: str) -> list[tuple[str, Part]]:
+    """Return the names of the streams of a maker's messages; the first one is named as the topic."""
+    beside = {"gnss_velocity": COURSE, "compass": HEADING}
+    return [(topic + beside[part.kind] if k else topic, part) for k, part in enumerate(VENDORS[msgtype])]
+
+
+def _part_row(part: Part, msg: Any) -> Row | None:
+    said = part.read(msg)
+    if isinstance(said, Rejection):
+        return None if said.outcome is Outcome.MALFORMED else _LIKE[part.kind][1]
+    return _said_row(said)
 
 
 def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:

@@ -12,6 +12,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from graphloc.frontends._open import text_of
+from graphloc.frontends._vendor_types import VENDOR_TYPES
 
 # Types outside of rosbags' stores; bags of ROS 2 Humble and older in sqlite3 carry no definitions.
 OTHER_TYPES = {
@@ -93,33 +94,60 @@ class MessageTypes:
 
     def __init__(self, name: str, connections: Iterable[Connection], warnings: list[str], *, ros1: bool) -> None:
         self._name, self._connections, self._warnings, self._ros1 = name, tuple(connections), warnings, ros1
-        self._stores: dict[str, Typestore] = {}
+        self._stores: dict[str, list[Typestore]] = {}
 
     def decode(self, data: bytes, msgtype: str) -> object:
         """Return the deserialised message. Raises whatever rosbags raises on damaged bytes."""
         if msgtype not in self._stores:
-            self._stores[msgtype] = self._store_of(msgtype)
-        store = self._stores[msgtype]
+            self._stores[msgtype] = self._stores_of(msgtype)
+        *others, last = self._stores[msgtype]
+        for store in others:
+            try:
+                msg = self._with(store, data, msgtype)
+            except Exception:  # noqa: BLE001, S112 - a version that it is not may raise nearly anything
+                continue
+            self._stores[msgtype] = [store]
+            return msg
+        return self._with(last, data, msgtype)
+
+    def _with(self, store: Typestore, data: bytes, msgtype: str) -> object:
         store.max_sequence_length = len(data) or 1  # of what takes no bytes there could be 2^32
         return (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(data, msgtype)
 
-    def _store_of(self, msgtype: str) -> Typestore:
-        """Return the definition of the type in the bag, if it has one, else the standard one."""
+    def _stores_of(self, msgtype: str) -> list[Typestore]:
+        """Return the definition of the type in the bag, if it has one, else the standard one; of a maker's, those of its versions."""
         definitions = (c.msgdef for c in self._connections if c.msgtype == msgtype)
         for definition in definitions:
             if definition.format == MessageDefinitionFormat.NONE:
                 continue
             try:
-                return _defined(definition.format, definition.data, msgtype)
+                return [_defined(definition.format, definition.data, msgtype)]
             except Exception as error:  # noqa: BLE001 - a definition may be any text
                 self._warnings.append(
                     f"{self._name}: its definition of {msgtype} cannot be read ({text_of(error)}); the standard one is used"
                 )
             break
-        store = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.LATEST)
+        if msgtype in VENDOR_TYPES:
+            return list(_versions(msgtype, ros1=self._ros1))
+        store = _standard(ros1=self._ros1)
         if msgtype in OTHER_TYPES:
             store.register(get_types_from_msg(OTHER_TYPES[msgtype], msgtype))
-        return store
+        return [store]
+
+
+def _standard(*, ros1: bool) -> Typestore:
+    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
+
+
+@lru_cache(maxsize=64)
+def _versions(msgtype: str, *, ros1: bool) -> tuple[Typestore, ...]:
+    """Return the definitions of a maker's message."""
+    stores = []
+    for text in VENDOR_TYPES[msgtype]:
+        store = _standard(ros1=ros1)
+        store.register(get_types_from_msg(text, msgtype))
+        stores.append(store)
+    return tuple(stores)
 
 
 @lru_cache(maxsize=64)  # a run opens its bag several times, and rosbags writes a program for each type

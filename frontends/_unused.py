@@ -103,9 +103,10 @@ def _why_unused(stream: TopicData) -> str:
         counts |= {
             "say 'no fix'": int((~fix).sum()),
             "have a latitude beyond 90 deg": beyond,
-            "lie at 0, 0 or are NaN": int(fix.sum()) - beyond,
+            "lie at 0, 0, are NaN or beyond 180 deg": int(fix.sum()) - beyond,
         }
     else:
         finite = int(np.isfinite(rows[:, :6]).all(axis=1).sum())
-        counts |= {"hold an acceleration or a rate that is NaN": len(rows) - finite, "are too few": finite}
+        broken = " or say that the IMU does not work" if stream.part else ""
+        counts |= {f"hold an acceleration or a rate that is NaN{broken}": len(rows) - finite, "are too few": finite}
     return ", ".join(f"{count} {what}" for what, count in counts.items() if count)

@@ -31,6 +31,15 @@ from graphloc.extras import added
 from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection, malformed, rejected
+from graphloc.frontends.vendors import (
+    STAMPS,
+    VENDORS,
+    Part,
+    SaidHeading,
+    SaidInertial,
+    SaidPlace,
+    SaidVelocity,
+)
 from graphloc.measurements import (
     AXES,
     NO_HEIGHT_M2,
@@ -100,9 +109,14 @@ def header_stamp_ns(msg: Any) -> int | None:
 def stamp_ns_of(msg: Any, msgtype: str, log_ns: int, *, recorded: bool = False) -> int | None:
     """Return the stamp of a message, ns: that of its header, or its recording time if that is configured or its type has no stamp.
 
-    None if the header's stamp is zero or negative.
+    None if the header's stamp is zero or negative. Of makers' messages without a header it is the time that they say.
     """
-    return log_ns if recorded or msgtype in UNSTAMPED else header_stamp_ns(msg)
+    if recorded or msgtype in UNSTAMPED:
+        return log_ns
+    try:
+        return STAMPS[msgtype](msg, log_ns) if msgtype in STAMPS else header_stamp_ns(msg)
+    except AttributeError:  # another version of a maker's message
+        return None
 
 
 def covariance_translation_first(values: ArrayLike) -> Array:
@@ -166,16 +180,23 @@ def nav_sat_status(status: int) -> int:
 def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -> Decoded:
     a, w = msg.linear_acceleration, msg.angular_velocity
     accel, gyro = (float(a.x), float(a.y), float(a.z)), (float(w.x), float(w.y), float(w.z))
-    if not all(map(isfinite, (*accel, *gyro))):
-        return malformed("acceleration or angular rate is NaN")
-    if max(map(abs, (*accel, *gyro))) > _MOST_INERTIAL:
-        return malformed(f"acceleration or angular rate is beyond {_MOST_INERTIAL:g}, which nothing measures")
     for name, values, cov in (
         ("linear_acceleration", accel, msg.linear_acceleration_covariance),
         ("angular_velocity", gyro, msg.angular_velocity_covariance),
     ):
         if not any(values) and cov[0] == -1.0:
             return malformed(f"the driver says that {name} is absent ({name}_covariance[0] = -1)")
+    return _inertial(accel, gyro, config)
+
+
+def _inertial(
+    accel: tuple[float, float, float], gyro: tuple[float, float, float], config: ImuConfig
+) -> ImuReading | Rejection:
+    """Return a sample, in the units that are configured, in SI units."""
+    if not all(map(isfinite, (*accel, *gyro))):
+        return malformed("acceleration or angular rate is NaN")
+    if max(map(abs, (*accel, *gyro))) > _MOST_INERTIAL:
+        return malformed(f"acceleration or angular rate is beyond {_MOST_INERTIAL:g}, which nothing measures")
     k = STANDARD_GRAVITY_MPS2 if config.accel_unit == "g" else 1.0
     k = -k if config.gravity == "inverted" else k
     r = pi / 180.0 if config.gyro_unit == "deg/s" else 1.0
@@ -469,6 +490,35 @@ def _pose(msg: Any, stamp_ns: int, seq: int, sensor: str, config: PoseConfig) ->
     return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=seq, axes=config.axes, modes=(mode,))
 
 
+def _by_maker(part: Part) -> Decoder:
+    """Return the decoder of one of the things that a maker's message says."""
+
+    def decoder(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Any) -> Decoded:
+        said = part.read(msg)
+        match said:
+            case Rejection():
+                return said
+            case SaidInertial():
+                return _inertial(*said, config)
+            case SaidPlace():
+                if said.status < _MIN_STATUS[config.min_status]:
+                    return rejected(f"fix status {said.status} is below min_status '{config.min_status}'")
+                cov = np.diag([said.horizontal_m, said.horizontal_m, said.vertical_m]) ** 2
+                return _placed(said[:3], cov, stamp_ns, seq, sensor, config)
+            case SaidVelocity():
+                cov = np.diag([said.horizontal_mps, said.horizontal_mps, said.vertical_mps]) ** 2
+                v, cov = (said.v_mps, cov) if part.told else _in_enu(said.v_mps, cov, config)
+                return _moving(v, cov, stamp_ns, seq, sensor, config)
+            case SaidHeading():
+                turned = not part.told and config.convention == "ned"
+                yaw = float(wrap_angle(pi / 2.0 - said.angle_rad if turned else said.angle_rad))
+                sigma = said.sigma_rad if config.use_reported_sigma else 0.0
+                sigma = sigma or float(np.radians(config.sigma_deg))
+                return CompassHeading(stamp_ns=stamp_ns, sensor=sensor, seq=seq, yaw_rad=yaw, sigma_rad=sigma)
+
+    return decoder
+
+
 DECODERS: dict[tuple[str, str], Decoder] = {
     ("imu", IMU): _imu,
     ("gnss", NAV_SAT_FIX): _gnss,
@@ -493,6 +543,7 @@ DECODERS: dict[tuple[str, str], Decoder] = {
     ("pose", POSE): _pose,
     ("pose", PLAIN_POSE): _pose,
     ("pose", ODOMETRY): _pose,
+    **{(part.kind, msgtype): _by_maker(part) for msgtype, parts in VENDORS.items() for part in parts},
 }
 
 

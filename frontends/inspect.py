@@ -247,7 +247,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
 def _topic_reports(bag: _Contents) -> tuple[TopicReport, ...]:
     """Report every topic of the bag, then every NMEA sentence."""
     topics = [
-        topic_report(bag.streams[t.topic], t.messages)
+        replace(topic_report(bag.streams[t.topic], t.messages), msgtype=t.msgtypes[0])
         if t.topic in bag.streams
         else TopicReport(topic=t.topic, msgtype=" or ".join(t.msgtypes), count=t.messages)
         for t in bag.topics.values()
@@ -381,10 +381,10 @@ def _lacking(
 
 
 def _without_echoes(compasses: Sequence[tuple[CompassReport, TopicData]]) -> list[tuple[CompassReport, TopicData]]:
-    """Return the compasses, those of types without a stamp last; one that repeats another names it in `like`."""
+    """Return the compasses, those of types without a stamp, and of filters, last; one that repeats another names it in `like`."""
     distinct: list[tuple[CompassReport, TopicData]] = []
     found = []
-    for report, stream in sorted(compasses, key=lambda pair: pair[1].msgtype in NUMBERS):
+    for report, stream in sorted(compasses, key=lambda pair: (filtered(pair[0].topic), pair[1].msgtype in NUMBERS)):
         for other, other_stream in distinct if report.usable else ():
             if says_the_same(other_stream, stream, mirrored=report.convention != other.convention):
                 report = replace(report, like=other.topic)

@@ -18,7 +18,8 @@ from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
 
 _FAR_M = 200e3
-_FIXES = ("NavSatFix", "GPSFix")  # as types of topics are named
+# As types of topics are named.
+_FIXES = ("NavSatFix", "GPSFix", "SbgGpsPos", "NavPVT", "BESTPOS", "PVTGeodetic", "SensorGps", "VehicleGpsPosition")
 
 
 def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sensor]) -> Datum:

@@ -92,6 +92,16 @@ def look(tmp_path: Path, items: list[Item], make: Messages) -> tuple[Inspection,
     return found, config, text
 
 
+def test_longitudes_that_are_none_are_no_places(tmp_path: Path) -> None:
+    """The first one became the origin, and PROJ refused it with a traceback."""
+    make = Messages(2)
+    items = [(topic, at, m) for topic, at, m in drive(make, seconds=20) if topic == "/fix"]
+    for k, (_, _, m) in enumerate(items):
+        m.longitude = -1012.0 if k % 2 == 0 else m.longitude
+    found, _, _ = look(tmp_path, items, make)
+    assert found.gnss[0].fixes == len(items) // 2
+
+
 @pytest.mark.parametrize("upright", [True, False], ids=["upright", "gravity on y"])
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0, -90.0])
 def test_mount_from_gravity_and_motion(tmp_path: Path, yaw_deg: float, upright: bool) -> None:

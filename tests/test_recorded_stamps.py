@@ -167,6 +167,14 @@ def test_a_silence_does_not_change_what_a_clock_gains(silent_s: int) -> None:
     assert gain(stamps_ns, logs_ns).drift_ppm == pytest.approx(100.0, rel=0.01)
 
 
+def test_a_clock_that_stands_does_not_drift() -> None:
+    """A million ppm were drafted, which no configuration takes."""
+    logs_ns = START_NS + np.arange(0, 60 * S, S // 10)
+    found = gain(START_NS + np.arange(len(logs_ns)) % 3, logs_ns)
+    assert found.drift_ppm == 0.0
+    assert found.gained_s < -50.0
+
+
 def test_a_clock_that_is_set_during_the_run_does_not_drift(tmp_path: Path) -> None:
     """A step is no drift: nothing is drafted, and the warning stays."""
     _, config, _ = look(tmp_path, restamped({"/fix": lambda ns: ns + S // 2 * (ns > START_NS + 30 * S)}), MAKE)

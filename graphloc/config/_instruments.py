@@ -18,7 +18,7 @@ STANDARD_GRAVITY_MPS2 = 9.80665
 
 
 class ImuConfig(SensorConfig):
-    """An inertial measurement unit (`sensor_msgs/Imu`)."""
+    """An inertial measurement unit (`sensor_msgs/Imu`, `sbg_driver/SbgImuData`, `px4_msgs/SensorCombined`)."""
 
     kind: Literal["imu"] = "imu"
     """The sensor kind."""
@@ -108,7 +108,7 @@ class SlowErrorConfig(Block):
 
 
 class GnssConfig(SensorConfig):
-    """GNSS position (`sensor_msgs/NavSatFix`, `gps_msgs/GPSFix`, NMEA in `nmea_msgs/Sentence` or `std_msgs/String`, poses in a `grid`)."""
+    """GNSS position (`sensor_msgs/NavSatFix`, `gps_msgs/GPSFix`, NMEA in `nmea_msgs/Sentence` or `std_msgs/String`, poses in a `grid`, [makers' messages](quick-start.md))."""
 
     kind: Literal["gnss"] = "gnss"
     """The sensor kind."""
@@ -147,13 +147,13 @@ class CompassConfig(SensorConfig):
     kind: Literal["compass"] = "compass"
     """The sensor kind."""
     convention: Literal["enu", "ned"] = "enu"
-    """Yaw in the message: `enu` from east, counter-clockwise (REP 103); `ned` from north, clockwise. NMEA is the latter."""
+    """Yaw in the message: `enu` from east, counter-clockwise (REP 103); `ned` from north, clockwise. Of NMEA and most makers' messages it is known."""
     unit: Literal["deg", "rad"] = "deg"
     """Unit of a plain number (`Float64`, `Float32`); other messages have a fixed one."""
     sigma_deg: Positive = 1.5
     """Heading noise, 1 sigma, deg, if the message carries no covariance."""
     use_reported_sigma: bool = True
-    """Use the yaw variance of an `Imu` message if it is positive and finite."""
+    """Use the yaw variance of an `Imu` message, or the accuracy in a maker's message, if it is positive and finite."""
     mount_offset_sigma_deg: NonNegative = 1.0
     """Unknown constant heading offset of the mount, 1 sigma, deg. 0: no offset, and neither deviation nor wander."""
     deviation_sigma_deg: NonNegative = 1.5
@@ -173,7 +173,7 @@ class VelocityConfig(SensorConfig):
     kind: Literal["gnss_velocity"] = "gnss_velocity"
     """The sensor kind."""
     convention: Literal["enu", "ned"] = "enu"
-    """Axes of the message: `enu` east, north, up; `ned` north, east, down. Of NMEA and GPSFix they are known."""
+    """Axes of the message: `enu` east, north, up; `ned` north, east, down. Of NMEA, GPSFix and most makers' messages they are known."""
     min_sigma_mps: Positive = 0.03
     """Floor of the velocity sigma, m/s."""
     default_sigma_mps: Positive = 0.3
