@@ -74,4 +74,6 @@ def made_comparable(run: Run) -> Run:
 
 def levers_m(run: Run) -> dict[str, Array]:
     """Return the antenna of each receiver in body, (3,) m."""
-    return {name: mount_of(name, sensor, run.recording.mounts)[0] for name, sensor in run.config.of_kind("gnss").items()}
+    return {
+        name: mount_of(name, sensor, run.recording.mounts)[0] for name, sensor in run.config.of_kind("gnss").items()
+    }
