@@ -29,7 +29,7 @@ def docking(compass_hz: str = "4") -> SimulatedRun:
     """Without GNSS: place by the dock's tags (which moves by 0.3 m), height by that and the tide."""
     less = {"imu_hz": "50", "gnss_hz": "2", "compass_hz": compass_hz, "lidar_hz": "0", "camera_hz": "0"}
     true = simulate(find_scenario("dock-floating-optimal", {**less, "duration_s": "45", "route_s": "45"}), 1)
-    run, _ = tagfactory.sighted(true, rate_hz=4.0)
+    run, _ = tagfactory.sighted(true, rate_hz=2.0)
     kept = tuple(m for m in run.recording.measurements if m.sensor != "gnss")
     config = with_few_states(run.config)
     return replace(run, recording=replace(run.recording, measurements=kept), config=config)
