@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from graphloc.berths import Berth, BerthTrack, track_from
 from graphloc.eval.metrics import Table
 from graphloc.frames import Array
+from graphloc.series import interpolated, rms
 from graphloc.survey import Survey
 from graphloc.time import NS_PER_S, seconds_since
 from graphloc.trajectory import Trajectory
@@ -84,7 +85,7 @@ def docking_table(
         wrong = _wrong_side(off[at_end], truth.p_world_m[at_end], survey)
         values = (
             *(_p95(error[band & covered]) for band in bands.values()),
-            float(np.sqrt(np.mean(of_sighted**2))) if len(of_sighted) else None,
+            rms(of_sighted) if len(of_sighted) else None,
             _p95(error[at_end]),
             lost,
             wrong if wrong or not lost else None,
@@ -165,5 +166,5 @@ def relative(track: Trajectory, berth: Berth, dock: DockMotion | None = None) ->
     if dock is not None:
         t, s = (seconds_since(int(track.stamps_ns[0]), stamps) for stamps in (track.stamps_ns, dock.stamps_ns))
         whole = np.column_stack([dock.moved[:, :3], np.unwrap(dock.moved[:, 3])])
-        moved = np.column_stack([np.interp(t, s, whole[:, k]) for k in range(4)])
+        moved = interpolated(t, s, whole)
     return track_from(berth, track, moved)

@@ -19,6 +19,7 @@ from graphloc.eval.formatting import number
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.recording import SpeedSeries
+from graphloc.series import rms
 from graphloc.solution import SlowEstimate
 from graphloc.trajectory import Trajectory
 
@@ -150,12 +151,12 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
         nees, coverage = float(squared.mean()), float((squared <= chi2_95(2)).mean())
         heading_coverage = float((heading**2 <= chi2_95(1) * there.cov[:, 5, 5]).mean())
     return TruthMetrics(
-        position_rmse_m=_rms(horizontal),
+        position_rmse_m=rms(horizontal),
         position_p50_m=float(np.percentile(horizontal, 50)),
         position_p95_m=float(np.percentile(horizontal, 95)),
         position_max_m=float(horizontal.max()),
-        error_3d_rmse_m=None if estimate.planar else _rms(np.linalg.norm(error, axis=1)),
-        heading_rmse_deg=float(np.degrees(_rms(heading))),
+        error_3d_rmse_m=None if estimate.planar else rms(np.linalg.norm(error, axis=1)),
+        heading_rmse_deg=float(np.degrees(rms(heading))),
         heading_max_deg=float(np.degrees(np.abs(heading).max())),
         nees=nees,
         coverage_95=coverage,
@@ -239,12 +240,12 @@ def compare_to_held_out(
     found = slow is not None and any(m.sensor in slow for m in held)
     predicted = held_out_errors(estimate, held, datum, levers_m, slow).horizontal_m if found else None
     return HeldOutMetrics(
-        horizontal_rmse_m=_rms(horizontal),
+        horizontal_rmse_m=rms(horizontal),
         horizontal_p95_m=float(np.percentile(horizontal, 95)),
         horizontal_max_m=float(horizontal.max()),
-        error_3d_rmse_m=None if estimate.planar or not solid else _rms(np.linalg.norm(off.position_m, axis=1)),
-        outage_drift_m=_rms(largest) if len(largest) > 1 else None,
-        fix_rmse_m=None if predicted is None else _rms(predicted),
+        error_3d_rmse_m=None if estimate.planar or not solid else rms(np.linalg.norm(off.position_m, axis=1)),
+        outage_drift_m=rms(largest) if len(largest) > 1 else None,
+        fix_rmse_m=None if predicted is None else rms(predicted),
         fixes=len(stamps),
         matched=off.covered,
     )
@@ -275,10 +276,6 @@ def compare_speed(estimate: Trajectory, check: SpeedSeries) -> SpeedMetrics:
     forward = np.einsum("ni,ni->n", there.v_world_mps, there.R_world_body[:, :, 0])
     difference = forward - check.speed_mps[covered][order]
     return SpeedMetrics(mean_mps=float(difference.mean()), std_mps=float(difference.std()), samples=len(difference))
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 _Named = Sequence[tuple[str, Trajectory]]

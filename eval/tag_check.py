@@ -19,6 +19,7 @@ from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import GnssPosition, TagSighting, world_from_fixes
 from graphloc.recording import Recording
+from graphloc.series import interpolated
 from graphloc.solution import Solution
 
 _FEWEST = 8
@@ -316,7 +317,7 @@ def _late(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:
             continue
         R = track.at(stamps).R_world_body[where]
         t, of_states = (stamps - stamps[0]) * 1e-9, (track.stamps_ns - stamps[0]) * 1e-9
-        w = np.column_stack([np.interp(t, of_states, solution.gyro_radps[:, k]) for k in range(3)])[where]
+        w = interpolated(t, of_states, solution.gyro_radps)[where]
         rate = np.array([m.R_body_camera[:, 2] @ turning for m, turning in zip(own, w, strict=True)])
         differs = [(B @ m.R_body_camera).T @ m.modes[0].R_world_camera for m, B in zip(own, R, strict=True)]
         roll = Rotation.from_matrix(np.array(differs)).as_rotvec()[:, 2]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,11 +57,6 @@ def vec(values: ArrayLike) -> Vec:
     """Return three numbers as a tuple."""
     a, b, c = (float(v) for v in np.asarray(values))
     return (a, b, c)
-
-
-def summed(t_s: Array, values: NDArray[Any]) -> NDArray[Any]:
-    """Return the running integral (N,) of values (N,) over times (N,), by trapezia; real or complex."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(t_s))])
 
 
 def topic_report(stream: TopicData, count: int) -> TopicReport:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.frontends._assess import sane
 from graphloc.frontends._streams import TopicData
+from graphloc.series import interpolated, robust_sigma
 from graphloc.time import NS_PER_S
 
 WANDER_S = 10.0
@@ -35,7 +36,7 @@ def wander_m(wheels: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatte
     begin_ns = int(wheels.stamps_ns[keep[0]])
     at = (wheels.stamps_ns[keep] - begin_ns) / NS_PER_S
     t, p = (stamps_ns[inside] - begin_ns) / NS_PER_S, p_m[inside, :2]
-    rolled = np.column_stack([np.interp(t, at, wheels.rows[keep, axis]) for axis in (0, 1)])
+    rolled = interpolated(t, at, wheels.rows[keep, :2])
     end = np.searchsorted(t, t + WANDER_S)
     begin = np.flatnonzero(end < len(t))
     begin = begin[t[end[begin]] - t[begin] < 1.5 * WANDER_S]  # not across an outage
@@ -46,7 +47,7 @@ def wander_m(wheels: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatte
         return None
     fixed, chord = fixed[moved], chord[moved]
     off = fixed - np.median(fixed / chord) * chord
-    sigma = 1.4826 * float(np.median(np.abs(off - np.median(off))))
+    sigma = float(robust_sigma(off - np.median(off)))
     if sigma < _SLIP * float(np.median(chord)):
         return None
     return float(np.sqrt(max(sigma**2 - 2.0 * scatter_m**2, 0.0)))

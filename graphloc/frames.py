@@ -123,6 +123,11 @@ def rotation_from_rpy_deg(rpy_deg: Array) -> Array:
     return np.asarray(Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix())
 
 
+def yaw_from_rotation(rotation: Array) -> Array:
+    """Return the yaw (...) in rad of rotation matrices (..., 3, 3): where their x axis points in the horizontal plane."""
+    return np.asarray(np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]))
+
+
 def rpy_from_rotation(rotation: Array) -> Array:
     """Return roll, pitch, yaw in rad, (3,) or (N, 3), of rotation matrices: the inverse of the above.
 

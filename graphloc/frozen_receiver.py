@@ -22,6 +22,7 @@ from graphloc.frozen_imu import stretches
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, world_from_fixes
 from graphloc.recording import Recording
+from graphloc.series import runs
 from graphloc.time import NS_PER_S
 
 _M = TypeVar("_M", bound=Measurement)
@@ -248,8 +249,8 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
     for sensor, velocities in _by_sensor(recording, GnssVelocity).items():
         stamps_ns, v_mps = np.array([m.stamp_ns for m in velocities]), np.array([m.v_world_mps for m in velocities])
         bad = frozen_velocities(stamps_ns, v_mps)
-        ends = np.flatnonzero(np.diff(np.pad(bad & (np.linalg.norm(v_mps, axis=1) > UNDER_WAY_MPS), 1).astype(int)))
-        hung = np.vstack([hung, np.column_stack([stamps_ns[ends[::2]], stamps_ns[ends[1::2] - 1]])])
+        hanging = runs(bad & (np.linalg.norm(v_mps, axis=1) > UNDER_WAY_MPS))
+        hung = np.vstack([hung, stamps_ns[hanging - [0, 1]]])
         gone |= {m.seq: WHY_VELOCITY for m, b in zip(velocities, bad, strict=True) if b}
         if bad.any():
             said.append(

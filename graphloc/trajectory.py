@@ -11,7 +11,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from graphloc.chi2 import SIGMAS_95, chi2_95
-from graphloc.frames import Array, rpy_from_rotation
+from graphloc.frames import Array, rpy_from_rotation, yaw_from_rotation
+from graphloc.series import interpolated
 from graphloc.time import seconds_since
 
 _MOST_APART_S = 1.0  # poses between which the vessel is taken for known
@@ -55,7 +56,7 @@ class Trajectory:
     @property
     def yaw_rad(self) -> Array:
         """Yaw (N,): direction of the body's x axis in the world's horizontal plane."""
-        return np.asarray(np.arctan2(self.R_world_body[:, 1, 0], self.R_world_body[:, 0, 0]))
+        return yaw_from_rotation(self.R_world_body)
 
     def where(self, kept: NDArray[np.bool_] | slice) -> Trajectory:
         """Return some of its poses: (N,) which, or a slice."""
@@ -97,7 +98,7 @@ class Trajectory:
         t, s = seconds_since(origin, self.stamps_ns[near]), seconds_since(origin, stamps)
         velocity: Array | None = None
         if self.v_world_mps is None:
-            position = np.column_stack([np.interp(s, t, self.p_world_m[near, i]) for i in range(3)])
+            position = interpolated(s, t, self.p_world_m[near])
         else:
             spline = CubicHermiteSpline(t, self.p_world_m[near], self.v_world_mps[near])
             position, velocity = spline(s), spline(s, 1)

@@ -25,6 +25,7 @@ from graphloc.measurements import (
     world_from_fixes,
 )
 from graphloc.recording import Recording
+from graphloc.series import interpolated
 from graphloc.time import NS_PER_S
 
 OUTAGES_S = (10.0, 30.0, 60.0, 120.0)
@@ -175,7 +176,7 @@ def _drift(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gene
     def error_m(t: Array) -> Array:
         grid = np.linspace(0.0, length_s, 601)
         drawn = drift_m(rng, grid, rmse_m) * np.clip((length_s - grid) / (0.1 * length_s), 0.0, 1.0)[:, None]
-        return np.column_stack([np.interp(t, grid, drawn[:, k]) for k in range(2)])
+        return interpolated(t, grid, drawn)
 
     return _moved_fixes(recording, begin_ns, end_ns, error_m)
 

@@ -15,6 +15,7 @@ from graphloc.eval.metrics import NoCommonTimeError, compare_to_truth, held_out_
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._published import BL_RUNS, DIGERUD_RUNS
 from graphloc.measurements import GnssPosition, PoseFix, TagSighting
+from graphloc.series import rms
 from graphloc.trajectory import Trajectory
 
 _BL = (
@@ -79,7 +80,7 @@ def _gnss_error_m(data: ReportData, truth: Trajectory) -> list[tuple[str, float,
                 off = held_out_errors(truth, fixes, data.solution.datum, {name: lever_m}).horizontal_m
             except NoCommonTimeError:
                 continue
-            found.append((name, float(np.sqrt(np.mean(off**2))), float(off.max())))
+            found.append((name, rms(off), float(off.max())))
     return found
 
 

@@ -17,6 +17,7 @@ from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_c
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
 from graphloc.frames import Array
+from graphloc.series import rms
 from graphloc.solution import Health, Solution
 from graphloc.trajectory import Trajectory, bounds_95
 
@@ -131,7 +132,7 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
     track = solution.trajectory
     if data.calibration is None or track.cov is None or track.v_world_mps is None:
         return
-    speed_mps, bound_m = _rms(_away(track.v_world_mps)), float(np.median(bounds_95(track.cov)[:, 0]))
+    speed_mps, bound_m = rms(_away(track.v_world_mps)), float(np.median(bounds_95(track.cov)[:, 0]))
     for found in data.calibration.suggestions:
         off_s, block = abs(found.suggested - found.configured), data.config.sensors[found.sensor]
         if isinstance(block, GnssConfig) and block.stamp_sigma_s > 0.0:
@@ -180,12 +181,12 @@ def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
         if filtered.name == (data.online.name if data.online else ""):
             continue
         both = _errors_of_both(data, solution, filtered.trajectory)
-        if both is not None and _rms(both[0]) > _WORSE * _rms(both[1]):
+        if both is not None and rms(both[0]) > _WORSE * rms(both[1]):
             ours, theirs = both
             yield Reason(
                 trust=Trust.WITH_CARE,
-                text=f"{filtered.name} is more accurate: RMSE {_rms(theirs):.2f} m, worst {theirs.max():.2f} m, against "
-                f"{_rms(ours):.2f} m, worst {ours.max():.2f} m, over the time that both cover.",
+                text=f"{filtered.name} is more accurate: RMSE {rms(theirs):.2f} m, worst {theirs.max():.2f} m, against "
+                f"{rms(ours):.2f} m, worst {ours.max():.2f} m, over the time that both cover.",
             )
 
 
@@ -214,10 +215,6 @@ def _away(error: Array) -> Array:
     return np.asarray(np.hypot(error[:, 0], error[:, 1]))
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
     """Yield the distance of the online track from the offline one, where there is no truth."""
     if solution is not data.online or data.recording.truth is not None:
@@ -232,7 +229,7 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
     said = "; honest bounds hold it for 95 % or more, as offline knows more: these are too small" if short else ""
     yield Reason(
         trust=trust,
-        text=f"It is {_rms(off):.2f} m from the offline track (RMS), {off.max():.2f} m at most; its own 95 % bounds hold the "
+        text=f"It is {rms(off):.2f} m from the offline track (RMS), {off.max():.2f} m at most; its own 95 % bounds hold the "
         f"offline position for {percent(placed)} of the time, the offline heading for {percent(headed)}{said}.",
     )
 
