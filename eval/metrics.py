@@ -19,7 +19,7 @@ from graphloc.eval.formatting import number
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.recording import SpeedSeries
-from graphloc.series import rms
+from graphloc.series import interpolated, rms
 from graphloc.solution import SlowEstimate
 from graphloc.trajectory import Trajectory
 
@@ -210,8 +210,7 @@ def held_out_errors(
     antenna = there.p_world_m[index] + np.einsum("nij,nj->ni", there.R_world_body[index], levers)
     for name, error in (slow or {}).items():
         own = np.array([m.sensor == name for m in held])[covered]
-        for axis in range(3 if own.any() else 0):
-            antenna[own, axis] += np.interp(stamps[covered][own], error.stamps_ns, error.value[:, axis])
+        antenna[own] += interpolated(stamps[covered][own], error.stamps_ns, error.value[:, :3])
     return PositionErrors(stamps_ns=stamps[covered], position_m=antenna - fixes[covered], covered=float(covered.mean()))
 
 

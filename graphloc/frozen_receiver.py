@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array, Datum
 from graphloc.frozen_imu import stretches
-from graphloc.ledger import LedgerRow, Outcome
+from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.series import runs
@@ -266,13 +266,7 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
         said += frozen_fixes_warning(sensor, stamps_ns, bad)
     if not gone:
         return recording, said
-    rows = tuple(
-        LedgerRow(
-            seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=recording.topics.get(m.sensor, ""), outcome=Outcome.REJECTED,
-            reason=gone[m.seq],
-        )
-        for m in recording.measurements if m.seq in gone
-    )  # fmt: skip
+    rows = (recording.row_of(m, Outcome.REJECTED, gone[m.seq]) for m in recording.measurements if m.seq in gone)
     left = tuple(m for m in recording.measurements if m.seq not in gone)
     return replace(recording, measurements=left, rows=(*recording.rows, *rows)), said
 

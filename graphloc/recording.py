@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.ledger import LedgerRow
+from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement, TagView
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory
@@ -98,6 +98,21 @@ class Recording:
     tag_views: tuple[TagView, ...] = ()
     warnings: tuple[str, ...] = ()
     span: Span | None = None
+
+    def row_of(self, m: Measurement, outcome: Outcome, reason: str) -> LedgerRow:
+        """Return the ledger row of one of its measurements."""
+        topic = self.topics.get(m.sensor, "")
+        return LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason)
+
+    def imu_rows(self, which: NDArray[np.bool_] | slice, outcome: Outcome, reason: str = "") -> list[LedgerRow]:
+        """Return the ledger rows of samples of its IMU: (N,) of which, or a slice."""
+        assert self.imu is not None
+        sensor, seqs, stamps_ns = self.imu.sensor, self.imu.seqs[which].tolist(), self.imu.stamps_ns[which].tolist()
+        topic = self.topics.get(sensor, "")
+        return [
+            LedgerRow(seq=seq, stamp_ns=stamp_ns, sensor=sensor, topic=topic, outcome=outcome, reason=reason)
+            for seq, stamp_ns in zip(seqs, stamps_ns, strict=True)
+        ]
 
     def lost(self, sensors: Container[str]) -> str:
         """Return a clause on why most of the messages of these sensors that gave nothing gave nothing; empty where none is."""

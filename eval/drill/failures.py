@@ -14,7 +14,7 @@ import numpy as np
 
 from graphloc.eval.simulate.noise import drift_m
 from graphloc.frames import Array, Datum, Geodetic, wrap_angle
-from graphloc.ledger import LedgerRow, Outcome
+from graphloc.ledger import Outcome
 from graphloc.measurements import (
     CompassHeading,
     GnssPosition,
@@ -127,13 +127,6 @@ def _timed(family: str, length_s: float, strike: Strike) -> Failure:
     return Failure(name=f"{family}, {length_s:g} s", family=family, length_s=length_s, strike=strike)
 
 
-def _taken(recording: Recording, m: Measurement) -> LedgerRow:
-    topic = recording.topics.get(m.sensor, "")
-    return LedgerRow(
-        seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=Outcome.HELD_OUT, reason=_TAKEN
-    )
-
-
 def _during(m: Measurement, begin_ns: int, end_ns: int) -> bool:
     return begin_ns <= m.stamp_ns < end_ns
 
@@ -146,7 +139,7 @@ def _silent(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Ge
         recording=replace(
             recording,
             measurements=tuple(m for m in recording.measurements if id(m) not in left),
-            rows=(*recording.rows, *(_taken(recording, m) for m in gone if m.seq >= 0)),
+            rows=(*recording.rows, *(recording.row_of(m, Outcome.HELD_OUT, _TAKEN) for m in gone if m.seq >= 0)),
         )
     )
 
@@ -260,11 +253,5 @@ def _imu_gap(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.G
     imu = recording.imu
     assert imu is not None  # the script asks for one
     gone = (imu.stamps_ns >= begin_ns) & (imu.stamps_ns < end_ns)
-    topic = recording.topics.get(imu.sensor, "")
-    rows = (
-        LedgerRow(
-            seq=int(q), stamp_ns=int(s), sensor=imu.sensor, topic=topic, outcome=Outcome.HELD_OUT, reason=_TAKEN
-        )
-        for q, s in zip(imu.seqs[gone], imu.stamps_ns[gone], strict=True)
-    )  # fmt: skip
+    rows = recording.imu_rows(gone, Outcome.HELD_OUT, _TAKEN)
     return Struck(recording=replace(recording, imu=imu.where(~gone), rows=(*recording.rows, *rows)))

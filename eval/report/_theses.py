@@ -9,6 +9,7 @@ import numpy as np
 
 from graphloc.build import mount_of
 from graphloc.eval.docking import accurate_within_m
+from graphloc.eval.ekf import named_tracks
 from graphloc.eval.formatting import number
 from graphloc.eval.html import note, table
 from graphloc.eval.metrics import NoCommonTimeError, compare_to_truth, held_out_errors
@@ -35,10 +36,6 @@ def theses_section(data: ReportData) -> str:
     return "".join(parts)
 
 
-def _estimates(data: ReportData) -> list[tuple[str, Trajectory]]:
-    return [(data.solution.name, data.solution.trajectory), *((f.name, f.trajectory) for f in data.filters)]
-
-
 def _bl(data: ReportData) -> Iterator[str]:
     truth = data.recording.truth
     assert truth is not None
@@ -57,7 +54,7 @@ def _bl(data: ReportData) -> Iterator[str]:
         for r in BL_RUNS
     ]
     mine4 = []
-    for name, track in _estimates(data):
+    for name, track in named_tracks(data.solution, data.filters):
         m = compare_to_truth(track, truth)
         values = (m.position_rmse_m, m.position_max_m, m.heading_rmse_deg, m.heading_max_deg)
         mine4.append((f"this run: {name}", *(number(v, 4) for v in values)))
@@ -97,7 +94,7 @@ def _digerud(data: ReportData) -> Iterator[str]:
             continue
         stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
         far, flipped = _farthest(seen, truth), _second_pose(data, sensor)
-        for name, track in _estimates(data):
+        for name, track in named_tracks(data.solution, data.filters):
             within = accurate_within_m(track, truth, config.surveyed, stamps, seen[0].t_body_camera_m)
             said = "not < 0.10 m anywhere" if within is None else f"< 0.10 m within {within:.1f} m"
             mine.append((f"this run: {name}", said, far, flipped if track is data.solution.trajectory else ""))

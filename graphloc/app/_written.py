@@ -15,6 +15,7 @@ from graphloc import found_tags, outputs
 from graphloc.app._run import Run, levers_m
 from graphloc.eval import metrics, report
 from graphloc.eval.docking import docking_table
+from graphloc.eval.ekf import named_tracks
 from graphloc.folders import fresh_folder
 from graphloc.measurements import TagSighting
 from graphloc.trajectory import Trajectory
@@ -23,7 +24,7 @@ from graphloc.trajectory import Trajectory
 def tables(run: Run) -> tuple[metrics.Table, ...]:
     """Return the numbers of a run: against truth, held-out fixes, and the speed check."""
     found: list[metrics.Table] = []
-    estimates = [(run.solution.name, run.solution.trajectory), *((f.name, f.trajectory) for f in run.filters)]
+    estimates = named_tracks(run.solution, run.filters)
     if run.recording.truth is not None:
         found.append(metrics.truth_table(estimates, run.recording.truth))
         found += _docking_tables(run, estimates, run.recording.truth)
