@@ -42,7 +42,7 @@ class HoldOut:
         Raises:
             ConfigError: there are too few fixes, or the gaps would overlap.
         """
-        fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)]
+        fixes = recording.of(GnssPosition)
         if len(fixes) < 3:
             raise ConfigError(f"{recording.source}: --hold-out needs at least 3 fixes, the run has {len(fixes)}")
         span = (fixes[-1].stamp_ns - fixes[0].stamp_ns) * 1e-9

@@ -21,6 +21,7 @@ from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.recording import SpeedSeries
 from graphloc.series import interpolated, rms
 from graphloc.solution import SlowEstimate
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
 Levers = Mapping[str, Array]
@@ -199,7 +200,7 @@ def held_out_errors(
     Raises:
         NoCommonTimeError: the estimate covers none of the fixes.
     """
-    stamps = np.array([m.stamp_ns for m in held], dtype=np.int64)
+    stamps = stamps_of(held)
     fixes = world_from_fixes(held, datum)
     covered = estimate.covers(stamps)
     if not covered.any():

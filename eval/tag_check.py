@@ -21,6 +21,7 @@ from graphloc.measurements import GnssPosition, TagSighting, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.series import interpolated
 from graphloc.solution import Solution
+from graphloc.time import stamps_of
 
 _FEWEST = 8
 _DOUBTED = 0.5  # share of a tag's sightings that disagree with the rest
@@ -47,9 +48,7 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
     """Return a line for each tag most of whose sightings disagree with the run, with a possible explanation."""
     rows = {row.seq: row for row in solution.ledger if row.seq >= 0}
     track = solution.trajectory
-    sightings = [
-        m for m in recording.measurements if isinstance(m, TagSighting) and track.covers(np.array([m.stamp_ns]))[0]
-    ]
+    sightings = [m for m in recording.of(TagSighting) if track.covers(np.array([m.stamp_ns]))[0]]
     said_of_mounts = list(_estimated_mounts(sightings, solution))
     cameras = {(m.sensor, m.camera) for m in sightings}
     found = {camera: mount_off(solution, *camera).as_matrix() for camera in cameras}
@@ -89,10 +88,10 @@ def _seen_from_behind(
 
     The track tells nothing of that: it may follow the tags, to the other side of the quay.
     """
-    fixes = sorted((m for m in recording.measurements if isinstance(m, GnssPosition)), key=lambda m: m.stamp_ns)
+    fixes = sorted(recording.of(GnssPosition), key=lambda m: m.stamp_ns)
     if len(fixes) < _FEWEST:
         return []
-    stamps, places = np.array([m.stamp_ns for m in fixes]), world_from_fixes(fixes, solution.datum)[:, :2]
+    stamps, places = stamps_of(fixes), world_from_fixes(fixes, solution.datum)[:, :2]
     seen: dict[Key, list[tuple[float, float, bool]]] = defaultdict(list)
     for m in sightings:
         nearest = int(np.argmin(np.abs(stamps - m.stamp_ns)))

@@ -22,7 +22,7 @@ from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import IMU, PLAIN_POSE, POSE, UNSTAMPED
 from graphloc.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.measurements import GnssPosition, world_from_fixes
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, stamps_of
 from graphloc.white_noise import white_noise
 
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
@@ -193,7 +193,7 @@ def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
     if len(fixes) < 20:
         return Courses(np.zeros(0, dtype=np.int64), np.zeros(0))
     p = world_from_fixes(fixes, Datum(fixes[0].position))[:, :2]
-    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(white_noise(p).max()))
+    return courses_of(stamps_of(fixes), p, float(white_noise(p).max()))
 
 
 def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> MeasuredMotion | None:
@@ -203,7 +203,7 @@ def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> MeasuredMotio
     moments = {m.stamp_ns: m for m in fixes}
     ordered = [moments[stamp_ns] for stamp_ns in sorted(moments)]
     p = world_from_fixes(ordered, Datum(ordered[0].position))
-    return motion_of_places(source, np.array([m.stamp_ns for m in ordered], dtype=np.int64), p)
+    return motion_of_places(source, stamps_of(ordered), p)
 
 
 def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> MeasuredMotion | None:

@@ -14,7 +14,7 @@ from graphloc.errors import InputError
 from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading, ImuSeries
 from graphloc.series import integral, rms
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, stamps_of
 
 _BLOCK_S = 120.0  # within it a gyro's bias and a compass's offset are steady
 _HOLE_S, _STEP_S = 0.5, 2.0
@@ -280,7 +280,7 @@ def _smooth(yaw: Array, at_s: Array) -> NDArray[np.bool_]:
 
 
 def _said(headings: Sequence[CompassHeading]) -> Yaws:
-    return np.array([m.stamp_ns for m in headings], dtype=np.int64), np.array([m.yaw_rad for m in headings])
+    return stamps_of(headings), np.array([m.yaw_rad for m in headings])
 
 
 def _blocks(

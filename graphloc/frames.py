@@ -108,6 +108,11 @@ def wrap_angle(angle_rad: Array | float) -> Array:
     return -((-a + np.pi) % (2.0 * np.pi) - np.pi)
 
 
+def continuous_longitudes(longitude_deg: Array) -> Array:
+    """Return longitudes (N,) about the first one, so that a run across the date line is continuous."""
+    return np.asarray(longitude_deg[0] + (longitude_deg - longitude_deg[0] + 180.0) % 360.0 - 180.0)
+
+
 def yaw_from_heading_deg(heading_deg: Array | float) -> Array:
     """Return yaw (rad, from east, counter-clockwise) of a compass heading (deg, from true north, clockwise)."""
     return wrap_angle(np.pi / 2.0 - np.radians(heading_deg))

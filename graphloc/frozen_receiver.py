@@ -23,7 +23,7 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.series import runs
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, stamps_of
 
 _M = TypeVar("_M", bound=Measurement)
 WHY = "frozen receiver or driver: it repeats one position while the vessel moves"
@@ -247,7 +247,7 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
     # First and last stamps of velocities that are repeated, of a vessel under way.
     hung = np.zeros((0, 2), dtype=np.int64)
     for sensor, velocities in _by_sensor(recording, GnssVelocity).items():
-        stamps_ns, v_mps = np.array([m.stamp_ns for m in velocities]), np.array([m.v_world_mps for m in velocities])
+        stamps_ns, v_mps = stamps_of(velocities), np.array([m.v_world_mps for m in velocities])
         bad = frozen_velocities(stamps_ns, v_mps)
         hanging = runs(bad & (np.linalg.norm(v_mps, axis=1) > UNDER_WAY_MPS))
         hung = np.vstack([hung, stamps_ns[hanging - [0, 1]]])
@@ -257,7 +257,7 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
                 f"{sensor}: for {stretches(stamps_ns, bad)} {WHY_VELOCITY}; {int(bad.sum())} velocities rejected"
             )
     for sensor, fixes in _by_sensor(recording, GnssPosition).items():
-        stamps_ns, lat_lon = np.array([m.stamp_ns for m in fixes]), np.array([m.position[:2] for m in fixes])
+        stamps_ns, lat_lon = stamps_of(fixes), np.array([m.position[:2] for m in fixes])
         bad = frozen_fixes(stamps_ns, lat_lon, world_from_fixes(fixes, datum)[:, :2])
         # One receiver, or its driver, says both.
         meanwhile = np.any((stamps_ns[:, None] >= hung[:, 0]) & (stamps_ns[:, None] <= hung[:, 1]), axis=1)
@@ -273,7 +273,6 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
 
 def _by_sensor(recording: Recording, kind: type[_M]) -> dict[str, list[_M]]:
     found: dict[str, list[_M]] = {}
-    for m in recording.measurements:
-        if isinstance(m, kind):
-            found.setdefault(m.sensor, []).append(m)
+    for m in recording.of(kind):
+        found.setdefault(m.sensor, []).append(m)
     return found

@@ -12,7 +12,7 @@ import numpy as np
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig
 from graphloc.errors import InputError
-from graphloc.frames import Datum, Geodetic
+from graphloc.frames import Datum, Geodetic, continuous_longitudes
 from graphloc.graph import Sensor
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
@@ -32,20 +32,14 @@ def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sens
         _refuse_far_fixes(recording, datum)
         return datum
     refuse_world_without_datum(config, recording.source, rows)
-    found = fixes_of(recording)
+    found = recording.of(GnssPosition)
     fixes = np.array([m.position for m in found][:5])
     if not len(fixes):
         raise InputError(f"{recording.source}: {_why_no_fix(recording, config)}")
-    # Longitudes about the first one, so that fixes on both sides of the date line stay together.
-    fixes[:, 1] = fixes[0, 1] + (fixes[:, 1] - fixes[0, 1] + 180.0) % 360.0 - 180.0
+    fixes[:, 1] = continuous_longitudes(fixes[:, 1])
     lat, lon = (float(v) for v in np.median(fixes[:, :2], axis=0))
     heights = [m.position.height_m for m in found if m.has_height][:5]
     return Datum(Geodetic(lat, lon, float(np.median(heights)) if heights else 0.0))
-
-
-def fixes_of(recording: Recording) -> list[GnssPosition]:
-    """Return the fixes that an origin can be taken from."""
-    return [m for m in recording.measurements if isinstance(m, GnssPosition)]
 
 
 def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:
@@ -54,7 +48,7 @@ def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:
     Raises:
         InputError: most fixes lie farther away than any run goes.
     """
-    fixes = [m.position for m in fixes_of(recording)]
+    fixes = [m.position for m in recording.of(GnssPosition)]
     if fixes:
         away_m = np.linalg.norm(datum.enu_from_geodetic(*np.array(fixes).T), axis=1)
         if np.median(away_m) > _FAR_M:
@@ -128,7 +122,7 @@ def height_m(recording: Recording, config: VesselConfig, configured_m: float | N
         return configured_m - datum.origin.height_m
     heights = [
         m.position.height_m - float(mount_of(m.sensor, config.sensors[m.sensor], recording.mounts)[0][2])
-        for m in fixes_of(recording)
+        for m in recording.of(GnssPosition)
         if m.has_height
     ]
     return float(np.median(heights)) - datum.origin.height_m if heights else 0.0

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from graphloc.measurements import ImuSeries, Measurement, TagView
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory
 
+_M = TypeVar("_M", bound=Measurement)
+Mounts = Mapping[str, tuple[Array, Array]]
+"""By sensor or LiDAR, its pose in body: t (3,) m, R (3, 3)."""
 Progress = Callable[[str, int, int], None]
 """Called with stage, done, total."""
 
@@ -92,12 +96,16 @@ class Recording:
     rows: tuple[LedgerRow, ...] = ()
     message_count: int = 0
     topics: Mapping[str, str] = field(default_factory=dict)
-    mounts: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+    mounts: Mounts = field(default_factory=dict)
     truth: Trajectory | None = None
     check_speed: SpeedSeries | None = None
     tag_views: tuple[TagView, ...] = ()
     warnings: tuple[str, ...] = ()
     span: Span | None = None
+
+    def of(self, kind: type[_M], sensor: str | None = None) -> list[_M]:
+        """Return its measurements of a class, in order: all, or those of one sensor."""
+        return [m for m in self.measurements if isinstance(m, kind) and sensor in (None, m.sensor)]
 
     def row_of(self, m: Measurement, outcome: Outcome, reason: str) -> LedgerRow:
         """Return the ledger row of one of its measurements."""

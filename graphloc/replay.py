@@ -28,6 +28,7 @@ from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
 from graphloc.solution import Cause, Solution, SolveStats
 from graphloc.solve._warnings import disagreement_warning, joint_rejection_warning
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
 Status = Callable[[float, float, Estimate | None, str], None]
@@ -276,7 +277,7 @@ def _rejection_warnings(ledger: Ledger, config: VesselConfig, false_of: Mapping[
         yield from disagreement_warning(name, weights)
         if (usual := getattr(config.sensors.get(name), "false_fraction", None)) is not None:
             false = np.array([false_of.get(row.seq, usual) for row in rows])
-            yield from joint_rejection_warning(name, np.array([row.stamp_ns for row in rows]), weights, false)
+            yield from joint_rejection_warning(name, stamps_of(rows), weights, false)
 
 
 def _solution(
@@ -294,7 +295,7 @@ def _solution(
             kept.pop()
         kept.append(estimate)
     assert smoother.datum is not None
-    stamps = np.array([e.stamp_ns for e in kept], dtype=np.int64)
+    stamps = stamps_of(kept)
     names = kept[-1].since_agreed_s
     warnings = [*(event.text for event in events if event.warns), *_rejection_warnings(ledger, config, false_of)]
     return Solution(

@@ -375,7 +375,7 @@ def test_compass_with_nan_roll_and_pitch(tmp_path: Path) -> None:
     quats = [(nan, nan, 0.0, 1.0), (nan, nan, nan, nan), (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)), (nan, nan, 1.0, 0.0)]
     items = [("/heading", t, MAKE.compass(t, q)) for t, q in zip(stamps, quats, strict=True)]
     recording = read(tmp_path, items, imu=None, gnss=None, compass={"topic": "/heading"})
-    yaws = [m.yaw_rad for m in recording.measurements if isinstance(m, CompassHeading)]
+    yaws = [m.yaw_rad for m in recording.of(CompassHeading)]
     np.testing.assert_allclose(np.abs(yaws), [0.0, np.pi / 2, np.pi])
     (row,) = rows_of(recording, "compass")
     assert (row.outcome, row.stamp_ns) == (Outcome.MALFORMED, stamps[1])

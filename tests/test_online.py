@@ -22,6 +22,7 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix, PoseMode
 from graphloc.online import OnlineSmoother, _waiting
 from graphloc.thinning import THINNED
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, delayed, feed, finish
 from tests.slowly import slowly
@@ -478,7 +479,7 @@ def test_odom_does_not_jump_where_the_map_does() -> None:
     run = slowly(simulate(replace(scenario, imu_hz=50.0, gnss_hz=5.0, compass_hz=2.0), 2))
     fed, _ = whole(run, arrivals_of(run))
     e = fed.estimates
-    true = run.truth.at(np.array([x.stamp_ns for x in e]))
+    true = run.truth.at(stamps_of(e))
     map_jumps, nis = [], []
     for n in range(1, len(e)):
         step = true.R_world_body[n - 1].T @ (true.p_world_m[n] - true.p_world_m[n - 1])

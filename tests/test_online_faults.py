@@ -26,6 +26,7 @@ from graphloc.online._agreement import Agreement
 from graphloc.online._live import live_problem
 from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._window import Window
+from graphloc.time import stamps_of
 from tests.faults import FAULTS, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
 from tests.slowly import slowly
 
@@ -105,7 +106,7 @@ def test_restarts_after_a_long_imu_silence() -> None:
     assert len([e for e in fed.events if e.startswith("started")]) == 2
     assert fed.errors_m[-1] < 1.0
     # Odometry goes on from where it was: no jump between the two pieces but the way of the new start's data.
-    stamps = np.array([e.stamp_ns for e in fed.estimates])
+    stamps = stamps_of(fed.estimates)
     n = int(np.argmax(np.diff(stamps)))
     step = np.linalg.norm(fed.estimates[n + 1].p_odom_m - fed.estimates[n].p_odom_m)
     assert step < 6.0 * (np.linalg.norm(fed.estimates[n].v_world_mps) + 1.0)

@@ -243,7 +243,7 @@ def test_the_ledger_adds_up(tmp_path: Path) -> None:
     # 500 IMU samples, 50 fixes, 1 CameraInfo, 6 images; 4 sightings, 3 troubles.
     assert recording.message_count == 500 + 50 + 1 + 6 + 4 + 3
     assert recording.message_count == accounted(recording)
-    seen = [m for m in recording.measurements if isinstance(m, TagSighting)]
+    seen = recording.of(TagSighting)
     assert [(m.frame, m.numbers) for m in seen] == [("world", (7,)), ("pier", (12,))] * 2
     assert [row.outcome for row in rows_of(recording, "tags")] == [Outcome.REJECTED] * 3
     assert [row.reason.split(":")[0] for row in rows_of(recording, "tags")] == [

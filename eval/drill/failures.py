@@ -86,7 +86,7 @@ def script(recording: Recording) -> tuple[tuple[Failure, ...], tuple[tuple[str, 
     no_pose = "" if has[PoseFix] else "no matches and no poses"
     no_compass = "" if has[CompassHeading] else "no compass"
     alone = has[GnssPosition] + has[PoseFix] + has[TagSighting] < 2
-    tags = [m for m in recording.measurements if isinstance(m, TagSighting)]
+    tags = recording.of(TagSighting)
     flips = "" if any(len(m.modes) > 1 for m in tags) else "no sighting with a second pose" if tags else "no tags"
     offer(no_gnss, *(_timed("GNSS outage", s, partial(_silent, kinds=_GNSS)) for s in OUTAGES_S))
     nothing = "a single sensor measures position: the same as its outage" if alone else ""
@@ -150,7 +150,7 @@ def _changed(recording: Recording, change: Callable[[Measurement], Measurement])
 
 def _moved_fixes(recording: Recording, begin_ns: int, end_ns: int, error_m: Callable[[Array], Array]) -> Struck:
     """Add errors to fixes; `error_m` maps times (N,), s since the failure began, to (N, 2) m, east, north."""
-    fixes = [m for m in recording.measurements if isinstance(m, GnssPosition) and _during(m, begin_ns, end_ns)]
+    fixes = [m for m in recording.of(GnssPosition) if _during(m, begin_ns, end_ns)]
     if not fixes:
         return Struck(recording=recording)
     datum = Datum(fixes[0].position)

@@ -125,7 +125,7 @@ def outages(recording: Recording) -> list[tuple[int, int]]:
 
     The periods before the first and after the last one count, too, as far as there is an IMU.
     """
-    stamps = np.unique([m.stamp_ns for m in recording.measurements if isinstance(m, GnssPosition)])
+    stamps = np.unique([m.stamp_ns for m in recording.of(GnssPosition)])
     if len(stamps) < 3:
         return []
     usual_ns = float(np.median(np.diff(stamps)))

@@ -17,6 +17,7 @@ from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._published import BL_RUNS, DIGERUD_RUNS
 from graphloc.measurements import GnssPosition, PoseFix, TagSighting
 from graphloc.series import rms
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
 _BL = (
@@ -70,7 +71,7 @@ def _gnss_error_m(data: ReportData, truth: Trajectory) -> list[tuple[str, float,
     """Return RMSE and largest horizontal error (m) of each receiver, at its antenna."""
     found = []
     for name in data.config.of_kind("gnss"):
-        fixes = [m for m in data.recording.measurements if isinstance(m, GnssPosition) and m.sensor == name]
+        fixes = data.recording.of(GnssPosition, name)
         if fixes:
             lever_m = mount_of(name, data.config.sensors[name], data.recording.mounts)[0]
             try:
@@ -89,10 +90,10 @@ def _digerud(data: ReportData) -> Iterator[str]:
     ]
     mine = []
     for sensor, config in data.config.of_kind("apriltag").items():
-        seen = [m for m in data.recording.measurements if isinstance(m, TagSighting) and m.sensor == sensor]
+        seen = data.recording.of(TagSighting, sensor)
         if not seen:
             continue
-        stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
+        stamps = stamps_of(seen)
         far, flipped = _farthest(seen, truth), _second_pose(data, sensor)
         for name, track in named_tracks(data.solution, data.filters):
             within = accurate_within_m(track, truth, config.surveyed, stamps, seen[0].t_body_camera_m)
@@ -106,7 +107,7 @@ def _digerud(data: ReportData) -> Iterator[str]:
 
 def _farthest(seen: list[TagSighting], truth: Trajectory) -> str:
     """Return the true distance from the camera to the tags, docks at rest, of the farthest sighting."""
-    stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
+    stamps = stamps_of(seen)
     covered = np.flatnonzero(truth.covers(stamps))
     if not len(covered):
         return "-"

@@ -19,6 +19,7 @@ from graphloc.eval.report._health import said_of, shares
 from graphloc.frames import Array
 from graphloc.series import rms
 from graphloc.solution import Health, Solution
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory, bounds_95
 
 # Shares of the run: called good, called lost, covered by the 95 % bounds, compared at all; beyond, a reader has to look closer.
@@ -202,7 +203,7 @@ def _errors_of_both(data: ReportData, solution: Solution, theirs: Trajectory) ->
             return None
         true = truth.at(stamps).p_world_m[:, :2]
         return _away(ours.at(stamps).p_world_m[:, :2] - true), _away(theirs.at(stamps).p_world_m[:, :2] - true)
-    at = np.array([m.stamp_ns for m in data.held], dtype=np.int64)
+    at = stamps_of(data.held)
     held = [m for m, both in zip(data.held, ours.covers(at) & theirs.covers(at), strict=True) if both]
     if not held:
         return None

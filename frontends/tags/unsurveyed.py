@@ -24,7 +24,7 @@ from graphloc.frontends.tags.pose import poses_of
 from graphloc.measurements import TagSighting, TagView
 from graphloc.series import interpolated
 from graphloc.survey import WORLD, DockConfig, Family, Survey, TagConfig
-from graphloc.time import seconds_since
+from graphloc.time import seconds_since, stamps_of
 from graphloc.trajectory import Trajectory
 
 _FEWEST = 5
@@ -135,7 +135,7 @@ def estimate_tags(
             )
             continue
         own = [v for v in views if (v.family, v.number) == (family, number)]
-        stamps = np.array([v.stamp_ns for v in own], dtype=np.int64)
+        stamps = stamps_of(own)
         own = [v for v, covered in zip(own, track.covers(stamps), strict=True) if covered]
         dock = (riding or {}).get((family, number))
         seen_from = track if dock is None else dock.seen_from(track)

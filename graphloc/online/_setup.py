@@ -9,9 +9,10 @@ from functools import cached_property
 
 from graphloc.build import mount_of
 from graphloc.config import ImuConfig, VesselConfig
-from graphloc.frames import Array, Datum, yaw_from_rotation
+from graphloc.frames import Datum, yaw_from_rotation
 from graphloc.graph import Hint, InertialRow, Sensor
 from graphloc.measurements import Measurement
+from graphloc.recording import Mounts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,7 +28,7 @@ class Setup:
     config: VesselConfig
     rows: tuple[Sensor, ...]
     inertial: InertialRow
-    mounts: Mapping[str, tuple[Array, Array]]
+    mounts: Mounts
     lag_s: float
 
     @cached_property

@@ -15,11 +15,11 @@ import gtsam
 import numpy as np
 
 from graphloc import keys, origin
-from graphloc.build import Problem, build_graph, company_of, make_problem
+from graphloc.build import Made, Problem, build_graph, company_of, make_problem
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
 from graphloc.ledger import LedgerRow
-from graphloc.measurements import ImuSeries, Measurement
+from graphloc.measurements import GnssPosition, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._setup import Setup
 from graphloc.online._unmeasured_heading import DOUBTFUL_RAD, UnmeasuredHeading
@@ -90,7 +90,7 @@ def try_start(setup: Setup, imu: ImuSeries, measurements: Sequence[Measurement],
         mounts=setup.mounts,
         topics={name: sensor.topic for name, sensor in config.sensors.items()},
     )
-    if datum is None and config.datum is None and len(origin.fixes_of(recording)) < _FIXES:
+    if datum is None and config.datum is None and len(recording.of(GnssPosition)) < _FIXES:
         return f"{_FIXES} GNSS fixes to set the origin, as no `datum:` is configured"
     try:
         datum = datum or origin.choose_datum(recording, config, setup.rows)
@@ -243,7 +243,7 @@ def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:
     k = int(np.searchsorted(timeline.slow_of, min(timeline.slow_of[back], timeline.slow_of[last] - 1)))
     if k == 0 or last_ns - first_ns <= duration_ns(_WHOLE * lag_s):
         return 0, Anchor.of_start(first_ns, result.prior)
-    made: dict[tuple[int, int], range] = {}
+    made: Made = {}
     graph, guess = build_graph(problem, values, decisions(result.verdicts), 0, last, result.prior, made=made)
     # Earlier measurements may be attached to this state; the window takes only those from its stamp on.
     stamps_ns = {s.number: [m.stamp_ns for m in s.measurements] for s in problem.streams}

@@ -29,7 +29,7 @@ from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
 from graphloc.online._start import LEAST_S
-from graphloc.time import duration_ns
+from graphloc.time import duration_ns, stamps_of
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -192,7 +192,7 @@ class Tracking:
     def _read_imu(self) -> None:
         """Hand the samples that have arrived to the window; where they came late, integrate anew."""
         if self._unread:
-            stamps = np.array([m.stamp_ns for m in self._unread], dtype=np.int64)
+            stamps = stamps_of(self._unread)
             readings = np.array([np.hstack([m.accel_mps2, m.gyro_radps]) for m in self._unread])
             self.lag.problem.links.extend(stamps, readings)
             self._unread = []

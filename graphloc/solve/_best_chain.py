@@ -17,6 +17,7 @@ from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
 from graphloc.solve._hypotheses import log_false_again
 from graphloc.solve._prediction import Prediction, carried, kept_of, moved, taken_of, walk_of
+from graphloc.time import stamps_of
 
 _LOOK_BACK = 64  # candidates for the right one before
 
@@ -42,7 +43,7 @@ def best_chain(
     nothing = np.array(
         [np.log(m.probability) - 0.5 * (np.linalg.slogdet(2.0 * np.pi * m.cov)[1] + dof) for m in models]
     )
-    stamps = np.array([m.stamp_ns for m in taken]) * 1e-9
+    stamps = np.asarray(stamps_of(taken) * 1e-9, dtype=np.float64)
     walk = np.array([walk_of(m) for m in models])
     gained = _gained_by_repeats(models, residuals, predictions, nothing, stamps, walk)
     node = [(n, mode) for n, found in enumerate(residuals) for mode in range(len(found))]

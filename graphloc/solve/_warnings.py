@@ -19,7 +19,7 @@ from graphloc.solve._decide import AGREES
 from graphloc.solve._health import CONTRADICTING_COST
 from graphloc.solve._imu_noise import too_quiet
 from graphloc.solve._passes import expected_cost
-from graphloc.time import utc_text
+from graphloc.time import stamps_of, utc_text
 
 _FAR_OFF = 3.0
 _MUCH_NOISIER = 1.5
@@ -202,7 +202,7 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     warnings += disagreement_warning(stream.name, weights)
     warnings += noisier_warning(stream.name, _noisier(stream, result))
     if stream.row.false is not None:
-        stamps_ns = np.array([m.stamp_ns for m in stream.measurements])
+        stamps_ns = stamps_of(stream.measurements)
         false = np.array([stream.row.false(m, stream.config).probability for m in stream.measurements])
         warnings += joint_rejection_warning(stream.name, stamps_ns, weights, false)
     return warnings
