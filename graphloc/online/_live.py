@@ -282,20 +282,17 @@ def live_problem(
     config, rows, mounts = setup.config, setup.rows, setup.mounts
     t, R = mount_of(imu.sensor, imu_config, mounts)
     by_kind = {row.kind: row for row in rows}
-    asked = {n: s for n, s in config.sensors.items() if s.kind in by_kind and s.enabled}
     company = company_of(config, rows)
     streams = {}
     for number, (name, block) in enumerate(config.sensors.items()):
-        if name not in asked:
+        if not block.enabled or block.kind not in by_kind:
             continue
         row = by_kind[block.kind]
         slow, left_out = slow_or_left_out(row, block, company)
         t_sensor, R_sensor = mount_of(name, block, mounts)
-        mount = gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t)
         detector = jump_detectors.setdefault(name, JumpDetector())
         if left_out is not None and (detector.jumps or name in slow_known):
             slow = without_drift(left_out)
-        scatter = Scatter(jumps=slow is not None and slow.jumps)
         streams[name] = LiveStream(
             number=number,
             name=name,
@@ -304,8 +301,8 @@ def live_problem(
             slow=slow,
             left_out=left_out,
             constants=row.constants(block),
-            mount=mount,
-            scatter=scatter,
+            mount=gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t),
+            scatter=Scatter(jumps=slow is not None and slow.jumps),
             jump_detector=detector,
             repeats=repeats.setdefault(name, Repeats()),
             jumps=detector.jumps,

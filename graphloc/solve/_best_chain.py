@@ -8,9 +8,10 @@ between them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphloc.build import Judged
 from graphloc.frames import Array
@@ -80,12 +81,16 @@ def best_chain(
             score[k], before[k] = path[best], lo + best
     ends = score + np.maximum(gained[count] - gained[np.minimum(at + 2, count)], 0.0)
     chosen: list[int | None] = [None] * count
-    k = int(np.argmax(ends))
-    while k >= 0:
-        n, mode = node[k]
+    for n, mode in (node[k] for k in _backwards(int(np.argmax(ends)), before)):
         chosen[n] = mode
-        k = int(before[k])
     return chosen
+
+
+def _backwards(k: int, before: NDArray[np.int64]) -> Iterator[int]:
+    """Yield the nodes of a path from its last, k, to its first; `before`: the node before each, -1 of the first."""
+    while k >= 0:
+        yield k
+        k = int(before[k])
 
 
 def _gained_by_repeats(
