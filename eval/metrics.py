@@ -205,10 +205,9 @@ def held_out_errors(
     covered = estimate.covers(stamps)
     if not covered.any():
         raise NoCommonTimeError("the track covers none of the held-out fixes")
-    moments, index = np.unique(stamps[covered], return_inverse=True)  # receivers share stamps
-    there = estimate.at(moments)
+    p_world_m, R_world_body = estimate.poses_at(stamps[covered])
     levers = np.array([levers_m[m.sensor] for m in held])[covered]
-    antenna = there.p_world_m[index] + np.einsum("nij,nj->ni", there.R_world_body[index], levers)
+    antenna = p_world_m + np.einsum("nij,nj->ni", R_world_body, levers)
     for name, error in (slow or {}).items():
         own = np.array([m.sensor == name for m in held])[covered]
         antenna[own] += interpolated(stamps[covered][own], error.stamps_ns, error.value[:, :3])

@@ -69,9 +69,7 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
         doubted = [m for m in own if _weight(rows, m) < 0.5]
         if key in said or len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
             continue
-        stamps, where = np.unique([m.stamp_ns for m in doubted], return_inverse=True)  # two cameras may see it at once
-        at = track.at(stamps)
-        why = _explained(doubted, at.p_world_m[where], at.R_world_body[where])
+        why = _explained(doubted, *track.poses_at(stamps_of(doubted)))
         said[key] = f"{len(doubted)} of {len(own)} sightings disagree with the rest; {why}"
     surveys = {name: sensor.surveyed for name, sensor in config.of_kind("apriltag").items()}
     return [
@@ -251,13 +249,12 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
         doubted = [m for m in own if _weight(rows, m) < 0.5]
         if len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
             continue
-        stamps, where = np.unique([m.stamp_ns for m in doubted], return_inverse=True)
-        R = track.at(stamps).R_world_body[where]
+        p, R = track.poses_at(stamps_of(doubted))
         seen = Rotation.from_matrix([B.T @ m.modes[0].R_world_camera for m, B in zip(doubted, R, strict=True)])
         usual = seen.mean()
         off_deg = float(np.degrees((usual.inv() * Rotation.from_matrix(doubted[0].R_body_camera)).magnitude()))
         scatter_deg = float(np.degrees(np.median((usual.inv() * seen).magnitude())))
-        offs = np.array([_by_tags(m, B) for m, B in zip(doubted, R, strict=True)]) - track.at(stamps).p_world_m[where]
+        offs = np.array([_by_tags(m, B) for m, B in zip(doubted, R, strict=True)]) - p
         moved = np.median(offs, axis=0)
         if off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
             lines.append(_looks_elsewhere(sensor, camera, off_deg, usual))

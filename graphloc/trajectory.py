@@ -117,6 +117,12 @@ class Trajectory:
             planar=self.planar,
         )
 
+    def poses_at(self, stamps_ns: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return positions (M, 3) and rotations (M, 3, 3) at M stamps inside its span, in any order, several of which may be equal."""
+        moments, index = np.unique(stamps_ns, return_inverse=True)
+        there = self.at(moments)
+        return there.p_world_m[index], there.R_world_body[index]
+
 
 def bounds_95(cov: Array) -> Array:
     """95 % bounds (N, 3) of covariances (N, 6, 6) as a `Trajectory` has them: horizontal radius m, height m, heading deg.

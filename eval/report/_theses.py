@@ -111,11 +111,9 @@ def _farthest(seen: list[TagSighting], truth: Trajectory) -> str:
     covered = np.flatnonzero(truth.covers(stamps))
     if not len(covered):
         return "-"
-    moments, index = np.unique(stamps[covered], return_inverse=True)
-    there = truth.at(moments)
     away = [
-        np.linalg.norm(there.p_world_m[i] + there.R_world_body[i] @ m.t_body_camera_m - m.points_m.mean(axis=0))
-        for i, m in zip(index, (seen[k] for k in covered), strict=True)
+        np.linalg.norm(p + R @ m.t_body_camera_m - m.points_m.mean(axis=0))
+        for p, R, m in zip(*truth.poses_at(stamps[covered]), (seen[k] for k in covered), strict=True)
     ]
     return f"{max(away):.1f} m"
 
