@@ -58,8 +58,8 @@ class HoldOut:
             raise ConfigError(f"{recording.source}: --hold-out every:{self.every} holds nothing of {len(fixes)} fixes")
         gone = {id(m) for m in held}
         rows = (recording.row_of(m, Outcome.HELD_OUT, "kept out of the graph to test it") for m in held)
-        kept = tuple(m for m in recording.measurements if id(m) not in gone)
-        return replace(recording, measurements=kept, rows=(*recording.rows, *rows)), held
+        kept = recording.where(lambda m: id(m) not in gone)
+        return replace(kept, rows=(*recording.rows, *rows)), held
 
     def _holds(self, i: int, m: GnssPosition, fixes: list[GnssPosition]) -> bool:
         if self.every:

@@ -267,8 +267,8 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
     if not gone:
         return recording, said
     rows = (recording.row_of(m, Outcome.REJECTED, gone[m.seq]) for m in recording.measurements if m.seq in gone)
-    left = tuple(m for m in recording.measurements if m.seq not in gone)
-    return replace(recording, measurements=left, rows=(*recording.rows, *rows)), said
+    left = recording.where(lambda m: m.seq not in gone)
+    return replace(left, rows=(*recording.rows, *rows)), said
 
 
 def _by_sensor(recording: Recording, kind: type[_M]) -> dict[str, list[_M]]:

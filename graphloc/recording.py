@@ -107,6 +107,14 @@ class Recording:
         """Return its measurements of a class, in order: all, or those of one sensor."""
         return [m for m in self.measurements if isinstance(m, kind) and sensor in (None, m.sensor)]
 
+    def where(self, keep: Callable[[Measurement], bool]) -> Recording:
+        """Return it without the measurements that are not to be kept."""
+        return replace(self, measurements=tuple(m for m in self.measurements if keep(m)))
+
+    def changed(self, change: Callable[[Measurement], Measurement]) -> Recording:
+        """Return it with each measurement changed."""
+        return replace(self, measurements=tuple(map(change, self.measurements)))
+
     def row_of(self, m: Measurement, outcome: Outcome, reason: str) -> LedgerRow:
         """Return the ledger row of one of its measurements."""
         topic = self.topics.get(m.sensor, "")

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -180,7 +180,7 @@ def replay(
     )
     if scans is not None:
         made = config.of_kind("aerial")
-        recording = replace(recording, measurements=tuple(m for m in recording.measurements if m.sensor not in made))
+        recording = recording.where(lambda m: m.sensor not in made)
     gathering = Gathering(recording)
     session = _Session(smoother, recording, status)
     interrupted = False

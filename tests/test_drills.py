@@ -315,9 +315,7 @@ def test_only_a_window_without_a_compass_is_told_its_heading(run: SimulatedRun, 
     assert imu is not None
     begin = int(imu.stamps_ns[len(imu) // 2])
     whole = DrillWindow(begin_ns=begin, end_ns=begin + 10 * S, whole=True)
-    blind = replace(
-        recording, measurements=tuple(m for m in recording.measurements if not isinstance(m, CompassHeading))
-    )
+    blind = recording.where(lambda m: not isinstance(m, CompassHeading))
     given = run.config.start.heading_deg
     part = replace(whole, whole=False)
     assert _started_there(run.config, blind, whole, run.truth).start.heading_deg == given

@@ -115,10 +115,8 @@ def test_scans_are_matched_around_its_own_prediction(bag: Path, tmp_path: Path) 
 
 
 def test_a_run_that_never_starts_says_what_it_waited_for(run: SimulatedRun) -> None:
-    without = replace(
-        run.recording, measurements=tuple(m for m in run.recording.measurements if not isinstance(m, GnssPosition))
-    )
-    alone = replace(without, measurements=tuple(m for m in without.measurements if m.sensor == "compass"))
+    without = run.recording.where(lambda m: not isinstance(m, GnssPosition))
+    alone = without.where(lambda m: m.sensor == "compass")
     with pytest.raises(SolveError, match="waiting for a position"):
         replay(alone, run.config)
 

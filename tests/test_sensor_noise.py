@@ -47,7 +47,7 @@ def stating(run: SimulatedRun, kind: type[Measurement], share: float) -> Simulat
         assert isinstance(m, PoseFix)
         return replace(m, modes=tuple(replace(mode, cov=share**2 * mode.cov) for mode in m.modes))
 
-    recording = replace(run.recording, measurements=tuple(less(m) for m in run.recording.measurements))
+    recording = run.recording.changed(less)
     return replace(run, recording=recording)
 
 

@@ -145,7 +145,7 @@ def _silent(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Ge
 
 
 def _changed(recording: Recording, change: Callable[[Measurement], Measurement]) -> Struck:
-    return Struck(recording=replace(recording, measurements=tuple(change(m) for m in recording.measurements)))
+    return Struck(recording=recording.changed(change))
 
 
 def _moved_fixes(recording: Recording, begin_ns: int, end_ns: int, error_m: Callable[[Array], Array]) -> Struck:
