@@ -21,7 +21,7 @@ from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_ba
 from graphloc.gather import with_surveys
 from graphloc.ledger import Outcome
 from graphloc.measurements import TagSighting
-from tests.bagfactory import START_NS, Messages, S
+from tests.bagfactory import START_NS, Messages, S, rows_of
 from tests.tagfactory import AHEAD, FACES_SOUTH
 from tests.tagimages import (
     BENT,
@@ -47,7 +47,6 @@ from tests.tagimages import (
     only,
     picture,
     recorded,
-    rows_of,
     tags,
 )
 from tests.test_bag import accounted
