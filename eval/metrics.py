@@ -18,6 +18,7 @@ from graphloc.errors import InputError
 from graphloc.eval.formatting import number
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.measurements import GnssPosition, world_from_fixes
+from graphloc.plain import aligned
 from graphloc.recording import SpeedSeries
 from graphloc.series import interpolated, rms
 from graphloc.solution import SlowEstimate
@@ -49,12 +50,7 @@ class Table:
         numbers = [[number(vs[k]) for _, vs in self.rows] for k in range(len(self.columns))]
         cells = [["", *(name for name, _ in self.rows)]]
         cells += [[column, *values] for column, values in zip(self.columns, numbers, strict=True)]
-        widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-        lines = [
-            "  ".join(c.rjust(w) if i else c.ljust(w) for i, (c, w) in enumerate(zip(r, widths, strict=True)))
-            for r in cells
-        ]
-        return "\n".join([self.title, *lines, *([self.note] if self.note else [])])
+        return "\n".join([self.title, *aligned(cells, numbers=True), *([self.note] if self.note else [])])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -62,14 +62,12 @@ def unread_lidars(topics: Iterable[TopicSummary]) -> list[str]:
 
 def unread_tags(topics: Iterable[TopicSummary]) -> list[str]:
     """Return a line for each topic of a bag without images or known lists that holds tags, or video, in another type."""
-    how = (
-        "tags are found in images (sensor_msgs/Image, CompressedImage), or read as apriltag_msgs/AprilTagDetectionArray"
-    )
-    return _unread(topics, _TAGS, how)
+    images = "tags are found in images (sensor_msgs/Image, CompressedImage)"
+    return _unread(topics, _TAGS, f"{images}, or read as apriltag_msgs/AprilTagDetectionArray")
 
 
 def _unread(topics: Iterable[TopicSummary], kinds: re.Pattern[str], how: str) -> list[str]:
-    """Return a line for each topic of types like these; `how` what is on it could be read."""
+    """Return a line for each topic with messages of types like these; `how`: in which form they would be read."""
     return [
         f"{t.topic}: {either(t.msgtypes)} is not read; {how}"
         for t in topics
