@@ -163,7 +163,7 @@ def make_way_motion(
     waves: tuple[Waves, Waves, Waves],
     lean_per_mps2: float,
     tide_m: float,
-    swing: Waves | None = None,
+    swing: Waves,
 ) -> Motion:
     """Build the motion along a path, from end to end in the given time; `slowing` (N,): shape of the speed.
 
@@ -176,7 +176,6 @@ def make_way_motion(
     speed, at = CubicSpline(t, scale * shape), CubicSpline(t, scale * travelled)
     before = float(at(0.0))
     first = float(way.heading(0.0))
-    swing = Waves(*np.zeros((3, 1))) if swing is None else swing
     return make_motion(
         duration_s,
         speed_mps=speed,

@@ -205,7 +205,7 @@ def seen_frames(config: VesselConfig, recording: Recording) -> VesselConfig:
 
 
 def match_at(
-    recording: Recording, config: VesselConfig, scans: Scans, at_s: float, progress: Progress = quiet
+    recording: Recording, config: VesselConfig, scans: Scans, at_s: float, progress: Progress
 ) -> tuple[Match, int]:
     """Match the scan nearest to a time (s since the first IMU sample) around the run smoothed without matches.
 

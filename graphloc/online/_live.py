@@ -73,7 +73,7 @@ class LiveTimeline:
             share their slow error, those before and after a jump do not.
     """
 
-    def __init__(self, config: TimelineConfig, start_ns: int, jumps_ns: Collection[int] = ()) -> None:
+    def __init__(self, config: TimelineConfig, start_ns: int, jumps_ns: Collection[int]) -> None:
         self._start_ns, self._jumps_ns = start_ns, jumps_ns
         self._period_ns, self._slow_ns = duration_ns(1.0 / config.rate_hz), duration_ns(config.slow_period_s)
         self.stamps_ns: Tape[int] = Tape()

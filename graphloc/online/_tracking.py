@@ -127,7 +127,7 @@ class Tracking:
         if len(self._pending) > _PENDING:
             self._ledger.drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
 
-    def keep_imu(self, m: ImuSample, hole: tuple[int, int] | None = None) -> None:
+    def keep_imu(self, m: ImuSample, hole: tuple[int, int] | None) -> None:
         """Keep an IMU sample; `hole`: of one that came late, the stamps (ns) of the samples before and after it."""
         if hole is not None:
             self._holes.append(hole)
@@ -343,8 +343,7 @@ class Tracking:
         ledger.enter(failed.gone())
         anchors = [a for a in recent.anchors if a.stamp_ns >= failed.first_ns]
         for anchor, without in [(anchors[0], False), (anchors[-1], True)] if anchors else []:
-            again = [m for m in recent.others() if m.stamp_ns >= anchor.stamp_ns and not ledger.has(m)]
-            again.sort(key=lambda m: m.stamp_ns)
+            again = [m for m in self.since(anchor.stamp_ns) if not isinstance(m, ImuSample)]
             mark = ledger.marked()
             try:
                 self._rebuild_from(anchor, [] if without else again, until_ns)
