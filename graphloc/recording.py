@@ -120,7 +120,7 @@ class Recording:
         topic = self.topics.get(m.sensor, "")
         return LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason)
 
-    def imu_rows(self, which: NDArray[np.bool_] | slice, outcome: Outcome, reason: str = "") -> list[LedgerRow]:
+    def imu_rows(self, which: NDArray[np.bool_] | slice, outcome: Outcome, reason: str) -> list[LedgerRow]:
         """Return the ledger rows of samples of its IMU: (N,) of which, or a slice."""
         assert self.imu is not None
         sensor, seqs, stamps_ns = self.imu.sensor, self.imu.seqs[which].tolist(), self.imu.stamps_ns[which].tolist()

@@ -464,7 +464,7 @@ def test_a_window_that_is_rebuilt_amid_a_suspicion_has_the_fixes_before_it() -> 
     online, now = smoother(run), next(k for k, a in enumerate(jumped) if a.true_ns > begin + 600_000_000)
     fed = feed(online, run, jumped[:now])
     assert online._tracking is not None  # noqa: SLF001
-    assert online._tracking.lag.problem.streams["gnss"].jump_detector.suspects(online._tracking.lag.newest.stamp_ns)  # noqa: SLF001
+    assert online._tracking.lag.problem.streams["gnss"].receiver.jump.suspects(online._tracking.lag.newest.stamp_ns)  # noqa: SLF001
     online._rebuild("planted")  # noqa: SLF001
     lag = online._tracking.lag  # noqa: SLF001
     own = lag._entries.of(lag.problem.streams["gnss"])  # noqa: SLF001

@@ -100,8 +100,7 @@ class Tracking:
             imu_config=persistent.noise.of(setup.imu),
             noise_scale=persistent.noise.scale,
             motion_model=persistent.motion_model,
-            jump_detectors=persistent.jump_detectors,
-            repeats=persistent.repeats,
+            receivers=persistent.receivers,
             slow_known=anchor.slow,
         )
         if before is not None:
