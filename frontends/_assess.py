@@ -87,10 +87,13 @@ def topic_report(stream: TopicData, count: int) -> TopicReport:
     )
 
 
-def sane(stream: TopicData) -> NDArray[np.intp]:
-    """Return indices of messages in order of strictly increasing stamps, without clock jumps."""
+def sane(stream: TopicData, finite: slice | None = None) -> NDArray[np.intp]:
+    """Return indices of messages in order of strictly increasing stamps, without clock jumps, and with some columns `finite`."""
     good = np.flatnonzero(~_clock.clock_jumps(stream.stamps_ns, stream.logs_ns))
-    return good[_clock.longest_increasing(stream.stamps_ns[good])]
+    keep = good[_clock.longest_increasing(stream.stamps_ns[good])]
+    if finite is None or not len(keep):
+        return keep
+    return keep[np.isfinite(stream.rows[keep, finite]).all(axis=1)]
 
 
 def without_drift(streams: Sequence[TopicData]) -> list[TopicData]:

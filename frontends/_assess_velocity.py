@@ -44,10 +44,9 @@ def axes_of(
         stream: velocities in its last three columns. stamps_ns: (N,) of the track. p_m: (N, 3) the track, east, north, up.
         scatter_m: noise of its positions, 1 sigma of an axis.
     """
-    keep = sane(stream)
+    keep = sane(stream, np.s_[-3:])
     v = stream.rows[keep, -3:] if len(keep) else np.zeros((0, 3))
-    good = np.isfinite(v).all(axis=1)
-    chords, mean = _pairs(stream.stamps_ns[keep][good], v[good], stamps_ns, p_m)
+    chords, mean = _pairs(stream.stamps_ns[keep], v, stamps_ns, p_m)
     noise = 2.0 * scatter_m / _CHORD_S  # of a chord between two places, both axes together, m/s
     speed = _less(float(np.sqrt((chords**2).sum(axis=1).mean())), noise) if len(chords) else 0.0
     if len(chords) < 10 or speed < 0.5:
@@ -163,8 +162,7 @@ def motions_of(
 
 def _told(stream: TopicData, axes: str) -> MeasuredMotion | None:
     """Return the motion by a stream of velocities; NaN before the first fix."""
-    keep = sane(stream)
-    keep = keep[np.isfinite(stream.rows[keep, -3:-1]).all(axis=1)] if len(keep) else keep
+    keep = sane(stream, np.s_[-3:-1])
     if len(keep) <= _FEWEST:
         return None
     v = stream.rows[keep, -3:]

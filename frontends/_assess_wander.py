@@ -28,8 +28,7 @@ def wander_m(wheels: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatte
     Args:
         wheels: odometry. stamps_ns: (N,) of the fixes. p_m: (N, 3), east, north, up. scatter_m: noise of each, 1 sigma of an axis.
     """
-    keep = sane(wheels)
-    keep = keep[np.isfinite(wheels.rows[keep, :2]).all(axis=1)] if len(keep) else keep
+    keep = sane(wheels, np.s_[:2])
     inside = (stamps_ns >= wheels.stamps_ns[keep[0]]) & (stamps_ns <= wheels.stamps_ns[keep[-1]]) if len(keep) else []
     if np.count_nonzero(inside) < 2:
         return None

@@ -57,8 +57,7 @@ def world_of(
         poses: odometry or poses. stamps_ns: (N,) of the fixes. p_m: (N, 3) m about `first_fix`, ENU.
         antenna_m: (3,) in body, if /tf_static has it.
     """
-    keep = sane(poses)
-    keep = keep[np.isfinite(poses.rows[keep, :3]).all(axis=1)] if len(keep) else keep
+    keep = sane(poses, np.s_[:3])
     away_m = float(np.linalg.norm(_middle_m(poses)))
     if away_m > _FAR_M:
         grid = in_map_grid(poses)
