@@ -32,7 +32,7 @@ def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sens
         _refuse_far_fixes(recording, datum)
         return datum
     refuse_world_without_datum(config, recording.source, rows)
-    found = recording.of(GnssPosition)
+    found = fixes_of(recording)
     fixes = np.array([m.position for m in found][:5])
     if not len(fixes):
         raise InputError(f"{recording.source}: {_why_no_fix(recording, config)}")
@@ -42,13 +42,18 @@ def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sens
     return Datum(Geodetic(lat, lon, float(np.median(heights)) if heights else 0.0))
 
 
+def fixes_of(recording: Recording) -> list[GnssPosition]:
+    """Return the fixes that an origin can be taken from."""
+    return recording.of(GnssPosition)
+
+
 def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:
     """A forgotten minus sign puts the datum on the other side of the world, where nothing can be solved.
 
     Raises:
         InputError: most fixes lie farther away than any run goes.
     """
-    fixes = [m.position for m in recording.of(GnssPosition)]
+    fixes = [m.position for m in fixes_of(recording)]
     if fixes:
         away_m = np.linalg.norm(datum.enu_from_geodetic(*np.array(fixes).T), axis=1)
         if np.median(away_m) > _FAR_M:
@@ -122,7 +127,7 @@ def height_m(recording: Recording, config: VesselConfig, configured_m: float | N
         return configured_m - datum.origin.height_m
     heights = [
         m.position.height_m - float(mount_of(m.sensor, config.sensors[m.sensor], recording.mounts)[0][2])
-        for m in recording.of(GnssPosition)
+        for m in fixes_of(recording)
         if m.has_height
     ]
     return float(np.median(heights)) - datum.origin.height_m if heights else 0.0

@@ -19,7 +19,7 @@ from graphloc.build import Made, Problem, build_graph, company_of, make_problem
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
 from graphloc.ledger import LedgerRow
-from graphloc.measurements import GnssPosition, ImuSeries, Measurement
+from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._setup import Setup
 from graphloc.online._unmeasured_heading import DOUBTFUL_RAD, UnmeasuredHeading
@@ -90,7 +90,7 @@ def try_start(setup: Setup, imu: ImuSeries, measurements: Sequence[Measurement],
         mounts=setup.mounts,
         topics={name: sensor.topic for name, sensor in config.sensors.items()},
     )
-    if datum is None and config.datum is None and len(recording.of(GnssPosition)) < _FIXES:
+    if datum is None and config.datum is None and len(origin.fixes_of(recording)) < _FIXES:
         return f"{_FIXES} GNSS fixes to set the origin, as no `datum:` is configured"
     try:
         datum = datum or origin.choose_datum(recording, config, setup.rows)
