@@ -283,5 +283,5 @@ def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> D
 
 def predicted_covariance(tree: Any) -> PredictedCovariance:
     """Return (state, key) -> covariance of the key's value, from a Bayes tree."""
-    of_key = cache(lambda key: tree.marginalCovariance(key))
+    of_key = cache(tree.marginalCovariance)
     return lambda _state, key: of_key(key)
