@@ -32,6 +32,7 @@ from graphloc.solve._align import align
 from graphloc.solve._decide import Verdicts
 from graphloc.solve._grow import grow
 from graphloc.solve._start import solve_start
+from graphloc.time import stamps_of
 
 SEEDS = {"illuminated": range(2)}  # of a condition
 OTHER_SEEDS = range(10)  # a run takes two minutes of a core
@@ -123,7 +124,7 @@ def _at_the_time(recording: Recording, config: VesselConfig) -> dict[int, int]:
 
 def _seen_as_far_as_he(run: SimulatedRun, config: VesselConfig, seen: Sequence[TagSighting], condition: str) -> int:
     """Stamp from which the camera is as near as Digerud's detector first saw a tag: farther off, his filter had none."""
-    stamps = np.unique(np.array([m.stamp_ns for m in seen], dtype=np.int64))
+    stamps = np.unique(stamps_of(seen))
     lever = run.rig.cameras["camera"].mount.t_body_sensor_m
     away = tag_range_m(run.truth.at(stamps), config.sensors["tags"].surveyed, lever)
     return int(stamps[np.flatnonzero(away <= _DIGERUD_SAW_M.get(condition, np.inf))[0]]) if len(stamps) else 0
@@ -141,7 +142,7 @@ def _moved(run: SimulatedRun, name: str, t: Any) -> Any:
 
 def solve(run: SimulatedRun, recording: Recording, config: VesselConfig, job: Job) -> Docked | None:
     """Solve a run in all ways; None where no tag is seen."""
-    seen = [m for m in recording.measurements if isinstance(m, TagSighting)]
+    seen = recording.of(TagSighting)
     if not seen:
         return None
     datum = app.choose_datum(recording, config)

@@ -160,9 +160,7 @@ def stating(run: DrawnRun, kind: type[Measurement], share: float) -> DrawnRun:
             return replace(m, modes=tuple(replace(mode, cov=share**2 * mode.cov) for mode in m.modes))
         return m
 
-    return replace(
-        run, recording=replace(run.recording, measurements=tuple(less(m) for m in run.recording.measurements))
-    )
+    return replace(run, recording=run.recording.changed(less))
 
 
 def _stating(seed: int) -> Found:

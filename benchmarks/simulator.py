@@ -29,6 +29,7 @@ from graphloc.eval.simulate.camera import Camera
 from graphloc.eval.simulate.lidar import scan, world_points
 from graphloc.eval.simulate.scene import scene_of
 from graphloc.measurements import GnssPosition
+from graphloc.time import stamps_of
 
 # BL tables 4.1 and 4.2: RMSE and largest error of the GNSS signal, m.
 _BL_SIGNALS = {
@@ -39,8 +40,8 @@ _BL_SIGNALS = {
 
 def _signal(job: tuple[str, int]) -> tuple[float, float]:
     run = simulate(harbour_scenarios()[job[0]], job[1])
-    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
-    at = run.truth.at(np.array([m.stamp_ns for m in fixes]))
+    fixes = run.recording.of(GnssPosition)
+    at = run.truth.at(stamps_of(fixes))
     antenna = at.p_world_m + at.R_world_body @ run.config.sensors["gnss"].mount.t_body_sensor_m
     datum = app.choose_datum(run.recording, run.config)
     error = np.hypot(*(datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - antenna)[:, :2].T)

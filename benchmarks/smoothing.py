@@ -26,6 +26,7 @@ from graphloc.frames import wrap_angle
 from graphloc.frontends._part import BagPart
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.measurements import GnssPosition
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory, bounds_95
 
 HUSKY = ROOT.parent / "shared/data/husky/husky_car_park.bag"
@@ -115,8 +116,8 @@ def kitti(_pool: ProcessPoolExecutor) -> list[Row]:
 
 def loss_ns(run: SimulatedRun) -> tuple[int, int] | None:
     """Stamps of the simulated signal loss: BL raised a2 by hand while it lasted, so their filter is told."""
-    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
-    stamps = np.array([m.stamp_ns for m in fixes])
+    fixes = run.recording.of(GnssPosition)
+    stamps = stamps_of(fixes)
     datum = app.choose_datum(run.recording, run.config)
     away = datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - run.truth.at(stamps).p_world_m
     lost = stamps[np.hypot(away[:, 0], away[:, 1]) > 6.0]

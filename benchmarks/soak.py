@@ -29,6 +29,7 @@ from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.measurements import ImuSample, Measurement
 from graphloc.online import OnlineSmoother
+from graphloc.time import stamps_of
 
 _WARM_MIN = 10  # minutes that do not count
 _BLOCK_MIN = 10  # means of blocks are nearly independent, minutes are not
@@ -53,7 +54,7 @@ def simulated(hours: float, seed: int, path: Path) -> VesselConfig:
     run = simulate(replace(Scenario(path="loops", noise="drift"), duration_s=hours * 3600.0), seed)
     imu = run.recording.imu
     assert imu is not None
-    stamps = np.array([m.stamp_ns for m in run.recording.measurements])
+    stamps = stamps_of(run.recording.measurements)
     edges = np.arange(imu.stamps_ns[0], imu.stamps_ns[-1] + 1, 60 * 10**9)
     with path.open("wb") as stream:
         for edge in edges:

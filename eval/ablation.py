@@ -13,6 +13,7 @@ from graphloc.eval.consistency import Contradiction
 from graphloc.eval.metrics import Levers, errors, held_out_errors
 from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import GnssPosition
+from graphloc.series import rms
 from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory, bounds_95
 
@@ -122,10 +123,10 @@ def effect(
     return Effect(
         without=without,
         measurements=measurements,
-        rmse_m=float(np.sqrt(np.mean(away.off_m**2))),
+        rmse_m=rms(away.off_m),
         worst_m=float(away.off_m[worst]),
         worst_at_s=float((away.stamps_ns[worst] - full.trajectory.stamps_ns[0]) * 1e-9),
-        heading_rmse_deg=None if away.off_deg is None else float(np.sqrt(np.mean(away.off_deg**2))),
+        heading_rmse_deg=None if away.off_deg is None else rms(away.off_deg),
         bound_m=float(bounds[0]),
         bound_deg=float(bounds[2]),
         missing=1.0 - float(track.covers(full.trajectory.stamps_ns).mean()),

@@ -29,6 +29,7 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import Measurement
 from graphloc.recording import Recording
 from graphloc.solution import Solution
+from graphloc.time import stamps_of
 
 _MOST = 400  # measurements that are looked at
 _STEP = 1e-4  # of slow states, for their Jacobian
@@ -62,7 +63,7 @@ def contradiction(
     sensor = config.sensors[name]
     row = next(r for r in rows if r.kind == sensor.kind)
     own = [m for m in recording.measurements if m.sensor == name]
-    covered = solution.trajectory.covers(np.array([m.stamp_ns for m in own], dtype=np.int64))
+    covered = solution.trajectory.covers(stamps_of(own))
     own = [m for m, inside in zip(own, covered, strict=True) if inside]
     own = own[:: max(1, -(-len(own) // _MOST))]
     if len(own) < _FEWEST:
@@ -88,7 +89,7 @@ def contradiction(
 
 
 def _at(solution: Solution, measurements: Sequence[Measurement]) -> list[_There]:
-    track, stamps = solution.trajectory, np.array([m.stamp_ns for m in measurements], dtype=np.int64)
+    track, stamps = solution.trajectory, stamps_of(measurements)
     moments, index = np.unique(stamps, return_inverse=True)
     there = track.at(moments)
     nearest = np.abs(track.stamps_ns[None, :] - moments[:, None]).argmin(axis=1)

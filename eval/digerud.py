@@ -228,12 +228,11 @@ class Losses:
 
     Attributes:
         at_end: more than 2 m off, horizontally, throughout the last 5 s.
-        lost_s: time with an error above 2 m. covered_s: time that was compared.
+        lost_s: time with an error above 2 m.
     """
 
     at_end: bool
     lost_s: float
-    covered_s: float
 
 
 def losses(result: FilterResult, truth: Trajectory) -> Losses:
@@ -248,5 +247,4 @@ def losses(result: FilterResult, truth: Trajectory) -> Losses:
     return Losses(
         at_end=bool(off[stamps > stamps[-1] - round(END_S * NS_PER_S)].all()),
         lost_s=float(off.sum()) * step_s,
-        covered_s=len(stamps) * step_s,
     )

@@ -4,17 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.berths import Berth, BerthTrack, track_from
 from graphloc.eval.metrics import Table
 from graphloc.frames import Array
+from graphloc.series import rms
 from graphloc.survey import Survey
-from graphloc.time import NS_PER_S, seconds_since
+from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 
 BANDS_M = (0, 5, 8, 12, 16, 20, 25)  # of distance; D's figures 4.5 b and 4.6 b, which end at about 25 m
@@ -84,7 +83,7 @@ def docking_table(
         wrong = _wrong_side(off[at_end], truth.p_world_m[at_end], survey)
         values = (
             *(_p95(error[band & covered]) for band in bands.values()),
-            float(np.sqrt(np.mean(of_sighted**2))) if len(of_sighted) else None,
+            rms(of_sighted) if len(of_sighted) else None,
             _p95(error[at_end]),
             lost,
             wrong if wrong or not lost else None,
@@ -143,27 +142,3 @@ def _wrong_side(off: Array, true: Array, survey: Survey) -> int | None:
     of_truth = (there - middles[nearest, :2]) @ sideways_out
     shift = off.mean(axis=0) @ sideways_out
     return int((((of_truth + shift) * of_truth < 0.0) & (np.abs(shift) > _SIDE_M)).any())
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DockMotion:
-    """Motion of a dock from rest at stamps (M,): `moved` (M, 4), east, north, up in m, yaw in rad."""
-
-    stamps_ns: Stamps
-    moved: Array
-
-
-def relative(track: Trajectory, berth: Berth, dock: DockMotion | None = None) -> BerthTrack:
-    """Return a track relative to a berth: across, along, angle, as in `graphloc.berths`, and their rates.
-
-    Args:
-        track: of the body.
-        berth: at rest.
-        dock: its motion, true or estimated; None: at rest. Interpolated linearly, and constant beyond its ends.
-    """
-    moved = np.zeros((len(track), 4))
-    if dock is not None:
-        t, s = (seconds_since(int(track.stamps_ns[0]), stamps) for stamps in (track.stamps_ns, dock.stamps_ns))
-        whole = np.column_stack([dock.moved[:, :3], np.unwrap(dock.moved[:, 3])])
-        moved = np.column_stack([np.interp(t, s, whole[:, k]) for k in range(4)])
-    return track_from(berth, track, moved)

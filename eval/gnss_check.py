@@ -23,7 +23,7 @@ from graphloc.eval.metrics import held_out_errors
 from graphloc.frames import Array, Datum, heading_deg_from_yaw
 from graphloc.measurements import GnssPosition
 from graphloc.recording import Recording
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, stamps_of
 from graphloc.trajectory import Trajectory
 
 _STEADY = 0.5  # RMS about the mean, as a share of it
@@ -44,8 +44,8 @@ def gnss_offset_warnings(track: Trajectory, datum: Datum, recording: Recording, 
     measured = {m.sensor for m in recording.measurements if m.seq >= 0}
     for name, sensor in config.of_kind("gnss").items():
         others = [n for kind in _PLACES for n in config.of_kind(kind) if n != name and n in measured]
-        fixes = [m for m in recording.measurements if isinstance(m, GnssPosition) and m.sensor == name]
-        covered = track.covers(np.array([m.stamp_ns for m in fixes], dtype=np.int64))
+        fixes = recording.of(GnssPosition, name)
+        covered = track.covers(stamps_of(fixes))
         if not covered.any() or sensor.slow_error.enabled is False or not others:
             continue
         lever = {name: mount_of(name, sensor, recording.mounts)[0]}

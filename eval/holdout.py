@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import count
 
 from graphloc.errors import ConfigError
-from graphloc.ledger import LedgerRow, Outcome
+from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition
 from graphloc.recording import Recording
 
@@ -42,7 +42,7 @@ class HoldOut:
         Raises:
             ConfigError: there are too few fixes, or the gaps would overlap.
         """
-        fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)]
+        fixes = recording.of(GnssPosition)
         if len(fixes) < 3:
             raise ConfigError(f"{recording.source}: --hold-out needs at least 3 fixes, the run has {len(fixes)}")
         span = (fixes[-1].stamp_ns - fixes[0].stamp_ns) * 1e-9
@@ -57,19 +57,9 @@ class HoldOut:
         if not held:
             raise ConfigError(f"{recording.source}: --hold-out every:{self.every} holds nothing of {len(fixes)} fixes")
         gone = {id(m) for m in held}
-        rows = tuple(
-            LedgerRow(
-                seq=m.seq,
-                stamp_ns=m.stamp_ns,
-                sensor=m.sensor,
-                topic=recording.topics.get(m.sensor, ""),
-                outcome=Outcome.HELD_OUT,
-                reason="kept out of the graph to test it",
-            )
-            for m in held
-        )
-        kept = tuple(m for m in recording.measurements if id(m) not in gone)
-        return replace(recording, measurements=kept, rows=recording.rows + rows), held
+        rows = (recording.row_of(m, Outcome.HELD_OUT, "kept out of the graph to test it") for m in held)
+        kept = recording.where(lambda m: id(m) not in gone)
+        return replace(kept, rows=(*recording.rows, *rows)), held
 
     def _holds(self, i: int, m: GnssPosition, fixes: list[GnssPosition]) -> bool:
         if self.every:

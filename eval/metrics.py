@@ -18,8 +18,11 @@ from graphloc.errors import InputError
 from graphloc.eval.formatting import number
 from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.measurements import GnssPosition, world_from_fixes
+from graphloc.plain import aligned
 from graphloc.recording import SpeedSeries
+from graphloc.series import interpolated, rms
 from graphloc.solution import SlowEstimate
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
 Levers = Mapping[str, Array]
@@ -47,12 +50,7 @@ class Table:
         numbers = [[number(vs[k]) for _, vs in self.rows] for k in range(len(self.columns))]
         cells = [["", *(name for name, _ in self.rows)]]
         cells += [[column, *values] for column, values in zip(self.columns, numbers, strict=True)]
-        widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-        lines = [
-            "  ".join(c.rjust(w) if i else c.ljust(w) for i, (c, w) in enumerate(zip(r, widths, strict=True)))
-            for r in cells
-        ]
-        return "\n".join([self.title, *lines, *([self.note] if self.note else [])])
+        return "\n".join([self.title, *aligned(cells, numbers=True), *([self.note] if self.note else [])])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,12 +148,12 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
         nees, coverage = float(squared.mean()), float((squared <= chi2_95(2)).mean())
         heading_coverage = float((heading**2 <= chi2_95(1) * there.cov[:, 5, 5]).mean())
     return TruthMetrics(
-        position_rmse_m=_rms(horizontal),
+        position_rmse_m=rms(horizontal),
         position_p50_m=float(np.percentile(horizontal, 50)),
         position_p95_m=float(np.percentile(horizontal, 95)),
         position_max_m=float(horizontal.max()),
-        error_3d_rmse_m=None if estimate.planar else _rms(np.linalg.norm(error, axis=1)),
-        heading_rmse_deg=float(np.degrees(_rms(heading))),
+        error_3d_rmse_m=None if estimate.planar else rms(np.linalg.norm(error, axis=1)),
+        heading_rmse_deg=float(np.degrees(rms(heading))),
         heading_max_deg=float(np.degrees(np.abs(heading).max())),
         nees=nees,
         coverage_95=coverage,
@@ -198,19 +196,17 @@ def held_out_errors(
     Raises:
         NoCommonTimeError: the estimate covers none of the fixes.
     """
-    stamps = np.array([m.stamp_ns for m in held], dtype=np.int64)
+    stamps = stamps_of(held)
     fixes = world_from_fixes(held, datum)
     covered = estimate.covers(stamps)
     if not covered.any():
         raise NoCommonTimeError("the track covers none of the held-out fixes")
-    moments, index = np.unique(stamps[covered], return_inverse=True)  # receivers share stamps
-    there = estimate.at(moments)
+    p_world_m, R_world_body = estimate.poses_at(stamps[covered])
     levers = np.array([levers_m[m.sensor] for m in held])[covered]
-    antenna = there.p_world_m[index] + np.einsum("nij,nj->ni", there.R_world_body[index], levers)
+    antenna = p_world_m + np.einsum("nij,nj->ni", R_world_body, levers)
     for name, error in (slow or {}).items():
         own = np.array([m.sensor == name for m in held])[covered]
-        for axis in range(3 if own.any() else 0):
-            antenna[own, axis] += np.interp(stamps[covered][own], error.stamps_ns, error.value[:, axis])
+        antenna[own] += interpolated(stamps[covered][own], error.stamps_ns, error.value[:, :3])
     return PositionErrors(stamps_ns=stamps[covered], position_m=antenna - fixes[covered], covered=float(covered.mean()))
 
 
@@ -239,12 +235,12 @@ def compare_to_held_out(
     found = slow is not None and any(m.sensor in slow for m in held)
     predicted = held_out_errors(estimate, held, datum, levers_m, slow).horizontal_m if found else None
     return HeldOutMetrics(
-        horizontal_rmse_m=_rms(horizontal),
+        horizontal_rmse_m=rms(horizontal),
         horizontal_p95_m=float(np.percentile(horizontal, 95)),
         horizontal_max_m=float(horizontal.max()),
-        error_3d_rmse_m=None if estimate.planar or not solid else _rms(np.linalg.norm(off.position_m, axis=1)),
-        outage_drift_m=_rms(largest) if len(largest) > 1 else None,
-        fix_rmse_m=None if predicted is None else _rms(predicted),
+        error_3d_rmse_m=None if estimate.planar or not solid else rms(np.linalg.norm(off.position_m, axis=1)),
+        outage_drift_m=rms(largest) if len(largest) > 1 else None,
+        fix_rmse_m=None if predicted is None else rms(predicted),
         fixes=len(stamps),
         matched=off.covered,
     )
@@ -275,10 +271,6 @@ def compare_speed(estimate: Trajectory, check: SpeedSeries) -> SpeedMetrics:
     forward = np.einsum("ni,ni->n", there.v_world_mps, there.R_world_body[:, :, 0])
     difference = forward - check.speed_mps[covered][order]
     return SpeedMetrics(mean_mps=float(difference.mean()), std_mps=float(difference.std()), samples=len(difference))
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 _Named = Sequence[tuple[str, Trajectory]]

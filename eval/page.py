@@ -13,6 +13,7 @@ from pathlib import Path
 from plotly.offline import get_plotlyjs
 
 from graphloc.eval import html, markdown
+from graphloc.plain import aligned
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,9 +58,7 @@ class Grid:
     def as_text(self) -> str:
         """Return the table as aligned text."""
         cells = [self.head, *(tuple(cell.text for cell in row) for row in self.rows)]
-        widths = [max(len(row[k]) for row in cells) for k in range(len(self.head))]
-        lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in cells]
-        return "\n".join([self.title, *lines])
+        return "\n".join([self.title, *aligned(cells)])
 
 
 def _number(text: str) -> bool:

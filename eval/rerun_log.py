@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import AerialConfig, VesselConfig
 from graphloc.errors import InputError, OutputError
-from graphloc.eval.ekf import FilterResult, as_pose
+from graphloc.eval.ekf import FilterResult, as_pose, named_tracks
 from graphloc.eval.plots import colour_of
 from graphloc.extras import need
 from graphloc.frames import Array, Datum
@@ -75,8 +75,7 @@ def write_rerun(
         stream.send_recording_name(f"{config.vessel}: {Path(recording.source).name}")
         stream.send_recording_start_time_nanos(int(solution.trajectory.stamps_ns[0]))
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        tracks = {solution.name: solution.trajectory, **{f.name: f.trajectory for f in filters}}
-        for name, track in tracks.items():
+        for name, track in named_tracks(solution, filters):
             _log_track(stream, name, track, colour_of(name), config)
         if recording.truth is not None:
             _log_track(stream, "truth", recording.truth, _TRUTH, config)

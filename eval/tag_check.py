@@ -19,7 +19,9 @@ from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import GnssPosition, TagSighting, world_from_fixes
 from graphloc.recording import Recording
+from graphloc.series import interpolated
 from graphloc.solution import Solution
+from graphloc.time import stamps_of
 
 _FEWEST = 8
 _DOUBTED = 0.5  # share of a tag's sightings that disagree with the rest
@@ -46,9 +48,7 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
     """Return a line for each tag most of whose sightings disagree with the run, with a possible explanation."""
     rows = {row.seq: row for row in solution.ledger if row.seq >= 0}
     track = solution.trajectory
-    sightings = [
-        m for m in recording.measurements if isinstance(m, TagSighting) and track.covers(np.array([m.stamp_ns]))[0]
-    ]
+    sightings = [m for m in recording.of(TagSighting) if track.covers(np.array([m.stamp_ns]))[0]]
     said_of_mounts = list(_estimated_mounts(sightings, solution))
     cameras = {(m.sensor, m.camera) for m in sightings}
     found = {camera: mount_off(solution, *camera).as_matrix() for camera in cameras}
@@ -69,9 +69,7 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
         doubted = [m for m in own if _weight(rows, m) < 0.5]
         if key in said or len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
             continue
-        stamps, where = np.unique([m.stamp_ns for m in doubted], return_inverse=True)  # two cameras may see it at once
-        at = track.at(stamps)
-        why = _explained(doubted, at.p_world_m[where], at.R_world_body[where])
+        why = _explained(doubted, *track.poses_at(stamps_of(doubted)))
         said[key] = f"{len(doubted)} of {len(own)} sightings disagree with the rest; {why}"
     surveys = {name: sensor.surveyed for name, sensor in config.of_kind("apriltag").items()}
     return [
@@ -88,10 +86,10 @@ def _seen_from_behind(
 
     The track tells nothing of that: it may follow the tags, to the other side of the quay.
     """
-    fixes = sorted((m for m in recording.measurements if isinstance(m, GnssPosition)), key=lambda m: m.stamp_ns)
+    fixes = sorted(recording.of(GnssPosition), key=lambda m: m.stamp_ns)
     if len(fixes) < _FEWEST:
         return []
-    stamps, places = np.array([m.stamp_ns for m in fixes]), world_from_fixes(fixes, solution.datum)[:, :2]
+    stamps, places = stamps_of(fixes), world_from_fixes(fixes, solution.datum)[:, :2]
     seen: dict[Key, list[tuple[float, float, bool]]] = defaultdict(list)
     for m in sightings:
         nearest = int(np.argmin(np.abs(stamps - m.stamp_ns)))
@@ -251,13 +249,12 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
         doubted = [m for m in own if _weight(rows, m) < 0.5]
         if len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
             continue
-        stamps, where = np.unique([m.stamp_ns for m in doubted], return_inverse=True)
-        R = track.at(stamps).R_world_body[where]
+        p, R = track.poses_at(stamps_of(doubted))
         seen = Rotation.from_matrix([B.T @ m.modes[0].R_world_camera for m, B in zip(doubted, R, strict=True)])
         usual = seen.mean()
         off_deg = float(np.degrees((usual.inv() * Rotation.from_matrix(doubted[0].R_body_camera)).magnitude()))
         scatter_deg = float(np.degrees(np.median((usual.inv() * seen).magnitude())))
-        offs = np.array([_by_tags(m, B) for m, B in zip(doubted, R, strict=True)]) - track.at(stamps).p_world_m[where]
+        offs = np.array([_by_tags(m, B) for m, B in zip(doubted, R, strict=True)]) - p
         moved = np.median(offs, axis=0)
         if off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
             lines.append(_looks_elsewhere(sensor, camera, off_deg, usual))
@@ -316,7 +313,7 @@ def _late(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:
             continue
         R = track.at(stamps).R_world_body[where]
         t, of_states = (stamps - stamps[0]) * 1e-9, (track.stamps_ns - stamps[0]) * 1e-9
-        w = np.column_stack([np.interp(t, of_states, solution.gyro_radps[:, k]) for k in range(3)])[where]
+        w = interpolated(t, of_states, solution.gyro_radps)[where]
         rate = np.array([m.R_body_camera[:, 2] @ turning for m, turning in zip(own, w, strict=True)])
         differs = [(B @ m.R_body_camera).T @ m.modes[0].R_world_camera for m, B in zip(own, R, strict=True)]
         roll = Rotation.from_matrix(np.array(differs)).as_rotvec()[:, 2]

@@ -34,7 +34,7 @@ from graphloc.config import AprilTagConfig
 from graphloc.factors._tag_corners import corner_factors
 from graphloc.factors._tag_seen import TagsSeen, middle_at_rest_m, middle_in_camera
 from graphloc.factors._tag_states import constants, docks_of, slow
-from graphloc.frames import Array, Datum, skew
+from graphloc.frames import Array, Datum, skew, yaw_from_rotation
 from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor
 from graphloc.linear import linear_factor
 from graphloc.measurements import TagMode, TagSighting
@@ -162,7 +162,7 @@ def hint(m: TagSighting, mount_yaw_rad: float, datum: Datum) -> Hint:
     return Hint(
         p_world_m=mode.p_world_camera_m - R_world_body @ m.t_body_camera_m,
         p_sigma_m=np.hypot(sigma[:3], reach * float(sigma[5])),
-        yaw_rad=float(np.arctan2(R_world_body[1, 0], R_world_body[0, 0])) - mount_yaw_rad,
+        yaw_rad=float(yaw_from_rotation(R_world_body)) - mount_yaw_rad,
         yaw_sigma_rad=float(sigma[5]),
     )
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +22,7 @@ from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import IMU, PLAIN_POSE, POSE, UNSTAMPED
 from graphloc.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.measurements import GnssPosition, world_from_fixes
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, stamps_of
 from graphloc.white_noise import white_noise
 
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
@@ -60,11 +59,6 @@ def vec(values: ArrayLike) -> Vec:
     return (a, b, c)
 
 
-def summed(t_s: Array, values: NDArray[Any]) -> NDArray[Any]:
-    """Return the running integral (N,) of values (N,) over times (N,), by trapezia; real or complex."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(t_s))])
-
-
 def topic_report(stream: TopicData, count: int) -> TopicReport:
     """Return rates, gaps, stamps and latency of a topic."""
     base = {"topic": stream.topic, "msgtype": stream.msgtype, "count": count}
@@ -93,10 +87,13 @@ def topic_report(stream: TopicData, count: int) -> TopicReport:
     )
 
 
-def sane(stream: TopicData) -> NDArray[np.intp]:
-    """Return indices of messages in order of strictly increasing stamps, without clock jumps."""
+def sane(stream: TopicData, finite: slice | None = None) -> NDArray[np.intp]:
+    """Return indices of messages in order of strictly increasing stamps, without clock jumps, and with some columns `finite`."""
     good = np.flatnonzero(~_clock.clock_jumps(stream.stamps_ns, stream.logs_ns))
-    return good[_clock.longest_increasing(stream.stamps_ns[good])]
+    keep = good[_clock.longest_increasing(stream.stamps_ns[good])]
+    if finite is None or not len(keep):
+        return keep
+    return keep[np.isfinite(stream.rows[keep, finite]).all(axis=1)]
 
 
 def without_drift(streams: Sequence[TopicData]) -> list[TopicData]:
@@ -199,7 +196,7 @@ def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
     if len(fixes) < 20:
         return Courses(np.zeros(0, dtype=np.int64), np.zeros(0))
     p = world_from_fixes(fixes, Datum(fixes[0].position))[:, :2]
-    return courses_of(np.array([m.stamp_ns for m in fixes], dtype=np.int64), p, float(white_noise(p).max()))
+    return courses_of(stamps_of(fixes), p, float(white_noise(p).max()))
 
 
 def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> MeasuredMotion | None:
@@ -209,7 +206,7 @@ def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> MeasuredMotio
     moments = {m.stamp_ns: m for m in fixes}
     ordered = [moments[stamp_ns] for stamp_ns in sorted(moments)]
     p = world_from_fixes(ordered, Datum(ordered[0].position))
-    return motion_of_places(source, np.array([m.stamp_ns for m in ordered], dtype=np.int64), p)
+    return motion_of_places(source, stamps_of(ordered), p)
 
 
 def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> MeasuredMotion | None:

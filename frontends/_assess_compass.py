@@ -15,6 +15,7 @@ from graphloc.frontends._reports import CompassReport, two_antennas
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._turning import Turning, against_turning, follows_turning
 from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, QUATERNION, yaw_of_x_axis
+from graphloc.series import robust_sigma
 from graphloc.time import NS_PER_S
 
 _FEWEST, _FEWEST_COURSES = 10, 20
@@ -192,7 +193,7 @@ def _middle_deg(angle: Array) -> tuple[float, float]:
     """Return a robust mean and standard deviation of angles (N,), deg: fixes may jump or be frozen."""
     mean = float(np.angle(np.exp(1j * angle).mean()))
     middle = mean + float(np.median(wrap_angle(angle - mean)))
-    scatter = 1.4826 * float(np.median(np.abs(wrap_angle(angle - middle))))
+    scatter = float(robust_sigma(wrap_angle(angle - middle)))
     return float(np.degrees(wrap_angle(middle))), float(np.degrees(scatter))
 
 

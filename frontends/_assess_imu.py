@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
-from graphloc.frontends._assess import Courses, MeasuredMotion, sane, summed, vec
+from graphloc.frontends._assess import Courses, MeasuredMotion, sane, vec
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
 from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, turns_gravity, without_gravity
@@ -22,6 +22,7 @@ from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turning import Turning, against_turning
 from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
 from graphloc.measurements import ImuSeries
+from graphloc.series import integral, runs
 from graphloc.time import NS_PER_S
 from graphloc.white_noise import white_noise
 
@@ -155,7 +156,7 @@ def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -
     """Return the integrated rate of an IMU whose mount is known or guessed, with its gyro bias removed if known."""
     stamps, _, gyro = _in_body(imu, report, tree, body)
     t = (stamps - stamps[0]) / NS_PER_S
-    return Turning(int(stamps[0]), t, summed(t, gyro[:, 2]))
+    return Turning(int(stamps[0]), t, integral(t, gyro[:, 2]))
 
 
 def felt_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Felt:
@@ -333,8 +334,7 @@ def _standstill(
         part = second == s
         calm = float(gyro[part].std(axis=0).max()) < 0.03 and float(accel[part].std(axis=0).max()) < 0.2
         quiet[s] = calm and float(np.abs(gyro[part].mean(axis=0)).max()) < 0.02
-    edges = np.flatnonzero(np.diff(quiet, prepend=False, append=False))
-    for first, after in edges.reshape(-1, 2):
+    for first, after in runs(quiet):
         quiet[first:after] &= after - first >= _QUIET_S
     still: NDArray[np.bool_] = quiet[second]
     if motion is not None:

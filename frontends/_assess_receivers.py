@@ -13,6 +13,7 @@ from graphloc.frontends._assess import track
 from graphloc.frontends._clock import MOST_LATE_S
 from graphloc.frontends._reports import GnssReport
 from graphloc.frontends._streams import TopicData
+from graphloc.series import interpolated
 from graphloc.time import NS_PER_S
 
 _FEWEST, _LAG_S = 20, 0.1
@@ -43,7 +44,7 @@ def apart_m(first: GnssReport, second: GnssReport, fixes: TopicData, others: Top
     t, p = t[inside], p[inside]
 
     def variance_m2(lag_s: float) -> float:
-        beside = np.column_stack([np.interp(t + lag_s, other_t, q[:, axis]) for axis in (0, 1)])
+        beside = interpolated(t + lag_s, other_t, q)
         apart = np.hypot(*(p - beside).T)
         # Two antennas far from each other are never near each other: then only what their distance varies by is error.
         lever = float(np.percentile(apart, 5)) > _NEVER_NEAR * float(np.sqrt((apart**2).mean()))

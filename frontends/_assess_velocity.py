@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane, summed, track
+from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane, track
 from graphloc.frontends._assess_world import World
 from graphloc.frontends._reports import (
     BODY_AXES,
@@ -22,6 +22,7 @@ from graphloc.frontends._reports import (
 )
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import ODOMETRY, VECTOR
+from graphloc.series import integral, interpolated
 from graphloc.time import NS_PER_S
 
 _CHORD_S = 2.0
@@ -43,10 +44,9 @@ def axes_of(
         stream: velocities in its last three columns. stamps_ns: (N,) of the track. p_m: (N, 3) the track, east, north, up.
         scatter_m: noise of its positions, 1 sigma of an axis.
     """
-    keep = sane(stream)
+    keep = sane(stream, np.s_[-3:])
     v = stream.rows[keep, -3:] if len(keep) else np.zeros((0, 3))
-    good = np.isfinite(v).all(axis=1)
-    chords, mean = _pairs(stream.stamps_ns[keep][good], v[good], stamps_ns, p_m)
+    chords, mean = _pairs(stream.stamps_ns[keep], v, stamps_ns, p_m)
     noise = 2.0 * scatter_m / _CHORD_S  # of a chord between two places, both axes together, m/s
     speed = _less(float(np.sqrt((chords**2).sum(axis=1).mean())), noise) if len(chords) else 0.0
     if len(chords) < 10 or speed < 0.5:
@@ -166,8 +166,7 @@ def motions_of(
 
 def _told(stream: TopicData, axes: str) -> MeasuredMotion | None:
     """Return the motion by a stream of velocities; NaN before the first fix."""
-    keep = sane(stream)
-    keep = keep[np.isfinite(stream.rows[keep, -3:-1]).all(axis=1)] if len(keep) else keep
+    keep = sane(stream, np.s_[-3:-1])
     if len(keep) <= _FEWEST:
         return None
     v = stream.rows[keep, -3:]
@@ -176,7 +175,7 @@ def _told(stream: TopicData, axes: str) -> MeasuredMotion | None:
     if axes == BODY_AXES:
         return MeasuredMotion(stream.topic, origin, t, -v[:, 0] if _astern(v[:, 0]) else v[:, 0])
     east, north = (v[:, 1], v[:, 0]) if axes == NORTH_AXES else (v[:, 0], v[:, 1])
-    return MeasuredMotion(stream.topic, origin, t, np.hypot(east, north), summed(t, east + 1j * north))
+    return MeasuredMotion(stream.topic, origin, t, np.hypot(east, north), integral(t, east + 1j * north))
 
 
 def _pairs(stamps_ns: NDArray[np.int64], v: Array, track_ns: NDArray[np.int64], p_m: Array) -> tuple[Array, Array]:
@@ -193,6 +192,6 @@ def _pairs(stamps_ns: NDArray[np.int64], v: Array, track_ns: NDArray[np.int64], 
     begin, end = (index[at[end] - at[begin] < 2.0 * _CHORD_S] for index in (begin, end))
     if not len(begin):
         return none
-    there = np.column_stack([np.interp(at, t, summed(t, v[:, k])) for k in range(3)])
+    there = interpolated(at, t, integral(t, v))
     span = (at[end] - at[begin])[:, None]
     return (p_m[end, :2] - p_m[begin, :2]) / span, (there[end] - there[begin]) / span

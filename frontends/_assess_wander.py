@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.frontends._assess import sane
 from graphloc.frontends._streams import TopicData
+from graphloc.series import interpolated, robust_sigma
 from graphloc.time import NS_PER_S
 
 WANDER_S = 10.0
@@ -27,15 +28,14 @@ def wander_m(wheels: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatte
     Args:
         wheels: odometry. stamps_ns: (N,) of the fixes. p_m: (N, 3), east, north, up. scatter_m: noise of each, 1 sigma of an axis.
     """
-    keep = sane(wheels)
-    keep = keep[np.isfinite(wheels.rows[keep, :2]).all(axis=1)] if len(keep) else keep
+    keep = sane(wheels, np.s_[:2])
     inside = (stamps_ns >= wheels.stamps_ns[keep[0]]) & (stamps_ns <= wheels.stamps_ns[keep[-1]]) if len(keep) else []
     if np.count_nonzero(inside) < 2:
         return None
     begin_ns = int(wheels.stamps_ns[keep[0]])
     at = (wheels.stamps_ns[keep] - begin_ns) / NS_PER_S
     t, p = (stamps_ns[inside] - begin_ns) / NS_PER_S, p_m[inside, :2]
-    rolled = np.column_stack([np.interp(t, at, wheels.rows[keep, axis]) for axis in (0, 1)])
+    rolled = interpolated(t, at, wheels.rows[keep, :2])
     end = np.searchsorted(t, t + WANDER_S)
     begin = np.flatnonzero(end < len(t))
     begin = begin[t[end[begin]] - t[begin] < 1.5 * WANDER_S]  # not across an outage
@@ -46,7 +46,7 @@ def wander_m(wheels: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatte
         return None
     fixed, chord = fixed[moved], chord[moved]
     off = fixed - np.median(fixed / chord) * chord
-    sigma = 1.4826 * float(np.median(np.abs(off - np.median(off))))
+    sigma = float(robust_sigma(off - np.median(off)))
     if sigma < _SLIP * float(np.median(chord)):
         return None
     return float(np.sqrt(max(sigma**2 - 2.0 * scatter_m**2, 0.0)))

@@ -13,6 +13,7 @@ from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._assess import sane, vec
 from graphloc.frontends._reports import Vec
 from graphloc.frontends._streams import TopicData
+from graphloc.series import interpolated
 from graphloc.time import NS_PER_S
 
 _EXTENT_M = 20.0  # a shorter way does not tell directions
@@ -56,8 +57,7 @@ def world_of(
         poses: odometry or poses. stamps_ns: (N,) of the fixes. p_m: (N, 3) m about `first_fix`, ENU.
         antenna_m: (3,) in body, if /tf_static has it.
     """
-    keep = sane(poses)
-    keep = keep[np.isfinite(poses.rows[keep, :3]).all(axis=1)] if len(keep) else keep
+    keep = sane(poses, np.s_[:3])
     away_m = float(np.linalg.norm(_middle_m(poses)))
     if away_m > _FAR_M:
         grid = in_map_grid(poses)
@@ -70,7 +70,7 @@ def world_of(
         q = q + Rotation.from_quat(_quaternions(poses.rows[keep, 3:7])).apply(antenna_m)
     inside = (stamps_ns >= at[0]) & (stamps_ns <= at[-1])
     t, there = (at - at[0]) / NS_PER_S, (stamps_ns[inside] - at[0]) / NS_PER_S
-    p, q = p_m[inside], np.column_stack([np.interp(there, t, q[:, k]) for k in range(3)])
+    p, q = p_m[inside], interpolated(there, t, q)
     extent = float(np.hypot(*np.ptp(p[:, :2], axis=0))) if len(p) else 0.0
     if len(p) < 10 or extent < _EXTENT_M:
         return World(None, f"the GNSS track is too short ({extent:.0f} m) to check its frame against")

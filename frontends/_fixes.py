@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from graphloc.config import GnssConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, stamps_of
 from graphloc.white_noise import white_noise_of_thirds
 
 _HELD_S = 2.5
@@ -124,7 +124,7 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
     ordered = sorted(fixes, key=lambda m: (m.stamp_ns, m.seq))
     lla = np.array([m.position for m in ordered])
     places = Datum(ordered[0].position).enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])[:, :2]
-    found = scatter_m(np.array([m.stamp_ns for m in ordered], dtype=np.int64), places)
+    found = scatter_m(stamps_of(ordered), places)
     variances = np.array([np.diagonal(m.cov_enu_m2)[:2] for m in ordered])
     reported = float(np.sqrt(np.median(variances, axis=0).max()))
     claimed = max(config.sigma_scale * reported, config.min_horizontal_sigma_m)

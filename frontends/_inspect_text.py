@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from graphloc.frontends._assess_wander import WANDER_S
 from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, OdometryReport, TopicReport
+from graphloc.plain import aligned
 from graphloc.time import utc_text
 
 # How the draft names an odometry or pose topic, by its role.
@@ -57,8 +58,7 @@ def _fate(item: OdometryReport) -> str:
 
 
 def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
-    head = ("topic", "type", "count", "Hz", "span s", "gaps", "longest s", "repeated", "backward", "latency s")
-    rows = [head]
+    rows = [("topic", "type", "count", "Hz", "span s", "gaps", "longest s", "repeated", "backward", "latency s")]
     for t in topics:
         latency = "-" if t.latency_s is None else f"{t.latency_s[1]:.3f} ({t.latency_s[0]:.3f}..{t.latency_s[2]:.3f})"
         rows.append(
@@ -75,8 +75,7 @@ def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
                 latency,
             )
         )
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
-    lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines = aligned(rows)
     starts = [t.start_ns for t in topics if t.start_ns is not None]
     if starts:
         lines.append(f"starts {utc_text(min(starts))}")

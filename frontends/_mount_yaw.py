@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import MeasuredMotion, summed
+from graphloc.frontends._assess import MeasuredMotion
+from graphloc.series import integral
 from graphloc.time import NS_PER_S
 
 # Half the time over which an acceleration is asked: short, a car's fits best; longer, waves and the noise of fixes are less.
@@ -74,10 +75,10 @@ class Felt:
     def of(cls, stamps_ns: NDArray[np.int64], accel: Array, gyro: Array) -> Felt:
         """Of samples: stamps (N,), increasing; accelerations (N, 3) m/s^2 and rates (N, 3) rad/s, levelled."""
         t = (stamps_ns - stamps_ns[0]) / NS_PER_S
-        turned = summed(t, gyro[:, 2])
+        turned = integral(t, gyro[:, 2])
         a = accel[:, 0] + 1j * accel[:, 1]
         a = a - np.median(a.real) - 1j * np.median(a.imag)
-        return cls(int(stamps_ns[0]), t, turned, summed(t, summed(t, a * np.exp(1j * turned))))
+        return cls(int(stamps_ns[0]), t, turned, integral(t, integral(t, a * np.exp(1j * turned))))
 
     def times_of(self, motion: MeasuredMotion) -> Array:
         """A motion's times (M,) as these are counted, s."""
@@ -105,7 +106,7 @@ def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | N
     """
     t, at = felt.t_s, felt.times_of(motion)
     there = np.interp(at, t, felt.turned)
-    way = summed(at, motion.speed_mps * np.exp(1j * there)) if motion.way_m is None else motion.way_m
+    way = integral(at, motion.speed_mps * np.exp(1j * there)) if motion.way_m is None else motion.way_m
     middle = np.arange(max(t[0], at[0]) + half_s, min(t[-1], at[-1]) - half_s, STEP_S)
     (moved, chord), (f, _) = bent(at, way, middle, half_s), bent(t, felt.way_m, middle, half_s)
     faced = np.exp(1j * np.interp(middle, t, felt.turned))

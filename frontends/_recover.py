@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -178,46 +179,49 @@ def _recover_ros1(path: Path) -> Recovered | None:
 
     A chunk is intact if the index records that follow it are there too.
     """
-    size = path.stat().st_size
     connections: dict[int, bytes] = {}
-    chunks: list[_Chunk] = []
     with path.open("rb") as file:
         magic = file.readline()
         Header.read(file, RecordType.BAGHEADER)
         file.seek(read_uint32(file), io.SEEK_CUR)
         head_bytes = whole = file.tell()
-        position, needed, counts = 0, set[int](), dict[int, int]()
-        times: list[int] = []
-        while file.tell() < size:
-            at = file.tell()
-            try:
-                header = Header.read(file)
-                length = read_uint32(file)
-            except ReaderError:
-                break
-            if file.tell() + length > size:
-                break
-            op = header.get_uint8("op")
-            if op == RecordType.CHUNK:
-                position, counts, times = at, {}, []
-                data = decompressors[header.get_string("compression")](file.read(length))
-                needed = _read_chunk(data, connections)
-            elif op == RecordType.IDXDATA:
-                conn = header.get_uint32("conn")
-                entries = struct.unpack(f"<{3 * (length // 12)}L", file.read(length))
-                counts[conn] = len(entries) // 3
-                times += [s * 10**9 + ns for s, ns in zip(entries[::3], entries[1::3], strict=True)]
-                if set(counts) == needed:
-                    chunks.append(_Chunk(position, min(times), max(times), counts))
-                    whole = file.tell()
-            else:
-                break  # the index itself: written last, so all chunks are read
+        chunks: list[_Chunk] = []
+        for chunk in _intact_chunks(file, path.stat().st_size, connections):
+            chunks.append(chunk)
+            whole = file.tell()
     known = {conn for chunk in chunks for conn in chunk.counts}
     if not chunks or not known <= set(connections):
         return None
     head = _ros1_head(magic, head_bytes, whole, len(known), len(chunks))
     tail = b"".join(connections[c] for c in sorted(known)) + b"".join(_ros1_chunk_info(c) for c in chunks)
     return Recovered(path, head, whole, tail)
+
+
+def _intact_chunks(file: BinaryIO, size: int, connections: dict[int, bytes]) -> Iterator[_Chunk]:
+    """Yield the intact chunks of a file of `size` bytes, each when it has been read; collect the connections in them."""
+    position, needed, counts, times = 0, set[int](), dict[int, int](), list[int]()
+    while (at := file.tell()) < size:
+        try:
+            header = Header.read(file)
+            length = read_uint32(file)
+        except ReaderError:
+            return
+        if file.tell() + length > size:
+            return
+        op = header.get_uint8("op")
+        if op == RecordType.CHUNK:
+            position, counts, times = at, {}, []
+            data = decompressors[header.get_string("compression")](file.read(length))
+            needed = _read_chunk(data, connections)
+        elif op == RecordType.IDXDATA:
+            conn = header.get_uint32("conn")
+            entries = struct.unpack(f"<{3 * (length // 12)}L", file.read(length))
+            counts[conn] = len(entries) // 3
+            times += [s * 10**9 + ns for s, ns in zip(entries[::3], entries[1::3], strict=True)]
+            if set(counts) == needed:
+                yield _Chunk(position, min(times), max(times), counts)
+        else:
+            return  # the index itself: written last, so all chunks are read
 
 
 def _read_chunk(data: bytes, connections: dict[int, bytes]) -> set[int]:

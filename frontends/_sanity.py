@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig, VesselConfig
 from graphloc.errors import InputError
-from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic, continuous_longitudes
 from graphloc.measurements import GnssPosition, PoseFix
 
 FAR_M = 100e3
@@ -161,16 +161,11 @@ def refuse_degrees(
         )
 
 
-def _together(longitude_deg: Array) -> Array:
-    """Return longitudes relative to the first one, so that a run across the date line is continuous."""
-    return np.asarray(longitude_deg[0] + (longitude_deg - longitude_deg[0] + 180.0) % 360.0 - 180.0)
-
-
 def far_fixes_of(lla: Array) -> NDArray[np.bool_]:
     """Return (N,) whether a position (N, 3), deg, deg, m, is farther than `FAR_M` from the median of all."""
     if len(lla) == 0:
         return np.zeros(0, dtype=bool)
-    lon = float(np.median(_together(lla[:, 1])))
+    lon = float(np.median(continuous_longitudes(lla[:, 1])))
     middle = Datum(Geodetic(float(np.median(lla[:, 0])), lon, float(np.median(lla[:, 2]))))
     enu = middle.enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])
     return np.asarray(np.linalg.norm(enu, axis=1) > FAR_M)
@@ -193,7 +188,7 @@ def gnss_warnings(sensor: str, fixes: Sequence[GnssPosition], config: VesselConf
         return []
     datum = Datum(config.datum.geodetic)
     lla = np.array([f.position for f in fixes])
-    lla[:, 1] = _together(lla[:, 1])
+    lla[:, 1] = continuous_longitudes(lla[:, 1])
     lat, lon, height = (float(v) for v in np.median(lla, axis=0))
 
     def distance_m(a: float, b: float) -> float:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.frontends._turns import without_line
+from graphloc.series import rms
 from graphloc.time import NS_PER_S
 
 _STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
@@ -61,7 +62,7 @@ def follows_turning(turning: Turning | None, at_ns: NDArray[np.int64], yaw: Arra
             turns.append(without_line(turned[block], at[block]))
     if not apart:
         return False
-    off_deg, turns_deg = (float(np.degrees(np.sqrt(np.mean(np.concatenate(part) ** 2)))) for part in (apart, turns))
+    off_deg, turns_deg = (float(np.degrees(rms(np.concatenate(part)))) for part in (apart, turns))
     return off_deg < min(_FOLLOWS_DEG, turns_deg / _FOLLOWS)
 
 

@@ -13,7 +13,8 @@ from graphloc.config import CompassConfig, ImuConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading, ImuSeries
-from graphloc.time import NS_PER_S
+from graphloc.series import integral, rms
+from graphloc.time import NS_PER_S, stamps_of
 
 _BLOCK_S = 120.0  # within it a gyro's bias and a compass's offset are steady
 _HOLE_S, _STEP_S = 0.5, 2.0
@@ -53,7 +54,10 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
         return [f"{said}{other}; or the signs of {imu.sensor} are wrong (gravity: inverted)"]
     if not apart:
         return []
-    claimed, part = float(np.degrees(np.median([m.sigma_rad for m in headings]))), float(np.degrees(_rms(apart)))
+    claimed, part = (
+        float(np.degrees(np.median([m.sigma_rad for m in headings]))),
+        float(np.degrees(rms(np.concatenate(apart)))),
+    )
     if part < max(_PART_DEG, _PART * claimed):
         return []
     said = f"{sensor}: its headings differ by {part:.0f} deg (RMS) from the integrated gyro of {imu.sensor} but claim {claimed:.1f} deg: "
@@ -88,7 +92,7 @@ def _compared(imu: ImuSeries, yaws: Yaws) -> tuple[bool, list[Array]]:
         power += float(np.sqrt((by_gyro**2).sum() * (by_yaw**2).sum()))
         apart.append(without_line(np.unwrap(yaw - turned), at_s))
         turns.append(without_line(turned, at_s))
-    if not apart or np.degrees(_rms(turns)) < _TURNS_DEG:
+    if not apart or np.degrees(rms(np.concatenate(turns))) < _TURNS_DEG:
         return False, []
     return together < -_CLEAR * power, apart
 
@@ -136,7 +140,7 @@ def _times_turned(imu: ImuSeries, yaws: Yaws) -> float:
     if alone <= 2.0:
         return 0.0
     a, b = a - a.mean(), b - b.mean()  # a gyro's bias is in the mean
-    largest = max(float(np.sqrt(np.mean(a**2))), float(np.sqrt(np.mean(b**2))))
+    largest = max(rms(a), rms(b))
     power = float(np.sqrt((a**2).sum() * (b**2).sum()))
     if np.degrees(largest) < _TURNS_DEG or power == 0.0:
         return 0.0
@@ -276,7 +280,7 @@ def _smooth(yaw: Array, at_s: Array) -> NDArray[np.bool_]:
 
 
 def _said(headings: Sequence[CompassHeading]) -> Yaws:
-    return np.array([m.stamp_ns for m in headings], dtype=np.int64), np.array([m.yaw_rad for m in headings])
+    return stamps_of(headings), np.array([m.yaw_rad for m in headings])
 
 
 def _blocks(
@@ -289,7 +293,7 @@ def _blocks(
         return
     t = (imu.stamps_ns - imu.stamps_ns[0]) / NS_PER_S
     rate = imu.gyro_radps @ (up / size)
-    turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
+    turned = integral(t, rate)
     holes: NDArray[np.intp] = np.flatnonzero(np.diff(t) > _HOLE_S)
     stamps, yaw = yaws
     order = np.argsort(stamps, kind="stable")
@@ -303,7 +307,3 @@ def _blocks(
     for k in np.unique(block[inside]):
         own = inside & (block == k)
         yield order[own], np.interp(at[own], t, turned), yaw[own], at[own]
-
-
-def _rms(parts: Sequence[Array]) -> float:
-    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))

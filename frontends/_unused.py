@@ -10,6 +10,7 @@ import numpy as np
 
 from graphloc.frontends._assess import sane
 from graphloc.frontends._assess_imu import samples_of
+from graphloc.frontends._reader import either
 from graphloc.frontends._source import TopicSummary
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import GPS_FIXES, IMU, NAV_SAT_FIX, NUMBERS
@@ -54,26 +55,24 @@ def unused_magnetometers(topics: Iterable[TopicSummary]) -> list[str]:
 
 def unread_lidars(topics: Iterable[TopicSummary]) -> list[str]:
     """Return a line for each topic of a bag without a `PointCloud2` that holds scans in another type."""
-    return [
-        f"{t.topic}: {_either(t)} is not read; scans are read as sensor_msgs/PointCloud2, which its driver, or a "
-        "converter, makes of it"
-        for t in topics
-        if t.messages and any(_LIDAR.search(kind) for kind in t.msgtypes)
-    ]
+    return _unread(
+        topics, _LIDAR, "scans are read as sensor_msgs/PointCloud2, which its driver, or a converter, makes of it"
+    )
 
 
 def unread_tags(topics: Iterable[TopicSummary]) -> list[str]:
     """Return a line for each topic of a bag without images or known lists that holds tags, or video, in another type."""
+    images = "tags are found in images (sensor_msgs/Image, CompressedImage)"
+    return _unread(topics, _TAGS, f"{images}, or read as apriltag_msgs/AprilTagDetectionArray")
+
+
+def _unread(topics: Iterable[TopicSummary], kinds: re.Pattern[str], how: str) -> list[str]:
+    """Return a line for each topic with messages of types like these; `how`: in which form they would be read."""
     return [
-        f"{t.topic}: {_either(t)} is not read; tags are found in images (sensor_msgs/Image, CompressedImage), or read "
-        "as apriltag_msgs/AprilTagDetectionArray"
+        f"{t.topic}: {either(t.msgtypes)} is not read; {how}"
         for t in topics
-        if t.messages and any(_TAGS.search(kind) for kind in t.msgtypes)
+        if t.messages and any(kinds.search(kind) for kind in t.msgtypes)
     ]
-
-
-def _either(topic: TopicSummary) -> str:
-    return " or ".join(kind.replace("/msg/", "/") for kind in topic.msgtypes)
 
 
 def unused_numbers(topics: Iterable[TopicSummary]) -> list[str]:

@@ -49,7 +49,7 @@ from graphloc.frontends.decode import (
 )
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
-from graphloc.recording import Progress, Recording, Span
+from graphloc.recording import Mounts, Progress, Recording, Span
 
 
 def check_bag(bags: Bags, config: VesselConfig) -> None:
@@ -207,7 +207,7 @@ def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str
     }
 
 
-def _far_levers(config: VesselConfig, mounts: Mapping[str, tuple[Array, Array]]) -> list[str]:
+def _far_levers(config: VesselConfig, mounts: Mounts) -> list[str]:
     enabled = ((name, sensor.mount) for name, sensor in config.sensors.items() if sensor.enabled)
     return [
         line
@@ -255,9 +255,7 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
     return lines
 
 
-def _mount_warnings(
-    imu: ImuSeries, sensors: Sequence[Readings], mounts: Mapping[str, tuple[Array, Array]], config: VesselConfig
-) -> list[str]:
+def _mount_warnings(imu: ImuSeries, sensors: Sequence[Readings], mounts: Mounts, config: VesselConfig) -> list[str]:
     """Return a line if the IMU's mount has a wrong yaw, by the motion of the fixes; no heading sensor would contradict it."""
     mount = config.sensors[imu.sensor].mount
     R = mounts[imu.sensor][1] if imu.sensor in mounts else mount.R_body_sensor

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphloc.frames import Array
+from graphloc.frames import Array, yaw_from_rotation
 from graphloc.solution import Health, HealthReason
 from graphloc.trajectory import bounds_95
 
@@ -62,7 +62,7 @@ class Estimate:
     @property
     def yaw_rad(self) -> float:
         """Yaw: from east, counter-clockwise."""
-        return float(np.arctan2(self.R_world_body[1, 0], self.R_world_body[0, 0]))
+        return float(yaw_from_rotation(self.R_world_body))
 
     @property
     def map_from_odom(self) -> tuple[Array, Array]:

@@ -50,7 +50,7 @@ def about_tags(
 
 def _riding(recording: Recording, surveys: Mapping[str, Survey], solution: Solution) -> dict[tuple[str, int], Riding]:
     """How the docks moved that tags which are not surveyed seem to ride on."""
-    seen = [m for m in recording.measurements if isinstance(m, TagSighting)]
+    seen = recording.of(TagSighting)
     found = {}
     for tag, (sensor, frame) in only_beside(recording.tag_views, seen).items():
         dock, slow = surveys[sensor].dock(frame), solution.slow[sensor]

@@ -108,6 +108,11 @@ def wrap_angle(angle_rad: Array | float) -> Array:
     return -((-a + np.pi) % (2.0 * np.pi) - np.pi)
 
 
+def continuous_longitudes(longitude_deg: Array) -> Array:
+    """Return longitudes (N,) about the first one, so that a run across the date line is continuous."""
+    return np.asarray(longitude_deg[0] + (longitude_deg - longitude_deg[0] + 180.0) % 360.0 - 180.0)
+
+
 def yaw_from_heading_deg(heading_deg: Array | float) -> Array:
     """Return yaw (rad, from east, counter-clockwise) of a compass heading (deg, from true north, clockwise)."""
     return wrap_angle(np.pi / 2.0 - np.radians(heading_deg))
@@ -121,6 +126,11 @@ def heading_deg_from_yaw(yaw_rad: Array | float) -> Array:
 def rotation_from_rpy_deg(rpy_deg: Array) -> Array:
     """Return R (3, 3) of roll, pitch, yaw in deg: R = Rz(yaw) Ry(pitch) Rx(roll), as in ROS."""
     return np.asarray(Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix())
+
+
+def yaw_from_rotation(rotation: Array) -> Array:
+    """Return the yaw (...) in rad of rotation matrices (..., 3, 3): where their x axis points in the horizontal plane."""
+    return np.asarray(np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]))
 
 
 def rpy_from_rotation(rotation: Array) -> Array:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.measurements import ImuSample
+from graphloc.series import runs
 from graphloc.time import NS_PER_S, utc_text
 
 LEAST_S, FEWEST = 0.2, 10
@@ -63,9 +64,8 @@ def frozen_imu_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[n
 
 def stretches(stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> str:
     """Describe the stretches of `bad` (N,) in words: for how long each lasts, and from when."""
-    first = np.flatnonzero(np.diff(bad.astype(int), prepend=0) == 1)
-    last = np.flatnonzero(np.diff(bad.astype(int), append=0) == -1)
-    lasts_s = (stamps_ns[last] - stamps_ns[first - 1]) / NS_PER_S
+    first, end = runs(bad).T
+    lasts_s = (stamps_ns[end - 1] - stamps_ns[first - 1]) / NS_PER_S
     longest = int(np.argmax(lasts_s))
     where = f"{lasts_s[longest]:.1f} s from {utc_text(int(stamps_ns[first[longest] - 1]))}"
     if len(first) > 1:

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array, Datum
 from graphloc.frozen_imu import stretches
-from graphloc.ledger import LedgerRow, Outcome
+from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, world_from_fixes
 from graphloc.recording import Recording
-from graphloc.time import NS_PER_S
+from graphloc.series import runs
+from graphloc.time import NS_PER_S, stamps_of
 
 _M = TypeVar("_M", bound=Measurement)
 WHY = "frozen receiver or driver: it repeats one position while the vessel moves"
@@ -246,17 +247,17 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
     # First and last stamps of velocities that are repeated, of a vessel under way.
     hung = np.zeros((0, 2), dtype=np.int64)
     for sensor, velocities in _by_sensor(recording, GnssVelocity).items():
-        stamps_ns, v_mps = np.array([m.stamp_ns for m in velocities]), np.array([m.v_world_mps for m in velocities])
+        stamps_ns, v_mps = stamps_of(velocities), np.array([m.v_world_mps for m in velocities])
         bad = frozen_velocities(stamps_ns, v_mps)
-        ends = np.flatnonzero(np.diff(np.pad(bad & (np.linalg.norm(v_mps, axis=1) > UNDER_WAY_MPS), 1).astype(int)))
-        hung = np.vstack([hung, np.column_stack([stamps_ns[ends[::2]], stamps_ns[ends[1::2] - 1]])])
+        hanging = runs(bad & (np.linalg.norm(v_mps, axis=1) > UNDER_WAY_MPS))
+        hung = np.vstack([hung, stamps_ns[hanging - [0, 1]]])
         gone |= {m.seq: WHY_VELOCITY for m, b in zip(velocities, bad, strict=True) if b}
         if bad.any():
             said.append(
                 f"{sensor}: for {stretches(stamps_ns, bad)} {WHY_VELOCITY}; {int(bad.sum())} velocities rejected"
             )
     for sensor, fixes in _by_sensor(recording, GnssPosition).items():
-        stamps_ns, lat_lon = np.array([m.stamp_ns for m in fixes]), np.array([m.position[:2] for m in fixes])
+        stamps_ns, lat_lon = stamps_of(fixes), np.array([m.position[:2] for m in fixes])
         bad = frozen_fixes(stamps_ns, lat_lon, world_from_fixes(fixes, datum)[:, :2])
         # One receiver, or its driver, says both.
         meanwhile = np.any((stamps_ns[:, None] >= hung[:, 0]) & (stamps_ns[:, None] <= hung[:, 1]), axis=1)
@@ -265,20 +266,13 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
         said += frozen_fixes_warning(sensor, stamps_ns, bad)
     if not gone:
         return recording, said
-    rows = tuple(
-        LedgerRow(
-            seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=recording.topics.get(m.sensor, ""), outcome=Outcome.REJECTED,
-            reason=gone[m.seq],
-        )
-        for m in recording.measurements if m.seq in gone
-    )  # fmt: skip
-    left = tuple(m for m in recording.measurements if m.seq not in gone)
-    return replace(recording, measurements=left, rows=(*recording.rows, *rows)), said
+    rows = (recording.row_of(m, Outcome.REJECTED, gone[m.seq]) for m in recording.measurements if m.seq in gone)
+    left = recording.where(lambda m: m.seq not in gone)
+    return replace(left, rows=(*recording.rows, *rows)), said
 
 
 def _by_sensor(recording: Recording, kind: type[_M]) -> dict[str, list[_M]]:
     found: dict[str, list[_M]] = {}
-    for m in recording.measurements:
-        if isinstance(m, kind):
-            found.setdefault(m.sensor, []).append(m)
+    for m in recording.of(kind):
+        found.setdefault(m.sensor, []).append(m)
     return found

@@ -112,21 +112,23 @@ class Residual:
     white: Array | None = None
     expected_nis: float | None = None
 
+    def _spread(self, inflation: Array | None) -> Array:
+        return self.cov if inflation is None else self.cov + inflation
+
     def nis(self, inflation: Array | None = None) -> float:
         """Squared residual normalised by `cov` (+ `inflation`)."""
-        return gauss.square(self.raw, self.cov if inflation is None else self.cov + inflation)
+        return gauss.square(self.raw, self._spread(inflation))
 
     def normalised(self, inflation: Array | None = None) -> Array:
         """The residual (k,) by a root of `cov` (+ `inflation`): its square is `nis`."""
-        s = self.cov if inflation is None else self.cov + inflation
+        s = self._spread(inflation)
         if len(self.raw) == 1:
             return np.asarray(self.raw / np.sqrt(s[0]))
         return np.asarray(np.linalg.solve(np.linalg.cholesky(s), self.raw))
 
     def log_density(self, inflation: Array | None = None) -> float:
         """Log of prior x Gaussian density of the residual, covariance `cov` (+ `inflation`)."""
-        cov = self.cov if inflation is None else self.cov + inflation
-        return float(np.log(self.prior)) + gauss.log_density(self.raw, cov)
+        return float(np.log(self.prior)) + gauss.log_density(self.raw, self._spread(inflation))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
+from graphloc.series import robust_sigma
 from graphloc.white_noise import white_noise_of_thirds
 
 _BLOCK = 1000  # samples
@@ -26,7 +27,7 @@ def noise_density(stamps_ns: NDArray[np.int64], columns: Array) -> tuple[float, 
     scatter = np.array([white_noise_of_thirds(block) for block in blocks]) * root_dt
     axis = int(np.argmax(np.median(scatter, axis=0)))
     found = float(np.median(scatter[:, axis]))
-    spread = 1.4826 * float(np.median(np.abs(scatter[:, axis] - found)))
+    spread = float(robust_sigma(scatter[:, axis] - found))
     steps = np.diff(np.unique(columns[:, axis]))
     floor = float(steps.min()) / np.sqrt(12.0) * root_dt if len(steps) else 0.0  # what rounding alone scatters
     return max(found, floor), max(1.25 * spread / float(np.sqrt(len(blocks))), 0.02 * found)

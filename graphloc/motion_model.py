@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from graphloc import keys
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Decision, Residual
@@ -36,6 +37,12 @@ class Moving(NamedTuple):
     key: int
     v_mps: Array
     R: Array
+
+    @classmethod
+    def of(cls, values: Any, k: int) -> Moving:
+        """Return that of state k among values (gtsam.Values)."""
+        key = keys.velocity(k)
+        return cls(key, np.asarray(values.atVector(key)), values.atPose3(keys.pose(k)).rotation().matrix())
 
 
 class MotionModel:

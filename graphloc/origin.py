@@ -12,7 +12,7 @@ import numpy as np
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig
 from graphloc.errors import InputError
-from graphloc.frames import Datum, Geodetic
+from graphloc.frames import Datum, Geodetic, continuous_longitudes
 from graphloc.graph import Sensor
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
@@ -37,8 +37,7 @@ def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sens
     fixes = np.array([m.position for m in found][:5])
     if not len(fixes):
         raise InputError(f"{recording.source}: {_why_no_fix(recording, config)}")
-    # Longitudes about the first one, so that fixes on both sides of the date line stay together.
-    fixes[:, 1] = fixes[0, 1] + (fixes[:, 1] - fixes[0, 1] + 180.0) % 360.0 - 180.0
+    fixes[:, 1] = continuous_longitudes(fixes[:, 1])
     lat, lon = (float(v) for v in np.median(fixes[:, :2], axis=0))
     heights = [m.position.height_m for m in found if m.has_height][:5]
     return Datum(Geodetic(lat, lon, float(np.median(heights)) if heights else 0.0))
@@ -46,7 +45,7 @@ def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sens
 
 def fixes_of(recording: Recording) -> list[GnssPosition]:
     """Return the fixes that an origin can be taken from."""
-    return [m for m in recording.measurements if isinstance(m, GnssPosition)]
+    return recording.of(GnssPosition)
 
 
 def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:

@@ -6,16 +6,20 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.ledger import LedgerRow
+from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement, TagView
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory
 
+_M = TypeVar("_M", bound=Measurement)
+Mounts = Mapping[str, tuple[Array, Array]]
+"""By sensor or LiDAR, its pose in body: t (3,) m, R (3, 3)."""
 Progress = Callable[[str, int, int], None]
 """Called with stage, done, total."""
 
@@ -92,12 +96,39 @@ class Recording:
     rows: tuple[LedgerRow, ...] = ()
     message_count: int = 0
     topics: Mapping[str, str] = field(default_factory=dict)
-    mounts: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+    mounts: Mounts = field(default_factory=dict)
     truth: Trajectory | None = None
     check_speed: SpeedSeries | None = None
     tag_views: tuple[TagView, ...] = ()
     warnings: tuple[str, ...] = ()
     span: Span | None = None
+
+    def of(self, kind: type[_M], sensor: str | None = None) -> list[_M]:
+        """Return its measurements of a class, in order: all, or those of one sensor."""
+        return [m for m in self.measurements if isinstance(m, kind) and sensor in (None, m.sensor)]
+
+    def where(self, keep: Callable[[Measurement], bool]) -> Recording:
+        """Return it without the measurements that are not to be kept."""
+        return replace(self, measurements=tuple(m for m in self.measurements if keep(m)))
+
+    def changed(self, change: Callable[[Measurement], Measurement]) -> Recording:
+        """Return it with each measurement changed."""
+        return replace(self, measurements=tuple(map(change, self.measurements)))
+
+    def row_of(self, m: Measurement, outcome: Outcome, reason: str) -> LedgerRow:
+        """Return the ledger row of one of its measurements."""
+        topic = self.topics.get(m.sensor, "")
+        return LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason)
+
+    def imu_rows(self, which: NDArray[np.bool_] | slice, outcome: Outcome, reason: str) -> list[LedgerRow]:
+        """Return the ledger rows of samples of its IMU: (N,) of which, or a slice."""
+        assert self.imu is not None
+        sensor, seqs, stamps_ns = self.imu.sensor, self.imu.seqs[which].tolist(), self.imu.stamps_ns[which].tolist()
+        topic = self.topics.get(sensor, "")
+        return [
+            LedgerRow(seq=seq, stamp_ns=stamp_ns, sensor=sensor, topic=topic, outcome=outcome, reason=reason)
+            for seq, stamp_ns in zip(seqs, stamps_ns, strict=True)
+        ]
 
     def lost(self, sensors: Container[str]) -> str:
         """Return a clause on why most of the messages of these sensors that gave nothing gave nothing; empty where none is."""

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
 from graphloc.solution import Cause, Solution, SolveStats
 from graphloc.solve._warnings import disagreement_warning, joint_rejection_warning
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
 Status = Callable[[float, float, Estimate | None, str], None]
@@ -179,7 +180,7 @@ def replay(
     )
     if scans is not None:
         made = config.of_kind("aerial")
-        recording = replace(recording, measurements=tuple(m for m in recording.measurements if m.sensor not in made))
+        recording = recording.where(lambda m: m.sensor not in made)
     gathering = Gathering(recording)
     session = _Session(smoother, recording, status)
     interrupted = False
@@ -221,10 +222,10 @@ def _result(session: _Session, recording: Recording, config: VesselConfig, *, in
         end_s = (estimates[-1].stamp_ns - session.first_ns) / 1e9
         events.append(Event(f"interrupted at {end_s:.1f} s: the track ends there, the run does not"))
         rows += [
-            LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=recording.topics.get(m.sensor, ""),
-                      outcome=Outcome.IGNORED, reason="the replay was interrupted before it")
-            for m in arrivals(recording) if m.seq >= 0 and m.seq not in fed
-        ]  # fmt: skip
+            recording.row_of(m, Outcome.IGNORED, "the replay was interrupted before it")
+            for m in arrivals(recording)
+            if m.seq >= 0 and m.seq not in fed
+        ]
     solution = _solution(estimates, Ledger(rows), session.smoother, events, config, _false_of(recording, config))
     return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=update_s)
 
@@ -264,6 +265,21 @@ def _false_of(recording: Recording, config: VesselConfig) -> dict[int, float]:
     return found
 
 
+def _rejection_warnings(ledger: Ledger, config: VesselConfig, false_of: Mapping[int, float]) -> Iterator[str]:
+    """Yield a line for each sensor whose measurements mostly disagree, or are refused together for long."""
+    judged: dict[str, list[LedgerRow]] = {}
+    for row in ledger:
+        if row.weight is not None:
+            judged.setdefault(row.sensor, []).append(row)
+    for name, rows in judged.items():
+        rows.sort(key=lambda row: row.stamp_ns)
+        weights = np.array([row.weight for row in rows])
+        yield from disagreement_warning(name, weights)
+        if (usual := getattr(config.sensors.get(name), "false_fraction", None)) is not None:
+            false = np.array([false_of.get(row.seq, usual) for row in rows])
+            yield from joint_rejection_warning(name, stamps_of(rows), weights, false)
+
+
 def _solution(
     estimates: Sequence[Estimate],
     ledger: Ledger,
@@ -279,20 +295,9 @@ def _solution(
             kept.pop()
         kept.append(estimate)
     assert smoother.datum is not None
-    stamps = np.array([e.stamp_ns for e in kept], dtype=np.int64)
+    stamps = stamps_of(kept)
     names = kept[-1].since_agreed_s
-    judged: dict[str, list[LedgerRow]] = {}
-    for row in ledger:
-        if row.weight is not None:
-            judged.setdefault(row.sensor, []).append(row)
-    warnings = [event.text for event in events if event.warns]
-    for name, rows in judged.items():
-        rows.sort(key=lambda row: row.stamp_ns)
-        weights = np.array([row.weight for row in rows])
-        warnings += disagreement_warning(name, weights)
-        if (usual := getattr(config.sensors.get(name), "false_fraction", None)) is not None:
-            false = np.array([false_of.get(row.seq, usual) for row in rows])
-            warnings += joint_rejection_warning(name, np.array([row.stamp_ns for row in rows]), weights, false)
+    warnings = [*(event.text for event in events if event.warns), *_rejection_warnings(ledger, config, false_of)]
     return Solution(
         datum=smoother.datum,
         trajectory=Trajectory(

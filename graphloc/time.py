@@ -3,9 +3,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import UTC, datetime
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
+
+
+class _Stamped(Protocol):
+    @property
+    def stamp_ns(self) -> int: ...
+
 
 NS_PER_S = 1_000_000_000
 
@@ -18,6 +27,11 @@ def seconds_between(start_ns: int, stop_ns: int) -> float:
 def seconds_since(origin_ns: int, stamps_ns: np.ndarray) -> np.ndarray:
     """Return stamps (N,) int64 ns as float s since `origin_ns`."""
     return (np.asarray(stamps_ns, dtype=np.int64) - np.int64(origin_ns)) / NS_PER_S
+
+
+def stamps_of(items: Iterable[_Stamped]) -> NDArray[np.int64]:
+    """Return the stamps (N,) of N measurements or the like."""
+    return np.array([item.stamp_ns for item in items], dtype=np.int64)
 
 
 def duration_ns(duration_s: float) -> int:

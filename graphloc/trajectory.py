@@ -11,7 +11,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from graphloc.chi2 import SIGMAS_95, chi2_95
-from graphloc.frames import Array, rpy_from_rotation
+from graphloc.frames import Array, rpy_from_rotation, yaw_from_rotation
+from graphloc.series import interpolated
 from graphloc.time import seconds_since
 
 _MOST_APART_S = 1.0  # poses between which the vessel is taken for known
@@ -55,7 +56,7 @@ class Trajectory:
     @property
     def yaw_rad(self) -> Array:
         """Yaw (N,): direction of the body's x axis in the world's horizontal plane."""
-        return np.asarray(np.arctan2(self.R_world_body[:, 1, 0], self.R_world_body[:, 0, 0]))
+        return yaw_from_rotation(self.R_world_body)
 
     def where(self, kept: NDArray[np.bool_] | slice) -> Trajectory:
         """Return some of its poses: (N,) which, or a slice."""
@@ -97,7 +98,7 @@ class Trajectory:
         t, s = seconds_since(origin, self.stamps_ns[near]), seconds_since(origin, stamps)
         velocity: Array | None = None
         if self.v_world_mps is None:
-            position = np.column_stack([np.interp(s, t, self.p_world_m[near, i]) for i in range(3)])
+            position = interpolated(s, t, self.p_world_m[near])
         else:
             spline = CubicHermiteSpline(t, self.p_world_m[near], self.v_world_mps[near])
             position, velocity = spline(s), spline(s, 1)
@@ -115,6 +116,12 @@ class Trajectory:
             cov=cov,
             planar=self.planar,
         )
+
+    def poses_at(self, stamps_ns: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return positions (M, 3) and rotations (M, 3, 3) at M stamps inside its span, in any order, several of which may be equal."""
+        moments, index = np.unique(stamps_ns, return_inverse=True)
+        there = self.at(moments)
+        return there.p_world_m[index], there.R_world_body[index]
 
 
 def bounds_95(cov: Array) -> Array:

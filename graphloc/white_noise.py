@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphloc.frames import Array
+from graphloc.series import robust_sigma
 
 
 def white_noise(columns: Array) -> Array:
@@ -19,4 +20,4 @@ def white_noise_of_thirds(thirds: Array) -> Array:
     They hold nothing of a constant acceleration; those of white noise have 1 + 9 + 9 + 1 times its variance. Their median is that of
     most of them, whatever jumps among the others.
     """
-    return np.asarray(1.4826 * np.median(np.abs(thirds), axis=0) / np.sqrt(20.0))
+    return np.asarray(robust_sigma(thirds) / np.sqrt(20.0))

@@ -12,6 +12,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from graphloc.ledger import LedgerRow
+from graphloc.recording import Recording
+
 START_NS = 1_700_000_000_000_000_000
 S = 1_000_000_000
 UP = (0.0, 0.0, 9.81)
@@ -173,6 +176,11 @@ def still_run(make: Messages, seconds: float = 4.0, start_ns: int = START_NS) ->
         if k % 10 == 0:
             items.append(("/fix", stamp + 10_000_000, make.fix(stamp)))
     return items
+
+
+def rows_of(recording: Recording, sensor: str) -> list[LedgerRow]:
+    """Ledger rows of what gave no measurement of a sensor."""
+    return [row for row in recording.rows if row.sensor == sensor]
 
 
 def damage_last_chunk(path: Path) -> None:

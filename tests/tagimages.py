@@ -18,7 +18,6 @@ from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.tags.sightings import Seen, sightings_of_bag
 from graphloc.gather import with_sightings
-from graphloc.ledger import LedgerRow
 from graphloc.measurements import TagMode, TagSighting
 from graphloc.recording import Recording
 from tests.bagfactory import START_NS, Item, Messages, S, still_run, write_bag
@@ -200,7 +199,3 @@ def recorded(
     said: list[tuple[str, int, int]] = []
     found = with_sightings(read_recording(path, whole), whole, [path], lambda *of: said.append(of))
     return found, said
-
-
-def rows_of(recording: Recording, sensor: str) -> list[LedgerRow]:
-    return [row for row in recording.rows if row.sensor == sensor]

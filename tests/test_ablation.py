@@ -28,6 +28,7 @@ from graphloc.frames import Array
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix, PoseMode
 from graphloc.solution import Solution
+from graphloc.time import stamps_of
 
 OFF_DEG = 12.0
 
@@ -223,8 +224,8 @@ def test_what_the_solution_knows_counts_along_the_worlds_axes(
     """Matches 3 m east of a track, which is known to 3 m east and to 1 cm north, while it turns."""
     run, _ = bad
     sensor = "matcher"
-    own = [m for m in run.recording.measurements if isinstance(m, PoseFix) and m.sensor == sensor]
-    there = whole.trajectory.at(np.array([m.stamp_ns for m in own]))
+    own = run.recording.of(PoseFix, sensor)
+    there = whole.trajectory.at(stamps_of(own))
     yaw = there.yaw_rad
     assert np.ptp(np.unwrap(yaw)) > 1.0
     cov = np.diag([0.01, 0.01, 1e-4])
@@ -242,8 +243,8 @@ def test_what_the_solution_knows_counts_along_the_worlds_axes(
 def test_the_false_ones_that_a_sensor_owns_to_do_not_count(bad: tuple[SimulatedRun, Ablated], whole: Solution) -> None:
     """Two of five are 40 m off: with a share of 0.4, the rest alone is judged."""
     run, _ = bad
-    own = [m for m in run.recording.measurements if isinstance(m, PoseFix)]
-    there = whole.trajectory.at(np.array([m.stamp_ns for m in own]))
+    own = run.recording.of(PoseFix)
+    there = whole.trajectory.at(stamps_of(own))
     rng = np.random.default_rng(1)
     right = np.column_stack([there.p_world_m[:, :2], there.yaw_rad]) + rng.normal(size=(len(own), 3)) * [0.1, 0.1, 0.01]
     wrong = np.arange(len(own)) % 5 < 2

@@ -36,6 +36,7 @@ from graphloc.gather import _matches, with_matches
 from graphloc.gather._matches import Matches, few_matches
 from graphloc.recording import Recording
 from graphloc.solution import Solution
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import S
 from tests.commands import called
@@ -164,7 +165,7 @@ def unseen(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("unseen")
 def test_matches_are_spent_where_they_inform(bag: Path) -> None:
     sensor, track = aerial(bag, every_m=4.0, still_s=1000.0)
-    stamps = np.array([m.stamp_ns for m in matched(bag, track, sensor)])
+    stamps = stamps_of(matched(bag, track, sensor))
     way = np.diff(track.at(stamps).p_world_m[:, :2], axis=0)
     assert 4 <= len(stamps) < 12
     assert np.hypot(*way.T).min() > 3.0  # from the end of a scan, stamped at its middle

@@ -87,7 +87,7 @@ def test_all_choices_are_weighed_whichever_is_in_the_graph(held: tuple[int, ...]
 def test_two_false_ones_that_agree_are_within_the_bounds_and_given_up_when_a_right_one_comes() -> None:
     """Two of them, 1.6 m off, after some seconds without any: four sigmas of what is predicted."""
     run = simulate(replace(bl_scenario(1, "drift"), false_fraction=0.0, duration_s=32.0), 3)
-    matches = [m for m in run.recording.measurements if isinstance(m, PoseFix)]
+    matches = run.recording.of(PoseFix)
     start_ns = int(run.truth.stamps_ns[0])
     silent = {m.seq for m in matches if 17.0 < (m.stamp_ns - start_ns) * 1e-9 < 21.0}
     false = {m.seq for m in matches if 21.0 < (m.stamp_ns - start_ns) * 1e-9 < 23.0}

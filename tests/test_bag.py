@@ -419,7 +419,7 @@ def test_kitti_example(tmp_path: Path, flags: list[str]) -> None:
     assert recording.imu is not None
     assert config.datum is not None
     assert (len(recording.imu), len(recording.measurements), recording.warnings) == (46967, 470, ())
-    fixes = [m.position for m in recording.measurements if isinstance(m, GnssPosition)]
+    fixes = [m.position for m in recording.of(GnssPosition)]
     enu = Datum(config.datum.geodetic).enu_from_geodetic(*np.array(fixes).T)
     example = gtsam.findExampleDataFile("KittiGps_converted.txt")  # type: ignore[no-untyped-call]
     expected = np.loadtxt(example, skiprows=1, delimiter=",")

@@ -19,10 +19,10 @@ from graphloc.frontends._clock import longest_increasing
 from graphloc.frontends._sanity import turns_gravity
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
-from graphloc.ledger import LedgerRow, Outcome
+from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, PoseFix
 from graphloc.recording import Recording
-from tests.bagfactory import START_NS, Item, Messages, S, damage_last_chunk, still_run, write_bag
+from tests.bagfactory import START_NS, Item, Messages, S, damage_last_chunk, rows_of, still_run, write_bag
 from tests.test_bag import accounted, vessel
 
 MAKE = Messages(2)
@@ -35,10 +35,6 @@ def read(tmp_path: Path, items: list[Item], kind: str = "mcap", **sensors: Any) 
     recording = read_recording(write_bag(tmp_path / "run", MAKE, ordered, kind), vessel(**sensors))
     assert recording.message_count == accounted(recording)
     return recording
-
-
-def rows_of(recording: Recording, sensor: str) -> list[LedgerRow]:
-    return [r for r in recording.rows if r.sensor == sensor]
 
 
 def one_line(error: pytest.ExceptionInfo[InputError], *words: str) -> None:
@@ -375,7 +371,7 @@ def test_compass_with_nan_roll_and_pitch(tmp_path: Path) -> None:
     quats = [(nan, nan, 0.0, 1.0), (nan, nan, nan, nan), (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)), (nan, nan, 1.0, 0.0)]
     items = [("/heading", t, MAKE.compass(t, q)) for t, q in zip(stamps, quats, strict=True)]
     recording = read(tmp_path, items, imu=None, gnss=None, compass={"topic": "/heading"})
-    yaws = [m.yaw_rad for m in recording.measurements if isinstance(m, CompassHeading)]
+    yaws = [m.yaw_rad for m in recording.of(CompassHeading)]
     np.testing.assert_allclose(np.abs(yaws), [0.0, np.pi / 2, np.pi])
     (row,) = rows_of(recording, "compass")
     assert (row.outcome, row.stamp_ns) == (Outcome.MALFORMED, stamps[1])

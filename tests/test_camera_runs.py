@@ -24,6 +24,7 @@ from graphloc.eval.simulate.noise import reported_sigma_m
 from graphloc.eval.simulate.scene import scene_of
 from graphloc.frames import Array
 from graphloc.measurements import GnssPosition
+from graphloc.time import stamps_of
 from tests.camerabench import CORNERS, LINEAR, detected, detectors, docking
 from tests.commands import called
 
@@ -267,8 +268,8 @@ def test_fixes_claim_what_is_right_on_average_only() -> None:
     assert 0.12 < np.log(claimed).std() < 0.5
     assert abs(np.log(claimed[1:] / claimed[:-1])).max() < 0.2  # it wanders, it does not flicker
     run = simulate(harbour_scenarios()["bl1-clean"], 3)
-    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
-    at = run.truth.at(np.array([m.stamp_ns for m in fixes]))
+    fixes = run.recording.of(GnssPosition)
+    at = run.truth.at(stamps_of(fixes))
     antenna = at.p_world_m + at.R_world_body @ run.rig.gnss.t_body_sensor_m
     assert run.harbour is not None
     error = run.harbour.datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - antenna
@@ -279,8 +280,8 @@ def test_fixes_claim_what_is_right_on_average_only() -> None:
 
 def test_the_long_run_has_all_of_it() -> None:
     run = simulate(replace(harbour_scenarios()["long"], imu_hz=10.0, compass_hz=0.0, pose_hz=0.0), 1)
-    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)][:-1]  # truth ends before
-    stamps = np.array([m.stamp_ns for m in fixes])
+    fixes = run.recording.of(GnssPosition)[:-1]  # truth ends before
+    stamps = stamps_of(fixes)
     t = (stamps - run.truth.stamps_ns[0]) * 1e-9
     at = run.truth.at(stamps)
     antenna = at.p_world_m + at.R_world_body @ run.rig.gnss.t_body_sensor_m

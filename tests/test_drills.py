@@ -36,7 +36,7 @@ def run() -> SimulatedRun:
 @pytest.fixture(scope="module")
 def recording(run: SimulatedRun) -> Recording:
     made = run.recording
-    at_ns = [m.stamp_ns for m in made.measurements if isinstance(m, PoseFix)]
+    at_ns = [m.stamp_ns for m in made.of(PoseFix)]
     tags = [sighting(stamp, 1_000_000 + k) for k, stamp in enumerate(at_ns)]
     every = tuple(sorted([*made.measurements, *tags], key=lambda m: (m.stamp_ns, m.seq)))
     return replace(made, measurements=every, message_count=1_000_000 + len(tags))
@@ -126,7 +126,7 @@ def test_a_jump_moves_fixes_by_ten_metres_and_not_their_height(recording: Record
 
 def test_a_frozen_receiver_repeats_what_it_said_last_under_new_stamps(recording: Recording) -> None:
     hangs = struck(recording, "GNSS frozen, 30 s")
-    before, after = ([m for m in r.measurements if isinstance(m, GnssPosition)] for r in (recording, hangs))
+    before, after = (r.of(GnssPosition) for r in (recording, hangs))
     assert [(m.stamp_ns, m.seq) for m in after] == [(m.stamp_ns, m.seq) for m in before]
     begin = begin_ns(recording)
     during = np.array([begin <= m.stamp_ns < begin + 30 * S for m in before])
@@ -208,7 +208,7 @@ def test_late_matches_come_late_and_say_when_they_are_of(recording: Recording) -
 
 
 def test_only_what_the_sensors_permit_is_drilled(recording: Recording) -> None:
-    fixes = tuple(m for m in recording.measurements if isinstance(m, GnssPosition))
+    fixes = tuple(recording.of(GnssPosition))
     found, left = script(replace(recording, measurements=fixes))
     assert {f.family for f in found} == {
         "GNSS outage",
@@ -315,9 +315,7 @@ def test_only_a_window_without_a_compass_is_told_its_heading(run: SimulatedRun, 
     assert imu is not None
     begin = int(imu.stamps_ns[len(imu) // 2])
     whole = DrillWindow(begin_ns=begin, end_ns=begin + 10 * S, whole=True)
-    blind = replace(
-        recording, measurements=tuple(m for m in recording.measurements if not isinstance(m, CompassHeading))
-    )
+    blind = recording.where(lambda m: not isinstance(m, CompassHeading))
     given = run.config.start.heading_deg
     part = replace(whole, whole=False)
     assert _started_there(run.config, blind, whole, run.truth).start.heading_deg == given

@@ -21,6 +21,7 @@ from graphloc.frames import Datum, Geodetic
 from graphloc.measurements import GnssPosition, GnssVelocity, PoseFix
 from graphloc.recording import SpeedSeries
 from graphloc.solution import SlowEstimate
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
 
@@ -50,9 +51,9 @@ def test_noise_free_imu_integrates_to_the_truth() -> None:
 def test_gnss_errors_are_those_of_the_thesis(case: int, noise: str, rmse: float, largest: float) -> None:
     """BL tables 4.1 and 4.2; the maximum is that of a signal without our white noise, so looser."""
     run = simulate(bl_scenario(case, noise), 3)  # type: ignore[arg-type]
-    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    fixes = run.recording.of(GnssPosition)
     datum = app.choose_datum(run.recording, run.config)
-    at = run.truth.at(np.array([m.stamp_ns for m in fixes]))
+    at = run.truth.at(stamps_of(fixes))
     antenna = at.p_world_m + at.R_world_body @ np.array([-1.5, 0.3, 2.2789])
     error = np.hypot(*(datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - antenna)[:, :2].T)
     assert np.sqrt((error**2).mean()) == pytest.approx(rmse, rel=0.1)
@@ -123,7 +124,7 @@ def test_gaps_are_where_they_should_be() -> None:
 
 def test_every_nth_is_the_nth() -> None:
     run = simulate(Scenario(duration_s=10.0, imu_hz=10.0, noise="clean", pose_hz=0.0), 0)
-    fixes = [m.seq for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    fixes = [m.seq for m in run.recording.of(GnssPosition)]
     _, held = HoldOut.parse("every:4").split(run.recording)
     assert [m.seq for m in held] == fixes[3::4]
 
@@ -276,8 +277,8 @@ def test_a_filter_that_is_told_of_the_signal_loss_stays() -> None:
     """BL section 4: a2 = 1000 while the signal is lost; without it the jump of 14 m pulls the track along."""
     run = simulate(bl_scenario(1, "jump"), 3)
     datum = app.choose_datum(run.recording, run.config)
-    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
-    stamps = np.array([m.stamp_ns for m in fixes])
+    fixes = run.recording.of(GnssPosition)
+    stamps = stamps_of(fixes)
     away = datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - run.truth.at(stamps).p_world_m
     lost = stamps[np.hypot(away[:, 0], away[:, 1]) > 6.0]
     told = filters(run, loss_ns=(int(lost[0]), int(lost[-1]) + 1))["BL EKF"]
@@ -348,8 +349,8 @@ def test_filters_start_moving_where_no_truth_says_so() -> None:
 def test_false_matches_repeat_as_often_as_asked() -> None:
     """Half of the false matches that follow a false one keep its error."""
     run = simulate(Scenario(duration_s=600.0, path="loops", imu_hz=10.0, gnss_hz=0.0, compass_hz=0.0, noise="clean"), 1)
-    poses = [m for m in run.recording.measurements if isinstance(m, PoseFix)]
-    at = run.truth.at(np.array([m.stamp_ns for m in poses]))
+    poses = run.recording.of(PoseFix)
+    at = run.truth.at(stamps_of(poses))
     off = np.array([m.modes[0].value[:2] for m in poses]) - at.p_world_m[:, :2]
     false = np.hypot(off[:, 0], off[:, 1]) > 1.2
     assert false.mean() == pytest.approx(0.4, abs=0.06)

@@ -63,7 +63,7 @@ def read(tmp_path: Path, items: list[Item], **gnss: object) -> Recording:
 
 def test_places_held_by_a_driver_count_once(tmp_path: Path) -> None:
     recording = read(tmp_path, fixes(10, every=10))
-    stamps = [m.stamp_ns for m in recording.measurements if isinstance(m, GnssPosition)]
+    stamps = [m.stamp_ns for m in recording.of(GnssPosition)]
     # The last one is not known to be held: nothing came after it.
     assert stamps[:40] == [START_NS + k * S for k in range(40)]
     assert len(stamps) == 49

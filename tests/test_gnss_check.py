@@ -43,7 +43,7 @@ def said(run: SimulatedRun, east_north_m: Array, every_s: int = 1, up_m: float =
         GnssPosition(stamp_ns=int(t), sensor="gnss", seq=k, position=Geodetic(*map(float, lla[k])), cov_enu_m2=unit)
         for k, t in enumerate(stamps)
     )
-    pose = next(m for m in run.recording.measurements if isinstance(m, PoseFix))
+    pose = run.recording.of(PoseFix)[0]
     return gnss_offset_warnings(track, DATUM, replace(run.recording, measurements=(pose, *fixes)), run.config)
 
 

@@ -29,6 +29,7 @@ from graphloc.eval.simulate.rig import load_rig
 from graphloc.eval.simulate.scene import Scene, extrude, scene_of
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition
+from graphloc.time import stamps_of
 from tests.commands import called
 
 SHORT = replace(harbour_scenarios()["bl1-drift"], duration_s=60.0)
@@ -340,8 +341,8 @@ def test_gnss_errors_are_those_of_the_thesis(name: str, rmse_m: float, largest_m
     found = []
     for seed in range(5):
         run = simulate(replace(harbour_scenarios()[name], imu_hz=10.0, compass_hz=0.0, pose_hz=0.0), seed)
-        fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)][:-1]  # truth ends before
-        at = run.truth.at(np.array([m.stamp_ns for m in fixes]))
+        fixes = run.recording.of(GnssPosition)[:-1]  # truth ends before
+        at = run.truth.at(stamps_of(fixes))
         antenna = at.p_world_m + at.R_world_body @ np.array([-1.5, 0.3, 2.2789])
         assert run.harbour is not None
         there = run.harbour.datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T)

@@ -63,7 +63,7 @@ def robot(
         accel_mps2=force + ACCEL_NOISE * np.sqrt(IMU_HZ) * rng.standard_normal(force.shape),
         gyro_radps=gyro + GYRO_NOISE * np.sqrt(IMU_HZ) * rng.standard_normal(gyro.shape),
     )
-    fix = next(m for m in template.recording.measurements if isinstance(m, GnssPosition))
+    fix = template.recording.of(GnssPosition)[0]
     datum = app.choose_datum(template.recording, template.config)
     fixes = tuple(
         replace(
@@ -374,7 +374,7 @@ def test_a_long_first_window_is_not_dead_reckoned_at_once() -> None:
         GnssVelocity(stamp_ns=int(ns), sensor="velocity", seq=-1, v_world_mps=v, cov_m2ps2=np.eye(3) * 0.01)
         for ns, v in zip(at_ns, v_world_mps, strict=True)
     ]
-    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    fixes = run.recording.of(GnssPosition)
     measurements = tuple(sorted([*fixes, *velocities], key=lambda m: m.stamp_ns))
     velocity = VelocityConfig(topic="/velocity", mount=run.config.sensors["gnss"].mount)
     sensors = {n: run.config.sensors[n] for n in ("imu", "gnss", "height")} | {"velocity": velocity}

@@ -30,10 +30,10 @@ from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag
 from graphloc.frontends.lines import Trouble, parse
-from graphloc.ledger import LedgerRow, Outcome
+from graphloc.ledger import Outcome
 from graphloc.recording import Recording
 from graphloc.solve._standstill import _swell
-from tests.bagfactory import START_NS, Item, Messages, S, still_run, write_bag
+from tests.bagfactory import START_NS, Item, Messages, S, rows_of, still_run, write_bag
 
 MAKE, MAKE1 = Messages(2), Messages(1)
 ROOT = Path(__file__).parent.parent
@@ -47,10 +47,6 @@ def read(path: Path, **sensors: Any) -> Recording:
     imu = 0 if found.imu is None else len(found.imu.stamps_ns)
     assert imu + len(found.measurements) + sum(r.count for r in found.rows) == found.message_count
     return found
-
-
-def rows_of(found: Recording, sensor: str) -> list[LedgerRow]:
-    return [row for row in found.rows if row.sensor == sensor]
 
 
 # numbers that are finite, and larger than anything

@@ -168,7 +168,7 @@ def test_matches_that_are_refused_together_are_reported() -> None:
             return m
         return replace(m, modes=tuple(replace(mode, value=mode.value + np.array([15.0, 0.0, 0.0])) for mode in m.modes))
 
-    recording = replace(run.recording, measurements=tuple(beside(m) for m in run.recording.measurements))
+    recording = run.recording.changed(beside)
     said = {
         "usual": app.simulated(run).solution.stats.warnings,
         "batch": app.smooth_recording(recording, run.config).solution.stats.warnings,

@@ -132,7 +132,7 @@ def test_a_whole_draft(tmp_path: Path) -> None:
     assert text.count("# guess:") >= 5
     recording = read_recording(tmp_path / "run", config)
     assert recording.warnings == ()
-    headings = [m for m in recording.measurements if isinstance(m, CompassHeading)]
+    headings = recording.of(CompassHeading)
     assert np.degrees(headings[0].yaw_rad) == pytest.approx(np.degrees(0.3), abs=4.0)
 
 
@@ -335,7 +335,7 @@ def test_axes_of_a_velocity(axes: str, said: str, enabled: bool, tmp_path: Path)
     assert config.sensors["body_velocity" if axes == "body" else "gnss_velocity"].enabled is enabled
     if enabled:
         recording = read_recording(tmp_path / "run", config)
-        read = [m.v_world_mps for m in recording.measurements if isinstance(m, GnssVelocity)]
+        read = [m.v_world_mps for m in recording.of(GnssVelocity)]
         np.testing.assert_allclose(read, v)
 
 
@@ -447,7 +447,7 @@ def test_places_in_a_map_grid_alone_are_fixes_once_the_grid_is_named(yaw_deg: fl
     assert any("gnss: none of the 200 messages" in w and "set grid to its name" in w for w in nowhere.warnings)
     (tmp_path / "vessel.yaml").write_text(text.replace("grid: ''", "grid: EPSG:32632"))
     placed = read_recording(tmp_path / "run", load_config(tmp_path / "vessel.yaml", KINDS))
-    first = next(m for m in placed.measurements if isinstance(m, GnssPosition))
+    first = placed.of(GnssPosition)[0]
     assert first.position.latitude_deg == pytest.approx(57.7, abs=1e-8)
     assert first.position.longitude_deg == pytest.approx(11.9, abs=1e-8)
     assert first.position.height_m == 40.0
@@ -502,7 +502,7 @@ def test_a_plain_velocity_tells_the_yaw_of_the_imu(tmp_path: Path) -> None:
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
     assert config.sensors["gnss_velocity"].enabled
     recording = read_recording(tmp_path / "run", config)
-    told = [m.v_world_mps for m in recording.measurements if isinstance(m, GnssVelocity)]
+    told = [m.v_world_mps for m in recording.of(GnssVelocity)]
     np.testing.assert_allclose(told, v)
 
 

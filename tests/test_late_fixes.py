@@ -49,8 +49,13 @@ def late(
     return replace(run, recording=recording, config=config)
 
 
+@cache
+def solved(run: SimulatedRun) -> app.Run:
+    return app.simulated(run)
+
+
 def offline(run: SimulatedRun) -> TruthMetrics:
-    return compare_to_truth(app.simulated(run).solution.trajectory, run.truth)
+    return compare_to_truth(solved(run).solution.trajectory, run.truth)
 
 
 def online(run: SimulatedRun) -> TruthMetrics:
@@ -117,7 +122,7 @@ def test_held_out_fixes_are_read_when_they_were_measured() -> None:
 
 
 def test_calibration_names_it_all_the_same_and_that_the_track_has_it() -> None:
-    found = app.simulated(late(0.1)).calibration
+    found = solved(late(0.1)).calibration
     assert found is not None
     (line,) = (s for s in found.suggestions if s.key == "sensors.gnss.time_offset_s")
     assert line.suggested == pytest.approx(-LATE_S, abs=0.03)

@@ -128,7 +128,7 @@ def test_a_heading_that_no_sensor_tells_is_handed_on(run: SimulatedRun, monkeypa
         return make_problem(part, config, *rest)
 
     monkeypatch.setattr(graphloc.solve, "make_problem", noted)
-    fixes = tuple(m for m in run.recording.measurements if isinstance(m, GnssPosition))
+    fixes = tuple(run.recording.of(GnssPosition))
     solved(run, 60.0, fixes)
     where = seams(replace(run.recording, measurements=fixes), 60.0, {"gnss"})
     assert asked[0] is None
@@ -152,7 +152,7 @@ def test_a_sensor_that_fell_silent_was_heard_in_the_leg_before(run: SimulatedRun
     first = begin_ns(run)
     quiet = tuple(m for m in run.recording.measurements if not isinstance(m, PoseFix) or m.stamp_ns < first + 30 * S)
     found = solved(run, measurements=quiet)
-    name = next(m.sensor for m in run.recording.measurements if isinstance(m, PoseFix))
+    name = next(m.sensor for m in run.recording.of(PoseFix))
     seconds = (found.trajectory.stamps_ns - first) * 1e-9
     since = found.since_agreed_s[name][seconds > 35.0]
     assert np.isfinite(since).all()

@@ -214,7 +214,7 @@ def test_a_bag_of_sentences_is_read_as_drafted(run: SimulatedRun, bag: Path, tmp
     )
     assert all(r.outcome is Outcome.IGNORED for r in recording.rows)
     for kind in (GnssPosition, CompassHeading):
-        ours, theirs = ([m for m in r.measurements if isinstance(m, kind)] for r in (recording, run.recording))
+        ours, theirs = (r.of(kind) for r in (recording, run.recording))
         assert [m.stamp_ns for m in ours] == [m.stamp_ns for m in theirs]
         for a, b in zip(ours, theirs, strict=True):
             if isinstance(a, GnssPosition) and isinstance(b, GnssPosition):
@@ -224,13 +224,13 @@ def test_a_bag_of_sentences_is_read_as_drafted(run: SimulatedRun, bag: Path, tmp
                 assert np.degrees(a.yaw_rad - b.yaw_rad) == pytest.approx(0.0, abs=1e-3)
     topics = {"imu": "/imu", "gnss": "/nmea_sentence", "compass": "/nmea_sentence"}
     known = {name: run.config.sensors[name].model_copy(update={"topic": topic}) for name, topic in topics.items()}
-    sigmas = np.sqrt(np.diagonal(next(m.cov_enu_m2 for m in run.recording.measurements if isinstance(m, GnssPosition))))
+    sigmas = np.sqrt(np.diagonal(next(m.cov_enu_m2 for m in run.recording.of(GnssPosition))))
     said = {"default_horizontal_sigma_m": float(sigmas[0]), "default_vertical_sigma_m": float(sigmas[2])}
     known["gnss"] = known["gnss"].model_copy(update=said)
     measured = run.config.model_copy(update={"sensors": {**run.config.sensors, **known}, "truth_topic": None})
     tracks = [smooth_recording(r, measured).solution.trajectory for r in (read_recording(bag, measured), run.recording)]
     assert np.abs(tracks[0].p_world_m - tracks[1].p_world_m).max() < 0.01
-    assert all(m.cov_m2ps2[2, 2] >= 1e6 for m in recording.measurements if isinstance(m, GnssVelocity))
+    assert all(m.cov_m2ps2[2, 2] >= 1e6 for m in recording.of(GnssVelocity))
 
 
 def test_lines_in_plain_strings_count_from_when_they_were_recorded(tmp_path: Path) -> None:
@@ -250,10 +250,10 @@ def test_lines_in_plain_strings_count_from_when_they_were_recorded(tmp_path: Pat
     lines = {(s.topic, s.nmea) for s in config.sensors.values() if isinstance(s, GnssConfig | CompassConfig)}
     assert lines == {("/line", ("GPGLL",)), ("/line", ("HEHDT",))}
     recording = read_recording(bag, config)
-    fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)]
+    fixes = recording.of(GnssPosition)
     assert [m.stamp_ns for m in fixes] == [begin_ns + k * S for k in range(40)]
     assert [m.position.latitude_deg for m in fixes] == pytest.approx([57.7 + 1e-5 * k for k in range(40)], abs=1e-8)
-    headings = [m for m in recording.measurements if isinstance(m, CompassHeading)]
+    headings = recording.of(CompassHeading)
     assert [np.degrees(m.yaw_rad) for m in headings] == pytest.approx([80.0 - k for k in range(40)])
     assert sum("has no stamp" in w for w in recording.warnings) == 2
 
@@ -491,7 +491,7 @@ def test_the_course_and_speed_of_a_gps_fix_are_a_velocity(tmp_path: Path) -> Non
     assert (velocity.topic, velocity.enabled) == ("/gps", True)
     assert "east, north, up" in text
     recording = read_recording(tmp_path / "run", config)
-    read = [m for m in recording.measurements if isinstance(m, GnssVelocity)]
+    read = recording.of(GnssVelocity)
     assert len(read) == len(fixes)
     np.testing.assert_allclose([m.v_world_mps[:2] for m in read], v[:, :2], atol=0.05)
     assert all(m.cov_m2ps2[2, 2] > 1e5 for m in read)  # no climb

@@ -68,7 +68,7 @@ def test_they_are_drafted_and_read_as_what_they_are(run: SimulatedRun, bag: Path
     assert [(found[t].convention, found[t].unit) for t in (HEADING, YAW)] == [("ned", "deg"), ("enu", "rad")]
     recording = read_recording(bag, config)
     assert recording.message_count == accounted(recording)
-    theirs = [m for m in run.recording.measurements if isinstance(m, CompassHeading)]
+    theirs = run.recording.of(CompassHeading)
     for name, sensor in config.of_kind("compass").items():
         ours = [m for m in recording.measurements if m.sensor == name and isinstance(m, CompassHeading)]
         assert [m.stamp_ns for m in ours] == [m.stamp_ns + LATE_NS for m in theirs]
@@ -102,8 +102,8 @@ def drafted(tmp_path: Path, run: SimulatedRun, late_ns: int, unknown: float) -> 
     items: list[Item] = [
         ("/imu", int(n), make.imu(int(n), a, w)) for n, a, w in zip(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps, strict=True)
     ]  # fmt: skip
-    headings = [m for m in run.recording.measurements if isinstance(m, CompassHeading)]
-    items += [("/fix", m.stamp_ns, make.fix(m.stamp_ns, *m.position)) for m in run.recording.measurements if isinstance(m, GnssPosition)]  # fmt: skip
+    headings = run.recording.of(CompassHeading)
+    items += [("/fix", m.stamp_ns, make.fix(m.stamp_ns, *m.position)) for m in run.recording.of(GnssPosition)]  # fmt: skip
     items += [
         (YAW, m.stamp_ns + late_ns, make.t[DOUBLE](data=unknown if k < 10 else m.yaw_rad))
         for k, m in enumerate(headings)

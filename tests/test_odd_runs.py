@@ -68,7 +68,7 @@ def test_of_a_parked_vessel_no_heading_is_known() -> None:
     assert imu is not None
     shape = (len(imu.stamps_ns), 3)
     rest = replace(imu, accel_mps2=rng.normal([0.0, 0.0, 9.8], 0.02, shape), gyro_radps=rng.normal(0.0, 1e-3, shape))
-    first = next(m for m in run.recording.measurements if isinstance(m, GnssPosition)).position
+    first = run.recording.of(GnssPosition)[0].position
     fixes = tuple(
         replace(
             m, position=Geodetic(*(np.array(first) + rng.normal(0.0, [2e-7, 3e-7, 0.02]))), cov_enu_m2=4e-4 * np.eye(3)
@@ -179,7 +179,7 @@ def test_held_out_fixes_of_two_receivers_keep_their_antennas() -> None:
     imu = run.recording.imu
     assert imu is not None
     more: list[Measurement] = []
-    for k, m in enumerate(m for m in run.recording.measurements if isinstance(m, GnssPosition)):
+    for k, m in enumerate(m for m in run.recording.of(GnssPosition)):
         at = run.truth.at(np.array([m.stamp_ns]))
         place = at.p_world_m[0] + at.R_world_body[0] @ np.array(second.xyz_m) + rng.normal(0.0, 0.2, 3)
         position = Geodetic(*datum.geodetic_from_enu(place)[0])
@@ -532,7 +532,7 @@ def test_roll_or_pitch_alone_is_refused(axes: tuple[str, ...]) -> None:
 def test_a_run_without_a_place_says_why(cause: str, words: str) -> None:
     """A datum is configured and a compass is heard, so nothing but the start misses the fixes."""
     run = simulate_slowly(replace(BASE, duration_s=20.0, gnss_hz=10.0), 3)
-    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    fixes = run.recording.of(GnssPosition)
     others = tuple(m for m in run.recording.measurements if not isinstance(m, GnssPosition))
     assert len(fixes) == 200
     bad = only(run.recording, others)

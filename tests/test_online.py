@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import chi2
 
 from graphloc import app
-from graphloc.config import GnssConfig, ImuConfig, PoseConfig, TimelineConfig
+from graphloc.config import GnssConfig, ImuConfig, PoseConfig, SensorConfig, TimelineConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.eval.simulate._scenario import harbour_scenarios
 from graphloc.factors import INERTIAL, SENSORS
@@ -22,6 +22,7 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix, PoseMode
 from graphloc.online import OnlineSmoother, _waiting
 from graphloc.thinning import THINNED
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, delayed, feed, finish
 from tests.slowly import slowly
@@ -63,6 +64,14 @@ def apart_m(a: Trajectory, b: Trajectory) -> Array:
 def yaw_of(track: Trajectory, at_ns: int) -> float:
     R = track.at(np.array([at_ns])).R_world_body[0]
     return float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def receiver_alone(run: SimulatedRun) -> dict[str, SensorConfig]:
+    """The IMU and the receiver, whose slow error is estimated."""
+    gnss = run.config.sensors["gnss"]
+    assert isinstance(gnss, GnssConfig)
+    slow_error = gnss.slow_error.model_copy(update={"enabled": True})
+    return {"imu": run.config.sensors["imu"], "gnss": gnss.model_copy(update={"slow_error": slow_error})}
 
 
 def without(arrivals: Arrivals, gone: Callable[[Arrival], bool]) -> Arrivals:
@@ -330,21 +339,17 @@ def test_a_start_that_waited_longer_than_the_lag_keeps_what_it_found() -> None:
     n = next(n for n, a in enumerate(arrivals) if feed(online, run, [a], fed).estimates)
     assert complaints(arrivals[: n + 1], finish(online, fed)) == []
     (begun,), end_ns = fed.estimates, fed.true_ns[0]
-    imu, gnss = run.recording.imu, run.config.sensors["gnss"]
+    imu = run.recording.imu
     assert imu is not None
-    assert isinstance(gnss, GnssConfig)
     assert end_ns - imu.stamps_ns[0] > 25e9
-    told = gnss.model_copy(update={"slow_error": gnss.slow_error.model_copy(update={"enabled": True})})
-    kept = imu.stamps_ns <= end_ns
     whole = app.smooth_recording(
         replace(
             run.recording,
-            imu=replace(imu, stamps_ns=imu.stamps_ns[kept], accel_mps2=imu.accel_mps2[kept],
-                        gyro_radps=imu.gyro_radps[kept], seqs=imu.seqs[kept]),
+            imu=imu.where(imu.stamps_ns <= end_ns),
             measurements=tuple(m for m in run.recording.measurements if m.sensor == "gnss" and m.stamp_ns <= end_ns),
         ),
-        run.config.model_copy(update={"sensors": {"imu": run.config.sensors["imu"], "gnss": told}}),
-    ).solution.trajectory  # fmt: skip
+        run.config.model_copy(update={"sensors": receiver_alone(run)}),
+    ).solution.trajectory
     assert np.degrees(abs(wrap_angle(begun.yaw_rad - yaw_of(whole, end_ns)))) < 5.0
     assert "the heading is a guess" in begun.reason.text
     assert begun.heading_bound_95_rad > np.pi  # so any heading is in its bounds
@@ -370,14 +375,11 @@ def test_a_start_that_waited_uses_what_came_just_before_its_first_state() -> Non
 def test_what_closes_a_slow_chain_counts_once_after_a_start_that_waited() -> None:
     """Slow states as far apart as the lag is long, or farther: the last of them is not the first of the lag."""
     run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=40.0, gnss_hz=2.0, imu_hz=50.0), 1)
-    gnss, kept = run.config.sensors["gnss"], ("imu", "gnss")
-    assert isinstance(gnss, GnssConfig)
-    told = gnss.model_copy(update={"slow_error": gnss.slow_error.model_copy(update={"enabled": True})})
     run = replace(run, config=run.config.model_copy(update={
         "timeline": TimelineConfig(rate_hz=5.0, slow_period_s=4.0),
-        "sensors": {name: told if name == "gnss" else run.config.sensors[name] for name in kept},
+        "sensors": receiver_alone(run),
     }))  # fmt: skip
-    arrivals = without(arrivals_of(run), lambda a: a.m.sensor not in kept)
+    arrivals = without(arrivals_of(run), lambda a: a.m.sensor not in run.config.sensors)
     sigmas_m = []
     for lag_s in (1.0, 12.0):
         online, fed = smoother(run, lag_s=lag_s), Fed()
@@ -391,16 +393,14 @@ def test_what_closes_a_slow_chain_counts_once_after_a_start_that_waited() -> Non
 def test_a_start_whose_heading_is_a_guess_is_no_surer_of_its_place_than_the_receiver() -> None:
     """Fixes whose slow error is 2 m and no compass: a heading that goes on turning in the lag tells no place."""
     run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=50.0, gnss_hz=2.0, imu_hz=50.0), 1)
-    gnss, kept = run.config.sensors["gnss"], ("imu", "gnss")
-    assert isinstance(gnss, GnssConfig)
-    told = gnss.model_copy(update={"slow_error": gnss.slow_error.model_copy(update={"enabled": True})})
-    run = slowly(
-        replace(run, config=run.config.model_copy(update={"sensors": {"imu": run.config.sensors["imu"], "gnss": told}}))
-    )
-    fed = feed(online := smoother(run), run, without(arrivals_of(run), lambda a: a.m.sensor not in kept))
+    run = slowly(replace(run, config=run.config.model_copy(update={"sensors": receiver_alone(run)})))
+    fed = feed(online := smoother(run), run, without(arrivals_of(run), lambda a: a.m.sensor not in run.config.sensors))
     finish(online, fed)
     for estimate in (fed.estimates[0], fed.estimates[-1]):
-        assert np.sqrt(np.diagonal(estimate.cov)[:2]).min() > 0.9 * told.slow_error.horizontal_sigma_m
+        assert (
+            np.sqrt(np.diagonal(estimate.cov)[:2]).min()
+            > 0.9 * run.config.sensors["gnss"].slow_error.horizontal_sigma_m
+        )
     assert fed.errors_m[-1] < 1.0
 
 
@@ -478,7 +478,7 @@ def test_odom_does_not_jump_where_the_map_does() -> None:
     run = slowly(simulate(replace(scenario, imu_hz=50.0, gnss_hz=5.0, compass_hz=2.0), 2))
     fed, _ = whole(run, arrivals_of(run))
     e = fed.estimates
-    true = run.truth.at(np.array([x.stamp_ns for x in e]))
+    true = run.truth.at(stamps_of(e))
     map_jumps, nis = [], []
     for n in range(1, len(e)):
         step = true.R_world_body[n - 1].T @ (true.p_world_m[n] - true.p_world_m[n - 1])

@@ -23,9 +23,11 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix
 from graphloc.online import OnlineSmoother
 from graphloc.online._agreement import Agreement
+from graphloc.online._lag import Lag
 from graphloc.online._live import live_problem
 from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._window import Window
+from graphloc.time import stamps_of
 from tests.faults import FAULTS, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
 from tests.slowly import slowly
 
@@ -60,6 +62,15 @@ def whole(arrivals: Arrivals, online: OnlineSmoother | None = None) -> Fed:
 def at_s(arrivals: Arrivals, t_s: float) -> int:
     """Index of the first arrival from a time on."""
     return next(n for n, a in enumerate(arrivals) if a.true_ns >= arrivals[0].true_ns + t_s * 1e9)
+
+
+@cache
+def after_12_s() -> Lag:
+    """The window after 12 s of the run; not to be changed."""
+    online, arrivals = smoother(run_of()), arrivals_of(run_of())
+    feed(online, run_of(), arrivals[: at_s(arrivals, 12.0)])
+    assert online._tracking is not None  # noqa: SLF001
+    return online._tracking.lag  # noqa: SLF001
 
 
 QUICK = ["backward stamps", "jumping stamps", "zero stamps", "repeated", "clock back", "latitude and longitude swapped",
@@ -105,7 +116,7 @@ def test_restarts_after_a_long_imu_silence() -> None:
     assert len([e for e in fed.events if e.startswith("started")]) == 2
     assert fed.errors_m[-1] < 1.0
     # Odometry goes on from where it was: no jump between the two pieces but the way of the new start's data.
-    stamps = np.array([e.stamp_ns for e in fed.estimates])
+    stamps = stamps_of(fed.estimates)
     n = int(np.argmax(np.diff(stamps)))
     step = np.linalg.norm(fed.estimates[n + 1].p_odom_m - fed.estimates[n].p_odom_m)
     assert step < 6.0 * (np.linalg.norm(fed.estimates[n].v_world_mps) + 1.0)
@@ -152,16 +163,12 @@ def test_agreement_with_a_rejected_choice_does_not_count(kept: bool, monkeypatch
 @pytest.mark.parametrize(("error_m", "denies", "lost_after_s"), [(3.0, False, 90), (20.0, False, 60), (20.0, True, 15)])
 def test_a_receiver_that_is_far_off_is_waited_for(error_m: float, denies: bool, lost_after_s: int) -> None:
     """It agrees by an error that it should not have: a jump, that ends. Where matches deny the estimate besides, it is lost."""
-    online = smoother(run_of())
-    feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
-    assert online._tracking is not None  # noqa: SLF001
-    lag = online._tracking.lag  # noqa: SLF001
+    lag = after_12_s()
     fix, match = (lag.problem.streams[name] for name in ("gnss", "matcher"))
     a_fix, a_match = (lag._judge._group(stream)[-1].measurement for stream in (fix, match))  # noqa: SLF001
     verdict = lag._judge._group(match)[-1].verdict  # noqa: SLF001
     agrees = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([error_m, 0.0, 0.0])))
-    agreement, begin_ns = lag._agreement, lag.newest.stamp_ns  # noqa: SLF001
-    agreement.back_to(Agreement(lag.problem.timeline).marked())
+    agreement, begin_ns = Agreement(lag.problem.timeline), lag.newest.stamp_ns
     for _ in range(5):  # what denied it before it agreed again is past
         agreement.note(match, replace(a_match, stamp_ns=begin_ns), None)
     agreement.note(fix, replace(a_fix, stamp_ns=begin_ns), replace(agrees, at=verdict.at))
@@ -183,10 +190,7 @@ def test_a_jump_that_lasts_longer_than_the_level_before_it_is_the_right_level(
     usual_s: int, error_m: float, lost_after_s: int
 ) -> None:
     """A run that begins in a jump takes its end for one: the level that is held longer is the right one. 3 sigmas are 6 m."""
-    online = smoother(run_of())
-    feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
-    assert online._tracking is not None  # noqa: SLF001
-    lag = online._tracking.lag  # noqa: SLF001
+    lag = after_12_s()
     fix = lag.problem.streams["gnss"]
     entry = lag._judge._group(fix)[-1]  # noqa: SLF001
     agreement, begin_ns = Agreement(lag.problem.timeline), lag.newest.stamp_ns
@@ -208,10 +212,7 @@ def test_a_jump_that_lasts_longer_than_the_level_before_it_is_the_right_level(
 
 def test_a_rebuild_does_not_begin_the_wait_for_the_end_of_a_jump_anew() -> None:
     """The rebuilt window notes what is in it; a level that has been held for longer would seem to begin there."""
-    online = smoother(run_of())
-    feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
-    assert online._tracking is not None  # noqa: SLF001
-    lag = online._tracking.lag  # noqa: SLF001
+    lag = after_12_s()
     fix = lag.problem.streams["gnss"]
     entry = lag._judge._group(fix)[-1]  # noqa: SLF001
     begin_ns = lag.first_ns
@@ -232,16 +233,12 @@ def test_a_rebuild_does_not_begin_the_wait_for_the_end_of_a_jump_anew() -> None:
 
 def test_a_sensor_found_frozen_does_not_hasten_a_restart() -> None:
     """A receiver that is far off is waited for, whatever a frozen one measured before it was detected."""
-    online = smoother(run_of())
-    feed(online, run_of(), arrivals_of(run_of())[: at_s(arrivals_of(run_of()), 12.0)])
-    assert online._tracking is not None  # noqa: SLF001
-    lag = online._tracking.lag  # noqa: SLF001
+    lag = after_12_s()
     fix, match = (lag.problem.streams[name] for name in ("gnss", "matcher"))
     a_fix = lag._judge._group(fix)[-1].measurement  # noqa: SLF001
     verdict = lag._judge._group(match)[-1].verdict  # noqa: SLF001
     far_off = replace(verdict, weight=1.0, at=replace(verdict.at, slow_value=np.array([20.0, 0.0, 0.0])))
-    agreement, begin_ns = lag._agreement, lag.newest.stamp_ns  # noqa: SLF001
-    agreement.back_to(Agreement(lag.problem.timeline).marked())
+    agreement, begin_ns = Agreement(lag.problem.timeline), lag.newest.stamp_ns
     for _ in range(5):
         agreement.note(match, replace(a_fix, stamp_ns=begin_ns, sensor="matcher"), None)
     agreement.forget_refused()
@@ -463,7 +460,7 @@ def test_a_window_that_is_rebuilt_amid_a_suspicion_has_the_fixes_before_it() -> 
     online, now = smoother(run), next(k for k, a in enumerate(jumped) if a.true_ns > begin + 600_000_000)
     fed = feed(online, run, jumped[:now])
     assert online._tracking is not None  # noqa: SLF001
-    assert online._tracking.lag.problem.streams["gnss"].jump_detector.suspects(online._tracking.lag.newest.stamp_ns)  # noqa: SLF001
+    assert online._tracking.lag.problem.streams["gnss"].receiver.jump.suspects(online._tracking.lag.newest.stamp_ns)  # noqa: SLF001
     online._rebuild("planted")  # noqa: SLF001
     lag = online._tracking.lag  # noqa: SLF001
     own = lag._entries.of(lag.problem.streams["gnss"])  # noqa: SLF001

@@ -201,7 +201,7 @@ def test_a_swing_at_rest_does_not_make_a_receiver_frozen() -> None:
 
 def frozen(run: SimulatedRun, begin_ns: int, end_ns: int, sensors: Collection[str]) -> Recording:
     """The recording of some sensors; between two times the receiver says one place, but for centimetres."""
-    fixes = [m for m in run.recording.measurements if isinstance(m, GnssPosition)]
+    fixes = run.recording.of(GnssPosition)
     held = next(m for m in fixes if m.stamp_ns >= begin_ns)
     datum, rng = Datum(held.position), np.random.default_rng(5)
 
@@ -238,7 +238,7 @@ def test_online_a_frozen_receiver_and_compass_do_not_pull_the_estimate() -> None
 def test_online_frozen_sensors_are_not_followed() -> None:
     """Beside matches, 40 % of them false. Followed, it would be off by 30 m and more, and call that good."""
     run = simulate_slowly(Scenario(path="loops", duration_s=45.0, noise="drift"), 1)
-    begin_ns = next(m.stamp_ns for m in run.recording.measurements if isinstance(m, GnssPosition)) + 18 * 10**9
+    begin_ns = next(m.stamp_ns for m in run.recording.of(GnssPosition)) + 18 * 10**9
     end_ns = begin_ns + 15 * 10**9
     said = frozen(run, begin_ns, end_ns, {m.sensor for m in run.recording.measurements})
     found = replay(said, run.config).solution

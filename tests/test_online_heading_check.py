@@ -131,7 +131,7 @@ def said_of(run: SimulatedRun, jump_s: tuple[float, float], turned_rad: float, b
         streams={"gnss": stream}, datum=datum, links=links, R_body_imu=of_imu.R_body_sensor, t_body_imu_m=of_imu.t_body_sensor_m
     )  # fmt: skip
     begin_ns = int(run.truth.stamps_ns[0])
-    waiting = deque(m for m in run.recording.measurements if isinstance(m, GnssPosition))
+    waiting = deque(m for m in run.recording.of(GnssPosition))
     check, said = HeadingCheck(), list[str]()
     if before_ns:
         at_once: Any = SimpleNamespace(stamp_ns=before_ns)

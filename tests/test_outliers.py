@@ -41,7 +41,7 @@ def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
             return m
         return replace(m, position=Geodetic(m.position[0] + 30.0 / 111_200.0, *m.position[1:]))
 
-    recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
+    recording = run.recording.changed(struck)
     done = app.smooth_recording(recording, run.config)
     said = done.solution.stats.warnings
     assert not any("IMU noise scaled up" in w or "times its expectation" in w for w in said)
@@ -61,7 +61,7 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one() -> None:
             return m
         return replace(m, yaw_rad=float(wrap_angle(m.yaw_rad + np.pi / 2.0)))
 
-    recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
+    recording = run.recording.changed(struck)
     solved = app.smooth_recording(recording, run.config).solution
     track = solved.trajectory
     off_deg = np.degrees(np.abs(wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad)))
@@ -331,7 +331,7 @@ def believed(off_m: float, last_s: float) -> tuple[Recording, Recording, VesselC
             return m
         return replace(m, position=Geodetic(m.position[0] + off_m / 111_000.0, *m.position[1:]))
 
-    wrong = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
+    wrong = run.recording.changed(struck)
     return run.recording, wrong, config
 
 
@@ -382,7 +382,7 @@ def test_a_jump_of_the_only_receiver_is_reported_in_the_run() -> None:
             return m
         return replace(m, position=Geodetic(m.position[0] + 1e-4, *m.position[1:]))  # 11 m north
 
-    recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
+    recording = run.recording.changed(struck)
     said = {
         name: app.smooth_recording(of, config).solution.stats.warnings
         for name, of in (("usual", run.recording), ("struck", recording))
@@ -517,7 +517,7 @@ def jumping_alone(
             return m
         return replace(m, position=Geodetic(m.position[0] + off_m / 111_300.0, *m.position[1:]))
 
-    recording = replace(run.recording, measurements=tuple(struck(m) for m in run.recording.measurements))
+    recording = run.recording.changed(struck)
     return run, recording, with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz=5.0)
 
 

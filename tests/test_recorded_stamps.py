@@ -65,7 +65,7 @@ def test_headers_without_stamps_are_read_by_the_recording_times(tmp_path: Path, 
     gnss = config.sensors["gnss"].model_copy(update={"time_offset_s": 0.0, "stamp_sigma_s": 0.0})
     recording = read(tmp_path, config.model_copy(update={"sensors": {**config.sensors, "gnss": gnss}}))
     for kind, way_ns in ((GnssPosition, WAY_NS["/fix"]), (CompassHeading, WAY_NS["/compass"])):
-        stamps = [m.stamp_ns for m in recording.measurements if isinstance(m, kind)]
+        stamps = [m.stamp_ns for m in recording.of(kind)]
         assert len(stamps) == 300  # every one of 5 Hz for 60 s
         assert stamps[:2] == [START_NS + way_ns, START_NS + way_ns + S // 5]
     assert recording.imu.stamps_ns[0] == START_NS
@@ -118,7 +118,7 @@ def test_a_clock_that_counts_from_its_start_is_set_by_one_that_tells_the_date(tm
     # The receiver's message takes 115 ms longer than the IMU's; recording times cannot tell that.
     apart_ns = WAY_NS["/fix"] - WAY_NS["/imu"]
     assert recording.imu.stamps_ns[0] == pytest.approx(START_NS - apart_ns, abs=S // 1000)
-    headings = [m.stamp_ns for m in recording.measurements if isinstance(m, CompassHeading)]
+    headings = [m.stamp_ns for m in recording.of(CompassHeading)]
     assert headings[0] == recording.imu.stamps_ns[0]  # of one clock, though it takes 25 ms longer
     assert config.sensors["gnss"].time_offset_s == pytest.approx(0.0, abs=0.2)  # by the accelerometer, of its latency
     assert "its clock is behind one that tells the date, by the recording times" in text
@@ -142,7 +142,7 @@ def test_a_clock_that_drifts_is_drafted_and_set_right(topic: str, share: float, 
     assert drifts == ({name: pytest.approx(1e6 * share, rel=0.02)} if said else {})
     recording = read(tmp_path, config)
     assert not any("during the run" in w for w in recording.warnings)
-    fixes = [m.stamp_ns for m in recording.measurements if isinstance(m, GnssPosition)]
+    fixes = [m.stamp_ns for m in recording.of(GnssPosition)]
     last_ns = (
         fixes[-1] - duration_ns(config.sensors["gnss"].time_offset_s)
         if topic == "/fix"

@@ -49,7 +49,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_messages_come_in_the_order_of_the_log(bag: Path) -> None:
     """Those of a bag by their number, whatever their stamps; and all of them, once."""
     recording, _ = app.load([bag / "run"], bag / "vessel.yaml")
-    fixes = [m for m in recording.measurements if isinstance(m, GnssPosition)]
+    fixes = recording.of(GnssPosition)
     late = replace(fixes[10], stamp_ns=fixes[10].stamp_ns - 3_000_000_000)  # came when it came, says another time
     changed = replace(recording, measurements=tuple(late if m is fixes[10] else m for m in recording.measurements))
     order = [m.seq for m in arrivals(changed)]
@@ -117,10 +117,8 @@ def test_scans_are_matched_around_its_own_prediction(bag: Path, tmp_path: Path) 
 
 
 def test_a_run_that_never_starts_says_what_it_waited_for(run: SimulatedRun) -> None:
-    without = replace(
-        run.recording, measurements=tuple(m for m in run.recording.measurements if not isinstance(m, GnssPosition))
-    )
-    alone = replace(without, measurements=tuple(m for m in without.measurements if m.sensor == "compass"))
+    without = run.recording.where(lambda m: not isinstance(m, GnssPosition))
+    alone = without.where(lambda m: m.sensor == "compass")
     with pytest.raises(SolveError, match="waiting for a position"):
         replay(alone, run.config)
 
@@ -181,7 +179,7 @@ def test_the_start_is_told_but_no_warning(whole: Replayed) -> None:
 def test_scans_that_were_never_tried_are_said_where_they_are_many(busy: int, said: bool) -> None:
     """Of all scans, not of those that gave no match: ten of fifteen or twelve were matched."""
     run = simulate(Scenario(duration_s=10.0, pose_hz=1.0), 0)
-    matched = [m for m in run.recording.measurements if isinstance(m, PoseFix)]
+    matched = run.recording.of(PoseFix)
     gathering = Gathering(replace(run.recording, measurements=tuple(matched[:10]), rows=()))
     for k in range(busy):
         gathering.refuse("matcher", run.recording.imu.stamps_ns[k], _live._BUSY)  # type: ignore[union-attr]  # noqa: SLF001

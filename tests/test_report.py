@@ -21,6 +21,7 @@ from graphloc.eval.simulate import Scenario, simulate
 from graphloc.measurements import GnssPosition
 from graphloc.solution import Solution
 from graphloc.survey import Survey
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 from tests.browser import CHROMIUM, Browser
 
@@ -133,8 +134,8 @@ def test_the_theses_tables_have_this_run_beside_the_print(data: ReportData) -> N
     """BL 4.1: the error of the receiver, at its antenna; here by hand, from truth and fixes."""
     truth = data.recording.truth
     assert truth is not None
-    fixes = [m for m in data.recording.measurements if isinstance(m, GnssPosition)]
-    at = truth.at(np.array([m.stamp_ns for m in fixes]))
+    fixes = data.recording.of(GnssPosition)
+    at = truth.at(stamps_of(fixes))
     lever = data.config.sensors["gnss"].mount.t_body_sensor_m
     antenna = at.p_world_m + np.einsum("nij,j->ni", at.R_world_body, lever)
     fixed = data.solution.datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T)

@@ -28,6 +28,7 @@ from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.replay import arrivals, replay
 from graphloc.solve._sensor_noise import Pair, Step, times_stated
+from graphloc.time import stamps_of
 from tests.faults import Fed, arrivals_of, feed
 from tests.slowly import simulate_slowly, slowly
 from tests.test_factors import attachment
@@ -46,7 +47,7 @@ def stating(run: SimulatedRun, kind: type[Measurement], share: float) -> Simulat
         assert isinstance(m, PoseFix)
         return replace(m, modes=tuple(replace(mode, cov=share**2 * mode.cov) for mode in m.modes))
 
-    recording = replace(run.recording, measurements=tuple(less(m) for m in run.recording.measurements))
+    recording = run.recording.changed(less)
     return replace(run, recording=recording)
 
 
@@ -140,7 +141,7 @@ def test_online_matches_that_state_a_third_are_taken_as_they_scatter_from_then_o
     truth = followed.run.truth
     late = [e for e in followed.fed.estimates if e.stamp_ns > truth.stamps_ns[0] + 25 * SECOND]
     assert len(late) > 50
-    off = np.array([e.p_world_m for e in late]) - truth.at(np.array([e.stamp_ns for e in late])).p_world_m
+    off = np.array([e.p_world_m for e in late]) - truth.at(stamps_of(late)).p_world_m
     nees = np.mean([d @ np.linalg.solve(e.cov[:2, :2], d) for d, e in zip(off[:, :2], late, strict=True)])
     assert nees < 4.0
 
@@ -177,7 +178,7 @@ def test_fixes_that_state_a_tenth_of_their_noise_are_taken_as_they_scatter() -> 
 
 def test_a_pose_has_a_factor_on_lengths_and_one_on_angles() -> None:
     run = matched(1, 3.0)
-    m = next(m for m in run.recording.measurements if isinstance(m, PoseFix))
+    m = run.recording.of(PoseFix)[0]
     row = next(row for row in SENSORS if row.kind == "pose")
     config = PoseConfig(topic="/p", min_sigma_m=1e-6, min_sigma_deg=1e-6)
     scaled = config.scaled({"sigma_scale": 2.0, "angle_sigma_scale": 3.0})

@@ -16,6 +16,7 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, bl_scenario
 from graphloc.measurements import GnssPosition, PoseFix
 from graphloc.recording import Recording
+from graphloc.time import stamps_of
 from tests.slowly import simulate_slowly
 
 SHORT = Scenario(duration_s=40.0, noise="drift", imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
@@ -73,8 +74,8 @@ def test_the_gnss_error_is_found_with_its_sign(short: app.Run) -> None:
     """The slow state, as written, is what must be subtracted from the fixes: metres of drift, known to decimetres."""
     truth, datum = short.recording.truth, short.solution.datum
     assert truth is not None
-    fixes = [m for m in short.recording.measurements if isinstance(m, GnssPosition)]
-    at = truth.at(np.array([m.stamp_ns for m in fixes]))
+    fixes = short.recording.of(GnssPosition)
+    at = truth.at(stamps_of(fixes))
     antenna = at.p_world_m + at.R_world_body @ np.array([-1.5, 0.3, 2.2789])
     error = datum.enu_from_geodetic(*np.array([m.position for m in fixes]).T) - antenna
     slow = short.solution.slow["gnss"]

@@ -56,7 +56,7 @@ def noisy_headings(seed: int) -> SimulatedRun:
             m, yaw_rad=float(wrap_angle(m.yaw_rad + rng.normal(0.0, np.radians(2.0)))), sigma_rad=np.radians(0.2)
         )
 
-    recording = replace(run.recording, measurements=tuple(told(m) for m in run.recording.measurements))
+    recording = run.recording.changed(told)
     return slowly(replace(run, recording=recording), 2.5)
 
 
@@ -84,7 +84,7 @@ def test_matches_that_state_a_tenth_of_their_noise_do_not_throw_the_start() -> N
             return m
         return replace(m, modes=tuple(replace(mode, cov=0.01 * mode.cov) for mode in m.modes))
 
-    recording = replace(run.recording, measurements=tuple(told(m) for m in run.recording.measurements))
+    recording = run.recording.changed(told)
     run = slowly(replace(run, recording=recording), 2.5)
     solution = app.smooth_recording(run.recording, run.config).solution
     assert compare_to_truth(solution.trajectory, run.truth).position_rmse_m < 0.6

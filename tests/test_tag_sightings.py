@@ -21,7 +21,7 @@ from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_ba
 from graphloc.gather import with_surveys
 from graphloc.ledger import Outcome
 from graphloc.measurements import TagSighting
-from tests.bagfactory import START_NS, Messages, S
+from tests.bagfactory import START_NS, Messages, S, rows_of
 from tests.tagfactory import AHEAD, FACES_SOUTH
 from tests.tagimages import (
     BENT,
@@ -47,7 +47,6 @@ from tests.tagimages import (
     only,
     picture,
     recorded,
-    rows_of,
     tags,
 )
 from tests.test_bag import accounted
@@ -243,7 +242,7 @@ def test_the_ledger_adds_up(tmp_path: Path) -> None:
     # 500 IMU samples, 50 fixes, 1 CameraInfo, 6 images; 4 sightings, 3 troubles.
     assert recording.message_count == 500 + 50 + 1 + 6 + 4 + 3
     assert recording.message_count == accounted(recording)
-    seen = [m for m in recording.measurements if isinstance(m, TagSighting)]
+    seen = recording.of(TagSighting)
     assert [(m.frame, m.numbers) for m in seen] == [("world", (7,)), ("pier", (12,))] * 2
     assert [row.outcome for row in rows_of(recording, "tags")] == [Outcome.REJECTED] * 3
     assert [row.reason.split(":")[0] for row in rows_of(recording, "tags")] == [

@@ -26,6 +26,7 @@ from graphloc.frontends._turns import (
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries
+from graphloc.time import stamps_of
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag_bad_input import accounted, rows_of, vessel
 
@@ -38,7 +39,7 @@ def run() -> SimulatedRun:
 
 def of(run: SimulatedRun) -> tuple[ImuSeries, list[CompassHeading]]:
     assert run.recording.imu is not None
-    return run.recording.imu, [m for m in run.recording.measurements if isinstance(m, CompassHeading)]
+    return run.recording.imu, run.recording.of(CompassHeading)
 
 
 def changed(headings: list[CompassHeading], change: Callable[[float], float]) -> list[CompassHeading]:
@@ -81,7 +82,7 @@ def test_poses_whose_yaw_turns_the_other_way_are_reported(against: bool, run: Si
     yaw = np.array([m.yaw_rad for m in headings])
     yaw = np.pi / 2.0 - yaw if against else yaw
     yaw[::5] = np.random.default_rng(3).uniform(-np.pi, np.pi, len(yaw[::5]))
-    lines = pose_turn_warning(imu, "slam", (np.array([m.stamp_ns for m in headings]), yaw))
+    lines = pose_turn_warning(imu, "slam", (stamps_of(headings), yaw))
     assert len(lines) == against
     assert all("slam: its yaw turns the other way than imu" in line and "north, east, down" in line for line in lines)
 
@@ -184,8 +185,8 @@ def told_by(run: SimulatedRun, source: str) -> Yaws:
     """Headings of the compass, or courses of the fixes."""
     if source == "compass":
         _, headings = of(run)
-        return np.array([m.stamp_ns for m in headings]), np.array([m.yaw_rad for m in headings])
-    courses = courses_of_fixes([m for m in run.recording.measurements if isinstance(m, GnssPosition)])
+        return stamps_of(headings), np.array([m.yaw_rad for m in headings])
+    courses = courses_of_fixes(run.recording.of(GnssPosition))
     return courses.stamps_ns, courses.course_rad
 
 

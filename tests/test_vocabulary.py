@@ -23,6 +23,7 @@ from graphloc.frames import (
 )
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition
+from graphloc.series import integral, interpolated, rms, robust_sigma, runs
 from graphloc.time import NS_PER_S, seconds_between, seconds_since, utc_text
 from graphloc.trajectory import Trajectory
 
@@ -123,6 +124,30 @@ def test_interpolation_follows_the_circle() -> None:
     a = 0.1 * stamps * 1e-9
     np.testing.assert_allclose(there.p_world_m[:, :2], 10 * np.column_stack([np.cos(a), np.sin(a)]), atol=1e-5)
     np.testing.assert_allclose(wrap_angle(there.yaw_rad - a - np.pi / 2), 0.0, atol=1e-9)
+
+
+def test_columns_over_time() -> None:
+    at, columns = np.array([0.0, 1.0, 3.0]), np.array([[0.0, 1.0], [2.0, 1.0], [6.0, -1.0]])
+    between = interpolated(np.array([-1.0, 0.5, 2.0, 9.0]), at, columns)
+    np.testing.assert_allclose(between, [[0.0, 1.0], [1.0, 1.0], [4.0, 0.0], [6.0, -1.0]])
+    # Trapezia of a straight line are exact: 2 t has the integral t^2; of a row of one value, that of a constant.
+    np.testing.assert_allclose(integral(at, columns), [[0.0, 0.0], [1.0, 1.0], [9.0, 1.0]])
+    np.testing.assert_allclose(integral(at, 1j * columns[:, 0]), [0.0, 1j, 9j])
+    assert rms(np.array([[3.0, -3.0], [1.0, 1.0]])) == pytest.approx(5.0**0.5)
+
+
+def test_a_robust_sigma_is_that_of_most() -> None:
+    off = np.random.default_rng(1).normal(0.0, [0.5, 2.0], (20_001, 2))
+    off[:500] = 1e6
+    np.testing.assert_allclose(robust_sigma(off), [0.5, 2.0], rtol=0.06)  # an outlier in 40 adds 4 %
+
+
+@pytest.mark.parametrize(
+    ("there", "expected"),
+    [("0110010", [[1, 3], [5, 6]]), ("111", [[0, 3]]), ("1001", [[0, 1], [3, 4]]), ("00", []), ("", [])],
+)
+def test_runs_of_true_values(there: str, expected: list[list[int]]) -> None:
+    assert runs(np.array([c == "1" for c in there], dtype=bool)).tolist() == expected
 
 
 def test_a_trajectory_covers_no_gap_and_no_outside() -> None:

@@ -49,7 +49,7 @@ def test_bounds_hold_beside_fixes_good_to_centimetres_that_walk() -> None:
     )
     run = simulate_slowly(scenario, 4, rate_hz=2.5)
     rng, walked, fixes = np.random.default_rng(6), np.zeros(3), []
-    datum = Datum(next(m.position for m in run.recording.measurements if isinstance(m, GnssPosition)))
+    datum = Datum(next(m.position for m in run.recording.of(GnssPosition)))
     for m in run.recording.measurements:
         if isinstance(m, GnssPosition):
             walked = walked + rng.normal(0.0, 0.15 / np.sqrt(5.0), 3)

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphloc.eval.simulate.noise import drift_m
 from graphloc.frames import Array, Datum, Geodetic, wrap_angle
-from graphloc.ledger import LedgerRow, Outcome
+from graphloc.ledger import Outcome
 from graphloc.measurements import (
     CompassHeading,
     GnssPosition,
@@ -25,6 +25,7 @@ from graphloc.measurements import (
     world_from_fixes,
 )
 from graphloc.recording import Recording
+from graphloc.series import interpolated
 from graphloc.time import NS_PER_S
 
 OUTAGES_S = (10.0, 30.0, 60.0, 120.0)
@@ -85,7 +86,7 @@ def script(recording: Recording) -> tuple[tuple[Failure, ...], tuple[tuple[str, 
     no_pose = "" if has[PoseFix] else "no matches and no poses"
     no_compass = "" if has[CompassHeading] else "no compass"
     alone = has[GnssPosition] + has[PoseFix] + has[TagSighting] < 2
-    tags = [m for m in recording.measurements if isinstance(m, TagSighting)]
+    tags = recording.of(TagSighting)
     flips = "" if any(len(m.modes) > 1 for m in tags) else "no sighting with a second pose" if tags else "no tags"
     offer(no_gnss, *(_timed("GNSS outage", s, partial(_silent, kinds=_GNSS)) for s in OUTAGES_S))
     nothing = "a single sensor measures position: the same as its outage" if alone else ""
@@ -126,13 +127,6 @@ def _timed(family: str, length_s: float, strike: Strike) -> Failure:
     return Failure(name=f"{family}, {length_s:g} s", family=family, length_s=length_s, strike=strike)
 
 
-def _taken(recording: Recording, m: Measurement) -> LedgerRow:
-    topic = recording.topics.get(m.sensor, "")
-    return LedgerRow(
-        seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=Outcome.HELD_OUT, reason=_TAKEN
-    )
-
-
 def _during(m: Measurement, begin_ns: int, end_ns: int) -> bool:
     return begin_ns <= m.stamp_ns < end_ns
 
@@ -145,18 +139,18 @@ def _silent(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Ge
         recording=replace(
             recording,
             measurements=tuple(m for m in recording.measurements if id(m) not in left),
-            rows=(*recording.rows, *(_taken(recording, m) for m in gone if m.seq >= 0)),
+            rows=(*recording.rows, *(recording.row_of(m, Outcome.HELD_OUT, _TAKEN) for m in gone if m.seq >= 0)),
         )
     )
 
 
 def _changed(recording: Recording, change: Callable[[Measurement], Measurement]) -> Struck:
-    return Struck(recording=replace(recording, measurements=tuple(change(m) for m in recording.measurements)))
+    return Struck(recording=recording.changed(change))
 
 
 def _moved_fixes(recording: Recording, begin_ns: int, end_ns: int, error_m: Callable[[Array], Array]) -> Struck:
     """Add errors to fixes; `error_m` maps times (N,), s since the failure began, to (N, 2) m, east, north."""
-    fixes = [m for m in recording.measurements if isinstance(m, GnssPosition) and _during(m, begin_ns, end_ns)]
+    fixes = [m for m in recording.of(GnssPosition) if _during(m, begin_ns, end_ns)]
     if not fixes:
         return Struck(recording=recording)
     datum = Datum(fixes[0].position)
@@ -175,7 +169,7 @@ def _drift(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gene
     def error_m(t: Array) -> Array:
         grid = np.linspace(0.0, length_s, 601)
         drawn = drift_m(rng, grid, rmse_m) * np.clip((length_s - grid) / (0.1 * length_s), 0.0, 1.0)[:, None]
-        return np.column_stack([np.interp(t, grid, drawn[:, k]) for k in range(2)])
+        return interpolated(t, grid, drawn)
 
     return _moved_fixes(recording, begin_ns, end_ns, error_m)
 
@@ -259,11 +253,5 @@ def _imu_gap(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.G
     imu = recording.imu
     assert imu is not None  # the script asks for one
     gone = (imu.stamps_ns >= begin_ns) & (imu.stamps_ns < end_ns)
-    topic = recording.topics.get(imu.sensor, "")
-    rows = (
-        LedgerRow(
-            seq=int(q), stamp_ns=int(s), sensor=imu.sensor, topic=topic, outcome=Outcome.HELD_OUT, reason=_TAKEN
-        )
-        for q, s in zip(imu.seqs[gone], imu.stamps_ns[gone], strict=True)
-    )  # fmt: skip
+    rows = recording.imu_rows(gone, Outcome.HELD_OUT, _TAKEN)
     return Struck(recording=replace(recording, imu=imu.where(~gone), rows=(*recording.rows, *rows)))

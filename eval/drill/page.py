@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -90,24 +90,27 @@ def _short(row: Row) -> Cell:
     return Cell(text=f"{_m(row.off_m)}{back}{never}{' *' if row.unsure else ''}")
 
 
-def brief(drilled: Drilled) -> list[Grid]:
-    """Return the tables for a terminal: largest error and time to recover; a star: recovered, but outside its own bounds."""
+def _rows(drilled: Drilled, cell_of: Callable[[Row], Cell]) -> tuple[tuple[Cell, ...], ...]:
+    """Return a row for each failure: its name, and a cell for each estimator."""
     by = {(r.failure, r.estimator): r for r in summed(drilled.measured)}
     names = dict.fromkeys(m.failure for m in drilled.measured)
-    rows = tuple((Cell(text=n), *(_short(by[n, e]) for e in drilled.estimators)) for n in names)
+    return tuple((Cell(text=n), *(cell_of(by[n, e]) for e in drilled.estimators)) for n in names)
+
+
+def brief(drilled: Drilled) -> list[Grid]:
+    """Return the tables for a terminal: largest error and time to recover; a star: recovered, but outside its own bounds."""
+    rows = _rows(drilled, _short)
     title = "Farthest off, s until back (*: near, but outside its own 95 % bounds)"
     return [Grid(title=title, head=("failure", *drilled.estimators), rows=rows), *grids(drilled)[1:]]
 
 
 def grids(drilled: Drilled) -> list[Grid]:
     """Return the table of failures, and that of failures that were not injected."""
-    by = {(r.failure, r.estimator): r for r in summed(drilled.measured)}
-    names = dict.fromkeys(m.failure for m in drilled.measured)
-    times = max(r.times for r in by.values())
+    times = max(r.times for r in summed(drilled.measured))
     table = Grid(
         title=f"Drills, each at {times} time{'s' if times > 1 else ''}",
         head=("failure", *drilled.estimators),
-        rows=tuple((Cell(text=n), *(_cell(by[n, e]) for e in drilled.estimators)) for n in names),
+        rows=_rows(drilled, _cell),
         note=(
             f"A cell: largest horizontal distance from the reference until {TAIL_S:g} s after the failure, worst of the times "
             "(in brackets: the same estimator undisturbed); how long after the failure's end it was back; share of "

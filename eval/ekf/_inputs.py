@@ -10,7 +10,7 @@ import numpy as np
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig
 from graphloc.errors import SolveError
-from graphloc.frames import Array, Datum, skew
+from graphloc.frames import Array, Datum, skew, yaw_from_rotation
 from graphloc.measurements import (
     BodyVelocity,
     CompassHeading,
@@ -23,6 +23,7 @@ from graphloc.measurements import (
     world_from_fixes,
 )
 from graphloc.recording import Recording
+from graphloc.series import integral, interpolated
 from graphloc.survey import Survey
 from graphloc.time import NS_PER_S, seconds_since
 
@@ -56,8 +57,8 @@ def intervals_of(recording: Recording, config: VesselConfig, rate_hz: float) -> 
     samples = np.hstack([imu.accel_mps2 @ R.T, imu.gyro_radps @ R.T])
     t = seconds_since(int(imu.stamps_ns[0]), imu.stamps_ns)
     edges = np.arange(0.0, t[-1], 1.0 / rate_hz)
-    total = np.vstack([np.zeros(6), np.cumsum(0.5 * (samples[1:] + samples[:-1]) * np.diff(t)[:, None], axis=0)])
-    there = np.column_stack([np.interp(edges, t, total[:, i]) for i in range(6)])
+    total = integral(t, samples)
+    there = interpolated(edges, t, total)
     mean = np.diff(there, axis=0) * rate_hz
     count = np.arange(1, len(mean) + 1)
     width = np.minimum(count, round(20.0 * rate_hz))
@@ -82,7 +83,7 @@ def measurements_of(recording: Recording, config: VesselConfig) -> list[MountedM
         planar = GnssPosition | GnssVelocity | BodyVelocity | CompassHeading | PoseFix
         if isinstance(m, planar) and sensor and sensor.enabled:
             t, R = mount_of(m.sensor, sensor, recording.mounts)
-            measured.append(MountedMeasurement(m, t, float(np.arctan2(R[1, 0], R[0, 0]))))
+            measured.append(MountedMeasurement(m, t, float(yaw_from_rotation(R))))
     return measured
 
 
@@ -103,7 +104,7 @@ def as_pose(m: TagSighting, survey: Survey) -> PoseFix:
         if dock is not None:
             cov += np.diag([dock.moves_m**2 / 4.0] * 2 + [np.radians(dock.moves_deg) ** 2 / 4.0])
         p = mode.p_world_camera_m - R @ m.t_body_camera_m
-        yaw = float(np.arctan2(R[1, 0], R[0, 0]))
+        yaw = float(yaw_from_rotation(R))
         modes.append(PoseMode(value=np.array([p[0], p[1], yaw]), cov=cov, probability=mode.probability))
     return PoseFix(stamp_ns=m.stamp_ns, sensor=m.sensor, seq=m.seq, axes=("x", "y", "yaw"), modes=tuple(modes))
 

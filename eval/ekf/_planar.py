@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -23,6 +24,7 @@ from graphloc.measurements import (
     world_from_fixes,
 )
 from graphloc.recording import Recording
+from graphloc.solution import Solution
 from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 
@@ -40,6 +42,11 @@ class FilterResult:
     trajectory: Trajectory
     ledger: Ledger
     why: str = ""
+
+
+def named_tracks(solution: Solution, filters: Iterable[FilterResult]) -> list[tuple[str, Trajectory]]:
+    """Return the track of a run and those of filters on the same measurements, each with its name."""
+    return [(solution.name, solution.trajectory), *((f.name, f.trajectory) for f in filters)]
 
 
 def _measurement(mounted: MountedMeasurement, x: Array, rate: float, datum: Datum) -> tuple[Array, Array, Array]:
@@ -159,17 +166,8 @@ def filter_row(
     m: Measurement, recording: Recording, nis: float | None, refused: str, away_m: float | None = None
 ) -> LedgerRow:
     """Return the row of a measurement that a filter used, or rejected with a reason."""
-    return LedgerRow(
-        seq=m.seq,
-        stamp_ns=m.stamp_ns,
-        sensor=m.sensor,
-        topic=recording.topics.get(m.sensor, ""),
-        outcome=Outcome.REJECTED if refused else Outcome.USED,
-        weight=0.0 if refused else 1.0,
-        residual_m=away_m,
-        nis=nis,
-        reason=refused,
-    )
+    row = recording.row_of(m, Outcome.REJECTED if refused else Outcome.USED, refused)
+    return replace(row, weight=0.0 if refused else 1.0, residual_m=away_m, nis=nis)
 
 
 def _planar(out: list[tuple[int, Array, Array]]) -> Trajectory:

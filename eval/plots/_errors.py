@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from graphloc.eval.ekf import FilterResult
+from graphloc.eval.ekf import FilterResult, named_tracks
 from graphloc.eval.metrics import Levers, errors, held_out_errors, squared_over_covariance
 from graphloc.eval.plots._marks import (
     COLOURS,
@@ -42,8 +42,7 @@ _SHARES = np.array([0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.9
 
 
 def _named(solution: Solution, filters: Sequence[FilterResult]) -> list[tuple[str, Trajectory, str]]:
-    tracks = [(solution.name, solution.trajectory), *((f.name, f.trajectory) for f in filters)]
-    return [(name, track, colour_of(name)) for name, track in tracks]
+    return [(name, track, colour_of(name)) for name, track in named_tracks(solution, filters)]
 
 
 def error_over_time(
@@ -126,7 +125,7 @@ def outages(recording: Recording) -> list[tuple[int, int]]:
 
     The periods before the first and after the last one count, too, as far as there is an IMU.
     """
-    stamps = np.unique([m.stamp_ns for m in recording.measurements if isinstance(m, GnssPosition)])
+    stamps = np.unique([m.stamp_ns for m in recording.of(GnssPosition)])
     if len(stamps) < 3:
         return []
     usual_ns = float(np.median(np.diff(stamps)))

@@ -26,42 +26,42 @@ Shape = Literal["circle", "circle-open", "diamond", "square", "x"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Line:
-    """A line through x, y (N,). `listed`: whether the legend names it; NaN in y interrupts it."""
+class _Named:
+    """What is drawn over x (N,). `listed`: whether the legend names it."""
 
     name: str
     x: Array
-    y: Array
     colour: str
-    dash: Dash = "solid"
-    width: float = 2.0
     listed: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Points:
+class Line(_Named):
+    """A line through x, y (N,); NaN in y interrupts it."""
+
+    y: Array
+    dash: Dash = "solid"
+    width: float = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Points(_Named):
     """Points x, y (N,) in one colour, or coloured by `weight` (N,) in [0, 1]; `text` (N,) are tooltips."""
 
-    name: str
-    x: Array
     y: Array
     colour: str = TRUTH
     weight: Array | None = None
     text: Sequence[str] = ()
     shape: Shape = "circle"
     size: float = 5.0
-    listed: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Band:
+class Band(_Named):
     """The area between `low` and `high` (N,) over x (N,)."""
 
-    name: str
-    x: Array
     low: Array
     high: Array
-    colour: str
     opacity: float = 0.18
     listed: bool = False
 

@@ -16,7 +16,7 @@ from graphloc.eval.plots._marks import COLOURS, Band, Figure, Line, Mark, Panel,
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.solution import SlowEstimate, Solution
-from graphloc.time import seconds_since
+from graphloc.time import seconds_since, stamps_of
 
 _PANEL_PX, _BESIDE_PX = 170, 120
 _SEEN_SIGMAS = 8.0  # of residuals at first; a double click shows all
@@ -75,7 +75,7 @@ def residuals_over_time(solution: Solution) -> Figure | None:
         shown = [rows[k] for k in some]
         sigmas = np.array([np.sqrt((r.nis or 0.0) / (r.dof or 1)) for r in shown])
         points = Points(
-            name=sensor, x=seconds_since(start, np.array([r.stamp_ns for r in shown])), y=sigmas, weight=weight[some],
+            name=sensor, x=seconds_since(start, stamps_of(shown)), y=sigmas, weight=weight[some],
             text=[hover(r) for r in shown], size=4.0, listed=False,
         )  # fmt: skip
         far = float(sigmas.max()) > _SEEN_SIGMAS

@@ -9,12 +9,15 @@ import numpy as np
 
 from graphloc.build import mount_of
 from graphloc.eval.docking import accurate_within_m
+from graphloc.eval.ekf import named_tracks
 from graphloc.eval.formatting import number
 from graphloc.eval.html import note, table
 from graphloc.eval.metrics import NoCommonTimeError, compare_to_truth, held_out_errors
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._published import BL_RUNS, DIGERUD_RUNS
 from graphloc.measurements import GnssPosition, PoseFix, TagSighting
+from graphloc.series import rms
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
 _BL = (
@@ -32,10 +35,6 @@ def theses_section(data: ReportData) -> str:
     """Return the tables that this run has data for, as HTML; empty without truth."""
     parts = [*_bl(data), *_digerud(data)] if data.recording.truth is not None else []
     return "".join(parts)
-
-
-def _estimates(data: ReportData) -> list[tuple[str, Trajectory]]:
-    return [(data.solution.name, data.solution.trajectory), *((f.name, f.trajectory) for f in data.filters)]
 
 
 def _bl(data: ReportData) -> Iterator[str]:
@@ -56,7 +55,7 @@ def _bl(data: ReportData) -> Iterator[str]:
         for r in BL_RUNS
     ]
     mine4 = []
-    for name, track in _estimates(data):
+    for name, track in named_tracks(data.solution, data.filters):
         m = compare_to_truth(track, truth)
         values = (m.position_rmse_m, m.position_max_m, m.heading_rmse_deg, m.heading_max_deg)
         mine4.append((f"this run: {name}", *(number(v, 4) for v in values)))
@@ -72,14 +71,14 @@ def _gnss_error_m(data: ReportData, truth: Trajectory) -> list[tuple[str, float,
     """Return RMSE and largest horizontal error (m) of each receiver, at its antenna."""
     found = []
     for name in data.config.of_kind("gnss"):
-        fixes = [m for m in data.recording.measurements if isinstance(m, GnssPosition) and m.sensor == name]
+        fixes = data.recording.of(GnssPosition, name)
         if fixes:
             lever_m = mount_of(name, data.config.sensors[name], data.recording.mounts)[0]
             try:
                 off = held_out_errors(truth, fixes, data.solution.datum, {name: lever_m}).horizontal_m
             except NoCommonTimeError:
                 continue
-            found.append((name, float(np.sqrt(np.mean(off**2))), float(off.max())))
+            found.append((name, rms(off), float(off.max())))
     return found
 
 
@@ -91,12 +90,12 @@ def _digerud(data: ReportData) -> Iterator[str]:
     ]
     mine = []
     for sensor, config in data.config.of_kind("apriltag").items():
-        seen = [m for m in data.recording.measurements if isinstance(m, TagSighting) and m.sensor == sensor]
+        seen = data.recording.of(TagSighting, sensor)
         if not seen:
             continue
-        stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
+        stamps = stamps_of(seen)
         far, flipped = _farthest(seen, truth), _second_pose(data, sensor)
-        for name, track in _estimates(data):
+        for name, track in named_tracks(data.solution, data.filters):
             within = accurate_within_m(track, truth, config.surveyed, stamps, seen[0].t_body_camera_m)
             said = "not < 0.10 m anywhere" if within is None else f"< 0.10 m within {within:.1f} m"
             mine.append((f"this run: {name}", said, far, flipped if track is data.solution.trajectory else ""))
@@ -108,15 +107,13 @@ def _digerud(data: ReportData) -> Iterator[str]:
 
 def _farthest(seen: list[TagSighting], truth: Trajectory) -> str:
     """Return the true distance from the camera to the tags, docks at rest, of the farthest sighting."""
-    stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
+    stamps = stamps_of(seen)
     covered = np.flatnonzero(truth.covers(stamps))
     if not len(covered):
         return "-"
-    moments, index = np.unique(stamps[covered], return_inverse=True)
-    there = truth.at(moments)
     away = [
-        np.linalg.norm(there.p_world_m[i] + there.R_world_body[i] @ m.t_body_camera_m - m.points_m.mean(axis=0))
-        for i, m in zip(index, (seen[k] for k in covered), strict=True)
+        np.linalg.norm(p + R @ m.t_body_camera_m - m.points_m.mean(axis=0))
+        for p, R, m in zip(*truth.poses_at(stamps[covered]), (seen[k] for k in covered), strict=True)
     ]
     return f"{max(away):.1f} m"
 

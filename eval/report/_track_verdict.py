@@ -18,7 +18,9 @@ from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
 from graphloc.frames import Array
 from graphloc.measurements import GnssPosition
+from graphloc.series import rms
 from graphloc.solution import Health, Solution
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory, bounds_95
 
 # Shares of the run: called good, called lost, covered by the 95 % bounds, compared at all; beyond, a reader has to look closer.
@@ -139,9 +141,8 @@ def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
     """
     track = solution.trajectory
     for name, sensor in data.config.of_kind("gnss").items():
-        fixes = [m for m in data.recording.measurements if isinstance(m, GnssPosition) and m.sensor == name]
-        kept = track.covers(np.array([m.stamp_ns for m in fixes], dtype=np.int64))
-        if not kept.any():
+        fixes = data.recording.of(GnssPosition, name)
+        if not track.covers(stamps_of(fixes)).any():
             continue
         off_m = held_out_errors(track, fixes, solution.datum, data.levers_m).horizontal_m
         half_m = float(np.median(off_m))
@@ -158,7 +159,7 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
     track = solution.trajectory
     if data.calibration is None or track.cov is None or track.v_world_mps is None:
         return
-    speed_mps, bound_m = _rms(_away(track.v_world_mps)), float(np.median(bounds_95(track.cov)[:, 0]))
+    speed_mps, bound_m = rms(_away(track.v_world_mps)), float(np.median(bounds_95(track.cov)[:, 0]))
     for found in data.calibration.suggestions:
         off_s, block = abs(found.suggested - found.configured), data.config.sensors[found.sensor]
         if isinstance(block, GnssConfig) and block.stamp_sigma_s > 0.0:
@@ -207,12 +208,12 @@ def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
         if filtered.name == (data.online.name if data.online else ""):
             continue
         both = _errors_of_both(data, solution, filtered.trajectory)
-        if both is not None and _rms(both[0]) > _WORSE * _rms(both[1]):
+        if both is not None and rms(both[0]) > _WORSE * rms(both[1]):
             ours, theirs = both
             yield Reason(
                 trust=Trust.WITH_CARE,
-                text=f"{filtered.name} is more accurate: RMSE {_rms(theirs):.2f} m, worst {theirs.max():.2f} m, against "
-                f"{_rms(ours):.2f} m, worst {ours.max():.2f} m, over the time that both cover.",
+                text=f"{filtered.name} is more accurate: RMSE {rms(theirs):.2f} m, worst {theirs.max():.2f} m, against "
+                f"{rms(ours):.2f} m, worst {ours.max():.2f} m, over the time that both cover.",
             )
 
 
@@ -228,7 +229,7 @@ def _errors_of_both(data: ReportData, solution: Solution, theirs: Trajectory) ->
             return None
         true = truth.at(stamps).p_world_m[:, :2]
         return _away(ours.at(stamps).p_world_m[:, :2] - true), _away(theirs.at(stamps).p_world_m[:, :2] - true)
-    at = np.array([m.stamp_ns for m in data.held], dtype=np.int64)
+    at = stamps_of(data.held)
     held = [m for m, both in zip(data.held, ours.covers(at) & theirs.covers(at), strict=True) if both]
     if not held:
         return None
@@ -239,10 +240,6 @@ def _errors_of_both(data: ReportData, solution: Solution, theirs: Trajectory) ->
 
 def _away(error: Array) -> Array:
     return np.asarray(np.hypot(error[:, 0], error[:, 1]))
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
@@ -259,7 +256,7 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
     said = "; honest bounds hold it for 95 % or more, as offline knows more: these are too small" if short else ""
     yield Reason(
         trust=trust,
-        text=f"It is {_rms(off):.2f} m from the offline track (RMS), {off.max():.2f} m at most; its own 95 % bounds hold the "
+        text=f"It is {rms(off):.2f} m from the offline track (RMS), {off.max():.2f} m at most; its own 95 % bounds hold the "
         f"offline position for {percent(placed)} of the time, the offline heading for {percent(headed)}{said}.",
     )
 

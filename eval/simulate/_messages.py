@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import cv2
@@ -16,6 +15,7 @@ from graphloc.eval.simulate.lidar import Scan
 from graphloc.eval.simulate.rig import RigCamera
 from graphloc.frames import Array
 from graphloc.measurements import AXES, BodyVelocity, CompassHeading, GnssPosition, PoseFix
+from graphloc.recording import Mounts
 
 TF = "tf2_msgs/msg/TFMessage"
 _JPEG_QUALITY = 90
@@ -58,6 +58,11 @@ class Messages:
             linear_acceleration_covariance=np.zeros(9),
         )
 
+    def _twist(self, v_mps: Array, cov: Array) -> Any:
+        """A `TwistWithCovariance` without rates, in the axes of v (3,)."""
+        twist = self._t["geometry_msgs/msg/Twist"](linear=self._vector(v_mps), angular=self._vector(np.zeros(3)))
+        return self._t["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=cov.reshape(36))
+
     def fix(self, m: GnssPosition) -> Any:
         return self._t["sensor_msgs/msg/NavSatFix"](
             header=self._header(m.stamp_ns, "gnss"),
@@ -79,10 +84,8 @@ class Messages:
         """A `TwistWithCovarianceStamped` in the sensor's axes."""
         picked, full, v = ["xyz".index(axis) for axis in m.axes], np.zeros((6, 6)), np.zeros(3)
         full[np.ix_(picked, picked)], v[picked] = m.cov, m.value
-        twist = self._t["geometry_msgs/msg/Twist"](linear=self._vector(v), angular=self._vector(np.zeros(3)))
-        inner = self._t["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=full.reshape(36))
         return self._t["geometry_msgs/msg/TwistWithCovarianceStamped"](
-            header=self._header(m.stamp_ns, "log"), twist=inner
+            header=self._header(m.stamp_ns, "log"), twist=self._twist(v, full)
         )
 
     def pose(self, m: PoseFix) -> Any:
@@ -94,12 +97,11 @@ class Messages:
 
     def odometry(self, stamp_ns: int, p: Array, R: Array, v: Array, child: str = "base_link") -> Any:
         none = np.zeros((6, 6))
-        twist = self._t["geometry_msgs/msg/Twist"](linear=self._vector(R.T @ v), angular=self._vector(np.zeros(3)))
         return self._t["nav_msgs/msg/Odometry"](
             header=self._header(stamp_ns, "map"),
             child_frame_id=child,
             pose=self._pose(p, Rotation.from_matrix(R), none),
-            twist=self._t["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=none.reshape(36)),
+            twist=self._twist(R.T @ v, none),
         )
 
     def cloud(self, stamp_ns: int, scan: Scan) -> Any:
@@ -153,7 +155,7 @@ class Messages:
             **{name if self._ros == 1 else name.lower(): value for name, value in given.items()},
         )  # fmt: skip
 
-    def mounts(self, stamp_ns: int, mounts: Mapping[str, tuple[Array, Array]]) -> Any:
+    def mounts(self, stamp_ns: int, mounts: Mounts) -> Any:
         """`/tf_static`: where every sensor sits in body, by frame."""
         stamped = [
             self._t["geometry_msgs/msg/TransformStamped"](

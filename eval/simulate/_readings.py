@@ -10,7 +10,7 @@ from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
 from graphloc.eval.simulate._scenario import Scenario
 from graphloc.eval.simulate._truth import Motion
 from graphloc.eval.simulate.noise import gnss_error_m, reported_sigma_m
-from graphloc.frames import Array, Datum, Geodetic, wrap_angle
+from graphloc.frames import Array, Datum, Geodetic, wrap_angle, yaw_from_rotation
 from graphloc.measurements import (
     BodyVelocity,
     CompassHeading,
@@ -88,7 +88,7 @@ def compass_headings(s: Scenario, motion: Motion, rng: np.random.Generator) -> l
     t = times(s.duration_s - 0.05, s.compass_hz) + 0.013
     sigma = np.radians(s.compass_sigma_deg)
     _, R, _ = motion.pose(t)
-    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0]) + np.radians(s.compass_offset_deg) + rng.normal(0.0, sigma, len(t))
+    yaw = yaw_from_rotation(R) + np.radians(s.compass_offset_deg) + rng.normal(0.0, sigma, len(t))
     return [
         CompassHeading(stamp_ns=int(n), sensor="compass", seq=0, yaw_rad=float(wrap_angle(y)), sigma_rad=sigma)
         for n, y, at in zip(stamps(t), yaw, t, strict=True)
@@ -118,7 +118,7 @@ def made_up_matches(s: Scenario, motion: Motion, rng: np.random.Generator) -> li
         return []
     t = times(s.duration_s - 0.5, s.pose_hz) + 0.437
     p, R, _ = motion.pose(t)
-    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    yaw = yaw_from_rotation(R)
     sigmas = np.array([s.pose_sigma_m, s.pose_sigma_m, np.radians(s.pose_sigma_deg)])
     false = rng.uniform(size=len(t)) < s.false_fraction
     offset = np.zeros(3)

@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array
+from graphloc.series import integral
 
 _STEP_S = 0.02  # knots of the velocity spline
 _WAVES = 12  # sinusoids that stand for a sea
@@ -162,7 +163,7 @@ def make_way_motion(
     waves: tuple[Waves, Waves, Waves],
     lean_per_mps2: float,
     tide_m: float,
-    swing: Waves | None = None,
+    swing: Waves,
 ) -> Motion:
     """Build the motion along a path, from end to end in the given time; `slowing` (N,): shape of the speed.
 
@@ -170,12 +171,11 @@ def make_way_motion(
     """
     t = np.arange(-1.0, duration_s + 1.0 + _STEP_S, _STEP_S)
     shape = slowing(t)
-    travelled = np.concatenate([[0.0], np.cumsum(0.5 * (shape[1:] + shape[:-1]) * np.diff(t))])
+    travelled = integral(t, shape)
     scale = way.length_m / travelled[-1]
     speed, at = CubicSpline(t, scale * shape), CubicSpline(t, scale * travelled)
     before = float(at(0.0))
     first = float(way.heading(0.0))
-    swing = Waves(*np.zeros((3, 1))) if swing is None else swing
     return make_motion(
         duration_s,
         speed_mps=speed,

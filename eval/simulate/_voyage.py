@@ -99,7 +99,7 @@ def _way_motion(
     s: Scenario, way: Way, sway: Waves, waves: tuple[Waves, Waves, Waves], rng: np.random.Generator
 ) -> Motion:
     slowing: Callable[[Array], Array] = lambda t: 1.0 - 0.5 * _ramp(t, 0.8 * s.route_s, 8.0)
-    swing = None
+    swing = Waves(*np.zeros((3, 1)))
     if s.path in ("dock", "tour"):
         swing = Waves.jonswap(rng, np.radians(1.0), 15.0)  # no helmsman holds a course to a hair
         shape = _docking if s.path == "dock" else _touring

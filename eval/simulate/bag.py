@@ -228,16 +228,20 @@ def _small(run: SimulatedRun, make: Messages) -> list[_Item]:
             add(m.stamp_ns, "/log/velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", make.speed(m))
         elif isinstance(m, PoseFix):
             add(m.stamp_ns, "/matcher/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", make.pose(m))
+    return sorted([*items, *_truth(run, make)], key=lambda item: item.log_ns)
+
+
+def _truth(run: SimulatedRun, make: Messages) -> Iterator[_Item]:
+    """Yield where the vessel is, and each dock, as odometry."""
     t = np.arange(round(run.scenario.duration_s * _TRUTH_HZ)) / _TRUTH_HZ
     stamps = (_start_ns(run) + np.rint(t * 1e9).astype(np.int64)).tolist()
     for stamp, p, R, v in zip(stamps, *run.motion.pose(t), strict=True):
-        add(stamp, "/truth", "nav_msgs/msg/Odometry", make.odometry(stamp, p, R, v))
+        yield _Item(stamp, "/truth", "nav_msgs/msg/Odometry", make.odometry(stamp, p, R, v))
     for dock in run.docks:
         at, turned = dock.pose(t)
         for stamp, p, R, v in zip(stamps, at, turned, np.gradient(at, 1.0 / _TRUTH_HZ, axis=0), strict=True):
             message = make.odometry(stamp, p, R, v, child=dock.dock.name)
-            add(stamp, f"/truth/{dock.dock.name}", "nav_msgs/msg/Odometry", message)
-    return sorted(items, key=lambda item: item.log_ns)
+            yield _Item(stamp, f"/truth/{dock.dock.name}", "nav_msgs/msg/Odometry", message)
 
 
 def _mounts(run: SimulatedRun) -> dict[str, Any]:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends.aerial.scan import LevelCloud
+from graphloc.recording import Mounts
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -186,9 +186,7 @@ def _warn_once(lidar: str, text: str) -> None:
         log.warning("LiDAR %s: %s", lidar, text)
 
 
-def level(
-    clouds: list[Cloud], mounts: Mapping[str, tuple[Array, Array]], track: Trajectory, at_ns: int, waterline_m: float
-) -> LevelCloud:
+def level(clouds: list[Cloud], mounts: Mounts, track: Trajectory, at_ns: int, waterline_m: float) -> LevelCloud:
     """Return the points of clouds in `level` at a time, each from where the track has its LiDAR at the time of the point.
 
     Points that the track does not cover are omitted. For the others,

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.frontends.aerial.image import Patch, Pixels
 from graphloc.frontends.aerial.vector import VectorMap
+from graphloc.series import robust_sigma
 
 Layer = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -228,7 +229,7 @@ def segment_water(patch: Patch, free: Mask) -> Mask:
         return np.zeros(seed.shape, dtype=bool)
     sample = lab[seed]
     middle = np.median(sample, axis=0)
-    spread = 1.4826 * np.median(np.abs(sample - middle), axis=0) + 1.5
+    spread = robust_sigma(sample - middle) + 1.5
     keep = (np.abs(sample - middle) < 3.0 * spread).all(axis=1)
     cov = np.cov(sample[keep].T) + np.diag([4.0, 1.0, 1.0])
     mean = sample[keep].mean(axis=0).astype(np.float32)

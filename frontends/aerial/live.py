@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -18,6 +18,8 @@ from graphloc.frontends.aerial.bl import BLMatcher
 from graphloc.frontends.aerial.cloud import Cloud, level
 from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
+from graphloc.recording import Mounts
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
 _JITTER_S = 0.05  # stamps are not a clock
@@ -75,9 +77,7 @@ class LiveMatcher:
         InputError: a map cannot be used.
     """
 
-    def __init__(
-        self, config: AerialConfig, folder: Path, datum: Datum, mounts: Mapping[str, tuple[Array, Array]]
-    ) -> None:
+    def __init__(self, config: AerialConfig, folder: Path, datum: Datum, mounts: Mounts) -> None:
         self._config, self._mounts = config, mounts
         self._matcher = _matcher(config, folder, datum)
         self._submap: deque[Turn] = deque(maxlen=config.submap)
@@ -144,7 +144,7 @@ class LiveMatcher:
 
 def outside(turn: Turn, track: Trajectory) -> str:
     """Return which scans are outside of a track; empty if none is."""
-    stamps = np.array([c.stamp_ns for c in turn.clouds], dtype=np.int64)
+    stamps = stamps_of(turn.clouds)
     if track.covers(stamps).all():
         return ""
     off_s = (stamps - track.stamps_ns[0]) / 1e9

@@ -69,12 +69,12 @@ def match_bag(
         matcher = LiveMatcher(config, folder, datum, feed.mounts)
         if at_ns is None:
             staying = Staying(config.hull_m or (), (t for t, _ in feed.mounts.values()))
-            for turn in feed:
-                answer = matcher.offer(turn, track, growing=False)
-                if isinstance(answer, Matched):
-                    if answer.match is not None:
-                        staying.take(answer.match.found, answer.match.prior.pose[:2])
-                    yield answer
+            for answer in (matcher.offer(turn, track, growing=False) for turn in feed):
+                if not isinstance(answer, Matched):
+                    continue
+                if answer.match is not None:
+                    staying.take(answer.match.found, answer.match.prior.pose[:2])
+                yield answer
             for line in staying.said():
                 warn(f"aerial: {line}")
         elif turns := _nearest(feed, config.submap, track, at_ns):

@@ -83,6 +83,13 @@ def homography(corners, side):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def mapped(H, x, y):  # type: ignore[no-untyped-def]
+    """Return the point that a homography (3, 3) makes of (x, y), and the inverse of its denominator."""
+    z = 1.0 / (H[2, 0] * x + H[2, 1] * y + H[2, 2])
+    return (H[0, 0] * x + H[0, 1] * y + H[0, 2]) * z, (H[1, 0] * x + H[1, 1] * y + H[1, 2]) * z, z
+
+
+@compiled
 def bilinear(grey, u, v):  # type: ignore[no-untyped-def]
     """Return the grey level at a point, -1 outside of the image."""
     j, i = int(np.floor(u)), int(np.floor(v))
@@ -103,9 +110,7 @@ def spots(corners, side):  # type: ignore[no-untyped-def]
         for c in range(-1, side + 1):
             for k in range(9):
                 x, y = c + 0.5 + _SPREAD * (k % 3 - 1), r + 0.5 + _SPREAD * (k // 3 - 1)
-                z = 1.0 / (H[2, 0] * x + H[2, 1] * y + H[2, 2])
-                found[n, 0] = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) * z
-                found[n, 1] = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) * z
+                found[n, 0], found[n, 1], _ = mapped(H, x, y)
                 n += 1
     return found
 

@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 
 from graphloc.frames import Array
 from graphloc.frontends.tags._bow import Unbowed
-from graphloc.frontends.tags._decode import compiled, homography
+from graphloc.frontends.tags._decode import compiled, homography, mapped
 
 _ROUNDS = (1200, 5000)  # about how many pixels are looked at: of a wide tag, some
 _FLOOR_PX, _BLENDED_PX = 0.015, 0.15  # 1 sigma of a corner, whatever the image; and times the square of blur over cell
@@ -211,13 +211,6 @@ def _shares(x, s, first, w, dx, ds):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _place(X, u, v):  # type: ignore[no-untyped-def]
-    """Return a pixel's position in cells (x, y), and the inverse z of the homography's denominator."""
-    z = 1.0 / (X[2, 0] * u + X[2, 1] * v + X[2, 2])
-    return (X[0, 0] * u + X[0, 1] * v + X[0, 2]) * z, (X[1, 0] * u + X[1, 1] * v + X[1, 2]) * z, z
-
-
-@compiled
 def _model(theta, X, slopes, cells, u, v, J, w):  # type: ignore[no-untyped-def]
     """Return a pixel's level, its derivatives J (17,), and the share of light from beyond the quiet zone.
 
@@ -226,7 +219,7 @@ def _model(theta, X, slopes, cells, u, v, J, w):  # type: ignore[no-untyped-def]
         w: (6, 24) workspace.
     """
     side = len(cells)
-    x, y, z = _place(X, u, v)
+    x, y, z = mapped(X, u, v)
     xu, xv = (X[0, 0] - x * X[2, 0]) * z, (X[0, 1] - x * X[2, 1]) * z
     yu, yv = (X[1, 0] - y * X[2, 0]) * z, (X[1, 1] - y * X[2, 1]) * z
     sx, sy = math.sqrt(theta[8] * (xu * xu + xv * xv)), math.sqrt(theta[9] * (yu * yu + yv * yv))
@@ -310,7 +303,7 @@ def _inside(grey, px, flat, X, side):  # type: ignore[no-untyped-def]
     found = np.empty((len(px), 3))
     n = 0
     for i in range(len(px)):
-        x, y, _ = _place(X, flat[i, 0], flat[i, 1])
+        x, y, _ = mapped(X, flat[i, 0], flat[i, 1])
         if min(x, y) >= -_QUIET and max(x, y) <= side + _QUIET:
             found[n, 0], found[n, 1], found[n, 2] = flat[i, 0], flat[i, 1], grey[int(px[i, 1]), int(px[i, 0])] / 255.0
             n += 1
@@ -335,7 +328,7 @@ def _gather(pixels, cells, theta, X, slopes, doubt):  # type: ignore[no-untyped-
             continue  # as it should be; how bright it was cannot be seen
         weight = 1.0 / (1.0 + doubt * strange * strange)
         off = pixels[i, 2] - level
-        x, y, _ = _place(X, u, v)
+        x, y, _ = mapped(X, u, v)
         column, row = int(_BLOCKS * x / side), int(_BLOCKS * y / side)
         block = _BLOCKS * min(max(row, 0), _BLOCKS - 1) + min(max(column, 0), _BLOCKS - 1)
         squares += weight * off * off

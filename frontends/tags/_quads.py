@@ -181,11 +181,8 @@ def _largest(hull, quad, dark, least):  # type: ignore[no-untyped-def]
             break
     for m in range(4):
         quad[m] = hull[c[m]]
-    shortest = 1e9
-    for m in range(4):
-        shortest = min(shortest, np.hypot(quad[m, 0] - quad[m - 1, 0], quad[m, 1] - quad[m - 1, 1]))
     inside = _area(quad)
-    return shortest >= 0.7 * least and inside >= max(least**2, _FULL * _area(hull)) and dark < 1.3 * inside
+    return _shortest(quad) >= 0.7 * least and inside >= max(least**2, _FULL * _area(hull)) and dark < 1.3 * inside
 
 
 @compiled
@@ -195,6 +192,15 @@ def _area(p):  # type: ignore[no-untyped-def]
     for k in range(len(p)):
         total += p[k - 1, 0] * p[k, 1] - p[k, 0] * p[k - 1, 1]
     return 0.5 * total
+
+
+@compiled
+def _shortest(quad):  # type: ignore[no-untyped-def]
+    """Return the length of the shortest side of a quadrilateral (4, 2)."""
+    shortest = 1e9
+    for k in range(4):
+        shortest = min(shortest, np.hypot(quad[k, 0] - quad[k - 1, 0], quad[k, 1] - quad[k - 1, 1]))
+    return shortest
 
 
 @compiled
@@ -217,10 +223,8 @@ def _straighten(grey, quad, cells):  # type: ignore[no-untyped-def]
     Each side becomes a line through the steepest points of profiles across it. Within a cell to either side there is no other edge
     from dark to bright.
     """
-    shortest, before = 1e9, _area(quad)
-    for k in range(4):
-        shortest = min(shortest, np.hypot(quad[k, 0] - quad[k - 1, 0], quad[k, 1] - quad[k - 1, 1]))
-    reach = min(max(shortest / cells, 1.5), 6.0)
+    before = _area(quad)
+    reach = min(max(_shortest(quad) / cells, 1.5), 6.0)
     lines = np.empty((4, 4))  # a point and a direction
     for k in range(4):
         if not _line(grey, quad[k], quad[(k + 1) % 4], reach, lines[k]):

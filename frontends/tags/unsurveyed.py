@@ -22,8 +22,9 @@ from scipy.spatial.transform import Rotation
 from graphloc.frames import Array, rpy_from_rotation, skew
 from graphloc.frontends.tags.pose import poses_of
 from graphloc.measurements import TagSighting, TagView
+from graphloc.series import interpolated
 from graphloc.survey import WORLD, DockConfig, Family, Survey, TagConfig
-from graphloc.time import seconds_since
+from graphloc.time import seconds_since, stamps_of
 from graphloc.trajectory import Trajectory
 
 _FEWEST = 5
@@ -79,7 +80,7 @@ class Riding:
     def seen_from(self, track: Trajectory) -> Trajectory:
         """Return a track relative to the dock at rest; its covariance, which includes the dock's, is kept."""
         t, s = (seconds_since(int(track.stamps_ns[0]), stamps) for stamps in (track.stamps_ns, self.stamps_ns))
-        moved = np.column_stack([np.interp(t, s, self.moved[:, k]) for k in range(6)])
+        moved = interpolated(t, s, self.moved)
         back, pivot = Rotation.from_rotvec(-moved[:, 3:]).as_matrix(), np.array(self.dock.xyz_m)
         return Trajectory(
             stamps_ns=track.stamps_ns,
@@ -134,7 +135,7 @@ def estimate_tags(
             )
             continue
         own = [v for v in views if (v.family, v.number) == (family, number)]
-        stamps = np.array([v.stamp_ns for v in own], dtype=np.int64)
+        stamps = stamps_of(own)
         own = [v for v, covered in zip(own, track.covers(stamps), strict=True) if covered]
         dock = (riding or {}).get((family, number))
         seen_from = track if dock is None else dock.seen_from(track)

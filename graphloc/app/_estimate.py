@@ -201,7 +201,7 @@ def solve(
 
 def seen_frames(config: VesselConfig, recording: Recording) -> VesselConfig:
     """Return the configuration whose surveys hold what was seen in the run: other frames need no states."""
-    seen = {(m.sensor, m.frame) for m in recording.measurements if isinstance(m, TagSighting)}
+    seen = {(m.sensor, m.frame) for m in recording.of(TagSighting)}
     cut = {
         name: sensor.model_copy(update={"survey": sensor.surveyed.of({f for s, f in seen if s == name})})
         for name, sensor in config.of_kind("apriltag").items()
@@ -210,7 +210,7 @@ def seen_frames(config: VesselConfig, recording: Recording) -> VesselConfig:
 
 
 def match_at(
-    recording: Recording, config: VesselConfig, scans: Scans, at_s: float, progress: Progress = quiet
+    recording: Recording, config: VesselConfig, scans: Scans, at_s: float, progress: Progress
 ) -> tuple[Match, int]:
     """Match the scan nearest to a time (s since the first IMU sample) around the run smoothed without matches.
 

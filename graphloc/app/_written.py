@@ -9,21 +9,21 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from graphloc import found_tags, outputs
 from graphloc.app._run import Run, levers_m
 from graphloc.eval import metrics, report
 from graphloc.eval.docking import docking_table
+from graphloc.eval.ekf import named_tracks
 from graphloc.folders import fresh_folder
 from graphloc.measurements import TagSighting
+from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
 
 def tables(run: Run) -> tuple[metrics.Table, ...]:
     """Return the numbers of a run: against truth, held-out fixes, and the speed check."""
     found: list[metrics.Table] = []
-    estimates = [(run.solution.name, run.solution.trajectory), *((f.name, f.trajectory) for f in run.filters)]
+    estimates = named_tracks(run.solution, run.filters)
     if run.recording.truth is not None:
         found.append(metrics.truth_table(estimates, run.recording.truth))
         found += _docking_tables(run, estimates, run.recording.truth)
@@ -42,9 +42,9 @@ def _docking_tables(
     """A table for each tag sensor that saw a tag."""
     sensors = run.config.of_kind("apriltag")
     for name, sensor in sensors.items():
-        seen = [m for m in run.recording.measurements if isinstance(m, TagSighting) and m.sensor == name]
+        seen = run.recording.of(TagSighting, name)
         if seen:
-            stamps = np.array([m.stamp_ns for m in seen], dtype=np.int64)
+            stamps = stamps_of(seen)
             table = docking_table(estimates, truth, sensor.surveyed, stamps, seen[0].t_body_camera_m)
             yield replace(table, title=table.title if len(sensors) == 1 else f"{table.title}: {name}")
 

@@ -23,8 +23,8 @@ from graphloc.build._chains import (
     walk_between_nodes,
     without_drift,
 )
-from graphloc.build._graph import Decided, Decisions, Level, Past, StartPrior, build_graph, state_keys
-from graphloc.build._layout import Mounts, company_of, make_problem, mount_of, slow_or_left_out
+from graphloc.build._graph import Decided, Decisions, Level, Made, Past, StartPrior, build_graph, state_keys
+from graphloc.build._layout import company_of, make_problem, mount_of, slow_or_left_out
 from graphloc.build._problem import (
     Problem,
     Stream,
@@ -45,7 +45,7 @@ __all__ = [
     "Decisions",
     "Judged",
     "Level",
-    "Mounts",
+    "Made",
     "Past",
     "Problem",
     "Sited",

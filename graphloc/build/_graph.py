@@ -101,7 +101,9 @@ class Decided:
         return self._update
 
 
-# By (stream number, measurement index); missing or None: left out of the graph.
+Made = dict[tuple[int, int], range]
+"""By (stream number, measurement index): where its factors stand in a graph."""
+# By the same; missing or None: left out of the graph.
 Decisions = Mapping[tuple[int, int], Decided | None]
 
 
@@ -114,7 +116,7 @@ def build_graph(
     prior: StartPrior | Past,
     *,
     jumps: bool = True,
-    made: dict[tuple[int, int], range] | None = None,
+    made: Made | None = None,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """Return the graph of states first..last and the values of its keys.
 

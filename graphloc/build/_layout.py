@@ -20,11 +20,11 @@ from graphloc.frames import Array, Datum
 from graphloc.graph import InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.measurements import Measurement
 from graphloc.position_jumps import allowed_jump_m, position_jumps
-from graphloc.recording import Recording
+from graphloc.recording import Mounts, Recording
+from graphloc.time import stamps_of
 from graphloc.timeline import Timeline, make_timeline
 
 _NO_JUMPS: PositionJumps = np.zeros(0, dtype=np.int64), np.zeros(0)
-Mounts = Mapping[str, tuple[Array, Array]]  # by sensor, from /tf_static: t (3,), R (3, 3) in body
 
 
 def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Array]:
@@ -131,7 +131,7 @@ def _streams(
                 measurements=tuple(own),
                 state=state,
                 carry=carry,
-                gyro_radps=problem.links.gyro_at(np.array([m.stamp_ns for m in own])),
+                gyro_radps=problem.links.gyro_at(stamps_of(own)),
                 apart_s=apart_s_of(own),
             )
         )

@@ -75,10 +75,7 @@ def sorted_out(
         if m.seq < 0:  # configuration, not a message
             outside[m.sensor] = 0
             continue
-        topic = recording.topics.get(m.sensor, "")
-        rows.append(
-            LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason)
-        )
+        rows.append(recording.row_of(m, outcome, reason))
     span = _span(imu)
     warnings = [
         f"{name}: {n} of {every[name]} measurements lie outside the IMU's time span ({span}) and are not used"

@@ -11,8 +11,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc import keys
-from graphloc.frames import Array
 from graphloc.motion_model import MotionModel, Moving
 from graphloc.timeline import Timeline
 
@@ -31,10 +29,12 @@ class UsualMotion:
         """Return the factors of the steps between nodes of a stretch whose first state is `first`."""
         factors: list[Any] = []
         for j in nodes[:-1]:
+            if j not in self.nodes:
+                continue
             a, b = (int(k) for k in np.searchsorted(timeline.slow_of, [j, j + 1]))
-            if j in self.nodes and a >= first:
+            if a >= first:
                 dt_s = float(timeline.stamps_ns[b] - timeline.stamps_ns[a]) * 1e-9
-                factors += self.model.step(_moving(values, a), _moving(values, b), dt_s)
+                factors += self.model.step(Moving.of(values, a), Moving.of(values, b), dt_s)
         return factors
 
 
@@ -57,14 +57,8 @@ def usual_motion(
     for j in range(len(node_ns) - 1):
         here_ns, next_ns = int(node_ns[j]), int(node_ns[j + 1])
         if not any(a <= here_ns and next_ns <= b for a, b in spans):
-            moving = _moving(values, int(np.searchsorted(timeline.slow_of, j)))
+            moving = Moving.of(values, int(np.searchsorted(timeline.slow_of, j)))
             model.learn(here_ns, (moving.R.T @ moving.v_mps)[:2])
         elif not any(a < next_ns and b > here_ns for a, b in holes):
             nodes.add(j)
     return UsualMotion(model, frozenset(nodes))
-
-
-def _moving(values: gtsam.Values, k: int) -> Moving:
-    key = keys.velocity(k)
-    v_mps: Array = values.atVector(key)
-    return Moving(key, v_mps, values.atPose3(keys.pose(k)).rotation().matrix())

@@ -15,7 +15,7 @@ from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_ba
 from graphloc.frontends.tags.sizes import size_factors
 from graphloc.gather._gathering import Gathering
 from graphloc.measurements import TagSighting
-from graphloc.recording import Progress, Recording, quiet
+from graphloc.recording import Progress, Recording
 from graphloc.survey import Survey, load_survey
 
 _REASONS = 8  # that are said, of those why something was refused
@@ -37,7 +37,7 @@ def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
     return config.with_sensors(read)
 
 
-def with_sightings(recording: Recording, config: VesselConfig, bags: Bags, progress: Progress = quiet) -> Recording:
+def with_sightings(recording: Recording, config: VesselConfig, bags: Bags, progress: Progress) -> Recording:
     """Add what every tag sensor sees; each sighting, and each thing that cannot be used, is a row of the ledger.
 
     Raises:

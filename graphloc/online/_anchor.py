@@ -44,6 +44,13 @@ class ConditionalGaussian:
         return cls(value=value, gain=np.zeros((len(value), _CORE)), cov=cov)
 
 
+def in_world(pose: Any) -> Array:
+    """Return the rotation (15, 15) of pose, velocity and bias from the tangent at a pose (body axes) to the axes of world."""
+    turn = np.eye(_CORE)
+    turn[:3, :3] = turn[3:6, 3:6] = pose.rotation().matrix()
+    return turn
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Anchor:
     """A state and its Gaussian.
@@ -148,8 +155,7 @@ class Anchor:
 
     def factors(self, pose: int, velocity: int, bias: int) -> list[Any]:
         """Return the prior factors of the state, by its keys; linear in world, as in `conditional_factor`."""
-        turn = np.eye(_CORE)
-        turn[:3, :3] = turn[3:6, 3:6] = self.pose.rotation().matrix()
+        turn = in_world(self.pose)
         whiten, mean = gauss.whitening(sound(turn @ self.cov @ turn.T)), turn @ self.step
 
         def error(this: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
@@ -169,9 +175,8 @@ class Anchor:
         tangent of a heading that is later corrected by 20 deg the factor would state another sum, and both sums together would
         determine the position.
         """
-        whiten, turn = gauss.whitening(sound(known.cov)), np.eye(_CORE)
-        turn[:3, :3] = turn[3:6, 3:6] = self.pose.rotation().matrix()
-        gain = whiten @ known.gain @ turn.T
+        whiten = gauss.whitening(sound(known.cov))
+        gain = whiten @ known.gain @ in_world(self.pose).T
 
         def error(this: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
             *own, other = this.keys()

@@ -28,6 +28,7 @@ from graphloc.online._lag import Lag
 from graphloc.online._states import Newest
 from graphloc.position_jumps import position_jumps
 from graphloc.solve._covariances import world_covariance
+from graphloc.time import stamps_of
 from graphloc.trajectory import bounds_95
 
 _WINDOW_S, _EVERY_S = 40.0, 5.0
@@ -185,7 +186,7 @@ class HeadingCheck:
         fixes = [fix for fix in self._fixes if self._steps[0].until_ns <= fix.stamp_ns <= newest.stamp_ns]
         if at_s[-1] - at_s[0] < 0.9 * _WINDOW_S or len(fixes) < _FEWEST:
             return None
-        stamps_ns = np.array([fix.stamp_ns for fix in fixes])
+        stamps_ns = stamps_of(fixes)
         places = np.array([fix.p_world_m for fix in fixes])
         t, z = (stamps_ns - newest.stamp_ns) * 1e-9, places @ np.array([1.0, 1j])
         rows = [np.interp(t, at_s, row.real) + 1j * np.interp(t, at_s, row.imag) for row in felt]

@@ -11,6 +11,7 @@ import numpy as np
 
 from graphloc.frozen_imu import WHY, FrozenImuDetector
 from graphloc.measurements import ImuSample, ImuSeries
+from graphloc.time import stamps_of
 
 _BACK = 50  # samples in a row with stamps before the newest: the clock was set back
 _LATE_S = 3.0  # how late samples may come before the start
@@ -44,7 +45,7 @@ def series_of(samples: Sequence[ImuSample]) -> ImuSeries:
     """Return samples of one IMU as a series."""
     return ImuSeries(
         sensor=samples[0].sensor if samples else "",
-        stamps_ns=np.array([m.stamp_ns for m in samples], dtype=np.int64),
+        stamps_ns=stamps_of(samples),
         accel_mps2=np.array([m.accel_mps2 for m in samples]).reshape(-1, 3),
         gyro_radps=np.array([m.gyro_radps for m in samples]).reshape(-1, 3),
         seqs=np.array([m.seq for m in samples], dtype=np.int64),

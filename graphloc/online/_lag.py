@@ -222,12 +222,12 @@ class Lag:
     def unmodelled_jumps(self) -> list[str]:
         """Names of the receivers that have jumped since the window was built, where the window can estimate that as their error."""
         streams = self.problem.streams.items()
-        return [n for n, s in streams if s.left_out is not None and s.jump_detector.jumps != s.jumps]
+        return [n for n, s in streams if s.left_out is not None and s.receiver.jump.jumps != s.jumps]
 
     def in_doubt(self, stamp_ns: int) -> str:
         """Return why the health cannot be good at a stamp: the only position sensor has jumped; empty where it has not."""
         streams = self.problem.streams.items()  # where a slow error is left out, the bounds include it
-        doubtful = [n for n, s in streams if (s.left_out is None or s.jumps) and s.jump_detector.doubtful(stamp_ns)]
+        doubtful = [n for n, s in streams if (s.left_out is None or s.jumps) and s.receiver.jump.doubtful(stamp_ns)]
         return "; ".join(why_in_doubt(n) for n in doubtful)
 
     def gone(self) -> list[LedgerRow]:

@@ -73,7 +73,7 @@ class LiveTimeline:
             share their slow error, those before and after a jump do not.
     """
 
-    def __init__(self, config: TimelineConfig, start_ns: int, jumps_ns: Collection[int] = ()) -> None:
+    def __init__(self, config: TimelineConfig, start_ns: int, jumps_ns: Collection[int]) -> None:
         self._start_ns, self._jumps_ns = start_ns, jumps_ns
         self._period_ns, self._slow_ns = duration_ns(1.0 / config.rate_hz), duration_ns(config.slow_period_s)
         self.stamps_ns: Tape[int] = Tape()
@@ -141,11 +141,17 @@ class LiveTimeline:
 
 
 @dataclass(slots=True, eq=False)
-class Repeats:
-    """Detectors of what a receiver repeats: of its fixes, or of its velocities."""
+class ReceiverDetectors:
+    """Detectors of what a receiver repeats, fixes or velocities, and of its position jumps; they outlive the window."""
 
-    fix: RepeatedFixDetector = field(default_factory=RepeatedFixDetector)
-    velocity: RepeatedVelocityDetector = field(default_factory=RepeatedVelocityDetector)
+    repeated_fix: RepeatedFixDetector = field(default_factory=RepeatedFixDetector)
+    repeated_velocity: RepeatedVelocityDetector = field(default_factory=RepeatedVelocityDetector)
+    jump: JumpDetector = field(default_factory=JumpDetector)
+
+    def forget(self) -> None:
+        """Forget what is by the estimate, which is given up; not the levels of the fixes: a restart makes none of them right."""
+        self.repeated_fix, self.repeated_velocity = RepeatedFixDetector(), RepeatedVelocityDetector()
+        self.jump.forget()
 
 
 @dataclass(slots=True, eq=False)
@@ -175,14 +181,13 @@ class LiveStream:
     by_stamp: list[tuple[int, int]] = field(default_factory=list)
     scatter: Scatter = field(default_factory=Scatter)
     frozen_detector: FrozenReceiverDetector = field(default_factory=FrozenReceiverDetector)
-    repeats: Repeats = field(default_factory=Repeats)
-    jump_detector: JumpDetector = field(default_factory=JumpDetector)
+    receiver: ReceiverDetectors = field(default_factory=ReceiverDetectors)
     jumps: tuple[PositionJump, ...] = ()
 
     @property
     def frozen(self) -> bool:
         """Whether it is a receiver that repeats one position while the vessel moves."""
-        return self.frozen_detector.frozen or self.repeats.fix.frozen
+        return self.frozen_detector.frozen or self.receiver.repeated_fix.frozen
 
     @property
     def noisier(self) -> float:
@@ -268,34 +273,30 @@ def live_problem(
     imu_config: Any,
     noise_scale: float,
     motion_model: MotionModel,
-    jump_detectors: MutableMapping[str, JumpDetector],
-    repeats: MutableMapping[str, Repeats],
+    receivers: MutableMapping[str, ReceiverDetectors],
     slow_known: Collection[str],
 ) -> LiveProblem:
     """Return a problem whose first state is at `start_ns`.
 
     Args:
         imu: the samples known from there on. imu_config: with the noise that they have, up to `noise_scale`.
-        jump_detectors, repeats: by sensor; missing ones are added.
+        receivers: by sensor; missing ones are added.
         slow_known: names of the sensors whose slow error is known at the start.
     """
     config, rows, mounts = setup.config, setup.rows, setup.mounts
     t, R = mount_of(imu.sensor, imu_config, mounts)
     by_kind = {row.kind: row for row in rows}
-    asked = {n: s for n, s in config.sensors.items() if s.kind in by_kind and s.enabled}
     company = company_of(config, rows)
     streams = {}
     for number, (name, block) in enumerate(config.sensors.items()):
-        if name not in asked:
+        if not block.enabled or block.kind not in by_kind:
             continue
         row = by_kind[block.kind]
         slow, left_out = slow_or_left_out(row, block, company)
         t_sensor, R_sensor = mount_of(name, block, mounts)
-        mount = gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t)
-        detector = jump_detectors.setdefault(name, JumpDetector())
-        if left_out is not None and (detector.jumps or name in slow_known):
+        receiver = receivers.setdefault(name, ReceiverDetectors())
+        if left_out is not None and (receiver.jump.jumps or name in slow_known):
             slow = without_drift(left_out)
-        scatter = Scatter(jumps=slow is not None and slow.jumps)
         streams[name] = LiveStream(
             number=number,
             name=name,
@@ -304,11 +305,10 @@ def live_problem(
             slow=slow,
             left_out=left_out,
             constants=row.constants(block),
-            mount=mount,
-            scatter=scatter,
-            jump_detector=detector,
-            repeats=repeats.setdefault(name, Repeats()),
-            jumps=detector.jumps,
+            mount=gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t),
+            scatter=Scatter(jumps=slow is not None and slow.jumps),
+            receiver=receiver,
+            jumps=receiver.jump.jumps,
         )
     jumps_ns = [jump.after_ns for stream in streams.values() if stream.left_out is not None for jump in stream.jumps]
     return LiveProblem(

@@ -13,14 +13,13 @@ from graphloc.measurements import ImuSample
 from graphloc.motion_model import MotionModel
 from graphloc.online._anchor import Anchor
 from graphloc.online._heading_check import HeadingCheck
-from graphloc.online._live import Repeats
+from graphloc.online._live import ReceiverDetectors
 from graphloc.online._noise import ImuNoise
 from graphloc.online._odometry import Odometry
 from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import UnmodelledError
-from graphloc.position_jumps import JumpDetector
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -35,8 +34,7 @@ class PersistentState:
         agreed_ns: stamp at which each absolute sensor last agreed, as known when the last window ended.
         odometry: the `odom` frame; None before the first start.
         motion_model: motion model. heading_check: whether the heading fits the motion.
-        jump_detectors: detectors of position jumps, by sensor: a restart does not make a level right.
-        repeats: detectors of what a receiver repeats, by sensor.
+        receivers: detectors of what a receiver repeats, and of its position jumps, by sensor.
         frozen: receivers that were last reported as frozen.
         unmodelled: what slow errors that are left out do to the newest state; None where none is left out.
     """
@@ -50,8 +48,7 @@ class PersistentState:
     odometry: Odometry | None = None
     motion_model: MotionModel = field(default_factory=MotionModel)
     heading_check: HeadingCheck = field(default_factory=HeadingCheck)
-    jump_detectors: dict[str, JumpDetector] = field(default_factory=dict)
-    repeats: dict[str, Repeats] = field(default_factory=dict)
+    receivers: dict[str, ReceiverDetectors] = field(default_factory=dict)
     frozen: set[str] = field(default_factory=set)
     unmodelled: UnmodelledError | None = None
 
@@ -103,14 +100,13 @@ class PersistentState:
         )
 
     def forget_receivers(self) -> None:
-        """Forget position jumps and repeated fixes, which are by the estimate: one that restarts takes a receiver as it is."""
-        self.repeats = {}
-        for detector in self.jump_detectors.values():
-            detector.forget()
+        """Forget position jumps and repeated fixes, which are by the estimate."""
+        for receiver in self.receivers.values():
+            receiver.forget()
 
     def forget_clock(self, stamp_ns: int) -> None:
         """Forget stamps of a clock that was set back; `stamp_ns`: by the clock as it is now."""
-        self.agreed_ns, self.jump_detectors, self.repeats = {}, {}, {}
+        self.agreed_ns, self.receivers = {}, {}
         self.sensor_noise.forget_clock()
         if self.odometry is not None:
             self.odometry.stamp_ns = stamp_ns

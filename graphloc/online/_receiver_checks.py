@@ -47,22 +47,23 @@ class ReceiverChecks:
             return ""
         hint = stream.row.hint(m, 0.0, self._problem.datum)
         if np.isfinite(hint.v_world_mps).all():
-            stream.repeats.velocity.note(m.stamp_ns, hint.v_world_mps)
-            return WHY_VELOCITY if stream.repeats.velocity.is_old(m.stamp_ns, hint.v_world_mps) else ""
+            repeated = stream.receiver.repeated_velocity
+            repeated.note(m.stamp_ns, hint.v_world_mps)
+            return WHY_VELOCITY if repeated.is_old(m.stamp_ns, hint.v_world_mps) else ""
         told_m = hint.p_world_m[:2]
         if not stream.row.absolute or not np.isfinite(told_m).all():
             return ""
         if self._repeats(stream, m, at, told_m):
-            return _FROZEN if stream.repeats.fix.frozen else _OLD
+            return _FROZEN if stream.receiver.repeated_fix.frozen else _OLD
         sigma_m = largest_sigma(residual.cov - _walked(residual, at))
         estimated_m = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2]
         if self._is_frozen(stream, m, told_m, estimated_m, sigma_m):
             return _FROZEN
         self._check_jump(stream, m.stamp_ns, told_m, sigma_m, self._off(stream, at, residual, told_m - estimated_m))
-        return _OFF if stream.jump_detector.suspects(m.stamp_ns) else ""
+        return _OFF if stream.receiver.jump.suspects(m.stamp_ns) else ""
 
     def _repeats(self, stream: LiveStream, m: Measurement, at: Attachment, told_m: Array) -> bool:
-        newest, detector = self._states.newest, stream.repeats.fix
+        newest, detector = self._states.newest, stream.receiver.repeated_fix
         # The antenna swings in waves, and the vessel may turn about it.
         slower_mps = min(newest.velocity, at.sensor_velocity_mps(), key=lambda v: float(np.linalg.norm(v[:2])))
         v_mps = np.asarray(at.T_world_body.rotation().matrix().T @ slower_mps)[:2]
@@ -92,7 +93,7 @@ class ReceiverChecks:
         Args:
             off_m: (2,) of the fix from the estimated place, slow error aside.
         """
-        if stream.left_out is None or not stream.left_out.jumps or stream.jump_detector.jumps != stream.jumps:
+        if stream.left_out is None or not stream.left_out.jumps or stream.receiver.jump.jumps != stream.jumps:
             return None
         without = residual.raw
         if stream.slow is not None and at.slow_value is not None and residual.slow_jacobian is not None:
@@ -112,7 +113,7 @@ class ReceiverChecks:
     ) -> None:
         if only_position_sensor(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
             allowed = stream.left_out is not None
-            found = stream.jump_detector.note(
+            found = stream.receiver.jump.note(
                 stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(stream.left_out), off=off
             )
             self._warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
@@ -120,7 +121,7 @@ class ReceiverChecks:
     def _reject_since(self, stream: LiveStream, since_ns: int, until_ns: int) -> None:
         """Take the fixes of an interval out of the graph: they pulled the estimate along."""
         self._agreement.forget_refused()
-        stream.jump_detector.forget_since(since_ns)
+        stream.receiver.jump.forget_since(since_ns)
         for entry in self._entries.of(stream):
             if since_ns <= entry.measurement.stamp_ns < until_ns:
                 self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0, reason=_FROZEN))

@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
-
 from graphloc.build import mount_of
 from graphloc.config import ImuConfig, VesselConfig
-from graphloc.frames import Array, Datum
+from graphloc.frames import Datum, yaw_from_rotation
 from graphloc.graph import Hint, InertialRow, Sensor
 from graphloc.measurements import Measurement
+from graphloc.recording import Mounts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,7 +28,7 @@ class Setup:
     config: VesselConfig
     rows: tuple[Sensor, ...]
     inertial: InertialRow
-    mounts: Mapping[str, tuple[Array, Array]]
+    mounts: Mounts
     lag_s: float
 
     @cached_property
@@ -75,7 +74,7 @@ class Setup:
         sensor = self.config.sensors[m.sensor]
         R = mount_of(m.sensor, sensor, self.mounts)[1]
         row = next(row for row in self.rows if row.kind == sensor.kind)
-        return row.hint(m, float(np.arctan2(R[1, 0], R[0, 0])), datum)
+        return row.hint(m, float(yaw_from_rotation(R)), datum)
 
     def scaled(self, times: Mapping[str, Mapping[str, float]]) -> Setup:
         """Return the same with numbers of sensors so many times as large; `times`: by sensor and key of its configuration."""

@@ -9,14 +9,14 @@ set back or where no absolute sensor agrees any more, the estimate restarts.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from graphloc.config import VesselConfig
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate, Event
-from graphloc.frames import Array, Datum
+from graphloc.frames import Datum
 from graphloc.frozen_imu import WHY
 from graphloc.graph import InertialRow, Sensor
 from graphloc.ledger import LedgerRow, Outcome
@@ -31,6 +31,7 @@ from graphloc.online._start import LEAST_S, Started, try_start
 from graphloc.online._tracking import Tracking, failure_text
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
+from graphloc.recording import Mounts
 from graphloc.solve._warnings import slow_error_warning
 from graphloc.thinning import THINNED, Thinning
 from graphloc.time import duration_ns, utc_text
@@ -64,7 +65,7 @@ class OnlineSmoother:
         rows: Sequence[Sensor],
         inertial: InertialRow,
         datum: Datum | None = None,
-        mounts: Mapping[str, tuple[Array, Array]] | None = None,
+        mounts: Mounts | None = None,
         lag_s: float = 10.0,
         snapshot: Path | None = None,
     ) -> None:

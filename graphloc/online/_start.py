@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 
 from graphloc import keys, origin
-from graphloc.build import Problem, build_graph, company_of, make_problem
+from graphloc.build import Made, Problem, build_graph, company_of, make_problem
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
 from graphloc.ledger import LedgerRow
@@ -243,7 +243,7 @@ def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:
     k = int(np.searchsorted(timeline.slow_of, min(timeline.slow_of[back], timeline.slow_of[last] - 1)))
     if k == 0 or last_ns - first_ns <= duration_ns(_WHOLE * lag_s):
         return 0, Anchor.of_start(first_ns, result.prior)
-    made: dict[tuple[int, int], range] = {}
+    made: Made = {}
     graph, guess = build_graph(problem, values, decisions(result.verdicts), 0, last, result.prior, made=made)
     # Earlier measurements may be attached to this state; the window takes only those from its stamp on.
     stamps_ns = {s.number: [m.stamp_ns for m in s.measurements] for s in problem.streams}

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -17,7 +16,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Going, Residual
 from graphloc.motion_model import UNSURE_MPS, Moving
-from graphloc.online._anchor import Anchor, without_prior
+from graphloc.online._anchor import Anchor, in_world, without_prior
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
@@ -43,13 +42,6 @@ class Newest:
     bias: gtsam.imuBias.ConstantBias
     pose_cov: Array
     velocity_cov: Array
-
-
-def in_world(pose: Any) -> Array:
-    """Return the rotation (15, 15) of pose, velocity and bias from the tangent at a pose (body axes) to the axes of world."""
-    turn = np.eye(15)
-    turn[:3, :3] = turn[3:6, 3:6] = pose.rotation().matrix()
-    return turn
 
 
 def propagated_covariance(cov: Array, newest: Newest, R: Array, dt_s: float, noise: Array) -> Array:
@@ -176,12 +168,8 @@ class States:
             return
         # The rotation across an IMU gap is unknown, and so are the axes that the model is about.
         if not any(a < end_ns and b > begin_ns and b - a > _HOLE_S * 1e9 for a, b in problem.links.gaps()):
-            before, now = self._moving(timeline.floor(begin_ns)), self._moving(timeline.last)
+            before, now = (Moving.of(self._window.values, k) for k in (timeline.floor(begin_ns), timeline.last))
             self._window.add(problem.motion_model.step(before, now, dt_s))
-
-    def _moving(self, k: int) -> Moving:
-        values, key = self._window.values, keys.velocity(k)
-        return Moving(key, np.asarray(values.atVector(key)), values.atPose3(keys.pose(k)).rotation().matrix())
 
     def _next_slow(self, j: int, dt_s: float, t: float) -> None:
         window = self._window

@@ -29,7 +29,7 @@ from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
 from graphloc.online._start import LEAST_S
-from graphloc.time import duration_ns
+from graphloc.time import duration_ns, stamps_of
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -100,8 +100,7 @@ class Tracking:
             imu_config=persistent.noise.of(setup.imu),
             noise_scale=persistent.noise.scale,
             motion_model=persistent.motion_model,
-            jump_detectors=persistent.jump_detectors,
-            repeats=persistent.repeats,
+            receivers=persistent.receivers,
             slow_known=anchor.slow,
         )
         if before is not None:
@@ -127,7 +126,7 @@ class Tracking:
         if len(self._pending) > _PENDING:
             self._ledger.drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
 
-    def keep_imu(self, m: ImuSample, hole: tuple[int, int] | None = None) -> None:
+    def keep_imu(self, m: ImuSample, hole: tuple[int, int] | None) -> None:
         """Keep an IMU sample; `hole`: of one that came late, the stamps (ns) of the samples before and after it."""
         if hole is not None:
             self._holes.append(hole)
@@ -192,7 +191,7 @@ class Tracking:
     def _read_imu(self) -> None:
         """Hand the samples that have arrived to the window; where they came late, integrate anew."""
         if self._unread:
-            stamps = np.array([m.stamp_ns for m in self._unread], dtype=np.int64)
+            stamps = stamps_of(self._unread)
             readings = np.array([np.hstack([m.accel_mps2, m.gyro_radps]) for m in self._unread])
             self.lag.problem.links.extend(stamps, readings)
             self._unread = []
@@ -343,8 +342,7 @@ class Tracking:
         ledger.enter(failed.gone())
         anchors = [a for a in recent.anchors if a.stamp_ns >= failed.first_ns]
         for anchor, without in [(anchors[0], False), (anchors[-1], True)] if anchors else []:
-            again = [m for m in recent.others() if m.stamp_ns >= anchor.stamp_ns and not ledger.has(m)]
-            again.sort(key=lambda m: m.stamp_ns)
+            again = [m for m in self.since(anchor.stamp_ns) if not isinstance(m, ImuSample)]
             mark = ledger.marked()
             try:
                 self._rebuild_from(anchor, [] if without else again, until_ns)

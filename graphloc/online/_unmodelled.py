@@ -25,9 +25,9 @@ import numpy as np
 from graphloc import keys
 from graphloc.frames import Array
 from graphloc.graph import Going, InertialLink, SlowProcess
-from graphloc.online._anchor import sound
+from graphloc.online._anchor import in_world, sound
 from graphloc.online._live import LiveStream
-from graphloc.online._states import Newest, in_world
+from graphloc.online._states import Newest
 from graphloc.solve._unmodelled import Unmodelled
 
 _ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)

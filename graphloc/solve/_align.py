@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.build import Level, Problem
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.errors import SolveError
-from graphloc.frames import Array, skew, wrap_angle, yaw_from_heading_deg
+from graphloc.frames import Array, skew, wrap_angle, yaw_from_heading_deg, yaw_from_rotation
 from graphloc.graph import Hint
 from graphloc.solve._standstill import Track, gyro_bias, samples_of, slope_of, standstill
 from graphloc.time import utc_text
@@ -110,8 +110,7 @@ def _hints(problem: Problem, origin: int) -> dict[str, list[tuple[float, Hint]]]
     """Return by sensor the hints (position, heading, velocity) of its measurements, with their times, s."""
     found = {}
     for stream in problem.streams:
-        R_sensor = stream.mount.rotation().matrix()
-        mount_yaw = float(np.arctan2(R_sensor[1, 0], R_sensor[0, 0]))
+        mount_yaw = float(yaw_from_rotation(stream.mount.rotation().matrix()))
         found[stream.name] = [
             ((m.stamp_ns - origin) * 1e-9, stream.row.hint(m, mount_yaw, problem.datum)) for m in stream.measurements
         ]
@@ -197,7 +196,7 @@ def _headings(
         sources.append("start.heading_deg")
     for name, rows in yaws.items():
         near = rows[rows[:, 0] <= max(config.window_s, rows[0, 0] + 5.0)]
-        at_start = wrap_angle(near[:, 1] - np.array([_turned(turn(s)) for s in near[:, 0]]))
+        at_start = wrap_angle(near[:, 1] - np.array([yaw_from_rotation(turn(s)) for s in near[:, 0]]))
         centre = _circular_median(at_start)
         candidates.append(centre)
         sources.append(f"{name} ({len(near)} readings)")
@@ -229,10 +228,6 @@ def _moved_at(track: Track) -> float | None:
     noise = 5.0 * float(np.nanmedian(track.sigma[:, :2]))
     far = np.flatnonzero(moved > max(MOVED_M, noise))
     return float(track.t[far[0]]) if len(far) else None
-
-
-def _turned(R: Array) -> float:
-    return float(np.arctan2(R[1, 0], R[0, 0]))
 
 
 def _circular_median(angles: Array) -> float:

@@ -8,15 +8,17 @@ between them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
 from graphloc.solve._hypotheses import log_false_again
 from graphloc.solve._prediction import Prediction, carried, kept_of, moved, taken_of, walk_of
+from graphloc.time import stamps_of
 
 _LOOK_BACK = 64  # candidates for the right one before
 
@@ -42,7 +44,7 @@ def best_chain(
     nothing = np.array(
         [np.log(m.probability) - 0.5 * (np.linalg.slogdet(2.0 * np.pi * m.cov)[1] + dof) for m in models]
     )
-    stamps = np.array([m.stamp_ns for m in taken]) * 1e-9
+    stamps = np.asarray(stamps_of(taken) * 1e-9, dtype=np.float64)
     walk = np.array([walk_of(m) for m in models])
     gained = _gained_by_repeats(models, residuals, predictions, nothing, stamps, walk)
     node = [(n, mode) for n, found in enumerate(residuals) for mode in range(len(found))]
@@ -79,12 +81,16 @@ def best_chain(
             score[k], before[k] = path[best], lo + best
     ends = score + np.maximum(gained[count] - gained[np.minimum(at + 2, count)], 0.0)
     chosen: list[int | None] = [None] * count
-    k = int(np.argmax(ends))
-    while k >= 0:
-        n, mode = node[k]
+    for n, mode in (node[k] for k in _backwards(int(np.argmax(ends)), before)):
         chosen[n] = mode
-        k = int(before[k])
     return chosen
+
+
+def _backwards(k: int, before: NDArray[np.int64]) -> Iterator[int]:
+    """Yield the nodes of a path from its last, k, to its first; `before`: the node before each, -1 of the first."""
+    while k >= 0:
+        yield k
+        k = int(before[k])
 
 
 def _gained_by_repeats(

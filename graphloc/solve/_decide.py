@@ -10,7 +10,7 @@ reject the right measurements.
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -132,8 +132,7 @@ def weigh(
         indices = [i for i in stream.between(first, last) if only is None or (stream.number, i) in only]
         if not indices:
             continue
-        met = [residuals_at(problem, stream, i, values) for i in indices]
-        attached, residuals = [at for at, _ in met], [found for _, found in met]
+        attached, residuals = _met(problem, stream, indices, values)
         if several and hypotheses:
             predictions = [
                 _predicted(r, at, int(stream.state[i]), covariance)
@@ -232,6 +231,14 @@ def by_hypotheses(
     return verdicts
 
 
+def _met(
+    problem: Problem, stream: Stream, indices: Iterable[int], values: gtsam.Values
+) -> tuple[list[Attachment], list[tuple[Residual, ...]]]:
+    """Return the attachments of measurements of a stream at an estimate, and the residuals of their modes there."""
+    met = [residuals_at(problem, stream, i, values) for i in indices]
+    return [at for at, _ in met], [found for _, found in met]
+
+
 def log_evidence(problem: Problem, values: gtsam.Values, first: int, last: int) -> float:
     """Return the log probability of states first..last around an estimate, marginalised over all hypotheses."""
     total = 0.0
@@ -249,9 +256,9 @@ def along_best_chains(problem: Problem, values: gtsam.Values, verdicts: Verdicts
     for stream in problem.streams:
         if stream.row.false is None:
             continue
-        met = [residuals_at(problem, stream, i, values) for i in range(len(stream.measurements))]
-        attached, residuals = [at for at, _ in met], [found for _, found in met]
-        chain = best_chain(stream, range(len(met)), residuals)
+        every = range(len(stream.measurements))
+        attached, residuals = _met(problem, stream, every, values)
+        chain = best_chain(stream, every, residuals)
         changed |= {(stream.number, i): v for i, v in enumerate(believing(chain, residuals, attached))}
     return changed
 
@@ -276,5 +283,5 @@ def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> D
 
 def predicted_covariance(tree: Any) -> PredictedCovariance:
     """Return (state, key) -> covariance of the key's value, from a Bayes tree."""
-    of_key = cache(lambda key: tree.marginalCovariance(key))
+    of_key = cache(tree.marginalCovariance)
     return lambda _state, key: of_key(key)

@@ -123,7 +123,7 @@ def log_false_again(
     return float(np.log(max(model.repeats * model.probability, 1e-12))) + _log_repeat(before, now, walked)
 
 
-def _log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...], walked: Array | float = 0.0) -> float:
+def _log_repeat(before: tuple[Residual, ...], now: tuple[Residual, ...], walked: Array | float) -> float:
     """Return the log density that the error of one measurement repeats in the next, over pairs of modes.
 
     Args:

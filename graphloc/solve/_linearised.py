@@ -14,7 +14,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from graphloc import keys
-from graphloc.build import JUMP, Decided, Problem, StartPrior, Stream, build_graph
+from graphloc.build import JUMP, Decided, Made, Problem, StartPrior, Stream, build_graph
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision
@@ -38,7 +38,7 @@ class Rows:
     states: int
     starts: NDArray[np.int64]
     stamps_ns: NDArray[np.int64]
-    made: dict[tuple[int, int], range]
+    made: Made
     kernels: list[tuple[range, KernelConfig]]
 
     def used(self, stream: Stream) -> list[int]:
@@ -81,7 +81,7 @@ def linearised(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior
         problem: that of the solution, or one with other slow states, which `values` then has.
         verdicts, prior: of the solution.
     """
-    last, made, decided = len(problem.timeline) - 1, dict[tuple[int, int], range](), {}
+    last, made, decided = len(problem.timeline) - 1, Made(), {}
     streams = {s.number: s for s in problem.streams}
     for key, verdict in verdicts.items():
         if verdict.decision is not None:

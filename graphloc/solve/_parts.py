@@ -100,20 +100,9 @@ def _cut(recording: Recording, bridge_s: float) -> list[Recording]:
 
 
 def _refused(part: Recording, why: str) -> list[LedgerRow]:
-    assert part.imu is not None
-    imu = ((seq, stamp, part.imu.sensor) for seq, stamp in zip(part.imu.seqs, part.imu.stamps_ns, strict=True))
-    others = ((m.seq, m.stamp_ns, m.sensor) for m in part.measurements if m.seq >= 0)
-    return [
-        LedgerRow(
-            seq=int(seq),
-            stamp_ns=int(stamp),
-            sensor=sensor,
-            topic=part.topics.get(sensor, ""),
-            outcome=Outcome.REJECTED,
-            reason=f"its part of the run could not be solved: {why}",
-        )
-        for seq, stamp, sensor in (*imu, *others)
-    ]
+    reason = f"its part of the run could not be solved: {why}"
+    others = (part.row_of(m, Outcome.REJECTED, reason) for m in part.measurements if m.seq >= 0)
+    return [*part.imu_rows(slice(None), Outcome.REJECTED, reason), *others]
 
 
 def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Sequence[str]) -> Solution:

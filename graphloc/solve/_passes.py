@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 
-from graphloc.build import Problem, StartPrior, build_graph
+from graphloc.build import Made, Problem, StartPrior, build_graph
 from graphloc.recording import Progress
 from graphloc.solve._decide import Stage, Verdicts, decisions, weigh
 from graphloc.solve._optimize import full_step, optimize
@@ -29,7 +29,7 @@ class Optimised:
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
-    made: dict[tuple[int, int], range]
+    made: Made
     iterations: int
     moved_m: float
 
@@ -38,7 +38,7 @@ def optimise_run(
     problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior, *, jumps: bool = True
 ) -> Optimised:
     """Optimise the whole run with the given decisions."""
-    last, made = len(problem.timeline) - 1, dict[tuple[int, int], range]()
+    last, made = len(problem.timeline) - 1, Made()
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps, made=made)
     solved = optimize(graph, guess, 12, 1e-3)
     return Optimised(solved.values, graph, made, solved.iterations, moved(guess, solved.values))
@@ -46,7 +46,7 @@ def optimise_run(
 
 def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Optimised:
     """Take one step over the whole run, and iterate only where the cost rises by more than a nonlinear step near the minimum does."""
-    last, made = len(problem.timeline) - 1, dict[tuple[int, int], range]()
+    last, made = len(problem.timeline) - 1, Made()
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, made=made)
     values, iterations = full_step(graph, guess), 1
     before = float(graph.error(guess))
@@ -61,7 +61,7 @@ class Settled:
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
-    made: dict[tuple[int, int], range]
+    made: Made
     verdicts: Verdicts
     passes: int
     iterations: int

@@ -15,6 +15,7 @@ from graphloc.build import Problem, Stream, solved_constants
 from graphloc.errors import in_one_line
 from graphloc.frames import Array
 from graphloc.recording import Recording
+from graphloc.series import interpolated
 from graphloc.solution import SlowEstimate, Solution
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._covariances import (
@@ -160,7 +161,7 @@ def _moved(problem: Problem, result: BatchResult, stream: Stream, berth: Berth, 
     at = problem.timeline.slow_stamps_ns
     nodes = [keys.slow(stream.number, j) for j in range(len(at))]
     held = np.array([result.values.atVector(key)[berth.moves + _IN_PLANE] for key in nodes])
-    return np.column_stack([np.interp(stamps, at, column) for column in held.T])
+    return interpolated(stamps, at, held)
 
 
 def _of_pose_and_berth(problem: Problem, result: BatchResult, stream: Stream, berth: Berth, k: int) -> Array:

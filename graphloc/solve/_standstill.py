@@ -10,6 +10,7 @@ import numpy as np
 
 from graphloc.build import Problem
 from graphloc.frames import Array
+from graphloc.series import runs
 from graphloc.time import duration_ns
 
 _STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
@@ -49,8 +50,7 @@ def standstill(problem: Problem, track: Track, yaws: dict[str, Array]) -> tuple[
         for a, b in pairwise(start)
     ]
     best: tuple[float, float] | None = None
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.array(quiet, dtype=int), [0]])))
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
+    for first, last in runs(np.array(quiet, dtype=bool)):
         longer = best is None or last - first > best[1] - best[0]
         if last - first >= 3 and longer and _rests(track, yaws, float(first), float(last)):
             best = (float(first), float(last))

@@ -64,22 +64,10 @@ def solve_start(problem: Problem, start: Start, progress: Progress, *, newest: b
     seconds, iterations, until = max(start.window_s, _placed_s(problem)), 0, 0
     longest_s = _LONGEST_UNTOLD_S if start.by_motion else _LONGEST_S
     candidates = [_candidate(problem, start, yaw) for yaw in start.yaws_rad]
-    failure: SolveError | None = None
     while True:
         known, until = until, _index_after(problem, seconds)
-        alive = []
-        for n, candidate in enumerate(candidates):
-            progress("start", n, len(candidates))
-            try:
-                iterations += _extend(problem, candidate, known, until)
-            except SolveError as caught:
-                failure = caught
-                continue
-            alive.append(candidate)
-        if not alive:
-            raise failure or SolveError("the start alignment found no heading to try")
-        alive.sort(key=lambda c: c.cost)
-        candidates = _different(alive)
+        alive, used = _extended(problem, candidates, known, until, progress)
+        candidates, iterations = _different(alive), iterations + used
         told_apart, last_window = len(candidates) == 1, seconds >= longest_s or until == len(problem.timeline) - 1
         if start.by_motion:
             for candidate in candidates if start.tried else ():
@@ -92,13 +80,34 @@ def solve_start(problem: Problem, start: Start, progress: Progress, *, newest: b
         if told_apart or last_window:
             heading_var = np.zeros(until + 1)
             if start.by_motion:
-                heading_var[:] = 0.0 if told_apart else _var_at(problem, start, best, until, until, beside)
-                if not newest:
-                    stamps = problem.timeline.stamps_ns[: until + 1]
-                    ends = _var_at(problem, start, best, until, 0), heading_var[-1]
-                    heading_var = np.interp(stamps, stamps[[0, -1]], ends)
+                last_var = 0.0 if told_apart else _var_at(problem, start, best, until, until, beside)
+                first_var = last_var if newest else _var_at(problem, start, best, until, 0)
+                stamps = problem.timeline.stamps_ns[: until + 1]
+                heading_var = np.interp(stamps, stamps[[0, -1]], (first_var, last_var))
             return Begun(best.values, best.prior, until, iterations, len(candidates), heading_var)
         seconds *= 1.6
+
+
+def _extended(
+    problem: Problem, candidates: Sequence[_Candidate], known: int, until: int, progress: Progress
+) -> tuple[list[_Candidate], int]:
+    """Extend candidates to a state; return those that can be extended, the cheapest first, and the iterations.
+
+    Raises:
+        SolveError: there is none.
+    """
+    alive, iterations, failure = list[_Candidate](), 0, SolveError("the start alignment found no heading to try")
+    for n, candidate in enumerate(candidates):
+        progress("start", n, len(candidates))
+        try:
+            iterations += _extend(problem, candidate, known, until)
+        except SolveError as caught:
+            failure = caught
+            continue
+        alive.append(candidate)
+    if not alive:
+        raise failure
+    return sorted(alive, key=lambda c: c.cost), iterations
 
 
 def _placed_s(problem: Problem) -> float:

@@ -12,6 +12,7 @@ from graphloc import keys
 from graphloc.build import (
     Decided,
     Decisions,
+    Made,
     Past,
     Problem,
     StartPrior,
@@ -35,7 +36,7 @@ class StretchStep(NamedTuple):
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
-    made: dict[tuple[int, int], range]
+    made: Made
     iterations: int
     error: float
     moved_m: float
@@ -57,7 +58,7 @@ def solve_stretch(
 
     `beside`: a factor (gtsam.NonlinearFactor) that is no part of the run.
     """
-    made: dict[tuple[int, int], range] = {}
+    made: Made = {}
     graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps, made=made)
     if beside is not None:
         graph.add(beside)

@@ -12,13 +12,14 @@ from graphloc.config import SIGMA_SCALES, SensorConfig
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.position_jumps import jump_warnings, largest_sigma
+from graphloc.series import runs
 from graphloc.solution import Graded, SolveStats
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
 from graphloc.solve._decide import AGREES
 from graphloc.solve._health import CONTRADICTING_COST
 from graphloc.solve._imu_noise import too_quiet
 from graphloc.solve._passes import expected_cost
-from graphloc.time import utc_text
+from graphloc.time import stamps_of, utc_text
 
 _FAR_OFF = 3.0
 _MUCH_NOISIER = 1.5
@@ -74,11 +75,10 @@ def joint_rejection_warning(sensor: str, stamps_ns: NDArray[np.int64], weights: 
     Args:
         false: (N,) probability of each that it is false.
     """
-    edges = np.flatnonzero(np.diff((weights < AGREES).astype(int), prepend=0, append=0)).reshape(-1, 2)
     chance = np.concatenate([[0.0], np.cumsum(np.log(np.maximum(false, 1e-6)))])
     rows = [
         ((stamps_ns[end - 1] - stamps_ns[begin]) * 1e-9, begin, end)
-        for begin, end in edges
+        for begin, end in runs(weights < AGREES)
         if end - begin < len(weights) and np.log(len(weights)) + chance[end] - chance[begin] < np.log(_BY_CHANCE)
     ]
     lasts_s, begin, end = max(rows, default=(0.0, 0, 0))
@@ -202,7 +202,7 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     warnings += disagreement_warning(stream.name, weights)
     warnings += noisier_warning(stream.name, _noisier(stream, result))
     if stream.row.false is not None:
-        stamps_ns = np.array([m.stamp_ns for m in stream.measurements])
+        stamps_ns = stamps_of(stream.measurements)
         false = np.array([stream.row.false(m, stream.config).probability for m in stream.measurements])
         warnings += joint_rejection_warning(stream.name, stamps_ns, weights, false)
     return warnings

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Columns of numbers over time: between their stamps, summed up, how large, how scattered, and where in a row."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+
+
+def interpolated(t: NDArray[Any], at: NDArray[Any], columns: Array) -> Array:
+    """Return columns (N, k), known at times `at` (N,), at times `t` (M,): linear in between, constant beyond the ends."""
+    return np.column_stack([np.interp(t, at, column) for column in columns.T])
+
+
+def integral(t_s: Array, values: NDArray[Any]) -> NDArray[Any]:
+    """Return the running integral of values (N, ...) over times (N,), by trapezia; real or complex, 0 at first."""
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s).reshape(-1, *[1] * (values.ndim - 1))
+    return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])
+
+
+def rms(values: Array) -> float:
+    """Return the root of the mean square of values (N, ...)."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def robust_sigma(off: NDArray[Any]) -> Array:
+    """Return the sigma (...) of values (N, ...) about zero by their median size, as of a normal: outliers hardly change it."""
+    return np.asarray(1.4826 * np.median(np.abs(off), axis=0))
+
+
+def runs(there: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return (K, 2) where values (N,) are true in a row: the first index of each run, and the one after its last."""
+    return np.flatnonzero(np.diff(there, prepend=False, append=False)).reshape(-1, 2)
