@@ -33,7 +33,7 @@ from graphloc.frontends.aerial.scan import LevelCloud, outline
 from graphloc.frontends.aerial.scans import Matched
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.gather import _matches, with_matches
-from graphloc.gather._matches import Matches, few_matches
+from graphloc.gather._matches import Matches, few_matches, turned_heading
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.time import stamps_of
@@ -174,8 +174,8 @@ def test_matches_are_spent_where_they_inform(bag: Path) -> None:
     assert [len(matched(bag, moored, aerial(bag, every_m=4.0, still_s=s)[0])) for s in (6.0, 1000.0)] == [3, 1]
 
 
-@pytest.mark.parametrize(("window", "cut_off"), [({}, False), ({"window_m": 3.0}, True), ({"window_deg": 5.0}, True)])
-def test_a_window_that_three_sigmas_exceed_is_told(window: dict[str, float], cut_off: bool, bag: Path) -> None:
+@pytest.mark.parametrize(("window", "cut_off"), [({}, False), ({"window_m": 1.9}, True), ({"window_deg": 3.5}, True)])
+def test_a_window_that_two_sigmas_exceed_is_told(window: dict[str, float], cut_off: bool, bag: Path) -> None:
     """The prior is good to 1 m and 1.8 deg."""
     assert matched_alone(bag, **window)[0].cut_off is cut_off
 
@@ -193,11 +193,25 @@ def test_a_tenth_of_the_windows_may_be_too_small(
     assert with_matches(recording, vessel, datum, solution, app.Scans((bag / "run",), bag)).cut_off is cut_off
 
 
-@pytest.mark.parametrize("cut_off", [False, True])
-def test_where_windows_were_too_small_scans_are_matched_around_the_second_track(
-    cut_off: bool, bag: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("turn_deg", "sigma_deg", "count", "said"),
+    [(-10.0, 4.0, 5, True), (-10.0, 4.0, 4, False), (-10.0, 5.5, 5, False), (-50.0, 15.0, 5, False)],
+)
+def test_a_heading_that_matches_turn_is_said_where_another_sensor_told_it(
+    turn_deg: float, sigma_deg: float, count: int, said: bool
 ) -> None:
-    """Without a compass the heading is open by tens of degrees: of a window of 5, most scans stayed refused."""
+    """One false match among them changes nothing."""
+    turns = [(np.radians(turn_deg), np.radians(sigma_deg))] * (count - 1) + [(0.0, np.radians(sigma_deg))]
+    lines = turned_heading("aerial", turns)
+    assert len(lines) == said
+    assert all(f"turn the heading by {turn_deg:.1f} deg" in line and "to 4.0 deg (1 sigma)" in line for line in lines)
+
+
+@pytest.mark.parametrize(("cut_off", "fewest", "again"), [(False, 0, False), (True, 0, True), (True, 1, False)])
+def test_where_windows_were_too_small_scans_are_matched_around_the_second_track(
+    cut_off: bool, fewest: int, again: bool, bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a compass the heading is open by tens of degrees: of a window of 5, most scans stayed refused. Where none is used, too."""
     recording, vessel = loaded(bag)
     fixes = tuple(m for m in recording.measurements if m.sensor == "gnss")
     short, around = replace(recording, measurements=fixes), list[Solution]()
@@ -205,12 +219,16 @@ def test_where_windows_were_too_small_scans_are_matched_around_the_second_track(
     def faked(given: Recording, _config: VesselConfig, _datum: Datum, solution: Solution, *_: object) -> Matches:
         assert sum(m.sensor == "gnss" for m in given.measurements) == len(fixes)  # whatever was found before
         around.append(solution)
-        return Matches(replace(given, measurements=fixes[: 10 + len(around)]), cut_off)
+        return Matches(replace(given, measurements=fixes[: 10 + len(around)]), cut_off, [f"turned, {len(around)}"])
 
     monkeypatch.setattr(_estimate, "with_matches", faked)
+    monkeypatch.setattr(_estimate, "_FEWEST_MATCHES", fewest)
     run = app.smooth_recording(short, vessel, scans=app.Scans((bag / "run",), bag))
     used = [len([row for row in s.ledger if row.sensor == "gnss"]) for s in (*around, run.solution)]
-    assert used == ([len(fixes), 11, 12] if cut_off else [len(fixes), 11])
+    assert used == ([len(fixes), 11, 12] if again else [len(fixes), 11])
+    assert [w for w in run.recording.warnings if "turned" in w] == [
+        "turned, 1"
+    ]  # the second track has the first matches
 
 
 def test_scans_are_laid_together(bag: Path) -> None:

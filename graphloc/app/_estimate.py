@@ -27,6 +27,7 @@ from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
 from graphloc.frozen_receiver import without_frozen_fixes
 from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
+from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.offsets import Probe
 from graphloc.recording import Progress, Recording, quiet
@@ -34,6 +35,8 @@ from graphloc.replay import Status, replay, silent
 from graphloc.solution import Solution
 from graphloc.solve import smooth
 from graphloc.time import NS_PER_S
+
+_FEWEST_MATCHES = 5  # used, without which a track is no better to match around than the one before
 
 
 def configured(config_path: Path, changes: Mapping[str, object] = MappingProxyType({})) -> VesselConfig:
@@ -71,7 +74,8 @@ def smooth_recording(
     """Smooth a recording; hold fixes out and run the filters beside it if asked.
 
     With `scans` and an aerial sensor the run is smoothed, its scans are matched around that, and it is smoothed again. Where the
-    first track left more open than the search windows hold, scans are matched once more, around the second.
+    first track left more open than the search windows hold, and some matches are used all the same, scans are matched once more, around
+    the second.
     """
     held: tuple[GnssPosition, ...] = ()
     if hold_out is not None:
@@ -82,12 +86,7 @@ def smooth_recording(
     solution = solve(recording, config, datum, probe=None if matched else calibrate.PROBE, progress=progress)
     gallery = Gallery()
     if scans is not None and matched:
-        found = with_matches(recording, config, datum, solution, scans, progress, gallery)
-        if found.cut_off:
-            solution, gallery = solve(found.recording, config, datum, progress=progress), Gallery()
-            found = with_matches(recording, config, datum, solution, scans, progress, gallery)
-        recording = found.recording
-        solution = solve(recording, config, datum, probe=calibrate.PROBE, progress=progress)
+        recording, solution, gallery = _matched(recording, config, datum, solution, scans, progress)
     filters: tuple[ekf.FilterResult, ...] = ()
     online, never = None, ""
     if compare:
@@ -108,6 +107,27 @@ def smooth_recording(
         calibration=calibrate.calibrate(recording, config, solution),
     )  # fmt: skip
     return made_comparable(_with_underlay(run, scans))
+
+
+def _matched(
+    recording: Recording, config: VesselConfig, datum: Datum, alone: Solution, scans: Scans, progress: Progress
+) -> tuple[Recording, Solution, Gallery]:
+    """Match scans around a solution without matches, and solve with them; once more where that leaves much open, if some are used.
+
+    Returns:
+        The recording with its matches, the solution with these, and pictures of some.
+    """
+    gallery = Gallery()
+    first = with_matches(recording, config, datum, alone, scans, progress, gallery)
+    solution = solve(first.recording, config, datum, probe=calibrate.PROBE, progress=progress)
+    found, counts = first, solution.ledger.counts()
+    used = sum(counts[name].get(Outcome.USED.value, 0) for name in config.of_kind("aerial") if name in counts)
+    if first.cut_off and used >= _FEWEST_MATCHES:
+        gallery = Gallery()
+        found = with_matches(recording, config, datum, solution, scans, progress, gallery)
+        solution = solve(found.recording, config, datum, probe=calibrate.PROBE, progress=progress)
+    warnings = (*found.recording.warnings, *first.turned)
+    return replace(found.recording, warnings=warnings), solution, gallery
 
 
 def _when_measured(held: Sequence[GnssPosition], solution: Solution) -> tuple[GnssPosition, ...]:

@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from graphloc.config import VesselConfig
 from graphloc.eval.match_picture import Gallery
-from graphloc.frames import Datum
+from graphloc.frames import Datum, wrap_angle
 from graphloc.frontends._part import Bags
 from graphloc.frontends.aerial import match_bag
 from graphloc.frontends.aerial.matcher import NO_POSE
@@ -19,6 +22,12 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 
 _MISLED = 0.25  # matches to scans that fit nowhere, below which the former are doubted
+_SURE = 0.5  # probability of a match that counts for how the heading turns
+_TURNED_SIGMAS, _TOLD_RAD, _FEWEST = (
+    2.0,
+    np.radians(10.0),
+    5,
+)  # of the heading without matches; a larger sigma tells none
 _CUT_OFF = 0.1  # share of scans whose search windows were too small, above which they are matched once more
 
 
@@ -31,10 +40,15 @@ class Scans:
 
 
 class Matches(NamedTuple):
-    """A recording with its matches; `cut_off`: many of the windows were too small for what the solution left open."""
+    """A recording with its matches.
+
+    Attributes:
+        cut_off: many of the windows were too small for what the solution left open. turned: what is said of headings (`turned_heading`).
+    """
 
     recording: Recording
     cut_off: bool
+    turned: list[str]
 
 
 def with_matches(
@@ -53,11 +67,11 @@ def with_matches(
     """
     gathered, track = Gathering(recording), solution.trajectory
     span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
-    tried = cut_off = 0
+    tried, cut_off, turned = 0, 0, list[str]()
     for name, sensor in config.of_kind("aerial").items():
         gathered.sensor(name, dict.fromkeys((lidar.topic for lidar in sensor.lidars.values()), f"read by {name}"))
         found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=gathered.said.append)
-        matched = 0
+        matched, turns = 0, list[tuple[float, float]]()
         for item in found:
             if item.match is not None:
                 tried, cut_off = tried + 1, cut_off + item.match.cut_off
@@ -65,13 +79,35 @@ def with_matches(
                     gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
             if item.match is not None and item.match.modes:
                 matched += 1
+                best, prior = item.match.modes[0], item.match.prior
+                if best.probability > _SURE:
+                    turns.append((float(wrap_angle(best.pose[2] - prior.pose[2])), float(prior.sigma[2])))
                 gathered.take(item.match.fix(item.stamp_ns, name, item.news, sensor.axes))
             else:
                 gathered.refuse(name, item.stamp_ns, item.why_not)
             progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)
         progress("matching", span_s, span_s)
         gathered.said += few_matches(name, gathered.refused(name), matched)
-    return Matches(gathered.recording(), cut_off > _CUT_OFF * tried)
+        turned += turned_heading(name, turns)
+    return Matches(gathered.recording(), cut_off > _CUT_OFF * tried, turned)
+
+
+def turned_heading(sensor: str, turns: Sequence[tuple[float, float]]) -> list[str]:
+    """Say so where matches turn the heading by more than a sensor of it is likely to be off: one of the two may be mounted askew.
+
+    Args:
+        turns: yaw of each sure match less that of the solution without matches, and the latter's sigma, rad.
+    """
+    if len(turns) < _FEWEST:
+        return []
+    turn, sigma = np.median(np.array(turns), axis=0)
+    if sigma > _TOLD_RAD or abs(turn) < _TURNED_SIGMAS * sigma:
+        return []
+    line = (
+        f"{sensor}: its matches turn the heading by {np.degrees(turn):.1f} deg (counter-clockwise) from what the rest of the run tells to "
+        f"{np.degrees(sigma):.1f} deg (1 sigma); bounds include neither a LiDAR's mount nor a heading sensor that is off by so much"
+    )
+    return [line]
 
 
 def few_matches(sensor: str, reasons: Counter[str], matched: int) -> list[str]:
