@@ -38,7 +38,7 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
     part = stream.part
     gnss = gnss if part is None else part.antennas
     told = "enu" if part is not None and part.told else None
-    default = "enu" if part is None or part.told else "ned"
+    default = "enu" if part is None or part.told else part.usual
     plain: dict[str, Any] = {
         "topic": stream.topic,
         "msgtype": stream.msgtype,
