@@ -27,7 +27,7 @@ from graphloc.frontends._vendor_types import VENDOR_TYPES
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS, QUATERNION, TWIST, ImuReading, stamp_ns_of
 from graphloc.frontends.inspect import inspect_bag
-from graphloc.frontends.vendors import VENDORS, Part
+from graphloc.frontends.vendors import VENDORS
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
