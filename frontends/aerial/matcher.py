@@ -103,15 +103,15 @@ class Matcher:
         if len(found.faces_m) + len(found.shore_m) < _LEAST_PLACES:
             return Match(prior, found, why_not=_too_little(found))
         layers = self._map.around(prior.pose, found)
-        need_m = max(3.0 * float(prior.sigma[:2].max()) + 1.0, 2.0)
-        need_deg = max(float(np.degrees(3.0 * prior.sigma[2])) + 0.5, 1.0)
-        half_m, half_deg = min(need_m, config.window_m), min(need_deg, config.window_deg)
+        open_m, open_deg = 3.0 * float(prior.sigma[:2].max()), float(np.degrees(3.0 * prior.sigma[2]))
+        half_m = float(np.clip(open_m + 1.0, 2.0, config.window_m))
+        half_deg = float(np.clip(open_deg + 0.5, 1.0, config.window_deg))
         grid = grid_around(layers, prior.pose, half_m, half_deg)
         score = log_likelihood_of(found, layers, grid)
         trust = _trust(score, _within(prior.sigma, np.array([half_m, half_m, np.radians(half_deg)])))
         modes, none = modes_of(score, grid, _NONE_LOG, 1.0 - trust, _MODES)
         why_not = "" if modes else NO_POSE
-        cut_off = half_m < need_m or half_deg < need_deg
+        cut_off = half_m < open_m or half_deg < open_deg
         return Match(prior, found, layers, grid, score, tuple(modes), none, why_not, cut_off)
 
 
