@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig
 from graphloc.frames import wrap_angle
+from graphloc.frontends._assess import Courses
 from graphloc.frontends._assess_compass import compass_report
 from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._rejections import Rejection
@@ -471,6 +472,26 @@ def test_at_rest_a_heading_has_the_convention_that_its_driver_comes_with(msgtype
     found = compass_report(stream, None, None)
     assert found is not None
     assert (found.usable, found.convention) == (True, convention)
+
+
+@pytest.mark.parametrize("baseline_deg", [0.0, 90.0])
+@pytest.mark.parametrize("course_deg", [20.0, 45.0, 90.0, 200.0])
+@pytest.mark.parametrize(("msgtype", "convention"), [(SBG + "SbgGpsHdt", "ned"), (SBF + "AttEuler", "enu")])
+def test_on_a_straight_antennas_are_along_or_athwart(
+    msgtype: str, convention: str, course_deg: float, baseline_deg: float
+) -> None:
+    """Of athwart ones the smaller offset is that of the wrong convention: 40 rather than 90 deg on a course of 20 deg."""
+    heading = np.radians(course_deg + baseline_deg)
+    stream = TopicData("/heading", QUATERNION, part=VENDORS[msgtype][0])
+    for k in range(200):
+        angle = heading + 0.02 * np.sin(k)
+        half = 0.5 * (angle if convention == "ned" else np.pi / 2.0 - angle)
+        stream.add(START_NS + k * S // 5, START_NS + k * S // 5, (0.0, 0.0, np.sin(half), np.cos(half)), "bag")
+    course = np.full(200, np.radians(90.0 - course_deg)) + 0.02 * np.cos(np.arange(200))
+    found = compass_report(stream, Courses(stream.stamps_ns, course), None)
+    assert found is not None
+    assert found.convention == convention
+    assert found.offset_deg == pytest.approx(-baseline_deg, abs=2.0)
 
 
 @pytest.mark.parametrize(("kind", "value"), [("string", "x"), ("float64[]", np.ones(2))])
