@@ -23,6 +23,7 @@ _TURNS_DEG, _SAME_DEG = 5.0, 0.2  # how much two headings must turn, and may dif
 _DELAYS_S = np.arange(-50, 51) / 100.0  # of one heading against another that is the same
 _MOST_COMPARED = 5000  # headings of a long run
 _STRAIGHT_DEG = 20.0  # courses that turn by less tell no convention
+_ASKEW_DEG = 15.0  # antennas are mounted along a vessel or athwart, to this
 _BLOCK_S = 30
 _SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
 _RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
@@ -39,7 +40,7 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
     part = stream.part
     gnss = gnss if part is None else part.antennas
     told = "enu" if part is not None and part.told else None
-    default = "enu" if part is None or part.told else "ned"
+    default = "enu" if part is None or part.told else part.usual
     plain: dict[str, Any] = {
         "topic": stream.topic,
         "msgtype": stream.msgtype,
@@ -60,8 +61,9 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
         named = stream.msgtype == QUATERNION  # a topic of bare orientations is meant as a compass
         return CompassReport(**plain, **untold, usable=named, convention=told or by_gyro or default, why=why)
     origin = int(stream.stamps_ns[keep[0]])
+    usual = part.usual if part is not None else None
     fit = _beside_courses(
-        (stamps_ns - origin) / NS_PER_S, angle, (courses.stamps_ns - origin) / NS_PER_S, courses, told or by_gyro
+        (stamps_ns - origin) / NS_PER_S, angle, (courses.stamps_ns - origin) / NS_PER_S, courses, told or by_gyro, usual
     )
     # Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
     # an IMU's own orientation follows the gyroscope wherever north is.
@@ -110,19 +112,32 @@ class _Fit(NamedTuple):
     straight: bool
 
 
-def _beside_courses(t_s: Array, angle: Array, courses_s: Array, courses: Courses, by_gyro: str | None) -> _Fit:
+def _beside_courses(
+    t_s: Array, angle: Array, courses_s: Array, courses: Courses, by_gyro: str | None, usual: str | None
+) -> _Fit:
     """Return how a heading fits the courses, in the convention that the gyroscope tells, or that fits best.
 
     Args:
         t_s, angle: (N,) s; (N,) rad, unwrapped. courses_s: (M,), s, of the courses, from the same origin.
+        usual: of a maker's driver, the convention that it comes with.
     """
     measured = np.interp(courses_s, t_s, angle)
     apart = {convention: _in_enu(measured, convention) - courses.course_rad for convention in ("enu", "ned")}
     fits = {convention: _middle_deg(off) for convention, off in apart.items()}
     turned = float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(max(abs(np.exp(1j * courses.course_rad).mean()), 1e-9))))))
     straight = turned < _STRAIGHT_DEG
-    # On a straight both conventions fit with some offset: the smaller offset is likelier.
-    convention = by_gyro or min(fits, key=lambda c: abs(fits[c][0]) if straight else fits[c][1])
+
+    def unlikely(convention: str) -> tuple[float, ...]:
+        offset_deg, scatter_deg = fits[convention]
+        if not straight:
+            return (scatter_deg,)
+        # On a straight both conventions fit with some offset: the smaller offset is likelier, of two antennas one of quarter turns.
+        if usual is None:
+            return (abs(offset_deg),)
+        askew = abs((offset_deg + 45.0) % 90.0 - 45.0) > _ASKEW_DEG
+        return askew, round(abs(offset_deg) / 90.0), convention != usual
+
+    convention = by_gyro or min(fits, key=unlikely)
     return _Fit(convention, *fits[convention], apart[convention], straight)
 
 

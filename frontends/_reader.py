@@ -104,7 +104,7 @@ class Reader:
         if decoder is not None:
             try:
                 value = decoder(msg, stamp_ns, seq, readings.sensor, readings.config)
-            except (ValueError, ArithmeticError, AttributeError) as error:
+            except (ValueError, ArithmeticError, AttributeError, TypeError) as error:
                 value = malformed(" ".join(str(error).split()))
         if not isinstance(value, Rejection):
             readings.add(seq, stamp_ns, raw.log_ns, value, raw.file)

@@ -62,13 +62,14 @@ class Part(NamedTuple):
 
     Attributes:
         kind: the kind of sensor that reads it. read: takes the message. told: whether its axes are known by the type; else `convention`
-            tells them. antennas: whether a heading is one of GNSS, not of a filter.
+            tells them, and `usual` is that of a driver that is left as it comes. antennas: whether a heading is one of GNSS, not of a filter.
     """
 
     kind: str
     read: Callable[[Any], Said | Rejection]
     told: bool = True
     antennas: bool = True
+    usual: str = "ned"
 
 
 _FEWEST_M, _MOST_M = 1e-4, 1e3  # sigmas of a fix that are believed; a receiver that knows its place no better has none
@@ -454,7 +455,7 @@ VENDORS: dict[str, tuple[Part, ...]] = {
     ),
     "novatel_oem7_msgs/msg/HEADING2": (Part("compass", _oem7_heading),),
     "septentrio_gnss_driver/msg/PVTGeodetic": (Part("gnss", _sbf_place), Part("gnss_velocity", _sbf_velocity)),
-    "septentrio_gnss_driver/msg/AttEuler": (Part("compass", _sbf_heading, told=False),),
+    "septentrio_gnss_driver/msg/AttEuler": (Part("compass", _sbf_heading, told=False, usual="enu"),),
     "px4_msgs/msg/SensorCombined": (Part("imu", _px4_imu),),
     **dict.fromkeys(("px4_msgs/msg/SensorGps", "px4_msgs/msg/VehicleGpsPosition"), _GPS),
 }  # fmt: skip

@@ -26,7 +26,9 @@ from graphloc.series import runs
 from graphloc.time import NS_PER_S, stamps_of
 
 _M = TypeVar("_M", bound=Measurement)
-WHY = "frozen receiver or driver: it repeats one position while the vessel moves"
+FROZEN = "frozen receiver"
+"""How the reason begins for which a fix of one is rejected, offline and online."""
+WHY = f"{FROZEN} or driver: it repeats one position while the vessel moves"
 WHY_VELOCITY = "frozen receiver or driver: it repeats one velocity bit for bit"
 # A stretch of one position; a driver that repeats fixes does so for less (`frontends/_fixes.py`).
 HELD_S, FEWEST = 2.5, 3

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of makers' own packages: values worked out by hand, flags, stamps, versions, and what `inspect` drafts of them."""
 
+import re
 from collections.abc import Callable
 from datetime import datetime
 from functools import partial
@@ -10,11 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
-from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig
+from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig
 from graphloc.frames import wrap_angle
+from graphloc.frontends._assess import Courses
+from graphloc.frontends._assess_compass import compass_report
 from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import EAST_AXES, NORTH_AXES
@@ -22,10 +26,12 @@ from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import MessageTypes
 from graphloc.frontends._vendor_types import VENDOR_TYPES
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.decode import DECODERS, TWIST, ImuReading, stamp_ns_of
+from graphloc.frontends.decode import DECODERS, QUATERNION, TWIST, ImuReading, stamp_ns_of
+from graphloc.frontends.inspect import inspect_bag
 from graphloc.frontends.vendors import VENDORS
+from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity
-from tests.bagfactory import START_NS, Item, Messages, S
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.makers import said
 from tests.test_inspect import drive, look
 
@@ -453,6 +459,78 @@ def test_without_a_track_a_velocity_has_the_axes_of_its_type(msgtype: str, axes:
     """And no other: what looks like speeds along the vessel is one over ground all the same."""
     stream = TopicData("/vel", TWIST, part=VENDORS[msgtype][0])
     assert velocity_report(stream, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None).axes == axes
+
+
+@pytest.mark.parametrize(
+    ("msgtype", "convention"), [(SBG + "SbgGpsHdt", "ned"), (SBF + "AttEuler", "enu"), (OEM7 + "HEADING2", "enu")]
+)
+def test_at_rest_a_heading_has_the_convention_that_its_driver_comes_with(msgtype: str, convention: str) -> None:
+    """Septentrio's, unlike SBG's, comes set to east, counter-clockwise (`use_ros_axis_orientation`)."""
+    stream = TopicData("/heading", QUATERNION, part=VENDORS[msgtype][0])
+    for k in range(30):
+        stream.add(START_NS + k * S, START_NS + k * S, (0.0, 0.0, 0.5, 0.75**0.5), "bag")
+    found = compass_report(stream, None, None)
+    assert found is not None
+    assert (found.usable, found.convention) == (True, convention)
+
+
+@pytest.mark.parametrize("baseline_deg", [0.0, 90.0])
+@pytest.mark.parametrize("course_deg", [20.0, 45.0, 90.0, 200.0])
+@pytest.mark.parametrize(("msgtype", "convention"), [(SBG + "SbgGpsHdt", "ned"), (SBF + "AttEuler", "enu")])
+def test_on_a_straight_antennas_are_along_or_athwart(
+    msgtype: str, convention: str, course_deg: float, baseline_deg: float
+) -> None:
+    """Of athwart ones the smaller offset is that of the wrong convention: 40 rather than 90 deg on a course of 20 deg."""
+    heading = np.radians(course_deg + baseline_deg)
+    stream = TopicData("/heading", QUATERNION, part=VENDORS[msgtype][0])
+    for k in range(200):
+        angle = heading + 0.02 * np.sin(k)
+        half = 0.5 * (angle if convention == "ned" else np.pi / 2.0 - angle)
+        stream.add(START_NS + k * S // 5, START_NS + k * S // 5, (0.0, 0.0, np.sin(half), np.cos(half)), "bag")
+    course = np.full(200, np.radians(90.0 - course_deg)) + 0.02 * np.cos(np.arange(200))
+    found = compass_report(stream, Courses(stream.stamps_ns, course), None)
+    assert found is not None
+    assert found.convention == convention
+    assert found.offset_deg == pytest.approx(-baseline_deg, abs=2.0)
+
+
+@pytest.mark.parametrize(("kind", "value"), [("string", "x"), ("float64[]", np.ones(2))])
+def test_fields_of_other_types_are_no_crash(kind: str, value: Any, tmp_path: Path) -> None:
+    """A fork may call its messages the same; a bag that defines them is read as it says."""
+    make = Messages(2)
+    items: list[Item] = [("/imu", START_NS, make.imu(START_NS))]
+    sensors: dict[str, Any] = {"imu": ImuConfig(topic="/imu")}
+    for msgtype in (UBX + "NavPVT", OEM7 + "BESTPOS", OEM7 + "BESTVEL", PX4 + "SensorGps"):  # of each way to a stamp
+        fields = r"(?m)^(?:u?int\d+|float\d+|bool|string)(?:\[\d+\])? (\w+)$"
+        make.store.register(get_types_from_msg(re.sub(fields, rf"{kind} \1", VENDOR_TYPES[msgtype][0]), msgtype))
+        items.append((f"/{msgtype}", START_NS, _of_other_fields(make, msgtype, value)))
+        own = {
+            f"{msgtype} {part.kind}": CONFIGS[part.kind].model_copy(update={"topic": f"/{msgtype}"})
+            for part in VENDORS[msgtype]
+        }
+        sensors |= own
+    path = write_bag(tmp_path / "run", make, items, "mcap")
+    assert inspect_bag(path)
+    recording = read_recording(path, VesselConfig(sensors=sensors))
+    unread = {row.sensor: row.outcome for row in recording.rows}
+    assert set(unread) >= set(sensors) - {"imu"}
+    assert set(unread.values()) <= {Outcome.MALFORMED, Outcome.REJECTED, Outcome.IGNORED}
+    assert not recording.measurements
+
+
+def _of_other_fields(make: Messages, msgtype: str, value: Any) -> Any:
+    """Return a message with one value in all fields that are no standard messages."""
+    if msgtype == "std_msgs/msg/Header":
+        return make.header(START_NS)
+    if msgtype.startswith("geometry_msgs"):
+        return make.t[msgtype](*[np.nan] * len(make.store.fielddefs[msgtype][1]))
+    named = ((name, str(kinds), node) for name, (node, kinds) in make.store.fielddefs[msgtype][1])
+    return make.t[msgtype](
+        **{
+            name: _of_other_fields(make, kinds, value) if node == Nodetype.NAME else value
+            for name, kinds, node in named
+        }
+    )
 
 
 def test_a_message_of_another_version_is_malformed_and_no_crash() -> None:

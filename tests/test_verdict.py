@@ -13,7 +13,9 @@ from graphloc.eval.metrics import Table
 from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verdict
 from graphloc.eval.report._health import cure, section
 from graphloc.eval.simulate import Scenario, simulate
-from graphloc.ledger import Ledger
+from graphloc.frozen_receiver import WHY
+from graphloc.ledger import Ledger, Outcome
+from graphloc.measurements import GnssPosition
 from graphloc.solution import Cause, Health, HealthReason, Solution
 from graphloc.solve._health import health_of
 from graphloc.trajectory import Trajectory
@@ -240,3 +242,34 @@ def test_a_track_that_most_fixes_contradict_is_not_relied_on(
     said = [r.text for r in offline.reasons if r.text.startswith("Half of the fixes of gnss are ")]
     assert len(said) == (trust is Trust.NO)
     assert all(float(line.split()[7]) == pytest.approx(off_m, abs=2.0) for line in said)
+
+
+def test_what_a_frozen_receiver_repeats_contradicts_nothing(data: ReportData) -> None:
+    fixes = [m for m in data.recording.measurements if m.sensor == "gnss"]
+    solution = replace(data.solution, trajectory=moved(data.solution.trajectory, 0.6, 30.0))
+    repeated = {m.seq for m in fixes[: len(fixes) * 2 // 3]}
+    rows = [replace(r, reason=WHY, outcome=Outcome.REJECTED) if r.seq in repeated else r for r in solution.ledger]
+    for ledger, trust in ((solution.ledger, Trust.NO), (Ledger(rows), Trust.YES)):
+        found = verdict(replace(data, solution=replace(solution, ledger=ledger))).tracks[0]
+        assert found.trust is trust
+
+
+@pytest.mark.parametrize(
+    ("others", "trust"), [(("gnss", "matcher"), Trust.WITH_CARE), (("gnss",), Trust.NO), (("matcher",), Trust.NO)]
+)
+def test_a_receiver_that_two_sensors_contradict_is_wrong_and_the_track_is_not(
+    others: tuple[str, ...], trust: Trust, data: ReportData
+) -> None:
+    """One of them a receiver: a survey or an image that is off would contradict that as well."""
+    fixes = [m for m in data.recording.measurements if isinstance(m, GnssPosition)]
+    off = [
+        replace(m, sensor="gnss_2", position=m.position._replace(latitude_deg=m.position.latitude_deg + 4e-4))
+        for m in fixes
+    ]
+    known = {name: sensor for name, sensor in data.config.sensors.items() if name in ("imu", *others)}
+    config = data.config.model_copy(update={"sensors": {**known, "gnss_2": data.config.sensors["gnss"]}})
+    levers = {"gnss": data.levers_m["gnss"], "gnss_2": data.levers_m["gnss"]}
+    recording = replace(data.recording, measurements=(*data.recording.measurements, *off))
+    found = verdict(replace(data, config=config, levers_m=levers, recording=recording)).tracks[0]
+    assert found.trust is trust
+    assert [r.trust for r in found.reasons if "fixes of gnss_2" in r.text] == [trust]

@@ -17,6 +17,7 @@ from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_c
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
 from graphloc.frames import Array
+from graphloc.frozen_receiver import FROZEN
 from graphloc.measurements import GnssPosition
 from graphloc.series import rms
 from graphloc.solution import Health, Solution
@@ -30,6 +31,7 @@ _TOO_SURE = 4.0  # NEES: errors are 1.4 times what the covariance says
 # Of the time in which online's 95 % bounds hold the offline position: that one is better informed, so honest ones do for 95 %.
 _HOLDS_OFFLINE = 0.9
 _PLACES = ("gnss", "pose", "aerial")
+_BESIDE_GNSS, _FEWEST_USED = ("pose", "aerial", "apriltag"), 10
 _APART_M, _APART_SIGMAS = (
     20.0,
     5.0,
@@ -137,20 +139,40 @@ def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
     """Yield receivers that most of the run contradicts: they are false, or what the track follows instead.
 
     A fix that is off by more, or a jump for a while, is what the graph is for; a survey or an image in a wrong place looks like
-    a receiver that is wrong all the time.
+    a receiver that is wrong all the time. One that is frozen is known to be wrong, and so is one that another receiver and a sensor
+    beside GNSS contradict.
     """
     track = solution.trajectory
+    frozen = {row.seq for row in solution.ledger if row.reason.startswith(FROZEN)}
+    far, near = {}, []
     for name, sensor in data.config.of_kind("gnss").items():
-        fixes = data.recording.of(GnssPosition, name)
+        fixes = [m for m in data.recording.of(GnssPosition, name) if m.seq not in frozen]
         if not track.covers(stamps_of(fixes)).any():
             continue
         off_m = held_out_errors(track, fixes, solution.datum, data.levers_m).horizontal_m
         half_m = float(np.median(off_m))
         if half_m > max(_APART_M, _APART_SIGMAS * sensor.slow_error.horizontal_sigma_m):
+            far[name] = half_m
+        else:
+            near.append(name)
+    counts = solution.ledger.counts()
+    near += [
+        n
+        for kind in _BESIDE_GNSS
+        for n in data.config.of_kind(kind)
+        if near and counts.get(n, {}).get("used", 0) >= _FEWEST_USED
+    ]
+    for name, half_m in far.items():
+        text = f"Half of the fixes of {name} are {half_m:.0f} m or more away from it"
+        if len(near) > 1:
+            yield Reason(
+                trust=Trust.WITH_CARE, text=f"{text}, and so from {' and '.join(near)}: that receiver is wrong."
+            )
+        else:
             yield Reason(
                 trust=Trust.NO,
-                text=f"Half of the fixes of {name} are {half_m:.0f} m or more away from it: these are wrong, or what the track follows "
-                "instead (a survey, an image, the datum); this run does not tell which.",
+                text=f"{text}: these are wrong, or what the track follows instead (a survey, an image, the datum); this run does not "
+                "tell which.",
             )
 
 

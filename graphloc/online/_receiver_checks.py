@@ -9,7 +9,7 @@ import numpy as np
 
 from graphloc import gauss
 from graphloc.frames import Array
-from graphloc.frozen_receiver import WHY_VELOCITY
+from graphloc.frozen_receiver import FROZEN, WHY_VELOCITY
 from graphloc.graph import Attachment, Residual
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
@@ -21,7 +21,7 @@ from graphloc.position_jumps import OffPrediction, allowed_jump_m, jump_warnings
 from graphloc.time import NS_PER_S
 
 _FITS = 3.0  # sigmas of a fix alone
-_FROZEN = "frozen receiver: it repeats one position while the vessel moves"
+_FROZEN = f"{FROZEN}: it repeats one position while the vessel moves"
 _OLD = "it repeats the fix before it while the vessel moves"
 _OFF = "off what the IMU predicts: an outlier, or a position jump too short to tell"
 
