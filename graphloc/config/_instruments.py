@@ -108,7 +108,7 @@ class SlowErrorConfig(Block):
 
 
 class GnssConfig(SensorConfig):
-    """GNSS position (`sensor_msgs/NavSatFix`, `gps_msgs/GPSFix`, NMEA in `nmea_msgs/Sentence` or `std_msgs/String`, poses in a `grid`, [makers' messages](quick-start.md))."""
+    """GNSS position (`sensor_msgs/NavSatFix`, `gps_msgs/GPSFix`, NMEA in `nmea_msgs/Sentence` or `std_msgs/String`, poses in a `grid`, [makers' messages](makers-messages.md))."""
 
     kind: Literal["gnss"] = "gnss"
     """The sensor kind."""
