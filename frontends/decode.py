@@ -115,12 +115,8 @@ def stamp_ns_of(msg: Any, msgtype: str, log_ns: int, *, recorded: bool = False) 
         return log_ns
     try:
         return STAMPS[msgtype](msg, log_ns) if msgtype in STAMPS else header_stamp_ns(msg)
-    except (
-        AttributeError,
-        TypeError,
-        ValueError,
-        OverflowError,
-    ):  # another version of a maker's message, fields of other types
+    except (AttributeError, TypeError, ValueError, OverflowError):
+        # another version of a maker's message, or fields of other types
         return None
 
 
