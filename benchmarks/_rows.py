@@ -24,5 +24,5 @@ def commit() -> str:
         [*git, "status", "--porcelain", "--untracked-files=no"], capture_output=True, text=True, check=False
     )
     return head.stdout.strip() + (
-        "+" if [n for n in changed.stdout.split("\n") if n and "docs/results" not in n] else ""
+        "+" if [n for n in changed.stdout.split("\n") if n and "docs/" not in n] else ""
     )
