@@ -23,6 +23,4 @@ def commit() -> str:
     changed = subprocess.run(
         [*git, "status", "--porcelain", "--untracked-files=no"], capture_output=True, text=True, check=False
     )
-    return head.stdout.strip() + (
-        "+" if [n for n in changed.stdout.split("\n") if n and "docs/" not in n] else ""
-    )
+    return head.stdout.strip() + ("+" if [n for n in changed.stdout.split("\n") if n and "docs/" not in n] else "")
