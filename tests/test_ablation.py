@@ -21,7 +21,7 @@ from graphloc.eval.consistency import contradiction
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.page import Cell, Grid
 from graphloc.eval.plots import Line
-from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.factors import SENSORS
 from graphloc.factors.velocity import VelocityConfig
 from graphloc.frames import Array
@@ -29,13 +29,14 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix, PoseMode
 from graphloc.solution import Solution
 from graphloc.time import stamps_of
+from tests.slowly import simulate_slowly
 
 OFF_DEG = 12.0
 
 
 def made(**changes: object) -> SimulatedRun:
     base = Scenario(duration_s=18.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, noise="clean", false_fraction=0.2)
-    return simulate(replace(base, **changes), 4)  # type: ignore[arg-type]
+    return simulate_slowly(replace(base, **changes), 4)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

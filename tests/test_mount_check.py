@@ -11,16 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from graphloc import app
 from graphloc.eval.mount_check import mount_doubts
-from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.solution import Health
 from graphloc.trajectory import Trajectory
+from tests.slowly import simulate_slowly
 
 QUICK = Scenario(path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, gnss_sigma_m=0.1)
 
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
-    return simulate(QUICK, 77)
+    return simulate_slowly(QUICK, 77)
 
 
 def turned(track: Trajectory, axis: str, degrees: float, heading_sigma_deg: float = 1.0) -> Trajectory:

@@ -24,12 +24,13 @@ from graphloc.gather import Gathering, _live, with_busy_warning
 from graphloc.measurements import GnssPosition, ImuSample, PoseFix
 from graphloc.replay import Replayed, _timed, arrivals, replay
 from graphloc.solution import Cause, HealthReason
+from tests.slowly import simulate_slowly
 
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
     scenario = replace(bl_scenario(1, "drift"), duration_s=20.0, imu_hz=50.0, gnss_hz=5.0)
-    return simulate(scenario, 4)
+    return simulate_slowly(scenario, 4)
 
 
 @pytest.fixture(scope="module")
@@ -150,12 +151,12 @@ def test_compare_has_it_beside_the_filters(run: SimulatedRun) -> None:
 
 
 def test_a_guessed_heading_is_reported_with_its_times(whole: Replayed) -> None:
-    """Doubted in the first 51 of the estimates, 10 a second: for 5 s."""
+    """Doubted in the first 26 of the estimates, 5 a second: for 5 s."""
     estimates = whole.estimates
     doubt = "the heading is a guess: 2 candidates explain the motion so far"
     first_ns = estimates[0].stamp_ns
     guessed = HealthReason(f"95 % bound 3 m; {doubt}", Cause.GUESSED_HEADING)
-    some = [replace(e, reason=guessed if k <= 50 else HealthReason()) for k, e in enumerate(estimates)]
+    some = [replace(e, reason=guessed if k <= 25 else HealthReason()) for k, e in enumerate(estimates)]
     (said,) = _timed([(first_ns, Event(doubt, heading_guessed=True))], some)
     assert said.text.startswith(f"at 0 s: {doubt}; it stays so until 5 s (5 s) and is not rated good")
     assert "start.heading_deg" in said.text

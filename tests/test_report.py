@@ -17,18 +17,19 @@ from graphloc.eval.formatting import significant
 from graphloc.eval.metrics import Table
 from graphloc.eval.plots import Underlay
 from graphloc.eval.report import ReportData, Trust, figures, theses_section, verdict, write_report
-from graphloc.eval.simulate import Scenario, simulate
+from graphloc.eval.simulate import Scenario
 from graphloc.measurements import GnssPosition
 from graphloc.solution import Solution
 from graphloc.survey import Survey
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 from tests.browser import CHROMIUM, Browser
+from tests.slowly import simulate_slowly
 
 
 @pytest.fixture(scope="module")
 def data() -> ReportData:
-    run = app.simulated(simulate(Scenario(duration_s=20.0), 3), compare=True)
+    run = app.simulated(simulate_slowly(Scenario(duration_s=20.0), 3), compare=True)
     return ReportData(
         title="a <run>",
         solution=run.solution,
