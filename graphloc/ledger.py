@@ -106,6 +106,10 @@ class Ledger:
             table.setdefault(row.sensor or row.topic, Counter())[row.outcome.value] += row.count
         return {name: dict(sorted(counter.items())) for name, counter in sorted(table.items())}
 
+    def used(self, sensor: str) -> int:
+        """Return how many messages of a sensor were used."""
+        return self.counts().get(sensor, {}).get(Outcome.USED.value, 0)
+
     def reasons(self) -> dict[tuple[str, str, str], int]:
         """Return messages per (sensor or topic, outcome, reason) for rows that carry a reason."""
         counter: Counter[tuple[str, str, str]] = Counter()

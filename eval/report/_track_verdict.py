@@ -32,10 +32,8 @@ _TOO_SURE = 4.0  # NEES: errors are 1.4 times what the covariance says
 _HOLDS_OFFLINE = 0.9
 _PLACES = ("gnss", "pose", "aerial")
 _BESIDE_GNSS, _FEWEST_USED = ("pose", "aerial", "apriltag"), 10
-_APART_M, _APART_SIGMAS = (
-    20.0,
-    5.0,
-)  # of a receiver from the track, beyond any multipath that lasts; and of its slow error
+# Of a receiver from the track, beyond any multipath that lasts; and in sigmas of its slow error.
+_APART_M, _APART_SIGMAS = 20.0, 5.0
 _WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
 
 
@@ -155,13 +153,9 @@ def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
             far[name] = half_m
         else:
             near.append(name)
-    counts = solution.ledger.counts()
-    near += [
-        n
-        for kind in _BESIDE_GNSS
-        for n in data.config.of_kind(kind)
-        if near and counts.get(n, {}).get("used", 0) >= _FEWEST_USED
-    ]
+    if near:
+        others = [name for kind in _BESIDE_GNSS for name in data.config.of_kind(kind)]
+        near += [name for name in others if solution.ledger.used(name) >= _FEWEST_USED]
     for name, half_m in far.items():
         text = f"Half of the fixes of {name} are {half_m:.0f} m or more away from it"
         if len(near) > 1:

@@ -27,7 +27,6 @@ from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
 from graphloc.frozen_receiver import without_frozen_fixes
 from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
-from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.offsets import Probe
 from graphloc.recording import Progress, Recording, quiet
@@ -120,9 +119,8 @@ def _matched(
     gallery = Gallery()
     first = with_matches(recording, config, datum, alone, scans, progress, gallery)
     solution = solve(first.recording, config, datum, probe=calibrate.PROBE, progress=progress)
-    found, counts = first, solution.ledger.counts()
-    used = sum(counts[name].get(Outcome.USED.value, 0) for name in config.of_kind("aerial") if name in counts)
-    if first.cut_off and used >= _FEWEST_MATCHES:
+    found = first
+    if first.cut_off and sum(map(solution.ledger.used, config.of_kind("aerial"))) >= _FEWEST_MATCHES:
         gallery = Gallery()
         found = with_matches(recording, config, datum, solution, scans, progress, gallery)
         solution = solve(found.recording, config, datum, probe=calibrate.PROBE, progress=progress)
