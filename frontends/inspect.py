@@ -61,7 +61,7 @@ from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, 
 from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends._unused import unread_lidars, unread_tags, unused_magnetometers, unused_numbers, unused_topics
-from graphloc.frontends.aerial.cloud import CLOUD
+from graphloc.frontends.aerial.cloud import CLOUDS
 from graphloc.frontends.decode import (
     GPS_FIXES,
     IMU,
@@ -227,7 +227,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
         topics = bag.topics
         bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
         streams, tree = read_streams(bag)
-        lidars = _firsts_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
+        lidars = _firsts_of(bag, [t.topic for t in topics.values() if set(CLOUDS) & set(t.msgtypes) and t.messages])
         cameras = _firsts_of(bag, _pictures(bag))
         infos = _firsts_of(
             bag, [t.topic for t in topics.values() if INFO in t.msgtypes and t.messages] if cameras else []
