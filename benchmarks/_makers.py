@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of a craft whose sensors speak in makers' own messages, as the drivers of SBG, PX4 and u-blox write them."""
+"""Bags of a craft whose sensors speak in makers' own messages, as the drivers of SBG, PX4, u-blox and of Doppler logs write them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from tests.makers import said
 
 _GEOID_M = 35.0
 _SIGMA_MPS, _SIGMA_DEG = 0.05, 0.3  # of a receiver's velocities, and of the headings of two antennas
+_CURRENT_MPS = np.array([0.3, -0.2, 0.0])
 _GPS_EPOCH_S, _LEAP_S, _WEEK_S = 315_964_800, 18, 604_800
 
 
@@ -120,4 +121,19 @@ def ublox(craft: Craft, items: list[Item]) -> list[Item]:
             flags=1 | 4 | 16 | 32 | 256, **tow,
         )  # fmt: skip
         items += [("/ublox/navpvt", log_ns, pvt), ("/ublox/navrelposned", log_ns, relative)]
+    return items
+
+
+def dvl(craft: Craft, items: list[Item]) -> list[Item]:
+    """A Doppler log that loses the bottom after a while, and then tracks the water, which moves."""
+    make, t = craft.make, craft.times(8.0, 0.03)
+    _, R, v = craft.motion.pose(t)
+    water = t > 0.6 * craft.odd.seconds
+    along = np.einsum("nji,nj->ni", R, v - water[:, None] * _CURRENT_MPS) + 0.02 * craft.rng.normal(size=v.shape)
+    for log_ns, at, (ahead, port, up), mode in zip(craft.recorded(t, 0.05), t, along, 1 + water, strict=True):
+        m = said(
+            make, "marine_acoustic_msgs/msg/Dvl", header=make.header(stamp(at), "dvl_link"), velocity_mode=int(mode), num_good_beams=4,
+            beam_velocities_valid=True, velocity=make.vector((ahead, -port, -up)), velocity_covar=4e-4 * np.eye(3).ravel(),
+        )  # fmt: skip
+        items.append(("/dvl/velocity", log_ns, m))
     return items

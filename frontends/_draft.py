@@ -18,11 +18,13 @@ from graphloc.frontends._reports import (
     BODY_AXES,
     EAST_AXES,
     NORTH_AXES,
+    WATER,
     CompassReport,
     GnssReport,
     ImuReport,
     Inspection,
     MountedTopic,
+    MountGuess,
     OdometryReport,
     VelocityReport,
     filtered,
@@ -209,7 +211,7 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
 
 def _topic_lines(topic: str) -> list[str]:
     """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
-    name, *sentence = topic.removesuffix(COURSE).removesuffix(HEADING).split(" ")
+    name, *sentence = topic.removesuffix(COURSE).removesuffix(HEADING).removesuffix(WATER).split(" ")
     return [f"  topic: {name}", *(f"  nmea: [{', '.join(said.split('+'))}]" for said in sentence)]
 
 
@@ -229,16 +231,18 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
         lines.append(f"  gyro_unit: {imu.gyro_unit}  # guess: {reason}")
     if imu.gravity != "included":
         lines.append(f"  gravity: {imu.gravity}  # guess: {reason}")
-    mount = imu.mount
-    if mount.tf_frame is not None:
-        lines.append(f"  mount: {{tf_frame: {json.dumps(mount.tf_frame)}}}  # {mount.evidence}")
-    else:
-        rpy = ", ".join(f"{a:.1f}" for a in mount.rpy_deg)
-        xyz = ", ".join(f"{a:.3f}" for a in mount.xyz_m) if mount.xyz_m else "0.0, 0.0, 0.0"
-        whose = "xyz as there" if mount.xyz_m else "xyz unknown"
-        lines.append(f"  mount: {{xyz_m: [{xyz}], rpy_deg: [{rpy}]}}  # guess: {mount.evidence}; {whose}")
+    lines.append(_mount_line(imu.mount))
     lines += _noise_lines(imu)
     return lines
+
+
+def _mount_line(mount: MountGuess) -> str:
+    if mount.tf_frame is not None:
+        return f"  mount: {{tf_frame: {json.dumps(mount.tf_frame)}}}  # {mount.evidence}"
+    rpy = ", ".join(f"{a:.1f}" for a in mount.rpy_deg)
+    xyz = ", ".join(f"{a:.3f}" for a in mount.xyz_m) if mount.xyz_m else "0.0, 0.0, 0.0"
+    whose = "xyz as there" if mount.xyz_m else "xyz unknown"
+    return f"  mount: {{xyz_m: [{xyz}], rpy_deg: [{rpy}]}}  # guess: {mount.evidence}; {whose}"
 
 
 def _noise_lines(imu: ImuReport) -> list[str]:
@@ -379,8 +383,16 @@ def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
     known = "from tf" if twist.tf_frame else "guess: where it sits is not in the bag; measure it"
     water = through_water(twist.topic)
     fuse = "true to fuse it" if water else "true to fuse it, through: water for a speed log"
+    lines = [f"{name}:", "  kind: body_velocity", *_topic_lines(twist.topic), *(["  through: water"] if water else [])]
+    if twist.mount:
+        return [
+            *lines,
+            f"  enabled: false  # guess: true to fuse it; {twist.why}",
+            "  axes: [x, y, z]",
+            _mount_line(twist.mount),
+        ]
     return [
-        f"{name}:", "  kind: body_velocity", *_topic_lines(twist.topic), *(["  through: water"] if water else []),
+        *lines,
         f"  enabled: false  # guess: {fuse}; its axes look {twist.axes}; {twist.why}",
         f"  mount: {{{frame}}}  # {known}",
     ]  # fmt: skip

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
+from graphloc.frontends._reports import WATER
 from graphloc.frontends._source import TF_MOVING, TF_STATIC, Bag, RawMessage
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.decode import (
@@ -37,7 +38,16 @@ from graphloc.frontends.decode import (
     nmea_sigmas_m,
     stamp_ns_of,
 )
-from graphloc.frontends.vendors import VENDORS, Part, Said, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
+from graphloc.frontends.vendors import (
+    VENDORS,
+    Part,
+    Said,
+    SaidAlong,
+    SaidHeading,
+    SaidInertial,
+    SaidPlace,
+    SaidVelocity,
+)
 from graphloc.ledger import Outcome
 from graphloc.time import NS_PER_S
 
@@ -138,6 +148,7 @@ _LIKE: dict[str, tuple[str, Row]] = {
     "gnss": (NAV_SAT_FIX, (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)),
     "gnss_velocity": (TWIST, (np.nan, np.nan, np.nan)),
     "compass": (QUATERNION, (0.0, 0.0, np.nan, np.nan)),
+    "body_velocity": (TWIST, (np.nan, np.nan, np.nan)),
 }
 
 
@@ -152,6 +163,8 @@ def _said_row(said: Said) -> Row:
             return said.v_mps
         case SaidHeading():
             return (0.0, 0.0, float(np.sin(said.angle_rad / 2.0)), float(np.cos(said.angle_rad / 2.0)))
+        case SaidAlong():  # ahead, to port, up
+            return (said.v_mps[0], -said.v_mps[1], -said.v_mps[2])
 
 
 _MOST = 1e12
@@ -264,7 +277,8 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
 
     An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type; 'TOPIC GPGGA+GNGGA' of a
     receiver that changes its talker. RMC gives another one of velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no
-    VTG is on the line; so does a GPSFix. A maker's message gives a stream of the equivalent type for each thing that it says.
+    VTG is on the line; so does a GPSFix. A maker's message gives a stream of the equivalent type for each thing that it says. A Doppler log's
+    velocities through water are one named 'TOPIC (through water)'.
     """
     streams = {
         t.topic: TopicData(t.topic, t.msgtypes[0])
@@ -304,7 +318,8 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
     for name in [
         name
         for name, stream in streams.items()
-        if name.endswith((COURSE, HEADING)) and _told_elsewhere(stream, streams)
+        if (name.endswith((COURSE, HEADING)) and _told_elsewhere(stream, streams))
+        or (name + WATER in streams and not np.isfinite(stream.rows).any())
     ]:
         del streams[name]
     for stream in streams.values():
@@ -364,7 +379,7 @@ def _plain(raw: RawMessage, msg: Any, streams: dict[str, TopicData]) -> list[tup
     if raw.topic not in streams:
         return []
     if raw.msgtype in VENDORS:
-        return [(streams[name], _part_row(part, msg)) for name, part in _parts(raw.topic, raw.msgtype)]
+        return [_said_of(part, msg, name, streams) for name, part in _parts(raw.topic, raw.msgtype)]
     said: list[tuple[TopicData, Row | None]] = [(streams[raw.topic], ROWS[raw.msgtype](msg))]
     if raw.msgtype in GPS_FIXES:
         v, name = gps_fix_velocity_mps(msg), raw.topic + COURSE
@@ -379,11 +394,15 @@ def _parts(topic: str, msgtype: str) -> list[tuple[str, Part]]:
     return [(topic + beside[part.kind] if k else topic, part) for k, part in enumerate(VENDORS[msgtype])]
 
 
-def _part_row(part: Part, msg: Any) -> Row | None:
+def _said_of(part: Part, msg: Any, name: str, streams: dict[str, TopicData]) -> tuple[TopicData, Row | None]:
+    """Return the stream and the row of a thing that a maker's message says; velocities through water have a stream of their own."""
     said = part.read(msg)
     if isinstance(said, Rejection):
-        return None if said.outcome is Outcome.MALFORMED else _LIKE[part.kind][1]
-    return _said_row(said)
+        return streams[name], None if said.outcome is Outcome.MALFORMED else _LIKE[part.kind][1]
+    if isinstance(said, SaidAlong) and said.through == "water":
+        name += WATER
+        streams.setdefault(name, TopicData(name, TWIST, part=part))
+    return streams[name], _said_row(said)
 
 
 def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:

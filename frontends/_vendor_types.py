@@ -111,6 +111,21 @@ _PX4_QUALITY = (
 )
 _PX4_AUTHENTIC = f"uint8 spoofing_state; uint8 authentication_state; {_PX4_VELOCITY}; uint32 system_error"
 
+_WATERLINKED_BEAM = "int64 id; float64 velocity; float64 distance; float64 rssi; float64 nsd; bool valid"
+_WATERLINKED = f"{_HEADER}; float64 time; geometry_msgs/Vector3 velocity; float64 fom; "
+_WATERLINKED_BEAMS = "float64 altitude; DVLBeam[] beams; bool velocity_valid; int64 status; "
+_DVL = (
+    f"{_HEADER}; uint8 velocity_mode; uint8 dvl_type; geometry_msgs/Vector3 velocity; float64[9] velocity_covar; float64 altitude; "
+    "float64 course_gnd; float64 speed_gnd; uint8 num_good_beams; float32 sound_speed; bool beam_ranges_valid; bool beam_velocities_valid; "
+    "geometry_msgs/Vector3[4] beam_unit_vec; float64[4] range; float32[4] range_covar; float32[4] beam_quality; float32[4] beam_velocity; "
+    "float32[4] beam_velocity_covar"
+)
+
+
+def _waterlinked(package: str, fields: str) -> str:
+    return _definition(fields, **{f"{package}__DVLBeam": _WATERLINKED_BEAM})
+
+
 VENDOR_TYPES: dict[str, tuple[str, ...]] = {
     "sbg_driver/msg/SbgImuData": (
         _definition(
@@ -239,4 +254,15 @@ VENDOR_TYPES: dict[str, tuple[str, ...]] = {
     "px4_msgs/msg/VehicleGpsPosition": (
         _definition(f"{_PX4_START}; {_PX4_INTEGERS}; {_PX4_ACCURACY}; {_PX4_VELOCITY}; {_PX4_HEADING}"),
     ),
+    "dvl_msgs/msg/DVL": tuple(
+        _waterlinked("dvl_msgs", fields)
+        for fields in (
+            f"{_WATERLINKED}float64[] covariance; {_WATERLINKED_BEAMS}int64 time_of_validity; int64 time_of_transmission; string form",
+            f"{_WATERLINKED}{_WATERLINKED_BEAMS}string form",
+        )
+    ),
+    "waterlinked_a50_ros_driver/msg/DVL": (
+        _waterlinked("waterlinked_a50_ros_driver", f"{_WATERLINKED}{_WATERLINKED_BEAMS}string form"),
+    ),
+    **dict.fromkeys(("marine_acoustic_msgs/msg/Dvl", "acoustic_msgs/msg/Dvl"), (_definition(_DVL),)),
 }  # fmt: skip

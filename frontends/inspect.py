@@ -178,7 +178,12 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     reference = _best_track(bag, gnss)
     odometry = _odometry_reports(bag, gnss, reference)
     velocities = [
-        (s, velocity_report(s, reference.stamps_ns, reference.p_m, bag.tf_frame(s), reference.scatter_m))
+        (
+            s,
+            _with_mount(
+                velocity_report(s, reference.stamps_ns, reference.p_m, bag.tf_frame(s), reference.scatter_m), s, bag
+            ),
+        )
         for s in bag.of_type(TWIST, PLAIN_TWIST, VECTOR)
     ]
     wheels = [s for s, report in odometry if report.role == "check_speed"]
@@ -459,6 +464,24 @@ def _beside_wheels(gnss: GnssReport, bag: _Contents, wheels: Sequence[TopicData]
 def _clearly(offset: MotionOffset | None) -> tuple[float, float] | None:
     """Return an offset that is clear, s, and its sigma."""
     return (offset.value_s, offset.sigma_s) if offset is not None and offset.clear else None
+
+
+def _with_mount(report: VelocityReport, stream: TopicData, bag: _Contents) -> VelocityReport:
+    """Return the report with the mount of a Doppler log, whose own z is down; drivers name frames of tf whose z is up."""
+    if stream.part is None or stream.part.kind != "body_velocity":
+        return report
+    pose = bag.tree.resolve(bag.tree.body(), report.tf_frame) if report.tf_frame else None
+    if pose is None:
+        down = (180.0, 0.0, 180.0 if report.reverse else 0.0)
+        return replace(
+            report, mount=MountGuess(rpy_deg=down, tf_frame=None, evidence="x ahead, y to starboard, z down")
+        )
+    if pose[1][2, 2] < 0.0:
+        rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
+        return replace(report, mount=MountGuess(rpy_deg=rpy, tf_frame=report.tf_frame, evidence="from tf"))
+    rpy = vec(np.degrees(rpy_from_rotation(pose[1] @ np.diag([1.0, -1.0, -1.0]))))
+    said = f"by tf '{report.tf_frame}' has z up: turned about x, as the messages have z down"
+    return replace(report, mount=MountGuess(rpy_deg=rpy, tf_frame=None, evidence=said, xyz_m=vec(pose[0])))
 
 
 def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic, ...]:

@@ -3,7 +3,7 @@
 
 A message says one thing or several: a receiver's says a place and a velocity. Velocities and headings of most types are in known axes and
 come out as east, north, up; a few drivers write them in north, east, down or in east, north, up, as they are configured: these come out as
-they are, and `convention` of the sensor tells. An IMU's axes stay its own.
+they are, and `convention` of the sensor tells. Axes of an IMU or a Doppler log stay its own.
 """
 
 from __future__ import annotations
@@ -54,7 +54,15 @@ class SaidHeading(NamedTuple):
     sigma_rad: float = 0.0
 
 
-Said = SaidInertial | SaidPlace | SaidVelocity | SaidHeading
+class SaidAlong(NamedTuple):
+    """A velocity along the axes of the sensor, m/s, its covariance, row by row (0: not told), and through what: ground, water, or not told."""
+
+    v_mps: tuple[float, float, float]
+    covariance: tuple[float, ...]
+    through: str = ""
+
+
+Said = SaidInertial | SaidPlace | SaidVelocity | SaidHeading | SaidAlong
 
 
 class Part(NamedTuple):
@@ -63,6 +71,7 @@ class Part(NamedTuple):
     Attributes:
         kind: the kind of sensor that reads it. read: takes the message. told: whether its axes are known by the type; else `convention`
             tells them, and `usual` is that of a driver that is left as it comes. antennas: whether a heading is one of GNSS, not of a filter.
+        through: whether each message says if its velocity is over ground or through the water.
     """
 
     kind: str
@@ -70,6 +79,7 @@ class Part(NamedTuple):
     told: bool = True
     antennas: bool = True
     usual: str = "ned"
+    through: bool = False
 
 
 _FEWEST_M, _MOST_M = 1e-4, 1e3  # sigmas of a fix that are believed; a receiver that knows its place no better has none
@@ -431,6 +441,30 @@ def _px4_stamp_ns(msg: Any, _log_ns: int) -> int | None:
     return 1000 * at_us if 0 < at_us < _LATEST_US else None
 
 
+# Doppler logs: x ahead, y to starboard, z down, where they point.
+
+_DVL_THROUGH = {1: "ground", 2: "water"}
+_DVL_BEAMS = 3  # that a velocity takes
+
+
+def _waterlinked_along(msg: Any) -> SaidAlong | Rejection:
+    if not msg.velocity_valid:
+        return rejected("no velocity (velocity_valid false: no lock on the bottom)")
+    covariance = tuple(float(v) for v in getattr(msg, "covariance", ()))  # of newer versions
+    if len(covariance) != 9:
+        fom = _known(float(msg.fom)) ** 2  # the figure of merit is a sigma
+        covariance = (fom, 0.0, 0.0, 0.0, fom, 0.0, 0.0, 0.0, fom)
+    return SaidAlong(_xyz(msg.velocity), covariance)
+
+
+def _dvl_along(msg: Any) -> SaidAlong | Rejection:
+    v, beams = _xyz(msg.velocity), int(msg.num_good_beams)
+    # Drivers of instruments that tell a velocity alone fill in neither beams nor flags.
+    if 0 < beams < _DVL_BEAMS or not (msg.beam_velocities_valid or any(v)):
+        return rejected(f"no velocity ({beams} good beams)")
+    return SaidAlong(v, tuple(float(c) for c in msg.velocity_covar), _DVL_THROUGH.get(int(msg.velocity_mode), ""))
+
+
 _GPS = (Part("gnss", _px4_place), Part("gnss_velocity", _px4_velocity), Part("compass", _px4_heading))
 VENDORS: dict[str, tuple[Part, ...]] = {
     "sbg_driver/msg/SbgImuData": (Part("imu", _sbg_imu),),
@@ -458,6 +492,8 @@ VENDORS: dict[str, tuple[Part, ...]] = {
     "septentrio_gnss_driver/msg/AttEuler": (Part("compass", _sbf_heading, told=False, usual="enu"),),
     "px4_msgs/msg/SensorCombined": (Part("imu", _px4_imu),),
     **dict.fromkeys(("px4_msgs/msg/SensorGps", "px4_msgs/msg/VehicleGpsPosition"), _GPS),
+    **dict.fromkeys(("dvl_msgs/msg/DVL", "waterlinked_a50_ros_driver/msg/DVL"), (Part("body_velocity", _waterlinked_along),)),
+    **dict.fromkeys(("marine_acoustic_msgs/msg/Dvl", "acoustic_msgs/msg/Dvl"), (Part("body_velocity", _dvl_along, through=True),)),
 }  # fmt: skip
 """By type of message: what it says, the first thing first."""
 
