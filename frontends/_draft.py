@@ -17,6 +17,7 @@ from graphloc.frontends._fixes import NOTHING_M, RTK_SIGMA_M, SCATTERS
 from graphloc.frontends._reports import (
     BODY_AXES,
     EAST_AXES,
+    FILTER,
     NORTH_AXES,
     WATER,
     CompassReport,
@@ -45,9 +46,7 @@ _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _RTK_M = (0.05, 0.1)
 _RTK_SCATTER_M = 0.1
 _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
-_FILTERED = (
-    "by its name a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
-)
+_FILTERED = "by its name, or its messages, a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 _MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
 _TURN_S = 0.1
 _MOST_PARTS = 100  # of a submap
@@ -88,7 +87,7 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         name = compass.topic.partition(" ")[0]
         off = "another heading of the same topic is used, a true one before a magnetic one" if name in seen else ""
         if k and filtered(compass.topic):
-            off = "by its name a filter's output, which the other heading may be in already"
+            off = "by its name, or its messages, a filter's output, which the other heading may be in already"
         yield _compass_block(_numbered("compass", k), compass, off)
         seen.add(name)
     for compass in (c for c in inspection.compasses if not c.usable):
@@ -211,7 +210,9 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
 
 def _topic_lines(topic: str) -> list[str]:
     """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
-    name, *sentence = topic.removesuffix(COURSE).removesuffix(HEADING).removesuffix(WATER).split(" ")
+    for beside in (FILTER, COURSE, HEADING, WATER):
+        topic = topic.removesuffix(beside)
+    name, *sentence = topic.split(" ")
     return [f"  topic: {name}", *(f"  nmea: [{', '.join(said.split('+'))}]" for said in sentence)]
 
 

@@ -19,6 +19,8 @@ _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|globa
 _DIFFERS = 1.5  # times the default of a slow error
 WATER = " (through water)"
 """At the end of the name of a stream of those of a Doppler log's messages that say so."""
+FILTER = " (of a filter)"
+"""At the end of the name of a stream whose messages say that a filter made them; see `filtered`."""
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
 
 
@@ -33,7 +35,7 @@ def through_water(topic: str) -> bool:
 
 
 def filtered(topic: str) -> bool:
-    """Return whether a place or velocity is a filter's output, by the name of its topic."""
+    """Return whether a place or velocity is a filter's output, by the name of its topic, or what its messages say."""
     return bool(_FILTERED.search(topic))
 
 

@@ -41,6 +41,7 @@ from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
 from graphloc.frontends._reports import (
     EAST_AXES,
+    FILTER,
     NORTH_AXES,
     CompassReport,
     GnssReport,
@@ -251,13 +252,14 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
 
 def _topic_reports(bag: _Contents) -> tuple[TopicReport, ...]:
     """Report every topic of the bag, then every NMEA sentence."""
+    streams = {name.removesuffix(FILTER): stream for name, stream in bag.streams.items()}
     topics = [
-        replace(topic_report(bag.streams[t.topic], t.messages), msgtype=t.msgtypes[0])
-        if t.topic in bag.streams
+        replace(topic_report(streams[t.topic], t.messages), topic=t.topic, msgtype=t.msgtypes[0])
+        if t.topic in streams
         else TopicReport(topic=t.topic, msgtype=" or ".join(t.msgtypes), count=t.messages)
         for t in bag.topics.values()
     ]
-    return (*topics, *(topic_report(s, len(s)) for s in bag.streams.values() if s.topic not in bag.topics))
+    return (*topics, *(topic_report(s, len(s)) for name, s in streams.items() if name not in bag.topics))
 
 
 def _gnss_reports(bag: _Contents) -> list[GnssReport]:
