@@ -223,14 +223,14 @@ def _sbg_filtered_place(msg: Any) -> SaidPlace | Rejection:
     if not msg.status.position_valid:
         return rejected("the filter says that its position is not valid")
     x, y, z = _xyz(msg.position_accuracy)
-    return _place(_sbg_where(msg), 0, max(x, y), z)
+    return _filtered(_place(_sbg_where(msg), 0, max(x, y), z))
 
 
 def _sbg_filtered_velocity(msg: Any) -> SaidVelocity | Rejection:
     if not msg.status.velocity_valid:
         return rejected("the filter says that its velocity is not valid")
     x, y, z = _xyz(msg.velocity_accuracy)
-    return SaidVelocity(_xyz(msg.velocity), _known(max(x, y)), _known(z))
+    return SaidVelocity(_xyz(msg.velocity), _known(max(x, y)), _known(z), filtered=True)
 
 
 def _sbg_filtered_heading(msg: Any) -> SaidHeading | Rejection:
@@ -240,7 +240,8 @@ def _sbg_filtered_heading(msg: Any) -> SaidHeading | Rejection:
         yaw = _yaw(msg.quaternion)
     else:
         yaw = float(msg.angle.z)
-    return _angle(degrees(yaw), degrees(float(msg.accuracy.z)))
+    said = _angle(degrees(yaw), degrees(float(msg.accuracy.z)))
+    return said if isinstance(said, Rejection) else said._replace(filtered=True)
 
 
 # u-blox: `ublox_msgs` with the manual's names of fields in ROS 1, in lower case in ROS 2, and `ublox_ubx_msgs` with flags of their own.
@@ -563,8 +564,10 @@ def _geo_covariance(msg: Any) -> tuple[Any, tuple[float, float, float]]:
     """Return the pose, and variances, horizontal, vertical and of the yaw; 0: not told."""
     if not hasattr(msg.pose, "covariance"):
         return msg.pose, (0.0, 0.0, 0.0)
-    variances = [float(c) for c in msg.pose.covariance][::7]  # north or east first, as drivers like
-    return msg.pose.pose, (max(variances[:2]), variances[2], variances[5])
+    if len(msg.pose.covariance) != 36:
+        raise ValueError(f"a covariance of {len(msg.pose.covariance)} values")
+    one, other, up, _, _, yaw = (float(c) for c in msg.pose.covariance[::7])  # north or east first, as drivers like
+    return msg.pose.pose, (max(one, other), up, yaw)
 
 
 def _geo_place(msg: Any) -> SaidPlace | Rejection:

@@ -413,7 +413,7 @@ def _sbg(make: Messages, at: int, fix: Any, v: Any, heading_deg: float, off_deg:
     vel = said(make, SBG + "SbgGpsVel", header=header, status={"vel_type": 2}, vel=make.vector((v[1], v[0], -v[2])), vel_acc=sigmas)  # fmt: skip
     hdt = said(make, SBG + "SbgGpsHdt", header=header, true_heading=heading_deg, true_heading_acc=0.25)
     own = said(make, SBG + "SbgEkfEuler", header=header, status={"heading_valid": True}, angle=make.vector((0, 0, np.radians(heading_deg + off_deg * np.sin(at / S)))))  # fmt: skip
-    return [("/sbg/gps_pos", at, pos), ("/sbg/gps_vel", at, vel), ("/sbg/gps_hdt", at, hdt), ("/sbg/ekf_euler", at, own)]  # fmt: skip
+    return [("/sbg/gps_pos", at, pos), ("/sbg/gps_vel", at, vel), ("/sbg/gps_hdt", at, hdt), ("/ins/euler", at, own)]  # fmt: skip
 
 
 def _px4(make: Messages, at: int, fix: Any, v: Any, heading_deg: float) -> list[Item]:
@@ -542,7 +542,8 @@ def test_fields_of_other_types_are_no_crash(kind: str, value: Any, tmp_path: Pat
     make = Messages(2)
     items: list[Item] = [("/imu", START_NS, make.imu(START_NS))]
     sensors: dict[str, Any] = {"imu": ImuConfig(topic="/imu")}
-    for msgtype in (UBX + "NavPVT", OEM7 + "BESTPOS", OEM7 + "BESTVEL", PX4 + "SensorGps"):  # of each way to a stamp
+    ways = (UBX + "NavPVT", OEM7 + "BESTPOS", OEM7 + "BESTVEL", PX4 + "SensorGps")  # of each way to a stamp
+    for msgtype in (*ways, OEM7 + "INSPVAX", SBF + "INSNavGeod", GEO + "GeoPoseWithCovarianceStamped"):
         fields = r"(?m)^(?:u?int\d+|float\d+|bool|string)(?:\[\d+\])? (\w+)$"
         make.store.register(get_types_from_msg(re.sub(fields, rf"{kind} \1", VENDOR_TYPES[msgtype][0]), msgtype))
         items.append((f"/{msgtype}", START_NS, _of_other_fields(make, msgtype, value)))
