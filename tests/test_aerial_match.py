@@ -320,9 +320,9 @@ def test_some_axes_of_a_match() -> None:
     match = Match(
         Prior(np.zeros(3), np.ones(3)), outline(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), None), modes=(mode,)
     )
-    fix = match.fix(0, "a", (1.0, 0.5, 0.25), ("y", "yaw"))
+    fix = match.fix(0, "a", axes=("y", "yaw"))
     np.testing.assert_allclose(fix.modes[0].value, [2.0, 0.3])
-    np.testing.assert_allclose(fix.modes[0].cov, np.diag([0.4, 0.04]))
+    np.testing.assert_allclose(fix.modes[0].cov, np.diag([0.2, 0.01]))
     assert fix.axes == ("y", "yaw")
 
 

@@ -22,6 +22,10 @@ _CONTRAST = (-3.46, 0.096)  # log-odds of windows with the truth to those withou
 _MOST_WITHIN = 0.95  # priors may be wrong, however sure
 _LEAST_PLACES = 30
 _MODES = 5
+# How long inertial sensors carry a place, and a heading, to a match's accuracy, and to which. Less accurate ones they carry for longer:
+# a place is lost with the square of time, a heading linearly.
+_CARRIED_S, _CARRIED_M = 5.0, 0.1
+_CARRIED_YAW_S, _CARRIED_YAW_RAD = 60.0, np.radians(0.5)
 NO_POSE = "no pose in the window stands out"
 """Why a scan has no match: it fits nowhere better than by chance."""
 
@@ -32,6 +36,37 @@ class Prior:
 
     pose: Array
     sigma: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Since:
+    """How far, and how long, a match is from the one before it.
+
+    Their errors, and which mode looks right, are a first-order Markov process along the path, r = exp(-way): the same walls, the same
+    boats. What a match adds to a mean of such ones is (1 - r) / (1 + r).
+
+    Attributes:
+        way: distance travelled, in lengths of correlation (`AerialConfig.alike_m`). waited_s: time.
+    """
+
+    way: float
+    waited_s: float
+
+    @property
+    def news(self) -> float:
+        """Share of the evidence for right or false that is independent of the match before."""
+        return float(np.tanh(0.5 * self.way))
+
+    def widened(self, cov: Array) -> Array:
+        """Return the covariance (3, 3) of what is independent of the match before, where inertial sensors have not forgotten it."""
+        variances, axes = np.linalg.eigh(cov[:2, :2])
+        carried_s = _CARRIED_S * np.maximum(np.sqrt(variances) / _CARRIED_M, 1.0) ** 0.5
+        yaw_s = _CARRIED_YAW_S * max(float(np.sqrt(cov[2, 2])) / _CARRIED_YAW_RAD, 1.0)
+        independent = np.tanh(0.5 * np.maximum(self.way, self.waited_s / np.append(carried_s, yaw_s)))
+        wider = np.zeros((3, 3))
+        wider[:2, :2] = (axes / np.sqrt(independent[:2])) @ axes.T
+        wider[2, 2] = 1.0 / np.sqrt(independent[2])
+        return np.asarray(wider @ cov @ wider)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,30 +90,34 @@ class Match:
     why_not: str = ""
     cut_off: bool = False
 
+    @property
+    def distance_m(self) -> float:
+        """Median distance to what was matched, m; 0 where the matcher does not say."""
+        places_m = np.vstack([self.found.faces_m, self.found.shore_m])
+        return float(np.median(np.hypot(*places_m.T))) if len(places_m) else 0.0
+
     def fix(
-        self,
-        stamp_ns: int,
-        sensor: str,
-        news: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        axes: tuple[str, ...] = ("x", "y", "yaw"),
+        self, stamp_ns: int, sensor: str, since: Since | None = None, axes: tuple[str, ...] = ("x", "y", "yaw")
     ) -> PoseFix:
         """Return the modes as one measurement.
 
         Args:
-            news: independent shares of east, north, yaw (`live.Matched`); variances grow by their inverse.
-            axes: to be used.
+            since: the match before, whose errors it shares in part; None: there is none. axes: to be used.
         """
-        wider = 1.0 / np.sqrt(np.outer(news, news))
+        news = 1.0 if since is None else since.news
+        # Which of its modes is right is no news if the match before saw the same.
+        stated = np.array([m.probability for m in self.modes])
+        share = stated**news * stated.sum() / (stated**news).sum()
         picked = [k for k, a in enumerate(("x", "y", "yaw")) if a in axes]
         modes = tuple(
             PoseMode(
                 value=np.array([m.pose[0], m.pose[1], float(wrap_angle(m.pose[2]))])[picked],
-                cov=(wider * m.cov)[np.ix_(picked, picked)],
-                probability=m.probability,
+                cov=(m.cov if since is None else since.widened(m.cov))[np.ix_(picked, picked)],
+                probability=float(p),
             )
-            for m in self.modes
+            for m, p in zip(self.modes, share, strict=True)
         )
-        return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes)
+        return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes, news=news)
 
 
 class Matcher:
