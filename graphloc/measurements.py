@@ -152,10 +152,13 @@ class PoseFix(Measurement):
     Attributes:
         axes: which of `AXES` are measured, in the order of `AXES`.
         modes: at least one; probabilities sum to at most 1, what is missing is 'none of them'.
+        fresh: share of its evidence that is independent of the one before: if that was false, so is this one, and alike, as
+            far as it is not.
     """
 
     axes: tuple[str, ...]
     modes: tuple[PoseMode, ...]
+    fresh: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.axes or tuple(a for a in AXES if a in self.axes) != tuple(self.axes):

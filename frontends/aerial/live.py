@@ -17,14 +17,13 @@ from graphloc.frames import Array, Datum
 from graphloc.frontends.aerial.bl import BLMatcher
 from graphloc.frontends.aerial.cloud import Cloud, level
 from graphloc.frontends.aerial.image import AerialImage
-from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
+from graphloc.frontends.aerial.matcher import Match, Matcher, Prior, Since
 from graphloc.recording import Mounts
-from graphloc.time import stamps_of
+from graphloc.time import NS_PER_S, stamps_of
 from graphloc.trajectory import Trajectory
 
 _JITTER_S = 0.05  # stamps are not a clock
 _AHEAD_NS = 300_000_000  # an IMU's messages are not later than that; a stamp farther ahead is on another clock
-_CARRIED_S = (5.0, 60.0)  # how long inertial sensors carry a place, and a heading, to a match's accuracy
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,14 +52,13 @@ class Matched:
     """A match and its stamp, or the reason why there is none.
 
     Attributes:
-        news: (3,) shares of the information on east, north and yaw that is independent of the match before
-            (`AerialConfig.alike_m`).
+        since: the match before; None: there is none.
     """
 
     stamp_ns: int
     match: Match | None
     why_not: str
-    news: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    since: Since | None = None
 
 
 class LiveMatcher:
@@ -109,7 +107,10 @@ class LiveMatcher:
         item = self.match(self._submap, track)
         if item.match is not None and item.match.modes:
             here = (item.match.prior.pose[:2], item.stamp_ns)
-            item = replace(item, news=_news(self._before, here, self._config.alike_m))
+            if self._before is not None and self._config.alike_m > 0.0:
+                way_m = float(np.hypot(*(here[0] - self._before[0])))
+                alike_m = max(self._config.alike_m, item.match.distance_m)
+                item = replace(item, since=Since(way_m / alike_m, abs(here[1] - self._before[1]) / NS_PER_S))
             self._before = here
         return item
 
@@ -158,16 +159,3 @@ def _matcher(config: AerialConfig, folder: Path, datum: Datum) -> Matcher | BLMa
     if not config.image:
         raise InputError("vessel.yaml: an aerial sensor with matcher: bl needs an `image`")
     return BLMatcher(config, AerialImage(folder / config.image, datum), config.seed)
-
-
-def _news(before: tuple[Array, int] | None, here: tuple[Array, int], alike_m: float) -> tuple[float, float, float]:
-    """Return the information that a match adds to a mean, with errors that are a first-order Markov process along the path.
-
-    That is (1 - r) / (1 + r). The mean is over the distance that inertial sensors bridge: shorter for position than for heading.
-    """
-    if before is None or alike_m == 0.0:
-        return (1.0, 1.0, 1.0)
-    way = float(np.hypot(*(here[0] - before[0]))) / alike_m
-    waited_s = abs(here[1] - before[1]) / 1e9
-    place, heading = (float(np.tanh(0.5 * max(way, waited_s / carried_s))) for carried_s in _CARRIED_S)
-    return (place, place, heading)

@@ -86,7 +86,7 @@ class LiveMatching:
 
     def _taken(self, found: Matched) -> Iterator[Measurement]:
         if found.match is not None and found.match.modes:
-            yield self._gathering.take(found.match.fix(found.stamp_ns, self._name, found.news, self._sensor.axes))
+            yield self._gathering.take(found.match.fix(found.stamp_ns, self._name, found.since, self._sensor.axes))
         else:
             self._gathering.refuse(self._name, found.stamp_ns, found.why_not)
 

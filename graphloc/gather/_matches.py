@@ -82,7 +82,7 @@ def with_matches(
                 best, prior = item.match.modes[0], item.match.prior
                 if best.probability > _SURE:
                     turns.append((float(wrap_angle(best.pose[2] - prior.pose[2])), float(prior.sigma[2])))
-                gathered.take(item.match.fix(item.stamp_ns, name, item.news, sensor.axes))
+                gathered.take(item.match.fix(item.stamp_ns, name, item.since, sensor.axes))
             else:
                 gathered.refuse(name, item.stamp_ns, item.why_not)
             progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)
