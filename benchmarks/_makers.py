@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of a craft whose sensors speak in makers' own messages, as the drivers of SBG, PX4 and u-blox write them."""
+"""Bags of a craft whose sensors speak in makers' own messages, as the drivers of SBG, PX4, u-blox, NovAtel and of Doppler logs write them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 from _odd_bags import START_NS, Change, Craft, Item, stamp
 from _vessels import gauss_markov
+from scipy.spatial.transform import Rotation
 
 from tests.makers import said
 
 _GEOID_M = 35.0
 _SIGMA_MPS, _SIGMA_DEG = 0.05, 0.3  # of a receiver's velocities, and of the headings of two antennas
+_SETTLED_S = 20.0  # from which on NovAtel's filter says a place
+_CURRENT_MPS = np.array([0.3, -0.2, 0.0])
 _GPS_EPOCH_S, _LEAP_S, _WEEK_S = 315_964_800, 18, 604_800
 
 
@@ -121,3 +124,61 @@ def ublox(craft: Craft, items: list[Item]) -> list[Item]:
         )  # fmt: skip
         items += [("/ublox/navpvt", log_ns, pvt), ("/ublox/navrelposned", log_ns, relative)]
     return items
+
+
+def dvl(craft: Craft, items: list[Item]) -> list[Item]:
+    """A Doppler log that loses the bottom after a while, and then tracks the water, which moves."""
+    make, t = craft.make, craft.times(8.0, 0.03)
+    _, R, v = craft.motion.pose(t)
+    water = t > 0.6 * craft.odd.seconds
+    along = np.einsum("nji,nj->ni", R, v - water[:, None] * _CURRENT_MPS) + 0.02 * craft.rng.normal(size=v.shape)
+    for log_ns, at, (ahead, port, up), mode in zip(craft.recorded(t, 0.05), t, along, 1 + water, strict=True):
+        m = said(
+            make, "marine_acoustic_msgs/msg/Dvl", header=make.header(stamp(at), "dvl_link"), velocity_mode=int(mode), num_good_beams=4,
+            beam_velocities_valid=True, velocity=make.vector((ahead, -port, -up)), velocity_covar=4e-4 * np.eye(3).ravel(),
+        )  # fmt: skip
+        items.append(("/dvl/velocity", log_ns, m))
+    return items
+
+
+def span(craft: Craft, items: list[Item]) -> list[Item]:
+    """NovAtel's receiver with its filter: its fixes, the best of both, and the filter's pose, which wanders, in two types."""
+    make, found = craft.make, _Receiver(craft)
+    items, imu = _split(items)
+    items += [("/imu/data", log_ns, m) for log_ns, m in imu]
+    slow = craft.fixes(found.t, 0.02, 0.5)
+    logs = craft.recorded(found.t, 0.03)
+    for log_ns, at, place, own, (north, east, down), heading in zip(
+        logs, found.t, found.places, slow, found.ned_mps, found.heading_deg, strict=True
+    ):
+        header, settled = make.header(stamp(at), "gps"), at > _SETTLED_S
+        track = {
+            "hor_speed": float(np.hypot(north, east)),
+            "trk_gnd": float(np.degrees(np.arctan2(east, north)) % 360.0),
+            "ver_speed": -down,
+        }
+        moving = {"north_velocity": north, "east_velocity": east, "up_velocity": -down}
+        turned = make.quat(Rotation.from_euler("z", 90.0 - heading, degrees=True).as_quat())
+        told: list[tuple[str, dict[str, Any]]] = [
+            ("BESTGNSSPOS", {"pos_type": {"type": 16}, **_oem7_place(place, 1.0)}),
+            ("BESTPOS", {"pos_type": {"type": 53}, **_oem7_place(own, 0.1)} if settled else {"pos_type": {"type": 16}, **_oem7_place(place, 1.0)}),
+            ("BESTGNSSVEL", {"vel_type": {"type": 8}, **track}),
+            ("INSPVAX", {
+                "ins_status": {"status": 3 if settled else 1}, "pos_type": {"type": 53}, "latitude": own[0], "longitude": own[1],
+                "height": own[2] - _GEOID_M, "undulation": _GEOID_M, "azimuth": heading, "azimuth_stdev": 0.1, **moving,
+            }),
+        ]  # fmt: skip
+        items += [
+            (f"/novatel/{kind.lower()}", log_ns, said(make, f"novatel_oem7_msgs/msg/{kind}", header=header, **values))
+            for kind, values in told
+        ]
+        pose = {"position": {"latitude": own[0], "longitude": own[1], "altitude": own[2]}, "orientation": turned}
+        items.append(("/geopose", log_ns, said(make, "geographic_msgs/msg/GeoPoseStamped", header=header, pose=pose)))
+    return items
+
+
+def _oem7_place(place: Any, sigma_m: float) -> dict[str, float]:
+    return {
+        "lat": place[0], "lon": place[1], "hgt": place[2] - _GEOID_M, "undulation": _GEOID_M,
+        "lat_stdev": sigma_m, "lon_stdev": sigma_m, "hgt_stdev": 2.0 * sigma_m,
+    }  # fmt: skip

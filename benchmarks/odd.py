@@ -293,6 +293,17 @@ CASES: dict[str, Odd] = {
     "u-blox's own messages beside its fixes, ROS 1": Odd(
         craft="boat", kind="ros1", change=_makers.ublox, draft=("(?s)kind: gnss\n.*kind: gnss\n.*enabled: false", "navrelposned"),
     ),
+    "NovAtel's filter beside its receiver, ROS 1": Odd(
+        craft="boat", kind="ros1", change=_makers.span,
+        draft=(
+            r"topic: /novatel/bestgnsspos\n    mount", r"/novatel/bestpos\n    enabled: false", r"/geopose\n    enabled: false",
+            r"/novatel/bestgnssvel  # guess: a velocity",
+        ),
+    ),
+    "Doppler log that loses the bottom": Odd(
+        craft="boat", change=_makers.dvl, draft=(r"rpy_deg: \[180.0, 0.0, 0.0\]", r"(?s)/dvl/velocity\n    enabled.*/dvl/velocity\n    through: water"),
+        edit=("enabled: false  # guess: true to fuse it", "enabled: true  # guess: true to fuse it"),
+    ),
     "compass 1 s late, car": Odd(compass=True, change=_late_compass(1.0), draft=(r"time_offset_s: -(1.0[0-4]|0.9[6-9])",)),
     "second receiver drifts, claims less": Odd(change=_second_drifts, draft=(r"topic: /gnss/fix\n    mount",)),
     "positions in UTM alone": Odd(change=_utm, draft=("grid: ''",), edit=("grid: ''", "grid: EPSG:32632")),

@@ -76,7 +76,9 @@ def velocity_report(
 ) -> VelocityReport:
     """Return the axes of a twist or vector: of `tf_frame`, if /tf_static has its frame; else as `axes_of`."""
     axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
-    if stream.part is not None and stream.part.told:
+    if stream.part is not None and stream.part.kind == "body_velocity":
+        axes, why = BODY_AXES, f"a Doppler log's, by its type; {why}"
+    elif stream.part is not None and stream.part.told:
         axes, why = EAST_AXES, f"known by its type; {why}"
     elif stream.part is not None and axes not in (EAST_AXES, NORTH_AXES):
         axes, why = NORTH_AXES, f"as its driver writes it by default; {why}"

@@ -17,12 +17,15 @@ from graphloc.frontends._fixes import NOTHING_M, RTK_SIGMA_M, SCATTERS
 from graphloc.frontends._reports import (
     BODY_AXES,
     EAST_AXES,
+    FILTER,
     NORTH_AXES,
+    WATER,
     CompassReport,
     GnssReport,
     ImuReport,
     Inspection,
     MountedTopic,
+    MountGuess,
     OdometryReport,
     VelocityReport,
     filtered,
@@ -43,9 +46,7 @@ _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _RTK_M = (0.05, 0.1)
 _RTK_SCATTER_M = 0.1
 _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
-_FILTERED = (
-    "by its name a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
-)
+_FILTERED = "by its name, or its messages, a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 _MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
 _TURN_S = 0.1
 _MOST_PARTS = 100  # of a submap
@@ -86,7 +87,7 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         name = compass.topic.partition(" ")[0]
         off = "another heading of the same topic is used, a true one before a magnetic one" if name in seen else ""
         if k and filtered(compass.topic):
-            off = "by its name a filter's output, which the other heading may be in already"
+            off = "by its name, or its messages, a filter's output, which the other heading may be in already"
         yield _compass_block(_numbered("compass", k), compass, off)
         seen.add(name)
     for compass in (c for c in inspection.compasses if not c.usable):
@@ -209,7 +210,9 @@ def _tags_block(cameras: tuple[MountedTopic, ...]) -> list[str]:
 
 def _topic_lines(topic: str) -> list[str]:
     """The topic; of NMEA (see `read_streams`) with the sentence that is read."""
-    name, *sentence = topic.removesuffix(COURSE).removesuffix(HEADING).split(" ")
+    for beside in (FILTER, COURSE, HEADING, WATER):
+        topic = topic.removesuffix(beside)
+    name, *sentence = topic.split(" ")
     return [f"  topic: {name}", *(f"  nmea: [{', '.join(said.split('+'))}]" for said in sentence)]
 
 
@@ -229,16 +232,18 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
         lines.append(f"  gyro_unit: {imu.gyro_unit}  # guess: {reason}")
     if imu.gravity != "included":
         lines.append(f"  gravity: {imu.gravity}  # guess: {reason}")
-    mount = imu.mount
-    if mount.tf_frame is not None:
-        lines.append(f"  mount: {{tf_frame: {json.dumps(mount.tf_frame)}}}  # {mount.evidence}")
-    else:
-        rpy = ", ".join(f"{a:.1f}" for a in mount.rpy_deg)
-        xyz = ", ".join(f"{a:.3f}" for a in mount.xyz_m) if mount.xyz_m else "0.0, 0.0, 0.0"
-        whose = "xyz as there" if mount.xyz_m else "xyz unknown"
-        lines.append(f"  mount: {{xyz_m: [{xyz}], rpy_deg: [{rpy}]}}  # guess: {mount.evidence}; {whose}")
+    lines.append(_mount_line(imu.mount))
     lines += _noise_lines(imu)
     return lines
+
+
+def _mount_line(mount: MountGuess) -> str:
+    if mount.tf_frame is not None:
+        return f"  mount: {{tf_frame: {json.dumps(mount.tf_frame)}}}  # {mount.evidence}"
+    rpy = ", ".join(f"{a:.1f}" for a in mount.rpy_deg)
+    xyz = ", ".join(f"{a:.3f}" for a in mount.xyz_m) if mount.xyz_m else "0.0, 0.0, 0.0"
+    whose = "xyz as there" if mount.xyz_m else "xyz unknown"
+    return f"  mount: {{xyz_m: [{xyz}], rpy_deg: [{rpy}]}}  # guess: {mount.evidence}; {whose}"
 
 
 def _noise_lines(imu: ImuReport) -> list[str]:
@@ -379,8 +384,16 @@ def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
     known = "from tf" if twist.tf_frame else "guess: where it sits is not in the bag; measure it"
     water = through_water(twist.topic)
     fuse = "true to fuse it" if water else "true to fuse it, through: water for a speed log"
+    lines = [f"{name}:", "  kind: body_velocity", *_topic_lines(twist.topic), *(["  through: water"] if water else [])]
+    if twist.mount:
+        return [
+            *lines,
+            f"  enabled: false  # guess: true to fuse it; {twist.why}",
+            "  axes: [x, y, z]",
+            _mount_line(twist.mount),
+        ]
     return [
-        f"{name}:", "  kind: body_velocity", *_topic_lines(twist.topic), *(["  through: water"] if water else []),
+        *lines,
         f"  enabled: false  # guess: {fuse}; its axes look {twist.axes}; {twist.why}",
         f"  mount: {{{frame}}}  # {known}",
     ]  # fmt: skip

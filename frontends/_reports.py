@@ -17,6 +17,10 @@ Vec = tuple[float, float, float]
 _TWO_ANTENNAS = re.compile(r"[ +]G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
 _DIFFERS = 1.5  # times the default of a slow error
+WATER = " (through water)"
+"""At the end of the name of a stream of those of a Doppler log's messages that say so."""
+FILTER = " (of a filter)"
+"""At the end of the name of a stream whose messages say that a filter made them; see `filtered`."""
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
 
 
@@ -26,12 +30,12 @@ def two_antennas(topic: str) -> bool:
 
 
 def through_water(topic: str) -> bool:
-    """Return whether a velocity is through the water, by the sentence of NMEA in the name of its stream."""
-    return topic.endswith(SPEEDS)
+    """Return whether a velocity is through the water, by the name of its stream: its sentence of NMEA, or what its messages say."""
+    return topic.endswith((*SPEEDS, WATER))
 
 
 def filtered(topic: str) -> bool:
-    """Return whether a place or velocity is a filter's output, by the name of its topic."""
+    """Return whether a place or velocity is a filter's output, by the name of its topic, or what its messages say."""
     return bool(_FILTERED.search(topic))
 
 
@@ -188,7 +192,7 @@ class CompassReport:
 class VelocityReport:
     """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why; `late_s` as of a receiver.
 
-    `reverse`: it says astern throughout, which is taken for a wrong sign.
+    `reverse`: it says astern throughout, which is taken for a wrong sign. `mount`: of one whose own axes are known by its type.
     """
 
     topic: str
@@ -198,6 +202,7 @@ class VelocityReport:
     tf_frame: str | None
     late_s: tuple[float, float] | None = None
     reverse: bool = False
+    mount: MountGuess | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
+from graphloc.frontends._reports import FILTER, WATER
 from graphloc.frontends._source import TF_MOVING, TF_STATIC, Bag, RawMessage
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.decode import (
@@ -37,7 +38,17 @@ from graphloc.frontends.decode import (
     nmea_sigmas_m,
     stamp_ns_of,
 )
-from graphloc.frontends.vendors import VENDORS, Part, Said, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
+from graphloc.frontends.vendors import (
+    GEOGRAPHIC,
+    VENDORS,
+    Part,
+    Said,
+    SaidAlong,
+    SaidHeading,
+    SaidInertial,
+    SaidPlace,
+    SaidVelocity,
+)
 from graphloc.ledger import Outcome
 from graphloc.time import NS_PER_S
 
@@ -85,6 +96,10 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
     PLAIN_POSE: _pose_row,
     **dict.fromkeys(NUMBERS, lambda m: (m.data,)),
 }
+# Places that no sensor of the craft says: wanted ones, the origin of a filter, other vessels, the truth.
+_ELSEWHERE = re.compile(
+    r"origin|home|set_?point|goal|target|waypoint|cmd|command|desired|contact|aton|anchor|truth|/gt", re.IGNORECASE
+)
 _HEADING = re.compile(r"head|hdg|hdt|yaw|compass|azimuth", re.IGNORECASE)  # a topic of numbers that may be one
 
 
@@ -138,6 +153,7 @@ _LIKE: dict[str, tuple[str, Row]] = {
     "gnss": (NAV_SAT_FIX, (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)),
     "gnss_velocity": (TWIST, (np.nan, np.nan, np.nan)),
     "compass": (QUATERNION, (0.0, 0.0, np.nan, np.nan)),
+    "body_velocity": (TWIST, (np.nan, np.nan, np.nan)),
 }
 
 
@@ -152,6 +168,8 @@ def _said_row(said: Said) -> Row:
             return said.v_mps
         case SaidHeading():
             return (0.0, 0.0, float(np.sin(said.angle_rad / 2.0)), float(np.cos(said.angle_rad / 2.0)))
+        case SaidAlong():  # ahead, to port, up
+            return (said.v_mps[0], -said.v_mps[1], -said.v_mps[2])
 
 
 _MOST = 1e12
@@ -162,7 +180,7 @@ class TopicData:
     """Columns of one topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`).
 
     recorded: whether the stamps are recording times, because the headers hold none, or whole seconds only.
-    part: what it is of a maker's message; None of other messages.
+    part: what it is of a maker's message; None of other messages. filtered: how many of these a filter made, by what they say.
     drift_ppm: by how much the clock ran fast; what it gained is taken off the stamps. elapsed: (N,) ns from the beginning of the bag.
     """
 
@@ -174,6 +192,7 @@ class TopicData:
     recorded: bool = False
     drift_ppm: float = 0.0
     part: Part | None = None
+    filtered: int = 0
     _stamps: list[int] = field(default_factory=list)
     _logs: list[int] = field(default_factory=list)
     tuples: list[tuple[float, ...]] = field(default_factory=list)
@@ -264,7 +283,8 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
 
     An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type; 'TOPIC GPGGA+GNGGA' of a
     receiver that changes its talker. RMC gives another one of velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no
-    VTG is on the line; so does a GPSFix. A maker's message gives a stream of the equivalent type for each thing that it says.
+    VTG is on the line; so does a GPSFix. A maker's message gives a stream of the equivalent type for each thing that it says. A Doppler log's
+    velocities through water are one named 'TOPIC (through water)', what a filter made one named 'TOPIC (of a filter)'.
     """
     streams = {
         t.topic: TopicData(t.topic, t.msgtypes[0])
@@ -272,7 +292,11 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
         if len(t.msgtypes) == 1 and t.msgtypes[0] in ROWS and (t.msgtypes[0] not in NUMBERS or _HEADING.search(t.topic))
     }
     for t in bag.topics.values():
-        if len(t.msgtypes) == 1 and t.msgtypes[0] in VENDORS:
+        if (
+            len(t.msgtypes) == 1
+            and t.msgtypes[0] in VENDORS
+            and not (t.msgtypes[0] in GEOGRAPHIC and _ELSEWHERE.search(t.topic))
+        ):
             for name, part in _parts(t.topic, t.msgtypes[0]):
                 streams[name] = TopicData(name, _LIKE[part.kind][0], part=part)
     tree = StaticTree()
@@ -304,12 +328,20 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
     for name in [
         name
         for name, stream in streams.items()
-        if name.endswith((COURSE, HEADING)) and _told_elsewhere(stream, streams)
+        if (name.endswith((COURSE, HEADING)) and _told_elsewhere(stream, streams))
+        or (name + WATER in streams and not np.isfinite(stream.rows).any())
     ]:
         del streams[name]
     for stream in streams.values():
         stream.settle()
-    return list(streams.values()), tree
+    return [_named_as_filters(stream) for stream in streams.values()], tree
+
+
+def _named_as_filters(stream: TopicData) -> TopicData:
+    """Return a stream with the name of a filter's, if most of what it says is of one."""
+    if not stream.filtered or 2 * stream.filtered < np.isfinite(stream.rows).all(axis=1).sum():
+        return stream
+    return replace(stream, topic=stream.topic + FILTER)
 
 
 def _join_talkers(streams: dict[str, TopicData]) -> None:
@@ -364,7 +396,7 @@ def _plain(raw: RawMessage, msg: Any, streams: dict[str, TopicData]) -> list[tup
     if raw.topic not in streams:
         return []
     if raw.msgtype in VENDORS:
-        return [(streams[name], _part_row(part, msg)) for name, part in _parts(raw.topic, raw.msgtype)]
+        return [_said_of(part, msg, name, streams) for name, part in _parts(raw.topic, raw.msgtype)]
     said: list[tuple[TopicData, Row | None]] = [(streams[raw.topic], ROWS[raw.msgtype](msg))]
     if raw.msgtype in GPS_FIXES:
         v, name = gps_fix_velocity_mps(msg), raw.topic + COURSE
@@ -379,11 +411,16 @@ def _parts(topic: str, msgtype: str) -> list[tuple[str, Part]]:
     return [(topic + beside[part.kind] if k else topic, part) for k, part in enumerate(VENDORS[msgtype])]
 
 
-def _part_row(part: Part, msg: Any) -> Row | None:
+def _said_of(part: Part, msg: Any, name: str, streams: dict[str, TopicData]) -> tuple[TopicData, Row | None]:
+    """Return the stream and the row of a thing that a maker's message says; velocities through water have a stream of their own."""
     said = part.read(msg)
     if isinstance(said, Rejection):
-        return None if said.outcome is Outcome.MALFORMED else _LIKE[part.kind][1]
-    return _said_row(said)
+        return streams[name], None if said.outcome is Outcome.MALFORMED else _LIKE[part.kind][1]
+    if isinstance(said, SaidAlong) and said.through == "water":
+        name += WATER
+        streams.setdefault(name, TopicData(name, TWIST, part=part))
+    streams[name].filtered += getattr(said, "filtered", False)
+    return streams[name], _said_row(said)
 
 
 def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:

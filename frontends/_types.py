@@ -11,6 +11,7 @@ from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from graphloc.frontends._livox import LIVOX, livox_cloud
 from graphloc.frontends._open import text_of
 from graphloc.frontends._vendor_types import VENDOR_TYPES
 
@@ -97,7 +98,9 @@ class MessageTypes:
         self._stores: dict[str, list[Typestore]] = {}
 
     def decode(self, data: bytes, msgtype: str) -> object:
-        """Return the deserialised message. Raises whatever rosbags raises on damaged bytes."""
+        """Return the deserialised message; of Livox's scans, as the cloud that they are. Raises whatever rosbags raises on damaged bytes."""
+        if msgtype in LIVOX:
+            return livox_cloud(data, ros1=self._ros1)
         if msgtype not in self._stores:
             self._stores[msgtype] = self._stores_of(msgtype)
         *others, last = self._stores[msgtype]

@@ -54,7 +54,7 @@ def unused_magnetometers(topics: Iterable[TopicSummary]) -> list[str]:
 
 
 def unread_lidars(topics: Iterable[TopicSummary]) -> list[str]:
-    """Return a line for each topic of a bag without a `PointCloud2` that holds scans in another type."""
+    """Return a line for each topic of a bag without a scan that is read that holds scans in another type."""
     return _unread(
         topics, _LIDAR, "scans are read as sensor_msgs/PointCloud2, which its driver, or a converter, makes of it"
     )

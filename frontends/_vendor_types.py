@@ -87,6 +87,11 @@ _OEM7_VELOCITY = _definition(
     **_OEM7,
 )
 
+_OEM7_INS = (
+    "float64 north_velocity; float64 east_velocity; float64 up_velocity; float64 roll; float64 pitch; float64 azimuth; "
+)
+_OEM7_SETTLED = {"novatel_oem7_msgs__InertialSolutionStatus": "uint32 status"}
+
 _SBF = {
     "septentrio_gnss_driver__BlockHeader": (
         "uint8 sync_1; uint8 sync_2; uint16 crc; uint16 id; uint8 revision; uint16 length; uint32 tow; uint16 wnc"
@@ -110,6 +115,27 @@ _PX4_QUALITY = (
     "uint8 quality_corrections; uint8 quality_receiver; uint8 quality_gnss_signals; uint8 quality_post_processing"
 )
 _PX4_AUTHENTIC = f"uint8 spoofing_state; uint8 authentication_state; {_PX4_VELOCITY}; uint32 system_error"
+
+_GEO_POINT = "float64 latitude; float64 longitude; float64 altitude"
+_GEO_POSE = {
+    "geographic_msgs__GeoPose": "GeoPoint position; geometry_msgs/Quaternion orientation",
+    "geographic_msgs__GeoPoint": _GEO_POINT,
+}
+
+_WATERLINKED_BEAM = "int64 id; float64 velocity; float64 distance; float64 rssi; float64 nsd; bool valid"
+_WATERLINKED = f"{_HEADER}; float64 time; geometry_msgs/Vector3 velocity; float64 fom; "
+_WATERLINKED_BEAMS = "float64 altitude; DVLBeam[] beams; bool velocity_valid; int64 status; "
+_DVL = (
+    f"{_HEADER}; uint8 velocity_mode; uint8 dvl_type; geometry_msgs/Vector3 velocity; float64[9] velocity_covar; float64 altitude; "
+    "float64 course_gnd; float64 speed_gnd; uint8 num_good_beams; float32 sound_speed; bool beam_ranges_valid; bool beam_velocities_valid; "
+    "geometry_msgs/Vector3[4] beam_unit_vec; float64[4] range; float32[4] range_covar; float32[4] beam_quality; float32[4] beam_velocity; "
+    "float32[4] beam_velocity_covar"
+)
+
+
+def _waterlinked(package: str, fields: str) -> str:
+    return _definition(fields, **{f"{package}__DVLBeam": _WATERLINKED_BEAM})
+
 
 VENDOR_TYPES: dict[str, tuple[str, ...]] = {
     "sbg_driver/msg/SbgImuData": (
@@ -201,6 +227,33 @@ VENDOR_TYPES: dict[str, tuple[str, ...]] = {
             **_OEM7,
         ),
     ),
+    "novatel_oem7_msgs/msg/INSPVAX": (
+        _definition(
+            f"{_HEADER}; Oem7Header nov_header; InertialSolutionStatus ins_status; PositionOrVelocityType pos_type; float64 latitude; "
+            f"float64 longitude; float64 height; float32 undulation; {_OEM7_INS}float32 latitude_stdev; float32 longitude_stdev; "
+            "float32 height_stdev; float32 north_velocity_stdev; float32 east_velocity_stdev; float32 up_velocity_stdev; float32 roll_stdev; "
+            "float32 pitch_stdev; float32 azimuth_stdev; INSExtendedSolutionStatus ext_sol_status; uint16 time_since_update",
+            novatel_oem7_msgs__INSExtendedSolutionStatus="uint32 status", **_OEM7, **_OEM7_SETTLED,
+        ),
+    ),
+    "novatel_oem7_msgs/msg/INSPVA": (
+        _definition(
+            f"{_HEADER}; Oem7Header nov_header; float64 latitude; float64 longitude; float64 height; {_OEM7_INS}InertialSolutionStatus status",
+            **_OEM7, **_OEM7_SETTLED,
+        ),
+    ),
+    "septentrio_gnss_driver/msg/INSNavGeod": (
+        _definition(
+            f"{_HEADER}; BlockHeader block_header; uint8 gnss_mode; uint8 error; uint16 info; uint16 gnss_age; float64 latitude; "
+            "float64 longitude; float64 height; float32 undulation; uint16 accuracy; uint16 latency; uint8 datum; uint16 sb_list; "
+            "float32 latitude_std_dev; float32 longitude_std_dev; float32 height_std_dev; float32 latitude_longitude_cov; "
+            "float32 latitude_height_cov; float32 longitude_height_cov; float32 heading; float32 pitch; float32 roll; "
+            "float32 heading_std_dev; float32 pitch_std_dev; float32 roll_std_dev; float32 heading_pitch_cov; float32 heading_roll_cov; "
+            "float32 pitch_roll_cov; float32 ve; float32 vn; float32 vu; float32 ve_std_dev; float32 vn_std_dev; float32 vu_std_dev; "
+            "float32 ve_vn_cov; float32 ve_vu_cov; float32 vn_vu_cov",
+            **_SBF,
+        ),
+    ),
     "septentrio_gnss_driver/msg/PVTGeodetic": (
         _definition(
             f"{_HEADER}; BlockHeader block_header; uint8 mode; uint8 error; float64 latitude; float64 longitude; float64 height; "
@@ -239,4 +292,22 @@ VENDOR_TYPES: dict[str, tuple[str, ...]] = {
     "px4_msgs/msg/VehicleGpsPosition": (
         _definition(f"{_PX4_START}; {_PX4_INTEGERS}; {_PX4_ACCURACY}; {_PX4_VELOCITY}; {_PX4_HEADING}"),
     ),
+    "dvl_msgs/msg/DVL": tuple(
+        _waterlinked("dvl_msgs", fields)
+        for fields in (
+            f"{_WATERLINKED}float64[] covariance; {_WATERLINKED_BEAMS}int64 time_of_validity; int64 time_of_transmission; string form",
+            f"{_WATERLINKED}{_WATERLINKED_BEAMS}string form",
+        )
+    ),
+    "geographic_msgs/msg/GeoPointStamped": (_definition(f"{_HEADER}; GeoPoint position", geographic_msgs__GeoPoint=_GEO_POINT),),
+    "geographic_msgs/msg/GeoPoseStamped": (_definition(f"{_HEADER}; GeoPose pose", **_GEO_POSE),),
+    "geographic_msgs/msg/GeoPoseWithCovarianceStamped": (
+        _definition(
+            f"{_HEADER}; GeoPoseWithCovariance pose", **_GEO_POSE, geographic_msgs__GeoPoseWithCovariance="GeoPose pose; float64[36] covariance",
+        ),
+    ),
+    "waterlinked_a50_ros_driver/msg/DVL": (
+        _waterlinked("waterlinked_a50_ros_driver", f"{_WATERLINKED}{_WATERLINKED_BEAMS}string form"),
+    ),
+    **dict.fromkeys(("marine_acoustic_msgs/msg/Dvl", "acoustic_msgs/msg/Dvl"), (_definition(_DVL),)),
 }  # fmt: skip

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VesselConfig
+from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuConfig, SensorConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import courses_of_fixes, motion_of_fixes
@@ -47,6 +47,7 @@ from graphloc.frontends.decode import (
     Decoded,
     supported_types,
 )
+from graphloc.frontends.vendors import VENDORS
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Mounts, Progress, Recording, Span
@@ -165,13 +166,28 @@ def _asked_for(config: VesselConfig, bag: Bag) -> tuple[list[Readings], Referenc
 
 def _subscriptions(config: VesselConfig, topics: Mapping[str, TopicSummary], bag: str) -> list[Readings]:
     """Return `Readings` for each enabled sensor that reads a topic."""
-    found = []
+    found: list[Readings] = []
     for name, sensor in config.sensors.items():
         types = supported_types(sensor.kind)
         if sensor.enabled and types:
             _check_topic(sensor.topic, f"sensors.{name}.topic", types, topics, bag)
+            _check_through(name, sensor, found, topics[sensor.topic], bag)
             found.append(Readings(name, sensor))
     return found
+
+
+def _check_through(name: str, sensor: SensorConfig, others: Sequence[Readings], topic: TopicSummary, bag: str) -> None:
+    """Raise an `InputError` if another sensor reads the same velocities as those through something else, and nothing tells which they are."""
+    if not isinstance(sensor, BodyVelocityConfig):
+        return
+    own = [r for r in others if r.config.topic == sensor.topic]
+    twins = [r.sensor for r in own if isinstance(r.config, BodyVelocityConfig) and r.config.through != sensor.through]
+    telling = any(part.through for msgtype in topic.msgtypes for part in VENDORS.get(msgtype, ()))
+    if twins and not telling:
+        raise InputError(
+            f"{bag}: sensors.{name} and sensors.{twins[0]} read {topic.topic} over ground and through water; {either(topic.msgtypes)} does not "
+            "say which it is, so both would count: delete one"
+        )
 
 
 def _check_topic(topic: str, key: str, types: tuple[str, ...], topics: Mapping[str, TopicSummary], bag: str) -> None:

@@ -30,11 +30,12 @@ from graphloc.config import (
 from graphloc.extras import added
 from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.frontends import nmea
-from graphloc.frontends._rejections import Rejection, malformed, rejected
+from graphloc.frontends._rejections import Rejection, ignored, malformed, rejected
 from graphloc.frontends.vendors import (
     STAMPS,
     VENDORS,
     Part,
+    SaidAlong,
     SaidHeading,
     SaidInertial,
     SaidPlace,
@@ -516,6 +517,10 @@ def _by_maker(part: Part) -> Decoder:
                 sigma = said.sigma_rad if config.use_reported_sigma else 0.0
                 sigma = sigma or float(np.radians(config.sigma_deg))
                 return CompassHeading(stamp_ns=stamp_ns, sensor=sensor, seq=seq, yaw_rad=yaw, sigma_rad=sigma)
+            case SaidAlong():
+                if said.through not in ("", config.through):
+                    return ignored(f"its velocity is through the {said.through}, and through is {config.through}")
+                return _along(said.v_mps, np.reshape(said.covariance, (3, 3)), stamp_ns, seq, sensor, config)
 
     return decoder
 

@@ -41,6 +41,7 @@ from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
 from graphloc.frontends._reports import (
     EAST_AXES,
+    FILTER,
     NORTH_AXES,
     CompassReport,
     GnssReport,
@@ -61,7 +62,7 @@ from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, 
 from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends._unused import unread_lidars, unread_tags, unused_magnetometers, unused_numbers, unused_topics
-from graphloc.frontends.aerial.cloud import CLOUD
+from graphloc.frontends.aerial.cloud import CLOUDS
 from graphloc.frontends.decode import (
     GPS_FIXES,
     IMU,
@@ -178,7 +179,12 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     reference = _best_track(bag, gnss)
     odometry = _odometry_reports(bag, gnss, reference)
     velocities = [
-        (s, velocity_report(s, reference.stamps_ns, reference.p_m, bag.tf_frame(s), reference.scatter_m))
+        (
+            s,
+            _with_mount(
+                velocity_report(s, reference.stamps_ns, reference.p_m, bag.tf_frame(s), reference.scatter_m), s, bag
+            ),
+        )
         for s in bag.of_type(TWIST, PLAIN_TWIST, VECTOR)
     ]
     wheels = [s for s, report in odometry if report.role == "check_speed"]
@@ -227,7 +233,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
         topics = bag.topics
         bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
         streams, tree = read_streams(bag)
-        lidars = _firsts_of(bag, [t.topic for t in topics.values() if CLOUD in t.msgtypes and t.messages])
+        lidars = _firsts_of(bag, [t.topic for t in topics.values() if set(CLOUDS) & set(t.msgtypes) and t.messages])
         cameras = _firsts_of(bag, _pictures(bag))
         infos = _firsts_of(
             bag, [t.topic for t in topics.values() if INFO in t.msgtypes and t.messages] if cameras else []
@@ -246,13 +252,14 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
 
 def _topic_reports(bag: _Contents) -> tuple[TopicReport, ...]:
     """Report every topic of the bag, then every NMEA sentence."""
+    streams = {name.removesuffix(FILTER): stream for name, stream in bag.streams.items()}
     topics = [
-        replace(topic_report(bag.streams[t.topic], t.messages), msgtype=t.msgtypes[0])
-        if t.topic in bag.streams
+        replace(topic_report(streams[t.topic], t.messages), topic=t.topic, msgtype=t.msgtypes[0])
+        if t.topic in streams
         else TopicReport(topic=t.topic, msgtype=" or ".join(t.msgtypes), count=t.messages)
         for t in bag.topics.values()
     ]
-    return (*topics, *(topic_report(s, len(s)) for s in bag.streams.values() if s.topic not in bag.topics))
+    return (*topics, *(topic_report(s, len(s)) for name, s in streams.items() if name not in bag.topics))
 
 
 def _gnss_reports(bag: _Contents) -> list[GnssReport]:
@@ -459,6 +466,24 @@ def _beside_wheels(gnss: GnssReport, bag: _Contents, wheels: Sequence[TopicData]
 def _clearly(offset: MotionOffset | None) -> tuple[float, float] | None:
     """Return an offset that is clear, s, and its sigma."""
     return (offset.value_s, offset.sigma_s) if offset is not None and offset.clear else None
+
+
+def _with_mount(report: VelocityReport, stream: TopicData, bag: _Contents) -> VelocityReport:
+    """Return the report with the mount of a Doppler log, whose own z is down; drivers name frames of tf whose z is up."""
+    if stream.part is None or stream.part.kind != "body_velocity":
+        return report
+    pose = bag.tree.resolve(bag.tree.body(), report.tf_frame) if report.tf_frame else None
+    if pose is None:
+        down = (180.0, 0.0, 180.0 if report.reverse else 0.0)
+        return replace(
+            report, mount=MountGuess(rpy_deg=down, tf_frame=None, evidence="x ahead, y to starboard, z down")
+        )
+    if pose[1][2, 2] < 0.0:
+        rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
+        return replace(report, mount=MountGuess(rpy_deg=rpy, tf_frame=report.tf_frame, evidence="from tf"))
+    rpy = vec(np.degrees(rpy_from_rotation(pose[1] @ np.diag([1.0, -1.0, -1.0]))))
+    said = f"by tf '{report.tf_frame}' has z up: turned about x, as the messages have z down"
+    return replace(report, mount=MountGuess(rpy_deg=rpy, tf_frame=None, evidence=said, xyz_m=vec(pose[0])))
 
 
 def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic, ...]:

@@ -3,7 +3,7 @@
 
 A message says one thing or several: a receiver's says a place and a velocity. Velocities and headings of most types are in known axes and
 come out as east, north, up; a few drivers write them in north, east, down or in east, north, up, as they are configured: these come out as
-they are, and `convention` of the sensor tells. An IMU's axes stay its own.
+they are, and `convention` of the sensor tells. Axes of an IMU or a Doppler log stay its own.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class SaidInertial(NamedTuple):
 class SaidPlace(NamedTuple):
     """A fix: degrees and height above the ellipsoid, m (NaN: not measured); status as in `NavSatStatus`.
 
-    horizontal_m, vertical_m: sigmas of each axis; 0: not told.
+    horizontal_m, vertical_m: sigmas of each axis; 0: not told. filtered: whether a filter made it of several sensors, as of what follows.
     """
 
     latitude_deg: float
@@ -37,6 +37,7 @@ class SaidPlace(NamedTuple):
     status: int
     horizontal_m: float = 0.0
     vertical_m: float = 0.0
+    filtered: bool = False
 
 
 class SaidVelocity(NamedTuple):
@@ -45,6 +46,7 @@ class SaidVelocity(NamedTuple):
     v_mps: tuple[float, float, float]
     horizontal_mps: float = 0.0
     vertical_mps: float = 0.0
+    filtered: bool = False
 
 
 class SaidHeading(NamedTuple):
@@ -52,9 +54,18 @@ class SaidHeading(NamedTuple):
 
     angle_rad: float
     sigma_rad: float = 0.0
+    filtered: bool = False
 
 
-Said = SaidInertial | SaidPlace | SaidVelocity | SaidHeading
+class SaidAlong(NamedTuple):
+    """A velocity along the axes of the sensor, m/s, its covariance, row by row (0: not told), and through what: ground, water, or not told."""
+
+    v_mps: tuple[float, float, float]
+    covariance: tuple[float, ...]
+    through: str = ""
+
+
+Said = SaidInertial | SaidPlace | SaidVelocity | SaidHeading | SaidAlong
 
 
 class Part(NamedTuple):
@@ -63,6 +74,7 @@ class Part(NamedTuple):
     Attributes:
         kind: the kind of sensor that reads it. read: takes the message. told: whether its axes are known by the type; else `convention`
             tells them, and `usual` is that of a driver that is left as it comes. antennas: whether a heading is one of GNSS, not of a filter.
+        through: whether each message says if its velocity is over ground or through the water.
     """
 
     kind: str
@@ -70,6 +82,7 @@ class Part(NamedTuple):
     told: bool = True
     antennas: bool = True
     usual: str = "ned"
+    through: bool = False
 
 
 _FEWEST_M, _MOST_M = 1e-4, 1e3  # sigmas of a fix that are believed; a receiver that knows its place no better has none
@@ -119,6 +132,15 @@ def _place(
     known = horizontal >= _FEWEST_M
     # The height may be worse: of a receiver that holds it, a kilometre.
     return SaidPlace(*place, status, horizontal if known else 0.0, vertical if vertical >= _FEWEST_M else 0.0)
+
+
+def _filtered(said: SaidPlace | Rejection, of_a_filter: bool = True) -> SaidPlace | Rejection:
+    return said if isinstance(said, Rejection) else said._replace(filtered=of_a_filter)
+
+
+def _yaw(q: Any) -> float:
+    """Return the direction of the x axis of a quaternion, rad."""
+    return atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
 
 
 def _bearing(angle_deg: float, sigma_deg: float) -> SaidHeading | Rejection:
@@ -201,25 +223,25 @@ def _sbg_filtered_place(msg: Any) -> SaidPlace | Rejection:
     if not msg.status.position_valid:
         return rejected("the filter says that its position is not valid")
     x, y, z = _xyz(msg.position_accuracy)
-    return _place(_sbg_where(msg), 0, max(x, y), z)
+    return _filtered(_place(_sbg_where(msg), 0, max(x, y), z))
 
 
 def _sbg_filtered_velocity(msg: Any) -> SaidVelocity | Rejection:
     if not msg.status.velocity_valid:
         return rejected("the filter says that its velocity is not valid")
     x, y, z = _xyz(msg.velocity_accuracy)
-    return SaidVelocity(_xyz(msg.velocity), _known(max(x, y)), _known(z))
+    return SaidVelocity(_xyz(msg.velocity), _known(max(x, y)), _known(z), filtered=True)
 
 
 def _sbg_filtered_heading(msg: Any) -> SaidHeading | Rejection:
     if not msg.status.heading_valid:
         return rejected("the filter says that its heading is not valid")
     if hasattr(msg, "quaternion"):
-        q = msg.quaternion
-        yaw = atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+        yaw = _yaw(msg.quaternion)
     else:
         yaw = float(msg.angle.z)
-    return _angle(degrees(yaw), degrees(float(msg.accuracy.z)))
+    said = _angle(degrees(yaw), degrees(float(msg.accuracy.z)))
+    return said if isinstance(said, Rejection) else said._replace(filtered=True)
 
 
 # u-blox: `ublox_msgs` with the manual's names of fields in ROS 1, in lower case in ROS 2, and `ublox_ubx_msgs` with flags of their own.
@@ -297,6 +319,8 @@ _OEM7_STATUS = {
 }  # fmt: skip
 _OEM7_NONE = {0: "none", 1: "a position that was set, not measured", 19: "propagated without observations"}
 _OEM7_FIXED = (48, 49, 50)
+_OEM7_INS = (51, 52, 53, 54, 55, 56, 73, 74, 79, 80)  # of a filter; of BESTPOS and BESTVEL too, where that is the best
+_INS_SETTLED = (3, 6, 7)
 
 
 def _oem7_trouble(msg: Any, solution: int, known: bool) -> Rejection | None:
@@ -311,7 +335,8 @@ def _oem7_place(msg: Any) -> SaidPlace | Rejection:
     if trouble := _oem7_trouble(msg, solution, solution in _OEM7_STATUS):
         return trouble
     place = float(msg.lat), float(msg.lon), float(msg.hgt) + float(msg.undulation)
-    return _place(place, _OEM7_STATUS[solution], max(float(msg.lat_stdev), float(msg.lon_stdev)), float(msg.hgt_stdev))
+    horizontal = max(float(msg.lat_stdev), float(msg.lon_stdev))
+    return _filtered(_place(place, _OEM7_STATUS[solution], horizontal, float(msg.hgt_stdev)), solution in _OEM7_INS)
 
 
 def _oem7_velocity(msg: Any) -> SaidVelocity | Rejection:
@@ -319,7 +344,8 @@ def _oem7_velocity(msg: Any) -> SaidVelocity | Rejection:
     if trouble := _oem7_trouble(msg, solution, solution not in _OEM7_NONE):
         return trouble
     speed, track = float(msg.hor_speed), radians(float(msg.trk_gnd))
-    return SaidVelocity((speed * sin(track), speed * cos(track), float(msg.ver_speed)))
+    v = speed * sin(track), speed * cos(track), float(msg.ver_speed)
+    return SaidVelocity(v, filtered=solution in _OEM7_INS)
 
 
 def _oem7_heading(msg: Any) -> SaidHeading | Rejection:
@@ -329,6 +355,47 @@ def _oem7_heading(msg: Any) -> SaidHeading | Rejection:
     if solution not in _OEM7_FIXED:
         return rejected(f"a heading with float ambiguities (type {solution})")
     return _bearing(float(msg.heading), float(msg.heading_stdev))
+
+
+def _ins_trouble(msg: Any) -> Rejection | None:
+    """Return why an INSPVAX, or an INSPVA, which holds less, is no solution."""
+    settled, solution = (
+        int(_any(msg, "ins_status", "status").status),
+        int(msg.pos_type.type) if hasattr(msg, "pos_type") else 0,
+    )
+    if settled in _INS_SETTLED and (solution in _OEM7_STATUS or not hasattr(msg, "pos_type")):
+        return None
+    return rejected(f"no solution (ins_status {settled}, type {_OEM7_NONE.get(solution, solution)})")
+
+
+def _ins_sigmas(msg: Any, *names: str) -> tuple[float, ...]:
+    return tuple(_known(float(getattr(msg, f"{name}_stdev", 0.0))) for name in names)
+
+
+def _ins_place(msg: Any) -> SaidPlace | Rejection:
+    if trouble := _ins_trouble(msg):
+        return trouble
+    # Heights of INSPVAX are above the sea, those of INSPVA above the ellipsoid.
+    place = float(msg.latitude), float(msg.longitude), float(msg.height) + float(getattr(msg, "undulation", 0.0))
+    north, east, up = _ins_sigmas(msg, "latitude", "longitude", "height")
+    return _filtered(
+        _place(place, _OEM7_STATUS[int(msg.pos_type.type)] if hasattr(msg, "pos_type") else 0, max(north, east), up)
+    )
+
+
+def _ins_velocity(msg: Any) -> SaidVelocity | Rejection:
+    if trouble := _ins_trouble(msg):
+        return trouble
+    north, east, up = _ins_sigmas(msg, "north_velocity", "east_velocity", "up_velocity")
+    v = float(msg.east_velocity), float(msg.north_velocity), float(msg.up_velocity)
+    return SaidVelocity(v, max(north, east), up, filtered=True)
+
+
+def _ins_heading(msg: Any) -> SaidHeading | Rejection:
+    if trouble := _ins_trouble(msg):
+        return trouble
+    said = _bearing(float(msg.azimuth), _ins_sigmas(msg, "azimuth")[0])
+    return said if isinstance(said, Rejection) else said._replace(filtered=True)
 
 
 def _oem7_velocity_stamp_ns(msg: Any, log_ns: int) -> int | None:
@@ -368,12 +435,14 @@ def _sbf_place(msg: Any) -> SaidPlace | Rejection:
 
 
 def _sbf_velocity(msg: Any) -> SaidVelocity | Rejection:
-    if trouble := _sbf_trouble(msg):
-        return trouble
+    said = _sbf_trouble(msg) or _sbf_up(msg)
+    return said if isinstance(said, Rejection) else SaidVelocity(said)
+
+
+def _sbf_up(msg: Any) -> tuple[float, float, float] | Rejection:
+    """Return a velocity east, north, up, m/s."""
     v = float(msg.ve), float(msg.vn), float(msg.vu)
-    if max(map(abs, v)) > _DO_NOT_USE:
-        return rejected("no velocity")
-    return SaidVelocity(v)
+    return rejected("no velocity") if max(map(abs, v)) > _DO_NOT_USE else v
 
 
 def _sbf_heading(msg: Any) -> SaidHeading | Rejection:
@@ -383,6 +452,34 @@ def _sbf_heading(msg: Any) -> SaidHeading | Rejection:
     if mode not in _SBF_FIXED:
         return rejected("a heading with float ambiguities")
     return _angle(float(msg.heading), 0.0)
+
+
+def _sbf_ins_trouble(msg: Any) -> Rejection | None:
+    mode, error = int(msg.gnss_mode) & _SBF_MODE, int(msg.error)
+    if error == 0 and mode in _SBF_STATUS:
+        return None
+    return rejected(f"no GNSS in it (error {error}, mode {_SBF_NONE.get(mode, mode)})")
+
+
+def _sbf_ins_place(msg: Any) -> SaidPlace | Rejection:
+    if trouble := _sbf_ins_trouble(msg):
+        return trouble
+    place = degrees(float(msg.latitude)), degrees(float(msg.longitude)), float(msg.height)
+    horizontal = max(float(msg.latitude_std_dev), float(msg.longitude_std_dev))
+    return _filtered(_place(place, _SBF_STATUS[int(msg.gnss_mode) & _SBF_MODE], horizontal, float(msg.height_std_dev)))
+
+
+def _sbf_ins_velocity(msg: Any) -> SaidVelocity | Rejection:
+    said = _sbf_ins_trouble(msg) or _sbf_up(msg)
+    if isinstance(said, Rejection):
+        return said
+    sigmas = _known(max(float(msg.ve_std_dev), float(msg.vn_std_dev))), _known(float(msg.vu_std_dev))
+    return SaidVelocity(said, *sigmas, filtered=True)
+
+
+def _sbf_ins_heading(msg: Any) -> SaidHeading | Rejection:
+    said = _sbf_ins_trouble(msg) or _angle(float(msg.heading), float(msg.heading_std_dev))
+    return said if isinstance(said, Rejection) else said._replace(filtered=True)
 
 
 # PX4: microseconds since boot, or of the computer's clock where its agent synchronises them.
@@ -431,6 +528,67 @@ def _px4_stamp_ns(msg: Any, _log_ns: int) -> int | None:
     return 1000 * at_us if 0 < at_us < _LATEST_US else None
 
 
+# Doppler logs: x ahead, y to starboard, z down, where they point.
+
+_DVL_THROUGH = {1: "ground", 2: "water"}
+_DVL_BEAMS = 3  # that a velocity takes
+
+
+def _waterlinked_along(msg: Any) -> SaidAlong | Rejection:
+    if not msg.velocity_valid:
+        return rejected("no velocity (velocity_valid false: no lock on the bottom)")
+    covariance = tuple(float(v) for v in getattr(msg, "covariance", ()))  # of newer versions
+    if len(covariance) != 9:
+        fom = _known(float(msg.fom)) ** 2  # the figure of merit is a sigma
+        covariance = (fom, 0.0, 0.0, 0.0, fom, 0.0, 0.0, 0.0, fom)
+    return SaidAlong(_xyz(msg.velocity), covariance)
+
+
+def _dvl_along(msg: Any) -> SaidAlong | Rejection:
+    v, beams = _xyz(msg.velocity), int(msg.num_good_beams)
+    # Drivers of instruments that tell a velocity alone fill in neither beams nor flags.
+    if 0 < beams < _DVL_BEAMS or not (msg.beam_velocities_valid or any(v)):
+        return rejected(f"no velocity ({beams} good beams)")
+    return SaidAlong(v, tuple(float(c) for c in msg.velocity_covar), _DVL_THROUGH.get(int(msg.velocity_mode), ""))
+
+
+# geographic_msgs: poses are what a filter says, points are not told. Axes are east, north, up, heights above the ellipsoid.
+
+
+def _geo_point(msg: Any) -> SaidPlace | Rejection:
+    p = msg.position
+    return SaidPlace(float(p.latitude), float(p.longitude), float(p.altitude), 0)
+
+
+def _geo_covariance(msg: Any) -> tuple[Any, tuple[float, float, float]]:
+    """Return the pose, and variances, horizontal, vertical and of the yaw; 0: not told."""
+    if not hasattr(msg.pose, "covariance"):
+        return msg.pose, (0.0, 0.0, 0.0)
+    if len(msg.pose.covariance) != 36:
+        raise ValueError(f"a covariance of {len(msg.pose.covariance)} values")
+    one, other, up, _, _, yaw = (float(c) for c in msg.pose.covariance[::7])  # north or east first, as drivers like
+    return msg.pose.pose, (max(one, other), up, yaw)
+
+
+def _geo_place(msg: Any) -> SaidPlace | Rejection:
+    pose, variances = _geo_covariance(msg)
+    p = pose.position
+    place = float(p.latitude), float(p.longitude), float(p.altitude)
+    return _filtered(_place(place, 0, *(_known(v) ** 0.5 for v in variances[:2])))
+
+
+def _geo_heading(msg: Any) -> SaidHeading | Rejection:
+    pose, variances = _geo_covariance(msg)
+    q = pose.orientation
+    x, y, z, w = (float(v) for v in (q.x, q.y, q.z, q.w))
+    if x == y == z == 0.0:
+        return rejected("no orientation: zero, or as drivers leave it that know none")
+    if not abs(x * x + y * y + z * z + w * w - 1.0) < 0.1:
+        return malformed("orientation is NaN or no unit quaternion")
+    return SaidHeading(_yaw(q), _known(variances[2]) ** 0.5, filtered=True)
+
+
+GEOGRAPHIC = tuple(f"geographic_msgs/msg/{name}Stamped" for name in ("GeoPoint", "GeoPose", "GeoPoseWithCovariance"))
 _GPS = (Part("gnss", _px4_place), Part("gnss_velocity", _px4_velocity), Part("compass", _px4_heading))
 VENDORS: dict[str, tuple[Part, ...]] = {
     "sbg_driver/msg/SbgImuData": (Part("imu", _sbg_imu),),
@@ -454,10 +612,22 @@ VENDORS: dict[str, tuple[Part, ...]] = {
         ("novatel_oem7_msgs/msg/BESTVEL", "novatel_oem7_msgs/msg/BESTGNSSVEL"), (Part("gnss_velocity", _oem7_velocity),)
     ),
     "novatel_oem7_msgs/msg/HEADING2": (Part("compass", _oem7_heading),),
+    **dict.fromkeys(
+        ("novatel_oem7_msgs/msg/INSPVAX", "novatel_oem7_msgs/msg/INSPVA"),
+        (Part("gnss", _ins_place), Part("gnss_velocity", _ins_velocity), Part("compass", _ins_heading, antennas=False)),
+    ),
+    "septentrio_gnss_driver/msg/INSNavGeod": (
+        Part("gnss", _sbf_ins_place), Part("gnss_velocity", _sbf_ins_velocity),
+        Part("compass", _sbf_ins_heading, told=False, antennas=False, usual="enu"),
+    ),
     "septentrio_gnss_driver/msg/PVTGeodetic": (Part("gnss", _sbf_place), Part("gnss_velocity", _sbf_velocity)),
     "septentrio_gnss_driver/msg/AttEuler": (Part("compass", _sbf_heading, told=False, usual="enu"),),
     "px4_msgs/msg/SensorCombined": (Part("imu", _px4_imu),),
     **dict.fromkeys(("px4_msgs/msg/SensorGps", "px4_msgs/msg/VehicleGpsPosition"), _GPS),
+    GEOGRAPHIC[0]: (Part("gnss", _geo_point),),
+    **dict.fromkeys(GEOGRAPHIC[1:], (Part("gnss", _geo_place), Part("compass", _geo_heading, antennas=False))),
+    **dict.fromkeys(("dvl_msgs/msg/DVL", "waterlinked_a50_ros_driver/msg/DVL"), (Part("body_velocity", _waterlinked_along),)),
+    **dict.fromkeys(("marine_acoustic_msgs/msg/Dvl", "acoustic_msgs/msg/Dvl"), (Part("body_velocity", _dvl_along, through=True),)),
 }  # fmt: skip
 """By type of message: what it says, the first thing first."""
 

@@ -47,7 +47,11 @@ def _filled(make: Messages, msgtype: str, given: dict[str, Any]) -> Any:
         elif node == Nodetype.BASE:
             values[name] = ("" if kinds[0] == "string" else 0) if value is None else value
         else:
-            (_, (kind, _)), length = kinds
-            values[name] = np.zeros(length, dtype=kind) if value is None else np.array(value, dtype=kind)
+            (of, inner), length = kinds
+            length = 0 if node == Nodetype.SEQUENCE else length
+            if of == Nodetype.NAME:
+                values[name] = [_filled(make, str(inner), one) for one in value or [{}] * length]
+            else:
+                values[name] = np.zeros(length, dtype=inner[0]) if value is None else np.array(value, dtype=inner[0])
     assert set(given) <= set(values), set(given) - set(values)
     return make.t[msgtype](**values)

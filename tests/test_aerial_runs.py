@@ -91,7 +91,7 @@ def test_one_match_is_drawn(
     ("changes", "said"),
     [
         ({"lidars": {}}, "needs `lidars`"),
-        ({"lidars": {"a": {"topic": "/imu/data"}}}, "holds no PointCloud2; such topics: /lidar_1/points"),
+        ({"lidars": {"a": {"topic": "/imu/data"}}}, "holds no PointCloud2, and no scan of Livox's drivers; such topics: /lidar_1/points"),
         ({"lidars": {"a": {"topic": "/lidar_1/points", "mount": {"tf_frame": "nowhere"}}}}, "no chain from 'base_link' to 'nowhere'"),
         ({"image": "none.tif"}, "not an image"),
     ],

@@ -674,8 +674,7 @@ def test_far_fewer_fixes_are_no_better_beside_a_filter(beside: bool, tmp_path: P
 @pytest.mark.parametrize(
     ("msgtype", "said"),
     [
-        ("livox_ros_driver2/msg/CustomMsg", "livox_ros_driver2/CustomMsg is not read; scans are read as sensor_msgs/PointCloud2"),
-        ("velodyne_msgs/msg/VelodyneScan", "velodyne_msgs/VelodyneScan is not read"),
+        ("velodyne_msgs/msg/VelodyneScan", "velodyne_msgs/VelodyneScan is not read; scans are read as sensor_msgs/PointCloud2"),
         ("isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray", "is not read; tags are found in images"),
     ],
 )  # fmt: skip

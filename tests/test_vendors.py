@@ -39,8 +39,9 @@ ROS2 = Messages(2)
 CONFIGS: dict[str, Any] = {
     "imu": ImuConfig(), "gnss": GnssConfig(), "compass": CompassConfig(sigma_deg=7.0), "gnss_velocity": VelocityConfig(),
 }  # fmt: skip
-SBG, UBX, DGNSS, OEM7, SBF, PX4 = (
-    f"{package}/msg/" for package in ("sbg_driver", "ublox_msgs", "ublox_ubx_msgs", "novatel_oem7_msgs", "septentrio_gnss_driver", "px4_msgs")
+SBG, UBX, DGNSS, OEM7, SBF, PX4, GEO = (
+    f"{package}/msg/"
+    for package in ("sbg_driver", "ublox_msgs", "ublox_ubx_msgs", "novatel_oem7_msgs", "septentrio_gnss_driver", "px4_msgs", "geographic_msgs")
 )  # fmt: skip
 
 
@@ -75,6 +76,17 @@ PLACES: dict[str, dict[str, Any]] = {
     PX4 + "SensorGps": {
         "fix_type": 6, "latitude_deg": 57.5, "longitude_deg": -11.25, "altitude_msl_m": 6.5, "altitude_ellipsoid_m": 41.5, "eph": 0.5, "epv": 2.0,
     },
+    OEM7 + "INSPVAX": {
+        "ins_status": {"status": 3}, "pos_type": {"type": 56}, "latitude": 57.5, "longitude": -11.25, "height": 6.5, "undulation": 35.0,
+        "latitude_stdev": 0.25, "longitude_stdev": 0.5, "height_stdev": 2.0,
+    },
+    SBF + "INSNavGeod": {
+        "gnss_mode": 4, "latitude": np.radians(57.5), "longitude": np.radians(-11.25), "height": 41.5, "undulation": 35.0,
+        "latitude_std_dev": 0.5, "longitude_std_dev": 0.25, "height_std_dev": 2.0,
+    },
+    GEO + "GeoPoseWithCovarianceStamped": {
+        "pose": {"pose": {"position": {"latitude": 57.5, "longitude": -11.25, "altitude": 41.5}}, "covariance": np.diag([0.0625, 0.25, 4, 0, 0, 0]).ravel()},
+    },
     PX4 + "VehicleGpsPosition": {
         "fix_type": 6, "lat": 575_000_000, "lon": -112_500_000, "alt": 6_500, "alt_ellipsoid": 41_500, "eph": 0.5, "epv": 2.0,
     },
@@ -87,8 +99,15 @@ VELOCITIES: dict[str, tuple[dict[str, Any], float]] = {
     DGNSS + "UBXNavPVT": ({"gps_fix": {"fix_type": 3}, "gnss_fix_ok": True, "vel_n": 3000, "vel_e": -1000, "vel_d": 500, "s_acc": 250}, 0.25),
     OEM7 + "BESTVEL": ({"vel_type": {"type": 8}, "hor_speed": 10.0**0.5, "trk_gnd": 341.565051177078, "ver_speed": -0.5}, 0.3),
     SBF + "PVTGeodetic": ({"mode": 1, "vn": 3.0, "ve": -1.0, "vu": -0.5}, 0.3),
+    OEM7 + "INSPVAX": (
+        {"ins_status": {"status": 3}, "pos_type": {"type": 56}, "north_velocity": 3.0, "east_velocity": -1.0, "up_velocity": -0.5, "north_velocity_stdev": 0.25, "up_velocity_stdev": 0.25},
+        0.25,
+    ),
+    OEM7 + "INSPVA": ({"status": {"status": 7}, "north_velocity": 3.0, "east_velocity": -1.0, "up_velocity": -0.5}, 0.3),
+    SBF + "INSNavGeod": ({"gnss_mode": 1, "vn": 3.0, "ve": -1.0, "vu": -0.5, "vn_std_dev": 0.25, "ve_std_dev": 0.125, "vu_std_dev": 0.25}, 0.25),
     PX4 + "SensorGps": ({"fix_type": 3, "vel_ned_valid": True, "vel_n_m_s": 3.0, "vel_e_m_s": -1.0, "vel_d_m_s": 0.5, "s_variance_m_s": 0.25}, 0.25),
 }  # fmt: skip
+WEST_BY_NORTH = Rotation.from_euler("ZYX", (150.0, 20.0, -10.0), degrees=True)  # in east, north, up
 # 300 deg: a bow to the west-north-west; sigma 0.5 deg, or not told.
 HEADINGS: dict[str, tuple[dict[str, Any], float]] = {
     SBG + "SbgGpsHdt": ({"status": 64, "true_heading": 300.0, "true_heading_acc": 0.5}, 0.5),
@@ -104,9 +123,16 @@ HEADINGS: dict[str, tuple[dict[str, Any], float]] = {
     ),
     OEM7 + "HEADING2": ({"pos_type": {"type": 50}, "heading": 300.0, "heading_stdev": 0.5}, 0.5),
     SBF + "AttEuler": ({"mode": 2, "heading": 300.0}, 7.0),
+    OEM7 + "INSPVAX": ({"ins_status": {"status": 6}, "pos_type": {"type": 53}, "azimuth": 300.0, "azimuth_stdev": 0.5}, 0.5),
+    OEM7 + "INSPVA": ({"status": {"status": 3}, "azimuth": 300.0}, 7.0),
+    SBF + "INSNavGeod": ({"gnss_mode": 1, "heading": 300.0, "heading_std_dev": 0.5}, 0.5),
+    GEO + "GeoPoseStamped": ({"pose": {"orientation": ROS2.quat(WEST_BY_NORTH.as_quat().tolist())}}, 7.0),
+    GEO + "GeoPoseWithCovarianceStamped": (
+        {"pose": {"pose": {"orientation": ROS2.quat(WEST_BY_NORTH.as_quat().tolist())}, "covariance": np.diag([0, 0, 0, 1, 1, np.radians(0.5) ** 2]).ravel()}}, 0.5,
+    ),
     PX4 + "SensorGps": ({"fix_type": 3, "heading": np.radians(-60.0), "heading_accuracy": np.radians(0.5)}, 0.5),
 }  # fmt: skip
-KNOWN_AXES = (UBX, DGNSS, OEM7, PX4)
+KNOWN_AXES = (UBX, DGNSS, OEM7, PX4, GEO)
 
 
 def read(kind: str, msgtype: str, fields: dict[str, Any], *, make: Messages = ROS2, **config: Any) -> Any:
@@ -128,6 +154,9 @@ def test_a_place_has_the_height_above_the_ellipsoid_and_the_sigma_of_an_axis(msg
 @pytest.mark.parametrize("msgtype", PLACES)
 def test_a_place_without_an_accuracy_gets_the_default(msgtype: str) -> None:
     silent = {"position_accuracy": vector(0, 0, 0), "h_acc": 0, "v_acc": 0, "lat_stdev": 0.0, "lon_stdev": 0.0, "hgt_stdev": 0.0, "h_accuracy": 65535, "v_accuracy": 65535, "eph": np.nan, "epv": np.nan}  # fmt: skip
+    silent |= dict.fromkeys(("latitude_stdev", "longitude_stdev", "height_stdev"), 0.0)
+    silent |= dict.fromkeys(("latitude_std_dev", "longitude_std_dev", "height_std_dev"), -2e10)
+    silent["pose"] = {"pose": PLACES[GEO + "GeoPoseWithCovarianceStamped"]["pose"]["pose"], "covariance": -np.ones(36)}
     fields = {name: silent.get(name, value) for name, value in PLACES[msgtype].items()}
     found = read("gnss", msgtype, fields)
     assert np.sqrt(np.diagonal(found.cov_enu_m2)) == pytest.approx([1.5, 1.5, 4.0])
@@ -215,6 +244,18 @@ INVALID: list[tuple[str, str, dict[str, Any], str]] = [
     ("compass", SBF + "AttEuler", {"error": 1}, "error 1"),
     ("compass", SBF + "AttEuler", {"heading": 90.0 + 2e10}, "no heading"),
     ("compass", PX4 + "SensorGps", {"heading": float("nan")}, "no heading"),
+    ("gnss", OEM7 + "INSPVAX", {"ins_status": {"status": 2}}, "ins_status 2"),
+    ("gnss", OEM7 + "INSPVAX", {"pos_type": {"type": 0}}, "none"),
+    ("gnss_velocity", OEM7 + "INSPVA", {"status": {"status": 1}}, "ins_status 1"),
+    ("compass", OEM7 + "INSPVAX", {"ins_status": {"status": 8}}, "ins_status 8"),
+    ("gnss", SBF + "INSNavGeod", {"gnss_mode": 0}, "no GNSS in it"),
+    ("gnss_velocity", SBF + "INSNavGeod", {"vu": -2e10}, "no velocity"),
+    ("gnss_velocity", SBF + "INSNavGeod", {"error": 5}, "error 5"),
+    ("compass", SBF + "INSNavGeod", {"heading": 90.0 + 2e10}, "no heading"),
+    ("compass", GEO + "GeoPoseStamped", {"pose": {"orientation": ROS2.quat((0, 0, 0, 1))}}, "no orientation"),
+    ("compass", GEO + "GeoPoseStamped", {"pose": {}}, "no orientation"),
+    ("compass", GEO + "GeoPoseStamped", {"pose": {"orientation": ROS2.quat((0, 0, 0.5, 0.5))}}, "unit quaternion"),
+    ("gnss", GEO + "GeoPoseWithCovarianceStamped", {"pose": {"pose": {"position": {"latitude": np.nan}}}}, "NaN"),
 ]
 
 
@@ -350,6 +391,7 @@ def test_a_bag_without_definitions_is_read_in_each_version(msgtype: str, version
     fields = {
         "SbgGpsPos": PLACES[SBG + "SbgGpsPos"], "SensorGps": PLACES[PX4 + "SensorGps"] | {"heading": 0.5}, "SbgGpsHdt": {"true_heading": 300.0},
         "SensorCombined": {"accelerometer_m_s2": (1, 2, 3)}, "SbgEkfEuler": {"angle": vector(0, 0, 1)},
+        "DVL": {"velocity": vector(1, 2, 3), "fom": 0.25, "velocity_valid": True, "altitude": -1.0, "beams": [{"id": k} for k in range(4)], "form": "json_v3"},
     }.get(msgtype.split("/")[-1], {})  # fmt: skip
     if "int32 lat\n" in VENDOR_TYPES[msgtype][version] and fields:
         fields = PLACES[PX4 + "VehicleGpsPosition"] | {"heading": 0.5}
@@ -371,7 +413,7 @@ def _sbg(make: Messages, at: int, fix: Any, v: Any, heading_deg: float, off_deg:
     vel = said(make, SBG + "SbgGpsVel", header=header, status={"vel_type": 2}, vel=make.vector((v[1], v[0], -v[2])), vel_acc=sigmas)  # fmt: skip
     hdt = said(make, SBG + "SbgGpsHdt", header=header, true_heading=heading_deg, true_heading_acc=0.25)
     own = said(make, SBG + "SbgEkfEuler", header=header, status={"heading_valid": True}, angle=make.vector((0, 0, np.radians(heading_deg + off_deg * np.sin(at / S)))))  # fmt: skip
-    return [("/sbg/gps_pos", at, pos), ("/sbg/gps_vel", at, vel), ("/sbg/gps_hdt", at, hdt), ("/sbg/ekf_euler", at, own)]  # fmt: skip
+    return [("/sbg/gps_pos", at, pos), ("/sbg/gps_vel", at, vel), ("/sbg/gps_hdt", at, hdt), ("/ins/euler", at, own)]  # fmt: skip
 
 
 def _px4(make: Messages, at: int, fix: Any, v: Any, heading_deg: float) -> list[Item]:
@@ -500,7 +542,8 @@ def test_fields_of_other_types_are_no_crash(kind: str, value: Any, tmp_path: Pat
     make = Messages(2)
     items: list[Item] = [("/imu", START_NS, make.imu(START_NS))]
     sensors: dict[str, Any] = {"imu": ImuConfig(topic="/imu")}
-    for msgtype in (UBX + "NavPVT", OEM7 + "BESTPOS", OEM7 + "BESTVEL", PX4 + "SensorGps"):  # of each way to a stamp
+    ways = (UBX + "NavPVT", OEM7 + "BESTPOS", OEM7 + "BESTVEL", PX4 + "SensorGps")  # of each way to a stamp
+    for msgtype in (*ways, OEM7 + "INSPVAX", SBF + "INSNavGeod", GEO + "GeoPoseWithCovarianceStamped"):
         fields = r"(?m)^(?:u?int\d+|float\d+|bool|string)(?:\[\d+\])? (\w+)$"
         make.store.register(get_types_from_msg(re.sub(fields, rf"{kind} \1", VENDOR_TYPES[msgtype][0]), msgtype))
         items.append((f"/{msgtype}", START_NS, _of_other_fields(make, msgtype, value)))
@@ -539,3 +582,89 @@ def test_a_message_of_another_version_is_malformed_and_no_crash() -> None:
     with pytest.raises(AttributeError, match="another version"):
         found(SimpleNamespace(status=SimpleNamespace(vel_status=0, vel_type=1)), START_NS, 0, "it", VelocityConfig())
     assert stamp_ns_of(SimpleNamespace(), UBX + "NavPVT", 7) is None
+
+
+def test_a_point_is_a_place_without_an_accuracy() -> None:
+    place = {"latitude": 57.5, "longitude": -11.25, "altitude": 41.5}
+    found = read("gnss", GEO + "GeoPointStamped", {"position": place})
+    assert found.position == pytest.approx((57.5, -11.25, 41.5))
+    assert np.sqrt(np.diagonal(found.cov_enu_m2)) == pytest.approx([1.5, 1.5, 4.0])
+    assert not read("gnss", GEO + "GeoPointStamped", {"position": place | {"altitude": np.nan}}).has_height
+    assert read("gnss", GEO + "GeoPoseStamped", {"pose": {"position": place}}).position == found.position
+
+
+def _span(make: Messages, at: int, fix: Any, v: Any, heading_deg: float, ins: bool, gnss_only: bool) -> list[Item]:
+    """NovAtel's receiver with an IMU: its best place is that of its filter, once it has settled."""
+    header = make.header(at)
+    place = {"header": header, "lat": fix.latitude, "lon": fix.longitude, "hgt": fix.altitude, "lat_stdev": 0.02, "lon_stdev": 0.02, "hgt_stdev": 0.04}  # fmt: skip
+    settled = ins and at > START_NS + 20 * S
+    track = {
+        "hor_speed": float(np.hypot(v[0], v[1])),
+        "trk_gnd": np.degrees(np.arctan2(v[0], v[1])) % 360.0,
+        "ver_speed": v[2],
+    }
+    items = [
+        ("/oem7/bestpos", at, said(make, OEM7 + "BESTPOS", pos_type={"type": 56 if settled else 50}, **place)),
+        (
+            "/oem7/bestvel",
+            at,
+            said(make, OEM7 + "BESTVEL", header=header, vel_type={"type": 56 if settled else 8}, **track),
+        ),
+    ]
+    if ins:
+        values: dict[str, Any] = {"latitude": fix.latitude, "longitude": fix.longitude, "height": fix.altitude, "north_velocity": v[1], "east_velocity": v[0], "up_velocity": v[2], "azimuth": heading_deg}  # fmt: skip
+        state: dict[str, Any] = {
+            "ins_status": {"status": 3 if settled else 1},
+            "pos_type": {"type": 56},
+            "azimuth_stdev": 0.1,
+        }
+        items.append(("/oem7/inspvax", at, said(make, OEM7 + "INSPVAX", header=header, **values, **state)))
+    if gnss_only:
+        items.append(("/oem7/bestgnsspos", at, said(make, OEM7 + "BESTGNSSPOS", pos_type={"type": 50}, **place)))
+    return items
+
+
+@pytest.mark.parametrize("ins", [True, False])
+def test_a_filters_place_stands_behind_a_receivers(ins: bool, tmp_path: Path) -> None:
+    """Whatever the name of its topic; by the type of its solution, BESTPOS is one or the other."""
+    make = Messages(2)
+    found, config, text = look(tmp_path, _spoken(make, partial(_span, ins=ins, gnss_only=True)), make)
+    (gnss,) = config.of_kind("gnss").values()
+    assert gnss.topic == ("/oem7/bestgnsspos" if ins else gnss.topic)
+    of_a_filter = " (of a filter)" if ins else ""
+    assert {g.topic for g in found.gnss} >= {"/oem7/bestgnsspos", f"/oem7/bestpos{of_a_filter}"}
+    assert [v.topic for v in found.velocities if "bestvel" in v.topic] == [f"/oem7/bestvel{of_a_filter}"]
+    topics = {sensor.topic for sensor in config.sensors.values()}
+    assert topics >= {"/oem7/bestpos", "/oem7/bestgnsspos", "/oem7/bestvel"} | ({"/oem7/inspvax"} if ins else set())
+    assert ("by its name, or its messages, a filter's output" in text) == ins
+
+
+def test_a_filters_place_alone_is_used_and_says_so(tmp_path: Path) -> None:
+    make = Messages(2)
+    found, config, text = look(tmp_path, _spoken(make, partial(_span, ins=True, gnss_only=False)), make)
+    (gnss,) = config.of_kind("gnss").values()
+    assert gnss.topic in ("/oem7/bestpos", "/oem7/inspvax")
+    assert {t.topic: t.msgtype for t in found.topics}["/oem7/inspvax"] == OEM7 + "INSPVAX"
+    assert all(t.rate_hz for t in found.topics)
+    assert f"  topic: {gnss.topic}\n    # guess: by its name, or its messages, a filter's output" in text
+    (compass,) = (c for c in config.sensors.values() if c.kind == "compass")
+    assert isinstance(compass, CompassConfig)
+    assert not compass.use_reported_sigma
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_geographic_pose_is_a_place_and_a_heading_of_a_filter(beside: bool, tmp_path: Path) -> None:
+    def say(make: Messages, at: int, fix: Any, _v: Any, heading_deg: float) -> list[Item]:
+        turned = make.quat(Rotation.from_euler("z", 90.0 - heading_deg, degrees=True).as_quat().tolist())
+        place = {"latitude": fix.latitude, "longitude": fix.longitude, "altitude": fix.altitude}
+        pose = said(make, GEO + "GeoPoseStamped", header=make.header(at), pose={"position": place, "orientation": turned})  # fmt: skip
+        far = {"position": {"latitude": 58.0, "longitude": 11.0}}
+        return [("/geopose", at, pose), ("/setpoint/global", at, said(make, GEO + "GeoPoseStamped", header=make.header(at), pose=far))]  # fmt: skip
+
+    make = Messages(2)
+    _, config, text = look(tmp_path, _spoken(make, say, beside=beside), make)
+    (gnss,) = config.of_kind("gnss").values()
+    assert gnss.topic == ("/fix" if beside else "/geopose")
+    (compass,) = config.of_kind("compass").values()
+    assert (compass.topic, compass.convention, compass.use_reported_sigma) == ("/geopose", "enu", False)
+    assert "setpoint" not in text

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from graphloc.errors import InputError
 from graphloc.frames import Array
+from graphloc.frontends._livox import LIVOX
 from graphloc.frontends.aerial.scan import LevelCloud
 from graphloc.recording import Mounts
 from graphloc.trajectory import Trajectory
@@ -19,6 +20,7 @@ from graphloc.trajectory import Trajectory
 log = logging.getLogger(__name__)
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
+CLOUDS = (CLOUD, *LIVOX)
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField
 _TIME_FIELDS = ("time", "t", "timestamp", "offset_time", "time_offset", "time_stamp")
 _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)

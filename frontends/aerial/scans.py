@@ -16,7 +16,7 @@ from graphloc.frontends._clock import corrected_ns
 from graphloc.frontends._mounts import mounts_of
 from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag
-from graphloc.frontends.aerial.cloud import CLOUD, Cloud, decode_cloud
+from graphloc.frontends.aerial.cloud import CLOUDS, Cloud, decode_cloud
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn, outside
 from graphloc.frontends.aerial.own import Staying
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
@@ -102,10 +102,10 @@ def _mounts(bag: Bag, config: AerialConfig, body_frame: str) -> dict[str, tuple[
         raise InputError("vessel.yaml: an aerial sensor needs `lidars`: name, topic and mount of each")
     for name, lidar in config.lidars.items():
         have = bag.topics.get(lidar.topic)
-        if have is None or CLOUD not in have.msgtypes:
-            fitting = [t.topic for t in bag.topics.values() if CLOUD in t.msgtypes]
+        if have is None or not set(CLOUDS) & set(have.msgtypes):
+            fitting = [t.topic for t in bag.topics.values() if set(CLOUDS) & set(t.msgtypes)]
             raise InputError(
-                f"{bag.name}: lidars.{name}.topic '{lidar.topic}' holds no PointCloud2; such topics: "
+                f"{bag.name}: lidars.{name}.topic '{lidar.topic}' holds no PointCloud2, and no scan of Livox's drivers; such topics: "
                 f"{', '.join(fitting) or 'none'}"
             )
     return mounts_of(bag, {name: lidar.mount for name, lidar in config.lidars.items()}, body_frame, "lidars")

@@ -185,7 +185,7 @@ class VelocityConfig(SensorConfig):
 class BodyVelocityConfig(SensorConfig):
     """Velocity along the vessel, of wheels, a Doppler log or a speed log: twist of `nav_msgs/Odometry` or of `gnss_velocity`'s types.
 
-    Also `std_msgs/Float64` or `Float32`, and VHW in NMEA as `gnss`. All along the axes of the sensor.
+    Also `std_msgs/Float64` or `Float32`, VHW in NMEA as `gnss`, and Doppler logs' own messages. All along the axes of the sensor.
     """
 
     kind: Literal["body_velocity"] = "body_velocity"
@@ -194,7 +194,7 @@ class BodyVelocityConfig(SensorConfig):
     """Axes of the sensor along which it measures; of a number and of VHW x alone. Wheels: [x, y], where the mount is a place that
     does not slip sideways (the rear axle of a car); x alone tells an error of the heading by its cosine only. A Doppler log: [x, y, z]."""
     through: Literal["ground", "water"] = "ground"
-    """What it moves over or through. Water has a current, which is estimated."""
+    """What it moves over or through. Water has a current, which is estimated. Messages that say the other are ignored."""
     unit: Literal["m/s", "km/h", "knots"] = "m/s"
     """Of a number; of other messages it is known."""
     use_reported_sigma: bool = True

@@ -64,13 +64,13 @@ class LidarConfig(Block):
     """A LiDAR whose scans are matched."""
 
     topic: str
-    """Its `sensor_msgs/PointCloud2` topic."""
+    """Its topic, of `sensor_msgs/PointCloud2` or Livox's `CustomMsg`."""
     mount: MountConfig = MountConfig()
     """Where it sits on the vessel."""
 
 
 class AerialConfig(AnyPoseConfig):
-    """LiDAR scans (`sensor_msgs/PointCloud2`) matched to an aerial image, drawn lines, or both."""
+    """LiDAR scans (`sensor_msgs/PointCloud2`, Livox's `CustomMsg`) matched to an aerial image, drawn lines, or both."""
 
     kind: Literal["aerial"] = "aerial"
     """The sensor kind."""
