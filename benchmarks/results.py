@@ -24,6 +24,7 @@ import docking
 import drawn
 import drills
 import fuzz
+import harbours
 import matcher
 import odd
 import online
@@ -54,6 +55,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "C.3": matcher.honesty,
     "C.4": matcher.runs,
     "C.5": matcher.speed,
+    "C.drawn": harbours.figures,
     "D.0": tag_detector.steps,
     "D.1": docking.docking,
     "D.4": single_tags.figures,

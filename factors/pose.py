@@ -84,7 +84,7 @@ def _false_probability(m: PoseFix, config: AnyPoseConfig) -> float:
 def false(m: PoseFix, config: AnyPoseConfig) -> FalseModel:
     """Return the model of a false pose: anywhere in BL's search window, and likely to repeat."""
     sigmas = np.array([FALSE_SPREAD_M if AXES.index(a) < 3 else FALSE_SPREAD_RAD for a in m.axes])
-    return FalseModel(probability=_false_probability(m, config), cov=np.diag(sigmas**2), repeats=config.false_repeats, fresh=m.fresh)
+    return FalseModel(probability=_false_probability(m, config), cov=np.diag(sigmas**2), repeats=config.false_repeats, news=m.news)
 
 
 def factors(m: PoseFix, config: AnyPoseConfig, at: Attachment, decision: Decision) -> GraphUpdate:

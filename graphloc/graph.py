@@ -210,13 +210,13 @@ class FalseModel:
         probability: that a measurement is false. cov: (k, k) of a false residual, around the truth.
         repeats: probability that a false one that follows a false one repeats its error (a moored boat
             taken for another one is so again in the next scan).
-        fresh: share of its evidence that is independent of the one before.
+        news: share of its evidence for right or false that is independent of the measurement before it.
     """
 
     probability: float
     cov: Array
     repeats: float
-    fresh: float = 1.0
+    news: float = 1.0
 
 
 def _unknown() -> Array:

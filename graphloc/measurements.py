@@ -152,13 +152,12 @@ class PoseFix(Measurement):
     Attributes:
         axes: which of `AXES` are measured, in the order of `AXES`.
         modes: at least one; probabilities sum to at most 1, what is missing is 'none of them'.
-        fresh: share of its evidence that is independent of the one before: if that was false, so is this one, and alike, as
-            far as it is not.
+        news: share of its evidence for right or false that is independent of the one before it.
     """
 
     axes: tuple[str, ...]
     modes: tuple[PoseMode, ...]
-    fresh: float = 1.0
+    news: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.axes or tuple(a for a in AXES if a in self.axes) != tuple(self.axes):

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,12 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import find_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.eval.simulate.harbour import load_harbour
-from graphloc.frames import Array, Datum
+from graphloc.frames import Array, Datum, rotation_from_rpy_deg
 from graphloc.frontends._source import RawMessage
 from graphloc.frontends.aerial import Match, Prior, live, match_bag, scans
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud
 from graphloc.frontends.aerial.match import Mode
+from graphloc.frontends.aerial.matcher import Since
 from graphloc.frontends.aerial.scan import LevelCloud, outline
 from graphloc.frontends.aerial.scans import Matched
 from graphloc.frontends.inspect import draft_config, inspect_bag
@@ -340,23 +342,39 @@ def test_inspect_drafts_the_lidars(bag: Path, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("unseen")
 def test_matches_near_each_other_tell_less(bag: Path) -> None:
-    """Of a first-order Markov process along the way, r = exp(-way / 15 m), a next one tells (1 - r) / (1 + r) of a mean;
-    of a place that inertial sensors carry for 5 s, of a heading for 60 s."""
+    """Errors are alike over the distance to what is in view, 15 m at least."""
     sensor, track = aerial(bag, every_m=0.0, every_s=3.0)
     found = [m for m in matched(bag, track, sensor) if m.match is not None and m.match.modes]
-    at = np.array([m.match.prior.pose[:2] for m in found if m.match is not None])
-    way = np.hypot(*np.diff(at, axis=0).T) / 15.0
-    waited_s = np.diff([m.stamp_ns for m in found]) * 1e-9
-    for axis, carried_s in ((0, 5.0), (1, 5.0), (2, 60.0)):
-        r = np.exp(-np.maximum(way, waited_s / carried_s))
-        np.testing.assert_allclose([m.news[axis] for m in found], [1.0, *((1.0 - r) / (1.0 + r))], rtol=1e-6)
-    first, second = found[0].match, found[1].match
-    assert first is not None
-    assert second is not None
-    np.testing.assert_allclose(first.fix(0, "a", found[0].news).modes[0].cov, first.modes[0].cov)
-    np.testing.assert_allclose(
-        np.diagonal(second.fix(0, "a", found[1].news).modes[0].cov) * found[1].news, np.diagonal(second.modes[0].cov)
-    )
+    assert found[0].since is None
+    for before, item in pairwise(found):
+        assert before.match is not None
+        assert item.match is not None
+        assert item.since is not None
+        way_m = np.hypot(*(item.match.prior.pose - before.match.prior.pose)[:2])
+        seen_m = np.median(np.hypot(*np.vstack([item.match.found.faces_m, item.match.found.shore_m]).T))
+        assert item.since.way == pytest.approx(way_m / max(15.0, seen_m), rel=1e-6)
+        assert item.since.waited_s == pytest.approx((item.stamp_ns - before.stamp_ns) * 1e-9)
+
+
+def test_what_is_independent_of_the_match_before() -> None:
+    """Of a first-order Markov process along the way a next one tells (1 - r) / (1 + r) of a mean, r = exp(-way), also of which mode
+    is right; r = exp(-waited / carried) if inertial sensors forget sooner: 0.1 m in 5 s, with the square of time, 0.5 deg in 60 s."""
+    turn = rotation_from_rpy_deg((0.0, 0.0, 30.0))
+    cov = turn @ np.diag([0.4**2, 0.05**2, np.radians(1.0) ** 2]) @ turn.T
+    modes = (Mode(np.zeros(3), cov, 0.6), Mode(np.ones(3), cov, 0.15))
+    nothing = outline(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), None)
+    match = Match(Prior(np.zeros(3), np.ones(3)), nothing, modes=modes, none=0.25)
+    first, near, far = (match.fix(0, "a", since) for since in (None, Since(0.1, 4.0), Since(2.0, 4.0)))
+    np.testing.assert_allclose(first.modes[0].cov, cov)
+    assert [m.probability for m in first.modes] == pytest.approx([0.6, 0.15])
+    for fix, ways in ((near, (0.4, 0.8, 0.1)), (far, (2.0, 2.0, 2.0))):  # 4 s of 10 s, 5 s and 120 s
+        told = (1.0 - np.exp(-np.array(ways))) / (1.0 + np.exp(-np.array(ways)))
+        np.testing.assert_allclose(turn.T @ fix.modes[0].cov @ turn, turn.T @ cov @ turn / told, atol=1e-9)
+    for fix, way in ((near, 0.1), (far, 2.0)):
+        r = np.exp(-way)
+        assert fix.news == pytest.approx((1.0 - r) / (1.0 + r))
+        assert fix.none_probability == pytest.approx(0.25)
+        assert fix.modes[0].probability / fix.modes[1].probability == pytest.approx(4.0**fix.news)
 
 
 def test_lines_elsewhere_change_nothing(bag: Path, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def sequence(request: pytest.FixtureRequest) -> FalseSequence:
     right, fresh = rng.normal(-1.0, 2.0, (2, 7)), rng.normal(-1.5, 1.0, (2, 7))
     repeated = np.concatenate([fresh[:, :1], fresh[:, 1:] + rng.normal(0.0, 2.0, (2, 6))], axis=1)
     new = np.array([False, False, True, False, True, True, True]) & (request.param == "some new")
-    return FalseSequence(right, fresh, repeated, new)
+    return FalseSequence(right, fresh, repeated, new, np.ones(7))
 
 
 def log_joint(s: FalseSequence, false: tuple[bool, ...]) -> float:
@@ -50,11 +50,20 @@ def test_posterior_is_that_of_all_128_sequences(sequence: FalseSequence) -> None
     right = np.array([[not f for f in p] for p in paths])
     np.testing.assert_allclose(sequence.posterior(), weights @ right / weights.sum(), atol=1e-12)
     assert sequence.log_evidence() == pytest.approx(np.logaddexp.reduce(logs))
+    # Of what is no news nothing counts: the last three, then the rest of it.
+    upto = np.array([log_joint(cut(sequence, 4), p) for p in product((False, True), repeat=4)])
+    unheard = replace(sequence, news=np.array([1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
+    assert unheard.log_evidence() == pytest.approx(np.logaddexp.reduce(upto))
 
 
-def stream_of(offsets: Array, repeats: float = 0.5) -> tuple[Any, range, list[tuple[Residual, ...]]]:
+def cut(s: FalseSequence, count: int) -> FalseSequence:
+    """The first of a sequence."""
+    return FalseSequence(s.right[:, :count], s.fresh[:, :count], s.repeated[:, :count], s.new[:count], s.news[:count])
+
+
+def stream_of(offsets: Array, repeats: float = 0.5, news: float = 1.0) -> tuple[Any, range, list[tuple[Residual, ...]]]:
     """A stream of matches at 1 Hz whose residuals lie at `offsets` (N, 2), m."""
-    model = FalseModel(probability=0.4, cov=np.eye(2) * 25.0, repeats=repeats)
+    model = FalseModel(probability=0.4, cov=np.eye(2) * 25.0, repeats=repeats, news=news)
     measurements = [SimpleNamespace(stamp_ns=n * 1_000_000_000) for n in range(len(offsets))]
     stream = SimpleNamespace(row=SimpleNamespace(false=lambda *_: model), config=None, measurements=measurements)
     cov = np.eye(2) * SIGMA_M**2
@@ -113,6 +122,15 @@ def test_right_ones_after_a_hole_are_no_repeated_false_one() -> None:
     weights = np.array([v.weight for v in verdicts])
     assert weights[~false].min() > 0.9
     assert weights[false].max() < 0.1
+
+
+@pytest.mark.parametrize(("news", "believed"), [(1.0, 6.0), (0.02, 0.0)])
+def test_a_row_of_boats_outvotes_the_prediction_only_where_each_is_news(news: float, believed: float) -> None:
+    """Thirty scans a second apart look right 6 m off, ten where the prediction, good to 2 m, has the vessel."""
+    offsets = np.array([[6.0, 0.0] if n % 4 else [0.0, 0.0] for n in range(40)])
+    stream, indices, found = stream_of(offsets, news=news)
+    chain = best_chain(stream, indices, found, [Prediction(np.eye(2) * 2.0, 1e6)] * 40)
+    assert {offsets[n, 0] for n, mode in enumerate(chain) if mode is not None} == {believed}
 
 
 def test_what_repeats_far_outside_the_prediction_is_false() -> None:

@@ -3,7 +3,7 @@
 import pickle
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +21,7 @@ from graphloc.frontends.aerial import live, match_bag, scans
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, level
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn
 from graphloc.frontends.aerial.match import Mode
-from graphloc.frontends.aerial.matcher import Match, Matcher, Prior
+from graphloc.frontends.aerial.matcher import Match, Matcher, Prior, Since
 from graphloc.frontends.aerial.scan import LevelCloud, outline
 from graphloc.frontends.aerial.scans import ScanFeed
 from graphloc.trajectory import Trajectory
@@ -94,16 +94,16 @@ def test_a_bag_is_matched_as_written_out(run: Run, matched: list[Matched]) -> No
                 np.array([*pose.p_world_m[0, :2], pose.yaw_rad[0]]), np.sqrt(np.array([1.0, 1.0, 1e-3]))
             )  # as `run` has it
             found = matcher.match(level(clouds, feed.mounts, run.track, at_ns, run.sensor.waterline_m), prior)
-            news = (1.0, 1.0, 1.0)
+            since = None
             if before is not None:
-                way = np.hypot(*(prior.pose[:2] - before[1])) / run.sensor.alike_m
-                place, heading = (np.tanh(0.5 * max(way, (at_ns - before[0]) / 1e9 / s)) for s in (5.0, 60.0))
-                news = (place, place, heading)
+                seen_m = np.median(np.hypot(*np.vstack([found.found.faces_m, found.found.shore_m]).T))
+                way_m = np.hypot(*(prior.pose[:2] - before[1]))
+                since = Since(way_m / max(run.sensor.alike_m, seen_m), (at_ns - before[0]) / 1e9)
             before = (at_ns, prior.pose[:2])
-            expected.append((at_ns, found, news))
+            expected.append((at_ns, found, since))
     assert 4 <= len(expected) <= 12
     assert [m.stamp_ns for m in matched] == [at_ns for at_ns, _, _ in expected]
-    assert [m.news for m in matched] == [news for _, _, news in expected]
+    assert [m.since for m in matched] == [since for _, _, since in expected]
     for item, (_, found, _) in zip(matched, expected, strict=True):
         assert item.match is not None
         assert item.match.modes
@@ -134,7 +134,7 @@ def test_live_as_offline_where_the_tracks_are_the_same(run: Run, matched: list[M
         assert item.match is not None
         assert other.match is not None
         # Seconds since another begin of the track: places differ by their rounding.
-        np.testing.assert_allclose(item.news, other.news, rtol=1e-6)
+        assert [item.since and asdict(item.since)] == [other.since and pytest.approx(asdict(other.since), rel=1e-6)]
         assert len(item.match.found.faces_m) == pytest.approx(len(other.match.found.faces_m), abs=2)
         assert len(item.match.modes) == len(other.match.modes)
         for mode, same in zip(item.match.modes, other.match.modes, strict=True):
@@ -239,9 +239,8 @@ def test_matches_tell_what_the_one_before_has_not(seen: Seen) -> None:
     first, second = (matcher.offer(turn_at(t), track_of(t - 4.0, t + 0.1, 6.0)) for t in (0.0, 2.0))
     assert isinstance(first, Matched)
     assert isinstance(second, Matched)
-    assert first.news == (1.0, 1.0, 1.0)
-    r = np.exp(-12.0 / 15.0)
-    np.testing.assert_allclose(second.news, [(1.0 - r) / (1.0 + r)] * 3)
+    assert first.since is None
+    assert second.since == Since(12.0 / 15.0, 2.0)
 
 
 def test_what_falls_out_of_the_window_leaves_the_submap(seen: Seen) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import special
@@ -23,8 +22,10 @@ _CONTRAST = (-3.46, 0.096)  # log-odds of windows with the truth to those withou
 _MOST_WITHIN = 0.95  # priors may be wrong, however sure
 _LEAST_PLACES = 30
 _MODES = 5
+# How long inertial sensors carry a place, and a heading, to a match's accuracy, and to which. Less accurate ones they carry for longer:
+# a place is lost with the square of time, a heading linearly.
 _CARRIED_S, _CARRIED_M = 5.0, 0.1
-_CARRIED_YAW_S, _CARRIED_RAD = 60.0, np.radians(0.5)
+_CARRIED_YAW_S, _CARRIED_YAW_RAD = 60.0, np.radians(0.5)
 NO_POSE = "no pose in the window stands out"
 """Why a scan has no match: it fits nowhere better than by chance."""
 
@@ -39,34 +40,33 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class Since:
-    """How far and how long before a match the one before it was made.
+    """How far, and how long, a match is from the one before it.
 
-    Errors of matches are a first-order Markov process along the path, which inertial sensors bridge for a while.
+    Their errors, and which mode looks right, are a first-order Markov process along the path, r = exp(-way): the same walls, the same
+    boats. What a match adds to a mean of such ones is (1 - r) / (1 + r).
 
     Attributes:
-        way: distance travelled, in lengths of correlation. waited_s: time.
+        way: distance travelled, in lengths of correlation (`AerialConfig.alike_m`). waited_s: time.
     """
 
     way: float
     waited_s: float
 
     @property
-    def fresh(self) -> float:
-        """Share of the evidence for one mode or the other that is independent of the match before: (1 - r) / (1 + r), r = exp(-way)."""
+    def news(self) -> float:
+        """Share of the evidence for right or false that is independent of the match before."""
         return float(np.tanh(0.5 * self.way))
 
     def widened(self, cov: Array) -> Array:
-        """Return the covariance (3, 3) that stands for the independent information only."""
-        values, axes = np.linalg.eigh(cov[:2, :2])
-        carried_s = _CARRIED_S * np.sqrt(np.maximum(np.sqrt(values) / _CARRIED_M, 1.0))
-        yaw_s = _CARRIED_YAW_S * np.maximum(np.sqrt(cov[2, 2]) / _CARRIED_RAD, 1.0)
-        wider = np.eye(3)
-        wider[:2, :2] = axes @ np.diag(1.0 / np.sqrt(self._news(carried_s))) @ axes.T
-        wider[2, 2] = 1.0 / np.sqrt(self._news(yaw_s))
+        """Return the covariance (3, 3) of what is independent of the match before, where inertial sensors have not forgotten it."""
+        variances, axes = np.linalg.eigh(cov[:2, :2])
+        carried_s = _CARRIED_S * np.maximum(np.sqrt(variances) / _CARRIED_M, 1.0) ** 0.5
+        yaw_s = _CARRIED_YAW_S * max(float(np.sqrt(cov[2, 2])) / _CARRIED_YAW_RAD, 1.0)
+        independent = np.tanh(0.5 * np.maximum(self.way, self.waited_s / np.append(carried_s, yaw_s)))
+        wider = np.zeros((3, 3))
+        wider[:2, :2] = (axes / np.sqrt(independent[:2])) @ axes.T
+        wider[2, 2] = 1.0 / np.sqrt(independent[2])
         return np.asarray(wider @ cov @ wider)
-
-    def _news(self, carried_s: Any) -> Any:
-        return np.tanh(0.5 * np.maximum(self.way, self.waited_s / carried_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,9 +92,9 @@ class Match:
 
     @property
     def distance_m(self) -> float:
-        """How far away what was matched is, median, m; 0 where the matcher does not say."""
-        places = np.vstack([self.found.faces_m[:, :2], self.found.shore_m[:, :2]])
-        return float(np.median(np.hypot(*places.T))) if len(places) else 0.0
+        """Median distance to what was matched, m; 0 where the matcher does not say."""
+        places_m = np.vstack([self.found.faces_m, self.found.shore_m])
+        return float(np.median(np.hypot(*places_m.T))) if len(places_m) else 0.0
 
     def fix(
         self, stamp_ns: int, sensor: str, since: Since | None = None, axes: tuple[str, ...] = ("x", "y", "yaw")
@@ -102,21 +102,21 @@ class Match:
         """Return the modes as one measurement.
 
         Args:
-            since: the match before, whose errors are in part its own. axes: to be used.
+            since: the match before, whose errors it shares in part; None: there is none. axes: to be used.
         """
+        news = 1.0 if since is None else since.news
+        # Which of its modes is right is no news if the match before saw the same.
+        share = np.array([m.probability for m in self.modes]) ** news
         picked = [k for k, a in enumerate(("x", "y", "yaw")) if a in axes]
-        fresh = 1.0 if since is None else since.fresh
-        share = np.array([m.probability for m in self.modes])
-        share = (1.0 - self.none) * share**fresh / (share**fresh).sum()
         modes = tuple(
             PoseMode(
                 value=np.array([m.pose[0], m.pose[1], float(wrap_angle(m.pose[2]))])[picked],
                 cov=(m.cov if since is None else since.widened(m.cov))[np.ix_(picked, picked)],
-                probability=float(p),
+                probability=(1.0 - self.none) * float(p),
             )
-            for m, p in zip(self.modes, share, strict=True)
+            for m, p in zip(self.modes, share / share.sum(), strict=True)
         )
-        return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes, fresh=fresh)
+        return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes, news=news)
 
 
 class Matcher:

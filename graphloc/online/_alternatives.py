@@ -70,8 +70,8 @@ def choices(
             for mode, r in enumerate(seen):
                 gain = np.linalg.solve(r.cov + P, c.cov[at[n]]).T
                 step, cov = c.step - gain @ r.raw, c.cov - gain @ c.cov[at[n]]
-                nis = r.nis(P)
-                log_right = model.fresh * (r.log_density(P) + 0.5 * nis) - 0.5 * nis
+                nis = r.nis(P)  # in full: it says whether they agree, not how well the modes look
+                log_right = model.news * (r.log_density(P) + 0.5 * nis) - 0.5 * nis
                 grown.append(Choice(c.log + log_right, (*c.modes, mode), step, cov))
             log = log_right_and_false(seen, P, model)[1]
             if n and c.modes[-1] is None and repeats > 0.0 and len(seen[0].raw) == len(residuals[n - 1][0].raw):
@@ -80,7 +80,7 @@ def choices(
                 walked = P + c.cov[at[n - 1], at[n - 1]] - cross - cross.T
                 again = log_false_again(model, before, seen, walked)
                 log = float(np.logaddexp(np.log1p(-repeats) + log, again))
-            grown.append(Choice(c.log + model.fresh * log, (*c.modes, None), c.step, c.cov))
+            grown.append(Choice(c.log + model.news * log, (*c.modes, None), c.step, c.cov))
         grown.sort(key=lambda c: -c.log)
         found = [c for c in grown[:_MOST] if c.log > grown[0].log - _LEAST]
     total = float(np.logaddexp.reduce([c.log for c in found]))

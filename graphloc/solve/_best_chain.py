@@ -32,7 +32,8 @@ def best_chain(
     """Return which mode of each of N measurements of a stream is right on the most probable chain; None: none is.
 
     It is a longest path: nodes are modes taken for right; the gain of an edge is the log likelihood ratio (right over false) of
-    its end, predicted from its beginning. False measurements in between that repeat each other add to the gain.
+    its end, predicted from its beginning, as far as it is news beside the measurement before. False measurements in between that
+    repeat each other add to the gain.
 
     Args:
         predictions: N, which limit where a chain may begin; None: anywhere.
@@ -62,8 +63,8 @@ def best_chain(
         else:
             begun = cov[k] + predictions[n].cov
             nis = float(raw[k] @ np.linalg.solve(begun, raw[k]))
-        fresh = models[n].fresh
-        score[k] = gained[n] + fresh * (alone[k] - 0.5 * np.linalg.slogdet(2.0 * np.pi * begun)[1]) - 0.5 * nis
+        news = models[n].news
+        score[k] = gained[n] + news * (alone[k] - 0.5 * np.linalg.slogdet(2.0 * np.pi * begun)[1]) - 0.5 * nis
         lo, hi = np.searchsorted(at, [n - _LOOK_BACK, n])
         if lo == hi:
             continue
@@ -75,7 +76,7 @@ def best_chain(
             expected, left = carried(expected, left, roots[lo:hi], roots[k], kept)
         spread, step = left + cov[k] + ages_s[:, None, None] * walk[n], expected - raw[k]
         off = np.einsum("ni,ni->n", step, np.linalg.solve(spread, step[:, :, None])[:, :, 0])
-        path = score[lo:hi] + fresh * (alone[k] - 0.5 * (off + np.linalg.slogdet(2.0 * np.pi * spread)[1]))
+        path = score[lo:hi] + news * (alone[k] - 0.5 * (off + np.linalg.slogdet(2.0 * np.pi * spread)[1]))
         path += np.maximum(gained[n] - gained[np.minimum(at[lo:hi] + 2, n)], 0.0)
         best = int(np.argmax(path))
         if path[best] > score[k]:
@@ -112,5 +113,5 @@ def _gained_by_repeats(
         age_s = stamps_s[n] - stamps_s[n - 1]
         walked = walk[n] * age_s + (0.0 if predictions is None else moved(predictions[n - 1], predictions[n], age_s))
         same = log_false_again(models[n], residuals[n - 1], residuals[n], walked)
-        again[n] = models[n].fresh * max(0.0, float(np.logaddexp(np.log1p(-models[n].repeats), same - nothing[n])))
+        again[n] = models[n].news * max(0.0, float(np.logaddexp(np.log1p(-models[n].repeats), same - nothing[n])))
     return np.concatenate([[0.0], np.cumsum(again)])

@@ -30,14 +30,15 @@ class FalseSequence:
 
     Attributes:
         right: (2, N) of any mode being right. fresh, repeated: (2, N) of all being false, after a right one and
-            after a false one. new: (N,) whether one is judged by a prediction.
+            after a false one. new: (N,) whether one is judged by a prediction. news: (N,) share of the evidence of each
+            that is independent of the one before it.
     """
 
     right: Array
     fresh: Array
     repeated: Array
     new: NDArray[np.bool_]
-    fresh_share: Array
+    news: Array
 
     def posterior(self) -> Array:
         """Return the probability (N,) that a mode is right."""
@@ -54,9 +55,9 @@ class FalseSequence:
         return np.asarray(np.exp(both[:, 0] - np.logaddexp(both[:, 0], both[:, 1])))
 
     def log_evidence(self) -> float:
-        """Return the log probability of the whole sequence; of each one given those before it only what is independent of them."""
+        """Return the log probability of the whole sequence, of each measurement as far as it is news."""
         so_far = np.logaddexp.reduce(self._ahead(), axis=(1, 2))
-        return float(self.fresh_share @ np.diff(so_far, prepend=0.0))
+        return float(self.news @ np.diff(so_far, prepend=0.0))
 
     def _ahead(self) -> Array:
         """(N, right or false, before or after)."""
@@ -100,9 +101,8 @@ def sequence_of(
         walked = moved(predictions[n - 1], predictions[n], (taken[n].stamp_ns - taken[n - 1].stamp_ns) * 1e-9)
         again = log_false_again(model, residuals[n - 1], residuals[n], walked)
         repeated[:, n] = np.logaddexp(np.log1p(-model.repeats) + fresh[:, n], again)
-    return FalseSequence(
-        right, fresh, repeated, np.array([prediction is not None for prediction in predictions]), np.array([m.fresh for m in models])
-    )
+    new = np.array([prediction is not None for prediction in predictions])
+    return FalseSequence(right, fresh, repeated, new, np.array([m.news for m in models]))
 
 
 def log_evidence_of(stream: Judged, indices: Sequence[int], residuals: Sequence[tuple[Residual, ...]]) -> float:
