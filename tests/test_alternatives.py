@@ -29,10 +29,10 @@ OFF = np.array([0.8, 1.4, 0.0])
 SECOND = 1_000_000_000
 
 
-def stream() -> Any:
+def stream(news: float = 1.0) -> Any:
     config = PoseConfig(topic="/aerial", axes=("x",), false_fraction=FALSE, false_repeats=0.0)
     mode = PoseMode(value=np.zeros(1), cov=np.eye(1) * SIGMA_M**2)
-    fixes = [PoseFix(stamp_ns=n * SECOND, sensor="aerial", seq=n, axes=("x",), modes=(mode,)) for n in range(3)]
+    fixes = [PoseFix(stamp_ns=n * SECOND, sensor="aerial", seq=n, axes=("x",), modes=(mode,), news=news) for n in range(3)]
     return SimpleNamespace(row=pose.ROW, config=config, measurements=fixes)
 
 
@@ -50,21 +50,26 @@ def after(right: tuple[int, ...]) -> tuple[Array, Array]:
     return gain @ TOLD_M[rows], PRIOR - gain @ PRIOR[rows]
 
 
-def probability(right: tuple[int, ...]) -> float:
-    """Prior x joint density of what is right, each other being false around its own place as known from what is right before it."""
+def probability(right: tuple[int, ...], news: float = 1.0) -> float:
+    """Prior x joint density of what is right, each other being false around its own place as known from what is right before it.
+
+    Of what is no news only the distance of what is right counts in full.
+    """
     log = 0.0
     for n in range(3):
         mean, cov = after(tuple(k for k in right if k < n))
         r, P = np.array([mean[n] - TOLD_M[n]]), cov[n : n + 1, n : n + 1]
         if n in right:
-            log += np.log(1.0 - FALSE) + log_gauss(r, P + SIGMA_M**2)
+            S = P + SIGMA_M**2
+            log += news * (np.log(1.0 - FALSE) + log_gauss(np.zeros(1), S)) - 0.5 * r @ np.linalg.solve(S, r)
         else:
-            log += np.log(FALSE) + log_gauss(r, P + SIGMA_M**2 + FALSE_M**2)
+            log += news * (np.log(FALSE) + log_gauss(r, P + SIGMA_M**2 + FALSE_M**2))
     return float(np.exp(log))
 
 
+@pytest.mark.parametrize("news", [1.0, 0.3])
 @pytest.mark.parametrize("held", [(), (0, 1), (2,), (0, 1, 2)])
-def test_all_choices_are_weighed_whichever_is_in_the_graph(held: tuple[int, ...]) -> None:
+def test_all_choices_are_weighed_whichever_is_in_the_graph(held: tuple[int, ...], news: float) -> None:
     mean, cov = after(held)
     residuals = [
         (Residual(raw=mean[n : n + 1] - TOLD_M[n], cov=np.eye(1) * SIGMA_M**2, jacobian=lambda: np.eye(1),
@@ -73,12 +78,12 @@ def test_all_choices_are_weighed_whichever_is_in_the_graph(held: tuple[int, ...]
     ]  # fmt: skip
     place = 2  # the newest
     J = np.vstack([np.eye(3)[place], np.eye(3)])
-    found = choices(stream(), range(3), residuals, J @ cov @ J.T, [(0, 1.0) if n in held else None for n in range(3)])
+    found = choices(stream(news), range(3), residuals, J @ cov @ J.T, [(0, 1.0) if n in held else None for n in range(3)])
     ways = [tuple(n for n in range(3) if bits[n]) for bits in product([False, True], repeat=3)]
-    total = sum(probability(right) for right in ways)
+    total = sum(probability(right, news) for right in ways)
     for c in found:
         right = tuple(n for n, mode in enumerate(c.modes) if mode is not None)
-        assert np.exp(c.log) == pytest.approx(probability(right) / total, rel=1e-6)
+        assert np.exp(c.log) == pytest.approx(probability(right, news) / total, rel=1e-6)
         assert c.step[0] == pytest.approx(after(right)[0][place] - mean[place], abs=1e-9)
         assert c.cov[0, 0] == pytest.approx(after(right)[1][place, place], abs=1e-9)
     assert len(found) == len(ways)

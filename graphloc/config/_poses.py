@@ -104,8 +104,8 @@ class AerialConfig(AnyPoseConfig):
     every_m: NonNegative = 0.5
     """Minimum distance travelled between two matches, m."""
     alike_m: NonNegative = 15.0
-    """Correlation length of match errors (the same walls, the same boats), m: variances grow by (1 + r) / (1 - r),
-    r = exp(-distance / alike_m), or less after some time; 0: independent."""
+    """Least correlation length of matches (the same walls, the same boats), m; it is the median distance to what is in view, if
+    that is longer. Their errors and which mode looks right count as far as they are news; 0: independent."""
     still_s: Positive = 10.0
     """Time after which a match is made although the vessel has not moved by `every_m`, s."""
     window_m: Annotated[Positive, Field(le=50.0)] = 6.5
