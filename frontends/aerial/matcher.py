@@ -26,6 +26,7 @@ _MODES = 5
 # a place is lost with the square of time, a heading linearly.
 _CARRIED_S, _CARRIED_M = 5.0, 0.1
 _CARRIED_YAW_S, _CARRIED_YAW_RAD = 60.0, np.radians(0.5)
+_LEAST_NEWS = 1e-6  # of a match at the same place and time: next to nothing, but its covariance stays finite
 NO_POSE = "no pose in the window stands out"
 """Why a scan has no match: it fits nowhere better than by chance."""
 
@@ -63,6 +64,7 @@ class Since:
         carried_s = _CARRIED_S * np.maximum(np.sqrt(variances) / _CARRIED_M, 1.0) ** 0.5
         yaw_s = _CARRIED_YAW_S * max(float(np.sqrt(cov[2, 2])) / _CARRIED_YAW_RAD, 1.0)
         independent = np.tanh(0.5 * np.maximum(self.way, self.waited_s / np.append(carried_s, yaw_s)))
+        independent = np.maximum(independent, _LEAST_NEWS)
         wider = np.zeros((3, 3))
         wider[:2, :2] = (axes / np.sqrt(independent[:2])) @ axes.T
         wider[2, 2] = 1.0 / np.sqrt(independent[2])
