@@ -82,8 +82,12 @@ def figures(pool: ProcessPoolExecutor) -> list[Row]:
     for name, tracks in zip(("GNSS alone, offline", "offline", "online"), zip(*found, strict=True), strict=True):
         label = f"{len(tracks)} drawn harbours, {name}"
         off_m = np.array([t.off_m for t in tracks])
-        rows.append(row("C.drawn", f"{label}: position RMSE from where the image shows it, median", np.median(off_m), "m"))
+        rows.append(
+            row("C.drawn", f"{label}: position RMSE from where the image shows it, median", np.median(off_m), "m")
+        )
         rows.append(row("C.drawn", f"{label}: position RMSE from where the image shows it, mean", off_m.mean(), "m"))
-        rows.append(row("C.drawn", f"{label}: inside the 95 % bounds, mean", 100.0 * np.mean([t.held for t in tracks]), "%"))
+        rows.append(
+            row("C.drawn", f"{label}: inside the 95 % bounds, mean", 100.0 * np.mean([t.held for t in tracks]), "%")
+        )
         rows.append(row("C.drawn", f"{label}: runs over {_FAR_M:g} m off", int((off_m > _FAR_M).sum()), "runs"))
     return rows

@@ -359,7 +359,7 @@ def test_matches_near_each_other_tell_less(bag: Path) -> None:
 def test_what_is_independent_of_the_match_before() -> None:
     """Of a first-order Markov process along the way a next one tells (1 - r) / (1 + r) of a mean, r = exp(-way), also of which mode
     is right; r = exp(-waited / carried) if inertial sensors forget sooner: 0.1 m in 5 s, with the square of time, 0.5 deg in 60 s."""
-    turn = rotation_from_rpy_deg((0.0, 0.0, 30.0))
+    turn = rotation_from_rpy_deg(np.array([0.0, 0.0, 30.0]))
     cov = turn @ np.diag([0.4**2, 0.05**2, np.radians(1.0) ** 2]) @ turn.T
     modes = (Mode(np.zeros(3), cov, 0.6), Mode(np.ones(3), cov, 0.15))
     nothing = outline(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), None)

@@ -32,7 +32,9 @@ SECOND = 1_000_000_000
 def stream(news: float = 1.0) -> Any:
     config = PoseConfig(topic="/aerial", axes=("x",), false_fraction=FALSE, false_repeats=0.0)
     mode = PoseMode(value=np.zeros(1), cov=np.eye(1) * SIGMA_M**2)
-    fixes = [PoseFix(stamp_ns=n * SECOND, sensor="aerial", seq=n, axes=("x",), modes=(mode,), news=news) for n in range(3)]
+    fixes = [
+        PoseFix(stamp_ns=n * SECOND, sensor="aerial", seq=n, axes=("x",), modes=(mode,), news=news) for n in range(3)
+    ]
     return SimpleNamespace(row=pose.ROW, config=config, measurements=fixes)
 
 
@@ -78,7 +80,9 @@ def test_all_choices_are_weighed_whichever_is_in_the_graph(held: tuple[int, ...]
     ]  # fmt: skip
     place = 2  # the newest
     J = np.vstack([np.eye(3)[place], np.eye(3)])
-    found = choices(stream(news), range(3), residuals, J @ cov @ J.T, [(0, 1.0) if n in held else None for n in range(3)])
+    found = choices(
+        stream(news), range(3), residuals, J @ cov @ J.T, [(0, 1.0) if n in held else None for n in range(3)]
+    )
     ways = [tuple(n for n in range(3) if bits[n]) for bits in product([False, True], repeat=3)]
     total = sum(probability(right, news) for right in ways)
     for c in found:
