@@ -75,7 +75,7 @@ def test_a_bag_is_matched_as_written_out(run: Run, matched: list[Matched]) -> No
     """The same numbers, bit for bit, as when turns are gone through in one loop around the whole track."""
     matcher, last, before = Matcher(run.sensor, run.folder, run.datum), None, None
     window: list[Turn] = []
-    expected: list[tuple[int, Any, tuple[float, ...]]] = []
+    expected: list[tuple[int, Any, Since | None]] = []
     with Bag([run.folder / "run"]) as bag:
         feed = ScanFeed(bag, run.sensor, "base_link")
         for turn in feed:

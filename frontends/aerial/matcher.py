@@ -108,15 +108,16 @@ class Match:
         """
         news = 1.0 if since is None else since.news
         # Which of its modes is right is no news if the match before saw the same.
-        share = np.array([m.probability for m in self.modes]) ** news
+        told = np.array([m.probability for m in self.modes])
+        share = told**news
         picked = [k for k, a in enumerate(("x", "y", "yaw")) if a in axes]
         modes = tuple(
             PoseMode(
                 value=np.array([m.pose[0], m.pose[1], float(wrap_angle(m.pose[2]))])[picked],
                 cov=(m.cov if since is None else since.widened(m.cov))[np.ix_(picked, picked)],
-                probability=(1.0 - self.none) * float(p),
+                probability=float(p),
             )
-            for m, p in zip(self.modes, share / share.sum(), strict=True)
+            for m, p in zip(self.modes, share * (told.sum() / share.sum()), strict=True)
         )
         return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes, news=news)
 
