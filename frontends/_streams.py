@@ -339,7 +339,7 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
 
 def _named_as_filters(stream: TopicData) -> TopicData:
     """Return a stream with the name of a filter's, if most of what it says is of one."""
-    if not stream.filtered or 2 * stream.filtered < np.isfinite(stream.rows).all(axis=1).sum():
+    if not (stream.filtered and len(stream)) or 2 * stream.filtered < np.isfinite(stream.rows).all(axis=1).sum():
         return stream
     return replace(stream, topic=stream.topic + FILTER)
 

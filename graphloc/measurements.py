@@ -166,6 +166,8 @@ class PoseFix(Measurement):
             raise ValueError("each mode needs one value per axis")
         if sum(m.probability for m in self.modes) > 1.0 + 1e-9:
             raise ValueError("mode probabilities sum to more than 1")
+        if not 0.0 <= self.news <= 1.0:
+            raise ValueError("news must be in [0, 1]")
 
     @property
     def none_probability(self) -> float:

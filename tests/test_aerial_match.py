@@ -30,6 +30,7 @@ from graphloc.frontends.aerial.layers import (
     weighed,
 )
 from graphloc.frontends.aerial.match import Mode, SearchGrid, modes_of
+from graphloc.frontends.aerial.matcher import Since
 from graphloc.frontends.aerial.scan import LevelCloud, inside, outline
 from graphloc.frontends.aerial.vector import VectorMap
 from graphloc.trajectory import Trajectory
@@ -320,9 +321,11 @@ def test_some_axes_of_a_match() -> None:
     match = Match(
         Prior(np.zeros(3), np.ones(3)), outline(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), None), modes=(mode,)
     )
-    fix = match.fix(0, "a", axes=("y", "yaw"))
+    fix = match.fix(0, "a", Since(np.log(3.0), 0.0), ("y", "yaw"))  # half of it is independent: tanh(log(3) / 2)
     np.testing.assert_allclose(fix.modes[0].value, [2.0, 0.3])
-    np.testing.assert_allclose(fix.modes[0].cov, np.diag([0.2, 0.01]))
+    np.testing.assert_allclose(fix.modes[0].cov, np.diag([0.4, 0.02]))
+    assert fix.news == pytest.approx(0.5)
+    assert fix.modes[0].probability == pytest.approx(0.9)
     assert fix.axes == ("y", "yaw")
 
 

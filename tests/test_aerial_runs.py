@@ -375,6 +375,9 @@ def test_what_is_independent_of_the_match_before() -> None:
         assert fix.news == pytest.approx((1.0 - r) / (1.0 + r))
         assert fix.none_probability == pytest.approx(0.25)
         assert fix.modes[0].probability / fix.modes[1].probability == pytest.approx(4.0**fix.news)
+    again = match.fix(0, "a", Since(0.0, 0.0))  # a scan under the stamp of the one before, at rest
+    assert again.news == 0.0
+    assert np.linalg.eigvalsh(again.modes[0].cov).min() > 1e3 * np.linalg.eigvalsh(cov).max()
 
 
 def test_lines_elsewhere_change_nothing(bag: Path, tmp_path: Path) -> None:

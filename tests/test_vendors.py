@@ -652,6 +652,20 @@ def test_a_filters_place_alone_is_used_and_says_so(tmp_path: Path) -> None:
     assert not compass.use_reported_sigma
 
 
+def test_one_message_of_a_filter_without_a_stamp_is_no_crash(tmp_path: Path) -> None:
+    """Nothing is left of its stream, which is no filter's then."""
+    make = Messages(2)
+    values: dict[str, Any] = {
+        "ins_status": {"status": 3},
+        "pos_type": {"type": 56},
+        "latitude": 58.0,
+        "longitude": 11.0,
+    }
+    item = ("/ins", START_NS, said(make, OEM7 + "INSPVAX", header=make.header(0), **values))
+    found = inspect_bag(write_bag(tmp_path / "run", make, [item], "mcap"))
+    assert {t.topic for t in found.topics} == {"/ins", "/ins (heading)"}
+
+
 @pytest.mark.parametrize("beside", [True, False])
 def test_a_geographic_pose_is_a_place_and_a_heading_of_a_filter(beside: bool, tmp_path: Path) -> None:
     def say(make: Messages, at: int, fix: Any, _v: Any, heading_deg: float) -> list[Item]:

@@ -22,7 +22,7 @@ from graphloc.frames import (
     yaw_from_heading_deg,
 )
 from graphloc.ledger import Ledger, LedgerRow, Outcome
-from graphloc.measurements import GnssPosition
+from graphloc.measurements import GnssPosition, PoseFix, PoseMode
 from graphloc.series import integral, interpolated, rms, robust_sigma, runs
 from graphloc.time import NS_PER_S, seconds_between, seconds_since, utc_text
 from graphloc.trajectory import Trajectory
@@ -204,3 +204,10 @@ def test_a_covariance_is_symmetric_to_a_millionth(off: float, refused: bool) -> 
                 GnssPosition(**fix)
         else:
             GnssPosition(**fix)
+
+
+@pytest.mark.parametrize("news", [-0.1, 1.1, np.nan])
+def test_news_is_a_share(news: float) -> None:
+    mode = PoseMode(value=np.zeros(1), cov=np.eye(1))
+    with pytest.raises(ValueError, match="news must be in"):
+        PoseFix(stamp_ns=0, sensor="given", seq=0, axes=("x",), modes=(mode,), news=news)

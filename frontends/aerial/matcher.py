@@ -26,6 +26,7 @@ _MODES = 5
 # a place is lost with the square of time, a heading linearly.
 _CARRIED_S, _CARRIED_M = 5.0, 0.1
 _CARRIED_YAW_S, _CARRIED_YAW_RAD = 60.0, np.radians(0.5)
+_LEAST_NEWS = 1e-6  # of a match at the same place and time: next to nothing, but its covariance stays finite
 NO_POSE = "no pose in the window stands out"
 """Why a scan has no match: it fits nowhere better than by chance."""
 
@@ -63,6 +64,7 @@ class Since:
         carried_s = _CARRIED_S * np.maximum(np.sqrt(variances) / _CARRIED_M, 1.0) ** 0.5
         yaw_s = _CARRIED_YAW_S * max(float(np.sqrt(cov[2, 2])) / _CARRIED_YAW_RAD, 1.0)
         independent = np.tanh(0.5 * np.maximum(self.way, self.waited_s / np.append(carried_s, yaw_s)))
+        independent = np.maximum(independent, _LEAST_NEWS)
         wider = np.zeros((3, 3))
         wider[:2, :2] = (axes / np.sqrt(independent[:2])) @ axes.T
         wider[2, 2] = 1.0 / np.sqrt(independent[2])
@@ -106,8 +108,8 @@ class Match:
         """
         news = 1.0 if since is None else since.news
         # Which of its modes is right is no news if the match before saw the same.
-        stated = np.array([m.probability for m in self.modes])
-        share = stated**news * stated.sum() / (stated**news).sum()
+        told = np.array([m.probability for m in self.modes])
+        share = told**news
         picked = [k for k, a in enumerate(("x", "y", "yaw")) if a in axes]
         modes = tuple(
             PoseMode(
@@ -115,7 +117,7 @@ class Match:
                 cov=(m.cov if since is None else since.widened(m.cov))[np.ix_(picked, picked)],
                 probability=float(p),
             )
-            for m, p in zip(self.modes, share, strict=True)
+            for m, p in zip(self.modes, share * (told.sum() / share.sum()), strict=True)
         )
         return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes, news=news)
 
