@@ -98,7 +98,8 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
 }
 # Places that no sensor of the craft says: wanted ones, the origin of a filter, other vessels, the truth.
 _ELSEWHERE = re.compile(
-    r"origin|home|set_?point|goal|target|waypoint|cmd|command|desired|contact|aton|anchor|truth|/gt", re.IGNORECASE
+    r"origin|home(?![a-z])|set_?point|goal|target|waypoint|cmd|command|desired|contact|aton|anchor|truth|/gt(?![a-z])",
+    re.IGNORECASE,
 )
 _HEADING = re.compile(r"head|hdg|hdt|yaw|compass|azimuth", re.IGNORECASE)  # a topic of numbers that may be one
 

@@ -673,12 +673,12 @@ def test_a_geographic_pose_is_a_place_and_a_heading_of_a_filter(beside: bool, tm
         place = {"latitude": fix.latitude, "longitude": fix.longitude, "altitude": fix.altitude}
         pose = said(make, GEO + "GeoPoseStamped", header=make.header(at), pose={"position": place, "orientation": turned})  # fmt: skip
         far = {"position": {"latitude": 58.0, "longitude": 11.0}}
-        return [("/geopose", at, pose), ("/setpoint/global", at, said(make, GEO + "GeoPoseStamped", header=make.header(at), pose=far))]  # fmt: skip
+        return [("/gtsam/geopose", at, pose), ("/setpoint/global", at, said(make, GEO + "GeoPoseStamped", header=make.header(at), pose=far))]  # fmt: skip
 
     make = Messages(2)
     _, config, text = look(tmp_path, _spoken(make, say, beside=beside), make)
     (gnss,) = config.of_kind("gnss").values()
-    assert gnss.topic == ("/fix" if beside else "/geopose")
+    assert gnss.topic == ("/fix" if beside else "/gtsam/geopose")
     (compass,) = config.of_kind("compass").values()
-    assert (compass.topic, compass.convention, compass.use_reported_sigma) == ("/geopose", "enu", False)
+    assert (compass.topic, compass.convention, compass.use_reported_sigma) == ("/gtsam/geopose", "enu", False)
     assert "setpoint" not in text
