@@ -22,6 +22,7 @@ from graphloc.eval.simulate.scene import scene_of
 from graphloc.frames import Array, Datum
 from graphloc.frontends.aerial.matcher import Prior
 from graphloc.frontends.aerial.scan import LevelCloud
+from graphloc.trajectory import Trajectory
 
 # Scenes that figures are of: harbour and route. Prior and search: as in the issue.
 SCENES = {
@@ -120,6 +121,12 @@ def _views(
             origins.append(origin[:, :2])
         found.append(LevelCloud(np.vstack(points), np.vstack(origins)))
     return tuple(found), np.array([p[0], p[1], yaw])
+
+
+def as_shown(truth: Trajectory, folder: Path) -> Trajectory:
+    """Return where the image of a simulated run, which is off as a whole, shows the vessel."""
+    shift = json.loads((folder / "truth.json").read_text())["image_shows_things_east_north_m"]
+    return replace(truth, p_world_m=truth.p_world_m + np.array([*shift, 0.0]))
 
 
 def together(clouds: tuple[LevelCloud, ...]) -> LevelCloud:

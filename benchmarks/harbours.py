@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -14,6 +13,7 @@ import cv2
 import numba
 import numpy as np
 from _rows import Row, row
+from _scenes import as_shown
 from _worlds import write_world
 
 from graphloc import app
@@ -62,8 +62,7 @@ def _run(seed: int) -> tuple[_Track, _Track, _Track]:
         config, scans = _with_matches(config), app.Scans((folder / "run",), folder)
         truth = recording.truth
         assert truth is not None
-        shift = json.loads((folder / "truth.json").read_text())["image_shows_things_east_north_m"]
-        shown = replace(truth, p_world_m=truth.p_world_m + np.array([*shift, 0.0]))
+        shown = as_shown(truth, folder)
 
         def track(solution: Solution) -> _Track:
             held = compare_to_truth(solution.trajectory, truth).coverage_95

@@ -4,13 +4,11 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import resource
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +16,7 @@ import cv2
 import numba
 import numpy as np
 from _rows import Row, row
-from _scenes import Sample, samples, scratch, together
+from _scenes import Sample, as_shown, samples, scratch, together
 from scipy.stats import chi2
 from smoothing import loss_ns
 
@@ -217,8 +215,7 @@ def _run(job: tuple[str, int]) -> _Errors:
         truth = recording.truth
         assert truth is not None
 
-        shift = json.loads((folder / "truth.json").read_text())["image_shows_things_east_north_m"]
-        shown = replace(truth, p_world_m=truth.p_world_m + np.array([*shift, 0.0]))
+        shown = as_shown(truth, folder)
 
         def off(track: Any, from_: Any = truth) -> tuple[float, float]:
             found = compare_to_truth(track, from_)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from datetime import UTC, datetime
 from math import atan2, cos, degrees, isfinite, pi, radians, sin
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from graphloc.frontends._clock import NO_DATE_NS
 from graphloc.frontends._rejections import Rejection, malformed, rejected
@@ -66,6 +66,7 @@ class SaidAlong(NamedTuple):
 
 
 Said = SaidInertial | SaidPlace | SaidVelocity | SaidHeading | SaidAlong
+_OfAFilter = TypeVar("_OfAFilter", SaidPlace, SaidVelocity, SaidHeading)
 
 
 class Part(NamedTuple):
@@ -134,7 +135,7 @@ def _place(
     return SaidPlace(*place, status, horizontal if known else 0.0, vertical if vertical >= _FEWEST_M else 0.0)
 
 
-def _filtered(said: SaidPlace | Rejection, of_a_filter: bool = True) -> SaidPlace | Rejection:
+def _filtered(said: _OfAFilter | Rejection, of_a_filter: bool = True) -> _OfAFilter | Rejection:
     return said if isinstance(said, Rejection) else said._replace(filtered=of_a_filter)
 
 
@@ -240,8 +241,7 @@ def _sbg_filtered_heading(msg: Any) -> SaidHeading | Rejection:
         yaw = _yaw(msg.quaternion)
     else:
         yaw = float(msg.angle.z)
-    said = _angle(degrees(yaw), degrees(float(msg.accuracy.z)))
-    return said if isinstance(said, Rejection) else said._replace(filtered=True)
+    return _filtered(_angle(degrees(yaw), degrees(float(msg.accuracy.z))))
 
 
 # u-blox: `ublox_msgs` with the manual's names of fields in ROS 1, in lower case in ROS 2, and `ublox_ubx_msgs` with flags of their own.
@@ -394,8 +394,7 @@ def _ins_velocity(msg: Any) -> SaidVelocity | Rejection:
 def _ins_heading(msg: Any) -> SaidHeading | Rejection:
     if trouble := _ins_trouble(msg):
         return trouble
-    said = _bearing(float(msg.azimuth), _ins_sigmas(msg, "azimuth")[0])
-    return said if isinstance(said, Rejection) else said._replace(filtered=True)
+    return _filtered(_bearing(float(msg.azimuth), _ins_sigmas(msg, "azimuth")[0]))
 
 
 def _oem7_velocity_stamp_ns(msg: Any, log_ns: int) -> int | None:
@@ -416,10 +415,14 @@ _SBF_BASELINE = 3  # bits of an attitude's error: of the first baseline
 
 
 def _sbf_trouble(msg: Any) -> Rejection | None:
-    mode, error = int(msg.mode) & _SBF_MODE, int(msg.error)
+    return _sbf_without("no fix", int(msg.mode), int(msg.error))
+
+
+def _sbf_without(what: str, mode: int, error: int) -> Rejection | None:
+    mode &= _SBF_MODE
     if error == 0 and mode in _SBF_STATUS:
         return None
-    return rejected(f"no fix (error {error}, mode {_SBF_NONE.get(mode, mode)})")
+    return rejected(f"{what} (error {error}, mode {_SBF_NONE.get(mode, mode)})")
 
 
 def _sbf_place(msg: Any) -> SaidPlace | Rejection:
@@ -455,10 +458,7 @@ def _sbf_heading(msg: Any) -> SaidHeading | Rejection:
 
 
 def _sbf_ins_trouble(msg: Any) -> Rejection | None:
-    mode, error = int(msg.gnss_mode) & _SBF_MODE, int(msg.error)
-    if error == 0 and mode in _SBF_STATUS:
-        return None
-    return rejected(f"no GNSS in it (error {error}, mode {_SBF_NONE.get(mode, mode)})")
+    return _sbf_without("no GNSS in it", int(msg.gnss_mode), int(msg.error))
 
 
 def _sbf_ins_place(msg: Any) -> SaidPlace | Rejection:
@@ -478,8 +478,7 @@ def _sbf_ins_velocity(msg: Any) -> SaidVelocity | Rejection:
 
 
 def _sbf_ins_heading(msg: Any) -> SaidHeading | Rejection:
-    said = _sbf_ins_trouble(msg) or _angle(float(msg.heading), float(msg.heading_std_dev))
-    return said if isinstance(said, Rejection) else said._replace(filtered=True)
+    return _filtered(_sbf_ins_trouble(msg) or _angle(float(msg.heading), float(msg.heading_std_dev)))
 
 
 # PX4: microseconds since boot, or of the computer's clock where its agent synchronises them.
