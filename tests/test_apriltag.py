@@ -21,7 +21,7 @@ from graphloc.frontends.tags.pose import modes_of, poses_of
 from graphloc.graph import Attachment, Decision
 from graphloc.linear import Term, linear_update
 from graphloc.measurements import TagSighting
-from graphloc.solve._decide import _predicted, by_hypotheses
+from graphloc.solve._decide import by_hypotheses, predicted
 from graphloc.survey import Survey
 from tests.tagfactory import AHEAD, FACES_SOUTH, SIGMA, SIZE_M, UNIT, degrees_between, nearest_mode, rays_of
 
@@ -205,7 +205,7 @@ def test_tags_of_quay_and_dock_are_judged_together_by_one_prediction() -> None:
     def covariance(_state: int, key: int) -> Array:
         return np.eye(3 if key == keys.velocity(0) else 6) * 0.3**2
 
-    predictions = [_predicted(r, at, 0, covariance) for r, at in zip(found, ats, strict=True)]
+    predictions = [predicted(r, at, 0, covariance) for r, at in zip(found, ats, strict=True)]
     stream: Any = SimpleNamespace(row=ROW, config=DOCKED, measurements=seen)
     assert min(v.weight for v in by_hypotheses(stream, [0, 1, 2], ats, found, predictions)) > 0.9
 

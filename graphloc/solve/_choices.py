@@ -15,7 +15,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from graphloc.build import Decided, Decisions, Problem, StartPrior, Thinned, attach, build_graph
+from graphloc.build import Decisions, Problem, StartPrior, Thinned, build_graph
 from graphloc.graph import Decision
 from graphloc.solve._decide import (
     Stage,
@@ -23,6 +23,7 @@ from graphloc.solve._decide import (
     Verdicts,
     along_best_chains,
     decisions,
+    decisions_on,
     log_evidence,
     predicted_covariance,
     weigh,
@@ -63,7 +64,7 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
         if s.row.false is not None
         for i, m in enumerate(s.measurements)
     }
-    judged, everything, iterations = dict(settled.verdicts), _decided(few, settled.verdicts, values), 0
+    judged, everything, iterations = dict(settled.verdicts), decisions_on(few, settled.verdicts, values), 0
     for third in range(3):
         own = {key for key, t in at_s.items() if int(t / _STRETCH_S) % 3 == third}
         around = {
@@ -71,7 +72,7 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
         }
         if not own or len(around) == len(at_s):  # nothing to judge, or no measurements to judge it by
             continue
-        rest = _without(problem, values, everything, prior, around)
+        rest = without(problem, values, everything, prior, around)
         fresh = weigh(
             problem,
             rest.values,
@@ -89,16 +90,6 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
         iterations += 1
         del rest  # and its tree, before the next one is made
     return judged, iterations
-
-
-def _decided(few: Thinned, verdicts: Verdicts, values: gtsam.Values) -> Decisions:
-    """Return the decisions on the measurements of a thinned run, from verdicts on the whole one."""
-    return {
-        (stream.number, i): Decided(decision, attach(few.problem, stream, i, values))
-        for stream in few.problem.streams
-        for i, whole in enumerate(few.chosen[stream.number].tolist())
-        if (decision := verdicts[stream.number, whole].decision) is not None
-    }
 
 
 def _without_its_ends(problem: Problem, settled: Settled) -> Verdicts:
@@ -121,20 +112,20 @@ def _without_its_ends(problem: Problem, settled: Settled) -> Verdicts:
     return others
 
 
-class _Rest(NamedTuple):
+class Rest(NamedTuple):
     """The run without some measurements: values, and the tree that gives their covariances."""
 
     values: gtsam.Values
     tree: gtsam.ISAM2
 
 
-def _without(
+def without(
     problem: Problem, estimate: gtsam.Values, decided: Decisions, prior: StartPrior, left_out: set[tuple[int, int]]
-) -> _Rest:
+) -> Rest:
     """Take one step of the whole run without some measurements."""
     kept = {key: found for key, found in decided.items() if key not in left_out}
     tree = bayes_tree(*build_graph(problem, estimate, kept, 0, len(problem.timeline) - 1, prior))
-    return _Rest(gtsam.Values(tree.calculateBestEstimate()), tree)
+    return Rest(gtsam.Values(tree.calculateBestEstimate()), tree)
 
 
 def _decisive(verdict: Verdict) -> Verdict:

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from graphloc import keys
-from graphloc.build import Decided, Decisions, Judged, Problem, Sited, Stream, attach
+from graphloc.build import Decided, Decisions, Judged, Problem, Sited, Stream, Thinned, attach
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
@@ -91,7 +91,7 @@ class Verdict:
 Verdicts = dict[tuple[int, int], Verdict]
 
 
-def _predicted(
+def predicted(
     found: tuple[Residual, ...], at: Attachment, k: int, covariance: PredictedCovariance
 ) -> Prediction | None:
     """Return the prediction of a residual; None where the estimate already contains the measurement."""
@@ -132,10 +132,10 @@ def weigh(
         indices = [i for i in stream.between(first, last) if only is None or (stream.number, i) in only]
         if not indices:
             continue
-        attached, residuals = _met(problem, stream, indices, values)
+        attached, residuals = met(problem, stream, indices, values)
         if several and hypotheses:
             predictions = [
-                _predicted(r, at, int(stream.state[i]), covariance)
+                predicted(r, at, int(stream.state[i]), covariance)
                 for i, at, r in zip(indices, attached, residuals, strict=True)
             ]
             found = by_hypotheses(stream, indices, attached, residuals, predictions)
@@ -231,7 +231,7 @@ def by_hypotheses(
     return verdicts
 
 
-def _met(
+def met(
     problem: Problem, stream: Stream, indices: Iterable[int], values: gtsam.Values
 ) -> tuple[list[Attachment], list[tuple[Residual, ...]]]:
     """Return the attachments of measurements of a stream at an estimate, and the residuals of their modes there."""
@@ -257,7 +257,7 @@ def along_best_chains(problem: Problem, values: gtsam.Values, verdicts: Verdicts
         if stream.row.false is None:
             continue
         every = range(len(stream.measurements))
-        attached, residuals = _met(problem, stream, every, values)
+        attached, residuals = met(problem, stream, every, values)
         chain = best_chain(stream, every, residuals)
         changed |= {(stream.number, i): v for i, v in enumerate(believing(chain, residuals, attached))}
     return changed
@@ -278,6 +278,16 @@ def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> D
     return {
         key: None if v.decision is None or key in without else Decided(v.decision, v.at, v.residual)
         for key, v in verdicts.items()
+    }
+
+
+def decisions_on(few: Thinned, verdicts: Verdicts, values: gtsam.Values) -> Decisions:
+    """Return the decisions on the measurements of a thinned run, from verdicts on the whole one."""
+    return {
+        (stream.number, i): Decided(decision, attach(few.problem, stream, i, values))
+        for stream in few.problem.streams
+        for i, whole in enumerate(few.chosen[stream.number].tolist())
+        if (decision := verdicts[stream.number, whole].decision) is not None
     }
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.berths import Berth, BerthTrack, rates, seen_from
 from graphloc.build import Problem, Stream, solved_constants
-from graphloc.errors import in_one_line
+from graphloc.errors import SolveError, in_one_line
 from graphloc.frames import Array
 from graphloc.recording import Recording
 from graphloc.series import interpolated
@@ -26,6 +26,7 @@ from graphloc.solve._covariances import (
     widen_heading,
     world_covariance,
 )
+from graphloc.solve._doubt import widen_by_doubt
 from graphloc.solve._health import health_over_time, misfits, since_agreed
 from graphloc.solve._ledger import ledger_of
 from graphloc.solve._unmodelled import unmodelled
@@ -58,10 +59,15 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         cov=np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k], lever) for k in range(n)]),
     )
     assert trajectory.cov is not None
+    ambiguous = _add_doubt(result, trajectory.cov)
     trajectory.cov[:, :3, :3] += unmodelled_covariance(problem.streams) + result.levels_cov
     v_cov = np.array([tree.marginalCovariance(keys.velocity(k)) for k in range(n)])
     guess = _add_others(result, trajectory.cov)
-    unsaid = [*_add_unmodelled(result, trajectory.cov, v_cov), *(guess or _add_guess(result, trajectory.cov))]
+    unsaid = [
+        *ambiguous,
+        *_add_unmodelled(result, trajectory.cov, v_cov),
+        *(guess or _add_guess(result, trajectory.cov)),
+    ]
     limit_heading(trajectory.cov)
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = stats_of(problem, result)
@@ -92,6 +98,16 @@ def _time_offsets_s(problem: Problem, result: BatchResult) -> Iterator[tuple[str
         for constant, value in solved_constants(stream, result.values):
             if constant.corrects == "time_offset_s":
                 yield stream.name, float(value[0])
+
+
+def _add_doubt(result: BatchResult, cov: Array) -> list[str]:
+    """Widen the position by what the choice of modes leaves open; return warnings, one where that fails."""
+    try:
+        return widen_by_doubt(result, cov)
+    except SolveError as error:
+        return [
+            f"the bounds of position do not include that believed poses may be false together ({in_one_line(error)})"
+        ]
 
 
 def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:

@@ -1,0 +1,151 @@
+"""Bounds that hold also where what was believed of a sensor is false as a whole."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal, norm
+
+from graphloc import app
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import bl_scenario
+from graphloc.frames import Array
+from graphloc.graph import Decision, FalseModel, Residual
+from graphloc.measurements import Measurement, PoseFix
+from graphloc.solve._doubt import doubt_of, probability_false, widening
+from tests.slowly import simulate_slowly
+
+SECOND = 1_000_000_000
+FAR_M2 = 1e12
+
+
+def turned(angle: float) -> Array:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def widened(cov: Array, more: Array, off: Array, spread_m2: float, probability: float) -> Array:
+    (turn,) = widening(cov[None], more[None], off[None], spread_m2, np.array([probability]))
+    return np.asarray(turn @ cov @ turn.T)
+
+
+@pytest.mark.parametrize("probability", [0.01, 0.04, 0.1, 0.6])
+@pytest.mark.parametrize("off_m", [0.0, 3.0])
+def test_bounds_hold_for_95_percent_of_both_cases(probability: float, off_m: float) -> None:
+    """Sigmas of 0.2 and 0.5 m; in the other case 2.0 and 1.5 m, and off along the first axis."""
+    cov, other = np.diag([0.2, 0.5]) ** 2, np.diag([2.0, 1.5]) ** 2
+    off = np.array([off_m, 0.0])
+    found = widened(cov, other - cov, off, FAR_M2, probability)
+    assert abs(found[0, 1]) < 1e-12
+    for k, bound in enumerate(norm.ppf(0.975) * np.sqrt(np.diag(found))):
+        inside = norm.cdf(bound, scale=np.sqrt(cov[k, k])) - norm.cdf(-bound, scale=np.sqrt(cov[k, k]))
+        beside = norm(loc=off[k], scale=np.sqrt(other[k, k]))
+        assert (1.0 - probability) * inside + probability * (beside.cdf(bound) - beside.cdf(-bound)) == pytest.approx(
+            0.95, abs=1e-6
+        )
+    R = turned(0.7)
+    np.testing.assert_allclose(
+        widened(R @ cov @ R.T, R @ (other - cov) @ R.T, R @ off, FAR_M2, probability), R @ found @ R.T, atol=1e-9
+    )
+
+
+def test_what_is_certain_stays_as_it_is() -> None:
+    cov = np.array([[0.2, 0.05], [0.05, 0.1]])
+    np.testing.assert_allclose(widened(cov, np.eye(2) * 100.0, np.ones(2), FAR_M2, 0.0), cov, atol=1e-9)
+    np.testing.assert_allclose(widened(cov, np.zeros((2, 2)), np.zeros(2), FAR_M2, 0.5), cov, atol=1e-9)
+
+
+def test_nowhere_is_the_vessel_farther_off_than_false_ones_are() -> None:
+    """A run without the sensor that knows nothing (sigma 10 km, 300 m off): the false ones are 5 m off, and so may the vessel be."""
+    cov = np.diag([0.04, 0.01])
+    limited = widened(cov, np.eye(2) * 1e8, np.array([300.0, -100.0]), 25.0, 0.2)
+    np.testing.assert_allclose(limited, widened(cov, np.eye(2) * 25.0, np.zeros(2), FAR_M2, 0.2), rtol=1e-3)
+
+
+def residual(raw: Array, prior: float = 0.5, sigma: float = 0.3) -> Residual:
+    along = np.zeros((2, 6))
+    along[:, 3:5] = np.eye(2)
+    return Residual(raw=raw, cov=np.eye(2) * sigma**2, jacobian=lambda: along, prior=prior, size_m=None, size_deg=None)
+
+
+def model(news: float) -> FalseModel:
+    return FalseModel(probability=0.2, cov=np.eye(2) * 25.0, repeats=0.5, news=news)
+
+
+def test_each_is_judged_by_the_run_without_its_sensor() -> None:
+    """Two modes 4 m apart, and one of them twice, around a prediction good to 2 m."""
+    P = np.eye(2) * 4.0
+    modes = (
+        residual(np.array([0.5, 0.0]), 0.3),
+        residual(np.array([4.5, 0.0]), 0.4),
+        residual(np.array([0.6, 0.1]), 0.1),
+    )
+    density = [m.prior * multivariate_normal(np.zeros(2), m.cov + P).pdf(m.raw) for m in modes]
+    false = 0.2 * sum(
+        m.prior / 0.8 * multivariate_normal(np.zeros(2), m.cov + P + np.eye(2) * 25.0).pdf(m.raw) for m in modes
+    )
+    for chosen, right in ((0, density[0] + density[2]), (1, density[1]), (2, density[0] + density[2])):
+        expected = 1.0 - right / (sum(density) + false)
+        assert probability_false(modes, P, model(0.1), chosen) == pytest.approx(expected)
+
+
+def doubts(news: Array, false: Array, weights: Array, sigmas: Array) -> Any:
+    verdicts: list[Any] = [
+        SimpleNamespace(weight=w, decision=Decision() if w else None, residual=residual(np.zeros(2), sigma=s))
+        for w, s in zip(weights, sigmas, strict=True)
+    ]
+    return doubt_of(np.arange(len(news)) * SECOND, false, [model(n) for n in news], verdicts)
+
+
+def test_of_many_that_repeat_each_other_all_are_false_together() -> None:
+    """However many there are; what a measurement tells anew, its neighbours have shown right or wrong."""
+    count, ones = 40, np.ones(40)
+    for news in (0.05, 0.5, 1.0):
+        found = doubts(np.full(count, news), np.full(count, 0.3), ones, ones)
+        np.testing.assert_allclose(found.probability, 0.3 * (1.0 - news))
+    assert found.spread_m2 == pytest.approx(25.0)
+
+
+def test_only_what_determines_the_position_is_in_doubt() -> None:
+    """Ten doubtful ones, then ten others that have no error in common with these; loose ones, and refused ones, count for nothing."""
+    count = 20
+    news, false = np.full(count, 0.01), np.where(np.arange(count) < 10, 0.4, 0.0)
+    news[10] = 0.999
+    found = doubts(news, false, np.ones(count), np.ones(count)).probability
+    np.testing.assert_allclose(found[:10], 0.4 * 0.99, rtol=2e-3)
+    assert found[10:].max() < 1e-3
+    far_off = np.where(np.arange(count) % 2, 0.9, 0.1)
+    loose = doubts(np.full(count, 0.01), far_off, np.ones(count), np.where(np.arange(count) % 2, 100.0, 1.0))
+    refused = doubts(np.full(count, 0.01), far_off, np.where(np.arange(count) % 2, 0.0, 1.0), np.ones(count))
+    for few in (loose, refused):
+        np.testing.assert_allclose(few.probability, 0.1 * 0.99, rtol=2e-3)
+    assert doubts(np.full(count, 0.01), far_off, np.zeros(count), np.ones(count)) is None
+
+
+def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds() -> None:
+    """All take one boat for the next, 3.4 m off, where GNSS is good to 2 m; they say themselves that half of such are false."""
+    run = simulate_slowly(replace(bl_scenario(1, "clean", false_fraction=0.0), duration_s=30.0), 3, rate_hz=2.5)
+
+    def a_berth_off(news: float) -> Any:
+        def moved(m: Measurement) -> Measurement:
+            if not isinstance(m, PoseFix):
+                return m
+            (mode,) = m.modes
+            berth = replace(mode, value=mode.value + np.array([3.0, 1.6, 0.0]), cov=mode.cov / news, probability=0.5)
+            return replace(m, modes=(berth,), news=news)
+
+        return moved
+
+    inside, said = {}, {}
+    for news in (0.03, 1.0):
+        solution = app.smooth_recording(run.recording.changed(a_berth_off(news)), run.config).solution
+        metrics = compare_to_truth(solution.trajectory, run.truth)
+        assert metrics.position_rmse_m > 2.0
+        assert metrics.coverage_95 is not None
+        inside[news] = metrics.coverage_95
+        said[news] = [line for line in solution.stats.warnings if "ambiguous" in line]
+    assert inside[0.03] > 0.95
+    assert inside[1.0] < 0.2  # independent, they confirm each other
+    assert len(said[0.03]) == 1
+    assert not said[1.0]
