@@ -12,6 +12,7 @@ from graphloc import app
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import bl_scenario
 from graphloc.frames import Array
+from graphloc.frontends.aerial.matcher import Since
 from graphloc.graph import Decision, FalseModel, Residual
 from graphloc.measurements import Measurement, PoseFix
 from graphloc.solve._doubt import doubt_of, probability_false, widening
@@ -105,6 +106,19 @@ def test_of_many_that_repeat_each_other_all_are_false_together() -> None:
         found = doubts(np.full(count, news), np.full(count, 0.3), ones, ones)
         np.testing.assert_allclose(found.probability, 0.3 * (1.0 - news))
     assert found.spread_m2 == pytest.approx(25.0)
+
+
+def test_their_errors_are_as_alike_as_the_matcher_says() -> None:
+    """Along a path they are by exp(-way); the first is all news, counts as if alone, and is as false as those that repeat it."""
+    way = np.random.default_rng(0).uniform(0.05, 1.5, 12)
+    along, false, sigmas = np.cumsum(way), np.linspace(0.1, 0.6, 12), np.linspace(0.3, 2.0, 12)
+    news = np.array([1.0, *(Since(w, 1.0).news for w in way[1:])])
+    says = np.exp(-np.abs(along[:, None] - along)) / sigmas**2
+    shared = 1.0 - np.minimum(news, [*news[1:], 1.0])
+    found = doubts(news, false, np.ones(12), sigmas)
+    np.testing.assert_allclose(found.probability, says @ (false * shared) / says.sum(axis=1))
+    tight = doubts(np.array([1.0, *[0.05] * 39]), np.full(40, 0.3), np.ones(40), np.array([0.1, *[0.45] * 39]))
+    np.testing.assert_allclose(tight.probability, 0.3 * 0.95)
 
 
 def test_only_what_determines_the_position_is_in_doubt() -> None:

@@ -135,7 +135,7 @@ def doubt_of(
     """Return the doubt about M measurements of a sensor; None where none of the believed ones says a position.
 
     It is the mean of `false` (M,), the probability of each, over those whose error is likely the same, each counted by what it
-    says of the position. What is news to the measurement before is confirmed, or not, by it.
+    says of the position. What is news to the measurement before and to the one after is confirmed, or not, by them.
     """
     news = np.array([model.news for model in models])
     weight = np.array([v.weight if v.decision is not None else 0.0 for v in verdicts])
@@ -143,8 +143,10 @@ def doubt_of(
     if not says.any():
         return None
     kept = (1.0 - news) / (1.0 + news)  # correlation with the measurement before
+    # The first one is all news, and weighs most: those after it may be false with it.
+    shared = 1.0 - np.minimum(news, np.append(news[1:], 1.0))
     around = np.maximum(_summed(says, kept), np.finfo(float).tiny)
-    probability = _summed(says * false * (1.0 - news), kept) / around
+    probability = _summed(says * false * shared, kept) / around
     spread = max(1.0 / i for v, model in zip(verdicts, models, strict=True) if (i := _information(v, model.cov)) > 0.0)
     return Doubt(stamps_ns, probability, spread)
 
