@@ -22,6 +22,7 @@ from graphloc.chi2 import chi2_95
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
 from graphloc.series import interpolated
+from graphloc.solution import Graded
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._choices import Rest, without
 from graphloc.solve._covariances import world_covariance
@@ -73,14 +74,13 @@ def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
         probability = np.interp(stamps_ns, doubt.stamps_ns, doubt.probability)
         sure *= 1.0 - probability
         if (typical := float(np.median(probability))) > _SAID:
-            warnings.append(
-                f"{name}: what it shows is ambiguous: with a probability of {typical:.0%} the poses that are believed are false "
-                "together; the bounds of position include that"
-            )
-    there = without(few.problem, values, decided, result.prior, set())
-    known_ns = few.problem.timeline.stamps_ns
-    more = _horizontal_covariances(few, rest) - _horizontal_covariances(few, there)
+            said = f"{name}: what it shows is ambiguous: with a probability of {typical:.0%} the poses that are believed are false"
+            said += " together; the bounds of position include that"
+            warnings.append(Graded(said, f"ambiguity of {name}", typical))
+    known_ns, more = few.problem.timeline.stamps_ns, _horizontal_covariances(few, rest)
     off_m = interpolated(stamps_ns, known_ns, _horizontal(few, rest.values) - _horizontal(few, values))
+    del rest  # and its tree, before the next one is made
+    more -= _horizontal_covariances(few, without(few.problem, values, decided, result.prior, set()))
     turn = widening(
         cov[:, :2, :2],
         interpolated(stamps_ns, known_ns, more.reshape(-1, 4)).reshape(-1, 2, 2),
@@ -88,8 +88,8 @@ def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
         max(doubt.spread_m2 for doubt in doubts.values()),
         1.0 - sure,
     )
-    cov[:, :2] = turn @ cov[:, :2]
-    cov[:, :, :2] = cov[:, :, :2] @ turn.transpose(0, 2, 1)
+    # What position and heading have in common stays: in the other case the arm between them is the same (see `widen_heading`).
+    cov[:, :2, :2] = turn @ cov[:, :2, :2] @ turn.transpose(0, 2, 1)
     return warnings
 
 
