@@ -12,9 +12,14 @@ from graphloc import app
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import bl_scenario
 from graphloc.frames import Array
+from graphloc.frontends.aerial.matcher import Since
 from graphloc.graph import Decision, FalseModel, Residual
 from graphloc.measurements import Measurement, PoseFix
+from graphloc.solution import Graded
+from graphloc.solve import _solution
+from graphloc.solve._batch import BatchResult
 from graphloc.solve._doubt import doubt_of, probability_false, widening
+from graphloc.solve._solution import _add_doubt
 from tests.slowly import simulate_slowly
 
 SECOND = 1_000_000_000
@@ -107,6 +112,19 @@ def test_of_many_that_repeat_each_other_all_are_false_together() -> None:
     assert found.spread_m2 == pytest.approx(25.0)
 
 
+def test_their_errors_are_as_alike_as_the_matcher_says() -> None:
+    """Along a path they are by exp(-way); the first is all news, counts as if alone, and is as false as those that repeat it."""
+    way = np.random.default_rng(0).uniform(0.05, 1.5, 12)
+    along, false, sigmas = np.cumsum(way), np.linspace(0.1, 0.6, 12), np.linspace(0.3, 2.0, 12)
+    news = np.array([1.0, *(Since(w, 1.0).news for w in way[1:])])
+    says = np.exp(-np.abs(along[:, None] - along)) / sigmas**2
+    shared = 1.0 - np.minimum(news, [*news[1:], 1.0])
+    found = doubts(news, false, np.ones(12), sigmas)
+    np.testing.assert_allclose(found.probability, says @ (false * shared) / says.sum(axis=1))
+    tight = doubts(np.array([1.0, *[0.05] * 39]), np.full(40, 0.3), np.ones(40), np.array([0.1, *[0.45] * 39]))
+    np.testing.assert_allclose(tight.probability, 0.3 * 0.95)
+
+
 def test_only_what_determines_the_position_is_in_doubt() -> None:
     """Ten doubtful ones, then ten others that have no error in common with these; loose ones, and refused ones, count for nothing."""
     count = 20
@@ -123,7 +141,7 @@ def test_only_what_determines_the_position_is_in_doubt() -> None:
     assert doubts(np.full(count, 0.01), far_off, np.zeros(count), np.ones(count)) is None
 
 
-def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds() -> None:
+def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """All take one boat for the next, 3.4 m off, where GNSS is good to 2 m; they say themselves that half of such are false."""
     run = simulate_slowly(replace(bl_scenario(1, "clean", false_fraction=0.0), duration_s=30.0), 3, rate_hz=2.5)
 
@@ -137,6 +155,15 @@ def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds() -
 
         return moved
 
+    covs, widen = list[tuple[Array, Array]](), _solution.widen_by_doubt
+
+    def watched(result: BatchResult, cov: Array) -> list[str]:
+        before = cov.copy()
+        lines = widen(result, cov)
+        covs.append((before, cov.copy()))
+        return lines
+
+    monkeypatch.setattr(_solution, "widen_by_doubt", watched)
     inside, said = {}, {}
     for news in (0.03, 1.0):
         solution = app.smooth_recording(run.recording.changed(a_berth_off(news)), run.config).solution
@@ -148,4 +175,20 @@ def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds() -
     assert inside[0.03] > 0.95
     assert inside[1.0] < 0.2  # independent, they confirm each other
     assert len(said[0.03]) == 1
+    assert isinstance(said[0.03][0], Graded)  # each leg of a long run has its own figure
     assert not said[1.0]
+    (narrow, wide), (same, as_it_was) = covs
+    np.testing.assert_array_equal(same, as_it_was)
+    assert np.linalg.eigvalsh((wide - narrow)[:, :2, :2]).min() > 0.5
+    wide[:, :2, :2] = narrow[:, :2, :2]
+    np.testing.assert_array_equal(wide, narrow)  # so the arm between heading and place is what it was
+
+
+def test_a_run_stands_where_its_doubt_cannot_be_reckoned(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(_result: BatchResult, _cov: Array) -> list[str]:
+        raise np.linalg.LinAlgError("not positive definite")
+
+    monkeypatch.setattr(_solution, "widen_by_doubt", fails)
+    result: Any = None
+    (said,) = _add_doubt(result, np.eye(6)[None])
+    assert "do not include that believed poses may be false together" in said

@@ -22,6 +22,7 @@ from graphloc.chi2 import chi2_95
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
 from graphloc.series import interpolated
+from graphloc.solution import Graded
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._choices import Rest, without
 from graphloc.solve._covariances import world_covariance
@@ -73,14 +74,13 @@ def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
         probability = np.interp(stamps_ns, doubt.stamps_ns, doubt.probability)
         sure *= 1.0 - probability
         if (typical := float(np.median(probability))) > _SAID:
-            warnings.append(
-                f"{name}: what it shows is ambiguous: with a probability of {typical:.0%} the poses that are believed are false "
-                "together; the bounds of position include that"
-            )
-    there = without(few.problem, values, decided, result.prior, set())
-    known_ns = few.problem.timeline.stamps_ns
-    more = _horizontal_covariances(few, rest) - _horizontal_covariances(few, there)
+            said = f"{name}: what it shows is ambiguous: with a probability of {typical:.0%} the poses that are believed are false"
+            said += " together; the bounds of position include that"
+            warnings.append(Graded(said, f"ambiguity of {name}", typical))
+    known_ns, more = few.problem.timeline.stamps_ns, _horizontal_covariances(few, rest)
     off_m = interpolated(stamps_ns, known_ns, _horizontal(few, rest.values) - _horizontal(few, values))
+    del rest  # and its tree, before the next one is made
+    more -= _horizontal_covariances(few, without(few.problem, values, decided, result.prior, set()))
     turn = widening(
         cov[:, :2, :2],
         interpolated(stamps_ns, known_ns, more.reshape(-1, 4)).reshape(-1, 2, 2),
@@ -88,8 +88,8 @@ def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
         max(doubt.spread_m2 for doubt in doubts.values()),
         1.0 - sure,
     )
-    cov[:, :2] = turn @ cov[:, :2]
-    cov[:, :, :2] = cov[:, :, :2] @ turn.transpose(0, 2, 1)
+    # What position and heading have in common stays: in the other case the arm between them is the same (see `widen_heading`).
+    cov[:, :2, :2] = turn @ cov[:, :2, :2] @ turn.transpose(0, 2, 1)
     return warnings
 
 
@@ -135,7 +135,7 @@ def doubt_of(
     """Return the doubt about M measurements of a sensor; None where none of the believed ones says a position.
 
     It is the mean of `false` (M,), the probability of each, over those whose error is likely the same, each counted by what it
-    says of the position. What is news to the measurement before is confirmed, or not, by it.
+    says of the position. What is news to the measurement before and to the one after is confirmed, or not, by them.
     """
     news = np.array([model.news for model in models])
     weight = np.array([v.weight if v.decision is not None else 0.0 for v in verdicts])
@@ -143,8 +143,10 @@ def doubt_of(
     if not says.any():
         return None
     kept = (1.0 - news) / (1.0 + news)  # correlation with the measurement before
+    # The first one is all news, and weighs most: those after it may be false with it.
+    shared = 1.0 - np.minimum(news, np.append(news[1:], 1.0))
     around = np.maximum(_summed(says, kept), np.finfo(float).tiny)
-    probability = _summed(says * false * (1.0 - news), kept) / around
+    probability = _summed(says * false * shared, kept) / around
     spread = max(1.0 / i for v, model in zip(verdicts, models, strict=True) if (i := _information(v, model.cov)) > 0.0)
     return Doubt(stamps_ns, probability, spread)
 

@@ -104,7 +104,7 @@ def _add_doubt(result: BatchResult, cov: Array) -> list[str]:
     """Widen the position by what the choice of modes leaves open; return warnings, one where that fails."""
     try:
         return widen_by_doubt(result, cov)
-    except SolveError as error:
+    except (SolveError, RuntimeError, np.linalg.LinAlgError, MemoryError) as error:
         return [
             f"the bounds of position do not include that believed poses may be false together ({in_one_line(error)})"
         ]
