@@ -24,14 +24,15 @@ from tests.slowly import simulate_slowly
 
 SECOND = 1_000_000_000
 FAR_M2 = 1e12
+PLANE = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # residuals of position, by x, y and yaw
 
 
 def turned(angle: float) -> Array:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def widened(cov: Array, more: Array, off: Array, spread_m2: float, probability: float) -> Array:
-    (turn,) = widening(cov[None], more[None], off[None], spread_m2, np.array([probability]))
+def widened(cov: Array, more: Array, off: Array, spread: float, probability: float) -> Array:
+    (turn,) = widening(cov[None], more[None], off[None], spread, np.array([probability]))
     return np.asarray(turn @ cov @ turn.T)
 
 
@@ -92,7 +93,27 @@ def test_each_is_judged_by_the_run_without_its_sensor() -> None:
     )
     for chosen, right in ((0, density[0] + density[2]), (1, density[1]), (2, density[0] + density[2])):
         expected = 1.0 - right / (sum(density) + false)
-        assert probability_false(modes, P, model(0.1), chosen) == pytest.approx(expected)
+        assert probability_false(modes, P, model(0.1), chosen, PLANE, slice(0, 2)) == pytest.approx(expected)
+    alike = 1.0 - sum(density) / (sum(density) + false)  # all have one heading, which none of them measures
+    assert probability_false(modes, P, model(0.1), 0, PLANE, slice(2, 3)) == pytest.approx(alike)
+
+
+def test_a_row_of_boats_leaves_the_place_open_but_not_the_heading() -> None:
+    """Two modes a berth apart with one heading, seen 2 m ahead of the body, and a third that is turned by 20 deg."""
+    by_plane = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 0.0, 1.0]])
+    noise, P = np.diag([0.2, 0.2, 0.01]) ** 2, np.diag([2.0, 2.0, 0.2]) ** 2
+
+    def mode(raw: list[float], prior: float) -> Residual:
+        return replace(residual(np.zeros(2), prior), raw=np.array(raw), cov=noise)
+
+    wide = FalseModel(probability=0.1, cov=np.diag([5.0, 5.0, 0.1]) ** 2, repeats=0.5, news=0.1)
+    modes = (mode([0.0, 0.0, 0.0], 0.4), mode([4.0, 0.0, 0.005], 0.4), mode([0.0, 0.7, 0.35], 0.1))
+    density = np.array([m.prior * multivariate_normal(np.zeros(3), noise + P).pdf(m.raw) for m in modes])
+    false = 0.1 * sum(m.prior / 0.9 * multivariate_normal(np.zeros(3), noise + P + wide.cov).pdf(m.raw) for m in modes)
+    # Turned about the body, the third is at the same place, and what the sensor sees 2 m ahead 0.7 m beside.
+    for axes, alike in ((slice(0, 2), [0, 2]), (slice(2, 3), [0, 1])):
+        expected = 1.0 - density[alike].sum() / (density.sum() + false)
+        assert probability_false(modes, P, wide, 0, by_plane, axes) == pytest.approx(expected)
 
 
 def doubts(news: Array, false: Array, weights: Array, sigmas: Array) -> Any:
@@ -100,7 +121,8 @@ def doubts(news: Array, false: Array, weights: Array, sigmas: Array) -> Any:
         SimpleNamespace(weight=w, decision=Decision() if w else None, residual=residual(np.zeros(2), sigma=s))
         for w, s in zip(weights, sigmas, strict=True)
     ]
-    return doubt_of(np.arange(len(news)) * SECOND, false, [model(n) for n in news], verdicts)
+    places = [PLANE[:, :2]] * len(news)
+    return doubt_of(np.arange(len(news)) * SECOND, false, [model(n) for n in news], verdicts, places)
 
 
 def test_of_many_that_repeat_each_other_all_are_false_together() -> None:
@@ -109,7 +131,7 @@ def test_of_many_that_repeat_each_other_all_are_false_together() -> None:
     for news in (0.05, 0.5, 1.0):
         found = doubts(np.full(count, news), np.full(count, 0.3), ones, ones)
         np.testing.assert_allclose(found.probability, 0.3 * (1.0 - news))
-    assert found.spread_m2 == pytest.approx(25.0)
+    assert found.spread == pytest.approx(25.0)
 
 
 def test_their_errors_are_as_alike_as_the_matcher_says() -> None:
@@ -174,13 +196,14 @@ def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds(mon
         said[news] = [line for line in solution.stats.warnings if "ambiguous" in line]
     assert inside[0.03] > 0.95
     assert inside[1.0] < 0.2  # independent, they confirm each other
-    assert len(said[0.03]) == 1
-    assert isinstance(said[0.03][0], Graded)  # each leg of a long run has its own figure
+    assert [aspect in line for aspect, line in zip(("position", "heading"), said[0.03], strict=True)] == [True, True]
+    assert all(isinstance(line, Graded) for line in said[0.03])  # each leg of a long run has its own figure
     assert not said[1.0]
     (narrow, wide), (same, as_it_was) = covs
     np.testing.assert_array_equal(same, as_it_was)
     assert np.linalg.eigvalsh((wide - narrow)[:, :2, :2]).min() > 0.5
-    wide[:, :2, :2] = narrow[:, :2, :2]
+    assert (wide - narrow)[:, 5, 5].min() > 0.0
+    wide[:, :2, :2], wide[:, 5, 5] = narrow[:, :2, :2], narrow[:, 5, 5]
     np.testing.assert_array_equal(wide, narrow)  # so the arm between heading and place is what it was
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What it adds to the covariance of a position that the measurements which determine it may be false together.
+"""What it adds to the covariance of position and heading that the measurements which determine them may be false together.
 
 A solved graph is as sure as if its choice of modes were right, and the estimate that follows it confirms it. Where errors are
 independent, neighbours show whether it is. Where those of a sensor repeat (matches that take the same moored boats for others), its
@@ -9,6 +9,7 @@ the vessel is where that run has it, or as far off as false ones are.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import gtsam
@@ -19,8 +20,8 @@ from scipy import special
 from graphloc import gauss, keys
 from graphloc.build import Stream, Thinned, thinned
 from graphloc.chi2 import chi2_95
-from graphloc.frames import Array
-from graphloc.graph import FalseModel, Residual
+from graphloc.frames import Array, wrap_angle
+from graphloc.graph import Attachment, FalseModel, Residual
 from graphloc.series import interpolated
 from graphloc.solution import Graded
 from graphloc.solve._batch import BatchResult
@@ -35,23 +36,31 @@ _SAID = 0.05  # beyond this one a bound that holds for 95 % depends on what else
 _BEYOND = 0.05  # share of the cases that a bound leaves out
 _BOUND = -float(special.ndtri(0.5 * _BEYOND))  # sigmas
 _HALVINGS = 40
+_PLANE = np.array([0, 1, 5])  # x, y and yaw in a covariance
+_ASPECTS = {
+    "position": slice(0, 2),
+    "heading": slice(2, 3),
+}  # of these three; a row of boats moves the one and not the other
 
 
 class Doubt(NamedTuple):
-    """How far those of a sensor's measurements that are believed may be false together.
+    """How far those of a sensor's measurements that are believed may be false together, in one aspect.
 
     Attributes:
-        stamps_ns: (M,) of its measurements. probability: (M,) that the ones which determine the position there are false.
-        spread_m2: variance of their error, if they are.
+        stamps_ns: (M,) of its measurements. probability: (M,) that the ones which determine the aspect there are false.
+        spread: variance of their error, if they are, m^2 or rad^2.
     """
 
     stamps_ns: NDArray[np.int64]
     probability: Array
-    spread_m2: float
+    spread: float
 
 
 def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
-    """Widen the horizontal position in covariances (N, 6, 6), in axes of world and in place, by what is left open; return warnings.
+    """Widen horizontal position and heading in covariances (N, 6, 6), in axes of world and in place, by what is left open.
+
+    Returns:
+        Warnings.
 
     Raises:
         SolveError: what the run knows without the sensors in doubt is not determined.
@@ -65,31 +74,35 @@ def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
     numbers = {s.number for s in streams}
     rest = without(few.problem, values, decided, result.prior, {key for key in decided if key[0] in numbers})
     thin = {s.number: s for s in few.problem.streams}
-    doubts = {s.name: doubt for s in streams if (doubt := _doubt_of(few, thin[s.number], result, rest)) is not None}
-    if max((float(doubt.probability.max()) for doubt in doubts.values()), default=0.0) < _SLIGHT:
+    doubts = {s.name: _doubts_of(few, thin[s.number], result, rest) for s in streams}
+    if not any(d.probability.max() > _SLIGHT for of_sensor in doubts.values() for d in of_sensor.values()):
         return []
-    stamps_ns, sure = result.problem.timeline.stamps_ns, np.ones(len(cov))
-    warnings = list[str]()
-    for name, doubt in doubts.items():
-        probability = np.interp(stamps_ns, doubt.stamps_ns, doubt.probability)
-        sure *= 1.0 - probability
-        if (typical := float(np.median(probability))) > _SAID:
-            said = f"{name}: what it shows is ambiguous: with a probability of {typical:.0%} the poses that are believed are false"
-            said += " together; the bounds of position include that"
-            warnings.append(Graded(said, f"ambiguity of {name}", typical))
-    known_ns, more = few.problem.timeline.stamps_ns, _horizontal_covariances(few, rest)
-    off_m = interpolated(stamps_ns, known_ns, _horizontal(few, rest.values) - _horizontal(few, values))
+    stamps_ns, known_ns = result.problem.timeline.stamps_ns, few.problem.timeline.stamps_ns
+    off = _planes(few, rest.values) - _planes(few, values)
+    off[:, 2] = wrap_angle(off[:, 2])
+    more = _plane_covariances(few, rest)
     del rest  # and its tree, before the next one is made
-    more -= _horizontal_covariances(few, without(few.problem, values, decided, result.prior, set()))
-    turn = widening(
-        cov[:, :2, :2],
-        interpolated(stamps_ns, known_ns, more.reshape(-1, 4)).reshape(-1, 2, 2),
-        off_m,
-        max(doubt.spread_m2 for doubt in doubts.values()),
-        1.0 - sure,
-    )
-    # What position and heading have in common stays: in the other case the arm between them is the same (see `widen_heading`).
-    cov[:, :2, :2] = turn @ cov[:, :2, :2] @ turn.transpose(0, 2, 1)
+    more -= _plane_covariances(few, without(few.problem, values, decided, result.prior, set()))
+    more, off = (interpolated(stamps_ns, known_ns, of.reshape(len(of), -1)) for of in (more, off))
+    more, warnings = more.reshape(-1, 3, 3), list[str]()
+    for aspect, axes in _ASPECTS.items():
+        found = {name: of_sensor[aspect] for name, of_sensor in doubts.items() if aspect in of_sensor}
+        if not found:
+            continue
+        sure = np.ones(len(cov))
+        for name, doubt in found.items():
+            probability = np.interp(stamps_ns, doubt.stamps_ns, doubt.probability)
+            sure *= 1.0 - probability
+            if (typical := float(np.median(probability))) > _SAID:
+                said = f"{name}: what it shows of the {aspect} is ambiguous: with a probability of {typical:.0%} what is believed of it"
+                warnings.append(
+                    Graded(f"{said} is false as a whole; the bounds include that", f"{aspect} by {name}", typical)
+                )
+        there = (slice(None), _PLANE[axes][:, None], _PLANE[axes])
+        spread = max(doubt.spread for doubt in found.values())
+        turn = widening(cov[there], more[:, axes, axes], off[:, axes], spread, 1.0 - sure)
+        # What position and heading have in common stays: in the other case the arm between them is the same (see `widen_heading`).
+        cov[there] = turn @ cov[there] @ turn.transpose(0, 2, 1)
     return warnings
 
 
@@ -103,43 +116,70 @@ def _shares_errors(stream: Stream) -> bool:
     return stream.row.false is not None and any(model.news < 1.0 for model in _models(stream))
 
 
-def _doubt_of(few: Thinned, stream: Stream, result: BatchResult, rest: Rest) -> Doubt | None:
-    """Return the doubt about a sensor of the thinned run, which has all its measurements; None where none says a position."""
+def _doubts_of(few: Thinned, stream: Stream, result: BatchResult, rest: Rest) -> dict[str, Doubt]:
+    """Return the doubt about a sensor of the thinned run, which has all its measurements, in each aspect that the believed ones say."""
     covariance = predicted_covariance(rest.tree)
     attached, residuals = met(few.problem, stream, range(len(stream.measurements)), rest.values)
     verdicts = [result.verdicts[stream.number, i] for i in range(len(attached))]
-    models, false = _models(stream), np.zeros(len(attached))
+    models, false = _models(stream), {aspect: np.zeros(len(attached)) for aspect in _ASPECTS}
     for n, (at, found, model, verdict) in enumerate(zip(attached, residuals, models, verdicts, strict=True)):
         prediction = predicted(found, at, int(stream.state[n]), covariance)
-        false[n] = probability_false(found, None if prediction is None else prediction.cov, model, verdict.mode)
-    return doubt_of(stamps_of(stream.measurements), false, models, verdicts)
+        P = None if prediction is None else prediction.cov
+        by_plane = _by_plane(found[verdict.mode], at)
+        for aspect, axes in _ASPECTS.items():
+            false[aspect][n] = probability_false(found, P, model, verdict.mode, by_plane, axes)
+    by_planes, stamps_ns = [_by_plane(v.residual, v.at) for v in verdicts], stamps_of(stream.measurements)
+    doubts = {
+        aspect: doubt_of(stamps_ns, false[aspect], models, verdicts, [J[:, axes] for J in by_planes])
+        for aspect, axes in _ASPECTS.items()
+    }
+    return {aspect: doubt for aspect, doubt in doubts.items() if doubt is not None}
 
 
-def probability_false(modes: tuple[Residual, ...], P: Array | None, model: FalseModel, chosen: int) -> float:
+def _by_plane(residual: Residual, at: Attachment) -> Array:
+    """Return the Jacobian (k, 3) of a residual by x, y and yaw of the body in world."""
+    J, back = residual.jacobian(), at.T_world_body.rotation().matrix().T
+    return np.column_stack([J[:, 3:] @ back[:, :2], J[:, :3] @ back[:, 2]])
+
+
+def probability_false(
+    modes: tuple[Residual, ...], P: Array | None, model: FalseModel, chosen: int, by_plane: Array, axes: slice
+) -> float:
     """Return the probability that neither the chosen mode of a measurement nor one at the same place is right.
 
     Args:
-        modes: residuals at a prediction of covariance P (k, k).
+        modes: residuals at a prediction of covariance P (k, k). by_plane: as of `_by_plane`. axes: those in which it is the same place,
+            as far as the noise of both explains the distance.
     """
-    right = np.array([r.log_density(P) for r in modes])
-    here = modes[chosen]
-    limit = chi2_95(len(here.raw))  # beyond, the noise of both does not explain the distance
-    alike = np.array([gauss.square(r.raw - here.raw, r.cov + here.cov) < limit for r in modes])
+    right, here = np.array([r.log_density(P) for r in modes]), modes[chosen]
+    alike = []
+    for r in modes:
+        whiten = gauss.whitening(r.cov + here.cov)
+        back = np.linalg.pinv(whiten @ by_plane)[axes]
+        off = back @ whiten @ (r.raw - here.raw)
+        alike.append(off @ np.linalg.pinv(back @ back.T) @ off < chi2_95(len(off)))
     every = np.logaddexp(*log_right_and_false(modes, P, model))
-    return float(-np.expm1(np.logaddexp.reduce(right[alike]) - every))
+    return float(-np.expm1(np.logaddexp.reduce(right[np.array(alike)]) - every))
 
 
 def doubt_of(
-    stamps_ns: NDArray[np.int64], false: Array, models: list[FalseModel], verdicts: list[Verdict]
+    stamps_ns: NDArray[np.int64],
+    false: Array,
+    models: Sequence[FalseModel],
+    verdicts: Sequence[Verdict],
+    by_aspect: Sequence[Array],
 ) -> Doubt | None:
-    """Return the doubt about M measurements of a sensor; None where none of the believed ones says a position.
+    """Return the doubt about M measurements of a sensor; None where none of the believed ones says anything of the aspect.
 
     It is the mean of `false` (M,), the probability of each, over those whose error is likely the same, each counted by what it
-    says of the position. What is news to the measurement before and to the one after is confirmed, or not, by them.
+    says of the aspect. What is news to the measurement before and to the one after is confirmed, or not, by them.
+
+    Args:
+        by_aspect: Jacobians (k, 2) by the position, 1/m, or (k, 1) by the heading.
     """
     news = np.array([model.news for model in models])
     weight = np.array([v.weight if v.decision is not None else 0.0 for v in verdicts])
-    says = weight * np.array([_information(v, v.residual.cov) for v in verdicts])
+    says = weight * np.array([_information(J, v.residual.cov) for J, v in zip(by_aspect, verdicts, strict=True)])
     if not says.any():
         return None
     kept = (1.0 - news) / (1.0 + news)  # correlation with the measurement before
@@ -147,13 +187,13 @@ def doubt_of(
     shared = 1.0 - np.minimum(news, np.append(news[1:], 1.0))
     around = np.maximum(_summed(says, kept), np.finfo(float).tiny)
     probability = _summed(says * false * shared, kept) / around
-    spread = max(1.0 / i for v, model in zip(verdicts, models, strict=True) if (i := _information(v, model.cov)) > 0.0)
+    spread = max(1.0 / i for J, model in zip(by_aspect, models, strict=True) if (i := _information(J, model.cov)) > 0.0)
     return Doubt(stamps_ns, probability, spread)
 
 
-def _information(verdict: Verdict, cov: Array) -> float:
-    """Return what a residual with a covariance (k, k) says of the position along the axis that it knows best, 1/m^2."""
-    return float(np.linalg.norm(gauss.whitening(cov) @ verdict.residual.jacobian()[:, 3:6], 2) ** 2)
+def _information(J: Array, cov: Array) -> float:
+    """Return what a residual of covariance (k, k) says along the axis that it knows best, given its Jacobian (k, d)."""
+    return float(np.linalg.norm(gauss.whitening(cov) @ J, 2) ** 2)
 
 
 def _summed(values: Array, kept: Array) -> Array:
@@ -165,39 +205,39 @@ def _summed(values: Array, kept: Array) -> Array:
     return np.asarray(ahead + back - values)
 
 
-def _horizontal(few: Thinned, values: gtsam.Values) -> Array:
-    """Return the horizontal position (N, 2) of the body in a thinned run, m."""
+def _planes(few: Thinned, values: gtsam.Values) -> Array:
+    """Return x, y and yaw (N, 3) of the body in a thinned run."""
     lever_m = -few.problem.t_body_imu_m
     poses = [values.atPose3(keys.pose(k)) for k in range(len(few.states))]
-    return np.array([pose.transformFrom(lever_m)[:2] for pose in poses])
+    return np.array([[*pose.transformFrom(lever_m)[:2], pose.rotation().yaw()] for pose in poses])
 
 
-def _horizontal_covariances(few: Thinned, solved: Rest) -> Array:
-    """Return the covariance (N, 2, 2) of that, m^2."""
+def _plane_covariances(few: Thinned, solved: Rest) -> Array:
+    """Return the covariance (N, 3, 3) of that."""
     lever_m, found = -few.problem.t_body_imu_m, []
     for k in map(keys.pose, range(len(few.states))):
         R = solved.values.atPose3(k).rotation().matrix()
-        found.append(world_covariance(solved.tree.marginalCovariance(k), R, lever_m)[:2, :2])
+        found.append(world_covariance(solved.tree.marginalCovariance(k), R, lever_m)[np.ix_(_PLANE, _PLANE)])
     return np.array(found)
 
 
-def widening(cov: Array, more: Array, off_m: Array, spread_m2: float, probability: Array) -> Array:
-    """Return the maps (N, 2, 2) that widen covariances (N, 2, 2), m^2, so that bounds of 95 % hold in both cases together.
+def widening(cov: Array, more: Array, off: Array, spread: float, probability: Array) -> Array:
+    """Return the maps (N, d, d) that widen covariances (N, d, d) so that bounds of 95 % hold in both cases together.
 
     Args:
-        more: (N, 2, 2) by how much the covariance is larger in the other case. off_m: (N, 2) how far off its mean is. Both are limited
-            by `spread_m2`, the variance of the distance between the two cases. probability: (N,) of the other case.
+        more: (N, d, d) by how much the covariance is larger in the other case. off: (N, d) how far off its mean is. Both are limited
+            by `spread`, the variance of the distance between the two cases. probability: (N,) of the other case.
     """
-    eye = np.eye(2)
+    eye = np.eye(cov.shape[1])
     size, axes = np.linalg.eigh(more)
     other = cov + (axes * np.maximum(size, 0.0)[:, None]) @ axes.transpose(0, 2, 1)
-    near = cov + spread_m2 * eye
+    near = cov + spread * eye
     share = near @ np.linalg.inv(near + other)  # of the other case, between it and what is near the first one
     other = share @ other
     root = np.linalg.cholesky(cov)
     back = np.linalg.inv(root)
     times, axes = np.linalg.eigh(back @ (0.5 * (other + other.transpose(0, 2, 1))) @ back.transpose(0, 2, 1))
-    off = axes.transpose(0, 2, 1) @ back @ share @ off_m[:, :, None]
+    off = axes.transpose(0, 2, 1) @ back @ share @ off[:, :, None]
     scale = _scale(np.sqrt(np.maximum(times, 1.0)), np.abs(off[:, :, 0]), probability[:, None])
     return np.asarray(root @ (axes * scale[:, None]) @ axes.transpose(0, 2, 1) @ back)
 
@@ -206,7 +246,7 @@ def _scale(times: Array, off: Array, probability: Array) -> Array:
     """Return by how much a sigma of 1 is to be raised so that 95 % of a mixture are within its bounds.
 
     Args:
-        times: (N, 2) sigma of the other normal, at least 1. off: (N, 2) its mean, 0 or more. probability: (N, 1) of that one.
+        times: (N, d) sigma of the other normal, at least 1. off: (N, d) its mean, 0 or more. probability: (N, 1) of that one.
     """
     low, high = np.ones_like(times), times + off / _BOUND
     for _ in range(_HALVINGS):

@@ -59,15 +59,14 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         cov=np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k], lever) for k in range(n)]),
     )
     assert trajectory.cov is not None
-    ambiguous = _add_doubt(result, trajectory.cov)
     trajectory.cov[:, :3, :3] += unmodelled_covariance(problem.streams) + result.levels_cov
     v_cov = np.array([tree.marginalCovariance(keys.velocity(k)) for k in range(n)])
     guess = _add_others(result, trajectory.cov)
     unsaid = [
-        *ambiguous,
         *_add_unmodelled(result, trajectory.cov, v_cov),
         *(guess or _add_guess(result, trajectory.cov)),
     ]
+    unsaid += _add_doubt(result, trajectory.cov)
     limit_heading(trajectory.cov)
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = stats_of(problem, result)
@@ -101,13 +100,11 @@ def _time_offsets_s(problem: Problem, result: BatchResult) -> Iterator[tuple[str
 
 
 def _add_doubt(result: BatchResult, cov: Array) -> list[str]:
-    """Widen the position by what the choice of modes leaves open; return warnings, one where that fails."""
+    """Widen position and heading by what the choice of modes leaves open; return warnings, one where that fails."""
     try:
         return widen_by_doubt(result, cov)
     except (SolveError, RuntimeError, np.linalg.LinAlgError, MemoryError) as error:
-        return [
-            f"the bounds of position do not include that believed poses may be false together ({in_one_line(error)})"
-        ]
+        return [f"the bounds do not include that believed poses may be false together ({in_one_line(error)})"]
 
 
 def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
