@@ -182,7 +182,7 @@ def _horizontal_covariances(few: Thinned, solved: Rest) -> Array:
 
 
 def widening(cov: Array, more: Array, off_m: Array, spread_m2: float, probability: Array) -> Array:
-    """Return the maps (N, 2, 2) that widen covariances (N, 2, 2), m^2, so that bounds of 95 % hold in both cases together.
+    """Return the maps (N, 2, 2) that widen covariances (N, 2, 2), m^2, so that bounds of 95 % hold in both cases together, per axis.
 
     Args:
         more: (N, 2, 2) by how much the covariance is larger in the other case. off_m: (N, 2) how far off its mean is. Both are limited
