@@ -222,7 +222,7 @@ def _plane_covariances(few: Thinned, solved: Rest) -> Array:
 
 
 def widening(cov: Array, more: Array, off: Array, spread: float, probability: Array) -> Array:
-    """Return the maps (N, d, d) that widen covariances (N, d, d) so that bounds of 95 % hold in both cases together.
+    """Return the maps (N, d, d) that widen covariances (N, d, d) so that bounds of 95 % hold in both cases together, per axis.
 
     Args:
         more: (N, d, d) by how much the covariance is larger in the other case. off: (N, d) how far off its mean is. Both are limited
