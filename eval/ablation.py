@@ -102,7 +102,7 @@ def off(solution: Solution, full: Solution, truth: Trajectory | None, held: Sequ
         NoCommonTimeError: they share no time.
     """
     if truth is None and held:
-        fixes = held_out_errors(solution.trajectory, held, solution.datum, levers, solution.slow)
+        fixes = held_out_errors(solution.trajectory, held, solution.datum, levers).predicted(solution.slow)
         return Off(stamps_ns=fixes.stamps_ns, off_m=fixes.horizontal_m, off_deg=None)
     found = errors(solution.trajectory, truth or full.trajectory)
     return Off(

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from graphloc.build import mount_of
 from graphloc.chi2 import chi2_95
 from graphloc.config import VesselConfig
-from graphloc.eval.metrics import held_out_errors
+from graphloc.eval.metrics import receiver_errors
 from graphloc.frames import Array, Datum, heading_deg_from_yaw
 from graphloc.measurements import GnssPosition
 from graphloc.recording import Recording
-from graphloc.time import NS_PER_S, stamps_of
+from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 
 _STEADY = 0.5  # RMS about the mean, as a share of it
@@ -45,11 +45,11 @@ def gnss_offset_warnings(track: Trajectory, datum: Datum, recording: Recording, 
     for name, sensor in config.of_kind("gnss").items():
         others = [n for kind in _PLACES for n in config.of_kind(kind) if n != name and n in measured]
         fixes = recording.of(GnssPosition, name)
-        covered = track.covers(stamps_of(fixes))
-        if not covered.any() or sensor.slow_error.enabled is False or not others:
+        if sensor.slow_error.enabled is False or not others:
             continue
-        lever = {name: mount_of(name, sensor, recording.mounts)[0]}
-        found = held_out_errors(track, fixes, datum, lever)
+        found = receiver_errors(track, fixes, datum, {name: mount_of(name, sensor, recording.mounts)[0]})
+        if found is None:
+            continue
         stamps, off = found.stamps_ns, _means(found.stamps_ns, -found.position_m)
         if len(off) < _FEWEST:
             continue

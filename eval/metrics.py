@@ -180,34 +180,50 @@ class HeldOutMetrics:
     matched: float
 
 
-def held_out_errors(
-    estimate: Trajectory,
-    held: Sequence[GnssPosition],
-    datum: Datum,
-    levers_m: Levers,
-    slow: Mapping[str, SlowEstimate] | None = None,
-) -> PositionErrors:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FixErrors(PositionErrors):
+    """Errors of a receiver's antenna at its fixes.
+
+    Attributes:
+        fixes: the M that the estimate covers.
+    """
+
+    fixes: Sequence[GnssPosition]
+
+    def predicted(self, slow: Mapping[str, SlowEstimate]) -> PositionErrors:
+        """Return the errors of the fixes as they are predicted, with the slow error of their receiver, where the estimate has found it."""
+        off_m, sensor = self.position_m.copy(), np.array([m.sensor for m in self.fixes])
+        for name, error in slow.items():
+            own = sensor == name
+            off_m[own] += interpolated(self.stamps_ns[own], error.stamps_ns, error.value[:, :3])
+        return PositionErrors(stamps_ns=self.stamps_ns, position_m=off_m, covered=self.covered)
+
+
+def held_out_errors(estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers) -> FixErrors:
     """Return the errors of the predicted antenna position at held-out fixes.
 
     Args:
         levers_m: antenna of each receiver in body, (3,) m.
-        slow: the slow errors that the estimate has found; then those of the predicted fix, which is off by the receiver's.
 
     Raises:
         NoCommonTimeError: the estimate covers none of the fixes.
     """
-    stamps = stamps_of(held)
-    fixes = world_from_fixes(held, datum)
-    covered = estimate.covers(stamps)
+    covered = estimate.covers(stamps_of(held))
     if not covered.any():
         raise NoCommonTimeError("the track covers none of the held-out fixes")
-    p_world_m, R_world_body = estimate.poses_at(stamps[covered])
-    levers = np.array([levers_m[m.sensor] for m in held])[covered]
-    antenna = p_world_m + np.einsum("nij,nj->ni", R_world_body, levers)
-    for name, error in (slow or {}).items():
-        own = np.array([m.sensor == name for m in held])[covered]
-        antenna[own] += interpolated(stamps[covered][own], error.stamps_ns, error.value[:, :3])
-    return PositionErrors(stamps_ns=stamps[covered], position_m=antenna - fixes[covered], covered=float(covered.mean()))
+    fixes = [m for m, there in zip(held, covered, strict=True) if there]
+    stamps = stamps_of(fixes)
+    p_world_m, R_world_body = estimate.poses_at(stamps)
+    antenna = p_world_m + np.einsum("nij,nj->ni", R_world_body, np.array([levers_m[m.sensor] for m in fixes]))
+    off_m = antenna - world_from_fixes(fixes, datum)
+    return FixErrors(stamps_ns=stamps, position_m=off_m, covered=float(covered.mean()), fixes=fixes)
+
+
+def receiver_errors(
+    track: Trajectory, fixes: Sequence[GnssPosition], datum: Datum, levers_m: Levers
+) -> PositionErrors | None:
+    """Return how far a track is off a receiver, at its fixes, as `held_out_errors`; None where it covers none of them."""
+    return held_out_errors(track, fixes, datum, levers_m) if track.covers(stamps_of(fixes)).any() else None
 
 
 def compare_to_held_out(
@@ -232,8 +248,7 @@ def compare_to_held_out(
     usual = np.median(steps) if len(steps) else 1
     gap = np.cumsum(np.concatenate([[0], np.diff(stamps) > 2.5 * max(usual, 1)]))
     largest = np.array([horizontal[gap == g].max() for g in range(gap[-1] + 1)])
-    found = slow is not None and any(m.sensor in slow for m in held)
-    predicted = held_out_errors(estimate, held, datum, levers_m, slow).horizontal_m if found else None
+    predicted = None if not slow or all(m.sensor not in slow for m in held) else off.predicted(slow).horizontal_m
     return HeldOutMetrics(
         horizontal_rmse_m=rms(horizontal),
         horizontal_p95_m=float(np.percentile(horizontal, 95)),
@@ -295,7 +310,7 @@ def held_out_table(
     levers_m: Levers,
     slow: Mapping[str, Mapping[str, SlowEstimate]],
 ) -> Table:
-    """Return a table with a row per estimate, against held-out fixes; `levers_m` and `slow` of each as for `held_out_errors`."""
+    """Return a table with a row per estimate, against held-out fixes; `levers_m` and `slow` of each as for `compare_to_held_out`."""
     rows = [(name, compare_to_held_out(t, held, datum, levers_m, slow.get(name))) for name, t in estimates]
     return _table("Against held-out fixes", rows, "the fixes' own noise is part of the error")
 

@@ -43,7 +43,7 @@ def _moving(at: Attachment, config: BodyVelocityConfig) -> tuple[Array, Array, A
     current = np.append(_slow_value(at, config)[_CURRENT], 0.0)
     along = at.T_world_body.rotation().matrix().T @ (at.v_world_mps + at.dv_world_mps - current)
     Q = at.T_state_sensor.rotation().matrix()
-    return Q.T @ (along + np.cross(at.gyro_radps, at.lever_m)), along, Q
+    return Q.T @ (along + at.swing_mps()), along, Q
 
 
 def residuals(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment) -> tuple[Residual, ...]:

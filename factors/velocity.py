@@ -22,7 +22,7 @@ from graphloc.measurements import GnssVelocity
 
 def _attitude_jacobian(at: Attachment) -> Array:
     """Return the derivative (3, 6) of R Exp(theta) (omega x l) by the body tangent (theta, rho)."""
-    swing = skew(np.cross(at.gyro_radps, at.lever_m))
+    swing = skew(at.swing_mps())
     return np.hstack([-at.T_world_body.rotation().matrix() @ swing, np.zeros((3, 3))])
 
 

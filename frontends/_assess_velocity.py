@@ -8,19 +8,21 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.frames import Array
-from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane, track
+from graphloc.frames import Array, rpy_from_rotation
+from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane, track, vec
 from graphloc.frontends._assess_world import World
 from graphloc.frontends._reports import (
     BODY_AXES,
     EAST_AXES,
     NORTH_AXES,
+    MountGuess,
     OdometryReport,
     VelocityReport,
     filtered,
     through_water,
 )
 from graphloc.frontends._streams import TopicData
+from graphloc.frontends._tf import Pose
 from graphloc.frontends.decode import ODOMETRY, VECTOR
 from graphloc.series import integral, interpolated
 from graphloc.time import NS_PER_S
@@ -72,11 +74,16 @@ def _less(rms: float, noise: float) -> float:
 
 
 def velocity_report(
-    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, tf_frame: str | None, scatter_m: float = 0.0
+    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, pose: Pose | None, scatter_m: float = 0.0
 ) -> VelocityReport:
-    """Return the axes of a twist or vector: of `tf_frame`, if /tf_static has its frame; else as `axes_of`."""
+    """Return the axes of a twist or vector: of its frame, if tf has it; else as `axes_of`. Of a Doppler log also the mount.
+
+    Args:
+        stream, stamps_ns, p_m, scatter_m: as for `axes_of`. pose: T_body_sensor by tf, which connects its frame with the body.
+    """
     axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
-    if stream.part is not None and stream.part.kind == "body_velocity":
+    log = stream.part is not None and stream.part.kind == "body_velocity"
+    if log:
         axes, why = BODY_AXES, f"a Doppler log's, by its type; {why}"
     elif stream.part is not None and stream.part.told:
         axes, why = EAST_AXES, f"known by its type; {why}"
@@ -85,11 +92,33 @@ def velocity_report(
     if through_water(stream.topic):
         axes, why = BODY_AXES, f"a speed through the water; {why}"
     rows = stream.rows[sane(stream)]
-    reverse = axes == BODY_AXES and tf_frame is None and len(rows) > 0 and _astern(rows[:, -3])
-    why = f"{why}; {_REVERSED}" if reverse else why
+    reverse = axes == BODY_AXES and pose is None and len(rows) > 0 and _astern(rows[:, -3])
     return VelocityReport(
-        topic=stream.topic, msgtype=stream.msgtype, axes=axes, why=why, tf_frame=tf_frame, reverse=reverse
+        topic=stream.topic,
+        msgtype=stream.msgtype,
+        axes=axes,
+        why=f"{why}; {_REVERSED}" if reverse else why,
+        tf_frame=None if pose is None else stream.frame_id,
+        reverse=reverse,
+        mount=_mount_of_log(stream.frame_id, pose, reverse) if log else None,
     )
+
+
+def _mount_of_log(frame: str, pose: Pose | None, reverse: bool) -> MountGuess:
+    """Return the mount of a Doppler log, whose own z is down; drivers name frames of tf whose z is up.
+
+    Args:
+        frame: of its messages. pose: T_body_frame by tf. reverse: it says astern throughout.
+    """
+    if pose is None:
+        down = (180.0, 0.0, 180.0 if reverse else 0.0)
+        return MountGuess(rpy_deg=down, tf_frame=None, evidence="x ahead, y to starboard, z down")
+    p_m, R = pose
+    if R[2, 2] < 0.0:
+        return MountGuess(rpy_deg=vec(np.degrees(rpy_from_rotation(R))), tf_frame=frame, evidence="from tf")
+    rpy = vec(np.degrees(rpy_from_rotation(R @ np.diag([1.0, -1.0, -1.0]))))
+    said = f"by tf '{frame}' has z up: turned about x, as the messages have z down"
+    return MountGuess(rpy_deg=rpy, tf_frame=None, evidence=said, xyz_m=vec(p_m))
 
 
 def _astern(forward_mps: Array) -> bool:

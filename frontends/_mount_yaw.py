@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
+from graphloc.frontends._turning import Turning
 from graphloc.series import integral
 from graphloc.time import NS_PER_S
 
@@ -79,6 +80,11 @@ class Felt:
         a = accel[:, 0] + 1j * accel[:, 1]
         a = a - np.median(a.real) - 1j * np.median(a.imag)
         return cls(int(stamps_ns[0]), t, turned, integral(t, integral(t, a * np.exp(1j * turned))))
+
+    @property
+    def turning(self) -> Turning:
+        """How it turned, alone."""
+        return Turning(self.origin_ns, self.t_s, self.turned)
 
     def times_of(self, motion: MeasuredMotion) -> Array:
         """A motion's times (M,) as these are counted, s."""

@@ -31,7 +31,7 @@ from graphloc.frontends._assess import (
     without_drift,
 )
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
-from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turning_of
+from graphloc.frontends._assess_imu import felt_of, imu_report, series_of
 from graphloc.frontends._assess_receivers import apart_m, apart_warning, height_wanders_m
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_wander import wander_m
@@ -57,7 +57,7 @@ from graphloc.frontends._reports import (
 )
 from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import TopicData, read_streams
-from graphloc.frontends._tf import WORLD_NAMES, StaticTree
+from graphloc.frontends._tf import WORLD_NAMES, Pose, StaticTree
 from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, motion_time_offset
 from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
@@ -147,10 +147,13 @@ class _Contents:
         """Return the aligned streams of some message types."""
         return [stream for stream in self.aligned.values() if stream.msgtype in msgtypes]
 
+    def tf_pose(self, stream: TopicData) -> Pose | None:
+        """Return T_body_sensor of a stream where tf connects its frame with the body."""
+        return self.tree.resolve(self.tree.body(), stream.frame_id) if stream.frame_id in self.tree.frames else None
+
     def tf_frame(self, stream: TopicData) -> str | None:
         """Return the frame of a stream where tf connects it with the body."""
-        frame = stream.frame_id
-        return frame if self.tree.resolve(self.tree.body(), frame) and frame in self.tree.frames else None
+        return None if self.tf_pose(stream) is None else stream.frame_id
 
 
 class _Track(NamedTuple):
@@ -179,12 +182,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     reference = _best_track(bag, gnss)
     odometry = _odometry_reports(bag, gnss, reference)
     velocities = [
-        (
-            s,
-            _with_mount(
-                velocity_report(s, reference.stamps_ns, reference.p_m, bag.tf_frame(s), reference.scatter_m), s, bag
-            ),
-        )
+        (s, velocity_report(s, reference.stamps_ns, reference.p_m, bag.tf_pose(s), reference.scatter_m))
         for s in bag.of_type(TWIST, PLAIN_TWIST, VECTOR)
     ]
     wheels = [s for s, report in odometry if report.role == "check_speed"]
@@ -195,8 +193,9 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     courses = courses_of(reference.stamps_ns, reference.p_m, reference.scatter_m) if known else None
     imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, motions, courses, tree, body))]
     imus.sort(key=lambda i: (bool(i.missing), i.gravity == "removed", i.gyro_noise_mdps))
-    late = _late_s(bag, imus, motions)
-    compasses = _compass_reports(bag, imus, courses)
+    felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body) if imus else None
+    late = {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
+    compasses = _compass_reports(bag, imus, felt.turning if felt else None, courses)
     used = {g.topic for g in gnss} | {i.topic for i in imus} | {c.topic for c in compasses if c.usable}
     reports = [report for _, report in odometry]
     return Inspection(
@@ -324,17 +323,10 @@ def _odometry_reports(
     return found
 
 
-def _late_s(
-    bag: _Contents, imus: Sequence[ImuReport], motions: Sequence[MeasuredMotion]
-) -> dict[str, MotionOffset | None]:
-    """Return by topic what should be added to the stamps of a motion, by the best IMU."""
-    felt = felt_of(bag.aligned[imus[0].topic], imus[0], bag.tree, bag.tree.body()) if imus else None
-    return {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
-
-
-def _compass_reports(bag: _Contents, imus: Sequence[ImuReport], courses: Courses | None) -> tuple[CompassReport, ...]:
-    """Report every orientation that may be a heading; see `_without_echoes` for their order."""
-    turning = turning_of(bag.aligned[imus[0].topic], imus[0], bag.tree, bag.tree.body()) if imus else None
+def _compass_reports(
+    bag: _Contents, imus: Sequence[ImuReport], turning: Turning | None, courses: Courses | None
+) -> tuple[CompassReport, ...]:
+    """Report every orientation that may be a heading, by how the best IMU turned; see `_without_echoes` for their order."""
     candidates = bag.of_type(QUATERNION, IMU, *NUMBERS)
     found = _without_echoes([pair for s in candidates if (pair := _timed_compass(s, courses, turning))])
     best = (imus[0], bag.aligned[imus[0].topic]) if imus else None
@@ -466,24 +458,6 @@ def _beside_wheels(gnss: GnssReport, bag: _Contents, wheels: Sequence[TopicData]
 def _clearly(offset: MotionOffset | None) -> tuple[float, float] | None:
     """Return an offset that is clear, s, and its sigma."""
     return (offset.value_s, offset.sigma_s) if offset is not None and offset.clear else None
-
-
-def _with_mount(report: VelocityReport, stream: TopicData, bag: _Contents) -> VelocityReport:
-    """Return the report with the mount of a Doppler log, whose own z is down; drivers name frames of tf whose z is up."""
-    if stream.part is None or stream.part.kind != "body_velocity":
-        return report
-    pose = bag.tree.resolve(bag.tree.body(), report.tf_frame) if report.tf_frame else None
-    if pose is None:
-        down = (180.0, 0.0, 180.0 if report.reverse else 0.0)
-        return replace(
-            report, mount=MountGuess(rpy_deg=down, tf_frame=None, evidence="x ahead, y to starboard, z down")
-        )
-    if pose[1][2, 2] < 0.0:
-        rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
-        return replace(report, mount=MountGuess(rpy_deg=rpy, tf_frame=report.tf_frame, evidence="from tf"))
-    rpy = vec(np.degrees(rpy_from_rotation(pose[1] @ np.diag([1.0, -1.0, -1.0]))))
-    said = f"by tf '{report.tf_frame}' has z up: turned about x, as the messages have z down"
-    return replace(report, mount=MountGuess(rpy_deg=rpy, tf_frame=None, evidence=said, xyz_m=vec(pose[0])))
 
 
 def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic, ...]:

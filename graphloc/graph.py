@@ -78,9 +78,14 @@ class Attachment:
     constants: tuple[tuple[int, Array], ...] = ()
     T_solver: Any | None = None
 
+    def swing_mps(self) -> Array:
+        """Return the velocity (3,) of the sensor by the turning of the body, w x l, body axes, m/s."""
+        (wx, wy, wz), (x, y, z) = self.gyro_radps.tolist(), self.lever_m.tolist()
+        return np.array([wy * z - wz * y, wz * x - wx * z, wx * y - wy * x])  # `np.cross` takes ten times as long
+
     def sensor_velocity_mps(self) -> Array:
         """Return the velocity (3,) of the sensor at the measurement, world axes, m/s."""
-        swing = self.T_world_body.rotation().matrix() @ np.cross(self.gyro_radps, self.lever_m)
+        swing = self.T_world_body.rotation().matrix() @ self.swing_mps()
         return np.asarray(self.v_world_mps + self.dv_world_mps + swing)
 
 

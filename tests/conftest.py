@@ -3,6 +3,8 @@
 
 import gc
 import os
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -19,3 +21,31 @@ def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 30.2)
     monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
+
+
+@pytest.fixture(scope="session")
+def scanned_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a simulated run with scans of five LiDARs, twice a second for 16 s."""
+    return _made_once(tmp_path_factory, "scanned", {"duration_s": "16"})
+
+
+@pytest.fixture(scope="session")
+def launch_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a simulated run with scans of one LiDAR, twice a second for 18 s."""
+    return _made_once(tmp_path_factory, "launch", {"duration_s": "18", "rig": "launch"})
+
+
+def _made_once(factory: pytest.TempPathFactory, name: str, changes: dict[str, str]) -> Path:
+    """Write the bag of a run in a harbour, or take that of another worker; it is not to be changed."""
+    from graphloc.eval.simulate import find_scenario, simulate
+    from graphloc.eval.simulate.bag import write_bag
+
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / f"{name}-run"
+    if not folder.exists():
+        made = factory.mktemp(name) / "sim"
+        scenario = find_scenario("bl1-drift", {"pose_hz": "0", "lidar_hz": "2", **changes})
+        write_bag(simulate(scenario, 3), made, ros=2)
+        with suppress(OSError):  # another worker was quicker
+            made.rename(folder)
+    return folder

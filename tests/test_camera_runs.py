@@ -177,7 +177,7 @@ def test_corners_are_where_the_bag_alone_says(tmp_path: Path, detector: Detector
         with (tmp_path / f"{name}.yaml").open("w") as stream:
             yaml.dump(block, stream)
     changes = {
-        "harbour": str(tmp_path / "harbour.yaml"), "rig": str(tmp_path / "rig.yaml"), "camera_hz": "2", "lidar_hz": "0.3",
+        "harbour": str(tmp_path / "harbour.yaml"), "rig": str(tmp_path / "rig.yaml"), "camera_hz": "1.5", "lidar_hz": "0.3",
         "tide_m": "0.6", "duration_s": "12", "route_s": "12",
     }  # fmt: skip
     run = replace(simulate(find_scenario("bl1-clean", changes), 2))

@@ -59,7 +59,8 @@ def test_a_draft_from_inspect_gives_a_track(
 
     The antenna's place and the IMU's yaw (5 deg here) are in no bag: that much the track is off.
     """
-    where, _ = write_bag(simulate(replace(bl_scenario(1, "clean"), duration_s=60.0), 1), tmp_path / "bag", ros=1)
+    scenario = replace(bl_scenario(1, "clean"), duration_s=60.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
+    where, _ = write_bag(simulate(scenario, 1), tmp_path / "bag", ros=1)
     draft = tmp_path / "vessel.yaml"
     assert called(monkeypatch, "inspect", where, "--out", draft) == 0
     assert "guess" in draft.read_text()
@@ -195,7 +196,8 @@ def test_an_interrupt_while_writing_leaves_nothing_and_keeps_the_old_run(
 
 
 def test_ctrl_c_in_the_solver_ends_at_once(tmp_path: Path) -> None:
-    where, config = write_bag(simulate(bl_scenario(1, "drift"), 2), tmp_path / "bag", ros=2)
+    scenario = replace(bl_scenario(1, "drift"), imu_hz=20.0, gnss_hz=2.0, compass_hz=2.0)
+    where, config = write_bag(simulate(scenario, 2), tmp_path / "bag", ros=2)
     command = [sys.executable, "-m", "graphloc", "smooth", where, "-c", config, "-o", tmp_path / "run"]
     code = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a `nohup` runner ignores it

@@ -150,7 +150,7 @@ def test_folders_are_made_whole_or_not_at_all(
 
 def test_a_recording_tells_how_it_was_made(run: SimulatedRun, tmp_path: Path) -> None:
     chosen = find_scenario("bl1-outage", {"outage_s": "3,5", "duration_s": "8", "lidar_hz": "0", "compass_hz": "0"})
-    _, config = write_bag(simulate(chosen, 6), tmp_path / "out", ros=2)
+    _, config = write_bag(replace(simulate(chosen, 6), harbour=None), tmp_path / "out", ros=2)  # without its image
     told = json.loads((tmp_path / "out/truth.json").read_text())
     assert told["seed"] == 6
     assert TypeAdapter(Scenario).validate_python(told["scenario"]) == chosen

@@ -12,8 +12,6 @@ import pytest
 
 from graphloc import app
 from graphloc.config import AerialConfig, LidarConfig
-from graphloc.eval.simulate import find_scenario, simulate
-from graphloc.eval.simulate.bag import write_bag
 from graphloc.frames import Datum, Geodetic
 from graphloc.frontends import decode
 from graphloc.frontends._source import Bag, RawMessage, TopicSummary
@@ -53,17 +51,14 @@ def matched(run: Run) -> list[Matched]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    folder = tmp_path_factory.mktemp("live") / "sim"
-    scenario = find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "18", "lidar_hz": "2", "rig": "launch"})
-    write_bag(simulate(scenario, 3), folder, ros=2)
-    recording, vessel = app.load([folder / "run"], folder / "vessel.yaml")
+def run(launch_bag: Path) -> Run:
+    recording, vessel = app.load([launch_bag / "run"], launch_bag / "vessel.yaml")
     truth, sensor = recording.truth, vessel.sensors["aerial"]
     assert truth is not None
     assert isinstance(sensor, AerialConfig)
     cov = np.broadcast_to(np.diag([1.0, 1.0, 0.1, 1e-4, 1e-4, 1e-3]), (len(truth), 6, 6))
     sensor = sensor.model_copy(update={"submap": 3, "every_s": 1.0, "every_m": 5.0})
-    return Run(folder, sensor, replace(truth, cov=cov), app.choose_datum(recording, vessel))
+    return Run(launch_bag, sensor, replace(truth, cov=cov), app.choose_datum(recording, vessel))
 
 
 def part(track: Trajectory, first_ns: float, last_ns: float) -> Trajectory:

@@ -88,7 +88,9 @@ def test_from_a_draft_to_a_track(kind: str, heading_deg: float, tmp_path: Path) 
 
     Without a compass the heading comes from one turn of the vessel, seen by velocity and acceleration.
     """
-    scenario = Scenario(path="turn", duration_s=60.0, gnss_hz=1.0, compass_hz=0.0, pose_hz=0.0, noise="clean")
+    scenario = Scenario(
+        path="turn", duration_s=60.0, imu_hz=50.0, gnss_hz=1.0, compass_hz=0.0, pose_hz=0.0, noise="clean"
+    )
     run = simulate(scenario, 21)
     make = Messages(2)
     bag = write_bag(
@@ -104,7 +106,7 @@ def test_from_a_draft_to_a_track(kind: str, heading_deg: float, tmp_path: Path) 
     solved = app.smooth_recording(recording, config)
     ours = compare_to_truth(solved.solution.trajectory, world_of(solved, run))
     counts = solved.solution.ledger.counts()[kind]
-    thinned = sum(row.reason == THINNED for row in recording.rows)  # of an orientation at 100 Hz
+    thinned = sum(row.reason == THINNED for row in recording.rows)  # of an orientation at 50 Hz
     assert counts["used"] > 0.9 * (sum(counts.values()) - thinned)
     assert solved.solution.stats.converged
     assert ours.position_rmse_m < 0.3

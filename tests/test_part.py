@@ -18,7 +18,7 @@ from rosbags.rosbag2.storage_mcap import McapReader
 from graphloc import app
 from graphloc.cli._shared import BagOptions
 from graphloc.errors import InputError
-from graphloc.eval.simulate import Scenario, find_scenario, simulate
+from graphloc.eval.simulate import Scenario, simulate
 from graphloc.eval.simulate.bag import write_bag as write_simulated
 from graphloc.frontends._part import BagPart
 from graphloc.frontends._source import Bag, RawMessage
@@ -327,11 +327,8 @@ def test_finished_runs_have_no_parts(
         assert option[0] in capsys.readouterr().err
 
 
-def test_scans_of_a_part_are_matched_and_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "sim"
-    bag, config = write_simulated(
-        simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "14", "rig": "launch"}), 3), folder, ros=2
-    )
+def test_scans_of_a_part_are_matched_and_no_others(launch_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag, config = launch_bag / "run", launch_bag / "vessel.yaml"
     begin_ns = first_of(bag)
     options = BagOptions(bag=[bag], config=config, start=4.0, duration=8.0)
     recording, loaded, where = options.load(quiet)
@@ -346,7 +343,7 @@ def test_scans_of_a_part_are_matched_and_no_others(tmp_path: Path, monkeypatch: 
     run = app.smooth_recording(recording, loaded, scans=where)
     assert decoded[: len(inside)] == inside
     assert set(decoded) == set(inside)  # once, or twice where the first track leaves much open
-    assert len(inside) == 8
+    assert len(inside) == 16
     stamps = [m.stamp_ns for m in run.recording.measurements if m.sensor == "aerial"]
     assert len(stamps) > 5
     assert begin_ns + 3.5 * S < min(stamps) <= max(stamps) < begin_ns + 12 * S

@@ -18,8 +18,7 @@ from graphloc.cli import app as cli
 from graphloc.errors import SolveError
 from graphloc.estimate import Event
 from graphloc.eval.metrics import compare_to_truth
-from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, find_scenario, simulate
-from graphloc.eval.simulate.bag import write_bag
+from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.gather import Gathering, _live, with_busy_warning
 from graphloc.measurements import GnssPosition, ImuSample, PoseFix
 from graphloc.replay import Replayed, _timed, arrivals, replay
@@ -38,18 +37,9 @@ def whole(run: SimulatedRun) -> Replayed:
     return replay(run.recording, run.config)
 
 
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("replay") / "sim"
-    write_bag(
-        simulate(find_scenario("bl1-drift", {"pose_hz": "0", "duration_s": "16", "lidar_hz": "2"}), 3), folder, ros=2
-    )
-    return folder
-
-
-def test_messages_come_in_the_order_of_the_log(bag: Path) -> None:
+def test_messages_come_in_the_order_of_the_log(scanned_bag: Path) -> None:
     """Those of a bag by their number, whatever their stamps; and all of them, once."""
-    recording, _ = app.load([bag / "run"], bag / "vessel.yaml")
+    recording, _ = app.load([scanned_bag / "run"], scanned_bag / "vessel.yaml")
     fixes = recording.of(GnssPosition)
     late = replace(fixes[10], stamp_ns=fixes[10].stamp_ns - 3_000_000_000)  # came when it came, says another time
     changed = replace(recording, measurements=tuple(late if m is fixes[10] else m for m in recording.measurements))
@@ -100,10 +90,19 @@ def test_each_pose_is_as_it_was_known_then(run: SimulatedRun, whole: Replayed) -
     )
 
 
-def test_scans_are_matched_around_its_own_prediction(bag: Path, tmp_path: Path) -> None:
+def test_scans_are_matched_around_its_own_prediction(scanned_bag: Path, tmp_path: Path) -> None:
     """From a bag to a run folder; no match is made before there is a pose, and each turn that is refused says why."""
     done = CliRunner().invoke(
-        cli, ["replay", str(bag / "run"), "-c", str(bag / "vessel.yaml"), "-o", str(tmp_path / "out"), "--json"]
+        cli,
+        [
+            "replay",
+            str(scanned_bag / "run"),
+            "-c",
+            str(scanned_bag / "vessel.yaml"),
+            "-o",
+            str(tmp_path / "out"),
+            "--json",
+        ],
     )
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout[: done.stdout.rindex("}") + 1])

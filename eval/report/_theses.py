@@ -7,12 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from graphloc.build import mount_of
 from graphloc.eval.docking import accurate_within_m
 from graphloc.eval.ekf import named_tracks
 from graphloc.eval.formatting import number
 from graphloc.eval.html import note, table
-from graphloc.eval.metrics import NoCommonTimeError, compare_to_truth, held_out_errors
+from graphloc.eval.metrics import compare_to_truth, receiver_errors
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._published import BL_RUNS, DIGERUD_RUNS
 from graphloc.measurements import GnssPosition, PoseFix, TagSighting
@@ -71,14 +70,9 @@ def _gnss_error_m(data: ReportData, truth: Trajectory) -> list[tuple[str, float,
     """Return RMSE and largest horizontal error (m) of each receiver, at its antenna."""
     found = []
     for name in data.config.of_kind("gnss"):
-        fixes = data.recording.of(GnssPosition, name)
-        if fixes:
-            lever_m = mount_of(name, data.config.sensors[name], data.recording.mounts)[0]
-            try:
-                off = held_out_errors(truth, fixes, data.solution.datum, {name: lever_m}).horizontal_m
-            except NoCommonTimeError:
-                continue
-            found.append((name, rms(off), float(off.max())))
+        off = receiver_errors(truth, data.recording.of(GnssPosition, name), data.solution.datum, data.levers_m)
+        if off is not None:
+            found.append((name, rms(off.horizontal_m), float(off.horizontal_m.max())))
     return found
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from graphloc.chi2 import SIGMAS_95, chi2_95
 from graphloc.config import GnssConfig
 from graphloc.eval.formatting import percent
-from graphloc.eval.metrics import Table, errors, held_out_errors, squared_over_covariance
+from graphloc.eval.metrics import Table, errors, held_out_errors, receiver_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
 from graphloc.frames import Array
@@ -145,10 +145,10 @@ def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
     far, near = {}, []
     for name, sensor in data.config.of_kind("gnss").items():
         fixes = [m for m in data.recording.of(GnssPosition, name) if m.seq not in frozen]
-        if not track.covers(stamps_of(fixes)).any():
+        off = receiver_errors(track, fixes, solution.datum, data.levers_m)
+        if off is None:
             continue
-        off_m = held_out_errors(track, fixes, solution.datum, data.levers_m).horizontal_m
-        half_m = float(np.median(off_m))
+        half_m = float(np.median(off.horizontal_m))
         if half_m > max(_APART_M, _APART_SIGMAS * sensor.slow_error.horizontal_sigma_m):
             far[name] = half_m
         else:
@@ -249,7 +249,7 @@ def _errors_of_both(data: ReportData, solution: Solution, theirs: Trajectory) ->
     held = [m for m, both in zip(data.held, ours.covers(at) & theirs.covers(at), strict=True) if both]
     if not held:
         return None
-    first = held_out_errors(ours, held, data.solution.datum, data.levers_m, solution.slow)
+    first = held_out_errors(ours, held, data.solution.datum, data.levers_m).predicted(solution.slow)
     second = held_out_errors(theirs, held, data.solution.datum, data.levers_m)
     return first.horizontal_m, second.horizontal_m
 

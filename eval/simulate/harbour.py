@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from typing import Annotated, Literal
 
@@ -317,4 +318,14 @@ def load_harbour(name_or_path: str) -> Harbour:
     Raises:
         ConfigError: there is none, or it is invalid.
     """
+    return _of_package(name_or_path) if name_or_path in shipped() else _read(name_or_path)
+
+
+@cache
+def _of_package(name: str) -> Harbour:
+    """Return a shipped harbour, read once: a sweep asks for it run after run."""
+    return _read(name)
+
+
+def _read(name_or_path: str) -> Harbour:
     return _built(*load_block("harbour", name_or_path, _SHIPPED, HarbourConfig))
