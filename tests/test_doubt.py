@@ -18,7 +18,7 @@ from graphloc.measurements import Measurement, PoseFix
 from graphloc.solution import Graded
 from graphloc.solve import _solution
 from graphloc.solve._batch import BatchResult
-from graphloc.solve._doubt import doubt_of, probability_false, widening
+from graphloc.solve._doubt import ambiguity, doubt_of, probability_false, widening
 from graphloc.solve._solution import _add_doubt
 from tests.slowly import simulate_slowly
 
@@ -163,6 +163,14 @@ def test_only_what_determines_the_position_is_in_doubt() -> None:
     assert doubts(np.full(count, 0.01), far_off, np.zeros(count), np.ones(count)) is None
 
 
+def test_ambiguity_at_the_end_of_a_run_is_said() -> None:
+    over_time = np.repeat([0.0, 0.04, 0.2, 0.3], [40, 20, 30, 10])
+    (line,) = ambiguity("aerial", "position", over_time)
+    assert "probability of 20%" in line
+    assert "for 40% of the run" in line
+    assert not ambiguity("aerial", "position", np.repeat([0.04, 0.2], [91, 9]))  # it is short
+
+
 def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """All take one boat for the next, 3.4 m off, where GNSS is good to 2 m; they say themselves that half of such are false."""
     run = simulate_slowly(replace(bl_scenario(1, "clean", false_fraction=0.0), duration_s=30.0), 3, rate_hz=2.5)
@@ -197,6 +205,7 @@ def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds(mon
     assert inside[0.03] > 0.95
     assert inside[1.0] < 0.2  # independent, they confirm each other
     assert [aspect in line for aspect, line in zip(("position", "heading"), said[0.03], strict=True)] == [True, True]
+    assert all("for 100% of the run" in line for line in said[0.03])
     assert all(isinstance(line, Graded) for line in said[0.03])  # each leg of a long run has its own figure
     assert not said[1.0]
     (narrow, wide), (same, as_it_was) = covs

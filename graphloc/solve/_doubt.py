@@ -33,6 +33,7 @@ from graphloc.time import stamps_of
 
 _SLIGHT = 0.005  # a probability that widens bounds by 3 % at most
 _SAID = 0.05  # beyond this one a bound that holds for 95 % depends on what else is possible
+_LONG = 0.1  # share of a run, from which that is said
 _BEYOND = 0.05  # share of the cases that a bound leaves out
 _BOUND = -float(special.ndtri(0.5 * _BEYOND))  # sigmas
 _HALVINGS = 40
@@ -93,17 +94,24 @@ def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
         for name, doubt in found.items():
             probability = np.interp(stamps_ns, doubt.stamps_ns, doubt.probability)
             sure *= 1.0 - probability
-            if (typical := float(np.median(probability))) > _SAID:
-                said = f"{name}: what it shows of the {aspect} is ambiguous: with a probability of {typical:.0%} what is believed of it"
-                warnings.append(
-                    Graded(f"{said} is false as a whole; the bounds include that", f"{aspect} by {name}", typical)
-                )
+            warnings += ambiguity(name, aspect, probability)
         there = (slice(None), _PLANE[axes][:, None], _PLANE[axes])
         spread = max(doubt.spread for doubt in found.values())
         turn = widening(cov[there], more[:, axes, axes], off[:, axes], spread, 1.0 - sure)
         # What position and heading have in common stays: in the other case the arm between them is the same (see `widen_heading`).
         cov[there] = turn @ cov[there] @ turn.transpose(0, 2, 1)
     return warnings
+
+
+def ambiguity(sensor: str, aspect: str, probability: Array) -> list[str]:
+    """Say so where bounds depend on the probability (N,), over the states of a run, that what is believed is false."""
+    open_still = probability[probability > _SAID]
+    if (share := len(open_still) / len(probability)) < _LONG:
+        return []
+    typical = float(np.median(open_still))
+    said = f"{sensor}: what it shows of the {aspect} is ambiguous: with a probability of {typical:.0%} what is believed of it"
+    said += f" is false as a whole, for {share:.0%} of the run; the bounds include that"
+    return [Graded(said, f"{aspect} by {sensor}", typical)]
 
 
 def _models(stream: Stream) -> list[FalseModel]:
