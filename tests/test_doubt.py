@@ -171,6 +171,20 @@ def test_ambiguity_at_the_end_of_a_run_is_said() -> None:
     assert not ambiguity("aerial", "position", np.repeat([0.04, 0.2], [91, 9]))  # it is short
 
 
+def watch(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array, Array]]:
+    """Return the covariances of each solution before and after they are widened, as they come."""
+    covs, widen = list[tuple[Array, Array]](), _solution.widen_by_doubt
+
+    def watched(result: BatchResult, cov: Array) -> list[str]:
+        before = cov.copy()
+        lines = widen(result, cov)
+        covs.append((before, cov.copy()))
+        return lines
+
+    monkeypatch.setattr(_solution, "widen_by_doubt", watched)
+    return covs
+
+
 def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """All take one boat for the next, 3.4 m off, where GNSS is good to 2 m; they say themselves that half of such are false."""
     run = simulate_slowly(replace(bl_scenario(1, "clean", false_fraction=0.0), duration_s=30.0), 3, rate_hz=2.5)
@@ -185,15 +199,7 @@ def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds(mon
 
         return moved
 
-    covs, widen = list[tuple[Array, Array]](), _solution.widen_by_doubt
-
-    def watched(result: BatchResult, cov: Array) -> list[str]:
-        before = cov.copy()
-        lines = widen(result, cov)
-        covs.append((before, cov.copy()))
-        return lines
-
-    monkeypatch.setattr(_solution, "widen_by_doubt", watched)
+    covs = watch(monkeypatch)
     inside, said = {}, {}
     for news in (0.03, 1.0):
         solution = app.smooth_recording(run.recording.changed(a_berth_off(news)), run.config).solution
@@ -214,6 +220,28 @@ def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds(mon
     assert (wide - narrow)[:, 5, 5].min() > 0.0
     wide[:, :2, :2], wide[:, 5, 5] = narrow[:, :2, :2], narrow[:, 5, 5]
     np.testing.assert_array_equal(wide, narrow)  # so the arm between heading and place is what it was
+
+
+@pytest.mark.parametrize(("news", "wider"), [(0.3, (1.0, 1.3)), (0.03, (4.0, 50.0))])
+def test_what_agrees_over_a_long_way_is_not_in_doubt(
+    news: float, wider: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without GNSS, matches of which each says that it may be false: 18 lengths of correlation that the IMU ties together, or two."""
+    run = simulate_slowly(replace(bl_scenario(1, "clean", false_fraction=0.0), duration_s=30.0), 3, rate_hz=2.5)
+
+    def doubtful(m: Measurement) -> Measurement:
+        if not isinstance(m, PoseFix):
+            return m
+        return replace(
+            m, modes=tuple(replace(mode, cov=mode.cov / news, probability=0.8) for mode in m.modes), news=news
+        )
+
+    covs = watch(monkeypatch)
+    recording = run.recording.changed(doubtful)
+    alone = replace(recording, measurements=tuple(m for m in recording.measurements if m.sensor != "gnss"))
+    app.smooth_recording(alone, run.config)
+    ((narrow, wide),) = covs
+    assert wider[0] <= np.median(np.sqrt(wide[:, 0, 0] / narrow[:, 0, 0])) <= wider[1]
 
 
 def test_a_run_stands_where_its_doubt_cannot_be_reckoned(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,8 +3,8 @@
 
 A solved graph is as sure as if its choice of modes were right, and the estimate that follows it confirms it. Where errors are
 independent, neighbours show whether it is. Where those of a sensor repeat (matches that take the same moored boats for others), its
-measurements are right or wrong together, however many there are. So each is judged by the run without its sensor. If they are false,
-the vessel is where that run has it, or as far off as false ones are.
+measurements are right or wrong together, however many there are. So each is judged by the run without those whose error may be the
+same. If these are false, the vessel is where that run has it, or as far off as false ones are.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from scipy import special
 
 from graphloc import gauss, keys
-from graphloc.build import Stream, Thinned, thinned
+from graphloc.build import Decisions, Stream, Thinned, thinned
 from graphloc.chi2 import chi2_95
 from graphloc.frames import Array, wrap_angle
 from graphloc.graph import Attachment, FalseModel, Residual
 from graphloc.series import interpolated
 from graphloc.solution import Graded
 from graphloc.solve._batch import BatchResult
-from graphloc.solve._choices import Rest, without
+from graphloc.solve._choices import without
 from graphloc.solve._covariances import world_covariance
 from graphloc.solve._decide import Verdict, decisions_on, met, predicted, predicted_covariance
 from graphloc.solve._hypotheses import log_right_and_false
@@ -37,6 +37,7 @@ _LONG = 0.1  # share of a run, from which that is said
 _BEYOND = 0.05  # share of the cases that a bound leaves out
 _BOUND = -float(special.ndtri(0.5 * _BEYOND))  # sigmas
 _HALVINGS = 40
+_STRETCH = 4.0  # lengths of correlation: half of it is kept away from, and errors are 0.14 alike there
 _PLANE = np.array([0, 1, 5])  # x, y and yaw in a covariance
 _ASPECTS = {
     "position": slice(0, 2),
@@ -57,6 +58,18 @@ class Doubt(NamedTuple):
     spread: float
 
 
+class _Apart(NamedTuple):
+    """A run, each state and measurement by the rest of it, without the measurements whose error may be the same.
+
+    Attributes:
+        planes: (N, 3) x, y and yaw of its states. cov: (N, 3, 3). false: (M,) probability that each measurement is false, by aspect.
+    """
+
+    planes: Array
+    cov: Array
+    false: dict[str, Array]
+
+
 def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
     """Widen horizontal position and heading in covariances (N, 6, 6), in axes of world and in place, by what is left open.
 
@@ -64,40 +77,52 @@ def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
         Warnings.
 
     Raises:
-        SolveError: what the run knows without the sensors in doubt is not determined.
+        SolveError: what the run knows without a sensor in doubt is not determined.
     """
-    streams = [s for s in result.problem.streams if _shares_errors(s)]
-    if not streams:
+    if not any(map(_shares_errors, result.problem.streams)):
         return []
-    few = thinned(result.problem)
+    few, warnings, sure = thinned(result.problem), list[str](), None
     values = few.of(result.values)
     decided = decisions_on(few, result.verdicts, values)
-    numbers = {s.number for s in streams}
-    rest = without(few.problem, values, decided, result.prior, {key for key in decided if key[0] in numbers})
-    thin = {s.number: s for s in few.problem.streams}
-    doubts = {s.name: _doubts_of(few, thin[s.number], result, rest) for s in streams}
-    if not any(d.probability.max() > _SLIGHT for of_sensor in doubts.values() for d in of_sensor.values()):
-        return []
-    stamps_ns, known_ns = result.problem.timeline.stamps_ns, few.problem.timeline.stamps_ns
-    off = _planes(few, rest.values) - _planes(few, values)
-    off[:, 2] = wrap_angle(off[:, 2])
-    more = _plane_covariances(few, rest)
-    del rest  # and its tree, before the next one is made
-    more -= _plane_covariances(few, without(few.problem, values, decided, result.prior, set()))
-    more, off = (interpolated(stamps_ns, known_ns, of.reshape(len(of), -1)) for of in (more, off))
-    more, warnings = more.reshape(-1, 3, 3), list[str]()
-    for aspect, axes in _ASPECTS.items():
-        found = {name: of_sensor[aspect] for name, of_sensor in doubts.items() if aspect in of_sensor}
-        if not found:
+    for stream in filter(_shares_errors, few.problem.streams):
+        apart = _judged_apart(few, stream, result, values, decided)
+        doubts = _doubts_of(stream, result, apart)
+        if not any(doubt.probability.max() > _SLIGHT for doubt in doubts.values()):
             continue
-        sure = np.ones(len(cov))
-        for name, doubt in found.items():
-            probability = np.interp(stamps_ns, doubt.stamps_ns, doubt.probability)
-            sure *= 1.0 - probability
-            warnings += ambiguity(name, aspect, probability)
+        if sure is None:
+            tree = without(few.problem, values, decided, result.prior, set()).tree
+            sure = np.array([_plane_covariance(few, tree, values, k) for k in range(len(few.states))])
+        warnings += _widen(result, few, stream, apart, doubts, _planes(few, values), sure, cov)
+    return warnings
+
+
+def _widen(
+    result: BatchResult,
+    few: Thinned,
+    stream: Stream,
+    apart: _Apart,
+    doubts: dict[str, Doubt],
+    planes: Array,
+    sure: Array,
+    cov: Array,
+) -> list[str]:
+    """Widen covariances by the doubt about one sensor.
+
+    Args:
+        planes: (N, 3) of the thinned run. sure: (N, 3, 3), their covariance.
+    """
+    stamps_ns, known_ns = result.problem.timeline.stamps_ns, few.problem.timeline.stamps_ns
+    off = apart.planes - planes
+    off[:, 2] = wrap_angle(off[:, 2])
+    off = interpolated(stamps_ns, known_ns, off)
+    more = interpolated(stamps_ns, known_ns, (apart.cov - sure).reshape(-1, 9)).reshape(-1, 3, 3)
+    warnings = list[str]()
+    for aspect, doubt in doubts.items():
+        probability = np.interp(stamps_ns, doubt.stamps_ns, doubt.probability)
+        warnings += ambiguity(stream.name, aspect, probability)
+        axes = _ASPECTS[aspect]
         there = (slice(None), _PLANE[axes][:, None], _PLANE[axes])
-        spread = max(doubt.spread for doubt in found.values())
-        turn = widening(cov[there], more[:, axes, axes], off[:, axes], spread, 1.0 - sure)
+        turn = widening(cov[there], more[:, axes, axes], off[:, axes], doubt.spread, probability)
         # What position and heading have in common stays: in the other case the arm between them is the same (see `widen_heading`).
         cov[there] = turn @ cov[there] @ turn.transpose(0, 2, 1)
     return warnings
@@ -124,21 +149,50 @@ def _shares_errors(stream: Stream) -> bool:
     return stream.row.false is not None and any(model.news < 1.0 for model in _models(stream))
 
 
-def _doubts_of(few: Thinned, stream: Stream, result: BatchResult, rest: Rest) -> dict[str, Doubt]:
-    """Return the doubt about a sensor of the thinned run, which has all its measurements, in each aspect that the believed ones say."""
-    covariance = predicted_covariance(rest.tree)
-    attached, residuals = met(few.problem, stream, range(len(stream.measurements)), rest.values)
-    verdicts = [result.verdicts[stream.number, i] for i in range(len(attached))]
-    models, false = _models(stream), {aspect: np.zeros(len(attached)) for aspect in _ASPECTS}
-    for n, (at, found, model, verdict) in enumerate(zip(attached, residuals, models, verdicts, strict=True)):
-        prediction = predicted(found, at, int(stream.state[n]), covariance)
-        P = None if prediction is None else prediction.cov
-        by_plane = _by_plane(found[verdict.mode], at)
-        for aspect, axes in _ASPECTS.items():
-            false[aspect][n] = probability_false(found, P, model, verdict.mode, by_plane, axes)
+def parts_of(news: Array) -> Array:
+    """Return where each of M measurements is along the way, in stretches: errors of two that are half a stretch apart are independent."""
+    kept = (1.0 - news) / (1.0 + news)
+    way = -np.log(np.maximum(kept, np.exp(-_STRETCH)))
+    way[:1] = 0.0
+    return np.asarray(np.cumsum(way) / _STRETCH)
+
+
+def _judged_apart(
+    few: Thinned, stream: Stream, result: BatchResult, values: gtsam.Values, decided: Decisions
+) -> _Apart:
+    """Judge all that a sensor measured by the run without those of its measurements whose error may be the same.
+
+    Every third stretch of the way is judged at once, without itself and half of its neighbours: three solutions for the whole run.
+    """
+    models, states = _models(stream), range(len(few.states))
+    along = parts_of(np.array([model.news for model in models]))
+    verdicts = [result.verdicts[stream.number, i] for i in range(len(models))]
+    third_of = along.astype(int) % 3
+    third_of_state = np.interp(few.problem.timeline.stamps_ns, stamps_of(stream.measurements), along).astype(int) % 3
+    planes, cov = np.zeros((len(states), 3)), np.zeros((len(states), 3, 3))
+    false = {aspect: np.zeros(len(models)) for aspect in _ASPECTS}
+    for third in np.unique([*third_of, *third_of_state]).tolist():
+        around = np.flatnonzero((along - third + 0.5) % 3.0 < 2.0)
+        rest = without(few.problem, values, decided, result.prior, {(stream.number, i) for i in around.tolist()})
+        own = np.flatnonzero(third_of_state == third)
+        planes[own] = _planes(few, rest.values)[own]
+        cov[own] = [_plane_covariance(few, rest.tree, rest.values, k) for k in own.tolist()]
+        covariance, mine = predicted_covariance(rest.tree), np.flatnonzero(third_of == third).tolist()
+        for n, at, found in zip(mine, *met(few.problem, stream, mine, rest.values), strict=True):
+            prediction, mode = predicted(found, at, int(stream.state[n]), covariance), verdicts[n].mode
+            P, by_plane = None if prediction is None else prediction.cov, _by_plane(found[mode], at)
+            for aspect, axes in _ASPECTS.items():
+                false[aspect][n] = probability_false(found, P, models[n], mode, by_plane, axes)
+        del rest, covariance  # and the tree, before the next one is made
+    return _Apart(planes, cov, false)
+
+
+def _doubts_of(stream: Stream, result: BatchResult, apart: _Apart) -> dict[str, Doubt]:
+    """Return the doubt about a sensor in each aspect that the believed measurements say."""
+    models, verdicts = _models(stream), [result.verdicts[stream.number, i] for i in range(len(stream.measurements))]
     by_planes, stamps_ns = [_by_plane(v.residual, v.at) for v in verdicts], stamps_of(stream.measurements)
     doubts = {
-        aspect: doubt_of(stamps_ns, false[aspect], models, verdicts, [J[:, axes] for J in by_planes])
+        aspect: doubt_of(stamps_ns, apart.false[aspect], models, verdicts, [J[:, axes] for J in by_planes])
         for aspect, axes in _ASPECTS.items()
     }
     return {aspect: doubt for aspect, doubt in doubts.items() if doubt is not None}
@@ -220,13 +274,11 @@ def _planes(few: Thinned, values: gtsam.Values) -> Array:
     return np.array([[*pose.transformFrom(lever_m)[:2], pose.rotation().yaw()] for pose in poses])
 
 
-def _plane_covariances(few: Thinned, solved: Rest) -> Array:
-    """Return the covariance (N, 3, 3) of that."""
-    lever_m, found = -few.problem.t_body_imu_m, []
-    for k in map(keys.pose, range(len(few.states))):
-        R = solved.values.atPose3(k).rotation().matrix()
-        found.append(world_covariance(solved.tree.marginalCovariance(k), R, lever_m)[np.ix_(_PLANE, _PLANE)])
-    return np.array(found)
+def _plane_covariance(few: Thinned, tree: gtsam.ISAM2, values: gtsam.Values, k: int) -> Array:
+    """Return the covariance (3, 3) of that in state k."""
+    R = values.atPose3(keys.pose(k)).rotation().matrix()
+    found = world_covariance(tree.marginalCovariance(keys.pose(k)), R, -few.problem.t_body_imu_m)
+    return np.asarray(found[np.ix_(_PLANE, _PLANE)])
 
 
 def widening(cov: Array, more: Array, off: Array, spread: float, probability: Array) -> Array:
