@@ -39,10 +39,8 @@ _BOUND = -float(special.ndtri(0.5 * _BEYOND))  # sigmas
 _HALVINGS = 40
 _STRETCH = 4.0  # lengths of correlation: half of it is kept away from, and errors are 0.14 alike there
 _PLANE = np.array([0, 1, 5])  # x, y and yaw in a covariance
-_ASPECTS = {
-    "position": slice(0, 2),
-    "heading": slice(2, 3),
-}  # of these three; a row of boats moves the one and not the other
+# Which of these three; a row of boats leaves the one open and not the other.
+_ASPECTS = {"position": slice(0, 2), "heading": slice(2, 3)}
 
 
 class Doubt(NamedTuple):
@@ -92,39 +90,19 @@ def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
         if sure is None:
             tree = without(few.problem, values, decided, result.prior, set()).tree
             sure = np.array([_plane_covariance(few, tree, values, k) for k in range(len(few.states))])
-        warnings += _widen(result, few, stream, apart, doubts, _planes(few, values), sure, cov)
-    return warnings
-
-
-def _widen(
-    result: BatchResult,
-    few: Thinned,
-    stream: Stream,
-    apart: _Apart,
-    doubts: dict[str, Doubt],
-    planes: Array,
-    sure: Array,
-    cov: Array,
-) -> list[str]:
-    """Widen covariances by the doubt about one sensor.
-
-    Args:
-        planes: (N, 3) of the thinned run. sure: (N, 3, 3), their covariance.
-    """
-    stamps_ns, known_ns = result.problem.timeline.stamps_ns, few.problem.timeline.stamps_ns
-    off = apart.planes - planes
-    off[:, 2] = wrap_angle(off[:, 2])
-    off = interpolated(stamps_ns, known_ns, off)
-    more = interpolated(stamps_ns, known_ns, (apart.cov - sure).reshape(-1, 9)).reshape(-1, 3, 3)
-    warnings = list[str]()
-    for aspect, doubt in doubts.items():
-        probability = np.interp(stamps_ns, doubt.stamps_ns, doubt.probability)
-        warnings += ambiguity(stream.name, aspect, probability)
-        axes = _ASPECTS[aspect]
-        there = (slice(None), _PLANE[axes][:, None], _PLANE[axes])
-        turn = widening(cov[there], more[:, axes, axes], off[:, axes], doubt.spread, probability)
-        # What position and heading have in common stays: in the other case the arm between them is the same (see `widen_heading`).
-        cov[there] = turn @ cov[there] @ turn.transpose(0, 2, 1)
+        off = apart.planes - _planes(few, values)
+        off[:, 2] = wrap_angle(off[:, 2])
+        stamps_ns, known_ns = result.problem.timeline.stamps_ns, few.problem.timeline.stamps_ns
+        off = interpolated(stamps_ns, known_ns, off)
+        more = interpolated(stamps_ns, known_ns, (apart.cov - sure).reshape(-1, 9)).reshape(-1, 3, 3)
+        for aspect, doubt in doubts.items():
+            probability = np.interp(stamps_ns, doubt.stamps_ns, doubt.probability)
+            warnings += ambiguity(stream.name, aspect, probability)
+            axes = _ASPECTS[aspect]
+            there = (slice(None), _PLANE[axes][:, None], _PLANE[axes])
+            turn = widening(cov[there], more[:, axes, axes], off[:, axes], doubt.spread, probability)
+            # What position and heading have in common stays: in the other case the arm between them is the same (see `widen_heading`).
+            cov[there] = turn @ cov[there] @ turn.transpose(0, 2, 1)
     return warnings
 
 
