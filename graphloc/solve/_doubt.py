@@ -22,6 +22,7 @@ from graphloc.build import Decisions, Stream, Thinned, thinned
 from graphloc.chi2 import chi2_95
 from graphloc.frames import Array, wrap_angle
 from graphloc.graph import Attachment, FalseModel, Residual
+from graphloc.measurements import Measurement
 from graphloc.series import interpolated
 from graphloc.solution import Graded
 from graphloc.solve._batch import BatchResult
@@ -29,6 +30,7 @@ from graphloc.solve._choices import without
 from graphloc.solve._covariances import world_covariance
 from graphloc.solve._decide import Verdict, decisions_on, met, predicted, predicted_covariance
 from graphloc.solve._hypotheses import log_right_and_false
+from graphloc.solve._prediction import taken_of
 from graphloc.time import stamps_of
 
 _SLIGHT = 0.005  # a probability that widens bounds by 3 % at most
@@ -117,22 +119,26 @@ def ambiguity(sensor: str, aspect: str, probability: Array) -> list[str]:
     return [Graded(said, f"{aspect} by {sensor}", typical)]
 
 
-def _models(stream: Stream) -> list[FalseModel]:
-    assert stream.row.false is not None
-    return [stream.row.false(m, stream.config) for m in stream.measurements]
-
-
 def _shares_errors(stream: Stream) -> bool:
     """Whether a sensor's measurements can be false, and some are by the error of the one before them."""
-    return stream.row.false is not None and any(model.news < 1.0 for model in _models(stream))
+    return stream.row.false is not None and any(model.news < 1.0 for model in _judged(stream)[1])
+
+
+def _judged(stream: Stream) -> tuple[list[Measurement], list[FalseModel]]:
+    """Return all that a sensor measured, and the error model of each."""
+    return taken_of(stream, range(len(stream.measurements)))
 
 
 def parts_of(news: Array) -> Array:
     """Return where each of M measurements is along the way, in stretches: errors of two that are half a stretch apart are independent."""
-    kept = (1.0 - news) / (1.0 + news)
-    way = -np.log(np.maximum(kept, np.exp(-_STRETCH)))
+    way = -np.log(np.maximum(_kept(news), np.exp(-_STRETCH)))
     way[:1] = 0.0
     return np.asarray(np.cumsum(way) / _STRETCH)
+
+
+def _kept(news: Array) -> Array:
+    """Return the correlation (M,) of the error of each measurement with that of the one before."""
+    return (1.0 - news) / (1.0 + news)
 
 
 def _judged_apart(
@@ -142,7 +148,7 @@ def _judged_apart(
 
     Every third stretch of the way is judged at once, without itself and half of its neighbours: three solutions for the whole run.
     """
-    models, states = _models(stream), range(len(few.states))
+    states, (_, models) = range(len(few.states)), _judged(stream)
     along = parts_of(np.array([model.news for model in models]))
     verdicts = [result.verdicts[stream.number, i] for i in range(len(models))]
     third_of = along.astype(int) % 3
@@ -167,8 +173,9 @@ def _judged_apart(
 
 def _doubts_of(stream: Stream, result: BatchResult, apart: _Apart) -> dict[str, Doubt]:
     """Return the doubt about a sensor in each aspect that the believed measurements say."""
-    models, verdicts = _models(stream), [result.verdicts[stream.number, i] for i in range(len(stream.measurements))]
-    by_planes, stamps_ns = [_by_plane(v.residual, v.at) for v in verdicts], stamps_of(stream.measurements)
+    measured, models = _judged(stream)
+    verdicts = [result.verdicts[stream.number, i] for i in range(len(measured))]
+    by_planes, stamps_ns = [_by_plane(v.residual, v.at) for v in verdicts], stamps_of(measured)
     doubts = {
         aspect: doubt_of(stamps_ns, apart.false[aspect], models, verdicts, [J[:, axes] for J in by_planes])
         for aspect, axes in _ASPECTS.items()
@@ -222,7 +229,7 @@ def doubt_of(
     says = weight * np.array([_information(J, v.residual.cov) for J, v in zip(by_aspect, verdicts, strict=True)])
     if not says.any():
         return None
-    kept = (1.0 - news) / (1.0 + news)  # correlation with the measurement before
+    kept = _kept(news)
     # The first one is all news, and weighs most: those after it may be false with it.
     shared = 1.0 - np.minimum(news, np.append(news[1:], 1.0))
     around = np.maximum(_summed(says, kept), np.finfo(float).tiny)

@@ -65,8 +65,8 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     unsaid = [
         *_add_unmodelled(result, trajectory.cov, v_cov),
         *(guess or _add_guess(result, trajectory.cov)),
+        *_add_doubt(result, trajectory.cov),
     ]
-    unsaid += _add_doubt(result, trajectory.cov)
     limit_heading(trajectory.cov)
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = stats_of(problem, result)
