@@ -17,6 +17,7 @@ from graphloc.eval.simulate import harbour_scenarios, simulate
 from graphloc.eval.simulate.camera import Camera
 from graphloc.eval.simulate.scene import scene_of
 from graphloc.frames import Array
+from graphloc.frontends.tags._decode import read
 from graphloc.frontends.tags.camera import CameraModel
 from graphloc.frontends.tags.detect import Detector
 
@@ -124,6 +125,15 @@ def test_corners_come_in_the_order_of_the_tags_axes(roll_deg: float) -> None:
     assert (found.number, found.family, found.hamming) == (42, "36h11", 0)
     assert np.abs(found.corners_px - at).max() < 0.08
     assert np.abs(found.corners_px - by_april_tag_3(image)[42]).max() < 0.6
+
+
+def test_its_loops_are_compiled_for_one_kind_of_image() -> None:
+    """An image of a bag may not be written to: compiled for those, and once more for others, the first one took seconds longer."""
+    image, _ = draw(cells_of(42), 160, 70.0)
+    of_a_bag = image.copy()
+    of_a_bag.flags.writeable = False
+    assert [d.number for one in (image, of_a_bag) for d in Detector().detect(one)] == [42, 42]
+    assert [grey.mutable for grey, *_ in read.signatures] == [False]
 
 
 @pytest.mark.parametrize("family", ["16h5", "25h9", "36h11"])

@@ -95,7 +95,7 @@ class Detector:
         """
         if min(grey.shape, default=0) < self._min_side_px or not self._books:
             return []
-        grey = np.ascontiguousarray(grey)
+        grey = _read_only(np.ascontiguousarray(grey))
         with ThreadPoolExecutor(_THREADS) as pool:
             candidates = itertools.chain(*pool.map(lambda part: self._candidates(*part), parts_of(grey)))
             settled = pool.map(lambda candidate: self._settled(grey, lens, candidate), _distinct(candidates))
@@ -131,12 +131,20 @@ class Detector:
         return Detection(number, book.family, fitted.corners_px, fitted.cov_px2, int(off), float(margin))
 
 
+def _read_only(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a view as images of a bag are: loops are compiled for one kind of array, not once more for what may be written to."""
+    image = image.view()
+    image.flags.writeable = False
+    return image
+
+
 def parts_of(grey: NDArray[np.uint8]) -> list[tuple[NDArray[np.uint8], float, int]]:
     """Return the image at half the resolution, for tall tags, noise and blur, and strips of it, to be shared by threads.
 
     Each comes with its reduction and its first row in the image.
     """
     half = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    half = _read_only(half)
     edges = np.linspace(0, len(grey), _STRIPS + 1).astype(int).tolist()
     strips = [(max(a - _OVERLAP_PX // 2, 0), b + _OVERLAP_PX // 2) for a, b in itertools.pairwise(edges)]
     return [(half, 2.0, 0), *((grey[a:b], 1.0, a) for a, b in strips)]
