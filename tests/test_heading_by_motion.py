@@ -31,7 +31,7 @@ IMU_HZ, ACCEL_NOISE, GYRO_NOISE, FIX_M = 25.0, 0.05, 0.003, 0.3  # noise densiti
 
 
 def robot(
-    seed: int, duration_s: float, *turns_at_s: float, speed_mps: float = 1.0, spins_s: float = 0.0
+    seed: int, duration_s: float, *turns_at_s: float, speed_mps: float = 1.0, spins_s: float = 0.0, rate_hz: float = 2.5
 ) -> tuple[Recording, VesselConfig, Array, Array]:
     """Drive straight, by default at a walking pace, and turn by 90 deg within 3 s at some moments.
 
@@ -79,7 +79,7 @@ def robot(
         }),
         "gnss": GnssConfig.model_validate({"topic": "/fix", "slow_error": {"enabled": False}}),
     }  # fmt: skip
-    config = with_few_states(template.config.model_copy(update={"sensors": sensors}), 2.5)
+    config = with_few_states(template.config.model_copy(update={"sensors": sensors}), rate_hz)
     recording = replace(template.recording, imu=imu, measurements=fixes, truth=None, mounts={})
     return recording, config, t, yaw
 
@@ -128,7 +128,7 @@ def guesses() -> list[Guess]:
     """Two of them."""
     ahead_m, found = 4.0, []
     for seed in range(2):
-        recording, config, t, yaw = robot(seed, 60.0)
+        recording, config, t, yaw = robot(seed, 60.0, rate_hz=1.25)
         gnss = config.sensors["gnss"]
         mount = gnss.mount.model_copy(update={"xyz_m": (ahead_m, 0.0, 0.0)})
         solved = app.smooth_recording(
@@ -342,7 +342,7 @@ def test_an_unmeasured_heading_goes_off_by_the_gyroscope_until_the_motion_tells_
 
 def test_a_noise_that_is_configured_too_small_excludes_no_headings() -> None:
     """Found after the start, it is used from the start on: which headings the motion excludes was found with the smaller noise."""
-    recording, config, t, yaw = robot(0, 60.0)
+    recording, config, t, yaw = robot(0, 60.0, rate_hz=1.25)
     quiet = {"accel_noise_ug_per_sqrt_hz": 200.0, "gyro_noise_mdps_per_sqrt_hz": 10.0}
     imu = config.sensors["imu"].model_copy(update=quiet)
     solved = app.smooth_recording(recording, config.with_sensors({"imu": imu})).solution
@@ -353,7 +353,7 @@ def test_a_noise_that_is_configured_too_small_excludes_no_headings() -> None:
 
 def test_a_leg_takes_no_guess_as_known() -> None:
     """What the leg before could not tell is no heading to start the next one with."""
-    recording, config, _, _ = robot(0, 65.0)
+    recording, config, _, _ = robot(0, 65.0, rate_hz=1.25)
     in_legs = config.model_copy(update={"timeline": config.timeline.model_copy(update={"leg_s": 30.0})})
     solved = app.smooth_recording(recording, in_legs).solution
     assert any("solved in 3 overlapping legs" in line for line in (*solved.stats.events, *solved.stats.warnings))
