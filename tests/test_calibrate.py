@@ -132,6 +132,7 @@ def simulated() -> SimulatedRun:
             compass_hz=5.0,
         ),
         5,
+        5.0,
     )
     true = {"accel_noise_ug_per_sqrt_hz": 300.0, "gyro_noise_mdps_per_sqrt_hz": 8.0}  # the scenario's
     config = changed(run.config, "imu", **true)

@@ -23,6 +23,7 @@ from graphloc.recording import Recording
 from graphloc.replay import arrivals
 from graphloc.trajectory import Trajectory
 from tests.commands import called
+from tests.slowly import simulate_slowly
 
 S = 1_000_000_000
 BEGIN_S = 30.0
@@ -382,7 +383,7 @@ def test_a_long_recording_is_cut(recording: Recording, monkeypatch: pytest.Monke
 @pytest.fixture(scope="module")
 def drilled() -> tuple[SimulatedRun, Drilled]:
     scenario = Scenario(duration_s=27.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, noise="clean", false_fraction=0.0)
-    run = simulate(scenario, 2)
+    run = simulate_slowly(scenario, 2)
     with pytest.MonkeyPatch.context() as patch:
         for name in ("LEAD_S", "TAIL_S"):
             patch.setattr(f"graphloc.eval.drill.plan.{name}", 8.0)

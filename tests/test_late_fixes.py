@@ -45,7 +45,7 @@ def late(
         "slow_error": gnss.slow_error.model_copy(update={"enabled": slow, "horizontal_sigma_m": 0.05}),
     }
     sensors = {**run.config.sensors, "gnss": gnss.model_copy(update=settings)}
-    config = with_few_states(run.config.model_copy(update={"sensors": sensors}))
+    config = with_few_states(run.config.model_copy(update={"sensors": sensors}), 5.0)
     return replace(run, recording=recording, config=config)
 
 

@@ -29,7 +29,7 @@ from tests.slowly import simulate_slowly
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
     scenario = replace(bl_scenario(1, "drift"), duration_s=20.0, imu_hz=50.0, gnss_hz=5.0)
-    return simulate_slowly(scenario, 4)
+    return simulate_slowly(scenario, 4, 5.0)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_scans_are_matched_around_its_own_prediction(scanned_bag: Path, tmp_path
     text = (tmp_path / "out/ledger.csv").read_text()
     assert "there was no estimate to match around" in text
     assert (tmp_path / "out/report.html").stat().st_size > 10_000
-    assert (tmp_path / "out/solution.tum").read_text().count("\n") > 100
+    assert (tmp_path / "out/solution.tum").read_text().count("\n") > 25
 
 
 def test_a_run_that_never_starts_says_what_it_waited_for(run: SimulatedRun) -> None:

@@ -44,7 +44,7 @@ def read(path: Path) -> dict[str, dict[str, list[Any]]]:
 
 @pytest.fixture(scope="module")
 def run() -> app.Run:
-    return app.simulated(simulate_slowly(Scenario(duration_s=14.0, noise="jump"), 5), compare=True)
+    return app.simulated(simulate_slowly(Scenario(duration_s=14.0, noise="jump"), 5, 5.0), compare=True)
 
 
 def write(run: app.Run, path: Path, **options: Any) -> dict[str, dict[str, list[Any]]]:

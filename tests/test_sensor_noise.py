@@ -116,7 +116,7 @@ def test_few_steps_and_false_ones_alone_tell_nothing() -> None:
 
 
 def test_matches_that_state_a_third_of_their_noise_are_taken_as_they_scatter() -> None:
-    right = matched(1)
+    right = matched(1, rate_hz=2.5)
     run = stating(right, PoseFix, 1 / 3)
     solved, as_stated = (app.smooth_recording(r.recording, r.config).solution for r in (run, right))
     found, best = (compare_to_truth(s.trajectory, run.truth) for s in (solved, as_stated))

@@ -82,7 +82,7 @@ def test_online_too(monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
     for seed in range(2):
         run, recording, config = drifting(seed, 0.5)
-        found.append(squares(app.replay_recording(recording, with_few_states(config)).solution, run))
+        found.append(squares(app.replay_recording(recording, with_few_states(config, 5.0)).solution, run))
     heading, velocity = np.mean([h.mean() for h, _ in found]), np.mean([v.mean() for _, v in found])
     assert 0.3 < heading < 1.5
     assert 0.3 < velocity < 1.3
