@@ -4,6 +4,7 @@
 import gc
 import os
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -37,15 +38,19 @@ def launch_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _made_once(factory: pytest.TempPathFactory, name: str, changes: dict[str, str]) -> Path:
     """Write the bag of a run in a harbour, or take that of another worker; it is not to be changed."""
-    from graphloc.eval.simulate import find_scenario, simulate
+    from graphloc.eval.simulate import find_scenario
     from graphloc.eval.simulate.bag import write_bag
+    from tests.slowly import simulate_slowly
 
     base = factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / f"{name}-run"
     if not folder.exists():
         made = factory.mktemp(name) / "sim"
         scenario = find_scenario("bl1-drift", {"pose_hz": "0", "lidar_hz": "2", **changes})
-        write_bag(simulate(scenario, 3), made, ros=2)
+        run = simulate_slowly(scenario, 3)
+        # Layers of the map reach as far: their area, and most of the time that a matcher takes to begin, are half.
+        aerial = run.config.sensors["aerial"].model_copy(update={"reach_m": 60.0})
+        write_bag(replace(run, config=run.config.with_sensors({"aerial": aerial})), made, ros=2)
         with suppress(OSError):  # another worker was quicker
             made.rename(folder)
     return folder

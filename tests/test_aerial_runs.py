@@ -252,7 +252,7 @@ def test_lines_alone_and_bl_can_be_matched_to(bag: Path, tmp_path: Path) -> None
         ({"image": "", "vector": str(tmp_path / "quays.geojson")}, np.zeros(2)),
         ({"matcher": "bl"}, shift),
     ):
-        match, true = matched_alone(bag, **changes)
+        match, true = matched_alone(bag, reach_m=100.0, **changes)
         assert np.hypot(*(match.modes[0].pose[:2] - true - off)) < 0.25
 
 

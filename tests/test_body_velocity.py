@@ -124,9 +124,9 @@ def test_a_residual_by_hand() -> None:
 
 
 def silent(seed: int, log_hz: float) -> SimulatedRun:
-    """Half a minute of loops, then 40 s without fixes and matches. Sensors and states at low rates: a quarter of the time."""
+    """Twenty seconds of loops, then 30 s without fixes and matches. Sensors and states at low rates: a quarter of the time."""
     scenario = Scenario(
-        path="loops", noise="drift", duration_s=71.0, outage_s=(30.0, 70.0), log_hz=log_hz,
+        path="loops", noise="drift", duration_s=51.0, outage_s=(20.0, 50.0), log_hz=log_hz,
         imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0,
     )  # fmt: skip
     return simulate_slowly(scenario, seed, rate_hz=2.5)
@@ -140,7 +140,7 @@ def test_a_log_holds_the_track_while_gnss_is_silent() -> None:
         for hz, found in largest.items():
             run = silent(seed, hz)
             track = replay(run.recording, run.config).solution.trajectory
-            begin, end = (int(run.truth.stamps_ns[0]) + round(t * 1e9) for t in (30.0, 70.0))
+            begin, end = (int(run.truth.stamps_ns[0]) + round(t * 1e9) for t in (20.0, 50.0))
             inside = (track.stamps_ns > begin) & (track.stamps_ns < end)
             off = (track.p_world_m - run.truth.at(track.stamps_ns).p_world_m)[inside, :2]
             assert track.cov is not None

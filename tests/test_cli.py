@@ -19,11 +19,12 @@ from graphloc.eval import report
 from graphloc.eval.simulate import Scenario, bl_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from tests.commands import called
+from tests.slowly import simulate_slowly
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return write_bag(simulate(Scenario(duration_s=15.0), 3), tmp_path_factory.mktemp("cli") / "bag", ros=2)
+    return write_bag(simulate_slowly(Scenario(duration_s=15.0), 3), tmp_path_factory.mktemp("cli") / "bag", ros=2)
 
 
 def edited(config: Path, folder: Path, old: str, new: str) -> Path:

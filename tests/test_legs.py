@@ -23,7 +23,7 @@ from graphloc.solve._legs import overlap_ns, seams
 
 S = 10**9
 LEG_S = 45.0
-RATE_HZ = 2.5  # of states: a quarter of the time
+RATE_HZ = 1.25  # of states: an eighth of the usual ones
 LOOPS = Scenario(path="loops", duration_s=100.0, noise="drift", imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0)
 
 

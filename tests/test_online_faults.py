@@ -448,7 +448,7 @@ def test_an_estimate_that_restarts_takes_a_receiver_that_repeats_a_fix_as_it_is(
 def test_a_jump_is_found_among_many_fixes_to_a_state() -> None:
     """Those between its detection and the rebuild were off as well: all fixes of the window were held out, and it was lost."""
     run, jumped, _, _ = jumping(20.0, 0.45, 2.0, 7.0, 13.1)
-    run = slowly(run, 5.0)
+    run = slowly(run)
     fed = finish(online := smoother(run), feed(online, run, jumped))
     assert len([e for e in fed.events if "position jump" in e and "rebuilt" in e]) == 2
     assert max(fed.errors_m) < 2.0
@@ -552,7 +552,7 @@ def broken_at(
 def test_a_rebuild_loses_nothing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     """One failure of the solver in the middle: a second later the estimate is that of the run without it, to cm."""
     every, online = arrivals_of(run_of()), smoother(run_of())
-    n, base = at_s(every, 12.0), every[: at_s(every, 18.0)]
+    n, base = at_s(every, 10.0), every[: at_s(every, 13.0)]
     fed = feed(online, run_of(), base[:n])
     with monkeypatch.context() as patch:
         raised = broken_at(patch, Window, "commit", lambda k: k == 1, error)
@@ -573,7 +573,7 @@ def test_a_rebuild_loses_nothing(monkeypatch: pytest.MonkeyPatch, error: Excepti
 def test_a_solver_that_runs_away_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps from far off may lead farther, and the linear algebra does not mind: 10^20 m were once given out."""
     every, online = arrivals_of(run_of()), smoother(run_of())
-    n, base = at_s(every, 12.0), every[: at_s(every, 18.0)]
+    n, base = at_s(every, 10.0), every[: at_s(every, 13.0)]
     fed, commit, lost = feed(online, run_of(), base[:n]), Window.commit, list[Window]()
 
     def astray(window: Window) -> None:
@@ -755,7 +755,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_a_damaged_snapshot_is_reported_and_not_used(tmp_path: Path, saved: str, damage: Callable[[str], str]) -> None:
     path, base = tmp_path / "snapshot.json", arrivals_of(run_of())
     path.write_text(damage(saved), encoding="utf-8")
-    online, again = smoother(run_of(), snapshot=path), base[at_s(base, 8.5) : at_s(base, 16.5)]
+    online, again = smoother(run_of(), snapshot=path), base[at_s(base, 8.5) : at_s(base, 14.5)]
     fed = finish(online, feed(online, run_of(), again))
     assert complaints(again, fed) == []
     assert [e for e in fed.events if "the snapshot cannot be used" in e and e.endswith("starts without it")]

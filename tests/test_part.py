@@ -18,7 +18,7 @@ from rosbags.rosbag2.storage_mcap import McapReader
 from graphloc import app
 from graphloc.cli._shared import BagOptions
 from graphloc.errors import InputError
-from graphloc.eval.simulate import Scenario, simulate
+from graphloc.eval.simulate import Scenario
 from graphloc.eval.simulate.bag import write_bag as write_simulated
 from graphloc.frontends._part import BagPart
 from graphloc.frontends._source import Bag, RawMessage
@@ -28,6 +28,7 @@ from graphloc.ledger import Outcome
 from graphloc.recording import Recording, quiet
 from tests.bagfactory import START_NS, Item, Messages, S, damage_last_chunk, still_run, write_bag
 from tests.commands import called
+from tests.slowly import simulate_slowly
 from tests.tagimages import IMAGE, INFO, MIDDLE, image, info, picture, tags
 from tests.test_bag import accounted, vessel
 
@@ -282,7 +283,7 @@ def first_of(path: Path) -> int:
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return write_simulated(
-        simulate(Scenario(duration_s=20.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3),
+        simulate_slowly(Scenario(duration_s=20.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3),
         tmp_path_factory.mktemp("part") / "bag",
         ros=2,
     )
