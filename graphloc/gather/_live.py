@@ -10,15 +10,18 @@ from typing import Literal
 
 from graphloc.config import VesselConfig
 from graphloc.frontends._source import Bag
-from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn
+from graphloc.frontends.aerial.live import LiveMatcher, Matched
 from graphloc.frontends.aerial.scans import ScanFeed
+from graphloc.frontends.aerial.submap import Turn
 from graphloc.gather._gathering import Gathering
 from graphloc.gather._matches import Scans
 from graphloc.measurements import Measurement
 from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
+from graphloc.trajectory import Trajectory
 
 _BUSY = "not tried: the previous scan was still being matched"
+_MARGIN_S = 1.0  # a scan lasts, and waits for the newest pose
 
 
 class LiveMatching:
@@ -34,6 +37,7 @@ class LiveMatching:
         self._feed = ScanFeed(bag, self._sensor, config.body_frame)
         self._turns = iter(self._feed)
         self._matcher: LiveMatcher | None = None
+        self._track: Trajectory | None = None  # the window that the last scan was offered with, and the way to it
         self._gathering = gathering
         self._next: Turn | None = next(self._turns, None)
         self._offered_ns = 0  # stamp of the scan that is underway
@@ -60,6 +64,9 @@ class LiveMatching:
                 continue
             if self._matcher is None:
                 self._matcher = LiveMatcher(self._sensor, self._scans.folder, datum, self._feed.mounts)
+            if self._track is not None:
+                window = window.prolonged(self._track, self._sensor.submap_s + _MARGIN_S)
+            self._track = window
             if self._pool is not None:
                 self._underway, self._offered_ns = self._pool.submit(self._matcher.offer, turn, window), turn.stamp_ns
                 self._next = next(self._turns, None)
