@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from graphloc.chi2 import SIGMAS_95, chi2_95
 from graphloc.frames import Array, rpy_from_rotation, yaw_from_rotation
 from graphloc.series import interpolated
-from graphloc.time import NS_PER_S, seconds_since
+from graphloc.time import seconds_since
 
 _MOST_APART_S = 1.0  # poses between which the vessel is taken for known
 
@@ -122,28 +122,6 @@ class Trajectory:
         moments, index = np.unique(stamps_ns, return_inverse=True)
         there = self.at(moments)
         return there.p_world_m[index], there.R_world_body[index]
-
-    def prolonged(self, earlier: Trajectory, length_s: float) -> Trajectory:
-        """Return it with the poses of an earlier estimate in front, moved as a whole to meet its first one; they have its covariance.
-
-        Args:
-            earlier: not used where it does not cover the first pose. length_s: how much is kept before the last pose.
-        """
-        first_ns = self.stamps_ns[:1]
-        if len(earlier) < 2 or not earlier.covers(first_ns).all():
-            return self
-        there, since_ns = earlier.at(first_ns), self.stamps_ns[-1] - round(length_s * NS_PER_S)
-        before = earlier.where((earlier.stamps_ns < first_ns) & (earlier.stamps_ns >= since_ns))
-        turn, n = self.R_world_body[0] @ there.R_world_body[0].T, len(before)
-        v, earlier_v, cov = self.v_world_mps, before.v_world_mps, self.cov
-        return replace(
-            self,
-            stamps_ns=np.concatenate([before.stamps_ns, self.stamps_ns]),
-            p_world_m=np.vstack([self.p_world_m[0] + (before.p_world_m - there.p_world_m) @ turn.T, self.p_world_m]),
-            R_world_body=np.concatenate([turn @ before.R_world_body, self.R_world_body]),
-            v_world_mps=None if v is None or earlier_v is None else np.vstack([earlier_v @ turn.T, v]),
-            cov=None if cov is None else np.concatenate([np.broadcast_to(cov[0], (n, 6, 6)), cov]),
-        )
 
 
 def bounds_95(cov: Array) -> Array:

@@ -183,10 +183,9 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
     return matcher
 
 
-def live_matcher(**changes: Any) -> LiveMatcher:
+def live_matcher(before_s: float = 0.0, **changes: Any) -> LiveMatcher:
     datum = Datum(Geodetic(57.7, 14.5, 30.0))
-    config = AerialConfig(**({"submap_s": 0.0} | changes))
-    return LiveMatcher(config, Path(), datum, {"top": (np.zeros(3), np.eye(3))})
+    return LiveMatcher(AerialConfig(**changes), Path(), datum, {"top": (np.zeros(3), np.eye(3))}, before_s=before_s)
 
 
 def turn_at(t_s: float, number: int = 0, first_s: float = 0.0, last_s: float = 0.0) -> Turn:
@@ -263,14 +262,13 @@ def test_a_submap_is_no_longer_than_asked(seen: Seen) -> None:
 @pytest.mark.parametrize(
     ("config", "speed_mps", "expected"),
     [
-        ({"submap_s": 2.0}, 1.0, [[0], [0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5]]),
-        ({"submap_s": 2.0, "submap": 2}, 1.0, [[0], [0, 1], [0, 1, 2], [0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]]),
+        ({"before_s": 2.0}, 1.0, [[0], [0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5]]),
+        ({"before_s": 2.0, "submap": 4}, 1.0, [[0], [0, 1], [0, 1, 2], [0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]]),
         # What she passes slowly, or at rest, she sees the same again.
-        ({"submap_s": 30.0}, 0.2, [[0], [0, 1], [0, 2], [0, 3], [0, 3, 4], [0, 3, 5]]),
-        ({"submap_s": 30.0}, 0.0, [[0], [0, 1], [0, 2], [0, 3], [0, 4], [0, 5]]),
-        ({"submap_s": 2.0, "matcher": "bl"}, 1.0, [[0], [1], [2], [3], [4], [5]]),  # as printed
+        ({"before_s": 30.0}, 0.2, [[0], [0, 1], [0, 2], [0, 3], [0, 3, 4], [0, 3, 5]]),
+        ({"before_s": 30.0}, 0.0, [[0], [0, 1], [0, 2], [0, 3], [0, 4], [0, 5]]),
     ],
-    ids=["apart", "parts", "slow", "at rest", "bl"],
+    ids=["apart", "scans together", "slow", "at rest"],
 )
 def test_what_was_seen_before_from_elsewhere_is_matched_as_well(
     config: dict[str, Any], speed_mps: float, expected: list[list[int]], seen: Seen

@@ -19,13 +19,10 @@ from graphloc.errors import SolveError
 from graphloc.estimate import Event
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
-from graphloc.frontends.aerial.live import LiveMatcher
-from graphloc.frontends.aerial.submap import Turn
 from graphloc.gather import Gathering, _live, with_busy_warning
 from graphloc.measurements import GnssPosition, ImuSample, PoseFix
 from graphloc.replay import Replayed, _timed, arrivals, replay
 from graphloc.solution import Cause, HealthReason
-from graphloc.trajectory import Trajectory
 from tests.slowly import simulate_slowly
 
 
@@ -93,17 +90,8 @@ def test_each_pose_is_as_it_was_known_then(run: SimulatedRun, whole: Replayed) -
     )
 
 
-def test_scans_are_matched_around_its_own_prediction(
-    scanned_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scans_are_matched_around_its_own_prediction(scanned_bag: Path, tmp_path: Path) -> None:
     """From a bag to a run folder; no match is made before there is a pose, and each turn that is refused says why."""
-    offer, spans_s = LiveMatcher.offer, []
-
-    def spied(self: LiveMatcher, turn: Turn, track: Trajectory) -> Any:
-        spans_s.append((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
-        return offer(self, turn, track)
-
-    monkeypatch.setattr(LiveMatcher, "offer", spied)
     done = CliRunner().invoke(
         cli,
         [
@@ -118,8 +106,6 @@ def test_scans_are_matched_around_its_own_prediction(
     )
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout[: done.stdout.rindex("}") + 1])
-    # What was seen 15 s before has left the window of 10 s, and is matched with what is seen now.
-    assert max(spans_s) > 13.0
     assert told["Against truth"]["graphloc online"]["position_rmse_m"] < 0.8
     assert told["verdict"]["graphloc online"]["said"] in ("can be trusted", "use with care", "do not rely on it")
     aerial = told["ledger"]["aerial"]

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from graphloc.config import AerialConfig
 from graphloc.frames import Array
@@ -32,7 +31,7 @@ def ahead(length_s: int, speed_mps: float) -> Trajectory:
 def test_the_vessel_herself_does_not_trail_behind() -> None:
     """Her cabin, and a wall 20 m to port, which stays where it is while she passes."""
     cabin_m = np.array([(3.0, 1.0, 0.5), (9.0, -1.0, 0.5)])  # x of -2 and 4 in body
-    submap = Submap(AerialConfig(hull_m=HULL_M), MOUNT)
+    submap = Submap(AerialConfig(hull_m=HULL_M), MOUNT, 15.0)
     for t in range(4):
         wall_m = np.array([(5.0 + 3.0 * t, -20.0, z) for z in (0.0, 1.0, 2.0)])  # at the origin of world
         submap.take(turn_of(t, np.vstack([cabin_m, wall_m])), np.array([3.0 * t, 0.0]))
@@ -57,7 +56,7 @@ def test_dense_scans_of_before_are_thinned() -> None:
     rng = np.random.default_rng(1)
     dense_m = rng.uniform(-50.0, 50.0, (128_000, 3))
     dense_m[:, 2] = np.arange(128_000) % 64
-    submap = Submap(AerialConfig(), MOUNT)
+    submap = Submap(AerialConfig(), MOUNT, 15.0)
     for t in range(3):
         submap.take(turn_of(t, dense_m), np.array([3.0 * t, 0.0]))
     now, before = submap.clouds()
@@ -67,34 +66,3 @@ def test_dense_scans_of_before_are_thinned() -> None:
         assert len(cloud.stamps_ns) == len(cloud.points_m)
         per_beam = np.bincount(cloud.points_m[:, 2].astype(int), minlength=64)
         assert per_beam.min() > 0.8 * per_beam.max()
-
-
-def circle(first_s: float, last_s: float, turned_rad: float, moved_m: Array) -> Trajectory:
-    """Round a circle of 10 m, 0.1 rad/s, as an estimate has it that is turned about the world's origin and moved."""
-    t = np.arange(first_s, last_s + 0.05, 0.1)
-    turn, around = Rotation.from_euler("z", turned_rad), Rotation.from_euler("z", 0.1 * t[:, None])
-    return Trajectory(
-        stamps_ns=np.rint(t * S).astype(np.int64),
-        p_world_m=turn.apply(around.apply([10.0, 0.0, 0.0])) + moved_m,
-        R_world_body=(turn * around).as_matrix(),
-        v_world_mps=turn.apply(around.apply([0.0, 1.0, 0.0])),
-        cov=np.broadcast_to(np.eye(6) * (1.0 + turned_rad), (len(t), 6, 6)),
-    )
-
-
-def test_a_window_is_prolonged_by_the_way_to_it() -> None:
-    """What has left the window keeps its shape, and goes where the window is now."""
-    earlier, now = circle(0.0, 12.0, 0.0, np.array([5.0, 6.0, 0.0])), circle(8.05, 18.0, 0.2, np.array([1.0, 2.0, 0.3]))
-    found = now.prolonged(earlier, 15.0)
-    expected = circle(3.0, 8.0, 0.2, np.array([1.0, 2.0, 0.3]))
-    assert found.stamps_ns.tolist() == [*expected.stamps_ns, *now.stamps_ns]
-    before = found.where(slice(len(expected)))
-    np.testing.assert_allclose(before.p_world_m, expected.p_world_m, atol=1e-4)
-    np.testing.assert_allclose(before.R_world_body, expected.R_world_body, atol=1e-6)
-    assert before.v_world_mps is not None
-    np.testing.assert_allclose(before.v_world_mps, expected.v_world_mps, atol=1e-6)
-    assert found.cov is not None
-    np.testing.assert_array_equal(found.cov, np.broadcast_to(np.eye(6) * 1.2, (len(found), 6, 6)))
-    # Nothing is known of the way to a window that begins after the earlier one's end.
-    for late in (circle(12.05, 18.0, 0.2, np.zeros(3)), circle(20.0, 25.0, 0.2, np.zeros(3))):
-        assert late.prolonged(earlier, 15.0) is late

@@ -47,16 +47,19 @@ class LiveMatcher:
     numba's OpenMP threads do not survive that.
 
     Args:
-        folder: base of relative paths of maps. mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name.
+        folder: base of relative paths of maps. mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name. before_s: how long before
+            a turn what was seen is matched with it. Around a track that follows the matches: 0, or its bends confirm themselves.
 
     Raises:
         InputError: a map cannot be used.
     """
 
-    def __init__(self, config: AerialConfig, folder: Path, datum: Datum, mounts: Mounts) -> None:
+    def __init__(
+        self, config: AerialConfig, folder: Path, datum: Datum, mounts: Mounts, *, before_s: float = 0.0
+    ) -> None:
         self._config, self._mounts = config, mounts
         self._matcher = _matcher(config, folder, datum)
-        self._submap = Submap(config, mounts)
+        self._submap = Submap(config, mounts, before_s)
         self._last: tuple[Array, int] | None = None  # place and stamp of the last turn that was due
         self._before: tuple[Array, int] | None = None  # and of the last one that had a mode
 

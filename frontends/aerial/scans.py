@@ -66,7 +66,9 @@ def match_bag(
     """
     with Bag(bags) as bag:
         feed = ScanFeed(bag, config, body_frame)
-        matcher = LiveMatcher(config, folder, datum, feed.mounts)
+        # BL matches single scans.
+        before_s = config.submap_s if config.matcher == "posterior" else 0.0
+        matcher = LiveMatcher(config, folder, datum, feed.mounts, before_s=before_s)
         if at_ns is None:
             staying = Staying(config.hull_m or (), (t for t, _ in feed.mounts.values()))
             for answer in (matcher.offer(turn, track, growing=False) for turn in feed):

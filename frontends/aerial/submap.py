@@ -50,13 +50,11 @@ class Submap:
     """Turns that are matched together.
 
     Args:
-        mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name.
+        mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name. before_s: how long others are kept.
     """
 
-    def __init__(self, config: AerialConfig, mounts: Mounts) -> None:
-        self._mounts = mounts
-        # BL matches single scans.
-        self._past_ns = round(config.submap_s * NS_PER_S) if config.matcher != "bl" else 0
+    def __init__(self, config: AerialConfig, mounts: Mounts, before_s: float) -> None:
+        self._mounts, self._past_ns = mounts, round(before_s * NS_PER_S)
         self._hull = np.array(config.hull_m, dtype=float) if config.hull_m else None
         self._newest: deque[Turn] = deque(maxlen=config.submap)
         self._before: deque[tuple[Array, int, list[Cloud]]] = deque()  # place and stamp of the turn, and its clouds
@@ -69,7 +67,8 @@ class Submap:
         while self._before and not oldest_ns <= self._before[0][1] <= turn.stamp_ns:
             self._before.popleft()
         if self._past_ns > 0 and self._is_apart(turn.stamp_ns, place_m):
-            clouds = [self._of_others(c) for t in self._newest for c in t.clouds]
+            kept_ns = self._before[-1][1] if self._before else -1
+            clouds = [self._of_others(c) for t in self._newest if t.stamp_ns > kept_ns for c in t.clouds]
             self._before.append((place_m, turn.stamp_ns, _thinned(clouds)))
 
     @property
@@ -80,10 +79,8 @@ class Submap:
     def clouds(self) -> tuple[list[Cloud], list[Cloud]]:
         """Return the clouds of now, and those of before."""
         now = [c for turn in self._newest for c in turn.clouds]
-        before = {(c.lidar, c.stamp_ns): c for *_, clouds in self._before for c in clouds}
-        for cloud in now:
-            before.pop((cloud.lidar, cloud.stamp_ns), None)
-        return now, list(before.values())
+        held = {(c.lidar, c.stamp_ns) for c in now}
+        return now, [c for *_, clouds in self._before for c in clouds if (c.lidar, c.stamp_ns) not in held]
 
     def _is_apart(self, stamp_ns: int, place_m: Array) -> bool:
         if not self._before:

@@ -102,7 +102,7 @@ class AerialConfig(AnyPoseConfig):
     parts."""
     submap_s: NonNegative = 15.0
     """What was seen in so many seconds before, from places at least 0.5 m and 0.5 s apart, is matched with it, s; 0: nothing.
-    Not with `matcher: bl`."""
+    Not online, and not with `matcher: bl`."""
     every_s: Positive = 1.0
     """Minimum time between two matches, s."""
     every_m: NonNegative = 0.5

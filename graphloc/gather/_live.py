@@ -18,10 +18,8 @@ from graphloc.gather._matches import Scans
 from graphloc.measurements import Measurement
 from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
-from graphloc.trajectory import Trajectory
 
 _BUSY = "not tried: the previous scan was still being matched"
-_MARGIN_S = 1.0  # a scan lasts, and waits for the newest pose
 
 
 class LiveMatching:
@@ -37,7 +35,6 @@ class LiveMatching:
         self._feed = ScanFeed(bag, self._sensor, config.body_frame)
         self._turns = iter(self._feed)
         self._matcher: LiveMatcher | None = None
-        self._track: Trajectory | None = None  # the window that the last scan was offered with, and the way to it
         self._gathering = gathering
         self._next: Turn | None = next(self._turns, None)
         self._offered_ns = 0  # stamp of the scan that is underway
@@ -64,9 +61,6 @@ class LiveMatching:
                 continue
             if self._matcher is None:
                 self._matcher = LiveMatcher(self._sensor, self._scans.folder, datum, self._feed.mounts)
-            if self._track is not None:
-                window = window.prolonged(self._track, self._sensor.submap_s + _MARGIN_S)
-            self._track = window
             if self._pool is not None:
                 self._underway, self._offered_ns = self._pool.submit(self._matcher.offer, turn, window), turn.stamp_ns
                 self._next = next(self._turns, None)
