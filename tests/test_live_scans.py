@@ -17,11 +17,12 @@ from graphloc.frontends import decode
 from graphloc.frontends._source import Bag, RawMessage, TopicSummary
 from graphloc.frontends.aerial import live, match_bag, scans
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, level
-from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn
+from graphloc.frontends.aerial.live import LiveMatcher, Matched
 from graphloc.frontends.aerial.match import Mode
 from graphloc.frontends.aerial.matcher import Match, Matcher, Prior, Since
 from graphloc.frontends.aerial.scan import LevelCloud, outline
 from graphloc.frontends.aerial.scans import ScanFeed
+from graphloc.frontends.aerial.submap import Turn
 from graphloc.trajectory import Trajectory
 
 S = 10**9
@@ -57,7 +58,7 @@ def run(launch_bag: Path) -> Run:
     assert truth is not None
     assert isinstance(sensor, AerialConfig)
     cov = np.broadcast_to(np.diag([1.0, 1.0, 0.1, 1e-4, 1e-4, 1e-3]), (len(truth), 6, 6))
-    sensor = sensor.model_copy(update={"submap": 3, "every_s": 1.0, "every_m": 5.0})
+    sensor = sensor.model_copy(update={"submap": 3, "submap_s": 0.0, "every_s": 1.0, "every_m": 5.0})
     return Run(launch_bag, sensor, replace(truth, cov=cov), app.choose_datum(recording, vessel))
 
 
@@ -182,9 +183,9 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
     return matcher
 
 
-def live_matcher(**changes: Any) -> LiveMatcher:
+def live_matcher(before_s: float = 0.0, **changes: Any) -> LiveMatcher:
     datum = Datum(Geodetic(57.7, 14.5, 30.0))
-    return LiveMatcher(AerialConfig(**changes), Path(), datum, {"top": (np.zeros(3), np.eye(3))})
+    return LiveMatcher(AerialConfig(**changes), Path(), datum, {"top": (np.zeros(3), np.eye(3))}, before_s=before_s)
 
 
 def turn_at(t_s: float, number: int = 0, first_s: float = 0.0, last_s: float = 0.0) -> Turn:
@@ -256,6 +257,29 @@ def test_a_submap_is_no_longer_than_asked(seen: Seen) -> None:
     for number in range(5):
         matcher.offer(turn_at(number, number), track_of(number - 3.5, number))
     assert seen.numbers == [[0, 0], [1, 1, 2, 2], [3, 3, 4, 4]]
+
+
+@pytest.mark.parametrize(
+    ("config", "speed_mps", "expected"),
+    [
+        ({"before_s": 2.0}, 1.0, [[0], [0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5]]),
+        ({"before_s": 2.0, "submap": 4}, 1.0, [[0], [0, 1], [0, 1, 2], [0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]]),
+        # What she passes slowly, or at rest, she sees the same again.
+        ({"before_s": 30.0}, 0.2, [[0], [0, 1], [0, 2], [0, 3], [0, 3, 4], [0, 3, 5]]),
+        ({"before_s": 30.0}, 0.0, [[0], [0, 1], [0, 2], [0, 3], [0, 4], [0, 5]]),
+    ],
+    ids=["apart", "scans together", "slow", "at rest"],
+)
+def test_what_was_seen_before_from_elsewhere_is_matched_as_well(
+    config: dict[str, Any], speed_mps: float, expected: list[list[int]], seen: Seen
+) -> None:
+    matcher = live_matcher(every_s=1.0, every_m=0.0, **config)
+    for number in range(6):
+        matcher.offer(turn_at(number, number), track_of(-1.0, number, speed_mps))
+    assert [sorted(set(numbers)) for numbers in seen.numbers] == expected
+    # A clock that is set back begins anew.
+    matcher.offer(turn_at(-60.0, 9), track_of(-64.0, -59.0, speed_mps))
+    assert 0 not in seen.numbers[-1]
 
 
 @pytest.mark.parametrize("ends_s", [0.0, 0.05], ids=["after its last point", "at its begin"])

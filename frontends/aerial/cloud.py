@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -44,6 +45,10 @@ class Cloud:
     stamp_ns: int
     points_m: Array
     stamps_ns: NDArray[np.int64]
+
+    def where(self, mask: NDArray[np.bool_]) -> Cloud:
+        """Return the points of a mask (N,)."""
+        return self if mask.all() else replace(self, points_m=self.points_m[mask], stamps_ns=self.stamps_ns[mask])
 
 
 def decode_cloud(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
@@ -188,7 +193,14 @@ def _warn_once(lidar: str, text: str) -> None:
         log.warning("LiDAR %s: %s", lidar, text)
 
 
-def level(clouds: list[Cloud], mounts: Mounts, track: Trajectory, at_ns: int, waterline_m: float) -> LevelCloud:
+def level(
+    clouds: list[Cloud],
+    mounts: Mounts,
+    track: Trajectory,
+    at_ns: int,
+    waterline_m: float,
+    before: Sequence[Cloud] = (),
+) -> LevelCloud:
     """Return the points of clouds in `level` at a time, each from where the track has its LiDAR at the time of the point.
 
     Points that the track does not cover are omitted. For the others,
@@ -196,7 +208,7 @@ def level(clouds: list[Cloud], mounts: Mounts, track: Trajectory, at_ns: int, wa
     with the pose of the body at the middle of the 2 ms that contain the point.
 
     Args:
-        mounts: T_body_lidar by name. waterline_m: height of the waterline in body.
+        mounts: T_body_lidar by name. waterline_m: height of the waterline in body. before: clouds from where the vessel was before.
 
     Raises:
         InputError: the track does not cover `at_ns`, or no point of the newest clouds (stamped within 1 s of it).
@@ -205,13 +217,13 @@ def level(clouds: list[Cloud], mounts: Mounts, track: Trajectory, at_ns: int, wa
     names = ", ".join(dict.fromkeys(c.lidar for c in ([clouds[k] for k in newest] or clouds))) or "no LiDAR"
     if not track.covers(np.array([at_ns])).all():
         raise InputError(f"the track does not cover the scan of {names}: {_outside(track, at_ns)}")
-    kept = [_during(c, track) for c in clouds]
+    kept = [_during(c, track) for c in (*clouds, *before)]
     bins, rows = _shared_bins([*(c.stamps_ns // _BIN_NS for c in kept), np.array([at_ns // _BIN_NS])])
     times = np.clip(bins * _BIN_NS + _BIN_NS // 2, track.stamps_ns[0], track.stamps_ns[-1])
     covered = track.covers(times)
     covered[rows[-1]] = True
     if not covered.all():  # a gap of the track
-        kept = [_select(c, covered[r]) for c, r in zip(kept, rows[:-1], strict=True)]
+        kept = [c.where(covered[r]) for c, r in zip(kept, rows[:-1], strict=True)]
         renumbered = np.cumsum(covered) - 1
         rows = [renumbered[r[covered[r]]] for r in rows]
         times = times[covered]
@@ -234,7 +246,9 @@ def level(clouds: list[Cloud], mounts: Mounts, track: Trajectory, at_ns: int, wa
         _move(cloud.points_m, to_level @ poses.R_world_body @ R, origin, row, points[begin : begin + len(row)])
         origins.append(origin[row, :2])
         begin += len(row)
-    return LevelCloud(points, np.vstack([*origins, np.empty((0, 2))]))
+    return LevelCloud(
+        points, np.vstack([*origins, np.empty((0, 2))]), now=sum(len(c.stamps_ns) for c in kept[: len(clouds)])
+    )
 
 
 def _move(points: Array, R: Array, t: Array, row: NDArray[np.int64], out: Array) -> None:
@@ -245,12 +259,8 @@ def _move(points: Array, R: Array, t: Array, row: NDArray[np.int64], out: Array)
         out[part] += t[row[part]]
 
 
-def _select(cloud: Cloud, mask: NDArray[np.bool_]) -> Cloud:
-    return cloud if mask.all() else replace(cloud, points_m=cloud.points_m[mask], stamps_ns=cloud.stamps_ns[mask])
-
-
 def _during(cloud: Cloud, track: Trajectory) -> Cloud:
-    return _select(cloud, (cloud.stamps_ns >= track.stamps_ns[0]) & (cloud.stamps_ns <= track.stamps_ns[-1]))
+    return cloud.where((cloud.stamps_ns >= track.stamps_ns[0]) & (cloud.stamps_ns <= track.stamps_ns[-1]))
 
 
 def _shared_bins(numbers: list[NDArray[np.int64]]) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -15,36 +13,16 @@ from graphloc.config import AerialConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
 from graphloc.frontends.aerial.bl import BLMatcher
-from graphloc.frontends.aerial.cloud import Cloud, level
+from graphloc.frontends.aerial.cloud import level
 from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.aerial.matcher import Match, Matcher, Prior, Since
+from graphloc.frontends.aerial.submap import Submap, Turn
 from graphloc.recording import Mounts
 from graphloc.time import NS_PER_S, stamps_of
 from graphloc.trajectory import Trajectory
 
 _JITTER_S = 0.05  # stamps are not a clock
 _AHEAD_NS = 300_000_000  # an IMU's messages are not later than that; a stamp farther ahead is on another clock
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Turn:
-    """One scan of each LiDAR, or the reason why one of them cannot be used.
-
-    Attributes:
-        stamp_ns: of the newest scan; of a message without a stamp, its arrival.
-        arrival_ns: arrival of the message that completed the turn: its last, or the first of the next one if a LiDAR is
-            missing. Turns come in this order.
-    """
-
-    stamp_ns: int
-    arrival_ns: int
-    clouds: tuple[Cloud, ...]
-    why_not: str = ""
-
-    @property
-    def last_ns(self) -> int:
-        """Stamp of the last point, or of the newest scan if that is later: headers may hold the begin of a scan."""
-        return max([self.stamp_ns, *(int(c.stamps_ns.max()) for c in self.clouds if len(c.stamps_ns))])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,16 +47,19 @@ class LiveMatcher:
     numba's OpenMP threads do not survive that.
 
     Args:
-        folder: base of relative paths of maps. mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name.
+        folder: base of relative paths of maps. mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name. before_s: how long before
+            a turn what was seen is matched with it. Around a track that follows the matches: 0, or its bends confirm themselves.
 
     Raises:
         InputError: a map cannot be used.
     """
 
-    def __init__(self, config: AerialConfig, folder: Path, datum: Datum, mounts: Mounts) -> None:
+    def __init__(
+        self, config: AerialConfig, folder: Path, datum: Datum, mounts: Mounts, *, before_s: float = 0.0
+    ) -> None:
         self._config, self._mounts = config, mounts
         self._matcher = _matcher(config, folder, datum)
-        self._submap: deque[Turn] = deque(maxlen=config.submap)
+        self._submap = Submap(config, mounts, before_s)
         self._last: tuple[Array, int] | None = None  # place and stamp of the last turn that was due
         self._before: tuple[Array, int] | None = None  # and of the last one that had a mode
 
@@ -101,10 +82,10 @@ class LiveMatcher:
             return "wait"
         if why_not := outside(turn, track):
             return Matched(turn.stamp_ns, None, why_not)
-        self._submap.append(turn)
+        self.see(turn, track)
         if not self._due(turn.stamp_ns, track):
             return None
-        item = self.match(self._submap, track)
+        item = self.match(track)
         if item.match is not None and item.match.modes:
             here = (item.match.prior.pose[:2], item.stamp_ns)
             if self._before is not None and self._config.alike_m > 0.0:
@@ -125,13 +106,18 @@ class LiveMatcher:
         self._last = (here, stamp_ns)
         return True
 
-    def match(self, turns: Sequence[Turn], track: Trajectory) -> Matched:
-        """Match the last of some turns that a track covers, stacked with those before it, whether due or not."""
-        newest, config = turns[-1], self._config
+    def see(self, turn: Turn, track: Trajectory) -> None:
+        """Take a turn that a track covers."""
+        self._submap.take(turn, track.at(np.array([turn.stamp_ns])).p_world_m[0, :2])
+
+    def match(self, track: Trajectory) -> Matched:
+        """Match the last turn that was taken, together with what was seen before it, whether due or not."""
+        newest, config = self._submap.newest, self._config
         stamps = np.sort(np.concatenate([c.stamps_ns for c in newest.clouds] + [np.array([newest.stamp_ns])]))
         at_ns = int(stamps[len(stamps) // 2])  # not a median, which goes through floats
         try:
-            cloud = level([c for turn in turns for c in turn.clouds], self._mounts, track, at_ns, config.waterline_m)
+            now, before = self._submap.clouds()
+            cloud = level(now, self._mounts, track, at_ns, config.waterline_m, before)
             pose = track.at(np.array([at_ns]))
             sigma = np.array([1.0, 1.0, np.radians(2.0)])
             if pose.cov is not None:

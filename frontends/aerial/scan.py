@@ -30,11 +30,13 @@ class LevelCloud:
     """Points of one or more scans in `level`.
 
     Attributes:
-        points_m: (N, 3). origin_m: (N, 2) origin of the ray of each.
+        points_m: (N, 3). origin_m: (N, 2) origin of the ray of each. now: how many of them, the first ones, are of the scan itself and
+            not of those before it; None: all.
     """
 
     points_m: Array
     origin_m: Array
+    now: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +47,8 @@ class Outline:
         faces_m: (M, 2) cells of faces. line_rad: (M,) direction of the line through each. tall: (M,) 1 if higher than a boat,
             else 0. face_share: (M,) weight of each. shore_m: (K, 2) first objects behind water. to_land_rad: (K,) direction
             away from the sensor. shore_share: (K,) weight of each. water_m: (L, 2) points seen as free water.
-        columns_m: (J, 2) where anything rises out of the water. lowest_m: height over the waterline below which a twentieth of
-            the points lies; NaN of none.
+        columns_m: (J, 2) where anything rises out of the water in the scan itself. lowest_m: height over the waterline below which
+            a twentieth of its points lies; NaN of none.
     """
 
     faces_m: Array
@@ -72,6 +74,7 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
     keep = (away < reach_m) & np.isfinite(p).all(axis=1)
     if hull is not None:
         keep &= ~inside(hull, p[:, :2])
+    now = np.arange(len(p))[keep] < (len(p) if cloud.now is None else cloud.now)
     p, origin = p[keep], cloud.origin_m[keep]
     dry = p[:, 2] > _DRY_M
     cells, low, high, count = _columns(p[dry])
@@ -89,8 +92,8 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
         to_land_rad=to_land,
         shore_share=_lines(shore, 2.0 * _NEAR_M)[1],
         water_m=_free_water(shore, p[~dry]),
-        columns_m=cells,
-        lowest_m=float(np.quantile(p[:, 2], 0.05)) if len(p) else float("nan"),
+        columns_m=cells if now.all() else _columns(p[dry & now])[0],
+        lowest_m=float(np.quantile(p[now, 2], 0.05)) if now.any() else float("nan"),
     )
 
 

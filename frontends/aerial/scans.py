@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,8 +16,9 @@ from graphloc.frontends._mounts import mounts_of
 from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import CLOUDS, Cloud, decode_cloud
-from graphloc.frontends.aerial.live import LiveMatcher, Matched, Turn, outside
+from graphloc.frontends.aerial.live import LiveMatcher, Matched, outside
 from graphloc.frontends.aerial.own import Staying
+from graphloc.frontends.aerial.submap import Turn
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
 from graphloc.trajectory import Trajectory
 
@@ -66,7 +66,9 @@ def match_bag(
     """
     with Bag(bags) as bag:
         feed = ScanFeed(bag, config, body_frame)
-        matcher = LiveMatcher(config, folder, datum, feed.mounts)
+        # BL matches single scans.
+        before_s = config.submap_s if config.matcher == "posterior" else 0.0
+        matcher = LiveMatcher(config, folder, datum, feed.mounts, before_s=before_s)
         if at_ns is None:
             staying = Staying(config.hull_m or (), (t for t, _ in feed.mounts.values()))
             for answer in (matcher.offer(turn, track, growing=False) for turn in feed):
@@ -77,24 +79,23 @@ def match_bag(
                 yield answer
             for line in staying.said():
                 warn(f"aerial: {line}")
-        elif turns := _nearest(feed, config.submap, track, at_ns):
-            yield matcher.match(turns, track)
+        elif _see_until(at_ns, feed, matcher, track):
+            yield matcher.match(track)
         for line in bag.warnings:
             warn(line)
 
 
-def _nearest(feed: Iterable[Turn], submap: int, track: Trajectory, at_ns: int) -> list[Turn]:
-    """Return the usable turn nearest to a time, after those that are stacked with it."""
-    window: deque[Turn] = deque(maxlen=submap)
-    nearest: list[Turn] = []
+def _see_until(at_ns: int, feed: Iterable[Turn], matcher: LiveMatcher, track: Trajectory) -> bool:
+    """Show the usable turns to a matcher, the one nearest to a time last; return whether there is any."""
+    nearest_ns: int | None = None
     for turn in feed:
         if turn.why_not or outside(turn, track):
             continue
-        if nearest and abs(turn.stamp_ns - at_ns) > abs(nearest[-1].stamp_ns - at_ns):
+        if nearest_ns is not None and abs(turn.stamp_ns - at_ns) > abs(nearest_ns - at_ns):
             break
-        window.append(turn)
-        nearest = list(window)
-    return nearest
+        matcher.see(turn, track)
+        nearest_ns = turn.stamp_ns
+    return nearest_ns is not None
 
 
 def _mounts(bag: Bag, config: AerialConfig, body_frame: str) -> dict[str, tuple[Array, Array]]:

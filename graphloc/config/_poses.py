@@ -98,7 +98,11 @@ class AerialConfig(AnyPoseConfig):
     seed: Annotated[int, Field(ge=0)] = 0
     """Random seed of the particle swarm (`bl`)."""
     submap: Annotated[int, Field(ge=1, le=100)] = 1
-    """Number of consecutive scans combined for one match, motion-compensated."""
+    """Number of consecutive scans combined for one match, motion-compensated: where drivers publish parts of a turn, the number of
+    parts."""
+    submap_s: NonNegative = 15.0
+    """What was seen in so many seconds before, from places at least 0.5 m and 0.5 s apart, is matched with it, s; 0: nothing.
+    Not online, and not with `matcher: bl`."""
     every_s: Positive = 1.0
     """Minimum time between two matches, s."""
     every_m: NonNegative = 0.5

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scans that are matched together: the newest one, and what was seen from other places in the seconds before.
+
+One scan among moored boats shows a few of their sides, which look like those of the next berths. A longer piece of the row, with its gaps
+and the quay at its end, does not.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphloc.config import AerialConfig
+from graphloc.frames import Array
+from graphloc.frontends.aerial.cloud import Cloud
+from graphloc.frontends.aerial.scan import inside
+from graphloc.recording import Mounts
+from graphloc.time import NS_PER_S
+
+# Nearer ones show the same again; of a fast vessel no more than two a second are kept.
+_APART_M, _APART_NS = 0.5, NS_PER_S // 2
+_MOST_POINTS = 20_000  # of a turn before
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turn:
+    """One scan of each LiDAR, or the reason why one of them cannot be used.
+
+    Attributes:
+        stamp_ns: of the newest scan; of a message without a stamp, its arrival.
+        arrival_ns: arrival of the message that completed the turn: its last, or the first of the next one if a LiDAR is
+            missing. Turns come in this order.
+    """
+
+    stamp_ns: int
+    arrival_ns: int
+    clouds: tuple[Cloud, ...]
+    why_not: str = ""
+
+    @property
+    def last_ns(self) -> int:
+        """Stamp of the last point, or of the newest scan if that is later: headers may hold the begin of a scan."""
+        return max([self.stamp_ns, *(int(c.stamps_ns.max()) for c in self.clouds if len(c.stamps_ns))])
+
+
+class Submap:
+    """Turns that are matched together.
+
+    Args:
+        mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name. before_s: how long others are kept.
+    """
+
+    def __init__(self, config: AerialConfig, mounts: Mounts, before_s: float) -> None:
+        self._mounts, self._past_ns = mounts, round(before_s * NS_PER_S)
+        self._hull = np.array(config.hull_m, dtype=float) if config.hull_m else None
+        self._newest: deque[Turn] = deque(maxlen=config.submap)
+        self._before: deque[tuple[Array, int, list[Cloud]]] = deque()  # place and stamp of the turn, and its clouds
+
+    def take(self, turn: Turn, place_m: Array) -> None:
+        """Add a turn, seen from a place (2,) in world, m."""
+        self._newest.append(turn)
+        oldest_ns = turn.stamp_ns - self._past_ns
+        # A clock that was set back begins anew.
+        while self._before and not oldest_ns <= self._before[0][1] <= turn.stamp_ns:
+            self._before.popleft()
+        if self._past_ns > 0 and self._is_apart(turn.stamp_ns, place_m):
+            kept_ns = self._before[-1][1] if self._before else -1
+            clouds = [self._of_others(c) for t in self._newest if t.stamp_ns > kept_ns for c in t.clouds]
+            self._before.append((place_m, turn.stamp_ns, _thinned(clouds)))
+
+    @property
+    def newest(self) -> Turn:
+        """The last turn that was taken."""
+        return self._newest[-1]
+
+    def clouds(self) -> tuple[list[Cloud], list[Cloud]]:
+        """Return the clouds of now, and those of before."""
+        now = [c for turn in self._newest for c in turn.clouds]
+        held = {(c.lidar, c.stamp_ns) for c in now}
+        return now, [c for *_, clouds in self._before for c in clouds if (c.lidar, c.stamp_ns) not in held]
+
+    def _is_apart(self, stamp_ns: int, place_m: Array) -> bool:
+        if not self._before:
+            return True
+        there_m, then_ns, _ = self._before[-1]
+        return stamp_ns - then_ns >= _APART_NS and float(np.hypot(*(place_m - there_m))) >= _APART_M
+
+    def _of_others(self, cloud: Cloud) -> Cloud:
+        """Leave out what is the vessel herself: of a turn before, that trails behind her."""
+        if self._hull is None:
+            return cloud
+        t, R = self._mounts[cloud.lidar]
+        return cloud.where(~inside(self._hull, (cloud.points_m @ R.T + t)[:, :2]))
+
+
+def _thinned(clouds: list[Cloud]) -> list[Cloud]:
+    """Return about `_MOST_POINTS` of the points of clouds, where they are more: others show the same places."""
+    share = _MOST_POINTS / max(sum(len(c.points_m) for c in clouds), 1)
+    # An even sequence: each n-th point may be of one beam.
+    return [c.where((_GOLDEN * np.arange(len(c.points_m))) % 1.0 < share) for c in clouds]

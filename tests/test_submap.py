@@ -1,0 +1,68 @@
+"""What was seen from other places before a scan, matched together with it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphloc.config import AerialConfig
+from graphloc.frames import Array
+from graphloc.frontends.aerial.cloud import Cloud, level
+from graphloc.frontends.aerial.scan import outline
+from graphloc.frontends.aerial.submap import Submap, Turn
+from graphloc.trajectory import Trajectory
+
+S = 10**9
+AT_MOST_M = 3.0 * 1.1e-3  # at 3 m/s: poses are those of the middle of 2 ms
+HULL_M = ((6.0, 2.0), (-6.0, 2.0), (-6.0, -2.0), (6.0, -2.0))
+MOUNT = {"bow": (np.array([5.0, 0.0, 1.0]), np.diag([-1.0, -1.0, 1.0]))}  # looks astern
+
+
+def turn_of(t_s: int, points_m: Array) -> Turn:
+    stamps_ns = np.full(len(points_m), t_s * S, dtype=np.int64)
+    return Turn(t_s * S, t_s * S, (Cloud("bow", t_s * S, points_m, stamps_ns),))
+
+
+def ahead(length_s: int, speed_mps: float) -> Trajectory:
+    t = np.arange(length_s + 1)
+    place_m = np.column_stack([speed_mps * t, 0.0 * t, 0.0 * t])
+    return Trajectory(stamps_ns=t * S, p_world_m=place_m, R_world_body=np.broadcast_to(np.eye(3), (len(t), 3, 3)))
+
+
+def test_the_vessel_herself_does_not_trail_behind() -> None:
+    """Her cabin, and a wall 20 m to port, which stays where it is while she passes."""
+    cabin_m = np.array([(3.0, 1.0, 0.5), (9.0, -1.0, 0.5)])  # x of -2 and 4 in body
+    submap = Submap(AerialConfig(hull_m=HULL_M), MOUNT, 15.0)
+    for t in range(4):
+        wall_m = np.array([(5.0 + 3.0 * t, -20.0, z) for z in (0.0, 1.0, 2.0)])  # at the origin of world
+        submap.take(turn_of(t, np.vstack([cabin_m, wall_m])), np.array([3.0 * t, 0.0]))
+    now, before = submap.clouds()
+    seen = level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0, before)
+    assert [len(c.points_m) for c in now] == [5]
+    assert seen.now == 5
+    np.testing.assert_allclose(seen.points_m[:2], [(2.0, -1.0, 1.5), (-4.0, 1.0, 1.5)], atol=1e-9)
+    np.testing.assert_allclose(seen.points_m[2:, :2], np.broadcast_to([-9.0, 20.0], (12, 2)), atol=AT_MOST_M)
+    np.testing.assert_allclose(
+        np.unique(seen.origin_m, axis=0), [(x, 0.0) for x in (-4.0, -1.0, 2.0, 5.0)], atol=AT_MOST_M
+    )
+    # What stays with the vessel is looked for in the scan itself, not in what another one showed.
+    more_m = np.vstack([seen.points_m, (-9.0, 22.0, 1.0)])
+    found = outline(replace(seen, points_m=more_m, origin_m=np.vstack([seen.origin_m, (0.0, 0.0)])), np.array(HULL_M))
+    assert len(found.columns_m) == 1
+    assert len(found.shore_m) == 2
+
+
+def test_dense_scans_of_before_are_thinned() -> None:
+    """To a constant number, and not to some of the beams, which take turns in a cloud."""
+    rng = np.random.default_rng(1)
+    dense_m = rng.uniform(-50.0, 50.0, (128_000, 3))
+    dense_m[:, 2] = np.arange(128_000) % 64
+    submap = Submap(AerialConfig(), MOUNT, 15.0)
+    for t in range(3):
+        submap.take(turn_of(t, dense_m), np.array([3.0 * t, 0.0]))
+    now, before = submap.clouds()
+    assert [len(c.points_m) for c in now] == [128_000]
+    for cloud in before:
+        assert abs(len(cloud.points_m) - 20_000) < 100
+        assert len(cloud.stamps_ns) == len(cloud.points_m)
+        per_beam = np.bincount(cloud.points_m[:, 2].astype(int), minlength=64)
+        assert per_beam.min() > 0.8 * per_beam.max()
