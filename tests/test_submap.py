@@ -66,3 +66,20 @@ def test_dense_scans_of_before_are_thinned() -> None:
         assert len(cloud.stamps_ns) == len(cloud.points_m)
         per_beam = np.bincount(cloud.points_m[:, 2].astype(int), minlength=64)
         assert per_beam.min() > 0.8 * per_beam.max()
+
+
+def stamps_s(submap: Submap) -> list[float]:
+    return [c.stamp_ns / S for c in submap.clouds()[1]]
+
+
+def test_a_clock_that_is_set_back_begins_anew() -> None:
+    """By less than what is kept, too; not by a scan that arrives late."""
+    submap = Submap(AerialConfig(), MOUNT, 15.0)
+    for t in range(20, 31):
+        submap.take(turn_of(t, np.ones((1, 3))), np.array([3.0 * t, 0.0]))
+    assert stamps_s(submap) == list(range(20, 30))
+    submap.take(turn_of(29, np.ones((1, 3))), np.array([87.0, 0.0]))
+    assert stamps_s(submap) == [*range(20, 29), 30]
+    for t in (24, 25):
+        submap.take(turn_of(t, np.ones((1, 3))), np.array([3.0 * t, 0.0]))
+    assert stamps_s(submap) == [24]

@@ -21,6 +21,7 @@ from graphloc.time import NS_PER_S
 
 # Nearer ones show the same again; of a fast vessel no more than two a second are kept.
 _APART_M, _APART_NS = 0.5, NS_PER_S // 2
+_LATE_NS = NS_PER_S  # scans that arrive in another order are not later
 _MOST_POINTS = 20_000  # of a turn before
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
@@ -62,9 +63,10 @@ class Submap:
     def take(self, turn: Turn, place_m: Array) -> None:
         """Add a turn, seen from a place (2,) in world, m."""
         self._newest.append(turn)
-        oldest_ns = turn.stamp_ns - self._past_ns
-        # A clock that was set back begins anew.
-        while self._before and not oldest_ns <= self._before[0][1] <= turn.stamp_ns:
+        # A clock that was set back begins anew: what is kept is of places elsewhere on the track. A scan may be a little late.
+        if self._before and turn.stamp_ns < self._before[-1][1] - _LATE_NS:
+            self._before.clear()
+        while self._before and self._before[0][1] < turn.stamp_ns - self._past_ns:
             self._before.popleft()
         if self._past_ns > 0 and self._is_apart(turn.stamp_ns, place_m):
             kept_ns = self._before[-1][1] if self._before else -1
