@@ -70,8 +70,8 @@ class Submap:
             self._before.popleft()
         if self._past_ns > 0 and self._is_apart(turn.stamp_ns, place_m):
             kept_ns = self._before[-1][1] if self._before else -1
-            clouds = [self._of_others(c) for t in self._newest if t.stamp_ns > kept_ns for c in t.clouds]
-            self._before.append((place_m, turn.stamp_ns, _thinned(clouds)))
+            clouds = _thinned([c for t in self._newest if t.stamp_ns > kept_ns for c in t.clouds])
+            self._before.append((place_m, turn.stamp_ns, [self._of_others(c) for c in clouds]))
 
     @property
     def newest(self) -> Turn:
