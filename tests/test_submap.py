@@ -17,9 +17,10 @@ HULL_M = ((6.0, 2.0), (-6.0, 2.0), (-6.0, -2.0), (6.0, -2.0))
 MOUNT = {"bow": (np.array([5.0, 0.0, 1.0]), np.diag([-1.0, -1.0, 1.0]))}  # looks astern
 
 
-def turn_of(t_s: int, points_m: Array) -> Turn:
-    stamps_ns = np.full(len(points_m), t_s * S, dtype=np.int64)
-    return Turn(t_s * S, t_s * S, (Cloud("bow", t_s * S, points_m, stamps_ns),))
+def turn_of(t_s: float, points_m: Array) -> Turn:
+    stamp_ns = round(t_s * S)
+    stamps_ns = np.full(len(points_m), stamp_ns, dtype=np.int64)
+    return Turn(stamp_ns, stamp_ns, (Cloud("bow", stamp_ns, points_m, stamps_ns),))
 
 
 def ahead(length_s: int, speed_mps: float) -> Trajectory:
@@ -44,11 +45,20 @@ def test_the_vessel_herself_does_not_trail_behind() -> None:
     np.testing.assert_allclose(
         np.unique(seen.origin_m, axis=0), [(x, 0.0) for x in (-4.0, -1.0, 2.0, 5.0)], atol=AT_MOST_M
     )
+    # A scan of the vessel alone is not matched by what was seen before.
+    blind = outline(
+        replace(seen, points_m=np.delete(seen.points_m, (2, 3, 4), 0), origin_m=seen.origin_m[3:], now=2),
+        np.array(HULL_M),
+    )
+    assert not len(blind.faces_m) + len(blind.shore_m) + len(blind.water_m)
     # What stays with the vessel is looked for in the scan itself, not in what another one showed.
     more_m = np.vstack([seen.points_m, (-9.0, 22.0, 1.0)])
     found = outline(replace(seen, points_m=more_m, origin_m=np.vstack([seen.origin_m, (0.0, 0.0)])), np.array(HULL_M))
     assert len(found.columns_m) == 1
     assert len(found.shore_m) == 2
+    deep_m = more_m.copy()
+    deep_m[5:, 2] = -9.0
+    assert outline(replace(seen, points_m=deep_m, origin_m=np.zeros((15, 2))), None).lowest_m > 0.0
 
 
 def test_dense_scans_of_before_are_thinned() -> None:
@@ -83,3 +93,10 @@ def test_a_clock_that_is_set_back_begins_anew() -> None:
     for t in (24, 25):
         submap.take(turn_of(t, np.ones((1, 3))), np.array([3.0 * t, 0.0]))
     assert stamps_s(submap) == [24]
+
+
+def test_of_a_fast_vessel_two_scans_a_second_are_kept() -> None:
+    submap = Submap(AerialConfig(), MOUNT, 15.0)
+    for t in np.arange(0.0, 17.1, 0.1):
+        submap.take(turn_of(t, np.ones((1, 3))), np.array([10.0 * t, 0.0]))
+    assert stamps_s(submap) == list(np.arange(2.0, 17.0, 0.5))

@@ -74,8 +74,9 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
     keep = (away < reach_m) & np.isfinite(p).all(axis=1)
     if hull is not None:
         keep &= ~inside(hull, p[:, :2])
-    now = np.arange(len(p))[keep] < (len(p) if cloud.now is None else cloud.now)
-    p, origin = p[keep], cloud.origin_m[keep]
+    now = np.arange(len(p)) < (len(p) if cloud.now is None else cloud.now)
+    keep &= (keep & now).any()  # without a point of its own a scan tells nothing new
+    now, p, origin = now[keep], p[keep], cloud.origin_m[keep]
     dry = p[:, 2] > _DRY_M
     cells, low, high, count = _columns(p[dry])
     # A face is hit at several heights; a roof or a quay's deck, seen at a grazing angle, is not.
