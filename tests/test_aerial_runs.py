@@ -237,6 +237,18 @@ def test_scans_are_laid_together(bag: Path) -> None:
         assert np.degrees(abs(off[2])) < 0.5
 
 
+@pytest.mark.usefixtures("unseen")
+def test_bl_gets_single_scans(bag: Path) -> None:
+    bl, one, more = (
+        matched(bag, track, sensor, at_ns=int(track.stamps_ns[0]) + 3 * S)[0].match
+        for sensor, track in (aerial(bag, **c) for c in ({"matcher": "bl"}, {"submap_s": 0.0}, {}))
+    )
+    assert bl is not None
+    assert one is not None
+    assert more is not None
+    assert len(bl.found.faces_m) == len(one.found.faces_m) < len(more.found.faces_m)
+
+
 def test_lines_alone_and_bl_can_be_matched_to(bag: Path, tmp_path: Path) -> None:
     """What stands still in the harbour, drawn as GeoJSON, without an image; and BL's matcher on the image."""
     harbour = load_harbour("marina")
