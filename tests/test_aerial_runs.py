@@ -243,7 +243,7 @@ def test_scans_are_laid_together(bag: Path) -> None:
 def test_bl_gets_single_scans(bag: Path) -> None:
     bl, one, more = (
         matched(bag, track, sensor, at_ns=int(track.stamps_ns[0]) + 3 * S)[0].match
-        for sensor, track in (aerial(bag, **c) for c in ({"matcher": "bl"}, {"submap_s": 0.0}, {}))
+        for sensor, track in (aerial(bag, **c) for c in ({"matcher": "bl", "submap_s": 15.0}, {}, {"submap_s": 15.0}))
     )
     assert bl is not None
     assert one is not None

@@ -58,7 +58,7 @@ def run(launch_bag: Path) -> Run:
     assert truth is not None
     assert isinstance(sensor, AerialConfig)
     cov = np.broadcast_to(np.diag([1.0, 1.0, 0.1, 1e-4, 1e-4, 1e-3]), (len(truth), 6, 6))
-    sensor = sensor.model_copy(update={"submap": 3, "submap_s": 0.0, "every_s": 1.0, "every_m": 5.0})
+    sensor = sensor.model_copy(update={"submap": 3, "every_s": 1.0, "every_m": 5.0})
     return Run(launch_bag, sensor, replace(truth, cov=cov), app.choose_datum(recording, vessel))
 
 

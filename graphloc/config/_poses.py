@@ -100,9 +100,9 @@ class AerialConfig(AnyPoseConfig):
     submap: Annotated[int, Field(ge=1, le=100)] = 1
     """Number of consecutive scans combined for one match, motion-compensated: where drivers publish parts of a turn, the number of
     parts."""
-    submap_s: NonNegative = 15.0
-    """What was seen in so many seconds before, from places at least 0.5 m and 0.5 s apart, is matched with it, s; 0: nothing.
-    Not online, and not with `matcher: bl`."""
+    submap_s: Annotated[NonNegative, Field(le=60.0)] = 0.0
+    """What was seen in so many seconds before, at most 60, from places at least 0.5 m and 0.5 s apart, is matched with it, s. 15 helps
+    where boats look alike, and costs decimetres where a single scan tells the place. Not online, and not with `matcher: bl`."""
     every_s: Positive = 1.0
     """Minimum time between two matches, s."""
     every_m: NonNegative = 0.5
