@@ -1,10 +1,12 @@
 """Turns of scans from a bag, and their matches one at a time around a track that still grows."""
 
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -23,6 +25,7 @@ from graphloc.frontends.aerial.matcher import Match, Matcher, Prior, Since
 from graphloc.frontends.aerial.scan import LevelCloud, outline
 from graphloc.frontends.aerial.scans import ScanFeed
 from graphloc.frontends.aerial.submap import Turn
+from graphloc.recording import Mounts
 from graphloc.trajectory import Trajectory
 
 S = 10**9
@@ -183,9 +186,20 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
     return matcher
 
 
-def live_matcher(before_s: float = 0.0, **changes: Any) -> LiveMatcher:
+@dataclass(frozen=True)
+class Feed:
+    """Turns of a bag, with the mounts of its LiDARs."""
+
+    mounts: Mounts
+    turns: Sequence[Turn]
+
+    def __iter__(self) -> Iterator[Turn]:
+        return iter(self.turns)
+
+
+def live_matcher(**changes: Any) -> LiveMatcher:
     datum = Datum(Geodetic(57.7, 14.5, 30.0))
-    return LiveMatcher(AerialConfig(**changes), Path(), datum, {"top": (np.zeros(3), np.eye(3))}, before_s=before_s)
+    return LiveMatcher(AerialConfig(**changes), Path(), datum, {"top": (np.zeros(3), np.eye(3))})
 
 
 def turn_at(t_s: float, number: int = 0, first_s: float = 0.0, last_s: float = 0.0) -> Turn:
@@ -259,27 +273,51 @@ def test_a_submap_is_no_longer_than_asked(seen: Seen) -> None:
     assert seen.numbers == [[0, 0], [1, 1, 2, 2], [3, 3, 4, 4]]
 
 
+def matched_turns(
+    monkeypatch: pytest.MonkeyPatch, turns: Sequence[Turn], speed_mps: float, at_ns: int | None = None, **config: Any
+) -> None:
+    """Match turns made by hand as those of a bag are, every second."""
+    feed = Feed({"top": (np.zeros(3), np.eye(3))}, turns)
+    monkeypatch.setattr(scans, "Bag", lambda *_: nullcontext(SimpleNamespace(warnings=[])))
+    monkeypatch.setattr(scans, "ScanFeed", lambda *_: feed)
+    sensor = AerialConfig(every_s=1.0, every_m=0.0, **config)
+    track, datum = track_of(-64.0, 6.0, speed_mps), Datum(Geodetic(57.7, 14.5, 30.0))
+    assert list(match_bag([Path()], sensor, Path(), "base_link", track, datum, at_ns=at_ns))
+
+
 @pytest.mark.parametrize(
     ("config", "speed_mps", "expected"),
     [
-        ({"before_s": 2.0}, 1.0, [[0], [0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5]]),
-        ({"before_s": 2.0, "submap": 4}, 1.0, [[0], [0, 1], [0, 1, 2], [0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]]),
+        ({"submap_s": 4.0}, 1.0, ["012", "0123", "01234", "12345", "2345", "345"]),
+        ({"submap_s": 4.0, "submap": 4}, 1.0, ["012", "0123", "01234", "012345", "12345", "2345"]),
         # What she passes slowly, or at rest, she sees the same again.
-        ({"before_s": 30.0}, 0.2, [[0], [0, 1], [0, 2], [0, 3], [0, 3, 4], [0, 3, 5]]),
-        ({"before_s": 30.0}, 0.0, [[0], [0, 1], [0, 2], [0, 3], [0, 4], [0, 5]]),
+        ({"submap_s": 60.0}, 0.2, ["03", "013", "023", "03", "034", "035"]),
+        ({"submap_s": 60.0}, 0.0, ["0", "01", "02", "03", "04", "05"]),
+        ({"submap_s": 4.0, "matcher": "bl"}, 1.0, ["0", "1", "2", "3", "4", "5"]),  # as printed
+        ({}, 1.0, ["0", "1", "2", "3", "4", "5"]),
     ],
-    ids=["apart", "scans together", "slow", "at rest"],
+    ids=["apart", "scans together", "slow", "at rest", "bl", "alone"],
 )
-def test_what_was_seen_before_from_elsewhere_is_matched_as_well(
-    config: dict[str, Any], speed_mps: float, expected: list[list[int]], seen: Seen
+def test_what_is_seen_from_elsewhere_before_and_after_is_matched_as_well(
+    config: dict[str, Any], speed_mps: float, expected: list[str], seen: Seen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    matcher = live_matcher(every_s=1.0, every_m=0.0, **config)
-    for number in range(6):
-        matcher.offer(turn_at(number, number), track_of(-1.0, number, speed_mps))
-    assert [sorted(set(numbers)) for numbers in seen.numbers] == expected
-    # A clock that is set back begins anew.
-    matcher.offer(turn_at(-60.0, 9), track_of(-64.0, -59.0, speed_mps))
-    assert 0 not in seen.numbers[-1]
+    turns = [turn_at(number, number) for number in range(6)]
+    matched_turns(monkeypatch, turns, speed_mps, **config)
+    assert ["".join(map(str, sorted(set(numbers)))) for numbers in seen.numbers] == expected
+    seen.numbers.clear()
+    matched_turns(monkeypatch, turns, speed_mps, BEGIN + 22 * S // 10, **config)
+    assert ["".join(map(str, sorted(set(numbers)))) for numbers in seen.numbers] == expected[2:3]
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_scans_of_two_clocks_are_not_matched_together(
+    damaged: bool, seen: Seen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A damaged scan between them, whose time is that of its arrival, is no turn of theirs."""
+    between = [Turn(BEGIN + 900 * S, BEGIN + 900 * S, (), "damaged")] if damaged else []
+    turns = [*(turn_at(t, t) for t in (0, 1, 2)), *between, *(turn_at(t, 60 + t) for t in (-60, -59))]
+    matched_turns(monkeypatch, turns, 1.0, submap_s=4.0)
+    assert [sorted(set(numbers)) for numbers in seen.numbers] == [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1], [0, 1]]
 
 
 @pytest.mark.parametrize("ends_s", [0.0, 0.05], ids=["after its last point", "at its begin"])

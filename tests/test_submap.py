@@ -12,6 +12,7 @@ from graphloc.frontends.aerial.submap import Submap, Turn
 from graphloc.trajectory import Trajectory
 
 S = 10**9
+AROUND_S = 15.0
 AT_MOST_M = 3.0 * 1.1e-3  # at 3 m/s: poses are those of the middle of 2 ms
 HULL_M = ((6.0, 2.0), (-6.0, 2.0), (-6.0, -2.0), (6.0, -2.0))
 MOUNT = {"bow": (np.array([5.0, 0.0, 1.0]), np.diag([-1.0, -1.0, 1.0]))}  # looks astern
@@ -23,6 +24,11 @@ def turn_of(t_s: float, points_m: Array) -> Turn:
     return Turn(stamp_ns, stamp_ns, (Cloud("bow", stamp_ns, points_m, stamps_ns),))
 
 
+def give(submap: Submap, turn: Turn, place_m: Array) -> None:
+    submap.show(turn, place_m)
+    submap.take(turn)
+
+
 def ahead(length_s: int, speed_mps: float) -> Trajectory:
     t = np.arange(length_s + 1)
     place_m = np.column_stack([speed_mps * t, 0.0 * t, 0.0 * t])
@@ -32,12 +38,12 @@ def ahead(length_s: int, speed_mps: float) -> Trajectory:
 def test_the_vessel_herself_does_not_trail_behind() -> None:
     """Her cabin, and a wall 20 m to port, which stays where it is while she passes."""
     cabin_m = np.array([(3.0, 1.0, 0.5), (9.0, -1.0, 0.5)])  # x of -2 and 4 in body
-    submap = Submap(AerialConfig(hull_m=HULL_M), MOUNT, 15.0)
+    submap = Submap(AerialConfig(hull_m=HULL_M), MOUNT, AROUND_S)
     for t in range(4):
         wall_m = np.array([(5.0 + 3.0 * t, -20.0, z) for z in (0.0, 1.0, 2.0)])  # at the origin of world
-        submap.take(turn_of(t, np.vstack([cabin_m, wall_m])), np.array([3.0 * t, 0.0]))
-    now, before = submap.clouds()
-    seen = level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0, before)
+        give(submap, turn_of(t, np.vstack([cabin_m, wall_m])), np.array([3.0 * t, 0.0]))
+    now, others = submap.clouds()
+    seen = level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0, others)
     assert [len(c.points_m) for c in now] == [5]
     assert seen.now == 5
     np.testing.assert_allclose(seen.points_m[:2], [(2.0, -1.0, 1.5), (-4.0, 1.0, 1.5)], atol=1e-9)
@@ -66,12 +72,12 @@ def test_dense_scans_of_before_are_thinned() -> None:
     rng = np.random.default_rng(1)
     dense_m = rng.uniform(-50.0, 50.0, (128_000, 3))
     dense_m[:, 2] = np.arange(128_000) % 64
-    submap = Submap(AerialConfig(), MOUNT, 15.0)
+    submap = Submap(AerialConfig(), MOUNT, AROUND_S)
     for t in range(3):
-        submap.take(turn_of(t, dense_m), np.array([3.0 * t, 0.0]))
-    now, before = submap.clouds()
+        give(submap, turn_of(t, dense_m), np.array([3.0 * t, 0.0]))
+    now, others = submap.clouds()
     assert [len(c.points_m) for c in now] == [128_000]
-    for cloud in before:
+    for cloud in others:
         assert abs(len(cloud.points_m) - 20_000) < 100
         assert len(cloud.stamps_ns) == len(cloud.points_m)
         per_beam = np.bincount(cloud.points_m[:, 2].astype(int), minlength=64)
@@ -84,19 +90,19 @@ def stamps_s(submap: Submap) -> list[float]:
 
 def test_a_clock_that_is_set_back_begins_anew() -> None:
     """By less than what is kept, too; not by a scan that arrives late."""
-    submap = Submap(AerialConfig(), MOUNT, 15.0)
+    submap = Submap(AerialConfig(), MOUNT, AROUND_S)
     for t in range(20, 31):
-        submap.take(turn_of(t, np.ones((1, 3))), np.array([3.0 * t, 0.0]))
+        give(submap, turn_of(t, np.ones((1, 3))), np.array([3.0 * t, 0.0]))
     assert stamps_s(submap) == list(range(20, 30))
-    submap.take(turn_of(29, np.ones((1, 3))), np.array([87.0, 0.0]))
+    give(submap, turn_of(29, np.ones((1, 3))), np.array([87.0, 0.0]))
     assert stamps_s(submap) == [*range(20, 29), 30]
     for t in (24, 25):
-        submap.take(turn_of(t, np.ones((1, 3))), np.array([3.0 * t, 0.0]))
+        give(submap, turn_of(t, np.ones((1, 3))), np.array([3.0 * t, 0.0]))
     assert stamps_s(submap) == [24]
 
 
 def test_of_a_fast_vessel_two_scans_a_second_are_kept() -> None:
-    submap = Submap(AerialConfig(), MOUNT, 15.0)
+    submap = Submap(AerialConfig(), MOUNT, AROUND_S)
     for t in np.arange(0.0, 17.1, 0.1):
-        submap.take(turn_of(t, np.ones((1, 3))), np.array([10.0 * t, 0.0]))
+        give(submap, turn_of(t, np.ones((1, 3))), np.array([10.0 * t, 0.0]))
     assert stamps_s(submap) == list(np.arange(2.0, 17.0, 0.5))

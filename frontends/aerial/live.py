@@ -47,19 +47,19 @@ class LiveMatcher:
     numba's OpenMP threads do not survive that.
 
     Args:
-        folder: base of relative paths of maps. mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name. before_s: how long before
-            a turn what was seen is matched with it. Around a track that follows the matches: 0, or its bends confirm themselves.
+        folder: base of relative paths of maps. mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name. around_s: how far off in time
+            turns that were shown may be, to be matched with another one.
 
     Raises:
         InputError: a map cannot be used.
     """
 
     def __init__(
-        self, config: AerialConfig, folder: Path, datum: Datum, mounts: Mounts, *, before_s: float = 0.0
+        self, config: AerialConfig, folder: Path, datum: Datum, mounts: Mounts, *, around_s: float = 0.0
     ) -> None:
         self._config, self._mounts = config, mounts
         self._matcher = _matcher(config, folder, datum)
-        self._submap = Submap(config, mounts, before_s)
+        self._submap = Submap(config, mounts, around_s)
         self._last: tuple[Array, int] | None = None  # place and stamp of the last turn that was due
         self._before: tuple[Array, int] | None = None  # and of the last one that had a mode
 
@@ -82,7 +82,8 @@ class LiveMatcher:
             return "wait"
         if why_not := outside(turn, track):
             return Matched(turn.stamp_ns, None, why_not)
-        if not self._due(turn.stamp_ns, self.see(turn, track)):
+        self.take(turn)
+        if not self._due(turn.stamp_ns, track.at(np.array([turn.stamp_ns])).p_world_m[0, :2]):
             return None
         item = self.match(track)
         if item.match is not None and item.match.modes:
@@ -105,20 +106,23 @@ class LiveMatcher:
         self._last = (here, stamp_ns)
         return True
 
-    def see(self, turn: Turn, track: Trajectory) -> Array:
-        """Take a turn that a track covers, and return its place (2,) in world, m."""
-        here = track.at(np.array([turn.stamp_ns])).p_world_m[0, :2]  # 1 ms: once, where there are 80 clouds a second
-        self._submap.take(turn, here)
-        return here
+    def show(self, turn: Turn, track: Trajectory) -> None:
+        """Show a turn that others may be matched with, if it can be used; it may be one that is not offered yet."""
+        if not turn.why_not and not outside(turn, track):
+            self._submap.show(turn, track.at(np.array([turn.stamp_ns])).p_world_m[0, :2])
+
+    def take(self, turn: Turn) -> None:
+        """Take a turn that a track covers as the newest."""
+        self._submap.take(turn)
 
     def match(self, track: Trajectory) -> Matched:
-        """Match the last turn that was taken, together with what was seen before it, whether due or not."""
+        """Match the newest turn, together with others that were shown, whether due or not."""
         newest, config = self._submap.newest, self._config
         stamps = np.sort(np.concatenate([c.stamps_ns for c in newest.clouds] + [np.array([newest.stamp_ns])]))
         at_ns = int(stamps[len(stamps) // 2])  # not a median, which goes through floats
         try:
-            now, before = self._submap.clouds()
-            cloud = level(now, self._mounts, track, at_ns, config.waterline_m, before)
+            now, others = self._submap.clouds()
+            cloud = level(now, self._mounts, track, at_ns, config.waterline_m, others)
             pose = track.at(np.array([at_ns]))
             sigma = np.array([1.0, 1.0, np.radians(2.0)])
             if pose.cov is not None:

@@ -31,7 +31,7 @@ class LevelCloud:
 
     Attributes:
         points_m: (N, 3). origin_m: (N, 2) origin of the ray of each. now: how many of them, the first ones, are of the scan itself and
-            not of those before it; None: all.
+            not of others beside it; None: all.
     """
 
     points_m: Array

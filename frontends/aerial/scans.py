@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,8 +19,9 @@ from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import CLOUDS, Cloud, decode_cloud
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, outside
 from graphloc.frontends.aerial.own import Staying
-from graphloc.frontends.aerial.submap import Turn
+from graphloc.frontends.aerial.submap import LATE_NS, Turn
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
+from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -67,11 +69,12 @@ def match_bag(
     with Bag(bags) as bag:
         feed = ScanFeed(bag, config, body_frame)
         # BL matches single scans.
-        before_s = config.submap_s if config.matcher == "posterior" else 0.0
-        matcher = LiveMatcher(config, folder, datum, feed.mounts, before_s=before_s)
+        around_s = 0.5 * config.submap_s if config.matcher == "posterior" else 0.0
+        matcher = LiveMatcher(config, folder, datum, feed.mounts, around_s=around_s)
+        turns = _shown_ahead(feed, matcher, track, around_s) if around_s > 0.0 else iter(feed)
         if at_ns is None:
             staying = Staying(config.hull_m or (), (t for t, _ in feed.mounts.values()))
-            for answer in (matcher.offer(turn, track, growing=False) for turn in feed):
+            for answer in (matcher.offer(turn, track, growing=False) for turn in turns):
                 if not isinstance(answer, Matched):
                     continue
                 if answer.match is not None:
@@ -79,21 +82,33 @@ def match_bag(
                 yield answer
             for line in staying.said():
                 warn(f"aerial: {line}")
-        elif _see_until(at_ns, feed, matcher, track):
+        elif _take_until(at_ns, turns, matcher, track):
             yield matcher.match(track)
         for line in bag.warnings:
             warn(line)
 
 
-def _see_until(at_ns: int, feed: Iterable[Turn], matcher: LiveMatcher, track: Trajectory) -> bool:
-    """Show the usable turns to a matcher, the one nearest to a time last; return whether there is any."""
-    nearest_ns: int | None = None
+def _shown_ahead(feed: Iterable[Turn], matcher: LiveMatcher, track: Trajectory, ahead_s: float) -> Iterator[Turn]:
+    """Show each turn to a matcher, and yield it once those of the time after it have been shown, too."""
+    waiting, ahead_ns = deque[Turn](), round(ahead_s * NS_PER_S)
     for turn in feed:
+        set_back = bool(waiting) and turn.stamp_ns < waiting[-1].stamp_ns - LATE_NS
+        while waiting and (set_back or turn.stamp_ns - waiting[0].stamp_ns > ahead_ns):
+            yield waiting.popleft()
+        matcher.show(turn, track)
+        waiting.append(turn)
+    yield from waiting
+
+
+def _take_until(at_ns: int, turns: Iterable[Turn], matcher: LiveMatcher, track: Trajectory) -> bool:
+    """Give the usable turns to a matcher, the one nearest to a time last; return whether there is any."""
+    nearest_ns: int | None = None
+    for turn in turns:
         if turn.why_not or outside(turn, track):
             continue
         if nearest_ns is not None and abs(turn.stamp_ns - at_ns) > abs(nearest_ns - at_ns):
             break
-        matcher.see(turn, track)
+        matcher.take(turn)
         nearest_ns = turn.stamp_ns
     return nearest_ns is not None
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scans that are matched together: the newest one, and what was seen from other places in the seconds before.
+"""The scans that are matched together: one, and what was seen from other places in the seconds before and after it.
 
 One scan among moored boats shows a few of their sides, which look like those of the next berths. A longer piece of the row, with its gaps
 and the quay at its end, does not.
@@ -21,8 +21,8 @@ from graphloc.time import NS_PER_S
 
 # Nearer ones show the same again; of a fast vessel no more than two a second are kept.
 _APART_M, _APART_NS = 0.5, NS_PER_S // 2
-_LATE_NS = NS_PER_S  # scans that arrive in another order are not later
-_MOST_POINTS = 20_000  # of a turn before
+LATE_NS = NS_PER_S  # scans that arrive in another order are not later
+_MOST_POINTS = 20_000  # of another turn
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
@@ -51,27 +51,32 @@ class Submap:
     """Turns that are matched together.
 
     Args:
-        mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name. before_s: how long others are kept.
+        mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name. around_s: how far off in time others may be.
     """
 
-    def __init__(self, config: AerialConfig, mounts: Mounts, before_s: float) -> None:
-        self._mounts, self._past_ns = mounts, round(before_s * NS_PER_S)
+    def __init__(self, config: AerialConfig, mounts: Mounts, around_s: float) -> None:
+        self._mounts, self._around_ns = mounts, round(around_s * NS_PER_S)
         self._hull = np.array(config.hull_m, dtype=float) if config.hull_m else None
         self._newest: deque[Turn] = deque(maxlen=config.submap)
-        self._before: deque[tuple[Array, int, list[Cloud]]] = deque()  # place and stamp of the turn, and its clouds
+        self._shown: deque[Turn] = deque(maxlen=config.submap)
+        self._kept: deque[tuple[Array, int, list[Cloud]]] = deque()  # place and stamp of the turn, and its clouds
 
-    def take(self, turn: Turn, place_m: Array) -> None:
-        """Add a turn, seen from a place (2,) in world, m."""
-        self._newest.append(turn)
+    def show(self, turn: Turn, place_m: Array) -> None:
+        """Keep a turn, seen from a place (2,) in world, m, for others. It may be as far ahead of the newest as others are."""
+        self._shown.append(turn)
         # A clock that was set back begins anew: what is kept is of places elsewhere on the track. A scan may be a little late.
-        if self._before and turn.stamp_ns < self._before[-1][1] - _LATE_NS:
-            self._before.clear()
-        while self._before and self._before[0][1] < turn.stamp_ns - self._past_ns:
-            self._before.popleft()
-        if self._past_ns > 0 and self._is_apart(turn.stamp_ns, place_m):
-            kept_ns = self._before[-1][1] if self._before else -1
-            clouds = _thinned([c for t in self._newest if t.stamp_ns > kept_ns for c in t.clouds])
-            self._before.append((place_m, turn.stamp_ns, [self._of_others(c) for c in clouds]))
+        if self._kept and turn.stamp_ns < self._kept[-1][1] - LATE_NS:
+            self._kept.clear()
+        if self._is_apart(turn.stamp_ns, place_m):
+            kept_ns = self._kept[-1][1] if self._kept else -1
+            clouds = _thinned([c for t in self._shown if t.stamp_ns > kept_ns for c in t.clouds])
+            self._kept.append((place_m, turn.stamp_ns, [self._of_others(c) for c in clouds]))
+
+    def take(self, turn: Turn) -> None:
+        """Take a turn as the newest."""
+        self._newest.append(turn)
+        while self._kept and self._kept[0][1] < turn.stamp_ns - self._around_ns:
+            self._kept.popleft()
 
     @property
     def newest(self) -> Turn:
@@ -79,19 +84,20 @@ class Submap:
         return self._newest[-1]
 
     def clouds(self) -> tuple[list[Cloud], list[Cloud]]:
-        """Return the clouds of now, and those of before."""
+        """Return the clouds of now, and those of before and after."""
         now = [c for turn in self._newest for c in turn.clouds]
-        held = {(c.lidar, c.stamp_ns) for c in now}
-        return now, [c for *_, clouds in self._before for c in clouds if (c.lidar, c.stamp_ns) not in held]
+        held, at_ns = {(c.lidar, c.stamp_ns) for c in now}, self.newest.stamp_ns
+        near = [clouds for _, stamp_ns, clouds in self._kept if abs(stamp_ns - at_ns) <= self._around_ns]
+        return now, [c for clouds in near for c in clouds if (c.lidar, c.stamp_ns) not in held]
 
     def _is_apart(self, stamp_ns: int, place_m: Array) -> bool:
-        if not self._before:
+        if not self._kept:
             return True
-        there_m, then_ns, _ = self._before[-1]
+        there_m, then_ns, _ = self._kept[-1]
         return stamp_ns - then_ns >= _APART_NS and float(np.hypot(*(place_m - there_m))) >= _APART_M
 
     def _of_others(self, cloud: Cloud) -> Cloud:
-        """Leave out what is the vessel herself: of a turn before, that trails behind her."""
+        """Leave out what is the vessel herself: of other turns, that lies along her way."""
         if self._hull is None:
             return cloud
         t, R = self._mounts[cloud.lidar]

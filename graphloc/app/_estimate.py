@@ -113,19 +113,31 @@ def _matched(
 ) -> tuple[Recording, Solution, Gallery]:
     """Match scans around a solution without matches, and solve with them; once more where that leaves much open, if some are used.
 
+    Scans that are matched together with others are once more matched in any case, alone at first: others are placed by the track, and so
+    they inherit the bends of one without matches.
+
     Returns:
         The recording with its matches, the solution with these, and pictures of some.
     """
     gallery = Gallery()
-    first = with_matches(recording, config, datum, alone, scans, progress, gallery)
+    single = _matched_alone(config)
+    first = with_matches(recording, single, datum, alone, scans, progress, gallery)
     solution = solve(first.recording, config, datum, probe=calibrate.PROBE, progress=progress)
     found = first
-    if first.cut_off and sum(map(solution.ledger.used, config.of_kind("aerial"))) >= _FEWEST_MATCHES:
+    some_used = sum(map(solution.ledger.used, config.of_kind("aerial"))) >= _FEWEST_MATCHES
+    if single is not config or (first.cut_off and some_used):
         gallery = Gallery()
         found = with_matches(recording, config, datum, solution, scans, progress, gallery)
         solution = solve(found.recording, config, datum, probe=calibrate.PROBE, progress=progress)
     warnings = (*found.recording.warnings, *first.turned)
     return replace(found.recording, warnings=warnings), solution, gallery
+
+
+def _matched_alone(config: VesselConfig) -> VesselConfig:
+    """Return a configuration in which no scan is matched together with others; the same one if none is."""
+    together = {name: sensor for name, sensor in config.of_kind("aerial").items() if sensor.submap_s > 0.0}
+    alone = {name: sensor.model_copy(update={"submap_s": 0.0}) for name, sensor in together.items()}
+    return config.model_copy(update={"sensors": config.sensors | alone}) if alone else config
 
 
 def _when_measured(held: Sequence[GnssPosition], solution: Solution) -> tuple[GnssPosition, ...]:
