@@ -25,6 +25,7 @@ from graphloc.solution import Solution
 
 _SEEDS = range(340, 352)  # a yardstick: nothing is tuned on them
 _FAR_M = 2.0
+_TOGETHER_S = 15.0
 
 
 class _Track(NamedTuple):
@@ -45,21 +46,22 @@ def _drawn(seed: int, folder: Path) -> Scenario:
     )  # fmt: skip
 
 
-def _with_matches(config: VesselConfig) -> VesselConfig:
+def _with_matches(config: VesselConfig, submap_s: float = 0.0) -> VesselConfig:
     """Switch the LiDARs on, with the search window of a draft."""
-    given = config.sensors["aerial"].model_dump(exclude={"window_m", "window_deg"}) | {"enabled": True}
+    given = config.sensors["aerial"].model_dump(exclude={"window_m", "window_deg"})
+    given |= {"enabled": True, "submap_s": submap_s}
     return config.model_copy(update={"sensors": config.sensors | {"aerial": type(config.sensors["aerial"])(**given)}})
 
 
-def _run(seed: int) -> tuple[_Track, _Track, _Track]:
-    """Smoothed without matches and with them, and online."""
+def _run(seed: int) -> tuple[_Track, ...]:
+    """Smoothed without matches, with them, and with those of scans that are matched together; and online."""
     cv2.setNumThreads(1)
     numba.set_num_threads(1)
     with tempfile.TemporaryDirectory() as scratch_:
         folder = Path(scratch_) / "sim"
         write_bag(simulate(_drawn(seed, Path(scratch_)), seed), folder, ros=2)
         recording, config = app.load([folder / "run"], folder / "vessel.yaml")
-        config, scans = _with_matches(config), app.Scans((folder / "run",), folder)
+        single, scans = _with_matches(config), app.Scans((folder / "run",), folder)
         truth = recording.truth
         assert truth is not None
         shown = as_shown(truth, folder)
@@ -69,16 +71,18 @@ def _run(seed: int) -> tuple[_Track, _Track, _Track]:
             return _Track(compare_to_truth(solution.trajectory, shown).position_rmse_m, float(held or 0.0))
 
         return (
-            track(app.smooth_recording(recording, config).solution),
-            track(app.smooth_recording(recording, config, scans=scans).solution),
-            track(app.replay_recording(recording, config, scans=scans).solution),
+            track(app.smooth_recording(recording, single).solution),
+            track(app.smooth_recording(recording, single, scans=scans).solution),
+            track(app.smooth_recording(recording, _with_matches(config, _TOGETHER_S), scans=scans).solution),
+            track(app.replay_recording(recording, single, scans=scans).solution),
         )
 
 
 def figures(pool: ProcessPoolExecutor) -> list[Row]:
     found = list(pool.map(_run, _SEEDS))
     rows = []
-    for name, tracks in zip(("GNSS alone, offline", "offline", "online"), zip(*found, strict=True), strict=True):
+    names = ("GNSS alone, offline", "offline", f"offline, submap_s {_TOGETHER_S:g}", "online")
+    for name, tracks in zip(names, zip(*found, strict=True), strict=True):
         label = f"{len(tracks)} drawn harbours, {name}"
         off_m = np.array([t.off_m for t in tracks])
         rows.append(
