@@ -68,10 +68,8 @@ def match_bag(
     """
     with Bag(bags) as bag:
         feed = ScanFeed(bag, config, body_frame)
-        # BL matches single scans.
-        around_s = 0.5 * config.submap_s if config.matcher == "posterior" else 0.0
-        matcher = LiveMatcher(config, folder, datum, feed.mounts, around_s=around_s)
-        turns = _shown_ahead(feed, matcher, track, around_s) if around_s > 0.0 else iter(feed)
+        matcher = LiveMatcher(config, folder, datum, feed.mounts, around_s=config.around_s)
+        turns = _shown_ahead(feed, matcher, track, config.around_s) if config.around_s > 0.0 else iter(feed)
         if at_ns is None:
             staying = Staying(config.hull_m or (), (t for t, _ in feed.mounts.values()))
             for answer in (matcher.offer(turn, track, growing=False) for turn in turns):

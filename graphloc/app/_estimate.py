@@ -135,7 +135,7 @@ def _matched(
 
 def _matched_alone(config: VesselConfig) -> VesselConfig:
     """Return a configuration in which no scan is matched together with others; the same one if none is."""
-    together = {name: sensor for name, sensor in config.of_kind("aerial").items() if sensor.submap_s > 0.0}
+    together = {name: sensor for name, sensor in config.of_kind("aerial").items() if sensor.around_s > 0.0}
     alone = {name: sensor.model_copy(update={"submap_s": 0.0}) for name, sensor in together.items()}
     return config.model_copy(update={"sensors": config.sensors | alone}) if alone else config
 

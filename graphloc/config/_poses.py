@@ -120,6 +120,11 @@ class AerialConfig(AnyPoseConfig):
     reach_m: Annotated[Positive, Field(le=300.0)] = 100.0
     """Points beyond this range are not used; at most 300 m."""
 
+    @property
+    def around_s(self) -> float:
+        """How far off in time scans may be that are matched together, s; BL matches single ones."""
+        return 0.5 * self.submap_s if self.matcher == "posterior" else 0.0
+
     @field_validator("topic", "mount")
     @classmethod
     def _of_the_lidars(cls, given: str | MountConfig) -> str | MountConfig:
