@@ -35,7 +35,7 @@ class _Track(NamedTuple):
     held: float
 
 
-def _drawn(seed: int, folder: Path) -> Scenario:
+def drawn(seed: int, folder: Path) -> Scenario:
     """Draw a harbour and what a vessel has there: a large one with five LiDARs or a launch with one, GNSS trouble, compass or none."""
     rng = np.random.default_rng([seed, 77])
     return replace(
@@ -46,7 +46,7 @@ def _drawn(seed: int, folder: Path) -> Scenario:
     )  # fmt: skip
 
 
-def _with_matches(config: VesselConfig, submap_s: float = 0.0) -> VesselConfig:
+def with_matches(config: VesselConfig, submap_s: float = 0.0) -> VesselConfig:
     """Switch the LiDARs on, with the search window of a draft."""
     given = config.sensors["aerial"].model_dump(exclude={"window_m", "window_deg"})
     given |= {"enabled": True, "submap_s": submap_s}
@@ -59,9 +59,9 @@ def _run(seed: int) -> tuple[_Track, ...]:
     numba.set_num_threads(1)
     with tempfile.TemporaryDirectory() as scratch_:
         folder = Path(scratch_) / "sim"
-        write_bag(simulate(_drawn(seed, Path(scratch_)), seed), folder, ros=2)
+        write_bag(simulate(drawn(seed, Path(scratch_)), seed), folder, ros=2)
         recording, config = app.load([folder / "run"], folder / "vessel.yaml")
-        single, scans = _with_matches(config), app.Scans((folder / "run",), folder)
+        single, scans = with_matches(config), app.Scans((folder / "run",), folder)
         truth = recording.truth
         assert truth is not None
         shown = as_shown(truth, folder)
@@ -73,7 +73,7 @@ def _run(seed: int) -> tuple[_Track, ...]:
         return (
             track(app.smooth_recording(recording, single).solution),
             track(app.smooth_recording(recording, single, scans=scans).solution),
-            track(app.smooth_recording(recording, _with_matches(config, _TOGETHER_S), scans=scans).solution),
+            track(app.smooth_recording(recording, with_matches(config, _TOGETHER_S), scans=scans).solution),
             track(app.replay_recording(recording, single, scans=scans).solution),
         )
 

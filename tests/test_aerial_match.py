@@ -30,8 +30,8 @@ from graphloc.frontends.aerial.layers import (
     weighed,
 )
 from graphloc.frontends.aerial.match import Mode, SearchGrid, modes_of
-from graphloc.frontends.aerial.matcher import Since
-from graphloc.frontends.aerial.scan import LevelCloud, inside, outline
+from graphloc.frontends.aerial.matcher import BELIEF, Belief, Since
+from graphloc.frontends.aerial.scan import LevelCloud, Outline, inside, outline
 from graphloc.frontends.aerial.vector import VectorMap
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import S
@@ -279,6 +279,29 @@ def test_modes_are_those_of_the_posterior() -> None:
     assert none == pytest.approx(1.0)
 
 
+def with_evidence(places: int, turns: int = 1) -> Outline:
+    """Places on no common line: each is evidence of 1."""
+    none = np.zeros(0)
+    shore = np.zeros((places, 2))
+    return Outline(
+        np.zeros((0, 2)), none, none, none, shore, np.zeros(places), np.ones(places), shore, shore, turns=turns
+    )
+
+
+def test_little_evidence_is_believed_less() -> None:
+    belief = Belief(enough=10.0, power=2.0, alike=0.5)
+    for evidence, odds in ((10, 1.0), (20, 4.0), (5, 0.25)):
+        assert belief.share(with_evidence(evidence)) == pytest.approx(odds / (1.0 + odds))
+    assert belief.share(with_evidence(40, turns=16)) == pytest.approx(0.5)  # of one alone 10
+    assert belief.share(with_evidence(0)) < 1e-6
+
+
+def test_modes_are_less_decided_than_they_look() -> None:
+    modes = [Mode(np.zeros(3), np.eye(3), p) for p in (0.64, 0.04)]
+    assert [m.probability for m in Belief(decided=0.5).less_decided(modes)] == pytest.approx([0.544, 0.136])
+    assert Belief().less_decided([]) == []
+
+
 def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path) -> None:
     """A pier with two corners in view, thought to be 1.7 m and 2 deg elsewhere; found to a cell of 0.25 m (C.2)."""
     picture(tmp_path / "a.tif", 32633, 0.2, np.array([-15.0, 10.0, 15.0, 60.0]))
@@ -297,6 +320,11 @@ def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path) -> None:
     assert abs(np.degrees(found.modes[0].pose[2] - true[2])) < 0.4
     fix = found.fix(5, "aerial")
     assert fix.none_probability == pytest.approx(found.none, abs=1e-6)
+    # The same evidence of a hundred places is less of it, and told so.
+    known, less = found.found, matcher.match(LevelCloud(points, np.zeros((len(points), 2)), turns=100), prior)
+    told, told_less = (BELIEF.share(f) for f in (known, less.found))
+    assert told_less < 0.3 < 0.8 < told
+    assert (1.0 - less.none) / (1.0 - found.none) == pytest.approx(told_less / told, rel=1e-3)
     empty = matcher.match(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), prior)
     assert not empty.modes
     assert empty.why_not == "a scan without a point outside the vessel"

@@ -45,7 +45,8 @@ def test_the_vessel_herself_does_not_trail_behind() -> None:
     now, others = submap.clouds()
     seen = level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0, others)
     assert [len(c.points_m) for c in now] == [5]
-    assert seen.now == 5
+    assert (seen.now, seen.turns) == (5, 4)
+    assert outline(seen, None).turns == 4
     np.testing.assert_allclose(seen.points_m[:2], [(2.0, -1.0, 1.5), (-4.0, 1.0, 1.5)], atol=1e-9)
     np.testing.assert_allclose(seen.points_m[2:, :2], np.broadcast_to([-9.0, 20.0], (12, 2)), atol=AT_MOST_M)
     np.testing.assert_allclose(
@@ -77,7 +78,7 @@ def test_dense_scans_of_before_are_thinned() -> None:
         give(submap, turn_of(t, dense_m), np.array([3.0 * t, 0.0]))
     now, others = submap.clouds()
     assert [len(c.points_m) for c in now] == [128_000]
-    for cloud in others:
+    for (cloud,) in others:
         assert abs(len(cloud.points_m) - 20_000) < 100
         assert len(cloud.stamps_ns) == len(cloud.points_m)
         per_beam = np.bincount(cloud.points_m[:, 2].astype(int), minlength=64)
@@ -85,7 +86,7 @@ def test_dense_scans_of_before_are_thinned() -> None:
 
 
 def stamps_s(submap: Submap) -> list[float]:
-    return [c.stamp_ns / S for c in submap.clouds()[1]]
+    return [c.stamp_ns / S for (c,) in submap.clouds()[1]]
 
 
 def test_a_clock_that_is_set_back_begins_anew() -> None:

@@ -199,7 +199,7 @@ def level(
     track: Trajectory,
     at_ns: int,
     waterline_m: float,
-    others: Sequence[Cloud] = (),
+    others: Sequence[Sequence[Cloud]] = (),
 ) -> LevelCloud:
     """Return the points of clouds in `level` at a time, each from where the track has its LiDAR at the time of the point.
 
@@ -208,7 +208,7 @@ def level(
     with the pose of the body at the middle of the 2 ms that contain the point.
 
     Args:
-        mounts: T_body_lidar by name. waterline_m: height of the waterline in body. others: clouds from where the vessel was before and after.
+        mounts: T_body_lidar by name. waterline_m: height of the waterline in body. others: clouds of each turn before and after.
 
     Raises:
         InputError: the track does not cover `at_ns`, or no point of the newest clouds (stamped within 1 s of it).
@@ -217,7 +217,7 @@ def level(
     names = ", ".join(dict.fromkeys(c.lidar for c in ([clouds[k] for k in newest] or clouds))) or "no LiDAR"
     if not track.covers(np.array([at_ns])).all():
         raise InputError(f"the track does not cover the scan of {names}: {_outside(track, at_ns)}")
-    kept = [_during(c, track) for c in (*clouds, *others)]
+    kept = [_during(c, track) for c in (*clouds, *(c for turn in others for c in turn))]
     bins, rows = _shared_bins([*(c.stamps_ns // _BIN_NS for c in kept), np.array([at_ns // _BIN_NS])])
     times = np.clip(bins * _BIN_NS + _BIN_NS // 2, track.stamps_ns[0], track.stamps_ns[-1])
     covered = track.covers(times)
@@ -247,7 +247,10 @@ def level(
         origins.append(origin[row, :2])
         begin += len(row)
     return LevelCloud(
-        points, np.vstack([*origins, np.empty((0, 2))]), now=sum(len(c.stamps_ns) for c in kept[: len(clouds)])
+        points,
+        np.vstack([*origins, np.empty((0, 2))]),
+        now=sum(len(c.stamps_ns) for c in kept[: len(clouds)]),
+        turns=1 + len(others),
     )
 
 

@@ -83,7 +83,7 @@ class LiveMatcher:
         if why_not := outside(turn, track):
             return Matched(turn.stamp_ns, None, why_not)
         self.take(turn)
-        if not self._due(turn.stamp_ns, track.at(np.array([turn.stamp_ns])).p_world_m[0, :2]):
+        if not self._due(turn.stamp_ns, track):
             return None
         item = self.match(track)
         if item.match is not None and item.match.modes:
@@ -95,8 +95,8 @@ class LiveMatcher:
             self._before = here
         return item
 
-    def _due(self, stamp_ns: int, here: Array) -> bool:
-        config = self._config
+    def _due(self, stamp_ns: int, track: Trajectory) -> bool:
+        config, here = self._config, track.at(np.array([stamp_ns])).p_world_m[0, :2]
         if self._last is not None:
             moved_m = float(np.hypot(*(here - self._last[0])))
             waited_s = (stamp_ns - self._last[1]) / 1e9

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,40 @@ class Match:
         return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes, news=news)
 
 
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """How far the posterior of a scan is to be believed, by runs through drawn harbours (`benchmarks/tune_odds.py`).
+
+    What the likelihood does not know: boats at other berths than on the image, a tide, a track that is not quite right. So a scan of
+    little evidence fits best at a false place as often as not, and modes are less decided than they look.
+
+    Attributes:
+        enough, power: the odds that one of the modes is right if the truth is in the window are (N / enough)^power, with the evidence N
+            of a scan. alike: the same walls seen from n places are n^alike times the evidence. decided: exponent of the odds between modes.
+    """
+
+    enough: float = 15.0
+    power: float = 2.8
+    alike: float = 0.32
+    decided: float = 0.35
+
+    def share(self, found: Outline) -> float:
+        """Return the probability that one of the modes is right if the truth is in the window."""
+        evidence = max(found.evidence, 1e-9) / found.turns**self.alike
+        return float(special.expit(self.power * np.log(evidence / self.enough)))
+
+    def less_decided(self, modes: Sequence[Mode]) -> list[Mode]:
+        """Return modes whose odds are closer to even; their sum stays."""
+        if not modes:
+            return []
+        told = np.array([m.probability for m in modes])
+        odds = told**self.decided
+        return [replace(m, probability=float(p)) for m, p in zip(modes, odds * (told.sum() / odds.sum()), strict=True)]
+
+
+BELIEF = Belief()
+
+
 class Matcher:
     """Matches scans to a map.
 
@@ -150,7 +185,8 @@ class Matcher:
         grid = grid_around(layers, prior.pose, half_m, half_deg)
         score = log_likelihood_of(found, layers, grid)
         trust = _trust(score, _within(prior.sigma, np.array([half_m, half_m, np.radians(half_deg)])))
-        modes, none = modes_of(score, grid, _NONE_LOG, 1.0 - trust, _MODES)
+        modes, none = modes_of(score, grid, _NONE_LOG, 1.0 - trust * BELIEF.share(found), _MODES)
+        modes = BELIEF.less_decided(modes)
         why_not = "" if modes else NO_POSE
         cut_off = half_m < 2.0 * sigma_m or half_deg < 2.0 * sigma_deg
         return Match(prior, found, layers, grid, score, tuple(modes), none, why_not, cut_off)

@@ -31,12 +31,13 @@ class LevelCloud:
 
     Attributes:
         points_m: (N, 3). origin_m: (N, 2) origin of the ray of each. now: how many of them, the first ones, are of the scan itself and
-            not of others beside it; None: all.
+            not of others beside it; None: all. turns: of how many places it is, seen from apart.
     """
 
     points_m: Array
     origin_m: Array
     now: int | None = None
+    turns: int = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +50,7 @@ class Outline:
             away from the sensor. shore_share: (K,) weight of each. water_m: (L, 2) points seen as free water.
         columns_m: (J, 2) where anything rises out of the water in the scan itself. lowest_m: height over the waterline below which
             a twentieth of its points lies; NaN of none.
+        turns: of how many places it is, seen from apart.
     """
 
     faces_m: Array
@@ -61,6 +63,7 @@ class Outline:
     water_m: Array
     columns_m: Array
     lowest_m: float = float("nan")
+    turns: int = 1
 
     @property
     def evidence(self) -> float:
@@ -95,6 +98,7 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
         water_m=_free_water(shore, p[~dry]),
         columns_m=cells if now.all() else _columns(p[dry & now])[0],
         lowest_m=float(np.quantile(p[now, 2], 0.05)) if now.any() else float("nan"),
+        turns=cloud.turns,
     )
 
 

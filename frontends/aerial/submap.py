@@ -83,12 +83,13 @@ class Submap:
         """The last turn that was taken."""
         return self._newest[-1]
 
-    def clouds(self) -> tuple[list[Cloud], list[Cloud]]:
-        """Return the clouds of now, and those of before and after."""
+    def clouds(self) -> tuple[list[Cloud], list[list[Cloud]]]:
+        """Return the clouds of now, and those of each turn before and after."""
         now = [c for turn in self._newest for c in turn.clouds]
         held, at_ns = {(c.lidar, c.stamp_ns) for c in now}, self.newest.stamp_ns
         near = [clouds for _, stamp_ns, clouds in self._kept if abs(stamp_ns - at_ns) <= self._around_ns]
-        return now, [c for clouds in near for c in clouds if (c.lidar, c.stamp_ns) not in held]
+        others = [[c for c in clouds if (c.lidar, c.stamp_ns) not in held] for clouds in near]
+        return now, [clouds for clouds in others if clouds]
 
     def _is_apart(self, stamp_ns: int, place_m: Array) -> bool:
         if not self._kept:
