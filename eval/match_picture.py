@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,8 +15,7 @@ from graphloc.frames import Array
 from graphloc.frontends.aerial import Match
 from graphloc.frontends.aerial.image import Pixels
 
-_ZOOM = 3
-_AROUND_M = 60.0
+_SIDE, _LEAST_M = 1440, 60.0  # pixels; to each side of the vessel, and farther where what was matched is
 _FACES, _SHORES, _PRIOR = (60, 60, 255), (80, 255, 80), (255, 160, 0)  # blue, green, red
 _LINES = (200, 160, 90)
 _SAID = {
@@ -24,6 +24,13 @@ _SAID = {
     "most ambiguous": "modes of {first:.2f} and {second:.2f}",
 }
 _MODES = ((0, 255, 255), (255, 0, 255), (255, 255, 0), (200, 200, 200), (120, 120, 120))
+
+
+class _View(NamedTuple):
+    """Map cell of the picture's top-left corner, and pixels per cell."""
+
+    corner: Array
+    zoom: float
 
 
 class Gallery:
@@ -93,15 +100,15 @@ def drawn(match: Match) -> Pixels:
     if match.layers is None or match.grid is None or match.score is None:
         raise OutputError(f"nothing to draw: {match.why_not or 'this matcher has no score of each pose'}")
     pose = match.modes[0].pose if match.modes else match.prior.pose
-    canvas, corner = _image(match, pose)
+    canvas, view = _image(match, pose)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for points, colour in ((match.found.shore_m, _SHORES), (match.found.faces_m, _FACES)):
-        for at in _pixels(match, points @ np.array([[c, s], [-s, c]]) + pose[:2], corner):
+        for at in _pixels(match, points @ np.array([[c, s], [-s, c]]) + pose[:2], view):
             cv2.circle(canvas, (int(at[0]), int(at[1])), 2, colour, -1)
-    _arrow(canvas, match, match.prior.pose, corner, _PRIOR)
+    _arrow(canvas, match, match.prior.pose, view, _PRIOR)
     for mode, colour in zip(match.modes, _MODES, strict=False):
-        _arrow(canvas, match, mode.pose, corner, colour)
-        _ellipse(canvas, match, mode.pose, mode.cov[:2, :2], corner, colour)
+        _arrow(canvas, match, mode.pose, view, colour)
+        _ellipse(canvas, match, mode.pose, mode.cov[:2, :2], view, colour)
     canvas = np.hstack([canvas, _heat(match, canvas.shape[0])])
     lines = [
         f"{m.probability:.2f}  +-{np.sqrt(m.cov[0, 0]):.2f} m east, {np.sqrt(m.cov[1, 1]):.2f} m north (1 sigma)"
@@ -119,39 +126,40 @@ def drawn(match: Match) -> Pixels:
     return np.asarray(canvas, dtype=np.uint8)
 
 
-def _image(match: Match, pose: Array) -> tuple[Pixels, Array]:
-    """Return the enlarged image around a pose, and the map cell of its top-left corner."""
+def _image(match: Match, pose: Array) -> tuple[Pixels, _View]:
+    """Return the enlarged image around a pose and what was matched, and where it is."""
     assert match.layers is not None
     patch = match.layers.patch
-    half = int(_AROUND_M / patch.cell_m)
+    places_m = np.vstack([match.found.faces_m, match.found.shore_m])
+    around_m = max(_LEAST_M, 1.1 * float(np.abs(places_m).max(initial=0.0)))
+    half = int(around_m / patch.cell_m)
+    zoom = 0.5 * _SIDE / half
     column, row = np.rint(patch.cells(pose[None, :2])[0]).astype(int)
     low = np.maximum([column - half, row - half], 0)
     window = (slice(low[1], row + half), slice(low[0], column + half))
     part = patch.pixels[window][..., ::-1].copy()
     if match.layers.drawn is not None:  # lines that a user drew may lie on no image
         part[match.layers.drawn[window]] = _LINES
-    large = cv2.resize(np.ascontiguousarray(part), None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_NEAREST)
-    return np.asarray(large, dtype=np.uint8), low.astype(float)
+    large = cv2.resize(np.ascontiguousarray(part), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(large, dtype=np.uint8), _View(low.astype(float), zoom)
 
 
-def _pixels(match: Match, p_m: Array, corner: Array) -> Array:
+def _pixels(match: Match, p_m: Array, view: _View) -> Array:
     assert match.layers is not None
-    return (match.layers.patch.cells(p_m) - corner + 0.5) * _ZOOM
+    return (match.layers.patch.cells(p_m) - view.corner + 0.5) * view.zoom
 
 
-def _arrow(canvas: Pixels, match: Match, pose: Array, corner: Array, colour: tuple[int, int, int]) -> None:
+def _arrow(canvas: Pixels, match: Match, pose: Array, view: _View, colour: tuple[int, int, int]) -> None:
     ahead = pose[:2] + 4.0 * np.array([np.cos(pose[2]), np.sin(pose[2])])
-    a, b = _pixels(match, np.stack([pose[:2], ahead]), corner).astype(int).tolist()
+    a, b = _pixels(match, np.stack([pose[:2], ahead]), view).astype(int).tolist()
     cv2.arrowedLine(canvas, a, b, colour, 2, cv2.LINE_AA)
 
 
-def _ellipse(
-    canvas: Pixels, match: Match, pose: Array, cov: Array, corner: Array, colour: tuple[int, int, int]
-) -> None:
+def _ellipse(canvas: Pixels, match: Match, pose: Array, cov: Array, view: _View, colour: tuple[int, int, int]) -> None:
     """Draw the 95 % ellipse of a mode."""
     angle = np.linspace(0.0, 2.0 * np.pi, 60)
     ring = np.column_stack([np.cos(angle), np.sin(angle)]) @ np.linalg.cholesky(chi2_95(2) * cov).T + pose[:2]
-    cv2.polylines(canvas, [_pixels(match, ring, corner).astype(np.int32)], True, colour, 2, cv2.LINE_AA)
+    cv2.polylines(canvas, [_pixels(match, ring, view).astype(np.int32)], True, colour, 2, cv2.LINE_AA)
 
 
 def _heat(match: Match, rows: int) -> Pixels:

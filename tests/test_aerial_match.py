@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from graphloc.config import AerialConfig
 from graphloc.errors import InputError
+from graphloc.eval.match_picture import drawn
 from graphloc.frames import Array
 from graphloc.frontends.aerial import Match, Matcher, Prior
 from graphloc.frontends.aerial.cloud import Cloud, decode_cloud, level
@@ -20,6 +22,7 @@ from graphloc.frontends.aerial.image import AerialImage, Patch
 from graphloc.frontends.aerial.layers import (
     EDGE_BINS,
     SHORE_BINS,
+    Layers,
     Weights,
     coarse_patch,
     drawn_layers,
@@ -294,6 +297,20 @@ def test_little_evidence_is_believed_less() -> None:
         assert belief.share(with_evidence(evidence)) == pytest.approx(odds / (1.0 + odds))
     assert belief.share(with_evidence(40, turns=16)) == pytest.approx(0.5)  # of one alone 10
     assert belief.share(with_evidence(0)) < 1e-6
+
+
+@pytest.mark.parametrize("away_m", [20.0, 90.0])
+def test_a_picture_shows_what_was_matched_however_far(away_m: float) -> None:
+    cells, g = np.zeros((960, 960, 3), np.uint8), grid(2)
+    patch = Patch(cells, np.ones((960, 960), dtype=bool), -120.0, 120.0, 0.25)
+    layers = Layers(patch, 1.0, cells[None, ..., 0], cells[None, ..., 0], None)
+    found = replace(with_evidence(1), shore_m=np.array([(away_m, 0.0)]))
+    match = Match(Prior(np.zeros(3), np.ones(3)), found, layers, g, np.zeros((17, 5, 5), np.float32))
+    picture_ = drawn(match)
+    size = len(picture_)
+    rows, columns = np.nonzero((picture_[:, :size] == (80, 255, 80)).all(axis=2))
+    assert abs(rows.mean() - 0.5 * size) < 5.0  # north is up: due east of the middle
+    assert columns.mean() - 0.5 * size == pytest.approx(0.5 * size * away_m / max(60.0, 1.1 * away_m), rel=0.02)
 
 
 def test_modes_are_less_decided_than_they_look() -> None:
