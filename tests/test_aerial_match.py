@@ -340,7 +340,8 @@ def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path) -> None:
     # The same evidence of a hundred places is less of it, and told so.
     known, less = found.found, matcher.match(LevelCloud(points, np.zeros((len(points), 2)), turns=100), prior)
     told, told_less = (BELIEF.share(f) for f in (known, less.found))
-    assert told_less < 0.3 < 0.8 < told
+    assert told_less < 0.3
+    assert told > 0.8
     assert (1.0 - less.none) / (1.0 - found.none) == pytest.approx(told_less / told, rel=1e-3)
     empty = matcher.match(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), prior)
     assert not empty.modes

@@ -19,7 +19,7 @@ from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import CLOUDS, Cloud, decode_cloud
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, outside
 from graphloc.frontends.aerial.own import Staying
-from graphloc.frontends.aerial.submap import LATE_NS, Turn
+from graphloc.frontends.aerial.submap import Turn, is_set_back
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
 from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
@@ -90,7 +90,7 @@ def _shown_ahead(feed: Iterable[Turn], matcher: LiveMatcher, track: Trajectory, 
     """Show each turn to a matcher, and yield it once those of the time after it have been shown, too."""
     waiting, ahead_ns = deque[Turn](), round(ahead_s * NS_PER_S)
     for turn in feed:
-        set_back = bool(waiting) and turn.stamp_ns < waiting[-1].stamp_ns - LATE_NS
+        set_back = bool(waiting) and is_set_back(turn.stamp_ns, waiting[-1].stamp_ns)
         while waiting and (set_back or turn.stamp_ns - waiting[0].stamp_ns > ahead_ns):
             yield waiting.popleft()
         matcher.show(turn, track)

@@ -21,7 +21,7 @@ from graphloc.time import NS_PER_S
 
 # Nearer ones show the same again; of a fast vessel no more than two a second are kept.
 _APART_M, _APART_NS = 0.5, NS_PER_S // 2
-LATE_NS = NS_PER_S  # scans that arrive in another order are not later
+_LATE_NS = NS_PER_S  # scans that arrive in another order are not later
 _MOST_POINTS = 20_000  # of another turn
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
@@ -47,6 +47,11 @@ class Turn:
         return max([self.stamp_ns, *(int(c.stamps_ns.max()) for c in self.clouds if len(c.stamps_ns))])
 
 
+def is_set_back(stamp_ns: int, before_ns: int) -> bool:
+    """Return whether a clock was set back since a stamp; a scan may also be a little late."""
+    return stamp_ns < before_ns - _LATE_NS
+
+
 class Submap:
     """Turns that are matched together.
 
@@ -64,8 +69,8 @@ class Submap:
     def show(self, turn: Turn, place_m: Array) -> None:
         """Keep a turn, seen from a place (2,) in world, m, for others. It may be as far ahead of the newest as others are."""
         self._shown.append(turn)
-        # A clock that was set back begins anew: what is kept is of places elsewhere on the track. A scan may be a little late.
-        if self._kept and turn.stamp_ns < self._kept[-1][1] - LATE_NS:
+        # A clock that was set back begins anew: what is kept is of places elsewhere on the track.
+        if self._kept and is_set_back(turn.stamp_ns, self._kept[-1][1]):
             self._kept.clear()
         if self._is_apart(turn.stamp_ns, place_m):
             kept_ns = self._kept[-1][1] if self._kept else -1
