@@ -1,6 +1,7 @@
 """Turns of scans from a bag, and their matches one at a time around a track that still grows."""
 
 import pickle
+import weakref
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -14,7 +15,7 @@ import pytest
 
 from graphloc import app
 from graphloc.config import AerialConfig, LidarConfig
-from graphloc.frames import Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import decode
 from graphloc.frontends._source import Bag, RawMessage, TopicSummary
 from graphloc.frontends.aerial import live, match_bag, scans
@@ -307,6 +308,44 @@ def test_what_is_seen_from_elsewhere_before_and_after_is_matched_as_well(
     seen.numbers.clear()
     matched_turns(monkeypatch, turns, speed_mps, BEGIN + 22 * S // 10, **config)
     assert ["".join(map(str, sorted(set(numbers)))) for numbers in seen.numbers] == expected[2:3]
+
+
+class Counted(Sequence[Turn]):
+    """Turns that a bag would read one after the other, ten a second; `alive` tells how many of their points are still in memory."""
+
+    def __init__(self, count: int) -> None:
+        self._count, self._points = count, list[weakref.ref[Array]]()
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[Turn]:
+        for number in range(self._count):
+            turn = turn_at(0.1 * number, number)
+            self._points.append(weakref.ref(turn.clouds[0].points_m))
+            yield turn
+
+    def __getitem__(self, _: Any) -> Any:
+        raise NotImplementedError
+
+    @property
+    def alive(self) -> int:
+        return sum(points() is not None for points in self._points)
+
+
+def test_only_scans_that_are_due_wait_for_those_after_them(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten scans a second, of which one is matched, with those of 2 s after it: two wait, not twenty."""
+    turns, alive = Counted(60), list[int]()
+    match = LiveMatcher.match
+
+    def counted(matcher: LiveMatcher, track: Trajectory) -> Matched:
+        alive.append(turns.alive)
+        return match(matcher, track)
+
+    monkeypatch.setattr(LiveMatcher, "match", counted)
+    matched_turns(monkeypatch, turns, 1.0, submap_s=4.0)
+    assert [max(numbers) for numbers in seen.numbers] == [20, 30, 40, 50, 55, 55]
+    assert max(alive) <= 12  # with what is kept, of 0.5 m
 
 
 @pytest.mark.parametrize("damaged", [False, True])

@@ -39,6 +39,26 @@ class Matched:
     since: Since | None = None
 
 
+class Pace:
+    """Which turns are due, at the configured interval."""
+
+    def __init__(self, config: AerialConfig) -> None:
+        self._config = config
+        self._last: tuple[Array, int] | None = None  # place and stamp of the last turn that was due
+
+    def is_due(self, stamp_ns: int, track: Trajectory) -> bool:
+        """Return whether a turn is due; if it is, the next one is at a distance from it."""
+        config, here = self._config, track.at(np.array([stamp_ns])).p_world_m[0, :2]
+        if self._last is not None:
+            moved_m = float(np.hypot(*(here - self._last[0])))
+            waited_s = (stamp_ns - self._last[1]) / 1e9
+            too_soon = waited_s < config.every_s - _JITTER_S or (moved_m < config.every_m and waited_s < config.still_s)
+            if waited_s >= 0.0 and too_soon:  # a clock that was set back begins anew
+                return False
+        self._last = (here, stamp_ns)
+        return True
+
+
 class LiveMatcher:
     """Matches turns as they come, at the configured interval.
 
@@ -60,7 +80,7 @@ class LiveMatcher:
         self._config, self._mounts = config, mounts
         self._matcher = _matcher(config, folder, datum)
         self._submap = Submap(config, mounts, around_s)
-        self._last: tuple[Array, int] | None = None  # place and stamp of the last turn that was due
+        self._pace = Pace(config)
         self._before: tuple[Array, int] | None = None  # and of the last one that had a mode
 
     def offer(self, turn: Turn, track: Trajectory, *, growing: bool = True) -> Matched | Literal["wait"] | None:
@@ -83,7 +103,7 @@ class LiveMatcher:
         if why_not := outside(turn, track):
             return Matched(turn.stamp_ns, None, why_not)
         self.take(turn)
-        if not self._due(turn.stamp_ns, track):
+        if not self._pace.is_due(turn.stamp_ns, track):
             return None
         item = self.match(track)
         if item.match is not None and item.match.modes:
@@ -94,17 +114,6 @@ class LiveMatcher:
                 item = replace(item, since=Since(way_m / alike_m, abs(here[1] - self._before[1]) / NS_PER_S))
             self._before = here
         return item
-
-    def _due(self, stamp_ns: int, track: Trajectory) -> bool:
-        config, here = self._config, track.at(np.array([stamp_ns])).p_world_m[0, :2]
-        if self._last is not None:
-            moved_m = float(np.hypot(*(here - self._last[0])))
-            waited_s = (stamp_ns - self._last[1]) / 1e9
-            too_soon = waited_s < config.every_s - _JITTER_S or (moved_m < config.every_m and waited_s < config.still_s)
-            if waited_s >= 0.0 and too_soon:  # a clock that was set back begins anew
-                return False
-        self._last = (here, stamp_ns)
-        return True
 
     def show(self, turn: Turn, track: Trajectory) -> None:
         """Show a turn that others may be matched with, if it can be used; it may be one that is not offered yet."""

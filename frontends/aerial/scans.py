@@ -17,7 +17,7 @@ from graphloc.frontends._mounts import mounts_of
 from graphloc.frontends._part import Bags
 from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import CLOUDS, Cloud, decode_cloud
-from graphloc.frontends.aerial.live import LiveMatcher, Matched, outside
+from graphloc.frontends.aerial.live import LiveMatcher, Matched, Pace, outside
 from graphloc.frontends.aerial.own import Staying
 from graphloc.frontends.aerial.submap import Turn, is_set_back
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
@@ -69,7 +69,9 @@ def match_bag(
     with Bag(bags) as bag:
         feed = ScanFeed(bag, config, body_frame)
         matcher = LiveMatcher(config, folder, datum, feed.mounts, around_s=config.around_s)
-        turns = _shown_ahead(feed, matcher, track, config.around_s) if config.around_s > 0.0 else iter(feed)
+        turns = iter(feed)
+        if config.around_s > 0.0:
+            turns = _shown_ahead(feed, matcher, track, config, due_alone=at_ns is None)
         if at_ns is None:
             staying = Staying(config.hull_m or (), (t for t, _ in feed.mounts.values()))
             for answer in (matcher.offer(turn, track, growing=False) for turn in turns):
@@ -86,15 +88,25 @@ def match_bag(
             warn(line)
 
 
-def _shown_ahead(feed: Iterable[Turn], matcher: LiveMatcher, track: Trajectory, ahead_s: float) -> Iterator[Turn]:
-    """Show each turn to a matcher, and yield it once those of the time after it have been shown, too."""
-    waiting, ahead_ns = deque[Turn](), round(ahead_s * NS_PER_S)
+def _shown_ahead(
+    feed: Iterable[Turn], matcher: LiveMatcher, track: Trajectory, config: AerialConfig, *, due_alone: bool
+) -> Iterator[Turn]:
+    """Show each turn to a matcher, and yield it once those of the time after it have been shown, too.
+
+    Args:
+        due_alone: turns that are not due are not yielded, unless they may be parts of one that is: full scans take much memory.
+    """
+    waiting, ahead_ns, pace = deque[Turn](), round(config.around_s * NS_PER_S), Pace(config)
+    newest_ns: int | None = None
     for turn in feed:
-        set_back = bool(waiting) and is_set_back(turn.stamp_ns, waiting[-1].stamp_ns)
+        set_back = newest_ns is not None and is_set_back(turn.stamp_ns, newest_ns)
         while waiting and (set_back or turn.stamp_ns - waiting[0].stamp_ns > ahead_ns):
             yield waiting.popleft()
         matcher.show(turn, track)
-        waiting.append(turn)
+        newest_ns = turn.stamp_ns
+        unusable = bool(turn.why_not or outside(turn, track))
+        if unusable or not due_alone or config.submap > 1 or pace.is_due(turn.stamp_ns, track):
+            waiting.append(turn)
     yield from waiting
 
 
