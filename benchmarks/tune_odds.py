@@ -41,9 +41,10 @@ Values = NDArray[np.float64]
 
 
 class _Seen(NamedTuple):
-    """A match: its evidence, its turns, and the probability of each mode without `Belief`; and which modes are right."""
+    """A match: its evidence, of the scan itself and of all turns, and the probability of each mode without `Belief`; and which are right."""
 
     harbour: int
+    own: float
     evidence: float
     turns: int
     told: Values
@@ -72,10 +73,10 @@ def _of_harbour(seed: int) -> list[_Seen]:
                 odds = told ** (1.0 / BELIEF.decided)
                 whole = told.sum() / BELIEF.share(item.match.found)
                 off_m = np.array([m.pose[:2] for m in item.match.modes]) - shown.at(at).p_world_m[0, :2]
-                found.append(
-                    _Seen(seed, item.match.found.evidence, item.match.found.turns, odds * whole / odds.sum(),
-                          np.hypot(*off_m.T) < _NEAR_M)
-                )  # fmt: skip
+                seen = item.match.found
+                own = seen.own.evidence if seen.own else seen.evidence
+                right = np.hypot(*off_m.T) < _NEAR_M
+                found.append(_Seen(seed, own, seen.evidence, seen.turns, odds * whole / odds.sum(), right))
         return found
 
 
@@ -87,7 +88,7 @@ def _weights(seen: list[_Seen]) -> Values:
 
 def _fit_share(seen: list[_Seen]) -> tuple[Values, float, float]:
     """`enough`, `power` and `alike`; the mean negative log-likelihood with them, and without."""
-    evidence, turns = np.array([s.evidence for s in seen]), np.array([s.turns for s in seen])
+    own, evidence, turns = (np.array([s[k] for s in seen], dtype=float) for k in (1, 2, 3))
     whole, some = np.array([s.told.sum() for s in seen]), np.array([s.right.any() for s in seen])
     weight = _weights(seen)
 
@@ -96,7 +97,7 @@ def _fit_share(seen: list[_Seen]) -> tuple[Values, float, float]:
         return -float((weight * np.log(np.where(some, p, 1.0 - p))).sum())
 
     def shares(z: Values) -> Values:
-        return np.asarray(expit(z[1] * (np.log(evidence) - z[2] * np.log(turns) - z[0])))
+        return np.asarray(expit(z[1] * (np.log(np.maximum(own, evidence / turns ** z[2])) - z[0])))
 
     z = minimize(lambda z: miss(shares(z)), np.array([3.0, 2.0, 0.3]), method="Nelder-Mead").x
     return np.array([np.exp(z[0]), z[1], z[2]]), miss(shares(z)), miss(1.0)
@@ -118,12 +119,12 @@ def _fit_decided(seen: list[_Seen]) -> tuple[float, float, float]:
 
 def _table(seen: list[_Seen]) -> Iterator[str]:
     for low, high in pairwise(_BANDS):
-        band = [s for s in seen if low <= s.evidence < high]
+        band = [s for s in seen if low <= s.own < high]
         if not band:
             continue
         told, right = np.mean([s.told.sum() for s in band]), np.mean([s.right.any() for s in band])
         harbours = len({s.harbour for s in band})
-        yield f"  evidence {low:3.0f} to {high:3.0f}: {len(band):4d} matches in {harbours:2d}: claimed {told:.2f}, right {right:.2f}"
+        yield f"  evidence of the scan {low:3.0f} to {high:3.0f}: {len(band):4d} matches in {harbours:2d}: claimed {told:.2f}, right {right:.2f}"
 
 
 def main() -> None:

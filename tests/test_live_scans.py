@@ -62,7 +62,7 @@ def run(launch_bag: Path) -> Run:
     assert truth is not None
     assert isinstance(sensor, AerialConfig)
     cov = np.broadcast_to(np.diag([1.0, 1.0, 0.1, 1e-4, 1e-4, 1e-3]), (len(truth), 6, 6))
-    sensor = sensor.model_copy(update={"submap": 3, "every_s": 1.0, "every_m": 5.0})
+    sensor = sensor.model_copy(update={"submap": 3, "submap_s": 0.0, "every_s": 1.0, "every_m": 5.0})
     return Run(launch_bag, sensor, replace(truth, cov=cov), app.choose_datum(recording, vessel))
 
 
@@ -295,9 +295,10 @@ def matched_turns(
         ({"submap_s": 60.0}, 0.2, ["03", "013", "023", "03", "034", "035"]),
         ({"submap_s": 60.0}, 0.0, ["0", "01", "02", "03", "04", "05"]),
         ({"submap_s": 4.0, "matcher": "bl"}, 1.0, ["0", "1", "2", "3", "4", "5"]),  # as printed
-        ({}, 1.0, ["0", "1", "2", "3", "4", "5"]),
+        ({"submap_s": 0.0}, 1.0, ["0", "1", "2", "3", "4", "5"]),
+        ({}, 1.0, ["012345"] * 6),  # 7.5 s around
     ],
-    ids=["apart", "scans together", "slow", "at rest", "bl", "alone"],
+    ids=["apart", "scans together", "slow", "at rest", "bl", "alone", "by default"],
 )
 def test_what_is_seen_from_elsewhere_before_and_after_is_matched_as_well(
     config: dict[str, Any], speed_mps: float, expected: list[str], seen: Seen, monkeypatch: pytest.MonkeyPatch

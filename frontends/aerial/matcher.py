@@ -132,17 +132,19 @@ class Belief:
 
     Attributes:
         enough, power: the odds that one of the modes is right if the truth is in the window are (N / enough)^power, with the evidence N
-            of a scan. alike: the same walls seen from n places are n^alike times the evidence. decided: exponent of the odds between modes.
+            of the scan, or that of all n turns / n^alike where this is more: they show the same walls. decided: exponent of the odds
+            between modes.
     """
 
     enough: float = 15.0
-    power: float = 2.8
-    alike: float = 0.32
+    power: float = 3.3
+    alike: float = 0.4
     decided: float = 0.35
 
     def share(self, found: Outline) -> float:
         """Return the probability that one of the modes is right if the truth is in the window."""
-        evidence = max(found.evidence, 1e-9) / found.turns**self.alike
+        own = found.own.evidence if found.own else 0.0
+        evidence = max(own, found.evidence / found.turns**self.alike, 1e-9)
         return float(special.expit(self.power * np.log(evidence / self.enough)))
 
     def less_decided(self, modes: Sequence[Mode]) -> list[Mode]:

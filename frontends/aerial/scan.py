@@ -50,7 +50,7 @@ class Outline:
             away from the sensor. shore_share: (K,) weight of each. water_m: (L, 2) points seen as free water.
         columns_m: (J, 2) where anything rises out of the water in the scan itself. lowest_m: height over the waterline below which
             a twentieth of its points lies; NaN of none.
-        turns: of how many places it is, seen from apart.
+        turns: of how many places it is, seen from apart. own: outline of the scan itself; None: this is it.
     """
 
     faces_m: Array
@@ -64,6 +64,7 @@ class Outline:
     columns_m: Array
     lowest_m: float = float("nan")
     turns: int = 1
+    own: Outline | None = None
 
     @property
     def evidence(self) -> float:
@@ -80,6 +81,7 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
     now = np.arange(len(p)) < (len(p) if cloud.now is None else cloud.now)
     keep &= (keep & now).any()  # without a point of its own a scan tells nothing new
     now, p, origin = now[keep], p[keep], cloud.origin_m[keep]
+    own = None if now.all() else outline(LevelCloud(p[now], origin[now]), None, reach_m)
     dry = p[:, 2] > _DRY_M
     cells, low, high, count = _columns(p[dry])
     # A face is hit at several heights; a roof or a quay's deck, seen at a grazing angle, is not.
@@ -96,9 +98,10 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
         to_land_rad=to_land,
         shore_share=_lines(shore, 2.0 * _NEAR_M)[1],
         water_m=_free_water(shore, p[~dry]),
-        columns_m=cells if now.all() else _columns(p[dry & now])[0],
+        columns_m=own.columns_m if own else cells,
         lowest_m=float(np.quantile(p[now, 2], 0.05)) if now.any() else float("nan"),
         turns=cloud.turns,
+        own=own,
     )
 
 

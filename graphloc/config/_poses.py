@@ -100,10 +100,10 @@ class AerialConfig(AnyPoseConfig):
     submap: Annotated[int, Field(ge=1, le=100)] = 1
     """Number of consecutive scans combined for one match, motion-compensated: where drivers publish parts of a turn, the number of
     parts."""
-    submap_s: Annotated[NonNegative, Field(le=60.0)] = 0.0
+    submap_s: Annotated[NonNegative, Field(le=60.0)] = 15.0
     """What was seen around a scan in so many seconds, half of them before and half after it, from places at least 0.5 m and 0.5 s apart,
-    is matched with it, s; at most 60. All scans are then matched twice, alone at first. 15 helps where boats look alike. Not
-    online, and not with `matcher: bl`."""
+    is matched with it, s; at most 60. Where boats look alike, a longer piece of a row does not. All scans are matched twice, alone at
+    first; 0: once, alone. Not online, and not with `matcher: bl`."""
     every_s: Positive = 1.0
     """Minimum time between two matches, s."""
     every_m: NonNegative = 0.5
