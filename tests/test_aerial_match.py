@@ -17,6 +17,7 @@ from graphloc.errors import InputError
 from graphloc.eval.match_picture import drawn
 from graphloc.frames import Array
 from graphloc.frontends.aerial import Match, Matcher, Prior
+from graphloc.frontends.aerial import matcher as matcher_
 from graphloc.frontends.aerial.cloud import Cloud, decode_cloud, level
 from graphloc.frontends.aerial.image import AerialImage, Patch
 from graphloc.frontends.aerial.layers import (
@@ -324,7 +325,7 @@ def test_modes_are_less_decided_than_they_look() -> None:
     assert Belief().less_decided([]) == []
 
 
-def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path) -> None:
+def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A pier with two corners in view, thought to be 1.7 m and 2 deg elsewhere; found to a cell of 0.25 m (C.2)."""
     picture(tmp_path / "a.tif", 32633, 0.2, np.array([-15.0, 10.0, 15.0, 60.0]))
     rng, true = np.random.default_rng(0), np.array([3.0, -4.0, np.radians(40.0)])
@@ -351,6 +352,11 @@ def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path) -> None:
     empty = matcher.match(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), prior)
     assert not empty.modes
     assert empty.why_not == "a scan without a point outside the vessel"
+    monkeypatch.setattr(matcher_, "modes_of", lambda *_: ([Mode(true, np.eye(3), p) for p in (0.64, 0.04)], 0.32))
+    two = matcher.match(LevelCloud(points, np.zeros((len(points), 2))), prior)
+    first, second = (m.probability for m in two.modes)
+    assert np.log(first / second) == pytest.approx(BELIEF.decided * np.log(16.0))
+    assert first + second + two.none == pytest.approx(1.0)
     wet = matcher.match(LevelCloud(sea, np.zeros((len(sea), 2))), prior)
     assert wet.why_not == "a scan of water alone"
 
