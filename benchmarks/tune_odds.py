@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fit how far a match is to be believed, on runs through harbours that no figure uses.
+"""Fit how far a match is to be believed, on runs through harbours that no item of docs/results.md uses.
 
 The scans of each are matched alone, and together with others, around its track without matches; so with all that a run has: a
 tide, boats that have moved, GNSS that bends the track. Prints what stands in `frontends/aerial/matcher.py` as `Belief`, and how
