@@ -68,6 +68,8 @@ def _of_harbour(seed: int) -> list[_Seen]:
                 at = np.array([item.stamp_ns])
                 if item.match is None or not item.match.modes or not shown.covers(at).all():
                     continue
+                if submap_s > 0.0 and item.match.found.turns == 1:
+                    continue  # nothing to be matched with: it is there already
                 told = np.array([m.probability for m in item.match.modes])
                 odds = told ** (1.0 / BELIEF.decided)
                 whole = told.sum() / BELIEF.share(item.match.found)
