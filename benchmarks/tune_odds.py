@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fit how far a match is to be believed, on runs through harbours that no figure uses.
+"""Fit how far a match is to be believed, on runs through harbours that no item of docs/results.md uses.
 
 The scans of each are matched alone, and together with others, around its track without matches; so with all that a run has: a
 tide, boats that have moved, GNSS that bends the track. Prints what stands in `frontends/aerial/matcher.py` as `Belief`, and how
@@ -69,6 +69,8 @@ def _of_harbour(seed: int) -> list[_Seen]:
                 at = np.array([item.stamp_ns])
                 if item.match is None or not item.match.modes or not shown.covers(at).all():
                     continue
+                if submap_s > 0.0 and item.match.found.turns == 1:
+                    continue  # nothing to be matched with: it is there already
                 told = np.array([m.probability for m in item.match.modes])
                 odds = told ** (1.0 / BELIEF.decided)
                 whole = told.sum() / BELIEF.share(item.match.found)

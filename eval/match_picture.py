@@ -131,7 +131,7 @@ def _image(match: Match, pose: Array) -> tuple[Pixels, _View]:
     assert match.layers is not None
     patch = match.layers.patch
     places_m = np.vstack([match.found.faces_m, match.found.shore_m])
-    around_m = max(_LEAST_M, 1.1 * float(np.abs(places_m).max(initial=0.0)))
+    around_m = max(_LEAST_M, 1.1 * float(np.hypot(*places_m.T).max(initial=0.0)))
     half = int(around_m / patch.cell_m)
     zoom = 0.5 * _SIDE / half
     column, row = np.rint(patch.cells(pose[None, :2])[0]).astype(int)

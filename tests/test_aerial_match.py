@@ -17,6 +17,7 @@ from graphloc.errors import InputError
 from graphloc.eval.match_picture import drawn
 from graphloc.frames import Array
 from graphloc.frontends.aerial import Match, Matcher, Prior
+from graphloc.frontends.aerial import matcher as matcher_
 from graphloc.frontends.aerial.cloud import Cloud, decode_cloud, level
 from graphloc.frontends.aerial.image import AerialImage, Patch
 from graphloc.frontends.aerial.layers import (
@@ -299,18 +300,23 @@ def test_little_evidence_is_believed_less() -> None:
     assert belief.share(with_evidence(0)) < 1e-6
 
 
-@pytest.mark.parametrize("away_m", [20.0, 90.0])
-def test_a_picture_shows_what_was_matched_however_far(away_m: float) -> None:
-    cells, g = np.zeros((960, 960, 3), np.uint8), grid(2)
+@pytest.mark.parametrize(
+    ("away_m", "yaw_deg", "east_m"), [(20.0, 0.0, 0.0), (90.0, 0.0, 0.0), (90.0, 45.0, 0.0), (90.0, 0.0, -100.0)]
+)
+def test_a_picture_shows_what_was_matched_however_far(away_m: float, yaw_deg: float, east_m: float) -> None:
+    """Due east of the vessel, which may head elsewhere, and lie 20 m from the edge of what is known."""
+    cells, g, yaw = np.zeros((960, 960, 3), np.uint8), grid(2), np.radians(yaw_deg)
     patch = Patch(cells, np.ones((960, 960), dtype=bool), -120.0, 120.0, 0.25)
     layers = Layers(patch, 1.0, cells[None, ..., 0], cells[None, ..., 0], None)
-    found = replace(with_evidence(1), shore_m=np.array([(away_m, 0.0)]))
-    match = Match(Prior(np.zeros(3), np.ones(3)), found, layers, g, np.zeros((17, 5, 5), np.float32))
+    found = replace(with_evidence(1), shore_m=away_m * np.array([(np.cos(yaw), -np.sin(yaw))]))
+    match = Match(Prior(np.array([east_m, 0.0, yaw]), np.ones(3)), found, layers, g, np.zeros((17, 5, 5), np.float32))
     picture_ = drawn(match)
-    size = len(picture_)
-    rows, columns = np.nonzero((picture_[:, :size] == (80, 255, 80)).all(axis=2))
-    assert abs(rows.mean() - 0.5 * size) < 5.0  # north is up: due east of the middle
-    assert columns.mean() - 0.5 * size == pytest.approx(0.5 * size * away_m / max(60.0, 1.1 * away_m), rel=0.02)
+    size, around_m = len(picture_), max(60.0, 1.1 * away_m)
+    image = picture_[:, : -(size // 2)]  # beside it: the score
+    rows, columns = np.nonzero((image == (80, 255, 80)).all(axis=2))
+    assert abs(rows.mean() - 0.5 * size) < 5.0  # north is up
+    from_edge_m = min(around_m, 120.0 + east_m) + away_m
+    assert columns.mean() == pytest.approx(0.5 * size * from_edge_m / around_m, rel=0.01)
 
 
 def test_modes_are_less_decided_than_they_look() -> None:
@@ -319,7 +325,7 @@ def test_modes_are_less_decided_than_they_look() -> None:
     assert Belief().less_decided([]) == []
 
 
-def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path) -> None:
+def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A pier with two corners in view, thought to be 1.7 m and 2 deg elsewhere; found to a cell of 0.25 m (C.2)."""
     picture(tmp_path / "a.tif", 32633, 0.2, np.array([-15.0, 10.0, 15.0, 60.0]))
     rng, true = np.random.default_rng(0), np.array([3.0, -4.0, np.radians(40.0)])
@@ -346,6 +352,11 @@ def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path) -> None:
     empty = matcher.match(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), prior)
     assert not empty.modes
     assert empty.why_not == "a scan without a point outside the vessel"
+    monkeypatch.setattr(matcher_, "modes_of", lambda *_: ([Mode(true, np.eye(3), p) for p in (0.64, 0.04)], 0.32))
+    two = matcher.match(LevelCloud(points, np.zeros((len(points), 2))), prior)
+    first, second = (m.probability for m in two.modes)
+    assert np.log(first / second) == pytest.approx(BELIEF.decided * np.log(16.0))
+    assert first + second + two.none == pytest.approx(1.0)
     wet = matcher.match(LevelCloud(sea, np.zeros((len(sea), 2))), prior)
     assert wet.why_not == "a scan of water alone"
 

@@ -276,14 +276,16 @@ def test_a_submap_is_no_longer_than_asked(seen: Seen) -> None:
 
 def matched_turns(
     monkeypatch: pytest.MonkeyPatch, turns: Sequence[Turn], speed_mps: float, at_ns: int | None = None, **config: Any
-) -> None:
+) -> list[Matched]:
     """Match turns made by hand as those of a bag are, every second."""
     feed = Feed({"top": (np.zeros(3), np.eye(3))}, turns)
     monkeypatch.setattr(scans, "Bag", lambda *_: nullcontext(SimpleNamespace(warnings=[])))
     monkeypatch.setattr(scans, "ScanFeed", lambda *_: feed)
     sensor = AerialConfig(every_s=1.0, every_m=0.0, **config)
     track, datum = track_of(-64.0, 6.0, speed_mps), Datum(Geodetic(57.7, 14.5, 30.0))
-    assert list(match_bag([Path()], sensor, Path(), "base_link", track, datum, at_ns=at_ns))
+    found = list(match_bag([Path()], sensor, Path(), "base_link", track, datum, at_ns=at_ns))
+    assert found
+    return found
 
 
 @pytest.mark.parametrize(
@@ -349,6 +351,24 @@ def test_only_scans_that_are_due_wait_for_those_after_them(seen: Seen, monkeypat
     assert max(alive) <= 12  # with what is kept, of 0.5 m
 
 
+def test_a_scan_between_those_that_are_due_is_matched_if_asked_for(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+    matched_turns(monkeypatch, Counted(60), 1.0, BEGIN + 24 * S // 10, submap_s=1.0)
+    assert [sorted(set(numbers)) for numbers in seen.numbers] == [[20, 24, 25]]
+
+
+def test_parts_of_a_turn_that_are_not_due_are_matched_with_it(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three parts of now, and of 0.5 s before and after."""
+    matched_turns(monkeypatch, Counted(50), 1.0, submap_s=1.0, submap=3)
+    assert sorted(set(seen.numbers[2])) == [13, 14, 15, 18, 19, 20, 23, 24, 25]
+
+
+def test_scans_outside_of_the_track_are_told_due_or_not(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ends at 6 s."""
+    found = matched_turns(monkeypatch, Counted(65), 1.0, submap_s=4.0)
+    assert [since_s(m) for m in found if m.match is not None] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    assert ["outside of the track" in m.why_not for m in found[7:]] == [True] * 4
+
+
 @pytest.mark.parametrize("damaged", [False, True])
 def test_scans_of_two_clocks_are_not_matched_together(
     damaged: bool, seen: Seen, monkeypatch: pytest.MonkeyPatch
@@ -356,8 +376,18 @@ def test_scans_of_two_clocks_are_not_matched_together(
     """A damaged scan between them, whose time is that of its arrival, is no turn of theirs."""
     between = [Turn(BEGIN + 900 * S, BEGIN + 900 * S, (), "damaged")] if damaged else []
     turns = [*(turn_at(t, t) for t in (0, 1, 2)), *between, *(turn_at(t, 60 + t) for t in (-60, -59))]
-    matched_turns(monkeypatch, turns, 1.0, submap_s=4.0)
+    found = matched_turns(monkeypatch, turns, 1.0, submap_s=4.0)
     assert [sorted(set(numbers)) for numbers in seen.numbers] == [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1], [0, 1]]
+    assert [m.why_not for m in found if m.match is None] == ["damaged"] * damaged
+
+
+def test_a_clock_that_is_set_back_is_seen_by_scans_that_are_not_due(
+    seen: Seen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From 0.9 s, of a scan that is not matched, to -0.5 s."""
+    turns = [turn_at(t, number) for t, number in ((0.0, 0), (0.9, 1), (-0.5, 60), (0.6, 61))]
+    matched_turns(monkeypatch, turns, 1.0, submap_s=4.0)
+    assert [sorted(set(numbers)) for numbers in seen.numbers] == [[0, 1], [60, 61], [60, 61]]
 
 
 @pytest.mark.parametrize("ends_s", [0.0, 0.05], ids=["after its last point", "at its begin"])

@@ -47,6 +47,8 @@ def test_the_vessel_herself_does_not_trail_behind() -> None:
     assert [len(c.points_m) for c in now] == [5]
     assert (seen.now, seen.turns) == (5, 4)
     assert outline(seen, None).turns == 4
+    of_two_lidars = [[*clouds, *clouds] for clouds in others]
+    assert level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0, of_two_lidars).turns == 4
     np.testing.assert_allclose(seen.points_m[:2], [(2.0, -1.0, 1.5), (-4.0, 1.0, 1.5)], atol=1e-9)
     np.testing.assert_allclose(seen.points_m[2:, :2], np.broadcast_to([-9.0, 20.0], (12, 2)), atol=AT_MOST_M)
     np.testing.assert_allclose(
@@ -66,6 +68,14 @@ def test_the_vessel_herself_does_not_trail_behind() -> None:
     deep_m = more_m.copy()
     deep_m[5:, 2] = -9.0
     assert outline(replace(seen, points_m=deep_m, origin_m=np.zeros((15, 2))), None).lowest_m > 0.0
+
+
+def test_where_nothing_but_the_vessel_was_seen_is_no_place_of_others() -> None:
+    cabin_m, wall_m = np.array([(3.0, 1.0, 0.5)]), np.array([(5.0, -20.0, 0.0)])
+    submap = Submap(AerialConfig(hull_m=HULL_M), MOUNT, AROUND_S)
+    for t, seen_m in enumerate((wall_m, cabin_m, np.zeros((0, 3)), wall_m)):
+        give(submap, turn_of(t, seen_m), np.array([3.0 * t, 0.0]))
+    assert stamps_s(submap) == [0]
 
 
 def test_dense_scans_of_before_are_thinned() -> None:

@@ -81,7 +81,7 @@ class LiveMatcher:
         self._matcher = _matcher(config, folder, datum)
         self._submap = Submap(config, mounts, around_s)
         self._pace = Pace(config)
-        self._before: tuple[Array, int] | None = None  # and of the last one that had a mode
+        self._before: tuple[Array, int] | None = None  # place and stamp of the last match that had a mode
 
     def offer(self, turn: Turn, track: Trajectory, *, growing: bool = True) -> Matched | Literal["wait"] | None:
         """Match a turn if it is due. Turns are offered in order, and the same one again after "wait".

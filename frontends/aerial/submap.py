@@ -89,11 +89,11 @@ class Submap:
         return self._newest[-1]
 
     def clouds(self) -> tuple[list[Cloud], list[list[Cloud]]]:
-        """Return the clouds of now, and those of each turn before and after."""
+        """Return the clouds of now, and those of each turn before and after that has a point."""
         now = [c for turn in self._newest for c in turn.clouds]
         held, at_ns = {(c.lidar, c.stamp_ns) for c in now}, self.newest.stamp_ns
         near = [clouds for _, stamp_ns, clouds in self._kept if abs(stamp_ns - at_ns) <= self._around_ns]
-        others = [[c for c in clouds if (c.lidar, c.stamp_ns) not in held] for clouds in near]
+        others = [[c for c in clouds if len(c.points_m) and (c.lidar, c.stamp_ns) not in held] for clouds in near]
         return now, [clouds for clouds in others if clouds]
 
     def _is_apart(self, stamp_ns: int, place_m: Array) -> bool:
