@@ -348,7 +348,8 @@ def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path, monkeypatch: pytest.
     told, told_less = (BELIEF.share(f) for f in (known, less.found))
     assert told_less < 0.3
     assert told > 0.8
-    assert (1.0 - less.none) / (1.0 - found.none) == pytest.approx(told_less / told, rel=1e-3)
+    assert (1.0 - less.none) / (1.0 - found.none) == pytest.approx(told_less / told)
+    assert len(less.modes) == len(found.modes)
     empty = matcher.match(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), prior)
     assert not empty.modes
     assert empty.why_not == "a scan without a point outside the vessel"
@@ -356,7 +357,11 @@ def test_a_clean_scene_is_matched_to_a_cell(tmp_path: Path, monkeypatch: pytest.
     two = matcher.match(LevelCloud(points, np.zeros((len(points), 2))), prior)
     first, second = (m.probability for m in two.modes)
     assert np.log(first / second) == pytest.approx(BELIEF.decided * np.log(16.0))
+    assert first + second == pytest.approx(0.68 * told)
     assert first + second + two.none == pytest.approx(1.0)
+    monkeypatch.setattr(matcher_, "modes_of", modes_of)
+    monkeypatch.setattr(matcher_, "BELIEF", Belief(enough=1e4))
+    assert len(matcher.match(LevelCloud(points, np.zeros((len(points), 2))), prior).modes) == len(found.modes)
     wet = matcher.match(LevelCloud(sea, np.zeros((len(sea), 2))), prior)
     assert wet.why_not == "a scan of water alone"
 

@@ -147,13 +147,16 @@ class Belief:
         evidence = max(own, found.evidence / found.turns**self.alike, 1e-9)
         return float(special.expit(self.power * np.log(evidence / self.enough)))
 
-    def less_decided(self, modes: Sequence[Mode]) -> list[Mode]:
-        """Return modes whose odds are closer to even; their sum stays."""
+    def less_decided(self, modes: Sequence[Mode], share: float = 1.0) -> list[Mode]:
+        """Return modes whose odds are closer to even, with a share of their sum."""
         if not modes:
             return []
         told = np.array([m.probability for m in modes])
         odds = told**self.decided
-        return [replace(m, probability=float(p)) for m, p in zip(modes, odds * (told.sum() / odds.sum()), strict=True)]
+        return [
+            replace(m, probability=float(p))
+            for m, p in zip(modes, odds * (share * told.sum() / odds.sum()), strict=True)
+        ]
 
 
 BELIEF = Belief()
@@ -187,8 +190,9 @@ class Matcher:
         grid = grid_around(layers, prior.pose, half_m, half_deg)
         score = log_likelihood_of(found, layers, grid)
         trust = _trust(score, _within(prior.sigma, np.array([half_m, half_m, np.radians(half_deg)])))
-        modes, none = modes_of(score, grid, _NONE_LOG, 1.0 - trust * BELIEF.share(found), _MODES)
-        modes = BELIEF.less_decided(modes)
+        modes, _ = modes_of(score, grid, _NONE_LOG, 1.0 - trust, _MODES)
+        modes = BELIEF.less_decided(modes, BELIEF.share(found))  # which modes there are does not turn on it
+        none = 1.0 - sum(m.probability for m in modes)
         why_not = "" if modes else NO_POSE
         cut_off = half_m < 2.0 * sigma_m or half_deg < 2.0 * sigma_deg
         return Match(prior, found, layers, grid, score, tuple(modes), none, why_not, cut_off)
