@@ -319,6 +319,17 @@ def test_a_picture_shows_what_was_matched_however_far(away_m: float, yaw_deg: fl
     assert columns.mean() == pytest.approx(0.5 * size * from_edge_m / around_m, rel=0.01)
 
 
+def test_the_heading_may_be_told_where_the_place_is_not() -> None:
+    modes = [(0.0, 179.0, 0.4), (4.0, -180.0, 0.3), (8.0, 170.0, 0.2)]
+    match = Match(
+        Prior(np.zeros(3), np.ones(3)),
+        with_evidence(1),
+        modes=tuple(Mode(np.array([x, 0.0, np.radians(yaw)]), np.eye(3), p) for x, yaw, p in modes),
+    )
+    assert match.of_heading == pytest.approx(0.7)
+    assert replace(match, modes=()).of_heading == 0.0
+
+
 def test_modes_are_less_decided_than_they_look() -> None:
     modes = [Mode(np.zeros(3), np.eye(3), p) for p in (0.64, 0.04)]
     assert [m.probability for m in Belief(decided=0.5).less_decided(modes)] == pytest.approx([0.544, 0.136])

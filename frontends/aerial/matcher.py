@@ -27,6 +27,7 @@ _MODES = 5
 # a place is lost with the square of time, a heading linearly.
 _CARRIED_S, _CARRIED_M = 5.0, 0.1
 _CARRIED_YAW_S, _CARRIED_YAW_RAD = 60.0, np.radians(0.5)
+_SAME_RAD = np.radians(2.0)  # headings that are as near are the same
 _LEAST_NEWS = 1e-6  # of a match at the same place and time: next to nothing, but its covariance stays finite
 NO_POSE = "no pose in the window stands out"
 """Why a scan has no match: it fits nowhere better than by chance."""
@@ -98,6 +99,12 @@ class Match:
         """Median distance to what was matched, m; 0 where the matcher does not say."""
         places_m = np.vstack([self.found.faces_m, self.found.shore_m])
         return float(np.median(np.hypot(*places_m.T))) if len(places_m) else 0.0
+
+    @property
+    def of_heading(self) -> float:
+        """Probability of the best mode's heading, wherever the vessel is: a row of boats moves the place, not the heading."""
+        alike = (m for m in self.modes if abs(float(wrap_angle(m.pose[2] - self.modes[0].pose[2]))) < _SAME_RAD)
+        return sum(m.probability for m in alike)
 
     def fix(
         self, stamp_ns: int, sensor: str, since: Since | None = None, axes: tuple[str, ...] = ("x", "y", "yaw")

@@ -22,7 +22,7 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
 
 _MISLED = 0.25  # matches to scans that fit nowhere, below which the former are doubted
-_SURE = 0.5  # probability of a match that counts for how the heading turns
+_SURE = 0.5  # probability of a match's heading that counts for how the heading turns
 _TURNED_SIGMAS, _TOLD_RAD, _FEWEST = (
     2.0,
     np.radians(10.0),
@@ -80,7 +80,7 @@ def with_matches(
             if item.match is not None and item.match.modes:
                 matched += 1
                 best, prior = item.match.modes[0], item.match.prior
-                if best.probability > _SURE:
+                if item.match.of_heading > _SURE:
                     turns.append((float(wrap_angle(best.pose[2] - prior.pose[2])), float(prior.sigma[2])))
                 gathered.take(item.match.fix(item.stamp_ns, name, item.since, sensor.axes))
             else:
