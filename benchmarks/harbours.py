@@ -21,7 +21,9 @@ from graphloc.config import VesselConfig
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, harbour_scenarios, simulate
 from graphloc.eval.simulate.bag import write_bag
+from graphloc.recording import Recording
 from graphloc.solution import Solution
+from graphloc.trajectory import Trajectory
 
 _SEEDS = range(340, 352)  # a yardstick: nothing is tuned on them
 _FAR_M = 2.0
@@ -35,7 +37,7 @@ class _Track(NamedTuple):
     held: float
 
 
-def drawn(seed: int, folder: Path) -> Scenario:
+def _drawn(seed: int, folder: Path) -> Scenario:
     """Draw a harbour and what a vessel has there: a large one with five LiDARs or a launch with one, GNSS trouble, compass or none."""
     rng = np.random.default_rng([seed, 77])
     return replace(
@@ -53,18 +55,24 @@ def with_matches(config: VesselConfig, submap_s: float = 0.0) -> VesselConfig:
     return config.model_copy(update={"sensors": config.sensors | {"aerial": type(config.sensors["aerial"])(**given)}})
 
 
-def _run(seed: int) -> tuple[_Track, ...]:
-    """Smoothed without matches, with them, and with those of scans that are matched together; and online."""
+def recorded(seed: int, scratch: Path) -> tuple[Path, Recording, VesselConfig, Trajectory]:
+    """Write the bag of a drawn run; return its folder, what is in it, its configuration, and where the image shows the vessel."""
     cv2.setNumThreads(1)
     numba.set_num_threads(1)
+    folder = scratch / "sim"
+    write_bag(simulate(_drawn(seed, scratch), seed), folder, ros=2)
+    recording, config = app.load([folder / "run"], folder / "vessel.yaml")
+    assert recording.truth is not None
+    return folder, recording, config, as_shown(recording.truth, folder)
+
+
+def _run(seed: int) -> tuple[_Track, ...]:
+    """Smoothed without matches, with them, and with those of scans that are matched together; and online."""
     with tempfile.TemporaryDirectory() as scratch_:
-        folder = Path(scratch_) / "sim"
-        write_bag(simulate(drawn(seed, Path(scratch_)), seed), folder, ros=2)
-        recording, config = app.load([folder / "run"], folder / "vessel.yaml")
+        folder, recording, config, shown = recorded(seed, Path(scratch_))
         single, scans = with_matches(config), app.Scans((folder / "run",), folder)
         truth = recording.truth
         assert truth is not None
-        shown = as_shown(truth, folder)
 
         def track(solution: Solution) -> _Track:
             held = compare_to_truth(solution.trajectory, truth).coverage_95

@@ -17,18 +17,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
-import numba
 import numpy as np
-from _scenes import as_shown
-from harbours import drawn, with_matches
+from harbours import recorded, with_matches
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
 from graphloc import app
-from graphloc.eval.simulate import simulate
-from graphloc.eval.simulate.bag import write_bag
 from graphloc.frontends.aerial import match_bag
 from graphloc.frontends.aerial.matcher import BELIEF
 
@@ -52,14 +47,8 @@ class _Seen(NamedTuple):
 
 
 def _of_harbour(seed: int) -> list[_Seen]:
-    cv2.setNumThreads(1)
-    numba.set_num_threads(1)
     with tempfile.TemporaryDirectory() as scratch_:
-        folder = Path(scratch_) / "sim"
-        write_bag(simulate(drawn(seed, Path(scratch_)), seed), folder, ros=2)
-        recording, config = app.load([folder / "run"], folder / "vessel.yaml")
-        assert recording.truth is not None
-        shown = as_shown(recording.truth, folder)
+        folder, recording, config, shown = recorded(seed, Path(scratch_))
         track = app.smooth_recording(recording, with_matches(config)).solution.trajectory
         datum = app.choose_datum(recording, config)
         found = []

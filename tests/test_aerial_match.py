@@ -297,6 +297,8 @@ def test_little_evidence_is_believed_less() -> None:
     for evidence, odds in ((10, 1.0), (20, 4.0), (5, 0.25)):
         assert belief.share(with_evidence(evidence)) == pytest.approx(odds / (1.0 + odds))
     assert belief.share(with_evidence(40, turns=16)) == pytest.approx(0.5)  # of one alone 10
+    assert belief.share(replace(with_evidence(40, turns=16), own=with_evidence(20))) == pytest.approx(0.8)
+    assert belief.share(replace(with_evidence(40, turns=16), own=with_evidence(5))) == pytest.approx(0.5)
     assert belief.share(with_evidence(0)) < 1e-6
 
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from graphloc.config import AerialConfig
 from graphloc.frames import Array
@@ -46,7 +47,13 @@ def test_the_vessel_herself_does_not_trail_behind() -> None:
     seen = level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0, others)
     assert [len(c.points_m) for c in now] == [5]
     assert (seen.now, seen.turns) == (5, 4)
-    assert outline(seen, None).turns == 4
+    found = outline(seen, None)
+    assert found.turns == 4
+    assert found.own is not None
+    assert found.own.own is None
+    alone = outline(level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0), None)
+    assert found.own.evidence == pytest.approx(alone.evidence)
+    assert alone.evidence < found.evidence
     of_two_lidars = [[*clouds, *clouds] for clouds in others]
     assert level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0, of_two_lidars).turns == 4
     np.testing.assert_allclose(seen.points_m[:2], [(2.0, -1.0, 1.5), (-4.0, 1.0, 1.5)], atol=1e-9)
