@@ -3,12 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from graphloc.config import AerialConfig
 from graphloc.frames import Array
 from graphloc.frontends.aerial.cloud import Cloud, level
-from graphloc.frontends.aerial.scan import outline
+from graphloc.frontends.aerial.scan import LevelCloud, outline
 from graphloc.frontends.aerial.submap import Submap, Turn
 from graphloc.trajectory import Trajectory
 
@@ -47,13 +46,7 @@ def test_the_vessel_herself_does_not_trail_behind() -> None:
     seen = level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0, others)
     assert [len(c.points_m) for c in now] == [5]
     assert (seen.now, seen.turns) == (5, 4)
-    found = outline(seen, None)
-    assert found.turns == 4
-    assert found.own is not None
-    assert found.own.own is None
-    alone = outline(level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0), None)
-    assert found.own.evidence == pytest.approx(alone.evidence)
-    assert alone.evidence < found.evidence
+    assert outline(seen, None).turns == 4
     of_two_lidars = [[*clouds, *clouds] for clouds in others]
     assert level(now, MOUNT, ahead(3, 3.0), 3 * S, 0.0, of_two_lidars).turns == 4
     np.testing.assert_allclose(seen.points_m[:2], [(2.0, -1.0, 1.5), (-4.0, 1.0, 1.5)], atol=1e-9)
@@ -83,6 +76,17 @@ def test_where_nothing_but_the_vessel_was_seen_is_no_place_of_others() -> None:
     for t, seen_m in enumerate((wall_m, cabin_m, np.zeros((0, 3)), wall_m)):
         give(submap, turn_of(t, seen_m), np.array([3.0 * t, 0.0]))
     assert stamps_s(submap) == [0]
+
+
+def test_the_outline_of_the_scan_itself_is_beside_that_of_all() -> None:
+    posts_m = np.array([(x, y, z) for x, y in ((10.0, 1.0), (1.0, 30.0)) for z in (0.5, 1.0, 1.5)])
+    found = outline(LevelCloud(posts_m, np.zeros((6, 2)), now=3, turns=2), None)
+    np.testing.assert_allclose(found.faces_m, [(1.0, 30.0), (10.0, 1.0)])
+    assert found.own is not None
+    np.testing.assert_allclose(found.own.faces_m, [(10.0, 1.0)])
+    assert found.own.evidence == 2.0  # a face, and a first return
+    assert found.evidence == 4.0
+    assert found.own.own is None
 
 
 def test_dense_scans_of_before_are_thinned() -> None:
