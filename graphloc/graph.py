@@ -216,12 +216,14 @@ class FalseModel:
         repeats: probability that a false one that follows a false one repeats its error (a moored boat
             taken for another one is so again in the next scan).
         news: share of its evidence for right or false that is independent of the measurement before it.
+        misled: (k, k) of the error of an estimate that believes false ones; None: `cov`.
     """
 
     probability: float
     cov: Array
     repeats: float
     news: float = 1.0
+    misled: Array | None = None
 
 
 def _unknown() -> Array:

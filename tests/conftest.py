@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-# As many threads of linear algebra as cores, in each of as many workers, wait for each other: 7 to 25 % of the processor's time.
-# Before numpy is imported; workers and programs that tests start inherit it.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# As many threads of linear algebra as cores, in each of as many workers, wait for each other: 7 to 25 % of the processor's time; those of
+# the matcher 5 %. Before numpy is imported; workers and programs that tests start inherit it.
+for threads in ("OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(threads, "1")
 gc.set_threshold(100_000, 20, 100)  # looking again and again through runs that tests share took 3 % of the time
 
 

@@ -127,7 +127,8 @@ class Match:
             )
             for m, p in zip(self.modes, share * (told.sum() / share.sum()), strict=True)
         )
-        return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes, news=news)
+        window = None if self.grid is None else self.grid.half_widths[picked]
+        return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes, news=news, window=window)
 
 
 @dataclass(frozen=True, slots=True)
