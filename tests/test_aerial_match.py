@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graphloc.config import AerialConfig, PoseConfig
+from graphloc.config import AerialConfig
 from graphloc.errors import InputError
 from graphloc.eval.match_picture import drawn
-from graphloc.factors import pose
+from graphloc.factors import aerial
 from graphloc.frames import Array
 from graphloc.frontends.aerial import Match, Matcher, Prior
 from graphloc.frontends.aerial import matcher as matcher_
@@ -410,14 +410,15 @@ def test_some_axes_of_a_match() -> None:
 def test_a_false_match_lies_in_the_window_too() -> None:
     """The wider it was sought in, the more does it say that it agrees with the prediction: in proportion, along each axis."""
     none = outline(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), None)
-    mode, config = Mode(np.zeros(3), 1e-6 * np.eye(3), 0.5), PoseConfig(topic="/aerial", axes=("x", "y", "yaw"))
-    nowhere = pose.false(Match(Prior(np.zeros(3), np.ones(3)), none, modes=(mode,)).fix(0, "a"), config)
+    mode, config, false_of = Mode(np.zeros(3), 1e-6 * np.eye(3), 0.5), AerialConfig(image="a.tif"), aerial.ROW.false
+    assert false_of is not None
+    nowhere = false_of(Match(Prior(np.zeros(3), np.ones(3)), none, modes=(mode,)).fix(0, "a"), config)
     np.testing.assert_allclose(np.sqrt(np.diagonal(nowhere.cov)), [5.0, 5.0, np.radians(5.0)])
     logs = []
     for half in (10, 18):
         g = replace(grid(half), east_m=grid(half - 2).east_m)
         match = Match(Prior(np.zeros(3), np.ones(3)), none, grid=g, modes=(mode,))
-        model = pose.false(match.fix(0, "a"), config)
+        model = false_of(match.fix(0, "a"), config)
         # What is as likely anywhere between -a and a has a variance of a^2 / 3.
         np.testing.assert_allclose(
             np.sqrt(3.0 * np.diagonal(model.cov)), [0.25 * (half - 2), 0.25 * half, np.radians(4.0)]
@@ -425,7 +426,7 @@ def test_a_false_match_lies_in_the_window_too() -> None:
         # Several of them lead an estimate farther off than a window reaches.
         assert model.misled is not None
         np.testing.assert_allclose(np.sqrt(np.diagonal(model.misled)), [5.0, 5.0, np.radians(5.0)])
-        heading = pose.false(match.fix(0, "a", axes=("yaw",)), config.model_copy(update={"axes": ("yaw",)}))
+        heading = false_of(match.fix(0, "a", axes=("yaw",)), config.model_copy(update={"axes": ("yaw",)}))
         np.testing.assert_allclose(heading.cov, model.cov[2:, 2:])
         seen = Residual(
             raw=np.zeros(3),
@@ -438,7 +439,7 @@ def test_a_false_match_lies_in_the_window_too() -> None:
         right, false = log_right_and_false((seen,), None, model)
         logs.append(right - false)
     wide = Match(Prior(np.zeros(3), np.ones(3)), none, grid=grid(80), modes=(mode,))
-    misled = pose.false(wide.fix(0, "a"), config).misled
+    misled = false_of(wide.fix(0, "a"), config).misled
     assert misled is not None
     np.testing.assert_allclose(np.sqrt(np.diagonal(misled)), [20.0 / np.sqrt(3.0)] * 2 + [np.radians(5.0)])
     assert logs[1] - logs[0] == pytest.approx(np.log((16.0 / 8.0) * (18.0 / 10.0)), abs=1e-3)
