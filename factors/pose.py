@@ -83,15 +83,15 @@ def _false_probability(m: PoseFix, config: AnyPoseConfig) -> float:
 
 def false(m: PoseFix, config: AnyPoseConfig) -> FalseModel:
     """Return the model of a false pose: anywhere in the window that it was sought in, and likely to repeat."""
-    sigmas = np.array([FALSE_SPREAD_M if AXES.index(a) < 3 else FALSE_SPREAD_RAD for a in m.axes])
-    # All places in a window are as likely. One after the other, each around the estimate that believes those before, they lead farther.
-    within = sigmas if m.window is None else m.window / np.sqrt(3.0)
+    anywhere = np.diag([FALSE_SPREAD_M if AXES.index(a) < 3 else FALSE_SPREAD_RAD for a in m.axes]) ** 2
+    # All places in a window are as likely.
+    within = None if m.window is None else np.diag(m.window**2 / 3.0)
     return FalseModel(
         probability=_false_probability(m, config),
-        cov=np.diag(within**2),
+        cov=anywhere if within is None else within,
         repeats=config.false_repeats,
         news=m.news,
-        misled=np.diag(np.maximum(sigmas, within) ** 2),
+        misled=None if within is None else np.maximum(anywhere, within),
     )
 
 

@@ -234,8 +234,8 @@ def doubt_of(
     shared = 1.0 - np.minimum(news, np.append(news[1:], 1.0))
     around = np.maximum(_summed(says, kept), np.finfo(float).tiny)
     probability = _summed(says * false * shared, kept) / around
-    misled = [model.cov if model.misled is None else model.misled for model in models]
-    spread = max(1.0 / i for J, cov in zip(by_aspect, misled, strict=True) if (i := _information(J, cov)) > 0.0)
+    says_false = [_information(J, model.widest) for J, model in zip(by_aspect, models, strict=True)]
+    spread = max(1.0 / i for i in says_false if i > 0.0)
     return Doubt(stamps_ns, probability, spread)
 
 
