@@ -27,7 +27,7 @@ from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, 
 from graphloc.measurements import AXES, PoseFix, PoseMode
 
 _WIDE_M, _WIDE_RAD = 1e3, 1e2
-# Where a false pose may lie if nothing says where it was sought: about BL's search window, 5 m and 5 deg around the truth.
+# Where a false pose may lie: about BL's search window, 5 m and 5 deg around the truth.
 FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(5.0))
 
 
@@ -82,16 +82,10 @@ def _false_probability(m: PoseFix, config: AnyPoseConfig) -> float:
 
 
 def false(m: PoseFix, config: AnyPoseConfig) -> FalseModel:
-    """Return the model of a false pose: anywhere in the window that it was sought in, and likely to repeat."""
-    anywhere = np.diag([FALSE_SPREAD_M if AXES.index(a) < 3 else FALSE_SPREAD_RAD for a in m.axes]) ** 2
-    # All places in a window are as likely.
-    within = None if m.window is None else np.diag(m.window**2 / 3.0)
+    """Return the model of a false pose: anywhere in BL's search window, and likely to repeat."""
+    sigmas = np.array([FALSE_SPREAD_M if AXES.index(a) < 3 else FALSE_SPREAD_RAD for a in m.axes])
     return FalseModel(
-        probability=_false_probability(m, config),
-        cov=anywhere if within is None else within,
-        repeats=config.false_repeats,
-        news=m.news,
-        misled=None if within is None else np.maximum(anywhere, within),
+        probability=_false_probability(m, config), cov=np.diag(sigmas**2), repeats=config.false_repeats, news=m.news
     )
 
 

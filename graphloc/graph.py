@@ -216,20 +216,12 @@ class FalseModel:
         repeats: probability that a false one that follows a false one repeats its error (a moored boat
             taken for another one is so again in the next scan).
         news: share of its evidence for right or false that is independent of the measurement before it.
-        misled: (k, k) of a false residual around an estimate that has moved since the measurement was sought, as by believing false ones;
-            one that agrees is as likely to be of either. None: `cov`.
     """
 
     probability: float
     cov: Array
     repeats: float
     news: float = 1.0
-    misled: Array | None = None
-
-    @property
-    def widest(self) -> Array:
-        """(k, k) of how far a false one may be from the estimate."""
-        return self.cov if self.misled is None else self.misled
 
 
 def _unknown() -> Array:

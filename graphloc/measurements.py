@@ -153,14 +153,11 @@ class PoseFix(Measurement):
         axes: which of `AXES` are measured, in the order of `AXES`.
         modes: at least one; probabilities sum to at most 1, what is missing is 'none of them'.
         news: share of its evidence for right or false that is independent of the one before it.
-        window: (k,) half the widths of the window that it was sought in, around the prediction, m and rad; None: unknown. A false one
-            lies in it, too: the smaller it is, the less does it say that one agrees with the prediction.
     """
 
     axes: tuple[str, ...]
     modes: tuple[PoseMode, ...]
     news: float = 1.0
-    window: Array | None = None
 
     def __post_init__(self) -> None:
         if not self.axes or tuple(a for a in AXES if a in self.axes) != tuple(self.axes):
@@ -171,10 +168,6 @@ class PoseFix(Measurement):
             raise ValueError("mode probabilities sum to more than 1")
         if not 0.0 <= self.news <= 1.0:
             raise ValueError("news must be in [0, 1]")
-        if self.window is not None:
-            object.__setattr__(self, "window", _frozen(self.window, (len(self.axes),), "window"))
-            if not (self.window > 0.0).all():
-                raise ValueError("window needs a positive half width for each axis")
 
     @property
     def none_probability(self) -> float:

@@ -11,12 +11,10 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.stats import multivariate_normal
 
 from graphloc.config import AerialConfig
 from graphloc.errors import InputError
 from graphloc.eval.match_picture import drawn
-from graphloc.factors import aerial
 from graphloc.frames import Array
 from graphloc.frontends.aerial import Match, Matcher, Prior
 from graphloc.frontends.aerial import matcher as matcher_
@@ -39,9 +37,6 @@ from graphloc.frontends.aerial.match import Mode, SearchGrid, modes_of
 from graphloc.frontends.aerial.matcher import BELIEF, Belief, Since
 from graphloc.frontends.aerial.scan import LevelCloud, Outline, inside, outline
 from graphloc.frontends.aerial.vector import VectorMap
-from graphloc.graph import Residual
-from graphloc.solve._hypotheses import log_right_and_false
-from graphloc.solve._prediction import walk_of
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import S
 from tests.mapfactory import DATUM, picture
@@ -407,42 +402,6 @@ def test_some_axes_of_a_match() -> None:
     assert fix.news == pytest.approx(0.5)
     assert fix.modes[0].probability == pytest.approx(0.9)
     assert fix.axes == ("y", "yaw")
-
-
-def test_a_false_match_lies_in_the_window_too() -> None:
-    """The narrower it was sought in, the less does it say that it agrees with the prediction."""
-    none = outline(LevelCloud(np.zeros((0, 3)), np.zeros((0, 2))), None)
-    mode, config, false_of = Mode(np.zeros(3), 1e-6 * np.eye(3), 0.5), AerialConfig(image="a.tif"), aerial.ROW.false
-    assert false_of is not None
-    nowhere = false_of(Match(Prior(np.zeros(3), np.ones(3)), none, modes=(mode,)).fix(0, "a"), config)
-    np.testing.assert_allclose(np.sqrt(np.diagonal(nowhere.cov)), [5.0, 5.0, np.radians(5.0)])
-    for half in (10, 18):
-        g = replace(grid(half), east_m=grid(half - 2).east_m)
-        match = Match(Prior(np.zeros(3), np.ones(3)), none, grid=g, modes=(mode,))
-        model = false_of(match.fix(0, "a"), config)
-        # What is as likely anywhere between -a and a has a variance of a^2 / 3.
-        np.testing.assert_allclose(
-            np.sqrt(3.0 * np.diagonal(model.cov)), [0.25 * (half - 2), 0.25 * half, np.radians(4.0)]
-        )
-        # Several of them lead an estimate farther off than a window reaches.
-        assert model.misled is not None
-        np.testing.assert_allclose(np.sqrt(np.diagonal(model.misled)), [5.0, 5.0, np.radians(5.0)])
-        heading = false_of(match.fix(0, "a", axes=("yaw",)), config.model_copy(update={"axes": ("yaw",)}))
-        np.testing.assert_allclose(heading.cov, model.cov[2:, 2:])
-        # The estimate may have moved since: what is far off is not much less likely than in a wide window.
-        for raw in (np.zeros(3), np.array([10.0, 0.0, 0.0])):
-            seen = Residual(
-                raw=raw, cov=0.01 * np.eye(3), jacobian=lambda: np.zeros((3, 6)), prior=0.5, size_m=None, size_deg=None
-            )
-            spreads = [model.cov + seen.cov, model.misled + seen.cov]
-            density = np.mean([multivariate_normal(np.zeros(3), spread).pdf(raw) for spread in spreads])
-            assert log_right_and_false((seen,), None, model)[1] == pytest.approx(np.log(0.5 * density))
-        # How fast an offset changes has nothing to do with where it was sought.
-        np.testing.assert_allclose(walk_of(model), walk_of(nowhere))
-    wide = Match(Prior(np.zeros(3), np.ones(3)), none, grid=grid(80), modes=(mode,))
-    misled = false_of(wide.fix(0, "a"), config).misled
-    assert misled is not None
-    np.testing.assert_allclose(np.sqrt(np.diagonal(misled)), [20.0 / np.sqrt(3.0)] * 2 + [np.radians(5.0)])
 
 
 def test_sources_are_laid_over_each_other() -> None:

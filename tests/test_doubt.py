@@ -75,9 +75,8 @@ def residual(raw: Array, prior: float = 0.5, sigma: float = 0.3) -> Residual:
     return Residual(raw=raw, cov=np.eye(2) * sigma**2, jacobian=lambda: along, prior=prior, size_m=None, size_deg=None)
 
 
-def model(news: float, misled_m: float | None = None) -> FalseModel:
-    misled = None if misled_m is None else np.eye(2) * misled_m**2
-    return FalseModel(probability=0.2, cov=np.eye(2) * 25.0, repeats=0.5, news=news, misled=misled)
+def model(news: float) -> FalseModel:
+    return FalseModel(probability=0.2, cov=np.eye(2) * 25.0, repeats=0.5, news=news)
 
 
 def test_each_is_judged_by_the_run_without_its_sensor() -> None:
@@ -117,13 +116,13 @@ def test_a_row_of_boats_leaves_the_place_open_but_not_the_heading() -> None:
         assert probability_false(modes, P, wide, 0, by_plane, axes) == pytest.approx(expected)
 
 
-def doubts(news: Array, false: Array, weights: Array, sigmas: Array, misled_m: float | None = None) -> Any:
+def doubts(news: Array, false: Array, weights: Array, sigmas: Array) -> Any:
     verdicts: list[Any] = [
         SimpleNamespace(weight=w, decision=Decision() if w else None, residual=residual(np.zeros(2), sigma=s))
         for w, s in zip(weights, sigmas, strict=True)
     ]
     places = [PLANE[:, :2]] * len(news)
-    return doubt_of(np.arange(len(news)) * SECOND, false, [model(n, misled_m) for n in news], verdicts, places)
+    return doubt_of(np.arange(len(news)) * SECOND, false, [model(n) for n in news], verdicts, places)
 
 
 def test_of_many_that_repeat_each_other_all_are_false_together() -> None:
@@ -133,7 +132,6 @@ def test_of_many_that_repeat_each_other_all_are_false_together() -> None:
         found = doubts(np.full(count, news), np.full(count, 0.3), ones, ones)
         np.testing.assert_allclose(found.probability, 0.3 * (1.0 - news))
     assert found.spread == pytest.approx(25.0)
-    assert doubts(np.full(9, 0.1), np.full(9, 0.3), np.ones(9), np.ones(9), 7.0).spread == pytest.approx(49.0)
 
 
 def test_their_errors_are_as_alike_as_the_matcher_says() -> None:

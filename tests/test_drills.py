@@ -168,15 +168,6 @@ def test_false_matches_lie_elsewhere_or_all_alike(recording: Recording) -> None:
     assert np.ptp(size) > 2.0
 
 
-def test_a_match_that_is_moved_does_not_lie_in_its_window(recording: Recording) -> None:
-    def windowed(m: Measurement) -> Measurement:
-        return replace(m, window=np.full(len(m.axes), 0.5)) if isinstance(m, PoseFix) else m
-
-    sought = recording.changed(windowed)
-    moved = pairs(sought, struck(sought, "all matches false alike, 20 s"))
-    assert [isinstance(b, PoseFix) and b.window is None for _, b in moved] == [True] * 20
-
-
 def test_flipped_tags_prefer_the_other_pose(recording: Recording) -> None:
     changed = pairs(recording, struck(recording, "tags flipped, 20 s"))
     assert len(changed) == 20

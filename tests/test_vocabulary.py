@@ -215,10 +215,3 @@ def test_news_is_a_share(news: float) -> None:
     mode = PoseMode(value=np.zeros(1), cov=np.eye(1))
     with pytest.raises(ValueError, match="news must be in"):
         PoseFix(stamp_ns=0, sensor="given", seq=0, axes=("x",), modes=(mode,), news=news)
-
-
-@pytest.mark.parametrize(("window", "message"), [([1.0, 0.0], "positive"), ([1.0], "shape"), ([np.nan, 1.0], "finite")])
-def test_a_window_has_a_width_for_each_axis(window: list[float], message: str) -> None:
-    mode = PoseMode(value=np.zeros(2), cov=np.eye(2))
-    with pytest.raises(ValueError, match=message):
-        PoseFix(stamp_ns=0, sensor="given", seq=0, axes=("x", "y"), modes=(mode,), window=np.array(window))

@@ -223,7 +223,7 @@ def _false(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gene
             return m
         offsets = fixed if alike else draw()
         off = np.array([offsets.get(axis, 0.0) for axis in m.axes])
-        return replace(m, modes=tuple(replace(mode, value=mode.value + off) for mode in m.modes), window=None)
+        return replace(m, modes=tuple(replace(mode, value=mode.value + off) for mode in m.modes))
 
     return _changed(recording, change)
 

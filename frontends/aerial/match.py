@@ -32,11 +32,6 @@ class SearchGrid:
     north_m: Array
     east_m: Array
 
-    @property
-    def half_widths(self) -> Array:
-        """Half the widths (3,), east, north, yaw, m and rad."""
-        return 0.5 * np.array([np.ptp(self.east_m), np.ptp(self.north_m), np.ptp(self.yaw_rad)])
-
 
 def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) -> SearchGrid:
     """Return the candidates around a pose (3,): east, north, yaw, on the cells of the layers."""

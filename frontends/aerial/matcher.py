@@ -127,8 +127,7 @@ class Match:
             )
             for m, p in zip(self.modes, share * (told.sum() / share.sum()), strict=True)
         )
-        window = None if self.grid is None else self.grid.half_widths[picked]
-        return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes, news=news, window=window)
+        return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=0, axes=axes, modes=modes, news=news)
 
 
 @dataclass(frozen=True, slots=True)

@@ -234,8 +234,7 @@ def doubt_of(
     shared = 1.0 - np.minimum(news, np.append(news[1:], 1.0))
     around = np.maximum(_summed(says, kept), np.finfo(float).tiny)
     probability = _summed(says * false * shared, kept) / around
-    says_false = [_information(J, model.widest) for J, model in zip(by_aspect, models, strict=True)]
-    spread = max(1.0 / i for i in says_false if i > 0.0)
+    spread = max(1.0 / i for J, model in zip(by_aspect, models, strict=True) if (i := _information(J, model.cov)) > 0.0)
     return Doubt(stamps_ns, probability, spread)
 
 

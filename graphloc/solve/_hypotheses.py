@@ -114,13 +114,10 @@ def log_evidence_of(stream: Judged, indices: Sequence[int], residuals: Sequence[
 def log_right_and_false(modes: tuple[Residual, ...], P: Array | None, model: FalseModel) -> tuple[float, float]:
     """Return the log of prior x density: that any mode is right, and that all are false; both widened by the prediction's covariance."""
     right = np.logaddexp.reduce([r.log_density(P) for r in modes])
+    around = model.cov if P is None else model.cov + P
     share = np.log([r.prior for r in modes]) - np.log(sum(r.prior for r in modes))
-    spreads = [model.cov] if model.misled is None else [model.cov, model.misled]
-    logs = [
-        share + np.array([gauss.log_density(r.raw, r.cov + (spread if P is None else spread + P)) for r in modes])
-        for spread in spreads
-    ]
-    return float(right), float(np.log(model.probability / len(spreads)) + np.logaddexp.reduce(logs, axis=None))
+    logs = share + np.array([gauss.log_density(r.raw, r.cov + around) for r in modes])
+    return float(right), float(np.log(model.probability) + np.logaddexp.reduce(logs))
 
 
 def log_false_again(

@@ -153,7 +153,7 @@ def moved(before: Prediction | None, now: Prediction | None, age_s: float) -> Ar
 
 def walk_of(model: FalseModel) -> Array:
     """Return the covariance (k, k) that an offset gains per second in addition."""
-    return np.asarray(_OFFSET_WALK**2 * model.widest)
+    return np.asarray(_OFFSET_WALK**2 * model.cov)
 
 
 def taken_of(stream: Judged, indices: Sequence[int]) -> tuple[list[Measurement], list[FalseModel]]:
