@@ -21,6 +21,7 @@ from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turning import Turning, against_turning
 from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
+from graphloc.imu_spikes import spike_warning, spikes
 from graphloc.measurements import ImuSeries
 from graphloc.series import integral, runs
 from graphloc.time import NS_PER_S
@@ -262,6 +263,7 @@ def imu_report(
     units = _units_of(stamps, accel, gyro)
     accel = accel * (STANDARD_GRAVITY_MPS2 if units.accel == "g" else 1.0)
     gyro = gyro * (np.pi / 180.0 if units.gyro == "deg/s" else 1.0)
+    spiked = spike_warning(imu.topic, stamps, spikes(stamps, np.hstack([accel, gyro])))
     up = np.median(accel, axis=0)
     still = _standstill(stamps, accel, gyro, next((m for m in motions if m.rests), None))
     root_dt = float(np.sqrt(np.median(np.diff(stamps)) / NS_PER_S))
@@ -279,7 +281,7 @@ def imu_report(
         accel_unit=units.accel,
         gyro_unit=units.gyro,
         gravity=units.gravity,
-        why=(*frozen, *([f"all its {missing} are 0: {HALF}"] if missing else []), *units.why),
+        why=(*frozen, *spiked, *([f"all its {missing} are 0: {HALF}"] if missing else []), *units.why),
         still_s=float(still.sum()) * root_dt**2,
         gyro_bias_radps=vec(gyro[still].mean(axis=0)) if quiet else None,
         accel_noise_ug=float(white_noise(accel).max()) * root_dt / ug,

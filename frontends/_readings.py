@@ -27,6 +27,8 @@ from graphloc.frontends._rejections import Rejection, rejected
 from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.decode import Decoded, ImuReading
 from graphloc.frozen_imu import WHY, frozen_imu_warning, frozen_samples
+from graphloc.imu_spikes import WHY as SPIKE
+from graphloc.imu_spikes import spike_warning, spikes
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
 from graphloc.thinning import HEADINGS_APART_NS, THINNED, Thinning
@@ -200,6 +202,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
     readings.sort()
     rows += _drop_hanging(readings, warnings)
+    rows += _drop_spikes(readings, warnings)
     samples = [v for v in readings.values if isinstance(v, ImuReading)]
     if not samples:
         return None, rows
@@ -244,6 +247,14 @@ def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     bad = frozen_samples(stamps, _imu_values(readings))
     warnings += frozen_imu_warning(readings.sensor, stamps, bad)
     return readings.drop(bad, rejected(WHY))
+
+
+def _drop_spikes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
+    """Drop samples that leap away and back: integrated, each would turn or push the estimate for good."""
+    stamps = readings.stamps()
+    bad = spikes(stamps, _imu_values(readings))
+    warnings += spike_warning(readings.sensor, stamps, bad)
+    return readings.drop(bad, rejected(SPIKE))
 
 
 def reject_repeats(readings: Readings) -> list[LedgerRow]:

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which IMU samples are taken, and in what order: clocks jump and are set back, samples come late or again, units are mistaken."""
+"""Which IMU samples are taken, and in what order: clocks jump and are set back, samples come late or again or leap, units are mistaken."""
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graphloc.frozen_imu import WHY, FrozenImuDetector
+from graphloc.imu_spikes import WHY as SPIKE
+from graphloc.imu_spikes import SpikeDetector
 from graphloc.measurements import ImuSample, ImuSeries
 from graphloc.time import stamps_of
 
@@ -29,6 +31,7 @@ class Taken:
         late: the sample itself, where its stamp lies before the newest. hole: stamps (ns) of the samples before and after
             it; None before the first.
         absurd: why it cannot be a reading of a vessel. newly_frozen: it is the first repetition of a frozen IMU.
+        newly_spiked: what was held back was the first spike.
         set_back_s: by how much the IMU's clock was set back; all earlier stamps are of another clock.
     """
 
@@ -38,6 +41,7 @@ class Taken:
     hole: tuple[int, int] | None = None
     absurd: str = ""
     newly_frozen: bool = False
+    newly_spiked: bool = False
     set_back_s: float = 0.0
 
 
@@ -66,7 +70,8 @@ class ImuIntake:
         # Held back until others follow it, so that one bad stamp does not cut the run.
         self.jumped: ImuSample | None = None
         self._jumped_age = self._behind = 0
-        self._frozen = FrozenImuDetector()
+        self._frozen, self._spikes = FrozenImuDetector(), SpikeDetector()
+        self._spiked = False
         self._stamps: list[int] = []  # in order, as far back as a late one may lie
 
     def accept(self, m: ImuSample) -> float:
@@ -85,7 +90,29 @@ class ImuIntake:
         del self._stamps[: bisect_left(self._stamps, before_ns)]
 
     def take(self, m: ImuSample, *, started: bool) -> Taken:
-        """Decide on a sample, and on one that was held back. `started`: there is an estimate."""
+        """Decide on a sample, and on those that were held back. `started`: there is an estimate."""
+        if m.stamp_ns <= self._spikes.held_ns:
+            return Taken(dropped=((m, "its stamp does not increase"),))
+        taken = self._in_order(m, started)
+        lost = self._spikes.let_go() if taken.set_back_s else []
+        dropped = [(held, "held back as it leapt, and then the clock was set back") for held in lost]
+        accepted: list[ImuSample] = []
+        for sample in taken.accepted:
+            right, wrong = self._spikes.take(sample)
+            accepted += right
+            dropped += [(held, SPIKE) for held in wrong]
+        already, self._spiked = self._spiked, self._spiked or any(why == SPIKE for _, why in dropped)
+        return replace(
+            taken, accepted=tuple(accepted), dropped=(*taken.dropped, *dropped), newly_spiked=self._spiked > already
+        )
+
+    def left(self) -> list[ImuSample]:
+        """Return what is still held back at the end."""
+        left = self._spikes.let_go() + ([] if self.jumped is None else [self.jumped])
+        self.jumped = None
+        return left
+
+    def _in_order(self, m: ImuSample, started: bool) -> Taken:
         if absurd := self._absurd(m):
             return Taken(dropped=((m, absurd),), absurd=absurd)
         already = self._frozen.frozen

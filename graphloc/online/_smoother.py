@@ -19,6 +19,7 @@ from graphloc.estimate import Estimate, Event
 from graphloc.frames import Datum
 from graphloc.frozen_imu import WHY
 from graphloc.graph import InertialRow, Sensor
+from graphloc.imu_spikes import WHY as SPIKE
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement
 from graphloc.online._intake import ImuIntake, series_of
@@ -202,6 +203,8 @@ class OnlineSmoother:
             self._waiting.why = f"IMU data that a vessel can have: {taken.absurd}"
         if taken.newly_frozen:
             self._say(f"{m.sensor}: {WHY}; treated as an IMU gap until the samples change")
+        if taken.newly_spiked:
+            self._say(f"{m.sensor}: a sample is {SPIKE}; all such are rejected")
         if taken.late is not None:
             self._keep_imu(taken.late, taken.hole)
         if taken.set_back_s:
@@ -422,8 +425,8 @@ class OnlineSmoother:
         if self._tracking is not None:
             why = "the run ended before there was a state at its stamp"
             self._tracking.end(why)
-        if self._intake.jumped is not None:
-            self._ledger.drop(self._intake.jumped, Outcome.REJECTED, why)
+        for m in self._intake.left():
+            self._ledger.drop(m, Outcome.REJECTED, why)
         self._waiting.refuse(why)
-        self._tracking, self._intake.jumped = None, None
+        self._tracking = None
         return self._ledger.taken()
