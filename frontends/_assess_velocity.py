@@ -27,7 +27,7 @@ from graphloc.frontends.decode import ODOMETRY, VECTOR
 from graphloc.series import integral, interpolated
 from graphloc.time import NS_PER_S
 
-_CHORD_S = 2.0
+_CHORD_S, _LONG_CHORD_S = 2.0, 10.0  # in which a craft turns little; and over which fixes wander by less than it goes
 _FITS = 0.4  # largest error of an axis convention that fits, as a share of the speed
 _AXES = (EAST_AXES, NORTH_AXES, BODY_AXES)
 _FEWEST = 20
@@ -46,10 +46,22 @@ def axes_of(
         stream: velocities in its last three columns. stamps_ns: (N,) of the track. p_m: (N, 3) the track, east, north, up.
         scatter_m: noise of its positions, 1 sigma of an axis.
     """
+    axes, why = _axes_by(stream, stamps_ns, p_m, scatter_m, _CHORD_S)
+    if axes == "unknown":
+        over, why_over = _axes_by(stream, stamps_ns, p_m, scatter_m, _LONG_CHORD_S)
+        if over in (EAST_AXES, NORTH_AXES):
+            return over, f"{why_over}, over {_LONG_CHORD_S:.0f} s: the fixes wander"
+    return axes, why
+
+
+def _axes_by(
+    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float, chord_s: float
+) -> tuple[str | None, str]:
+    """Return the same by chords of one length."""
     keep = sane(stream, np.s_[-3:])
     v = stream.rows[keep, -3:] if len(keep) else np.zeros((0, 3))
-    chords, mean = _pairs(stream.stamps_ns[keep], v, stamps_ns, p_m)
-    noise = 2.0 * scatter_m / _CHORD_S  # of a chord between two places, both axes together, m/s
+    chords, mean = _pairs(stream.stamps_ns[keep], v, stamps_ns, p_m, chord_s)
+    noise = 2.0 * scatter_m / chord_s  # of a chord between two places, both axes together, m/s
     speed = _less(float(np.sqrt((chords**2).sum(axis=1).mean())), noise) if len(chords) else 0.0
     if len(chords) < 10 or speed < 0.5:
         return None, "no GNSS track in motion to check it against"
@@ -209,7 +221,9 @@ def _told(stream: TopicData, axes: str) -> MeasuredMotion | None:
     return MeasuredMotion(stream.topic, origin, t, np.hypot(east, north), integral(t, east + 1j * north))
 
 
-def _pairs(stamps_ns: NDArray[np.int64], v: Array, track_ns: NDArray[np.int64], p_m: Array) -> tuple[Array, Array]:
+def _pairs(
+    stamps_ns: NDArray[np.int64], v: Array, track_ns: NDArray[np.int64], p_m: Array, chord_s: float
+) -> tuple[Array, Array]:
     """Return the track's mean velocities (M, 2) over some seconds, and the twists' (M, 3) over the same."""
     none = np.zeros((0, 2)), np.zeros((0, 3))
     if len(stamps_ns) < 10 or len(track_ns) < 3:
@@ -217,10 +231,10 @@ def _pairs(stamps_ns: NDArray[np.int64], v: Array, track_ns: NDArray[np.int64], 
     t, at = (stamps_ns - stamps_ns[0]) / NS_PER_S, (track_ns - stamps_ns[0]) / NS_PER_S
     inside = (at >= t[0]) & (at <= t[-1])
     at, p_m = at[inside], p_m[inside]
-    end = np.searchsorted(at, at + _CHORD_S)
+    end = np.searchsorted(at, at + chord_s)
     begin = np.flatnonzero(end < len(at))
     end = end[begin]
-    begin, end = (index[at[end] - at[begin] < 2.0 * _CHORD_S] for index in (begin, end))
+    begin, end = (index[at[end] - at[begin] < 2.0 * chord_s] for index in (begin, end))
     if not len(begin):
         return none
     there = interpolated(at, t, integral(t, v))

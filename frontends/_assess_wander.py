@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast the error of fixes changes: by the lengths of their chords against those of the wheels' odometry."""
+"""How fast the error of fixes changes: by the lengths of their chords against those of wheels, or of the receiver's own velocity."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import sane
+from graphloc.frontends._assess import MeasuredMotion, sane
 from graphloc.frontends._streams import TopicData
 from graphloc.series import interpolated, robust_sigma
 from graphloc.time import NS_PER_S
@@ -16,31 +16,32 @@ WANDER_S = 10.0
 """Time from one end of a chord to the other, s."""
 _LEAST_M = 3.0  # of a shorter chord the length is mostly error
 _SHORTEST_S = 100.0  # of motion: ten chords that do not overlap
-_SLIP = 0.03  # of a chord: so much may be the wheels'
+_SLIP = 0.03  # of a chord: so much may be the wheels', or a turn's
 
 
-def wander_m(wheels: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float) -> float | None:
+def wander_m(motion: MeasuredMotion, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float) -> float | None:
     """Return by how much the error of fixes changes along the way in `WANDER_S`, m, 1 sigma; None where that is not told.
 
-    Of lengths, so that no heading is needed, by the poses of the odometry itself, which drift little in so short a time. Their scale is
-    the median's; and jumps, of which there are few, hardly count.
+    Of lengths, so that no heading is needed: of the way of wheels, or of an integrated velocity, which drift little in so short a time.
+    Their scale is the median's; and jumps, of which there are few, hardly count.
 
     Args:
-        wheels: odometry. stamps_ns: (N,) of the fixes. p_m: (N, 3), east, north, up. scatter_m: noise of each, 1 sigma of an axis.
+        motion: with a way. stamps_ns: (N,) of the fixes. p_m: (N, 3), east, north, up. scatter_m: noise of each, 1 sigma of an axis.
     """
-    keep = sane(wheels, np.s_[:2])
-    inside = (stamps_ns >= wheels.stamps_ns[keep[0]]) & (stamps_ns <= wheels.stamps_ns[keep[-1]]) if len(keep) else []
+    if motion.way_m is None or not len(motion.t_s):
+        return None
+    at = motion.t_s
+    t = (stamps_ns - motion.origin_ns) / NS_PER_S
+    inside = (t >= at[0]) & (t <= at[-1])
     if np.count_nonzero(inside) < 2:
         return None
-    begin_ns = int(wheels.stamps_ns[keep[0]])
-    at = (wheels.stamps_ns[keep] - begin_ns) / NS_PER_S
-    t, p = (stamps_ns[inside] - begin_ns) / NS_PER_S, p_m[inside, :2]
-    rolled = interpolated(t, at, wheels.rows[keep, :2])
+    t, p = t[inside], p_m[inside, :2]
+    moved_m = interpolated(t, at, np.column_stack([motion.way_m.real, motion.way_m.imag]))
     end = np.searchsorted(t, t + WANDER_S)
     begin = np.flatnonzero(end < len(t))
     begin = begin[t[end[begin]] - t[begin] < 1.5 * WANDER_S]  # not across an outage
     end = end[begin]
-    fixed, chord = (np.hypot(*(way[end] - way[begin]).T) for way in (p, rolled))
+    fixed, chord = (np.hypot(*(way[end] - way[begin]).T) for way in (p, moved_m))
     moved = chord > _LEAST_M
     if np.count_nonzero(moved) * float(np.median(np.diff(t))) < _SHORTEST_S:
         return None
@@ -50,3 +51,14 @@ def wander_m(wheels: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatte
     if sigma < _SLIP * float(np.median(chord)):
         return None
     return float(np.sqrt(max(sigma**2 - 2.0 * scatter_m**2, 0.0)))
+
+
+def way_of(wheels: TopicData) -> MeasuredMotion | None:
+    """Return the motion by the poses of an odometry itself; None of an empty one."""
+    keep = sane(wheels, np.s_[:2])
+    if not len(keep):
+        return None
+    begin_ns = int(wheels.stamps_ns[keep[0]])
+    x, y = wheels.rows[keep, :2].T
+    t_s = (wheels.stamps_ns[keep] - begin_ns) / NS_PER_S
+    return MeasuredMotion(wheels.topic, begin_ns, t_s, np.zeros(len(keep)), x + 1j * y)

@@ -278,24 +278,44 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     if not gnss.slow_error:
         lines.append(_rtk_slow_error(gnss))
     else:
-        vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3) if wanders else None
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
-        keys = [*([f"vertical_sigma_m: {vertical:.1f}"] if vertical else []), *_wandering(gnss)]
-        apart = ""
-        if gnss.differs and not any(key.startswith("horizontal") for key in keys):
-            keys = [f"horizontal_sigma_m: {gnss.apart_m:.1f}", *keys]
-            apart = f"; so far it and {gnss.apart_from} wander against each other"
+        keys, apart = _wandering(gnss), ""
+        if not any(key.startswith("horizontal") for key in keys):
+            large, apart = _as_large(gnss)
+            keys = [*large, *keys]
+        if wanders:
+            keys = [
+                f"vertical_sigma_m: {max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3):.1f}",
+                *keys,
+            ]
         more = ", ".join(keys)
         fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
-        wander = f"; by the wheels it changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s" if _wandering(gnss) else ""
+        wander = (
+            f"; by {gnss.wander_by} it changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s" if _wandering(gnss) else ""
+        )
         lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{wander}{apart}{fixed}")
     return lines
 
 
-def _wandering(gnss: GnssReport) -> list[str]:
-    """Return the keys of a slow error that changes as fast as wheels show, where that is faster than by default.
+def _as_large(gnss: GnssReport) -> tuple[list[str], str]:
+    """Return the key of a slow error that is larger than by default, and why: another receiver, or what the fixes claim, less what is white."""
+    claimed_m = max(gnss.reported_sigma_m[:2]) if gnss.reported_sigma_m else 0.0
+    white_m = max(gnss.scatter_m[:2]) if gnss.scatter_m else claimed_m
+    slow_m = claimed_m if SCATTERS * white_m < claimed_m <= NOTHING_M else 0.0
+    if gnss.differs and gnss.apart_m >= slow_m:
+        return [
+            f"horizontal_sigma_m: {gnss.apart_m:.1f}"
+        ], f"; so far it and {gnss.apart_from} wander against each other"
+    if slow_m <= SlowErrorConfig().horizontal_sigma_m:
+        return [], ""
+    said = f"; scatter from fix to fix is {white_m:.1f} m, so that most of what they claim to be off is slow"
+    return [f"horizontal_sigma_m: {slow_m:.1f}"], said
 
-    Otherwise wheels contradict the fixes, and what gives way is the heading.
+
+def _wandering(gnss: GnssReport) -> list[str]:
+    """Return the keys of a slow error that changes as fast as wheels or a velocity show, where that is faster than by default.
+
+    Otherwise these contradict the fixes, and what gives way is the heading.
     """
     default = SlowErrorConfig()
     if gnss.wander_m is None:

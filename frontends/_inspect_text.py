@@ -134,5 +134,5 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
             f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m[: 2 if flat else 3])} m"
         )
     if gnss.wander_m is not None:
-        lines.append(f"  error changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s along the way, by the wheels")
+        lines.append(f"  error changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s along the way, by {gnss.wander_by}")
     return lines

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
@@ -18,6 +19,7 @@ from graphloc.time import NS_PER_S
 
 _BLOCK_S = 20.0
 _CLEAR, _LEAST_S = 4.0, 0.02  # sigmas, s
+_BY_CHANCE = 5e-3  # a few blocks that agree by chance look like many
 _APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # how closely is looked; from which it is said
 _STEPS = 3  # to an offset of a second in the sharpest turns
 _CHORD_S = 2.0  # half the time of a chord of fixes, and of a velocity's integral
@@ -34,19 +36,20 @@ def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: A
         turning: integrated rate. stamps_ns: (N,), increasing. angle: (N,) rad, counter-clockwise, unwrapped.
     """
     at_s = (stamps_ns - turning.origin_ns) / NS_PER_S
-    value_s, sigma_s = 0.0, 0.0
+    value_s, sigma_s, clear = 0.0, 0.0, _CLEAR
     for _ in range(_STEPS):
         step = _heading_step(turning, at_s + value_s, angle)
         if step is None:
             return None
-        value_s, sigma_s = value_s + step[0], step[1]
+        value_s, sigma_s, blocks = value_s + step[0], *step[1:]
+        clear = max(_CLEAR, float(student.isf(_BY_CHANCE / 2.0, blocks - 1)))
         if abs(value_s) > MOST_LATE_S:
             return None
-    return (value_s, sigma_s) if abs(value_s) > max(_CLEAR * sigma_s, _LEAST_S) else None
+    return (value_s, sigma_s) if abs(value_s) > max(clear * sigma_s, _LEAST_S) else None
 
 
-def _heading_step(turning: Turning, at: Array, angle: Array) -> tuple[float, float] | None:
-    """Return what should be added to times (N,) of headings, s since the turning's origin, to first order, and its sigma."""
+def _heading_step(turning: Turning, at: Array, angle: Array) -> tuple[float, float, int] | None:
+    """Return what should be added to times (N,) of headings, s since the turning's origin, to first order, its sigma, and of how many blocks."""
     inside = (at > turning.t_s[0] + 1.0) & (at < turning.t_s[-1] - 1.0)
     at, angle = at[inside], angle[inside]
     if len(at) < 50:
@@ -68,7 +71,7 @@ def _heading_step(turning: Turning, at: Array, angle: Array) -> tuple[float, flo
         return None
     value = float(up.sum() / down.sum())
     without = (up.sum() - up) / (down.sum() - down)
-    return value, float(np.sqrt((len(up) - 1) / len(up) * ((without - without.mean()) ** 2).sum()))
+    return value, float(np.sqrt((len(up) - 1) / len(up) * ((without - without.mean()) ** 2).sum())), len(up)
 
 
 class MotionOffset(NamedTuple):

@@ -34,7 +34,7 @@ from graphloc.frontends._assess_compass import compass_report, headings, says_th
 from graphloc.frontends._assess_imu import felt_of, imu_report, series_of
 from graphloc.frontends._assess_receivers import apart_m, apart_warning, height_wanders_m
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
-from graphloc.frontends._assess_wander import wander_m
+from graphloc.frontends._assess_wander import wander_m, way_of
 from graphloc.frontends._assess_world import in_map_grid, world_of
 from graphloc.frontends._clock import FEWEST_STAMPS, GAIN_LIMIT_S, refuse_woven, step, usual_latency_s
 from graphloc.frontends._draft import draft_config
@@ -58,7 +58,7 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import TopicData, read_streams
 from graphloc.frontends._tf import WORLD_NAMES, Pose, StaticTree
-from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, motion_time_offset
+from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, later_than, motion_time_offset
 from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends._unused import unread_lidars, unread_tags, unused_magnetometers, unused_numbers, unused_topics
@@ -198,12 +198,15 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     compasses = _compass_reports(bag, imus, felt.turning if felt else None, courses)
     used = {g.topic for g in gnss} | {i.topic for i in imus} | {c.topic for c in compasses if c.usable}
     reports = [report for _, report in odometry]
+    doppler = {v.topic for _, v in velocities if v.axes in (EAST_AXES, NORTH_AXES) and not filtered(v.topic)}
+    own = [motion for motion in motions if motion.source in doppler]
     return Inspection(
         source=bag.source,
         topics=_topic_reports(bag),
         imus=tuple(imus),
         gnss=tuple(
-            _beside_wheels(_timed_fixes(report, late, motions, velocities, bag.streams), bag, wheels) for report in gnss
+            _beside_motion(_timed_fixes(report, late, motions, velocities, bag.streams), bag, wheels, own)
+            for report in gnss
         ),
         compasses=compasses,
         odometry=tuple(reports),
@@ -445,14 +448,31 @@ def _timed_fixes(
     return replace(gnss, late_s=_clearly(known.get(by)), late_by=by)
 
 
-def _beside_wheels(gnss: GnssReport, bag: _Contents, wheels: Sequence[TopicData]) -> GnssReport:
-    """Return the report with how fast the fixes' error changes, by the first wheels that are no filter's output."""
+def _beside_motion(
+    gnss: GnssReport, bag: _Contents, wheels: Sequence[TopicData], velocities: Sequence[MeasuredMotion]
+) -> GnssReport:
+    """Return the report with how fast the fixes' error changes, by the first wheels, or velocity, that is no filter's output.
+
+    A receiver's velocity is by Doppler, on which multipath has little effect.
+    """
     rolling = next((s for s in wheels if not filtered(s.topic)), None)
-    if rolling is None:
-        return gnss
+    rolled = way_of(rolling) if rolling else None
     stamps, p_m, _ = track(bag.aligned[gnss.topic])
     scatter_m = max(gnss.scatter_m[:2]) if gnss.scatter_m else 0.0
-    return replace(gnss, wander_m=wander_m(rolling, stamps, p_m, scatter_m))
+    fixes = motion_of_places(gnss.topic, stamps, p_m)
+    known = [(rolled, "the wheels")] if rolled else []
+    if fixes is not None:
+        known += [(_at_the_time_of(fixes, m), m.source) for m in velocities]
+    for motion, name in known:
+        if (wanders := wander_m(motion, stamps, p_m, scatter_m)) is not None:
+            return replace(gnss, wander_m=wanders, wander_by=name)
+    return gnss
+
+
+def _at_the_time_of(fixes: MeasuredMotion, velocity: MeasuredMotion) -> MeasuredMotion:
+    """Return a velocity's motion with what it shows later than the fixes taken off its times: else braking looks like an error of these."""
+    later = later_than(fixes, velocity)
+    return replace(velocity, t_s=velocity.t_s - later[0]) if later else velocity
 
 
 def _clearly(offset: MotionOffset | None) -> tuple[float, float] | None:

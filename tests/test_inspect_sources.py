@@ -377,6 +377,24 @@ def test_two_antennas_on_a_ship_do_not_wander_against_each_other(tmp_path: Path)
     assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
 
 
+@pytest.mark.parametrize(("claims_m", "scatter_m", "slow_m"), [(6.0, 0.3, 6.0), (6.0, 6.0, 2.0), (1.0, 0.1, 2.0)])
+def test_what_fixes_claim_and_do_not_scatter_by_is_slow(
+    claims_m: float, scatter_m: float, slow_m: float, tmp_path: Path
+) -> None:
+    """A receiver that claims 6 m and says a smooth way had bounds of 2 m; one whose fixes scatter by what they claim, or that claims less, keeps these."""
+    make = Messages(2)
+    items = [
+        item
+        for item in drive(make, seconds=60, status=0, sigma_m=claims_m, noise_m=scatter_m)
+        if item[0] != "/wheel/odom"
+    ]
+    _, config, text = look(tmp_path, items, make)
+    receiver = config.sensors["gnss"]
+    assert isinstance(receiver, GnssConfig)
+    assert receiver.slow_error.horizontal_sigma_m == pytest.approx(slow_m)
+    assert ("most of what they claim to be off is slow" in text) == (slow_m > 2.0)
+
+
 @pytest.mark.parametrize("silent", ["/fix", "/cheap/fix"])
 def test_a_gap_of_one_receiver_is_no_wander(silent: str, tmp_path: Path) -> None:
     """The way that the other one went meanwhile was taken for it: metres of slow error were drafted for receivers that agree."""

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from graphloc.config import BodyVelocityConfig, GnssConfig
 from graphloc.frames import Array
-from graphloc.frontends._assess_wander import WANDER_S, wander_m
+from graphloc.frontends._assess import MeasuredMotion
+from graphloc.frontends._assess_wander import WANDER_S, wander_m, way_of
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import ODOMETRY
 from graphloc.time import NS_PER_S
@@ -35,12 +36,14 @@ def way(t_s: Array, speed: float, rate: float = 0.03) -> Array:
     return speed / rate * np.column_stack([np.sin(rate * t_s), 1.0 - np.cos(rate * t_s)])
 
 
-def odometry(t_s: Array, places: Array) -> TopicData:
+def odometry(t_s: Array, places: Array) -> MeasuredMotion:
     found = TopicData("/odom", ODOMETRY)
     for t, (x, y) in zip(t_s, places, strict=True):
         stamp = int(t * NS_PER_S)
         found.add(stamp, stamp, (x, y, *np.zeros(8)), "a")
-    return found
+    motion = way_of(found)
+    assert motion is not None
+    return motion
 
 
 def fixes(t_s: Array, places: Array) -> tuple[NDArray[np.int64], Array]:
@@ -65,7 +68,7 @@ def test_wheels_that_tell_nothing() -> None:
     assert wander_m(odometry(t, 0.0 * way(t, 1.0)), *fixes(t, error), 0.0) is None
     short = t < 90.0
     assert wander_m(odometry(t[short], way(t[short], 1.0)), *fixes(t, way(t, 1.0) + error), 0.0) is None
-    assert wander_m(TopicData("/odom", ODOMETRY), *fixes(t, error), 0.0) is None
+    assert way_of(TopicData("/odom", ODOMETRY)) is None
     assert wander_m(odometry(t, way(t, 1.0)), *fixes(t[:0], error[:0]), 0.0) is None
     slip = np.cumsum(20.0 * 0.5 * (1.0 + wandering(t, 5, 0.02)[:, 0]))
     straight = np.column_stack([slip, np.zeros(len(t))])
@@ -101,3 +104,30 @@ def test_fixes_that_wander_are_drafted_as_fast_as_they_do(sigma: float, tmp_path
     change = np.sqrt(2.0 * drafted.horizontal_sigma_m**2 * (1.0 - np.exp(-WANDER_S / drafted.time_constant_s)))
     assert change == pytest.approx(found.gnss[0].wander_m, rel=0.05)
     assert (drafted.horizontal_sigma_m > 2.0) == (sigma == 5.0)
+
+
+@pytest.mark.parametrize(("sigma", "late_s", "filtered"), [(5.0, 0.5, False), (0.1, 0.5, False), (5.0, 0.0, True)])
+def test_a_velocity_shows_it_as_well(sigma: float, late_s: float, filtered: bool, tmp_path: Path) -> None:
+    """Without wheels a receiver among houses had a slow error of 2 m, whatever its velocity said; braking is none, however late it is said."""
+    make, rng = Messages(2), np.random.default_rng(2)
+    items = [item for item in drive(make, status=1, sigma_m=0.8, seconds=130) if item[0] != "/wheel/odom"]
+    stamps = np.array([stamp for topic, stamp, _ in items if topic == "/fix"])
+    told = [m for topic, _, m in items if topic == "/fix"]
+    enu = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for m in told]).T)
+    t = (stamps - stamps[0]) / NS_PER_S
+    away = DATUM.geodetic_from_enu(enu + np.column_stack([wandering(t, 7, sigma), np.zeros(len(t))]))
+    for m, (lat, lon, _) in zip(told, away, strict=True):
+        m.latitude, m.longitude = float(lat), float(lon)
+    speeds = np.gradient(enu, t, axis=0) + 0.1 * rng.normal(size=enu.shape)
+    topic = "/ekf/velocity" if filtered else "/fix_velocity"
+    items += [
+        (topic, at, make.twist(at, v))
+        for at, v in zip((stamps + round(late_s * NS_PER_S)).tolist(), speeds, strict=True)
+    ]
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    receiver = config.sensors["gnss"]
+    assert isinstance(receiver, GnssConfig)
+    seen = sigma > 1.0 and not filtered
+    assert (receiver.slow_error.time_constant_s < 20.0) == seen
+    assert (receiver.slow_error.horizontal_sigma_m > 3.0) == seen
+    assert ("by /fix_velocity it changes by" in text) == seen
