@@ -34,9 +34,9 @@ from tests.slowly import simulate_slowly
 OFF_DEG = 12.0
 
 
-def made(**changes: object) -> SimulatedRun:
+def made(rate_hz: float = 2.5, **changes: object) -> SimulatedRun:
     base = Scenario(duration_s=18.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, noise="clean", false_fraction=0.2)
-    return simulate_slowly(replace(base, **changes), 4)  # type: ignore[arg-type]
+    return simulate_slowly(replace(base, **changes), 4, rate_hz)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_each_sensor_is_left_out_but_the_imu(bad: tuple[SimulatedRun, Ablated]) 
 
 
 def test_against_truth_the_numbers_are_those_of_a_run_without_it() -> None:
-    run = made(compass_hz=0.0, duration_s=12.0)
+    run = made(1.25, compass_hz=0.0, duration_s=12.0)
     found = ablate(run.recording, run.config)
     assert found.basis == "truth"
     gone = run.config.sensors["matcher"].model_copy(update={"enabled": False})

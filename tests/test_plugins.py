@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from graphloc import factors
 from graphloc.config import load_config
 from graphloc.errors import ConfigError
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.eval.simulate.bag import write_bag as write_simulated
+from graphloc.extras import added
 from graphloc.factors import KINDS
 from tests.bagfactory import Messages, write_bag
 
@@ -84,17 +86,34 @@ def test_the_example_is_read_from_a_bag_and_used(tmp_path: Path) -> None:
 GOOD = "graphloc_range_beacon:ROW"
 
 
+def test_a_broken_package_is_one_line(tmp_path: Path) -> None:
+    points = {"graphloc.sensors": {"broken": "nowhere:ROW"}}
+    done = graphloc(installed(tmp_path / "site", points), "sensors")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "'broken' of some-package: cannot be loaded" in done.stderr
+    assert "uninstall" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("points", "said"),
     [
-        ({"graphloc.sensors": {"broken": "nowhere:ROW"}}, "'broken' of some-package: cannot be loaded"),
         ({"graphloc.sensors": {"number": "math:pi"}}, "'number': is a float, no Sensor"),
         ({"graphloc.sensors": {"other": GOOD}}, "'other': its row is of kind 'range_beacon'"),
     ],
 )
-def test_a_broken_package_is_one_line(tmp_path: Path, points: Points, said: str) -> None:
-    done = graphloc(installed(tmp_path / "site", points, EXAMPLE / "graphloc_range_beacon.py"), "sensors")
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert said in done.stderr
-    assert "uninstall" in done.stderr
+def test_a_package_whose_entry_is_no_row_of_its_kind_is_refused(
+    tmp_path: Path, points: Points, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the table of sensors is made; how the command line says it, the test above shows."""
+    installed(tmp_path / "site", points, EXAMPLE / "graphloc_range_beacon.py")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.setattr(factors, "added", added.__wrapped__)
+    try:
+        with pytest.raises(ConfigError) as caught:
+            factors._theirs()  # noqa: SLF001
+    finally:
+        sys.modules.pop("graphloc_range_beacon", None)
+    assert said in str(caught.value)
+    assert "uninstall" in str(caught.value)
+    assert "\n" not in str(caught.value)
