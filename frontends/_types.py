@@ -132,14 +132,22 @@ class MessageTypes:
             break
         if msgtype in VENDOR_TYPES:
             return list(_versions(msgtype, ros1=self._ros1))
-        store = _standard(ros1=self._ros1)
-        if msgtype in OTHER_TYPES:
-            store.register(get_types_from_msg(OTHER_TYPES[msgtype], msgtype))
-        return [store]
+        return [
+            _known(OTHER_TYPES[msgtype], msgtype, self._ros1) if msgtype in OTHER_TYPES else _known("", "", self._ros1)
+        ]
 
 
 def _standard(*, ros1: bool) -> Typestore:
     return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
+
+
+@lru_cache(maxsize=64)  # as `_defined`
+def _known(text: str, msgtype: str, ros1: bool) -> Typestore:
+    """Return the standard definitions, and one of ours beside them, if any."""
+    store = _standard(ros1=ros1)
+    if text:
+        store.register(get_types_from_msg(text, msgtype))
+    return store
 
 
 @lru_cache(maxsize=64)

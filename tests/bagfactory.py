@@ -2,6 +2,7 @@
 """Small bags for tests: messages of both ROS versions, and files of every kind."""
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from graphloc.ledger import LedgerRow
 from graphloc.recording import Recording
@@ -21,13 +23,26 @@ UP = (0.0, 0.0, 9.81)
 Item = tuple[str, int, Any]  # topic, recording time, message (or (type, raw bytes))
 
 
+@cache
+def _store(ros: int) -> Typestore:
+    """The types of a ROS version; what writes each is compiled once, 30 ms."""
+    return get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+
+
 class Messages:
     """Makes messages of one ROS version; the stamp is the header's, ns."""
 
     def __init__(self, ros: int) -> None:
         self.ros = ros
-        self.store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+        self.store = _store(ros)
         self.t = self.store.types
+
+    def register(self, definition: str, msgtype: str) -> None:
+        """Add a type, for these messages alone."""
+        if self.store is _store(self.ros):
+            self.store = _store.__wrapped__(self.ros)
+            self.t = self.store.types
+        self.store.register(get_types_from_msg(definition, msgtype))
 
     def header(self, stamp_ns: int, frame: str = "sensor") -> Any:
         stamp = self.t["builtin_interfaces/msg/Time"](sec=stamp_ns // S, nanosec=stamp_ns % S)
@@ -126,8 +141,7 @@ class Messages:
     def transforms(self, edges: Iterable[tuple[str, str, Sequence[float], Sequence[float]]]) -> Any:
         """`tf2_msgs/TFMessage` of (parent, child, xyz, xyzw)."""
         if "tf2_msgs/msg/TFMessage" not in self.t:
-            definition = get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
-            self.store.register(definition)
+            self.register("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
         stamped = [
             self.t["geometry_msgs/msg/TransformStamped"](
                 header=self.header(START_NS, parent),

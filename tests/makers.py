@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import get_types_from_msg
 
 from graphloc.frontends._vendor_types import VENDOR_TYPES
 from tests.bagfactory import Messages
@@ -30,7 +29,7 @@ def said(make: Messages, msgtype: str, version: int = 0, **fields: Any) -> Any:
     """Return a message; nested ones are given as dictionaries, `ublox_msgs` by ROS 2 names in either ROS."""
     if msgtype not in make.t:
         text = ros1_definition(msgtype) if make.ros == 1 else VENDOR_TYPES[msgtype][version]
-        make.store.register(get_types_from_msg(text, msgtype))
+        make.register(text, msgtype)
     if make.ros == 1 and msgtype.startswith("ublox_msgs"):
         fields = {_camel(name): value for name, value in fields.items()}
     return _filled(make, msgtype, fields)

@@ -11,7 +11,6 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from rosbags.typesys import get_types_from_msg
 from ruamel.yaml import YAML
 
 from graphloc.config import (
@@ -240,7 +239,7 @@ def test_memory_does_not_grow_with_image_topics(tmp_path: Path) -> None:
 
 def test_an_unknown_type_on_another_topic_is_counted(tmp_path: Path) -> None:
     make = Messages(2)
-    make.store.register(get_types_from_msg("float64 depth\n", "boat_msgs/msg/Sonar"))
+    make.register("float64 depth\n", "boat_msgs/msg/Sonar")
     sonar = make.store.types["boat_msgs/msg/Sonar"]
     items = still_run(make) + [("/sonar", START_NS + 5 * S + k, sonar(depth=3.0)) for k in range(7)]
     recording = read_recording(write_bag(tmp_path / "run", make, items), vessel())

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.typesys import get_types_from_msg
 
 from graphloc import factors
 from graphloc.config import (
@@ -519,7 +518,7 @@ def test_a_receiver_that_claims_more_accuracy_is_taken_before_one_that_says_more
 def test_what_no_run_can_do_without_is_reported(tmp_path: Path) -> None:
     """A draft of an IMU alone was all that came of a bag whose places are in messages of another kind."""
     make = Messages(2)
-    make.store.register(get_types_from_msg("float64 latitude\nfloat64 longitude", "foxglove_msgs/msg/LocationFix"))
+    make.register("float64 latitude\nfloat64 longitude", "foxglove_msgs/msg/LocationFix")
     items = [item for item in drive(make, seconds=10) if item[0] == "/imu"]
     place = make.t["foxglove_msgs/msg/LocationFix"](latitude=57.7, longitude=11.9)
     found, _, _ = look(tmp_path, [*items, ("/location", items[-1][1], place)], make)
@@ -699,7 +698,7 @@ def test_far_fewer_fixes_are_no_better_beside_a_filter(beside: bool, tmp_path: P
 def test_scans_and_tags_in_other_types_are_named(msgtype: str, said: str, tmp_path: Path) -> None:
     """Nothing was said of them in a bag with an IMU and fixes: their sensors would seem to be missing."""
     make = Messages(2)
-    make.store.register(get_types_from_msg("std_msgs/Header header\nuint8[] data", msgtype))
+    make.register("std_msgs/Header header\nuint8[] data", msgtype)
     packet = make.t[msgtype](header=make.header(START_NS), data=np.zeros(4, np.uint8))
     found, _, _ = look(tmp_path, [*drive(make, seconds=20), ("/odd", START_NS + 20 * S, packet)], make)
     assert [w for w in found.warnings if w.startswith("/odd: ") and said in w]

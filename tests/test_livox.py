@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.typesys import get_types_from_msg
 
 from graphloc.config import AerialConfig
 from graphloc.frames import Array
@@ -34,12 +33,12 @@ def message(
     """A scan stamped at the beginning; `changes` replace fields."""
     point = msgtype.replace("Msg", "Point")
     if msgtype not in make.t:
-        make.store.register(get_types_from_msg(
+        make.register(
             "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
             f"{'=' * 80}\nMSG: {point.replace('/msg', '')}\n"
             "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n",
             msgtype,
-        ))  # fmt: skip
+        )  # fmt: skip
     points = [
         make.t[point](offset_time=int(t), x=float(x), y=float(y), z=float(z), reflectivity=7, tag=int(tag), line=1)
         for (x, y, z), t, tag in zip(xyz, since_ns, np.broadcast_to(tags, len(xyz)), strict=True)

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.typesys import get_types_from_msg
 
 from graphloc.app import smooth_recording
 from graphloc.config import (
@@ -168,7 +167,7 @@ def bag(run: SimulatedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Receiver, gyro compass and fluxgate talk on one line (the velocity is that of the body), in sqlite3, which holds no definitions of messages."""
     make, imu = Messages(2), run.recording.imu
     assert imu is not None
-    make.store.register(get_types_from_msg("std_msgs/Header header\nstring sentence", SENTENCE))
+    make.register("std_msgs/Header header\nstring sentence", SENTENCE)
     items: list[Item] = [
         ("/imu", int(n), make.imu(int(n), a, w)) for n, a, w in zip(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps, strict=True)
     ]  # fmt: skip
@@ -350,7 +349,7 @@ def ahead(k: int, mps: float = 5.0) -> str:
 
 def test_a_line_that_is_read_is_not_said_to_be_of_no_known_type(tmp_path: Path) -> None:
     make = Messages(2)
-    make.store.register(get_types_from_msg("std_msgs/Header header\nstring sentence", SENTENCE))
+    make.register("std_msgs/Header header\nstring sentence", SENTENCE)
     items = []
     for k in range(30):
         at = 1_700_000_000 * S + k * S
@@ -464,7 +463,7 @@ def test_a_sensor_that_hears_nothing_says_so_of_its_own_sentences(tmp_path: Path
 def gps_fix(make: Messages, stamp_ns: int, lat: float, lon: float, *, status: int = 0, **told: float) -> Any:
     """A `gps_msgs/GPSFix` at 40 m with sigmas of 0.5, 0.5, 1 m; `told`: other fields, 0 where not given."""
     if "gps_msgs/msg/GPSFix" not in make.t:
-        make.store.register(get_types_from_msg(OTHER_TYPES["gps_msgs/msg/GPSFix"], "gps_msgs/msg/GPSFix"))
+        make.register(OTHER_TYPES["gps_msgs/msg/GPSFix"], "gps_msgs/msg/GPSFix")
     numbers = {n: 0.0 for n in ("track", "speed", "climb", "pitch", "roll", "dip", "time", "gdop", "pdop", "hdop", "vdop", "tdop", "err", "err_horz", "err_vert", "err_track", "err_speed", "err_climb", "err_time", "err_pitch", "err_roll", "err_dip")}  # fmt: skip
     lists = {n: np.zeros(0, dtype=np.int32) for n in ("satellite_used_prn", "satellite_visible_prn", "satellite_visible_z", "satellite_visible_azimuth", "satellite_visible_snr")}  # fmt: skip
     header = make.header(stamp_ns)

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 from pupil_apriltags import Detector
-from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import AprilTagConfig, load_config
@@ -44,7 +43,7 @@ AWAY = (1.0, 0.0, 0.0, 0.0)  # half a turn about x: a tag whose print faces the 
 def maker(msgtype: str) -> Messages:
     make = Messages(1 if msgtype == POSES else 2)
     for name, text in DEFINITIONS[msgtype].items():
-        make.store.register(get_types_from_msg(text, name))
+        make.register(text, name)
     return make
 
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig
@@ -369,7 +368,7 @@ def test_a_flag_that_older_versions_lack_changes_nothing() -> None:
     assert old != new
     for frame in ("", "a", "abcd", "imu_link"):
         make = Messages(2)
-        make.store.register(get_types_from_msg(old, SBG + "SbgImuData"))
+        make.register(old, SBG + "SbgImuData")
         fields = {
             "imu_status": {"imu_com": True, "imu_status": True},
             "accel": vector(1, 2, 3),
@@ -545,7 +544,7 @@ def test_fields_of_other_types_are_no_crash(kind: str, value: Any, tmp_path: Pat
     ways = (UBX + "NavPVT", OEM7 + "BESTPOS", OEM7 + "BESTVEL", PX4 + "SensorGps")  # of each way to a stamp
     for msgtype in (*ways, OEM7 + "INSPVAX", SBF + "INSNavGeod", GEO + "GeoPoseWithCovarianceStamped"):
         fields = r"(?m)^(?:u?int\d+|float\d+|bool|string)(?:\[\d+\])? (\w+)$"
-        make.store.register(get_types_from_msg(re.sub(fields, rf"{kind} \1", VENDOR_TYPES[msgtype][0]), msgtype))
+        make.register(re.sub(fields, rf"{kind} \1", VENDOR_TYPES[msgtype][0]), msgtype)
         items.append((f"/{msgtype}", START_NS, _of_other_fields(make, msgtype, value)))
         own = {
             f"{msgtype} {part.kind}": CONFIGS[part.kind].model_copy(update={"topic": f"/{msgtype}"})
