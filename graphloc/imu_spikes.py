@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spikes of an IMU: one or two readings that leap away and back, as a disturbed cable or a driver that misreads a byte gives.
 
-Integrated, one rate of 2 rad/s at 100 Hz turns the estimate by 1.1 deg for good, and no noise model expects it. A real knock of that
-size lasts for more samples, or its neighbours are as restless.
+Integrated, one rate of 2 rad/s at 100 Hz turns the estimate by 1.1 deg for good, and no noise model expects it. A real knock lasts for
+longer than a spike may (so of an IMU at 40 Hz or less none is judged), or its neighbours are as restless.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ from graphloc.time import NS_PER_S, utc_text
 WHY = "a spike: the samples before and after it agree; check cable and driver"
 LONGEST = 2
 """Number of samples in a row that may be one spike."""
-_LEAST = np.repeat([20.0, 0.5], 3)  # m/s^2, rad/s: what leaps by less does little harm
+_LEAST = np.repeat([40.0, 0.5], 3)  # m/s^2, rad/s: what leaps by less does little harm
 _TIMES, _QUANTILE = 6.0, 0.9  # a leap is so many times what most steps from sample to sample are
 _RECENT, _FEWEST = 200, 20  # steps that it is compared with; with fewer nothing is judged
 _BACK = 0.25  # of a leap may be left where it has gone back: less than of a knock that rings
-_APART_NS = NS_PER_S // 5  # samples that are farther apart say nothing of each other
+_LASTS_NS = (
+    NS_PER_S // 22
+)  # at most, from the sample before to the one after: knocks of a hull or a wheel last for longer
 
 
 def spikes(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
@@ -41,7 +43,7 @@ def spikes(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
         limit = _limit(recent)
         for length in range(1, LONGEST + 1):
             after = n + length
-            if after >= len(samples) or stamps_ns[after] - stamps_ns[n - 1] > _APART_NS:
+            if after >= len(samples) or stamps_ns[after] - stamps_ns[n - 1] > _LASTS_NS:
                 break
             if _leaps_back(samples[n - 1], samples[n:after], samples[after], limit):
                 bad[n:after] = True
@@ -93,7 +95,7 @@ class SpikeDetector:
         before = self._recent[-1] if self._recent else row
         if not self._held and not (np.abs(row - before) > _LEAST).any():
             return self._accepted([(m, row)]), []
-        if m.stamp_ns - self._newest_ns > _APART_NS:
+        if m.stamp_ns - self._newest_ns > _LASTS_NS:
             return self._accepted([*self._held, (m, row)]), []
         limit = _limit(np.array(self._recent))
         if self._held and _leaps_back(before, np.array([r for _, r in self._held]), row, limit):

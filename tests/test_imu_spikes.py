@@ -16,6 +16,7 @@ from graphloc.imu_spikes import SpikeDetector, spikes
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample
 from graphloc.online import OnlineSmoother
+from tests.bagfactory import START_NS, S
 from tests.faults import arrivals_of, complaints, feed, finish, numbered
 from tests.slowly import simulate_slowly
 from tests.test_bag_bad_input import accounted, rows_of, vessel
@@ -46,7 +47,7 @@ def leaping(at: dict[int, float], axis: int = 5) -> Array:
 
 @pytest.mark.parametrize(
     "samples",
-    [leaping({300: 2.0, 500: -9.0}), leaping({300: 60.0, 500: -30.0}, axis=1), leaping({300: 2.0, 500: -1.0}) - 5.0],
+    [leaping({300: 2.0, 500: -9.0}), leaping({300: 60.0, 500: -50.0}, axis=1), leaping({300: 2.0, 500: -1.0}) - 5.0],
     ids=["rate", "force", "about another mean"],
 )
 def test_a_reading_that_leaps_away_and_back_is_a_spike(samples: Array) -> None:
@@ -71,6 +72,13 @@ def test_what_a_vessel_does_is_none() -> None:
     for samples in (turning, knocked, shaking, small):
         assert not spikes(STAMPS, samples).any()
         assert as_they_come(samples) == []
+
+
+def test_of_a_slow_imu_nothing_is_judged() -> None:
+    """At 25 Hz a slam of 60 ms is one sample."""
+    stamps = START_NS + np.arange(len(STAMPS)) * (S // 25)
+    assert not spikes(stamps, leaping({300: 2.0})).any()
+    assert not spikes(stamps, leaping({300: 60.0}, axis=2)).any()
 
 
 def test_beside_a_gap_nothing_is_judged() -> None:
