@@ -461,8 +461,8 @@ def _beside_motion(
     scatter_m = max(gnss.scatter_m[:2]) if gnss.scatter_m else 0.0
     fixes = motion_of_places(gnss.topic, stamps, p_m)
     known = [(rolled, "the wheels")] if rolled else []
-    if fixes is not None:
-        known += [(_at_the_time_of(fixes, m), m.source) for m in velocities]
+    if rolled is None and fixes is not None:
+        known = [(_at_the_time_of(fixes, m), m.source) for m in velocities]
     for motion, name in known:
         if (wanders := wander_m(motion, stamps, p_m, scatter_m)) is not None:
             return replace(gnss, wander_m=wanders, wander_by=name)

@@ -20,8 +20,11 @@ WHY = "a spike: the samples before and after it agree; check cable and driver"
 LONGEST = 2
 """Number of samples in a row that may be one spike."""
 _LEAST = np.repeat([40.0, 0.5], 3)  # m/s^2, rad/s: what leaps by less does little harm
-_TIMES, _QUANTILE = 6.0, 0.9  # a leap is so many times what most steps from sample to sample are
-_RECENT, _FEWEST = 200, 20  # steps that it is compared with; with fewer nothing is judged
+# A leap is so many times what most steps from sample to sample are. A spike makes two steps that are more: after four of them among so
+# many samples the next is motion, as of a robot that walks.
+_TIMES, _QUANTILE = 5.0, 0.97
+_RECENT, _FEWEST = 200, 40  # steps that it is compared with; with fewer nothing is judged
+_CALM = 2  # steps before a leap that are usual: else it rings
 _BACK = 0.25  # of a leap may be left where it has gone back: less than of a knock that rings
 _LASTS_NS = (
     NS_PER_S // 22
@@ -39,8 +42,7 @@ def spikes(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
     for n in (np.flatnonzero(leaps) + 1).tolist():
         if bad[n] or bad[n - 1]:
             continue
-        recent = samples[max(n - 1 - _RECENT, 0) : n][~bad[max(n - 1 - _RECENT, 0) : n]]
-        limit = _limit(recent)
+        limit = _limit(samples[max(n - 1 - _RECENT, 0) : n])
         for length in range(1, LONGEST + 1):
             after = n + length
             if after >= len(samples) or stamps_ns[after] - stamps_ns[n - 1] > _LASTS_NS:
@@ -60,12 +62,13 @@ def spike_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.boo
 
 
 def _limit(recent: Array) -> Array:
-    """Return how far (6,) a reading may leap after samples (N, 6); infinity where too few are known, or the last one leapt: it rings."""
+    """Return how far (6,) a reading may leap after samples (N, 6); infinity where too few are known, or the last ones leapt."""
     if len(recent) <= _FEWEST:
         return np.full(6, np.inf)
     steps = np.abs(np.diff(recent, axis=0))
-    limit = np.maximum(_LEAST, _TIMES * np.quantile(steps, _QUANTILE, axis=0))
-    return np.asarray(np.full(6, np.inf) if (steps[-1] > limit).any() else limit)
+    rank = int(_QUANTILE * (len(steps) - 1))
+    limit = np.maximum(_LEAST, _TIMES * np.partition(steps, rank, axis=0)[rank])
+    return np.asarray(np.full(6, np.inf) if (steps[-_CALM:] > limit).any() else limit)
 
 
 def _leaps_back(before: Array, held: Array, after: Array, limit: Array) -> bool:
@@ -100,6 +103,7 @@ class SpikeDetector:
         limit = _limit(np.array(self._recent))
         if self._held and _leaps_back(before, np.array([r for _, r in self._held]), row, limit):
             spiked = [held for held, _ in self._held]
+            self._recent.extend(r for _, r in self._held)
             return self._accepted([(m, row)]), spiked
         if len(self._held) < LONGEST and (np.abs(row - before) > limit).any():
             self._held.append((m, row))

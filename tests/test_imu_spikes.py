@@ -16,6 +16,7 @@ from graphloc.imu_spikes import SpikeDetector, spikes
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample
 from graphloc.online import OnlineSmoother
+from graphloc.online._intake import ImuIntake
 from tests.bagfactory import START_NS, S
 from tests.faults import arrivals_of, complaints, feed, finish, numbered
 from tests.slowly import simulate_slowly
@@ -72,6 +73,30 @@ def test_what_a_vessel_does_is_none() -> None:
     for samples in (turning, knocked, shaking, small):
         assert not spikes(STAMPS, samples).any()
         assert as_they_come(samples) == []
+
+
+def test_spikes_again_and_again_are_motion() -> None:
+    """A robot that walks: an impact of one sample every half second. Four among 200 samples are rejected, and no more."""
+    walking = leaping(dict.fromkeys(range(100, 1000, 50), 3.0))
+    found = np.flatnonzero(spikes(STAMPS, walking)).tolist()
+    assert found == as_they_come(walking) == [100, 150, 200, 250]
+
+
+def test_a_clock_that_is_set_back_while_one_is_held_is_seen() -> None:
+    """All samples were dropped until the new clock had come to the one that was held."""
+    samples = leaping({100: 3.0})
+    stamps = STAMPS.copy()
+    stamps[101:] -= 100 * S
+    intake, set_back_s, seen = ImuIntake(0.2, floats=True), 0.0, list[int]()
+    for k, (stamp, row) in enumerate(zip(stamps[:300], samples, strict=False)):
+        m = ImuSample(stamp_ns=int(stamp), sensor="imu", seq=k, accel_mps2=row[:3], gyro_radps=row[3:])
+        taken = intake.take(m, started=True)
+        set_back_s = max(set_back_s, taken.set_back_s)
+        seen += [m.seq for m in taken.accepted] + [m.seq for m, _ in taken.dropped]
+        for accepted in taken.accepted:
+            intake.accept(accepted)
+    assert set_back_s > 99.0
+    assert sorted(seen) == list(range(300))
 
 
 def test_of_a_slow_imu_nothing_is_judged() -> None:

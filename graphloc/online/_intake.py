@@ -91,7 +91,7 @@ class ImuIntake:
 
     def take(self, m: ImuSample, *, started: bool) -> Taken:
         """Decide on a sample, and on those that were held back. `started`: there is an estimate."""
-        if m.stamp_ns <= self._spikes.held_ns:
+        if self.newest is not None and self.newest.stamp_ns < m.stamp_ns <= self._spikes.held_ns:
             return Taken(dropped=((m, "its stamp does not increase"),))
         taken = self._in_order(m, started)
         lost = self._spikes.let_go() if taken.set_back_s else []
