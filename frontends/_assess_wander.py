@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends._assess import MeasuredMotion, sane
+from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane
 from graphloc.frontends._streams import TopicData
 from graphloc.series import interpolated, robust_sigma
 from graphloc.time import NS_PER_S
@@ -54,11 +54,6 @@ def wander_m(motion: MeasuredMotion, stamps_ns: NDArray[np.int64], p_m: Array, s
 
 
 def way_of(wheels: TopicData) -> MeasuredMotion | None:
-    """Return the motion by the poses of an odometry itself; None of an empty one."""
+    """Return the motion by the poses of an odometry itself; None of few."""
     keep = sane(wheels, np.s_[:2])
-    if not len(keep):
-        return None
-    begin_ns = int(wheels.stamps_ns[keep[0]])
-    x, y = wheels.rows[keep, :2].T
-    t_s = (wheels.stamps_ns[keep] - begin_ns) / NS_PER_S
-    return MeasuredMotion(wheels.topic, begin_ns, t_s, np.zeros(len(keep)), x + 1j * y)
+    return motion_of_places(wheels.topic, wheels.stamps_ns[keep], wheels.rows[keep, :2]) if len(keep) else None

@@ -279,20 +279,13 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(_rtk_slow_error(gnss))
     else:
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
-        keys, apart = _wandering(gnss), ""
-        if not any(key.startswith("horizontal") for key in keys):
+        wandering, large, apart = _wandering(gnss), list[str](), ""
+        if not any(key.startswith("horizontal") for key in wandering):
             large, apart = _as_large(gnss)
-            keys = [*large, *keys]
-        if wanders:
-            keys = [
-                f"vertical_sigma_m: {max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3):.1f}",
-                *keys,
-            ]
-        more = ", ".join(keys)
+        vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3)
+        more = ", ".join([*([f"vertical_sigma_m: {vertical:.1f}"] if wanders else []), *large, *wandering])
         fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
-        wander = (
-            f"; by {gnss.wander_by} it changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s" if _wandering(gnss) else ""
-        )
+        wander = f"; by {gnss.wander_by} it changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s" if wandering else ""
         lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{wander}{apart}{fixed}")
     return lines
 
@@ -303,9 +296,8 @@ def _as_large(gnss: GnssReport) -> tuple[list[str], str]:
     white_m = max(gnss.scatter_m[:2]) if gnss.scatter_m else claimed_m
     slow_m = claimed_m if SCATTERS * white_m < claimed_m <= NOTHING_M else 0.0
     if gnss.differs and gnss.apart_m >= slow_m:
-        return [
-            f"horizontal_sigma_m: {gnss.apart_m:.1f}"
-        ], f"; so far it and {gnss.apart_from} wander against each other"
+        said = f"; so far it and {gnss.apart_from} wander against each other"
+        return [f"horizontal_sigma_m: {gnss.apart_m:.1f}"], said
     if slow_m <= SlowErrorConfig().horizontal_sigma_m:
         return [], ""
     said = f"; scatter from fix to fix is {white_m:.1f} m, so that most of what they claim to be off is slow"

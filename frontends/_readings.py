@@ -201,8 +201,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     bad = ~_clock.in_order_or_late(readings.stamps())
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
     readings.sort()
-    rows += _drop_hanging(readings, warnings)
-    rows += _drop_spikes(readings, warnings)
+    rows += _drop_wrong(readings, warnings)
     samples = [v for v in readings.values if isinstance(v, ImuReading)]
     if not samples:
         return None, rows
@@ -241,20 +240,16 @@ def _even_out(readings: Readings, warnings: list[str]) -> None:
         )
 
 
-def _drop_hanging(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop the repetitions of a frozen IMU: the solver bridges them like a gap."""
-    stamps = readings.stamps()
-    bad = frozen_samples(stamps, _imu_values(readings))
-    warnings += frozen_imu_warning(readings.sensor, stamps, bad)
-    return readings.drop(bad, rejected(WHY))
-
-
-def _drop_spikes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop samples that leap away and back: integrated, each would turn or push the estimate for good."""
-    stamps = readings.stamps()
-    bad = spikes(stamps, _imu_values(readings))
-    warnings += spike_warning(readings.sensor, stamps, bad)
-    return readings.drop(bad, rejected(SPIKE))
+def _drop_wrong(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
+    """Drop the repetitions of a frozen IMU, which the solver bridges like a gap, and spikes, which would turn or push the estimate for good."""
+    stamps, values = readings.stamps(), _imu_values(readings)
+    frozen = frozen_samples(stamps, values)
+    warnings += frozen_imu_warning(readings.sensor, stamps, frozen)
+    rows = readings.drop(frozen, rejected(WHY))
+    stamps, values = stamps[~frozen], values[~frozen]
+    spiked = spikes(stamps, values)
+    warnings += spike_warning(readings.sensor, stamps, spiked)
+    return rows + readings.drop(spiked, rejected(SPIKE))
 
 
 def reject_repeats(readings: Readings) -> list[LedgerRow]:

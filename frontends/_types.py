@@ -131,34 +131,19 @@ class MessageTypes:
                 )
             break
         if msgtype in VENDOR_TYPES:
-            return list(_versions(msgtype, ros1=self._ros1))
+            return [_known(text, msgtype, self._ros1) for text in VENDOR_TYPES[msgtype]]
         return [
             _known(OTHER_TYPES[msgtype], msgtype, self._ros1) if msgtype in OTHER_TYPES else _known("", "", self._ros1)
         ]
 
 
-def _standard(*, ros1: bool) -> Typestore:
-    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
-
-
 @lru_cache(maxsize=64)  # as `_defined`
 def _known(text: str, msgtype: str, ros1: bool) -> Typestore:
     """Return the standard definitions, and one of ours beside them, if any."""
-    store = _standard(ros1=ros1)
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
     if text:
         store.register(get_types_from_msg(text, msgtype))
     return store
-
-
-@lru_cache(maxsize=64)
-def _versions(msgtype: str, *, ros1: bool) -> tuple[Typestore, ...]:
-    """Return the definitions of a maker's message."""
-    stores = []
-    for text in VENDOR_TYPES[msgtype]:
-        store = _standard(ros1=ros1)
-        store.register(get_types_from_msg(text, msgtype))
-        stores.append(store)
-    return tuple(stores)
 
 
 @lru_cache(maxsize=64)  # a run opens its bag several times, and rosbags writes a program for each type

@@ -26,9 +26,8 @@ _TIMES, _QUANTILE = 5.0, 0.97
 _RECENT, _FEWEST = 200, 40  # steps that it is compared with; with fewer nothing is judged
 _CALM = 2  # steps before a leap that are usual: else it rings
 _BACK = 0.25  # of a leap may be left where it has gone back: less than of a knock that rings
-_LASTS_NS = (
-    NS_PER_S // 22
-)  # at most, from the sample before to the one after: knocks of a hull or a wheel last for longer
+# At most, from the sample before to the one after: knocks of a hull or a wheel last for longer.
+_LASTS_NS = NS_PER_S // 22
 
 
 def spikes(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:

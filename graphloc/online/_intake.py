@@ -19,6 +19,7 @@ _BACK = 50  # samples in a row with stamps before the newest: the clock was set 
 _LATE_S = 3.0  # how late samples may come before the start
 _HOLE = 0.7  # of the IMU's period to either side without a sample: one is missing there
 _FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # plausible for a vessel; readings in g or deg/s fall outside
+_BEHIND, _LOST = "its stamp does not increase", "held back as it leapt, and then the clock was set back"
 _PERIODS = 1000  # newest steps, from which the IMU's period is taken
 
 
@@ -92,19 +93,17 @@ class ImuIntake:
     def take(self, m: ImuSample, *, started: bool) -> Taken:
         """Decide on a sample, and on those that were held back. `started`: there is an estimate."""
         if self.newest is not None and self.newest.stamp_ns < m.stamp_ns <= self._spikes.held_ns:
-            return Taken(dropped=((m, "its stamp does not increase"),))
+            return Taken(dropped=((m, _BEHIND),))
         taken = self._in_order(m, started)
         lost = self._spikes.let_go() if taken.set_back_s else []
-        dropped = [(held, "held back as it leapt, and then the clock was set back") for held in lost]
-        accepted: list[ImuSample] = []
+        accepted, spiked = list[ImuSample](), list[ImuSample]()
         for sample in taken.accepted:
             right, wrong = self._spikes.take(sample)
             accepted += right
-            dropped += [(held, SPIKE) for held in wrong]
-        already, self._spiked = self._spiked, self._spiked or any(why == SPIKE for _, why in dropped)
-        return replace(
-            taken, accepted=tuple(accepted), dropped=(*taken.dropped, *dropped), newly_spiked=self._spiked > already
-        )
+            spiked += wrong
+        already, self._spiked = self._spiked, self._spiked or bool(spiked)
+        dropped = (*taken.dropped, *((held, _LOST) for held in lost), *((held, SPIKE) for held in spiked))
+        return replace(taken, accepted=tuple(accepted), dropped=dropped, newly_spiked=self._spiked and not already)
 
     def left(self) -> list[ImuSample]:
         """Return what is still held back at the end."""
@@ -159,6 +158,6 @@ class ImuIntake:
         # A smaller step back is caught up with, and bridged.
         self._behind += newest.stamp_ns - m.stamp_ns > self._gap_ns
         if self._behind < _BACK:
-            return Taken(dropped=((m, "its stamp does not increase"),))
+            return Taken(dropped=((m, _BEHIND),))
         self.newest = None
         return Taken(accepted=(m,), set_back_s=(newest.stamp_ns - m.stamp_ns) * 1e-9)
