@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graphloc import app
+from graphloc import app, keys
 from graphloc.config import KernelConfig, SlowErrorConfig, VesselConfig
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
@@ -23,9 +23,13 @@ from graphloc.online import _start as online_start
 from graphloc.position_jumps import JumpDetector, OffPrediction, PositionJump, jump_warnings, position_jumps
 from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
-from graphloc.solution import Health
+from graphloc.solution import Health, Solution
+from graphloc.solve import _batch
 from graphloc.solve._decide import Stage, _by_kernel
+from graphloc.solve._grow import grow
 from tests.slowly import simulate_slowly, with_few_states
+
+_FINE_FIXES = Scenario(gnss_sigma_m=0.05, gnss_reported_sigma_m=0.21, imu_hz=50.0)
 
 
 def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
@@ -48,25 +52,62 @@ def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
     assert compare_to_truth(done.solution.trajectory, run.truth).position_max_m < 2.0
 
 
-def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one() -> None:
-    """90 deg off for 35 s of 70: taken for scatter, it turned the run by up to 180 deg, and 69 of 70 matches were refused."""
-    scenario = Scenario(
-        path="turn", duration_s=70.0, gnss_hz=5.0, compass_hz=5.0, gnss_sigma_m=0.05, gnss_reported_sigma_m=0.21
-    )  # fmt: skip
-    run = simulate(scenario, 1)
+def _heading_off_deg(
+    scenario: Scenario, seed: int, by_deg: float, from_s: float, to_s: float
+) -> tuple[float, Solution]:
+    """Return the largest error of the heading, and the solution, where the compass is off by an angle for a part of the run."""
+    run = simulate(scenario, seed)
     begin_ns = int(run.truth.stamps_ns[0])
 
     def struck(m: Measurement) -> Measurement:
-        if not isinstance(m, CompassHeading) or not 15.0 <= (m.stamp_ns - begin_ns) * 1e-9 < 50.0:
+        if not isinstance(m, CompassHeading) or not from_s <= (m.stamp_ns - begin_ns) * 1e-9 < to_s:
             return m
-        return replace(m, yaw_rad=float(wrap_angle(m.yaw_rad + np.pi / 2.0)))
+        return replace(m, yaw_rad=float(wrap_angle(m.yaw_rad + np.radians(by_deg))))
 
-    recording = run.recording.changed(struck)
-    solved = app.smooth_recording(recording, run.config).solution
+    solved = app.smooth_recording(run.recording.changed(struck), run.config).solution
     track = solved.trajectory
-    off_deg = np.degrees(np.abs(wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad)))
-    assert off_deg.max() < 3.0
+    off_rad = np.abs(wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad))
+    return float(np.degrees(off_rad.max())), solved
+
+
+@pytest.mark.parametrize("kind", ["none", "huber", "cauchy", "geman_mcclure", "tukey"])
+def test_what_a_residual_costs_is_the_integral_of_its_weight(kind: Any) -> None:
+    kernel, dof = KernelConfig(kind=kind, scale=1.3), 3
+    nis = np.linspace(0.0, 30.0, 3001)
+    weight = [kernel.model_copy(update={"scale": 1.3 * dof**0.5}).weight(n) for n in nis]
+    np.testing.assert_allclose(kernel.loss(nis[-1], dof), 0.5 * np.trapezoid(weight, nis), rtol=1e-4)
+
+
+def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """90 deg off for 35 s of 70, and the run is not tried without it.
+
+    Taken for scatter, it turned the run by up to 180 deg, and 69 of 70 matches were refused; with gentle losses it bent the gyroscope's
+    bias while the run was grown, and the heading was 48 deg off.
+    """
+    scenario = replace(_FINE_FIXES, path="turn", duration_s=70.0, gnss_hz=5.0, compass_hz=5.0)
+    monkeypatch.setattr(_batch, "_OFTEN", np.inf)
+    grown_deg: list[float] = []
+
+    def watched(problem: Any, values: Any, *args: Any) -> int:
+        used = grow(problem, values, *args)
+        yaw = [float(values.atPose3(keys.pose(k)).rotation().yaw()) for k in range(len(problem.timeline))]
+        off = wrap_angle(np.array(yaw) - simulate(scenario, 1).truth.at(problem.timeline.stamps_ns).yaw_rad)
+        grown_deg.append(float(np.degrees(np.abs(off).max())))
+        return used
+
+    monkeypatch.setattr(_batch, "grow", watched)
+    off_deg, solved = _heading_off_deg(scenario, 1, 90.0, 15.0, 50.0)
+    assert len(grown_deg) == 1
+    assert grown_deg[0] < 3.0
+    assert off_deg < 3.0
     assert solved.ledger.counts()["matcher"]["used"] > 30
+
+
+def test_a_compass_that_is_off_for_most_of_a_run_is_found_by_leaving_it_out() -> None:
+    """Followed from the start, it left the heading 180 deg off."""
+    scenario = replace(_FINE_FIXES, path="loops", duration_s=20.0, gnss_hz=2.0, compass_hz=2.0)
+    off_deg, _ = _heading_off_deg(scenario, 3, 90.0, 6.0, 17.0)
+    assert off_deg < 2.0
 
 
 @pytest.mark.parametrize("allowed_m", [3.0, 0.0])

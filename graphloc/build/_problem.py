@@ -65,6 +65,13 @@ class Stream:
         lo, hi = np.searchsorted(self.state, [first, last + 1])
         return range(int(lo), int(hi))
 
+    def silenced(self) -> Stream:
+        """Return it without its measurements."""
+        none = np.empty(0)
+        return replace(
+            self, measurements=(), state=none.astype(np.int64), carry=(), gyro_radps=np.empty((0, 3)), apart_s=none
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:

@@ -33,6 +33,20 @@ class KernelConfig(Block):
             return 1.0 / (1.0 + u2) ** 2
         return (1.0 - u2) ** 2 if u2 < 1.0 else 0.0
 
+    def loss(self, nis: float, dof: int) -> float:
+        """Return what a squared normalised residual of so many components costs, -log of its density but for a constant."""
+        if self.kind == "none":
+            return 0.5 * nis
+        c2 = self.scale**2 * dof
+        u2 = nis / c2
+        if self.kind == "huber":
+            return 0.5 * nis if u2 <= 1.0 else c2 * (math.sqrt(u2) - 0.5)
+        if self.kind == "cauchy":
+            return 0.5 * c2 * math.log1p(u2)
+        if self.kind == "geman_mcclure":
+            return 0.5 * c2 * u2 / (1.0 + u2)
+        return c2 / 6.0 * (1.0 - (1.0 - min(u2, 1.0)) ** 3)
+
 
 SIGMA_SCALES = {
     "sigma_scale": ("min_horizontal_sigma_m", "min_vertical_sigma_m", "min_sigma_m"),

@@ -12,13 +12,15 @@
 
 Where no sensor measures position or velocity for a while, 3 to 6 have the motion model (`graphloc.motion_model`).
 Sensors that scatter more than they state are taken as they scatter, and 3 and 4 repeated.
-Where the IMU contradicts the other sensors, its noise is scaled up, and 3 and 4 are repeated, beginning with gentle losses.
+Where the IMU contradicts the other sensors, or one of heading or velocity often disagrees, 1 to 4 are tried without such a sensor,
+and then with all from there. If the IMU contradicts them still, its noise is scaled up, and 3 and 4 are repeated, beginning with
+gentle losses; where that explains little, it is not the IMU, and its noise stays as configured.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -26,6 +28,7 @@ import numpy as np
 from graphloc.build import (
     Problem,
     StartPrior,
+    Stream,
     Thinned,
     bridged,
     thinned,
@@ -33,26 +36,37 @@ from graphloc.build import (
     with_sensor_noise,
     with_usual_motion,
 )
+from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
-from graphloc.solve._align import align
+from graphloc.solve._align import Start, align
 from graphloc.solve._choices import other_choices, take_more_probable
-from graphloc.solve._decide import Stage, Verdicts, weigh
+from graphloc.solve._decide import AGREES, Stage, Verdicts, weigh
 from graphloc.solve._grow import grow
 from graphloc.solve._imu_noise import with_needed_noise
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
-from graphloc.solve._passes import Settled, cost_without_outliers, expected_cost, rough_passes, settle
+from graphloc.solve._passes import (
+    Settled,
+    cost_as_configured,
+    cost_without_outliers,
+    expected_cost,
+    rough_passes,
+    settle,
+)
 from graphloc.solve._sensor_noise import scattering
 from graphloc.solve._start import solve_start
 
-_MAX_NOISE_ROUNDS, _MAX_SENSOR_ROUNDS = 5, 2
+_MAX_NOISE_ROUNDS, _MAX_SENSOR_ROUNDS = 4, 2
 # Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
 _FIRST_PASSES, _LAST_PASSES = 6, 15
 # At most: over the thinned run after growing; with each gentle loss, where the IMU's noise has changed.
 _SEAM_PASSES, _OPEN_PASSES = 2, 4
 CONTRADICTION = 2.5  # cost over its expectation, from which the configured IMU noise is not believed
 LARGEST_NOISE_SCALE = 10.0  # no IMU is so many times noisier than configured
+# More noise of the IMU explains a misfit if it falls below that, or by this factor; else the noise stays as configured.
+_EXPLAINED = 2.0
+_OFTEN = 0.3  # share of a sensor's measurements that disagree, from which the run is tried without it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,43 +112,39 @@ def solve_batch(problem: Problem, progress: Progress = quiet, *, newest: bool = 
     Raises:
         SolveError: it could not be started, or the linear algebra failed.
     """
-    start, few = align(problem), thinned(problem)
-    grown, prior, known, iterations, headings, few_var = solve_start(few.problem, start, progress, newest=newest)
-    heading_var = np.interp(problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1], few_var)
-    begun = int(few.states[known])
-    iterations += grow(few.problem, grown, prior, known, progress)
-    grown, used, _ = rough_passes(few.problem, grown, prior, progress, (Stage.FINAL,), _SEAM_PASSES)
-    iterations += used
-    passes, estimate = 0, few.filled(problem, grown)
-    if problem.links.gaps():
-        problem = bridged(problem, estimate)
-    problem = with_usual_motion(problem, estimate)
-    if problem.usual_motion is not None or problem.links.gaps():
-        few = thinned(problem)
-    for attempt in range(_MAX_NOISE_ROUNDS):
-        problem, few, settled = _as_they_scatter(problem, few, estimate, prior, progress)
-        passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
-        ratio = cost_without_outliers(settled) / max(expected_cost(problem, settled.verdicts), 1.0)
-        if attempt == _MAX_NOISE_ROUNDS - 1 or not problem.config.sensors[problem.imu.sensor].adapt_noise:
+    begun, solved = _first_solution(problem, progress, newest=newest)
+    as_stated, misfit = solved.choice(), solved.misfit()
+    passes, iterations = solved.settled.passes, begun.iterations + solved.settled.iterations
+    for _ in range(_MAX_NOISE_ROUNDS):
+        problem, settled = solved
+        ratio, estimate = solved.misfit(), settled.values
+        if not problem.config.sensors[problem.imu.sensor].adapt_noise:
             break
         if ratio < CONTRADICTION:
-            noisier = with_needed_noise(problem, estimate, settled.verdicts, prior)
+            noisier = with_needed_noise(problem, estimate, settled.verdicts, begun.prior)
         else:
             noisier = with_noise_scale(problem, problem.noise_scale * noise_step(ratio))
         if noisier is None:
             break
-        if start.by_motion and ratio < CONTRADICTION:
+        if begun.start.by_motion and ratio < CONTRADICTION:
             # Which headings the motion excludes was found with the smaller noise.
             return solve_batch(replace(noisier, usual_motion=None), progress, newest=newest)
         problem = bridged(noisier, estimate)
-        few = thinned(problem)
         if ratio >= CONTRADICTION:
             estimate, used, passed = rough_passes(
-                problem, estimate, prior, progress, (Stage.FAR, Stage.OPEN), _OPEN_PASSES
+                problem, estimate, begun.prior, progress, (Stage.FAR, Stage.OPEN), _OPEN_PASSES
             )
             passes, iterations = passes + passed, iterations + used
-    settled, levels_cov = at_usual_level(problem, settled, prior, progress, _LAST_PASSES)
-    if settled.values is not estimate:
+        del settled, solved  # and their graph, before the next one is made
+        solved = _as_they_scatter(problem, estimate, begun.prior, progress)
+        passes, iterations = passes + solved.settled.passes, iterations + solved.settled.iterations
+    if solved.problem.noise_scale > 1.0 and CONTRADICTION <= solved.misfit() and misfit < _EXPLAINED * solved.misfit():
+        del solved
+        solved = as_stated.settled_again(begun.prior, progress)
+        passes, iterations = passes + solved.settled.passes, iterations + solved.settled.iterations
+    problem, last = solved
+    settled, levels_cov = at_usual_level(problem, last, begun.prior, progress, _LAST_PASSES)
+    if settled is not last:
         passes, iterations = passes + settled.passes, iterations + settled.iterations
     return BatchResult(
         problem=problem,
@@ -147,32 +157,134 @@ def solve_batch(problem: Problem, progress: Progress = quiet, *, newest: bool = 
         cost=cost_without_outliers(settled),
         converged=settled.converged,
         noise_scale=problem.noise_scale,
-        prior=prior,
-        heading_var=heading_var,
-        begun=begun,
-        headings=headings if start.yaw_sigma_rad < np.pi else 0,
+        prior=begun.prior,
+        heading_var=begun.heading_var,
+        begun=begun.last,
+        headings=begun.headings if begun.start.yaw_sigma_rad < np.pi else 0,
         levels_cov=levels_cov,
-        notes=start.notes,
+        notes=begun.start.notes,
     )
 
 
-def _as_they_scatter(
-    problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
-) -> tuple[Problem, Thinned, Settled]:
-    """Make the final passes, again with larger sigmas of the sensors that scatter more than they state (see `_sensor_noise`).
+class _Grown(NamedTuple):
+    """A run grown from its start over the thinned run; for the fields that it shares with a `BatchResult`, see there."""
 
-    Returns:
-        The problem with these, its thinned run, and the solution.
+    start: Start
+    values: gtsam.Values
+    prior: StartPrior
+    last: int
+    iterations: int
+    headings: int
+    heading_var: Array
+
+
+class _Choice(NamedTuple):
+    """A solution without its graph, which takes gigabytes on a run of hours."""
+
+    problem: Problem
+    values: gtsam.Values
+    verdicts: Verdicts
+
+    def settled_again(self, prior: StartPrior, progress: Progress) -> _Solved:
+        return _Solved(self.problem, settle(*self, prior, progress, _LAST_PASSES))
+
+
+class _Solved(NamedTuple):
+    """A run after its final passes, and the problem with the noise that it was solved with."""
+
+    problem: Problem
+    settled: Settled
+
+    def misfit(self) -> float:
+        """Return the cost over its expectation."""
+        return cost_without_outliers(self.settled) / max(expected_cost(self.problem, self.settled.verdicts), 1.0)
+
+    def choice(self) -> _Choice:
+        return _Choice(self.problem, self.settled.values, self.settled.verdicts)
+
+
+def _first_solution(problem: Problem, progress: Progress, *, newest: bool) -> tuple[_Grown, _Solved]:
+    """Solve a run with the IMU's noise as configured.
+
+    Where that contradicts the other sensors, it is begun without each sensor of heading or velocity, too; else without those of
+    them that often disagree. The solution in which all measurements are most probable is taken: a compass that is wrong for most
+    of a run may lead the heading away, where nothing leads back.
     """
+    begun = _begin(problem, progress, newest=newest)
+    solved = _from_there(problem, begun, progress)
+    misfit, last = solved.misfit(), len(problem.timeline) - 1
+    doubted = [
+        number
+        for number, stream in enumerate(problem.streams)
+        if stream.row.false is None
+        and not stream.row.absolute
+        and (misfit >= CONTRADICTION or _share_off(stream, solved.settled.verdicts) > _OFTEN)
+    ]
+    if not doubted:
+        return begun, solved
+
+    def cost(values: gtsam.Values, prior: StartPrior) -> float:
+        return cost_as_configured(problem, values, 0, last, prior, judged=last)
+
+    lowest, best = cost(solved.settled.values, begun.prior), (begun, solved.choice())
+    for number in doubted:
+        rest = list(problem.streams)
+        rest[number] = rest[number].silenced()
+        try:
+            begun = _begin(replace(problem, streams=tuple(rest)), progress, newest=newest)
+        except SolveError:
+            continue
+        del solved
+        solved = _from_there(problem, begun, progress)
+        if (found := cost(solved.settled.values, begun.prior)) < lowest:
+            lowest, best = found, (begun, solved.choice())
+    begun, choice = best
+    del solved
+    return begun, choice.settled_again(begun.prior, progress)
+
+
+def _share_off(stream: Stream, verdicts: Verdicts) -> float:
+    """Return the share of its measurements that disagree."""
+    return float(np.mean([verdicts[stream.number, i].weight < AGREES for i in range(len(stream.measurements))]))
+
+
+def _begin(problem: Problem, progress: Progress, *, newest: bool) -> _Grown:
+    """Start a run, and grow it over the thinned one."""
+    start, few = align(problem), thinned(problem)
+    begun = solve_start(few.problem, start, progress, newest=newest)
+    whole, thin = problem.timeline.stamps_ns, few.problem.timeline.stamps_ns
+    heading_var = np.interp(whole, thin[: begun.last + 1], begun.heading_var)
+    iterations = begun.iterations + grow(few.problem, begun.values, begun.prior, begun.last, progress)
+    grown, used, _ = rough_passes(few.problem, begun.values, begun.prior, progress, (Stage.FINAL,), _SEAM_PASSES)
+    return _Grown(
+        start=start,
+        values=few.filled(problem, grown),
+        prior=begun.prior,
+        last=int(few.states[begun.last]),
+        iterations=iterations + used,
+        headings=begun.headings,
+        heading_var=heading_var,
+    )
+
+
+def _from_there(problem: Problem, begun: _Grown, progress: Progress) -> _Solved:
+    """Make the final passes from a grown run."""
+    if problem.links.gaps():
+        problem = bridged(problem, begun.values)
+    problem = with_usual_motion(problem, begun.values)
+    return _as_they_scatter(problem, begun.values, begun.prior, progress)
+
+
+def _as_they_scatter(problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress) -> _Solved:
+    """Make the final passes, again with larger sigmas of the sensors that scatter more than they state (see `_sensor_noise`)."""
     passes = iterations = 0
     for more in range(_MAX_SENSOR_ROUNDS, -1, -1):
-        settled = _final_passes(problem, few, estimate, prior, progress)
+        settled = _final_passes(problem, thinned(problem), estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
         if not more or not (times := scattering(problem, settled.verdicts)):
             break
         problem = with_sensor_noise(problem, times)
-        few = thinned(problem)
-    return problem, few, replace(settled, passes=passes, iterations=iterations)
+    return _Solved(problem, replace(settled, passes=passes, iterations=iterations))
 
 
 def _final_passes(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 
 import gtsam
 import numpy as np
@@ -12,7 +12,16 @@ from graphloc.build import Past, Problem, StartPrior
 from graphloc.recording import Progress
 from graphloc.solve._decide import PredictedCovariance, Stage, Verdicts, decisions, predicted_covariance, weigh
 from graphloc.solve._optimize import bayes_tree
-from graphloc.solve._stretch import StretchStep, dead_reckon, past_at, solve_stretch, solve_until_written_there
+from graphloc.solve._passes import cost_as_configured
+from graphloc.solve._stretch import (
+    StretchStep,
+    copy_states,
+    dead_reckon,
+    past_at,
+    solve_stretch,
+    solve_until_written_there,
+    update_states,
+)
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
 _SETTLED_M = 0.5
@@ -66,15 +75,7 @@ def _solve_grown(
     reckoning).
     """
     fresh = {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
-    iterations = 0
-    for stage in (Stage.FINAL, *[Stage.FAR] * _MAX_FAR_ROUNDS, Stage.FINAL):
-        verdicts = weigh(problem, values, first=first, last=last, stage=stage)
-        step = solve_stretch(
-            problem, values, first, last, prior, decisions(verdicts, fresh), jumps=stage is not Stage.FAR
-        )
-        iterations += step.iterations
-        if step.moved_m < _FAR_SETTLED_M:
-            break
+    step, verdicts, iterations = _solve_without(problem, values, first, known, last, prior, fresh)
     if not fresh:
         return iterations, step, verdicts
     predicted = predicted_covariance(bayes_tree(step.graph, step.values))
@@ -87,3 +88,44 @@ def _solve_grown(
         if step.moved_m < _SETTLED_M:
             break
     return iterations, step, verdicts
+
+
+def _solve_without(
+    problem: Problem,
+    values: gtsam.Values,
+    first: int,
+    known: int,
+    last: int,
+    prior: StartPrior | Past,
+    fresh: Container[tuple[int, int]],
+) -> tuple[StretchStep, Verdicts, int]:
+    """Solve a window without its new hypotheses, in place; return the step, its verdicts, and the iterations.
+
+    Where it moves far, gentle losses may have to lead back. They also follow a sensor that is wrong: a compass that is 90 deg off for
+    the whole window bends the gyroscope's bias. So of the solution with them and the one before, the less costly stays.
+    """
+
+    def solved(stage: Stage) -> tuple[StretchStep, Verdicts]:
+        verdicts = weigh(problem, values, first=first, last=last, stage=stage)
+        decided, jumps = decisions(verdicts, fresh), stage is not Stage.FAR
+        return solve_stretch(problem, values, first, last, prior, decided, jumps=jumps), verdicts
+
+    step, verdicts = solved(Stage.FINAL)
+    iterations = step.iterations
+    if step.moved_m < _FAR_SETTLED_M:
+        return step, verdicts, iterations
+    before = copy_states(problem, values, first, last)
+    for _ in range(_MAX_FAR_ROUNDS):
+        step, _ = solved(Stage.FAR)
+        iterations += step.iterations
+        if step.moved_m < _FAR_SETTLED_M:
+            break
+    found = []
+    for start in (before, copy_states(problem, values, first, last)):
+        update_states(problem, values, start, first, last)
+        step, verdicts = solved(Stage.FINAL)
+        iterations += step.iterations
+        found.append((cost_as_configured(problem, values, first, last, prior, judged=known), step, verdicts))
+    _, step, verdicts = min(found, key=lambda f: f[0])
+    update_states(problem, values, step.values, first, last)
+    return step, verdicts, iterations

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import gtsam
 
-from graphloc.build import Made, Problem, StartPrior, build_graph
+from graphloc.build import Made, Past, Problem, StartPrior, build_graph
 from graphloc.recording import Progress
-from graphloc.solve._decide import Stage, Verdicts, decisions, weigh
+from graphloc.solve._decide import Stage, Verdicts, decisions, log_evidence, met, weigh
 from graphloc.solve._optimize import full_step, optimize
 from graphloc.solve._stretch import moved
 
@@ -169,3 +169,22 @@ def expected_cost(problem: Problem, verdicts: Verdicts, last: int = -1) -> float
         if stream.slow is not None:
             expected += m * int((~stream.slow.constant).sum())  # a constant's steps are as many as its nodes
     return expected
+
+
+def cost_as_configured(
+    problem: Problem, values: gtsam.Values, first: int, last: int, prior: StartPrior | Past, *, judged: int
+) -> float:
+    """Return -log of how probable states first..last are (but for a constant), with each sensor's loss as wide as configured.
+
+    Other than the cost of their graph, it does not fall where a loss is widened because the residuals around an estimate scatter.
+
+    Args:
+        judged: the last state whose measurements of sensors with hypotheses count.
+    """
+    graph, guess = build_graph(problem, values, {}, first, last, prior)
+    cost = float(graph.error(guess)) - log_evidence(problem, values, first, judged)
+    for stream in problem.streams:
+        if stream.row.false is None:
+            _, residuals = met(problem, stream, stream.between(first, last), values)
+            cost += sum(min(stream.config.kernel.loss(r.nis(), len(r.raw)) for r in found) for found in residuals)
+    return cost
