@@ -34,7 +34,7 @@ from graphloc.frontends._assess_compass import compass_report, headings, says_th
 from graphloc.frontends._assess_imu import felt_of, imu_report, series_of
 from graphloc.frontends._assess_receivers import apart_m, apart_warning, height_wanders_m
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
-from graphloc.frontends._assess_wander import wander_m, way_of
+from graphloc.frontends._assess_wander import changes, way_of
 from graphloc.frontends._assess_world import in_map_grid, world_of
 from graphloc.frontends._clock import FEWEST_STAMPS, GAIN_LIMIT_S, refuse_woven, step, usual_latency_s
 from graphloc.frontends._draft import draft_config
@@ -464,8 +464,8 @@ def _beside_motion(
     if rolled is None and fixes is not None:
         known = [(_at_the_time_of(fixes, m), m.source) for m in velocities]
     for motion, name in known:
-        if (wanders := wander_m(motion, stamps, p_m, scatter_m)) is not None:
-            return replace(gnss, wander_m=wanders, wander_by=name)
+        if wander := changes(motion, stamps, p_m, scatter_m, turned=motion is rolled):
+            return replace(gnss, wander=wander, wander_by=name)
     return gnss
 
 
