@@ -90,7 +90,12 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     for compass in (c for c in inspection.compasses if not c.usable):
         yield [f"# orientation of {compass.topic}: left out as a compass; {compass.why}"]
     yield from _velocities(inspection)
-    wheels = [o for o in inspection.odometry if o.role == "check_speed" and not filtered(o.topic)]
+    speeds = [o for o in inspection.odometry if o.role == "check_speed"]
+    wheels = [o for o in speeds if not o.fused]
+    for item in (o for o in speeds if o.fused):
+        yield [
+            f"# {item.topic}: not fused, as receiver and IMU are in it already; truth_topic if it is better than they are; {item.why}"
+        ]
     yield from (_wheels_block(_numbered("wheels", k), item) for k, item in enumerate(wheels))
     for k, item in enumerate(o for o in inspection.odometry if o.role == "pose"):
         yield [
@@ -519,6 +524,6 @@ def _beside(odometry: tuple[OdometryReport, ...]) -> list[str]:
         off = "# " if k or item.origin is None else ""
         lines.append(f"{off}truth_topic: {item.topic}  # guess: {item.why}; {item.world}; for comparison, never fused")
     speeds = [o for o in odometry if o.role == "check_speed"]
-    for k, item in enumerate(sorted(speeds, key=lambda o: filtered(o.topic))):
+    for k, item in enumerate(sorted(speeds, key=lambda o: o.fused)):
         lines.append(f"{'# ' if k else ''}check_speed_topic: {item.topic}  # guess: {item.why}; compared, never fused")
     return lines

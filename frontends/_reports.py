@@ -220,7 +220,7 @@ class OdometryReport:
 
     `origin`: latitude, longitude (deg) and height (m) of its frame's origin, where the frame is
     east-north-up by the fixes; `world`: the evidence. `grid`: whether its positions are as large as in a map grid. `reverse`: as of a
-    velocity.
+    velocity. `fused`: whether it is the output of a filter or an INS, by its name or as no wheels know its frame: the fixes are in it already.
     """
 
     topic: str
@@ -233,6 +233,7 @@ class OdometryReport:
     world: str
     grid: bool = False
     reverse: bool = False
+    fused: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -186,6 +186,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         for s in bag.of_type(TWIST, PLAIN_TWIST, VECTOR)
     ]
     wheels = [s for s, report in odometry if report.role == "check_speed"]
+    rolling = [s for s, report in odometry if report.role == "check_speed" and not report.fused]
     motions = motions_of(wheels, velocities, bag.of_type(*_FIXES))
     if not gnss and (motion := motion_of_places("the poses in a map grid", reference.stamps_ns, reference.p_m)):
         motions.append(motion)
@@ -205,7 +206,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         topics=_topic_reports(bag),
         imus=tuple(imus),
         gnss=tuple(
-            _beside_motion(_timed_fixes(report, late, motions, velocities, bag.streams), bag, wheels, own)
+            _beside_motion(_timed_fixes(report, late, motions, velocities, bag.streams), bag, rolling, own)
             for report in gnss
         ),
         compasses=compasses,
@@ -455,8 +456,7 @@ def _beside_motion(
 
     A receiver's velocity is by Doppler, on which multipath has little effect.
     """
-    rolling = next((s for s in wheels if not filtered(s.topic)), None)
-    rolled = way_of(rolling) if rolling else None
+    rolled = way_of(wheels[0]) if wheels else None
     stamps, p_m, _ = track(bag.aligned[gnss.topic])
     scatter_m = max(gnss.scatter_m[:2]) if gnss.scatter_m else 0.0
     fixes = motion_of_places(gnss.topic, stamps, p_m)
