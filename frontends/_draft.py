@@ -34,6 +34,10 @@ from graphloc.frontends._turns import WANDERS_DEG
 from graphloc.frontends.decode import IMU, VECTOR
 
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
+_WANDER_DEG, _LARGER = (
+    0.7,
+    1.4,
+)  # of a compass, from which it is drafted: the comparison errs by less; times what is usual
 _TURNED_DEG = 10.0  # off the course, from which a compass is taken for turned in the craft
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
@@ -474,7 +478,7 @@ def _error_lines(compass: CompassReport) -> list[str]:
     else:
         lines = ["  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass"]
         why = "passing errors near iron; 0.2 for a GNSS compass"
-    if wander > max(WANDERS_DEG, 2.0 * usual):
+    if wander > max(_WANDER_DEG, _LARGER * usual):
         usual, why = wander, "as it wanders beside the gyro; iron near it, or its own filter"
     return [*lines, f"  wander_sigma_deg: {usual:.1f}  # guess: {why}"]
 
