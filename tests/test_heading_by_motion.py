@@ -226,6 +226,15 @@ def test_travel_that_may_tell_a_heading(sigma_m: float, slow: dict[str, Any], tr
     assert wanted_travel_m([(np.full((9, 2), sigma_m), process)]) == pytest.approx(travel_m)
 
 
+def test_online_a_robot_at_rest_waits_for_travel() -> None:
+    """Fixes that scatter by 0.3 m are no travel."""
+    recording, config, _, _ = robot(1, 8.0, speed_mps=0.0)
+    online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL)
+    for m in arrivals(recording):
+        online.feed(m)
+    assert online.waiting_for.endswith("from 2 m of travel")
+
+
 def test_online_a_robot_in_a_yard_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     """It never goes 7 m from where it stood; with fixes good to 2 cm its turns tell the heading all the same. 15 m were demanded."""
     monkeypatch.setattr(sys.modules[__name__], "FIX_M", 0.02)
