@@ -100,17 +100,16 @@ def slow_error_by(wander: Sequence[Change], sigma_m: float) -> tuple[float, floa
         + 0.5 * (np.log(time_s / _USUAL_S) / np.log(_WITHIN_S)) ** 2
     )
     cost += 0.5 * _DEPENDENT * (np.log(expected) + variance / expected) @ seen
-    weight = np.exp(cost.min() - cost)
-    mean_m = _mean(sigma, weight)
+    mean_m, mean_s = _mean(sigma, cost), _mean(time_s, cost)
     if mean_m < default.horizontal_sigma_m:
-        weight[np.abs(sigma - default.horizontal_sigma_m) > 1e-6] = 0.0
-        mean_m = default.horizontal_sigma_m
-    return mean_m, _mean(time_s, weight)
+        least = np.abs(sigma - default.horizontal_sigma_m) < 1e-6
+        return default.horizontal_sigma_m, _mean(time_s[least], cost[least])
+    return mean_m, mean_s
 
 
-def _mean(values: Array, weight: Array) -> float:
-    """Return the weighted mean of positive values, by their logarithms."""
-    return float(np.exp(np.average(np.log(values), weights=weight)))
+def _mean(values: Array, cost: Array) -> float:
+    """Return the mean of positive values, by their logarithms, each weighed by its cost (nats)."""
+    return float(np.exp(np.average(np.log(values), weights=np.exp(cost.min() - cost))))
 
 
 def _variance(sigma_m: Array | float, time_s: Array | float, span_s: Array) -> Array:

@@ -107,6 +107,9 @@ def test_what_changes_as_by_default_is_left_at_that() -> None:
     assert slow_error_by((), 2.0) is None
     assert slow_error_by(as_usual, 2.0) is None
     assert slow_error_by([Change(c.span_s, 2.5 * c.m, c.seen) for c in as_usual], 5.0) is None
+    small = slow_error_by([Change(span_s, change_m(span_s, 1.0, 5.0), 1e5) for span_s in SPANS_S], 2.0)
+    assert small is not None
+    assert small[0] == 2.0  # what does not change shows in no change
     far = slow_error_by([Change(c.span_s, 4.0 * c.m, 100.0 * c.seen) for c in as_usual], 2.0)
     assert far == pytest.approx((8.0, 200.0), rel=0.25)
 
