@@ -407,7 +407,7 @@ def test_a_start_whose_heading_is_a_guess_is_no_surer_of_its_place_than_the_rece
             np.sqrt(np.diagonal(estimate.cov)[:2]).min()
             > 0.9 * run.config.sensors["gnss"].slow_error.horizontal_sigma_m
         )
-    assert fed.errors_m[-1] < 1.0
+    assert fed.errors_m[-1] < 1.5  # of a heading that is 55 deg off, within its bounds
 
 
 def test_starts_from_given_poses() -> None:
