@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,8 +29,12 @@ from graphloc.series import integral, interpolated
 from graphloc.time import NS_PER_S
 
 _CHORD_S, _LONG_CHORD_S = 2.0, 10.0  # in which a craft turns little; and over which fixes wander by less than it goes
+_FOLLOWS, _NO_WANDER = 0.5, 3.0  # correlation; RMS of what is across, over that along
 _FITS = 0.4  # largest error of an axis convention that fits, as a share of the speed
 _AXES = (EAST_AXES, NORTH_AXES, BODY_AXES)
+_INS = re.compile(r"(^|[/_])(o?ins|oxts|inspvax?|span)([/_]|$)", re.IGNORECASE)
+EITHER = f"{EAST_AXES}, or {BODY_AXES}"
+_OF_GNSS = re.compile(r"gps|gnss|fix|ublox|novatel|septentrio|antenna|enu", re.IGNORECASE)
 _FEWEST = 20
 _ASTERN, _MOVES_MPS = 0.95, 0.3
 _REVERSED = "it goes astern nearly all the time: its sign looks wrong, and is taken for reversed"
@@ -40,7 +45,7 @@ def axes_of(
 ) -> tuple[str | None, str]:
     """Return the axes in which the velocities of a stream fit chords of a track, and the evidence in words.
 
-    The axes are None if the data do not show them, 'unknown' if none fits.
+    The axes are None if the data do not show them, 'unknown' if none fits, `EITHER` if two do.
 
     Args:
         stream: velocities in its last three columns. stamps_ns: (N,) of the track. p_m: (N, 3) the track, east, north, up.
@@ -76,8 +81,30 @@ def _axes_by(
         for v, part in ((mean[:, :2], 1.0), (mean[:, 1::-1], 1.0), (along, 0.5**0.5))
     ]
     best = int(np.argmin(errors))
+    if _AXES[best] == BODY_AXES and errors[0] < _FITS * speed:
+        own = _east_or_ahead(chords, mean)
+        if own is None:
+            said = "the craft goes east or west throughout, where a speed ahead looks like a velocity to the east"
+            return EITHER, f"{said}: either differs by {errors[0]:.2f} m/s RMS from the GNSS track"
+        best = _AXES.index(own)
     why = f"differs from the GNSS track by {errors[best]:.2f} m/s RMS, {errors[0]:.2f} m/s as east, north, up"
     return (_AXES[best] if errors[best] < _FITS * speed else "unknown"), why
+
+
+def _east_or_ahead(chords: Array, mean: Array) -> str | None:
+    """Return the axes of velocities that fit both, of a craft that goes about east or west: by whether their y is what it goes north.
+
+    Both errors do not tell: beside the chords' own direction nothing that the fixes wander across them counts.
+
+    Args:
+        chords: (N, 2), m/s. mean: (N, 3), of the stream over the same times.
+    """
+    north, y, along = chords[:, 1], mean[:, 1], np.abs(mean[:, 0]) - np.hypot(*chords.T)
+    together = float(y @ north)
+    if together > _FOLLOWS * max(float(y @ y), float(np.sqrt((y @ y) * (north @ north)))):
+        return EAST_AXES
+    # What it went north is no wander of the fixes, and y does not tell of it.
+    return BODY_AXES if float(north @ north) > _NO_WANDER**2 * float(along @ along) else None
 
 
 def _less(rms: float, noise: float) -> float:
@@ -101,6 +128,9 @@ def velocity_report(
         axes, why = EAST_AXES, f"known by its type; {why}"
     elif stream.part is not None and axes not in (EAST_AXES, NORTH_AXES):
         axes, why = NORTH_AXES, f"as its driver writes it by default; {why}"
+    if axes == EITHER:
+        axes = EAST_AXES if _OF_GNSS.search(f"{stream.topic} {stream.frame_id}") else BODY_AXES
+        why = f"by the names of its topic and frame; {why}"
     if through_water(stream.topic):
         axes, why = BODY_AXES, f"a speed through the water; {why}"
     rows = stream.rows[sane(stream)]
@@ -157,15 +187,12 @@ def odometry_report(
         role, why = "pose", "it reports poses and no speed"
     else:
         axes, fit = axes_of(stream, stamps_ns, p_m, scatter_m)
-        whose = (
-            "a filter's output by its name, no check by other means"
-            if filtered(stream.topic)
-            else "looks like wheel odometry"
-        )
+        fused = _fused(stream.topic, world)
+        whose = f"{fused}, no check by other means" if fused else "looks like wheel odometry"
         role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: {whose}"
         reverse = _astern(rows[:, 7])
         why = f"{why}; {_REVERSED}" if reverse else why
-        if axes not in (None, BODY_AXES):
+        if axes not in (None, BODY_AXES, EITHER):
             role, why = "pose", f"its speeds are none along the craft: {fit}"
     if not world.pose and role != "check_speed":
         role, why = "other", "no pose about a datum that the vessel could have"
@@ -180,7 +207,20 @@ def odometry_report(
         world=world.why,
         grid=world.grid and not truth,
         reverse=reverse,
+        fused=bool(_fused(stream.topic, world)),
     )
+
+
+def _fused(topic: str, world: World) -> str:
+    """Return why an odometry is the output of a filter or an INS; '' where nothing says so."""
+    if filtered(topic):
+        return "a filter's output by its name"
+    if _INS.search(topic):
+        return "an INS's output by its name"
+    if world.grid or world.origin is not None:
+        frame = "a map grid" if world.grid else "east-north-up about the fixes"
+        return f"an INS's or a filter's output, as its frame is {frame}, which no wheels know"
+    return ""
 
 
 def motions_of(

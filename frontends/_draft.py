@@ -8,10 +8,8 @@ from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 
-import numpy as np
-
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SlowErrorConfig
-from graphloc.frontends._assess_wander import WANDER_S
+from graphloc.frontends._assess_wander import slow_error_by
 from graphloc.frontends._draft_clock import recorded_lines, with_clock
 from graphloc.frontends._fixes import NOTHING_M, RTK_SIGMA_M, SCATTERS
 from graphloc.frontends._reports import (
@@ -36,6 +34,10 @@ from graphloc.frontends._turns import WANDERS_DEG
 from graphloc.frontends.decode import IMU, VECTOR
 
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
+_WANDER_DEG, _LARGER = (
+    0.7,
+    1.4,
+)  # of a compass, from which it is drafted: the comparison errs by less; times what is usual
 _TURNED_DEG = 10.0  # off the course, from which a compass is taken for turned in the craft
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
@@ -50,7 +52,6 @@ _FILTERED = "by its name, or its messages, a filter's output: the IMU is in it a
 _MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
 _TURN_S = 0.1
 _MOST_PARTS = 100  # of a submap
-_FASTER = 2.0  # times as fast as by default, from which a slow error is drafted as fast as it is
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
 
@@ -93,7 +94,12 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     for compass in (c for c in inspection.compasses if not c.usable):
         yield [f"# orientation of {compass.topic}: left out as a compass; {compass.why}"]
     yield from _velocities(inspection)
-    wheels = [o for o in inspection.odometry if o.role == "check_speed" and not filtered(o.topic)]
+    speeds = [o for o in inspection.odometry if o.role == "check_speed"]
+    wheels = [o for o in speeds if not o.fused]
+    for item in (o for o in speeds if o.fused):
+        yield [
+            f"# {item.topic}: not fused, as receiver and IMU are in it already; truth_topic if it is better than they are; {item.why}"
+        ]
     yield from (_wheels_block(_numbered("wheels", k), item) for k, item in enumerate(wheels))
     for k, item in enumerate(o for o in inspection.odometry if o.role == "pose"):
         yield [
@@ -279,46 +285,40 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(_rtk_slow_error(gnss))
     else:
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
-        wandering, large, apart = _wandering(gnss), list[str](), ""
-        if not any(key.startswith("horizontal") for key in wandering):
-            large, apart = _as_large(gnss)
+        large, said = _slow_error(gnss)
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3)
-        more = ", ".join([*([f"vertical_sigma_m: {vertical:.1f}"] if wanders else []), *large, *wandering])
+        more = ", ".join([*([f"vertical_sigma_m: {vertical:.1f}"] if wanders else []), *large])
         fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
-        wander = f"; by {gnss.wander_by} it changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s" if wandering else ""
-        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{wander}{apart}{fixed}")
+        lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{said}{fixed}")
     return lines
 
 
-def _as_large(gnss: GnssReport) -> tuple[list[str], str]:
-    """Return the key of a slow error that is larger than by default, and why: another receiver, or what the fixes claim, less what is white."""
+def _slow_error(gnss: GnssReport) -> tuple[list[str], str]:
+    """Return the keys of a horizontal slow error other than by default, and why: as large and fast as wheels or a velocity show.
+
+    Otherwise these contradict the fixes, and what gives way is the heading.
+    """
+    default_m = SlowErrorConfig().horizontal_sigma_m
+    sigma_m, why = _as_large(gnss)
+    found = slow_error_by(gnss.wander, sigma_m)
+    if found is None:
+        return ([f"horizontal_sigma_m: {sigma_m:.1f}"] if sigma_m > default_m else []), why
+    seen = ", ".join(f"{change.m:.1f} m in {change.span_s:.0f} s" for change in gnss.wander)
+    keys = [f"horizontal_sigma_m: {found[0]:.1f}", f"time_constant_s: {found[1]:.0f}"]
+    return keys, f"; by {gnss.wander_by} it changes by {seen}{why}"
+
+
+def _as_large(gnss: GnssReport) -> tuple[float, str]:
+    """Return the sigma of a slow error, m, if larger than by default, and why: another receiver, or what the fixes claim, less what is white."""
     claimed_m = max(gnss.reported_sigma_m[:2]) if gnss.reported_sigma_m else 0.0
     white_m = max(gnss.scatter_m[:2]) if gnss.scatter_m else claimed_m
     slow_m = claimed_m if SCATTERS * white_m < claimed_m <= NOTHING_M else 0.0
     if gnss.differs and gnss.apart_m >= slow_m:
-        said = f"; so far it and {gnss.apart_from} wander against each other"
-        return [f"horizontal_sigma_m: {gnss.apart_m:.1f}"], said
+        return gnss.apart_m, f"; so far it and {gnss.apart_from} wander against each other"
     if slow_m <= SlowErrorConfig().horizontal_sigma_m:
-        return [], ""
+        return SlowErrorConfig().horizontal_sigma_m, ""
     said = f"; scatter from fix to fix is {white_m:.1f} m, so that most of what they claim to be off is slow"
-    return [f"horizontal_sigma_m: {slow_m:.1f}"], said
-
-
-def _wandering(gnss: GnssReport) -> list[str]:
-    """Return the keys of a slow error that changes as fast as wheels or a velocity show, where that is faster than by default.
-
-    Otherwise these contradict the fixes, and what gives way is the heading.
-    """
-    default = SlowErrorConfig()
-    if gnss.wander_m is None:
-        return []
-    # A Gauss-Markov process changes by 2 s^2 (1 - exp(-t / T)) in t.
-    share = gnss.wander_m**2 / (2.0 * default.horizontal_sigma_m**2)
-    if share < 1.0 - np.exp(-_FASTER * WANDER_S / default.time_constant_s):
-        return []
-    most = 1.0 - np.exp(-1.0)  # larger changes are those of a larger error, not of a faster one
-    sigma = [f"horizontal_sigma_m: {gnss.wander_m / np.sqrt(2.0 * most):.1f}"] if share > most else []
-    return [*sigma, f"time_constant_s: {-WANDER_S / np.log1p(-min(share, most)):.0f}"]
+    return slow_m, said
 
 
 def _scatter_lines(gnss: GnssReport) -> list[str]:
@@ -478,7 +478,7 @@ def _error_lines(compass: CompassReport) -> list[str]:
     else:
         lines = ["  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass"]
         why = "passing errors near iron; 0.2 for a GNSS compass"
-    if wander > max(WANDERS_DEG, 2.0 * usual):
+    if wander > max(_WANDER_DEG, _LARGER * usual):
         usual, why = wander, "as it wanders beside the gyro; iron near it, or its own filter"
     return [*lines, f"  wander_sigma_deg: {usual:.1f}  # guess: {why}"]
 
@@ -528,6 +528,6 @@ def _beside(odometry: tuple[OdometryReport, ...]) -> list[str]:
         off = "# " if k or item.origin is None else ""
         lines.append(f"{off}truth_topic: {item.topic}  # guess: {item.why}; {item.world}; for comparison, never fused")
     speeds = [o for o in odometry if o.role == "check_speed"]
-    for k, item in enumerate(sorted(speeds, key=lambda o: filtered(o.topic))):
+    for k, item in enumerate(sorted(speeds, key=lambda o: o.fused)):
         lines.append(f"{'# ' if k else ''}check_speed_topic: {item.topic}  # guess: {item.why}; compared, never fused")
     return lines

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from graphloc.frontends._assess_wander import WANDER_S
 from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, OdometryReport, TopicReport
 from graphloc.plain import aligned
 from graphloc.time import utc_text
@@ -133,6 +132,7 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         lines.append(
             f"  scatter from fix to fix        {' '.join(f'{s:.3f}' for s in gnss.scatter_m[: 2 if flat else 3])} m"
         )
-    if gnss.wander_m is not None:
-        lines.append(f"  error changes by {gnss.wander_m:.1f} m in {WANDER_S:.0f} s along the way, by {gnss.wander_by}")
+    if gnss.wander:
+        said = ", ".join(f"{change.m:.1f} m in {change.span_s:.0f} s" for change in gnss.wander)
+        lines.append(f"  error changes by {said} along the way, by {gnss.wander_by}")
     return lines

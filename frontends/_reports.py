@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from graphloc.config import SlowErrorConfig
 from graphloc.frontends.nmea import SPEEDS
@@ -109,6 +109,14 @@ class ImuReport:
     missing: str = ""
 
 
+class Change(NamedTuple):
+    """By how much an error changes within `span_s`: m, 1 sigma of an axis; `seen`: by how many independent values."""
+
+    span_s: float
+    m: float
+    seen: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GnssReport:
     """A GNSS receiver.
@@ -120,7 +128,7 @@ class GnssReport:
         spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
             1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
         frozen, stored: warning where it repeats one position while the vessel moves, or one of before the run; '' where it does not.
-        wander_m: by how much their error changes along the way in `WANDER_S`, 1 sigma, by `wander_by`, wheels or a velocity; None where these do not tell.
+        wander: by how much their error changes along the way, by `wander_by`, wheels or a velocity; empty where these do not tell.
         apart_m: by how much it and `apart_from`, the receiver it agrees with best, wander against each other, 1 sigma of an axis.
         without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
@@ -142,7 +150,7 @@ class GnssReport:
     white_m: float | None = None
     frozen: str = ""
     stored: str = ""
-    wander_m: float | None = None
+    wander: tuple[Change, ...] = ()
     wander_by: str = ""
     without_height: int = 0
     spans_s: float = 0.0
@@ -212,7 +220,7 @@ class OdometryReport:
 
     `origin`: latitude, longitude (deg) and height (m) of its frame's origin, where the frame is
     east-north-up by the fixes; `world`: the evidence. `grid`: whether its positions are as large as in a map grid. `reverse`: as of a
-    velocity.
+    velocity. `fused`: whether it is the output of a filter or an INS, by its name or as no wheels know its frame: the fixes are in it already.
     """
 
     topic: str
@@ -225,6 +233,7 @@ class OdometryReport:
     world: str
     grid: bool = False
     reverse: bool = False
+    fused: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.signal import lfilter
 
 from graphloc.config import CompassConfig, ImuConfig
 from graphloc.errors import InputError
@@ -28,6 +29,7 @@ _LEAP_DEG, _SMOOTH_DEG = 120.0, 15.0  # beyond the one, which way it turned is a
 SCATTERED = (
     "differs from most headings around it, with and without the gyro: a course over ground at rest is no heading"
 )
+_TILT_S, _UPRIGHT_RAD = 5.0, 0.8  # a wave lasts less; a craft is seldom tilted by more
 WANDERS_DEG = 1.0
 """Of a compass beside the gyroscope: above it there is more than such a comparison errs by."""
 _CELL_S, _WANDER_BLOCK_S, _LONG_BLOCK_S, _LAGS_S, _MINUTE_S = 2.0, 300.0, 60.0, (4.0, 24.0), 60.0
@@ -157,8 +159,7 @@ def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | No
     turn (scale) and rate (delay) are removed. If the rest diffuses, its mean square step grows by q t from some seconds to half a
     minute, on top of white noise. For a first-order Gauss-Markov process, q = 2 sigma^2 / tau.
 
-    What is removed takes part of the wander along, in a run of 90 s two thirds of it, which is known and made up for; below
-    `WANDERS_DEG` it is not: in waves the gyroscope's turn is off by as much.
+    What is removed takes part of the wander along, in a run of 90 s two thirds of it, which is known and made up for.
 
     Args:
         headings: of one compass, converted as configured.
@@ -186,8 +187,6 @@ def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | No
     soon, late = (_squared_steps(blocks, left, round(lag_s / _CELL_S)) for lag_s in _LAGS_S)
     grown = max(late - soon, 0.0)
     wander = float(np.degrees(np.sqrt(0.5 * grown / (_LAGS_S[1] - _LAGS_S[0]) * _MINUTE_S)))
-    if wander < WANDERS_DEG:
-        return wander
     cells = [own for own, _ in blocks]
     by_steps = grown / _grown_of_unit(cells, _left_of_unit(cells, design))
     # No wander scatters by less about a line than it should; what swings evenly only looks as if much had been taken off.
@@ -279,6 +278,43 @@ def _smooth(yaw: Array, at_s: Array) -> NDArray[np.bool_]:
     return np.asarray((n > _FEW) & (too_far[last - 1] == too_far[first]) & (rest < np.radians(_SMOOTH_DEG)))
 
 
+def yaw_rate(t_s: Array, accel_mps2: Array, gyro_radps: Array, up: Array) -> Array:
+    """Return how fast (N,), rad/s, the yaw changes of a craft that rolls and pitches: (q sin(roll) + r cos(roll)) / cos(pitch).
+
+    Roll and pitch are those of the gyroscope within `_TILT_S`, and of the accelerometer beyond. The rate about the mean vertical alone goes off by
+    half of the area that the two enclose, each wave: of 8 and 4 deg by degrees a minute, and by another rate in each group of waves.
+
+    Args:
+        t_s: (N,). accel_mps2, gyro_radps: (N, 3), in any axes. up: (3,) the vertical in these, on average.
+    """
+    z = up / np.linalg.norm(up)
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    level = np.column_stack([x, np.cross(z, x), z])
+    p, q, r = (gyro_radps @ level).T
+    f = accel_mps2 @ level
+    # Of an IMU that stands a little askew on the way, and of rates that carry a bias: both are slow.
+    roll, pitch = (
+        _joined(t_s, rate, felt)
+        for rate, felt in ((p, np.arctan2(f[:, 1], f[:, 2])), (q, np.arctan2(-f[:, 0], np.hypot(f[:, 1], f[:, 2]))))
+    )
+    if max(float(np.quantile(np.abs(angle), 0.95)) for angle in (roll, pitch)) > _UPRIGHT_RAD:
+        return np.asarray(r)  # rates in another unit, or a camera in the hand
+    return np.asarray((q * np.sin(roll) + r * np.cos(roll)) / np.cos(pitch))
+
+
+def _joined(t_s: Array, rate: Array, slow: Array) -> Array:
+    """Return an angle (N,), rad, whose changes within `_TILT_S` are those of a rate (N,), and the others those of another angle (N,)."""
+    steps = np.diff(t_s)
+    if not len(steps) or np.median(steps) <= 0.0:
+        return slow
+    kept = float(np.exp(-np.median(steps) / _TILT_S))
+    fast = integral(t_s, rate) - slow
+    forth = [float(np.median(fast[: max(1, round(_TILT_S / float(np.median(steps))))]))]
+    smooth = lfilter([1.0 - kept], [1.0, -kept], fast, zi=[kept * forth[0]])[0]
+    return np.asarray(slow + fast - smooth)
+
+
 def _said(headings: Sequence[CompassHeading]) -> Yaws:
     return stamps_of(headings), np.array([m.yaw_rad for m in headings])
 
@@ -288,12 +324,10 @@ def _blocks(
 ) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
     """Yield for each block without an IMU gap: indices into `yaws`, turn by the gyroscope, yaw, and time (s)."""
     up = np.median(imu.accel_mps2, axis=0) if len(imu.stamps_ns) else np.zeros(3)
-    size = float(np.linalg.norm(up))
-    if size < 5.0 or len(yaws[0]) < 20:  # m/s^2: no gravity in it
+    if float(np.linalg.norm(up)) < 5.0 or len(yaws[0]) < 20:  # m/s^2: no gravity in it
         return
     t = (imu.stamps_ns - imu.stamps_ns[0]) / NS_PER_S
-    rate = imu.gyro_radps @ (up / size)
-    turned = integral(t, rate)
+    turned = integral(t, yaw_rate(t, imu.accel_mps2, imu.gyro_radps, up))
     holes: NDArray[np.intp] = np.flatnonzero(np.diff(t) > _HOLE_S)
     stamps, yaw = yaws
     order = np.argsort(stamps, kind="stable")

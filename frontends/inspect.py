@@ -34,7 +34,7 @@ from graphloc.frontends._assess_compass import compass_report, headings, says_th
 from graphloc.frontends._assess_imu import felt_of, imu_report, series_of
 from graphloc.frontends._assess_receivers import apart_m, apart_warning, height_wanders_m
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
-from graphloc.frontends._assess_wander import wander_m, way_of
+from graphloc.frontends._assess_wander import changes, way_of
 from graphloc.frontends._assess_world import in_map_grid, world_of
 from graphloc.frontends._clock import FEWEST_STAMPS, GAIN_LIMIT_S, refuse_woven, step, usual_latency_s
 from graphloc.frontends._draft import draft_config
@@ -186,6 +186,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         for s in bag.of_type(TWIST, PLAIN_TWIST, VECTOR)
     ]
     wheels = [s for s, report in odometry if report.role == "check_speed"]
+    rolling = [s for s, report in odometry if report.role == "check_speed" and not report.fused]
     motions = motions_of(wheels, velocities, bag.of_type(*_FIXES))
     if not gnss and (motion := motion_of_places("the poses in a map grid", reference.stamps_ns, reference.p_m)):
         motions.append(motion)
@@ -205,7 +206,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         topics=_topic_reports(bag),
         imus=tuple(imus),
         gnss=tuple(
-            _beside_motion(_timed_fixes(report, late, motions, velocities, bag.streams), bag, wheels, own)
+            _beside_motion(_timed_fixes(report, late, motions, velocities, bag.streams), bag, rolling, own)
             for report in gnss
         ),
         compasses=compasses,
@@ -455,8 +456,7 @@ def _beside_motion(
 
     A receiver's velocity is by Doppler, on which multipath has little effect.
     """
-    rolling = next((s for s in wheels if not filtered(s.topic)), None)
-    rolled = way_of(rolling) if rolling else None
+    rolled = way_of(wheels[0]) if wheels else None
     stamps, p_m, _ = track(bag.aligned[gnss.topic])
     scatter_m = max(gnss.scatter_m[:2]) if gnss.scatter_m else 0.0
     fixes = motion_of_places(gnss.topic, stamps, p_m)
@@ -464,8 +464,8 @@ def _beside_motion(
     if rolled is None and fixes is not None:
         known = [(_at_the_time_of(fixes, m), m.source) for m in velocities]
     for motion, name in known:
-        if (wanders := wander_m(motion, stamps, p_m, scatter_m)) is not None:
-            return replace(gnss, wander_m=wanders, wander_by=name)
+        if wander := changes(motion, stamps, p_m, scatter_m, turned=motion is rolled):
+            return replace(gnss, wander=wander, wander_by=name)
     return gnss
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A vehicle without a heading sensor: as sure of its heading as its motion tells it, and no surer."""
 
+import sys
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,9 +14,10 @@ from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuCo
 from graphloc.estimate import Event
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
+from graphloc.factors import gnss as factors_gnss
 from graphloc.frames import Array, Geodetic, heading_deg_from_yaw, wrap_angle
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSample
-from graphloc.online import OnlineSmoother, _smoother
+from graphloc.online import OnlineSmoother, _smoother, _waiting
 from graphloc.online import _start as online_start
 from graphloc.online._heading_check import Fit, HeadingCheck
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
@@ -23,7 +25,7 @@ from graphloc.recording import Recording, quiet
 from graphloc.replay import arrivals
 from graphloc.solution import Cause, Solution
 from graphloc.solve import _start
-from graphloc.solve._align import align
+from graphloc.solve._align import align, wanted_travel_m
 from graphloc.solve._start import solve_start
 from tests.slowly import with_few_states
 
@@ -208,6 +210,43 @@ def test_online_a_guess_ends_once_the_motion_tells_the_heading(monkeypatch: pyte
     assert np.abs(error[-1]) < 10.0
     assert solved.health_reason[0].cause is Cause.GUESSED_HEADING
     assert solved.health_reason[-1].cause is not Cause.GUESSED_HEADING
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "slow", "travel_m"),
+    [
+        (0.02, {"horizontal_sigma_m": 0.03}, 1.0),
+        (1.0, {}, 5.0 * np.hypot(1.0, 2.0 * np.sqrt(2.0 * (1.0 - np.exp(-0.15))))),
+        (4.0, {"enabled": False}, 20.0),
+    ],
+)
+def test_travel_that_may_tell_a_heading(sigma_m: float, slow: dict[str, Any], travel_m: float) -> None:
+    """Five times what places are off by, or drift by within half a minute: RTK needs no 15 m."""
+    process = factors_gnss.slow(GnssConfig.model_validate({"topic": "/fix", "slow_error": slow}))
+    assert wanted_travel_m([(np.full((9, 2), sigma_m), process)]) == pytest.approx(travel_m)
+
+
+def test_online_a_robot_at_rest_waits_for_travel() -> None:
+    """Fixes that scatter by 0.3 m are no travel."""
+    recording, config, _, _ = robot(1, 8.0, speed_mps=0.0)
+    online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL)
+    for m in arrivals(recording):
+        online.feed(m)
+    assert online.waiting_for.endswith("from 2 m of travel")
+
+
+def test_online_a_robot_in_a_yard_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It never goes 7 m from where it stood; with fixes good to 2 cm its turns tell the heading all the same. 15 m were demanded."""
+    monkeypatch.setattr(sys.modules[__name__], "FIX_M", 0.02)
+    monkeypatch.setattr(sys.modules[__name__], "IMU_HZ", 100.0)  # a turn that begins between two samples is centimetres
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 5.5)  # each solves all that there is
+    recording, config, t, yaw = robot(1, 14.0, 3.0, 8.0, rate_hz=5.0)
+    solved = app.replay_recording(recording, config).solution
+    error, sigma = errors(solved, recording, t, yaw)
+    assert recording.imu is not None
+    assert (solved.trajectory.stamps_ns[0] - recording.imu.stamps_ns[0]) * 1e-9 < 12.0
+    assert (np.abs(error) < 2.5 * sigma).all()
+    assert sigma[-1] < 12.0
 
 
 @pytest.mark.usefixtures("few_tries")

@@ -13,7 +13,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuConfig, VesselConfig, load_config
 from graphloc.frames import Array, Datum, Geodetic
-from graphloc.frontends._assess_velocity import axes_of
+from graphloc.frontends._assess_velocity import EITHER, axes_of, velocity_report
+from graphloc.frontends._reports import BODY_AXES, EAST_AXES
 from graphloc.frontends._source import Bag, RawMessage
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.bag import read_recording
@@ -351,6 +352,57 @@ def test_a_velocity_is_judged_without_the_noise_of_the_fixes(scatter_m: float, a
     told, why = axes_of(stream, stamps, way + rng.normal(0.0, scatter_m, way.shape), scatter_m)
     assert (told or "").startswith(axes or "")
     assert (told is None) == (axes is None), why
+
+
+@pytest.mark.parametrize(
+    ("course_deg", "ahead", "axes"),
+    [
+        (10.0, False, EAST_AXES),
+        (190.0, False, EAST_AXES),
+        (30.0, True, BODY_AXES),
+        (0.0, False, EITHER),
+        (0.0, True, EITHER),
+    ],
+)
+def test_a_way_east_tells_a_velocity_to_the_east_from_a_speed_ahead_if_at_all(
+    course_deg: float, ahead: bool, axes: str
+) -> None:
+    """Fixes that wander across the way were no evidence against a speed ahead: a receiver's velocity was taken for one, and left out."""
+    t, rng = np.arange(300.0), np.random.default_rng(2)
+    speed, course = 8.0 + 2.0 * np.sin(t / 10.0), np.radians(course_deg)
+    way = np.cumsum(speed)[:, None] * [np.cos(course), np.sin(course), 0.0]
+    wanders = 3.0 * np.column_stack([np.sin(t / 17.0), np.cos(t / 13.0), 0.0 * t])
+    stream = TopicData("/vel", TWIST, "base_link")
+    for stamp, v in zip((START_NS + (t * S).astype(np.int64)).tolist(), speed.tolist(), strict=True):
+        said = (v, 0.0) if ahead else (v * np.cos(course), v * np.sin(course))
+        stream.add(stamp, stamp, (*(said + 0.05 * rng.normal(size=2)), 0.0), "run.db3")
+    told, why = axes_of(stream, stream.stamps_ns, way + wanders, 0.1)
+    assert told == axes, why
+    report = velocity_report(stream, stream.stamps_ns, way + wanders, None, 0.1)
+    assert report.axes == (BODY_AXES if axes == EITHER else axes)
+    stream.frame_id = "gps_antenna"
+    report = velocity_report(stream, stream.stamps_ns, way + wanders, None, 0.1)
+    assert report.axes == (EAST_AXES if axes == EITHER else axes)
+
+
+@pytest.mark.parametrize(("topic", "knows_east"), [("/ins/odometry", False), ("/odometry", True), ("/odom", False)])
+def test_odometry_of_an_ins_is_no_wheels(topic: str, knows_east: bool, tmp_path: Path) -> None:
+    """By its name, or as it knows where east is, it holds the fixes already: it was drafted as wheels to switch on."""
+    make = Messages(2)
+    items = [item for item in drive(make, sigma_m=0.8, status=1, seconds=80)]
+    told = [(stamp, m) for name, stamp, m in items if name == "/fix"]
+    enu = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for _, m in told]).T)
+    for k, (name, stamp, m) in enumerate(items):
+        if name == "/wheel/odom":
+            p = [float(np.interp(stamp, [at for at, _ in told], enu[:, axis])) for axis in (0, 1)]
+            m.pose.pose.position.x, m.pose.pose.position.y = p if knows_east else (p[1], -p[0])
+            items[k] = (topic, stamp, m)
+    found, config, text = look(tmp_path, items, make)
+    fused = topic != "/odom"
+    assert found.odometry[0].fused == fused
+    assert ("wheels" in config.sensors) == (not fused)
+    assert ("an INS's" in text) == fused
+    assert config.check_speed_topic == topic
 
 
 @pytest.mark.parametrize("body", ["vessel", "hull"])

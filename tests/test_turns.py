@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import CompassConfig, ImuConfig
 from graphloc.errors import InputError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
-from graphloc.frames import Array
+from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import courses_of_fixes
 from graphloc.frontends._turns import (
     Yaws,
@@ -136,6 +136,31 @@ def test_most_of_a_wander_is_told_in_a_short_run(run: SimulatedRun) -> None:
     found = [wander_deg(imu, wandering(short, 5.0, 60.0, seed)) for seed in range(12)]
     rms = float(np.sqrt(np.mean(np.square([v for v in found if v is not None]))))
     assert 0.65 * 5.0 < rms < 1.25 * 5.0  # the less of two estimates
+
+
+@pytest.mark.parametrize(("wander_deg_", "low", "high"), [(0.0, 0.0, 0.5), (3.0, 2.0, 3.6)])
+def test_waves_are_no_wander(wander_deg_: float, low: float, high: float) -> None:
+    """Roll and pitch of 4 and 3 deg (RMS), 90 deg apart, in groups: the rate about the mean vertical went off by 2 deg in a minute."""
+    rng, dt_s = np.random.default_rng(3), 0.04
+    t = np.arange(0.0, 600.0, dt_s)
+    group = 1.0 + 0.7 * np.sin(t / 23.0) + 0.3 * np.sin(t / 9.0)
+    roll, pitch = np.radians(5.5) * group * np.sin(1.2 * t), np.radians(4.0) * group * np.cos(1.2 * t)
+    yaw = 2.0 * np.sin(t / 40.0)
+    R = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]))
+    rate = (R[:-1].inv() * R[1:]).as_rotvec() / dt_s
+    imu = ImuSeries(
+        sensor="imu", seqs=np.arange(len(t)), stamps_ns=np.round(t * S).astype(np.int64),
+        accel_mps2=R.inv().apply([0.0, 0.0, 9.81]), gyro_radps=np.vstack([rate, rate[-1:]]) + np.array([0.002, -0.001, 0.003]),
+    )  # fmt: skip
+    headings = [
+        CompassHeading(stamp_ns=int(imu.stamps_ns[k]), sensor="compass", seq=int(k), sigma_rad=1.0,
+                       yaw_rad=float(wrap_angle(yaw[k] + np.radians(0.5) * rng.normal())))
+        for k in range(0, len(t), 5)
+    ]  # fmt: skip
+    found = wander_deg(imu, wandering(headings, wander_deg_, 60.0) if wander_deg_ else headings)
+    assert found is not None
+    assert low <= found < high
+    assert turn_warnings(imu, "compass", headings, "enu") == []
 
 
 def test_what_is_no_wander_is_not_taken_for_it(run: SimulatedRun) -> None:

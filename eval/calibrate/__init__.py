@@ -7,7 +7,7 @@ import numpy as np
 
 from graphloc.build import mount_of
 from graphloc.chi2 import SIGMAS_95
-from graphloc.config import GnssConfig, VesselConfig
+from graphloc.config import AerialConfig, GnssConfig, VesselConfig
 from graphloc.eval.calibrate._evidence import LEAST, Evidence, Name, OffsetEstimate
 from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
 from graphloc.eval.calibrate._imu import imu_noise
@@ -25,7 +25,7 @@ PROBE: Probe = {
     "body_velocity": ("time",),
     "compass": ("yaw", "time"),
     "pose": ("yaw", "time"),
-    "aerial": ("time",),
+    "aerial": ("yaw", "time"),
 }
 """What is looked at, by kind of sensor, those first that are wrong most often; heights show too little."""
 
@@ -86,6 +86,8 @@ def _configured(name: Name, recording: Recording, config: VesselConfig) -> tuple
     if what == "time":
         return f"sensors.{sensor}.time_offset_s", float(block.time_offset_s)
     t, R = mount_of(sensor, block, recording.mounts)
+    if what == "yaw" and isinstance(block, AerialConfig):
+        return f"sensors.{sensor}.lidars.*.mount.rpy_deg[2], beside what is configured", 0.0
     if what == "yaw":
         return f"sensors.{sensor}.mount.rpy_deg[2]", float(np.degrees(rpy_from_rotation(R))[2])
     return f"sensors.{sensor}.mount.xyz_m[{_AXIS[what]}]", float(t[_AXIS[what]])

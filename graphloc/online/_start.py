@@ -24,7 +24,7 @@ from graphloc.online._anchor import Anchor
 from graphloc.online._setup import Setup
 from graphloc.online._unmeasured_heading import DOUBTFUL_RAD, UnmeasuredHeading
 from graphloc.recording import Recording
-from graphloc.solve._align import MOVED_M
+from graphloc.solve._align import wanted_travel_m
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult, solve_batch
 from graphloc.solve._covariances import ANY_HEADING_RAD, world_covariance
 from graphloc.solve._decide import AGREES, decisions
@@ -107,14 +107,21 @@ def try_start(setup: Setup, imu: ImuSeries, measurements: Sequence[Measurement],
 def _missing(setup: Setup, recording: Recording, datum: Datum) -> str:
     """Return what position or heading still needs; empty where both are observable."""
     hints = [setup.hint(m, datum) for m in recording.measurements]
-    places = [h for h in hints if np.isfinite(h.p_world_m[:2]).all()]
+    placed = [k for k, h in enumerate(hints) if np.isfinite(h.p_world_m[:2]).all()]
+    places = [hints[k] for k in placed]
     if not places:
         return "a position: a fix, a match, a tag or a pose"
     if setup.config.start.heading_deg is not None or any(np.isfinite(h.yaw_rad) for h in hints):
         return ""
     p = np.array([h.p_world_m[:2] for h in places])
-    noise_m = 5.0 * float(np.nanmedian([h.p_sigma_m[:2] for h in places]))
-    wanted_m = max(MOVED_M, noise_m)
+    names = [recording.measurements[k].sensor for k in placed]
+    kinds = {row.kind: row for row in setup.rows}
+    noises = []
+    for name in dict.fromkeys(names):
+        config = setup.config.sensors[name]
+        sigma_m = np.array([h.p_sigma_m[:2] for h, of in zip(places, names, strict=True) if of == name])
+        noises.append((sigma_m, kinds[config.kind].slow(config)))
+    wanted_m = wanted_travel_m(noises)
     if np.hypot(*(p - np.median(p[:5], axis=0)).T).max() > wanted_m:
         return ""
     return f"a heading: from a sensor, from `start.heading_deg`, or from {wanted_m:.0f} m of travel"

@@ -8,7 +8,7 @@ course. Where headings disagree, or none is known, there are several candidates,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,14 +20,15 @@ from graphloc.build import Level, Problem
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.errors import SolveError
 from graphloc.frames import Array, skew, wrap_angle, yaw_from_heading_deg, yaw_from_rotation
-from graphloc.graph import Hint
+from graphloc.graph import Hint, SlowProcess
 from graphloc.solve._standstill import Track, gyro_bias, samples_of, slope_of, standstill
 from graphloc.time import utc_text
 
 _USUAL_SPEED_MPS = 10.0  # 1 sigma, where the speed is unknown
 _CARRIED_RAD = np.radians(20.0)  # error by gyro bias, 1 sigma: from later on, a heading is no longer one of the start
 _OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, without accelerometer data
-MOVED_M = 15.0  # travel from which the heading is observable without a heading sensor
+# Travel from which the motion may tell the heading: so many times what places are off by, or drift by within so long; and at least so far.
+_NOISES, _DRIFT_S, _LEAST_M = 5.0, 30.0, 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,13 +80,15 @@ def align(problem: Problem) -> Start:
     still = standstill(problem, track, yaws)
     bias, bias_sigma, notes = gyro_bias(problem, window, still, yaws)
     early = {name: rows for name, rows in yaws.items() if rows[0, 0] * bias_sigma[2] < _CARRIED_RAD}
-    moved_s = _moved_at(track)
+    noises = [(np.array([h.p_sigma_m[:2] for _, h in hints[stream.name]]), stream.row.slow(stream.config))
+              for stream in problem.streams if hints[stream.name]]  # fmt: skip
+    moved_s = _moved_at(track, wanted_travel_m(noises))
     if early or (moved_s is not None and moved_s < min((rows[0, 0] for rows in yaws.values()), default=np.inf)):
         yaws = early
     turn = _turns(problem, max([window, *(rows[0, 0] for rows in yaws.values())]) + 10.0 if yaws else 180.0, bias)
     at_start = still if still is not None and still[0] == 0.0 else None
     R_level, tilt_sigma, level, tilt_note = _level(problem, window, at_start, turn, bias)
-    yaws_rad, yaw_sigma_rad, window_s, heading_note = _headings(problem, track, yaws, turn)
+    yaws_rad, yaw_sigma_rad, window_s, heading_note = _headings(problem, yaws, turn, moved_s)
     p0, p_sigma, v0, v_sigma = _position_and_velocity(hints, track, at_start)
     return Start(
         R_level_body=R_level,
@@ -185,7 +188,7 @@ def _level(
 
 
 def _headings(
-    problem: Problem, track: Track, yaws: dict[str, Array], turn: Callable[[float], Array]
+    problem: Problem, yaws: dict[str, Array], turn: Callable[[float], Array], moved_s: float | None
 ) -> tuple[tuple[float, ...], float, float, str]:
     """Return candidates for the yaw at the start, their sigma, the span that distinguishes them, and a note."""
     config = problem.config.start
@@ -210,7 +213,6 @@ def _headings(
             max(window, config.window_s if len(apart) > 1 else 0.0),
             ("heading from " + ", ".join(sources)),
         )
-    moved_s = _moved_at(track)
     if moved_s is None:
         return (0.0,), np.pi, window, "heading unknown: no sensor tells it and the vessel does not move"
     course = np.arange(8) * np.pi / 4.0
@@ -222,11 +224,28 @@ def _headings(
     )
 
 
-def _moved_at(track: Track) -> float | None:
-    """Return when (s) the vessel has travelled far enough for a heading from its course; None: never."""
+def wanted_travel_m(noises: Sequence[tuple[Array, SlowProcess | None]]) -> float:
+    """Return the travel, m, from which the motion may tell a heading that no sensor measures.
+
+    By a fifth of it the places are off, or drift meanwhile: a course by two of them is good to 16 deg. How well a motion tells it is
+    seen once it is solved: by centimetres, a robot in a yard shows it within metres.
+
+    Args:
+        noises: of each sensor, sigma (N, 2) of its places, m, NaN where it tells none; and its slow error.
+    """
+    off = []
+    for sigma_m, slow in noises:
+        drift = 0.0
+        if slow is not None and (level := [k for k, axis in enumerate(slow.axes) if axis in ("east", "north")]):
+            drift = float(np.sqrt(2.0 * slow.sigma**2 * (1.0 - slow.after(_DRIFT_S)[0]))[level].max())
+        off.append(np.hypot(sigma_m, drift))
+    return max(_LEAST_M, _NOISES * float(np.nanmedian(np.concatenate(off))))
+
+
+def _moved_at(track: Track, wanted_m: float) -> float | None:
+    """Return when (s) the vessel has travelled far enough for the motion to tell a heading; None: never."""
     moved = np.hypot(*(track.p[:, :2] - np.median(track.p[:5, :2], axis=0)).T)
-    noise = 5.0 * float(np.nanmedian(track.sigma[:, :2]))
-    far = np.flatnonzero(moved > max(MOVED_M, noise))
+    far = np.flatnonzero(moved > wanted_m)
     return float(track.t[far[0]]) if len(far) else None
 
 

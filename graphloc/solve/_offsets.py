@@ -116,7 +116,7 @@ def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values]:
     streams = []
     for stream in problem.streams:
         slow, left_out = stream.slow, stream.left_out
-        if slow is not None and slow.axes[0] == "yaw" and not np.isfinite(slow.time_constant_s[0]):
+        if slow is not None and any(slow.constant & (np.array(slow.axes) == "yaw")):
             slow = _without_mount(problem, stream, slow, values)
         if left_out is not None:
             slow = left_out
@@ -132,13 +132,14 @@ def _surveyed(stream: Stream) -> tuple[Constant, ...]:
 
 
 def _without_mount(problem: Problem, stream: Stream, slow: SlowProcess, values: gtsam.Values) -> SlowProcess | None:
-    """Return a compass's slow state without its mount, which is held as configured (in `values` too); None where nothing else is in it."""
+    """Return the slow state without the yaw of a compass, or of LiDARs, which is held as configured (in `values` too); None where nothing else is in it."""
     if len(slow.axes) == 1:
         return None
+    held = np.array(slow.axes) == "yaw"
     for j in range(len(problem.timeline.slow_stamps_ns)):
         key = keys.slow(stream.number, j)
-        values.update(key, np.concatenate([[0.0], values.atVector(key)[1:]]))
-    return replace(slow, sigma=np.concatenate([[_HELD_RAD], slow.sigma[1:]]))
+        values.update(key, np.where(held, 0.0, values.atVector(key)))
+    return replace(slow, sigma=np.where(held, _HELD_RAD, slow.sigma))
 
 
 def _columns(

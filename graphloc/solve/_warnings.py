@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import Problem, Stream, solved_constants
+from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
 from graphloc.config import SIGMA_SCALES, SensorConfig
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
@@ -22,6 +22,7 @@ from graphloc.solve._passes import expected_cost
 from graphloc.time import stamps_of, utc_text
 
 _FAR_OFF = 3.0
+_TURNED, _TOLD = 2.5, 0.1  # sigmas; share of a prior's variance
 _MUCH_NOISIER = 1.5
 _SMALL_M = 0.1  # a slow error below it is that of RTK
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
@@ -100,6 +101,36 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     k = int(np.argmax(far))
     where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
     return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where})"
+
+
+def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
+    """Return a line if the other sensors say that headings are turned by more than the mount's sigma and theirs allow.
+
+    Two sensors that may each be turned share between them what they differ by, and neither lies far from zero: of 4 deg between mounts good to
+    1 deg each is 2 deg off, 2.8 sigmas of what they should differ by. So what the others alone say is taken, its variance with it.
+    """
+    slow = stream.slow
+    if slow is None or "yaw" not in slow.axes or not slow.constant[slow.axes.index("yaw")]:
+        return []
+    k, key = slow.axes.index("yaw"), keys.slow(stream.number, 0)
+    value, sigma = float(result.values.atVector(key)[k]), float(slow.sigma[k])
+    try:
+        var = float(result.tree.marginalCovariance(key)[k, k])
+    except (RuntimeError, IndexError):  # not determined
+        return []
+    prior = sigma**2 * (1.0 + (value / sigma) ** 2 / CONSTANT_TAILS)
+    told = prior - var  # what the other sensors took off it
+    if told < _TOLD * prior:
+        return []
+    others, others_var = value * prior / told, var * prior / told
+    sigmas = abs(others) / float(np.sqrt(sigma**2 + others_var))
+    if sigmas < _TURNED:
+        return []
+    said = (
+        f"its headings are turned by {np.degrees(others):+.1f} deg against the other sensors' ({sigmas:.1f} sigmas of what mounts are "
+        "allowed to be off by): check its mount (of a LiDAR matcher, those of the LiDARs) and theirs"
+    )
+    return [f"{stream.name}: {said}"]
 
 
 def _noisier(stream: Stream, result: BatchResult) -> float:
@@ -184,6 +215,8 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
         warnings.append(
             f"{stream.name}: {said} from zero: check its mount and the IMU's, or raise the configured sigma"
         )
+    else:
+        warnings += _turned_mount(stream, result)
     for constant, value in solved_constants(stream, result.values):
         off = float(np.abs(value / constant.sigma).max())
         if off > _FAR_OFF and constant.corrects:
