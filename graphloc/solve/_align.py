@@ -27,8 +27,9 @@ from graphloc.time import utc_text
 _USUAL_SPEED_MPS = 10.0  # 1 sigma, where the speed is unknown
 _CARRIED_RAD = np.radians(20.0)  # error by gyro bias, 1 sigma: from later on, a heading is no longer one of the start
 _OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, without accelerometer data
-# Travel from which the motion may tell the heading: so many times what places are off by, or drift by within so long; and at least so far.
-_NOISES, _DRIFT_S, _LEAST_M = 5.0, 30.0, 1.0
+# Travel from which the motion may tell the heading: so many times what places are off by, or drift by within so long. Few are enough
+# beyond the usual travel; below the least, an antenna sways.
+_MANY, _FEW, _DRIFT_S, _LEAST_M, _USUAL_M = 20.0, 5.0, 30.0, 1.0, 15.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,8 +228,8 @@ def _headings(
 def wanted_travel_m(noises: Sequence[tuple[Array, SlowProcess | None]]) -> float:
     """Return the travel, m, from which the motion may tell a heading that no sensor measures.
 
-    By a fifth of it the places are off, or drift meanwhile: a course by two of them is good to 16 deg. How well a motion tells it is
-    seen once it is solved: by centimetres, a robot in a yard shows it within metres.
+    By a twentieth of it the places are off, or drift meanwhile: a course by two of them is good to 4 deg. 15 m are enough as long as
+    that is no more than a fifth. How well a motion tells it is seen once it is solved.
 
     Args:
         noises: of each sensor, sigma (N, 2) of its places, m, NaN where it tells none; and its slow error.
@@ -239,7 +240,8 @@ def wanted_travel_m(noises: Sequence[tuple[Array, SlowProcess | None]]) -> float
         if slow is not None and (level := [k for k, axis in enumerate(slow.axes) if axis in ("east", "north")]):
             drift = float(np.sqrt(2.0 * slow.sigma**2 * (1.0 - slow.after(_DRIFT_S)[0]))[level].max())
         off.append(np.hypot(sigma_m, drift))
-    return max(_LEAST_M, _NOISES * float(np.nanmedian(np.concatenate(off))))
+    off_m = float(np.nanmedian(np.concatenate(off)))
+    return float(max(_FEW * off_m, np.clip(_MANY * off_m, _LEAST_M, _USUAL_M)))
 
 
 def _moved_at(track: Track, wanted_m: float) -> float | None:
