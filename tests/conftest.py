@@ -18,10 +18,11 @@ gc.set_threshold(100_000, 20, 100)  # looking again and again through runs that 
 
 @pytest.fixture
 def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An online start that waits for half a minute is tried at its end, not thirteen times: each solves all that there is."""
-    from graphloc.online import _waiting
+    """An online start waits for 15 s, not for 30, and is tried at their end, not ten times: each solves all that there is."""
+    from graphloc.online import _start, _waiting
 
-    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 30.2)
+    monkeypatch.setattr(_start, "_LONGEST_WAIT_S", 15.0)
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 15.2)
     monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
 
 
