@@ -26,6 +26,16 @@ def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
 
 
+@pytest.fixture
+def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `few_tries`, for 10 s."""
+    from graphloc.online import _start, _waiting
+
+    monkeypatch.setattr(_start, "_LONGEST_WAIT_S", 10.0)
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 10.2)
+    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
+
+
 @pytest.fixture(scope="session")
 def scanned_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a simulated run with scans of five LiDARs, twice a second for 16 s."""

@@ -15,7 +15,7 @@ from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, heading_deg_from_yaw, wrap_angle
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSample
-from graphloc.online import OnlineSmoother, _smoother, _waiting
+from graphloc.online import OnlineSmoother, _smoother
 from graphloc.online import _start as online_start
 from graphloc.online._heading_check import Fit, HeadingCheck
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
@@ -100,14 +100,6 @@ def with_compass(
     sensors = {**config.sensors, "compass": CompassConfig.model_validate({"topic": "/compass"})}
     measurements = tuple(sorted([*recording.measurements, *compass], key=lambda m: m.stamp_ns))
     return replace(recording, measurements=measurements), config.model_copy(update={"sensors": sensors})
-
-
-@pytest.fixture
-def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An online start waits for 10 s, not for 30, and is tried then, not ten times before: each solves all that there is."""
-    monkeypatch.setattr(online_start, "_LONGEST_WAIT_S", 10.0)
-    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 10.2)
-    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
 
 
 def errors(solved: Solution, recording: Recording, t: Array, yaw: Array) -> tuple[Array, Array]:
