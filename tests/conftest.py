@@ -36,6 +36,14 @@ def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
 
 
+@pytest.fixture
+def coarse_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The aerial image beside a bag has pixels of 2 m, where nothing looks at it: drawn in full, it takes as long as the bag."""
+    from graphloc.eval.simulate import aerial, bag
+
+    monkeypatch.setattr(bag, "render", lambda harbour, seed: aerial.render(harbour, seed, pixel_m=2.0))
+
+
 @pytest.fixture(scope="session")
 def scanned_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a simulated run with scans of five LiDARs, twice a second for 16 s."""
