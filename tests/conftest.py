@@ -18,11 +18,30 @@ gc.set_threshold(100_000, 20, 100)  # looking again and again through runs that 
 
 @pytest.fixture
 def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An online start that waits for half a minute is tried at its end, not thirteen times: each solves all that there is."""
-    from graphloc.online import _waiting
+    """An online start waits for 15 s, not for 30, and is tried at their end, not ten times: each solves all that there is."""
+    from graphloc.online import _start, _waiting
 
-    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 30.2)
+    monkeypatch.setattr(_start, "_LONGEST_WAIT_S", 15.0)
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 15.2)
     monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
+
+
+@pytest.fixture
+def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `few_tries`, for 10 s."""
+    from graphloc.online import _start, _waiting
+
+    monkeypatch.setattr(_start, "_LONGEST_WAIT_S", 10.0)
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 10.2)
+    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
+
+
+@pytest.fixture
+def coarse_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The aerial image beside a bag has pixels of 2 m, where nothing looks at it: drawn in full, it takes as long as the bag."""
+    from graphloc.eval.simulate import aerial, bag
+
+    monkeypatch.setattr(bag, "render", lambda harbour, seed: aerial.render(harbour, seed, pixel_m=2.0))
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,10 @@
 
 from dataclasses import replace
 
+import pytest
+
+from graphloc import app
+from graphloc.app import _estimate
 from graphloc.config import TimelineConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 
@@ -20,3 +24,10 @@ def slowly(run: SimulatedRun, rate_hz: float = 2.5) -> SimulatedRun:
 def simulate_slowly(scenario: Scenario, seed: int, rate_hz: float = 2.5) -> SimulatedRun:
     """Simulate a run `with_few_states`."""
     return slowly(simulate(scenario, seed), rate_hz)
+
+
+def beside_filters(run: SimulatedRun) -> app.Run:
+    """Solve a run, and the filters beside it, but not the online mode: a third to a half of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_estimate, "_online", lambda *_: (None, ""))
+        return app.simulated(run, compare=True)

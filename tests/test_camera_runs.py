@@ -28,6 +28,8 @@ from graphloc.time import stamps_of
 from tests.camerabench import CORNERS, LINEAR, detected, detectors, docking
 from tests.commands import called
 
+pytestmark = pytest.mark.usefixtures("coarse_image")
+
 
 @pytest.fixture(scope="module")
 def detector() -> Iterator[Detector]:

@@ -129,7 +129,7 @@ def test_a_heading_that_no_sensor_tells_is_handed_on(run: SimulatedRun, monkeypa
 
     monkeypatch.setattr(graphloc.solve, "make_problem", noted)
     fixes = tuple(run.recording.of(GnssPosition))
-    solved(run, 60.0, fixes)
+    solved(run, 60.0, fixes, rate_hz=0.625)
     where = seams(replace(run.recording, measurements=fixes), 60.0, {"gnss"})
     assert asked[0] is None
     for seam, heading_deg in zip(where, asked[1:], strict=True):

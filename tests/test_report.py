@@ -24,12 +24,12 @@ from graphloc.survey import Survey
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 from tests.browser import CHROMIUM, Browser
-from tests.slowly import simulate_slowly
+from tests.slowly import beside_filters, simulate_slowly
 
 
 @pytest.fixture(scope="module")
 def data() -> ReportData:
-    run = app.simulated(simulate_slowly(Scenario(duration_s=20.0), 3), compare=True)
+    run = beside_filters(simulate_slowly(Scenario(duration_s=20.0), 3))
     return ReportData(
         title="a <run>",
         solution=run.solution,

@@ -51,7 +51,7 @@ def stating(run: SimulatedRun, kind: type[Measurement], share: float) -> Simulat
     return replace(run, recording=recording)
 
 
-def matched(seed: int, duration_s: float = 40.0, rate_hz: float = 5.0) -> SimulatedRun:
+def matched(seed: int, duration_s: float = 40.0, rate_hz: float = 2.5) -> SimulatedRun:
     """BL's case 1 with matches of 0.3 m, 40 % of them false, and GNSS that drifts."""
     scenario = replace(bl_scenario(1, "drift"), duration_s=duration_s, pose_hz=4.0, imu_hz=50.0, gnss_hz=5.0)
     return simulate_slowly(scenario, seed, rate_hz)
@@ -68,7 +68,7 @@ class Followed:
 
 @pytest.fixture(scope="module")
 def followed(tmp_path_factory: pytest.TempPathFactory) -> Followed:
-    run = stating(matched(2), PoseFix, 1 / 3)
+    run = stating(matched(2, rate_hz=5.0), PoseFix, 1 / 3)
     path = tmp_path_factory.mktemp("followed") / "snapshot.json"
     fed = feed(OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, snapshot=path), run, arrivals_of(run))
     return Followed(run, fed, Snapshot.read(path, "imu"))
@@ -116,7 +116,7 @@ def test_few_steps_and_false_ones_alone_tell_nothing() -> None:
 
 
 def test_matches_that_state_a_third_of_their_noise_are_taken_as_they_scatter() -> None:
-    right = matched(1, rate_hz=2.5)
+    right = matched(1, 30.0)
     run = stating(right, PoseFix, 1 / 3)
     solved, as_stated = (app.smooth_recording(r.recording, r.config).solution for r in (run, right))
     found, best = (compare_to_truth(s.trajectory, run.truth) for s in (solved, as_stated))
@@ -157,7 +157,7 @@ def test_online_the_kernel_of_fixes_is_found_anew_by_their_new_sigma(monkeypatch
 
     as_ever = Scatter.note
     monkeypatch.setattr(Scatter, "note", note)
-    run = stating(matched(3, rate_hz=2.5), GnssPosition, 0.5)  # too little for the start to see
+    run = stating(matched(3), GnssPosition, 0.5)  # too little for the start to see
     events = replay(run.recording, run.config).solution.stats.events
     rebuilt = [line for line in events if "gnss: its measurements scatter" in line and "rebuilt" in line]
     assert len(rebuilt) >= 1

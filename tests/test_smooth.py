@@ -17,14 +17,14 @@ from graphloc.eval.simulate import Scenario, bl_scenario
 from graphloc.measurements import GnssPosition, PoseFix
 from graphloc.recording import Recording
 from graphloc.time import stamps_of
-from tests.slowly import simulate_slowly
+from tests.slowly import beside_filters, simulate_slowly
 
 SHORT = Scenario(duration_s=40.0, noise="drift", imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
 
 
 @pytest.fixture(scope="module")
 def short() -> app.Run:
-    return app.simulated(simulate_slowly(SHORT, 5), compare=True)
+    return beside_filters(simulate_slowly(SHORT, 5))
 
 
 def test_smoother_beats_the_filter_and_its_covariance_holds(short: app.Run) -> None:

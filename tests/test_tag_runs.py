@@ -26,7 +26,7 @@ from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement, TagSighting, TagView
 from graphloc.survey import Survey, TagConfig, load_survey
 from tests import tagfactory
-from tests.slowly import with_few_states
+from tests.slowly import beside_filters, with_few_states
 
 S = 1_000_000_000
 QUAY = (226, 227, 228)
@@ -130,7 +130,8 @@ def dock(
     cameras = {name: c.model_copy(update={"mount_sigma_deg": mount_sigma_deg}) for name, c in tags.cameras.items()}
     sensors = seen.config.sensors | {"tags": tags.model_copy(update={"cameras": cameras})}
     config = with_few_states(seen.config.model_copy(update={"sensors": sensors}), rate_hz=2.5)
-    run = app.simulated(replace(seen, recording=recording, config=config), compare=compare)
+    solve = beside_filters if compare else app.simulated
+    run = solve(replace(seen, recording=recording, config=config))
     return Docked(true, run, {m.seq: right for m, right in numbered})
 
 
