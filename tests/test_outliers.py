@@ -100,6 +100,12 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one(monkeypatch
     assert solved.ledger.counts()["matcher"]["used"] > 30
 
 
+def test_outliers_in_a_row_are_told_from_scattered_ones() -> None:
+    scattered = np.random.default_rng(1).random(200) < 0.4
+    assert not _batch._off_for_long(scattered)  # noqa: SLF001
+    assert _batch._off_for_long(np.sort(scattered))  # noqa: SLF001
+
+
 def test_a_compass_that_is_off_for_most_of_a_run_is_found_by_leaving_it_out() -> None:
     """Followed from the start, it left the heading 74 deg off."""
     scenario = replace(_FINE_FIXES, path="loops", duration_s=20.0, gnss_hz=2.0, compass_hz=2.0)

@@ -23,7 +23,17 @@ from graphloc.build._chains import (
     walk_between_nodes,
     without_drift,
 )
-from graphloc.build._graph import Decided, Decisions, Level, Made, Past, StartPrior, build_graph, state_keys
+from graphloc.build._graph import (
+    Decided,
+    Decisions,
+    Level,
+    Made,
+    Past,
+    StartPrior,
+    build_graph,
+    cost_of_constants,
+    state_keys,
+)
 from graphloc.build._layout import company_of, make_problem, mount_of, slow_or_left_out
 from graphloc.build._problem import (
     Problem,
@@ -59,6 +69,7 @@ __all__ = [
     "closing_variance",
     "company_of",
     "constant_keys",
+    "cost_of_constants",
     "make_problem",
     "mount_of",
     "nav_state",

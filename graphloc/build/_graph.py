@@ -173,6 +173,17 @@ def state_keys(problem: Problem, first: int, last: int) -> list[int]:
     return names + [keys.slow(s.number, j) for s in problem.streams if s.slow is not None for j in nodes]
 
 
+def cost_of_constants(problem: Problem, values: gtsam.Values, known: Collection[int]) -> float:
+    """Return -log of how probable the constants in `values` are, but for a constant, without those of the keys `known`."""
+    cost = 0.0
+    for stream in problem.streams:
+        for (key, value), constant in zip(constants_of(stream, values), stream.constants, strict=True):
+            if key not in known:
+                squares = float(((value / constant.sigma) ** 2).sum())
+                cost += 0.5 * CONSTANT_TAILS * float(np.log1p(squares / CONSTANT_TAILS))
+    return cost
+
+
 def _add_constants(
     graph: gtsam.NonlinearFactorGraph,
     guess: gtsam.Values,

@@ -12,7 +12,7 @@
 
 Where no sensor measures position or velocity for a while, 3 to 6 have the motion model (`graphloc.motion_model`).
 Sensors that scatter more than they state are taken as they scatter, and 3 and 4 repeated.
-Where the IMU contradicts the other sensors, or one of heading or velocity often disagrees, 1 to 4 are tried without such a sensor,
+Where the IMU contradicts the other sensors, or one of heading or velocity disagrees for long, 1 to 4 are tried without such a sensor,
 and then with all from there. If the IMU contradicts them still, its noise is scaled up, and 3 and 4 are repeated, beginning with
 gentle losses; where that explains little, it is not the IMU, and its noise stays as configured.
 """
@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from graphloc.build import (
     Problem,
@@ -66,7 +67,9 @@ CONTRADICTION = 2.5  # cost over its expectation, from which the configured IMU 
 LARGEST_NOISE_SCALE = 10.0  # no IMU is so many times noisier than configured
 # More noise of the IMU explains a misfit if it falls below that, or by this factor; else the noise stays as configured.
 _EXPLAINED = 2.0
-_OFTEN = 0.3  # share of a sensor's measurements that disagree, from which the run is tried without it
+# Share of a sensor's measurements that disagree, from which the run is tried without it; and below which it tells the heading.
+_OFTEN, _MOSTLY = 0.3, 0.7
+_CLEARLY = 10.0  # log-likelihood by which a solution must be more probable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,7 +141,8 @@ def solve_batch(problem: Problem, progress: Progress = quiet, *, newest: bool = 
         del settled, solved  # and their graph, before the next one is made
         solved = _as_they_scatter(problem, estimate, begun.prior, progress)
         passes, iterations = passes + solved.settled.passes, iterations + solved.settled.iterations
-    if solved.problem.noise_scale > 1.0 and CONTRADICTION <= solved.misfit() and misfit < _EXPLAINED * solved.misfit():
+    scaled = solved.problem.noise_scale > as_stated.problem.noise_scale
+    if scaled and CONTRADICTION <= solved.misfit() and misfit < _EXPLAINED * solved.misfit():
         del solved
         solved = as_stated.settled_again(begun.prior, progress)
         passes, iterations = passes + solved.settled.passes, iterations + solved.settled.iterations
@@ -204,29 +208,31 @@ class _Solved(NamedTuple):
 
 
 def _first_solution(problem: Problem, progress: Progress, *, newest: bool) -> tuple[_Grown, _Solved]:
-    """Solve a run with the IMU's noise as configured.
+    """Solve a run with the IMU's noise as it is.
 
-    Where that contradicts the other sensors, it is begun without each sensor of heading or velocity, too; else without those of
-    them that often disagree. The solution in which all measurements are most probable is taken: a compass that is wrong for most
-    of a run may lead the heading away, where nothing leads back.
+    Where that contradicts the other sensors, the run is begun without each sensor of heading or velocity, too; else without those of
+    them that disagree for long. If all measurements are clearly more probable in such a solution, it is taken: a compass that is wrong
+    for most of a run may lead the heading away, where nothing leads back. Not for `newest`, as a start online has no time for it.
     """
-    begun = _begin(problem, progress, newest=newest)
+    begun = whole = _begin(problem, progress, newest=newest)
     solved = _from_there(problem, begun, progress)
     misfit, last = solved.misfit(), len(problem.timeline) - 1
-    doubted = [
+    doubted = [] if newest else [
         number
         for number, stream in enumerate(problem.streams)
         if stream.row.false is None
         and not stream.row.absolute
-        and (misfit >= CONTRADICTION or _share_off(stream, solved.settled.verdicts) > _OFTEN)
-    ]
+        and (misfit >= CONTRADICTION or _off_for_long(_off(stream, solved.settled.verdicts)))
+    ]  # fmt: skip
     if not doubted:
         return begun, solved
 
     def cost(values: gtsam.Values, prior: StartPrior) -> float:
         return cost_as_configured(problem, values, 0, last, prior, judged=last)
 
-    lowest, best = cost(solved.settled.values, begun.prior), (begun, solved.choice())
+    lowest, best = cost(solved.settled.values, begun.prior) - _CLEARLY, (begun, solved.choice())
+    iterations, passes = begun.iterations, 0
+    del solved  # and its graph, before the next one is made
     for number in doubted:
         rest = list(problem.streams)
         rest[number] = rest[number].silenced()
@@ -234,18 +240,29 @@ def _first_solution(problem: Problem, progress: Progress, *, newest: bool) -> tu
             begun = _begin(replace(problem, streams=tuple(rest)), progress, newest=newest)
         except SolveError:
             continue
-        del solved
         solved = _from_there(problem, begun, progress)
+        iterations, passes = iterations + begun.iterations, passes + solved.settled.passes
         if (found := cost(solved.settled.values, begun.prior)) < lowest:
+            if _off(problem.streams[number], solved.settled.verdicts).mean() < _MOSTLY:
+                # The sensor tells the heading after all.
+                begun = whole._replace(values=begun.values, prior=begun.prior)
             lowest, best = found, (begun, solved.choice())
+        del solved
     begun, choice = best
-    del solved
-    return begun, choice.settled_again(begun.prior, progress)
+    again = choice.settled_again(begun.prior, progress)
+    settled = replace(again.settled, passes=again.settled.passes + passes)
+    return begun._replace(iterations=iterations), again._replace(settled=settled)
 
 
-def _share_off(stream: Stream, verdicts: Verdicts) -> float:
-    """Return the share of its measurements that disagree."""
-    return float(np.mean([verdicts[stream.number, i].weight < AGREES for i in range(len(stream.measurements))]))
+def _off(stream: Stream, verdicts: Verdicts) -> NDArray[np.bool_]:
+    """Return which of its measurements disagree."""
+    return np.array([verdicts[stream.number, i].weight < AGREES for i in range(len(stream.measurements))])
+
+
+def _off_for_long(off: NDArray[np.bool_]) -> bool:
+    """Whether many measurements disagree, and in a row: as many scattered outliers change twice as often."""
+    share = float(off.mean())
+    return bool(share > _OFTEN and np.count_nonzero(off[1:] != off[:-1]) < share * (1.0 - share) * len(off))
 
 
 def _begin(problem: Problem, progress: Progress, *, newest: bool) -> _Grown:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 
-from graphloc.build import Made, Past, Problem, StartPrior, build_graph
+from graphloc.build import Made, Past, Problem, StartPrior, build_graph, cost_of_constants
 from graphloc.recording import Progress
 from graphloc.solve._decide import Stage, Verdicts, decisions, log_evidence, met, weigh
 from graphloc.solve._optimize import full_step, optimize
@@ -183,6 +183,8 @@ def cost_as_configured(
     """
     graph, guess = build_graph(problem, values, {}, first, last, prior)
     cost = float(graph.error(guess)) - log_evidence(problem, values, first, judged)
+    # Of constants that the prior knows, it is in the graph.
+    cost += cost_of_constants(problem, values, prior.known if isinstance(prior, Past) else ())
     for stream in problem.streams:
         if stream.row.false is None:
             _, residuals = met(problem, stream, stream.between(first, last), values)
