@@ -179,7 +179,7 @@ def odometry_report(
     """
     rows = stream.rows[sane(stream)]
     speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
-    name, reverse = stream.topic.lower(), False
+    name, reverse, fused = stream.topic.lower(), False, _fused(stream.topic, world)
     truth = any(word in name for word in ("truth", "groundtruth", "/gt"))
     if truth:
         role, why = "truth", "its name says so"
@@ -187,7 +187,6 @@ def odometry_report(
         role, why = "pose", "it reports poses and no speed"
     else:
         axes, fit = axes_of(stream, stamps_ns, p_m, scatter_m)
-        fused = _fused(stream.topic, world)
         whose = f"{fused}, no check by other means" if fused else "looks like wheel odometry"
         role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: {whose}"
         reverse = _astern(rows[:, 7])
@@ -207,7 +206,7 @@ def odometry_report(
         world=world.why,
         grid=world.grid and not truth,
         reverse=reverse,
-        fused=bool(_fused(stream.topic, world)),
+        fused=bool(fused),
     )
 
 

@@ -16,24 +16,24 @@ for threads in ("OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
 gc.set_threshold(100_000, 20, 100)  # looking again and again through runs that tests share took 3 % of the time
 
 
+def _tried_after(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    from graphloc.online import _start, _waiting
+
+    monkeypatch.setattr(_start, "_LONGEST_WAIT_S", seconds)
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", seconds + 0.2)
+    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
+
+
 @pytest.fixture
 def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
     """An online start waits for 15 s, not for 30, and is tried at their end, not ten times: each solves all that there is."""
-    from graphloc.online import _start, _waiting
-
-    monkeypatch.setattr(_start, "_LONGEST_WAIT_S", 15.0)
-    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 15.2)
-    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
+    _tried_after(monkeypatch, 15.0)
 
 
 @pytest.fixture
 def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     """As `few_tries`, for 10 s."""
-    from graphloc.online import _start, _waiting
-
-    monkeypatch.setattr(_start, "_LONGEST_WAIT_S", 10.0)
-    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 10.2)
-    monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
+    _tried_after(monkeypatch, 10.0)
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ from graphloc.build import (
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
-from graphloc.solve._align import Start, align
+from graphloc.solve._align import align
 from graphloc.solve._choices import other_choices, take_more_probable
 from graphloc.solve._decide import AGREES, Stage, Verdicts, weigh
 from graphloc.solve._grow import grow
@@ -56,7 +56,7 @@ from graphloc.solve._passes import (
     settle,
 )
 from graphloc.solve._sensor_noise import scattering
-from graphloc.solve._start import solve_start
+from graphloc.solve._start import Begun, solve_start
 
 _MAX_NOISE_ROUNDS, _MAX_SENSOR_ROUNDS = 4, 2
 # Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
@@ -139,7 +139,7 @@ def solve_batch(problem: Problem, progress: Progress = quiet, *, newest: bool = 
             )
             passes, iterations = passes + passed, iterations + used
         del settled, solved  # and their graph, before the next one is made
-        solved = _as_they_scatter(problem, estimate, begun.prior, progress)
+        solved = _as_they_scatter(problem, thinned(problem), estimate, begun.prior, progress)
         passes, iterations = passes + solved.settled.passes, iterations + solved.settled.iterations
     scaled = solved.problem.noise_scale > as_stated.problem.noise_scale
     if scaled and CONTRADICTION <= solved.misfit() and misfit < _EXPLAINED * solved.misfit():
@@ -170,18 +170,6 @@ def solve_batch(problem: Problem, progress: Progress = quiet, *, newest: bool = 
     )
 
 
-class _Grown(NamedTuple):
-    """A run grown from its start over the thinned run; for the fields that it shares with a `BatchResult`, see there."""
-
-    start: Start
-    values: gtsam.Values
-    prior: StartPrior
-    last: int
-    iterations: int
-    headings: int
-    heading_var: Array
-
-
 class _Choice(NamedTuple):
     """A solution without its graph, which takes gigabytes on a run of hours."""
 
@@ -207,15 +195,16 @@ class _Solved(NamedTuple):
         return _Choice(self.problem, self.settled.values, self.settled.verdicts)
 
 
-def _first_solution(problem: Problem, progress: Progress, *, newest: bool) -> tuple[_Grown, _Solved]:
+def _first_solution(problem: Problem, progress: Progress, *, newest: bool) -> tuple[Begun, _Solved]:
     """Solve a run with the IMU's noise as it is.
 
     Where that contradicts the other sensors, the run is begun without each sensor of heading or velocity, too; else without those of
     them that disagree for long. If all measurements are clearly more probable in such a solution, it is taken: a compass that is wrong
     for most of a run may lead the heading away, where nothing leads back. Not for `newest`, as a start online has no time for it.
     """
-    begun = whole = _begin(problem, progress, newest=newest)
-    solved = _from_there(problem, begun, progress)
+    few = thinned(problem)
+    begun = whole = _begin(problem, few, progress, newest=newest)
+    solved = _from_there(problem, few, begun, progress)
     misfit, last = solved.misfit(), len(problem.timeline) - 1
     doubted = [] if newest else [
         number
@@ -231,17 +220,19 @@ def _first_solution(problem: Problem, progress: Progress, *, newest: bool) -> tu
         return cost_as_configured(problem, values, 0, last, prior, judged=last)
 
     lowest, best = cost(solved.settled.values, begun.prior) - _CLEARLY, (begun, solved.choice())
-    iterations, passes = begun.iterations, 0
+    iterations, passes = begun.iterations + solved.settled.iterations, solved.settled.passes
     del solved  # and its graph, before the next one is made
     for number in doubted:
-        rest = list(problem.streams)
-        rest[number] = rest[number].silenced()
+        streams = list(problem.streams)
+        streams[number] = streams[number].silenced()
+        rest = replace(problem, streams=tuple(streams))
         try:
-            begun = _begin(replace(problem, streams=tuple(rest)), progress, newest=newest)
+            begun = _begin(rest, thinned(rest), progress, newest=newest)
         except SolveError:
             continue
-        solved = _from_there(problem, begun, progress)
-        iterations, passes = iterations + begun.iterations, passes + solved.settled.passes
+        solved = _from_there(problem, few, begun, progress)
+        iterations += begun.iterations + solved.settled.iterations
+        passes += solved.settled.passes
         if (found := cost(solved.settled.values, begun.prior)) < lowest:
             if _off(problem.streams[number], solved.settled.verdicts).mean() < _MOSTLY:
                 # The sensor tells the heading after all.
@@ -265,42 +256,43 @@ def _off_for_long(off: NDArray[np.bool_]) -> bool:
     return bool(share > _OFTEN and np.count_nonzero(off[1:] != off[:-1]) < share * (1.0 - share) * len(off))
 
 
-def _begin(problem: Problem, progress: Progress, *, newest: bool) -> _Grown:
-    """Start a run, and grow it over the thinned one."""
-    start, few = align(problem), thinned(problem)
-    begun = solve_start(few.problem, start, progress, newest=newest)
-    whole, thin = problem.timeline.stamps_ns, few.problem.timeline.stamps_ns
-    heading_var = np.interp(whole, thin[: begun.last + 1], begun.heading_var)
-    iterations = begun.iterations + grow(few.problem, begun.values, begun.prior, begun.last, progress)
-    grown, used, _ = rough_passes(few.problem, begun.values, begun.prior, progress, (Stage.FINAL,), _SEAM_PASSES)
-    return _Grown(
-        start=start,
+def _begin(problem: Problem, few: Thinned, progress: Progress, *, newest: bool) -> Begun:
+    """Start a run, grow it over the thinned one, and fill in the other states."""
+    begun = solve_start(few.problem, align(problem), progress, newest=newest)
+    grown, prior, known, iterations, *_ = begun
+    iterations += grow(few.problem, grown, prior, known, progress)
+    grown, used, _ = rough_passes(few.problem, grown, prior, progress, (Stage.FINAL,), _SEAM_PASSES)
+    stamps, few_stamps = problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1]
+    return begun._replace(
         values=few.filled(problem, grown),
-        prior=begun.prior,
-        last=int(few.states[begun.last]),
+        last=int(few.states[known]),
         iterations=iterations + used,
-        headings=begun.headings,
-        heading_var=heading_var,
+        heading_var=np.interp(stamps, few_stamps, begun.heading_var),
     )
 
 
-def _from_there(problem: Problem, begun: _Grown, progress: Progress) -> _Solved:
+def _from_there(problem: Problem, few: Thinned, begun: Begun, progress: Progress) -> _Solved:
     """Make the final passes from a grown run."""
     if problem.links.gaps():
         problem = bridged(problem, begun.values)
     problem = with_usual_motion(problem, begun.values)
-    return _as_they_scatter(problem, begun.values, begun.prior, progress)
+    if problem.usual_motion is not None or problem.links.gaps():
+        few = thinned(problem)
+    return _as_they_scatter(problem, few, begun.values, begun.prior, progress)
 
 
-def _as_they_scatter(problem: Problem, estimate: gtsam.Values, prior: StartPrior, progress: Progress) -> _Solved:
+def _as_they_scatter(
+    problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
+) -> _Solved:
     """Make the final passes, again with larger sigmas of the sensors that scatter more than they state (see `_sensor_noise`)."""
     passes = iterations = 0
     for more in range(_MAX_SENSOR_ROUNDS, -1, -1):
-        settled = _final_passes(problem, thinned(problem), estimate, prior, progress)
+        settled = _final_passes(problem, few, estimate, prior, progress)
         passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
         if not more or not (times := scattering(problem, settled.verdicts)):
             break
         problem = with_sensor_noise(problem, times)
+        few = thinned(problem)
     return _Solved(problem, replace(settled, passes=passes, iterations=iterations))
 
 

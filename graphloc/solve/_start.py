@@ -41,7 +41,7 @@ _FREE = 1e4  # 1 sigma, m or rad, of what is not held
 
 
 class Begun(NamedTuple):
-    """The start of a run: values, prior, the last state solved, iterations, and how many headings explain it.
+    """The start of a run: values, prior, the last state solved, iterations, how many headings explain it, and what it was aligned to.
 
     `heading_var`: (last + 1,), rad^2, of each state, from how much other headings cost (at both ends, linear in between); 0 where the
     motion excludes those beside the solved one, or a sensor tells it.
@@ -53,6 +53,7 @@ class Begun(NamedTuple):
     iterations: int
     headings: int
     heading_var: Array
+    start: Start
 
 
 def solve_start(problem: Problem, start: Start, progress: Progress, *, newest: bool = False) -> Begun:
@@ -84,7 +85,7 @@ def solve_start(problem: Problem, start: Start, progress: Progress, *, newest: b
                 first_var = last_var if newest else _var_at(problem, start, best, until, 0)
                 stamps = problem.timeline.stamps_ns[: until + 1]
                 heading_var = np.interp(stamps, stamps[[0, -1]], (first_var, last_var))
-            return Begun(best.values, best.prior, until, iterations, len(candidates), heading_var)
+            return Begun(best.values, best.prior, until, iterations, len(candidates), heading_var, start)
         seconds *= 1.6
 
 
