@@ -59,6 +59,7 @@ class Links:
         self._noise_scale = noise_scale
         self._gravity_mps2 = gravity_mps2 if config.gravity != "removed" else 0.0
         gyro = config.gyro_noise_radps * noise_scale
+        self._left_out: list[tuple[int, int]] = []
         self._params = self._make_params(self._gravity_mps2, config.accel_noise_mps2 * noise_scale, np.full(3, gyro))
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
@@ -69,8 +70,16 @@ class Links:
             stamps, rows = stamps[order], rows[order]
         self._stamps, self._samples = stamps, rows
 
+    def leave_out(self, after_ns: int, until_ns: int) -> None:
+        """Drop the samples of an interval, of which the first of all is none; however short, it is a gap."""
+        kept = (self._stamps <= after_ns) | (self._stamps > until_ns)
+        self._stamps, self._samples = self._stamps[kept], self._samples[kept]
+        within = [gap for gap in self._left_out if after_ns <= gap[0] and gap[1] <= until_ns]
+        self._left_out = [gap for gap in self._left_out if gap not in within] + [(after_ns, until_ns)]
+
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a stamp except the last of them."""
+        self._left_out = [gap for gap in self._left_out if gap[1] >= before_ns]
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
         self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()
 
@@ -125,6 +134,9 @@ class Links:
 
     def _gap_of(self, start_ns: int, stop_ns: int) -> tuple[int, int] | None:
         """Return the longest gap (start, stop) that overlaps an interval, if any; the time after the last sample is one too."""
+        for after_ns, until_ns in self._left_out:
+            if after_ns < stop_ns and start_ns < until_ns:
+                return self._around(after_ns, until_ns)
         left = max(int(np.searchsorted(self._stamps, start_ns, side="right")) - 1, 0)
         right = int(np.searchsorted(self._stamps, stop_ns, side="left"))
         stamps = self._stamps[left : right + 1]
@@ -134,6 +146,12 @@ class Links:
         if not len(steps) or (n := int(np.argmax(steps)), steps[n])[1] <= self._max_gap_ns:
             return None
         return int(stamps[n]), int(stamps[n + 1])
+
+    def _around(self, after_ns: int, until_ns: int) -> tuple[int, int]:
+        """Return the samples (stamps) around an interval without any; where none follows it, its end."""
+        left, right = np.searchsorted(self._stamps, [after_ns, until_ns], side="right")
+        before_ns = min(int(self._stamps[max(left - 1, 0)]), after_ns)
+        return before_ns, int(self._stamps[right]) if right < len(self._stamps) else until_ns
 
     def _bridge(self, stamps_ns: NDArray[np.int64], samples: Array, gap: tuple[int, int], going: Going) -> Array:
         """Return samples (M, 6) for an interval with a gap, to be integrated without gravity."""
@@ -211,7 +229,8 @@ class Links:
     def gaps(self) -> list[tuple[int, int]]:
         """Return the gaps in the data, (start, stop) in ns."""
         wide = np.flatnonzero(np.diff(self._stamps) > self._max_gap_ns)
-        return [(int(self._stamps[i]), int(self._stamps[i + 1])) for i in wide]
+        found = {(int(self._stamps[i]), int(self._stamps[i + 1])) for i in wide}
+        return sorted(found | {self._around(*gap) for gap in self._left_out})
 
 
 def _sinh_share(t: Array, length: float) -> Array:

@@ -339,6 +339,10 @@ class InertialLink(Protocol):
         """Add samples (N, 6), late ones among them: specific force, m/s^2, and rate, rad/s, in IMU axes."""
         ...
 
+    def leave_out(self, after_ns: int, until_ns: int) -> None:
+        """Treat an interval as a gap, however short: its samples are dropped, and those that are added later are after it."""
+        ...
+
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a stamp, but for the last of them."""
         ...

@@ -22,6 +22,7 @@ from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
 from graphloc.online._alternatives import choices
 from graphloc.online._entries import Entries, Entry
+from graphloc.online._imu_doubt import Denials
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._receiver_checks import ReceiverChecks
 from graphloc.online._states import States
@@ -49,7 +50,7 @@ class Judge:
         agreement: notes how absolute sensors were judged.
 
     Attributes:
-        receivers: checks of single receivers, before a measurement is judged.
+        receivers: checks of single receivers, before a measurement is judged. denials: of all sensors, on arrival.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Judge:
     ) -> None:
         self._problem, self._window = problem, window
         self._states, self._entries, self._agreement = states, entries, agreement
+        self.denials = Denials()
         self.receivers = ReceiverChecks(problem, states, entries, agreement)
         self._scheduled: list[tuple[float, int, Entry]] = []  # a heap: due time (s), order, entry
         self._turn = count()
@@ -88,11 +90,14 @@ class Judge:
             raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
         if why := self.receivers.reject(stream, m, at, residuals[0]):
             self._entries.add(Entry(stream, i, Verdict.false(residuals[0], at, why)))
+            if stream.receiver.jump.suspects(m.stamp_ns):
+                self.denials.note(stream.name, m.stamp_ns, agrees=False, outlier=False)
         elif stream.row.false is None:
             verdict, widened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
             # Behind a widened kernel it is used, but whether it agrees shows only when it is judged again.
             if not widened or verdict.weight < AGREES:
                 self._agreement.note(stream, m, verdict)
+                self.denials.note(stream.name, m.stamp_ns, agrees=verdict.weight >= AGREES, outlier=False)
             entry = Entry(stream, i, verdict, widened=widened)
             self._entries.add(entry)
             self._schedule(self._problem.timeline.seconds(m.stamp_ns) + _REJUDGE_AGES_S[0], entry)
@@ -182,6 +187,9 @@ class Judge:
             settled = entry.verdict.settled + (entry.judged and verdict.mode != entry.verdict.mode)
             if not entry.judged or verdict.weight >= AGREES:
                 self._agreement.note(stream, entry.measurement, verdict)
+            if not entry.judged:
+                agrees, stamp_ns = verdict.weight >= AGREES, entry.measurement.stamp_ns
+                self.denials.note(stream.name, stamp_ns, agrees=agrees, outlier=True)
             if not entry.judged and verdict.weight < AGREES:
                 self._refuted.add(stream.name)
             if not entry.judged and (verdict.weight < _CERTAIN or stream.name in self._others):

@@ -8,7 +8,7 @@ of the states, and neither of these knows the judge.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -29,6 +29,7 @@ from graphloc.online._states import Newest, States
 from graphloc.online._unmodelled import UnmodelledError, estimated_beside
 from graphloc.online._window import Window
 from graphloc.position_jumps import why_in_doubt
+from graphloc.solve._decide import AGREES
 from graphloc.solve._imu_noise import log_likelihood
 from graphloc.solve._unmodelled import Unmodelled
 from graphloc.solve._warnings import noisier_warning
@@ -36,6 +37,9 @@ from graphloc.solve._warnings import noisier_warning
 # Of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10.
 _STEP_COST = 1.0
 _STEP_M = 0.3  # a commit that moves the newest state by more is followed by further iterations
+# Share of the measurements that denied an estimate, that must agree with another; and of a sensor with outliers.
+_EXPLAINED, _HALF = 0.8, 0.5
+_MOTION = 3.0  # sigmas of the motion in a gap (`factors.imu`), once and per second
 _MOST_STEPS, _STANDS = 10, 0.1  # largest number of iterations; relative change of the cost at which they end
 
 
@@ -229,6 +233,26 @@ class Lag:
         streams = self.problem.streams.items()  # where a slow error is left out, the bounds include it
         doubtful = [n for n, s in streams if (s.left_out is None or s.jumps) and s.receiver.jump.doubtful(stamp_ns)]
         return "; ".join(why_in_doubt(n) for n in doubtful)
+
+    @property
+    def denied(self) -> Mapping[str, int]:
+        """Stamps of the first denials of sensors that deny the estimate together (see `_imu_doubt.Denials`)."""
+        return self._judge.denials.at_once(self.newest.stamp_ns)
+
+    def explained(self, sensors: Collection[str], since_ns: int) -> bool:
+        """Return whether the measurements of some sensors since a stamp now agree, and by a motion that a vessel may have made.
+
+        Of two of them at least, and of all but those with outliers.
+        """
+        agreeing = 0
+        for stream in map(self.problem.streams.__getitem__, sensors):
+            own = [e for e in self._entries.of(stream) if e.measurement.stamp_ns >= since_ns]
+            share = sum(e.verdict.weight >= AGREES for e in own) / max(len(own), 1)
+            if stream.row.false is None and share < _EXPLAINED:
+                return False
+            agreeing += share >= (_EXPLAINED if stream.row.false is None else _HALF)
+        lasts_s = (self.newest.stamp_ns - since_ns) * 1e-9
+        return agreeing >= 2 and 2.0 * self._states.steps_cost(since_ns) <= _MOTION**2 * (1.0 + lasts_s)
 
     def gone(self) -> list[LedgerRow]:
         """Return ledger rows of measurements that have left since this was last called."""

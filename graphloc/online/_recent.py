@@ -59,6 +59,12 @@ class Recent:
         while len(self.anchors) > 1 and self.anchors[-1].stamp_ns >= since_ns:
             self.anchors.pop()
 
+    def leave_out(self, after_ns: int) -> list[ImuSample]:
+        """Take out the IMU samples since a stamp and return them."""
+        out = [m for m in self._came if isinstance(m, ImuSample) and m.stamp_ns > after_ns]
+        self._came = [m for m in self._came if not isinstance(m, ImuSample) or m.stamp_ns <= after_ns]
+        return out
+
     def __iter__(self) -> Iterator[Measurement]:
         """All measurements, in order of arrival."""
         return iter(self._came)

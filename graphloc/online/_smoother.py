@@ -240,6 +240,9 @@ class OnlineSmoother:
             tracking.advance(until_ns)
             self._keep_anchor(tracking)
             self._events += tracking.news()
+            if (doubted := tracking.doubt_imu(until_ns)) is not None:
+                self._say(doubted)
+                return self._estimate()
             if lost_s := tracking.lag.lost_s:
                 why = f"for {lost_s:.0f} s no absolute sensor agreed, unless its error had jumped"
                 return self._start_over(tracking, until_ns - duration_ns(_AGAIN_S), why)

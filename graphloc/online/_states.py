@@ -282,6 +282,11 @@ class States:
         steps = self._window.errors_of(held for held in self._links.values() if held.slots)
         return float(np.median(steps)) if steps else 0.0
 
+    def steps_cost(self, since_ns: int) -> float:
+        """Return the cost of the IMU factors that reach beyond a stamp, together."""
+        first = self._problem.timeline.floor(since_ns)
+        return sum(self._window.errors_of(held for k, held in self._links.items() if k >= first and held.slots))
+
     def anchor(self) -> Anchor:
         """Return the anchor at the newest state, without the priors that close the slow chains: these continue from here."""
         timeline, window, streams = self._problem.timeline, self._window, self._problem.streams

@@ -7,6 +7,7 @@ import logging
 from bisect import insort
 from collections import deque
 from collections.abc import Iterable, Sequence
+from copy import deepcopy
 
 import gtsam
 import numpy as np
@@ -18,6 +19,8 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._estimates import estimate_of
+from graphloc.online._heading_check import HeadingCheck
+from graphloc.online._imu_doubt import WHY, ImuDoubt, turns_otherwise
 from graphloc.online._intake import series_of
 from graphloc.online._lag import Lag
 from graphloc.online._ledger import OnlineLedger
@@ -29,7 +32,7 @@ from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
 from graphloc.online._start import LEAST_S
-from graphloc.time import duration_ns, stamps_of
+from graphloc.time import duration_ns, stamps_of, utc_text
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -69,7 +72,8 @@ class Tracking:
         self._unread: list[ImuSample] = []  # not yet handed to the window
         self._holes: list[tuple[int, int]] = []  # stamps (ns) between which samples came late
         self._height_due_ns: dict[str, int] = {}  # of the next configured height, by sensor
-        self._recent = Recent()
+        self._recent, self._doubt = Recent(), ImuDoubt()
+        self._held_out: list[ImuSample] = []  # left out since the last gap began, or went on
         self.lag = self._built(anchor, samples, guess)
         if persistent.odometry is None:
             pose = self.lag.newest.pose
@@ -103,6 +107,8 @@ class Tracking:
             receivers=persistent.receivers,
             slow_known=anchor.slow,
         )
+        for gap in self._doubt.gaps:
+            problem.links.leave_out(*gap)
         if before is not None:
             for name, stream in problem.streams.items():
                 was = before.problem.streams[name]
@@ -128,6 +134,16 @@ class Tracking:
 
     def keep_imu(self, m: ImuSample, hole: tuple[int, int] | None) -> None:
         """Keep an IMU sample; `hole`: of one that came late, the stamps (ns) of the samples before and after it."""
+        if self._held_out and self._doubt.over(m.stamp_ns):
+            if (wrong := self._goes_on_wrong()) is not False:
+                self._doubt.go_on()
+                self.lag.problem.links.leave_out(*self._doubt.gaps[-1])
+            if wrong is not None:
+                self._held_out = []
+        if self._doubt.leaves_out(m.stamp_ns):
+            self._held_out.append(m)
+            self._ledger.drop(m, Outcome.REJECTED, WHY)
+            return
         if hole is not None:
             self._holes.append(hole)
         self._unread.append(m)
@@ -256,7 +272,8 @@ class Tracking:
             now = propagate(lag.problem, newest, self._odometry, stamp_ns)
         heading = persistent.heading
         guess, heading_var = (heading.doubt(now.stamp_ns), heading.var(now.stamp_ns)) if heading else ("", 0.0)
-        doubts = (persistent.heading_check.said, guess, lag.in_doubt(now.stamp_ns))
+        wrong = f"{self._setup.imu_name} {WHY}" if self._doubt.leaves_out(now.stamp_ns) else ""
+        doubts = (persistent.heading_check.said, guess, lag.in_doubt(now.stamp_ns), wrong)
         return estimate_of(
             now,
             lag,
@@ -295,14 +312,23 @@ class Tracking:
 
     def news(self) -> list[Event]:
         """Return what the newest state newly shows: a wrong heading, frozen receivers, position jumps, noise."""
-        check = self._persistent.heading_check
+        check, at_ns = self._persistent.heading_check, self.lag.newest.stamp_ns
         heading = [Event(check.said)] if check.look(self.lag) else []
         heading += self._heading_news()
         was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now
         frozen = [Event(f"{name}: {_FROZEN}") for name in sorted(now - was)]
         thawed = [Event(f"{name}: {_NO_LONGER_FROZEN}", warns=False) for name in sorted(was - now)]
-        return [*heading, *frozen, *thawed, *map(Event, [*self.lag.receiver_warnings(), *self.lag.noisier_warnings()])]
+        fits = (
+            [Event(f"{self._setup.imu_name}: its samples fit again", warns=False)] if self._doubt.ended(at_ns) else []
+        )
+        return [
+            *heading,
+            *frozen,
+            *thawed,
+            *fits,
+            *map(Event, [*self.lag.receiver_warnings(), *self.lag.noisier_warnings()]),
+        ]
 
     def _heading_news(self) -> list[Event]:
         """Follow a heading that no sensor measures; return that it is a guess by now, or is none any more."""
@@ -370,6 +396,70 @@ class Tracking:
         self.lag = self._built(anchor, self._recent.samples(), before=self.lag)
         self._extend(until_ns)
         self.lag.settle()
+
+    def doubt_imu(self, until_ns: int) -> str | None:
+        """Try the samples of the IMU as a gap where sensors that do not know each other deny the estimate (see `_imu_doubt`).
+
+        Args:
+            until_ns: stamp of the newest IMU sample.
+
+        Returns:
+            None: nothing has changed. Else the window is another, and this is to be said; empty: it was said before.
+        """
+        denied = self.lag.denied
+        since_ns = self._doubt.suspected(denied, until_ns) if denied else None
+        failed, recent, ledger, persistent = self.lag, self._recent, self._ledger, self._persistent
+        anchors = [a for a in recent.anchors if failed.first_ns <= a.stamp_ns]
+        if since_ns is None or not anchors or anchors[0].stamp_ns >= since_ns:
+            return None
+        ledger.enter(failed.gone())
+        mark, doubt, pending = ledger.marked(), deepcopy(self._doubt), self._pending
+        receivers, check = persistent.receivers, persistent.heading_check
+        persistent.receivers, persistent.heading_check = deepcopy(receivers), HeadingCheck()
+        for receiver in persistent.receivers.values():
+            receiver.jump.forget_since(since_ns)
+        self._doubt.leave_out(since_ns, until_ns)
+        out = recent.leave_out(since_ns)
+        again = [m for m in self.since(anchors[0].stamp_ns) if not isinstance(m, ImuSample)]
+        try:
+            self._rebuild_from(anchors[0], again, until_ns)
+            explained = self.lag.explained(denied, min(denied.values()))
+        except Exception as error:  # noqa: BLE001 - whatever failed, the window before the trial stands
+            log.warning("online: the IMU could not be tried as wrong: %s", in_one_line(error))
+            explained = False
+        if not explained:
+            ledger.back_to(mark)
+            self.lag, self._pending, self._doubt = failed, pending, doubt
+            persistent.receivers, persistent.heading_check = receivers, check
+            for m in out:
+                recent.keep(m)
+            return None
+        self._held_out = []
+        self._doubt.forget(self.lag.first_ns)
+        recent.forget_anchors(since_ns)
+        self._settle_rows(failed, again)
+        if doubt.underway:
+            return ""
+        return (
+            f"{self._setup.imu_name}: from {utc_text(since_ns)} on it {WHY} ({', '.join(sorted(denied))}): its samples are rejected, as in "
+            "an IMU gap, until they fit again"
+        )
+
+    def _goes_on_wrong(self) -> bool | None:
+        """Return whether the samples that were left out last contradict the states that were made without them; None: too few to tell."""
+        lag = self.lag
+        stamps_ns, _, R, _ = lag.track()
+        first, end = np.searchsorted(stamps_ns, [self._held_out[0].stamp_ns, self._held_out[-1].stamp_ns + 1])
+        held = (
+            [m for m in self._held_out if stamps_ns[first] <= m.stamp_ns <= stamps_ns[end - 1]]
+            if end > first + 1
+            else []
+        )
+        if len(held) < 2:
+            return None
+        bias = lag.newest.bias.gyroscope()
+        rates = np.array([m.gyro_radps - bias for m in held]) @ lag.problem.R_body_imu.T
+        return turns_otherwise(stamps_of(held), rates, R[first].T @ R[end - 1])
 
     def end(self, reason: str) -> None:
         """Give every measurement its row; `reason`: of those that the states have not reached."""

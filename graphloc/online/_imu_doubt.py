@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is the IMU wrong? Where sensors that were right a moment ago deny the estimate at once, it is: a wrong unit, a loose plug, a saturated axis.
+
+One sensor that disagrees is itself in doubt, and its kernel takes its weight. Two that begin to within seconds of each other have
+one thing in common: the motion between them and what was known before. So the samples since then are tried as a gap
+(`Tracking.doubt_imu`), and they are left out where that explains what denied them by a motion that a vessel may have made. What
+follows is left out for half a second, and again for as long as its rates turn otherwise than the estimate does without them. Where
+wrong ones do not (an accelerometer) and are denied again, it is twice as long each time: an IMU that stays wrong costs a rebuild every
+few seconds, one that is right again is missed for about as long as it was wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+from graphloc.time import duration_ns
+
+WHY = "contradicts the other sensors, which agree with each other"
+_SENSORS, _FEWEST, _MANY = 2, 2, 5  # that deny; measurements in a row of each, and of one of them at least
+_AT_ONCE_S = 2.5  # since the first denial: after that, a gap explains a jump of the fixes as well
+_BEFORE_S = 0.3  # the wrong samples begin before anything denies them
+_AGAIN_S = 1.0  # after a trial that explained nothing
+_HOLD_S = (0.5, 4.0)  # for how long samples are left out: at first, and at most
+_QUIET_S = 10.0  # without a denial after that, it is over
+_TURNED_RADPS = 0.6  # per sqrt(s): 3 sigmas of the turn in a gap (`factors.imu`)
+
+
+class Denials:
+    """Which sensors have denied the estimate on arrival, in a row."""
+
+    def __init__(self) -> None:
+        self._in_a_row: dict[str, list[int]] = {}
+
+    def note(self, sensor: str, stamp_ns: int, *, agrees: bool, outlier: bool) -> None:
+        """Note how a measurement was judged; `outlier`: its sensor denies any estimate now and then, so only its last ones count."""
+        stamps = self._in_a_row.setdefault(sensor, [])
+        if agrees:
+            stamps.clear()
+        elif outlier or len(stamps) < _MANY:
+            stamps.append(stamp_ns)
+        if outlier:
+            del stamps[:-_FEWEST]
+
+    def at_once(self, now_ns: int) -> Mapping[str, int]:
+        """Return the stamp (ns) of the first denial of each sensor that began to deny a moment ago; nothing where it may be chance."""
+        begun = {
+            name: stamps
+            for name, stamps in self._in_a_row.items()
+            if len(stamps) >= _FEWEST and now_ns - min(stamps) < _AT_ONCE_S * 1e9
+        }
+        if len(begun) < _SENSORS or max(map(len, begun.values())) < _MANY:
+            return {}
+        return {name: min(stamps) for name, stamps in begun.items()}
+
+
+class ImuDoubt:
+    """Which samples of the IMU are left out.
+
+    Attributes:
+        gaps: from after one stamp to another (ns), in order.
+        underway: whether the last of them may not have been the last.
+    """
+
+    def __init__(self) -> None:
+        self.gaps: list[tuple[int, int]] = []
+        self.underway = False
+        self._hold_s, self._tried_ns = _HOLD_S[0], 0
+
+    def suspected(self, denied: Mapping[str, int], now_ns: int) -> int | None:
+        """Return since when (stamp, ns) the samples are to be tried as a gap; None: nothing is to be tried.
+
+        Args:
+            denied: `Denials.at_once`.
+        """
+        if not denied or self.leaves_out(now_ns) or now_ns - self._tried_ns < _AGAIN_S * 1e9:
+            return None
+        self._tried_ns = now_ns
+        since_ns, over_ns = min(denied.values()) - duration_ns(_BEFORE_S), self._over_ns()
+        # What came since the last gap is wrong from its first sample on, if it is.
+        return over_ns if 0 <= since_ns - over_ns < _AT_ONCE_S * 1e9 else since_ns
+
+    def leave_out(self, since_ns: int, now_ns: int) -> None:
+        """Leave out the samples since a stamp (ns), and those of the time to come."""
+        self._hold_s = min(2.0 * self._hold_s, _HOLD_S[1]) if self.underway else _HOLD_S[0]
+        self.underway = True
+        if self.gaps and since_ns <= self._over_ns():
+            since_ns, _ = self.gaps.pop()
+        self.gaps.append((since_ns, now_ns + duration_ns(self._hold_s)))
+        self._tried_ns = 0
+
+    def go_on(self) -> None:
+        """Leave out more: those at the end of the last gap were wrong, or too few to tell."""
+        since_ns, until_ns = self.gaps[-1]
+        self.gaps[-1] = since_ns, until_ns + duration_ns(_HOLD_S[0])
+
+    def ended(self, now_ns: int) -> bool:
+        """Return whether the samples have been right for so long that it is over: once."""
+        ended = self.underway and now_ns - self._over_ns() > _QUIET_S * 1e9
+        self.underway = self.underway and not ended
+        return ended
+
+    def leaves_out(self, stamp_ns: int) -> bool:
+        """Return whether a sample is left out."""
+        return any(a < stamp_ns <= b for a, b in self.gaps)
+
+    def forget(self, before_ns: int) -> None:
+        """Forget gaps that ended before a stamp, but for the last: the next may follow it."""
+        self.gaps = [gap for gap in self.gaps[:-1] if gap[1] >= before_ns] + self.gaps[-1:]
+
+    def over(self, stamp_ns: int) -> bool:
+        """Return whether a sample comes after the last gap."""
+        return stamp_ns > self._over_ns()
+
+    def _over_ns(self) -> int:
+        return self.gaps[-1][1] if self.gaps else 0
+
+
+def turns_otherwise(stamps_ns: NDArray[np.int64], rates_radps: Array, R: Array) -> bool:
+    """Return whether rates turn otherwise than an estimate did without them, by more than a vessel may.
+
+    Args:
+        stamps_ns: (N,). rates_radps: (N, 3), body axes. R: (3, 3), rotation of the body from the first stamp to the last, by the estimate.
+    """
+    told = gtsam.Rot3()
+    for rate, dt_s in zip(rates_radps, np.diff(stamps_ns) * 1e-9, strict=False):
+        told = told.compose(gtsam.Rot3.Expmap(rate * dt_s))
+    off_rad = float(np.linalg.norm(gtsam.Rot3.Logmap(told.inverse().compose(gtsam.Rot3(R)))))
+    return off_rad > float(_TURNED_RADPS * np.sqrt((stamps_ns[-1] - stamps_ns[0]) * 1e-9))

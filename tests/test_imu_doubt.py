@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An IMU that goes wrong for a while: whom to believe, and what becomes of its samples."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from graphloc.config import ImuConfig
+from graphloc.factors.imu import ROW
+from graphloc.frames import Array
+from graphloc.graph import Going
+from graphloc.ledger import Outcome
+from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, ImuSeries, Measurement
+from graphloc.online._imu_doubt import Denials, ImuDoubt, turns_otherwise
+from graphloc.online._lag import Lag
+from graphloc.online._tracking import Tracking
+from graphloc.solution import Health
+from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
+from tests.test_online_faults import run_of, smoother
+
+S = 1_000_000_000
+Change = Callable[[Measurement], Measurement]
+
+
+def changed(change: Change, from_s: float = 12.0, until_s: float = 16.0) -> Arrivals:
+    """The run with what came in a span changed."""
+    arrivals = arrivals_of(run_of())
+    begin = arrivals[0].true_ns
+    inside = [from_s <= (a.true_ns - begin) / S < until_s for a in arrivals]
+    return numbered([replace(a, m=change(a.m)) if n else a for a, n in zip(arrivals, inside, strict=True)])
+
+
+def in_degrees(m: Measurement) -> Measurement:
+    return replace(m, gyro_radps=np.degrees(m.gyro_radps)) if isinstance(m, ImuSample) else m
+
+
+def axes_swapped(m: Measurement) -> Measurement:
+    if not isinstance(m, ImuSample):
+        return m
+    return replace(m, gyro_radps=m.gyro_radps[[1, 0, 2]] * [1, 1, -1], accel_mps2=m.accel_mps2[[1, 0, 2]])
+
+
+def biased(m: Measurement) -> Measurement:
+    return replace(m, gyro_radps=m.gyro_radps + [0.0, 0.0, 0.3]) if isinstance(m, ImuSample) else m
+
+
+def blamed(fed: Fed) -> int:
+    return sum("contradicts the other sensors, which agree" in event for event in fed.events)
+
+
+@pytest.mark.parametrize("change", [in_degrees, axes_swapped, biased])
+def test_an_imu_that_goes_wrong_is_left_out_until_it_is_right_again(change: Change) -> None:
+    arrivals = changed(change)
+    online = smoother(run_of())
+    fed = finish(online, feed(online, run_of(), arrivals))
+    assert complaints(arrivals, fed) == []
+    assert blamed(fed) == 1
+    assert fed.worst_m() < 4.0
+    begin = arrivals[0].true_ns
+    assert fed.worst_m(begin + 18 * S) < 1.0
+    left_out = [r for r in fed.rows if r.sensor == "imu" and r.outcome is Outcome.REJECTED]
+    assert left_out
+    assert all(begin + 12 * S < r.stamp_ns < begin + 18 * S for r in left_out)
+    during = [e.health for e in fed.estimates if left_out[0].stamp_ns < e.stamp_ns < left_out[-1].stamp_ns]
+    assert during
+    assert Health.GOOD not in during
+
+
+def compass_off(m: Measurement) -> Measurement:
+    return replace(m, yaw_rad=m.yaw_rad + 1.0) if isinstance(m, CompassHeading) else m
+
+
+def fixes_off(m: Measurement) -> Measurement:
+    if not isinstance(m, GnssPosition):
+        return m
+    return replace(m, position=m.position._replace(latitude_deg=m.position.latitude_deg + 8e-5))  # 9 m
+
+
+def both_off(m: Measurement) -> Measurement:
+    return fixes_off(compass_off(m))
+
+
+@pytest.mark.parametrize("change", [compass_off, fixes_off, both_off])
+def test_sensors_that_no_motion_explains_are_not_believed_against_the_imu(change: Change) -> None:
+    online = smoother(run_of())
+    fed = finish(online, feed(online, run_of(), changed(change)))
+    assert blamed(fed) == 0
+    assert not [r for r in fed.rows if r.sensor == "imu" and r.outcome is Outcome.REJECTED]
+
+
+def test_a_trial_that_explains_nothing_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    def estimates() -> Array:
+        online = smoother(run_of())
+        fed = finish(online, feed(online, run_of(), changed(in_degrees)))
+        assert blamed(fed) == 0
+        return np.array([e.p_world_m for e in fed.estimates])
+
+    tried = []
+    monkeypatch.setattr(Lag, "explained", lambda *_: bool(tried.append(1)))
+    after_trials = estimates()
+    assert tried
+    monkeypatch.setattr(Tracking, "doubt_imu", lambda *_: None)
+    assert np.array_equal(after_trials, estimates())
+
+
+def test_denials_count_in_a_row_and_at_once() -> None:
+    denials = Denials()
+    for n in range(5):
+        denials.note("gnss", n * S // 4, agrees=False, outlier=False)
+    assert not denials.at_once(S)  # a single sensor is itself in doubt
+    denials.note("compass", S // 2, agrees=False, outlier=False)
+    assert not denials.at_once(S)
+    denials.note("compass", S, agrees=False, outlier=False)
+    assert denials.at_once(S) == {"gnss": 0, "compass": S // 2}
+    assert not denials.at_once(3 * S)  # a while ago
+    denials.note("compass", 2 * S, agrees=True, outlier=False)
+    assert not denials.at_once(2 * S)
+
+
+def test_what_a_matcher_denied_long_ago_does_not_count_for_or_against() -> None:
+    denials = Denials()
+    for n in (0, 20, 21):
+        denials.note("matcher", n * S, agrees=False, outlier=True)
+    for n in range(5):
+        denials.note("gnss", 20 * S + n * S // 5, agrees=False, outlier=False)
+    assert denials.at_once(21 * S) == {"gnss": 20 * S, "matcher": 20 * S}
+
+
+def test_the_longer_an_imu_is_wrong_the_longer_it_is_left_out() -> None:
+    doubt, denied, lengths = ImuDoubt(), 10 * S, []
+    for _ in range(6):
+        now = denied + S
+        since = doubt.suspected({"gnss": denied, "compass": denied}, now)
+        assert since is not None
+        doubt.leave_out(since, now)
+        lengths.append((doubt.gaps[-1][1] - now) / S)
+        assert doubt.leaves_out(now)
+        assert doubt.suspected({"gnss": denied, "compass": denied}, now) is None
+        denied = doubt.gaps[-1][1] + S
+    assert lengths == [0.5, 1.0, 2.0, 4.0, 4.0, 4.0]
+    # Each follows the one before: the samples between are as wrong.
+    assert doubt.gaps == [(10 * S - 300_000_000, doubt.gaps[-1][1])]
+    over = doubt.gaps[-1][1]
+    assert not doubt.ended(over + 9 * S)
+    assert doubt.ended(over + 11 * S)
+    assert not doubt.ended(over + 12 * S)
+    doubt.leave_out(over + 20 * S, over + 21 * S)
+    assert doubt.gaps[-1] == (over + 20 * S, over + 21 * S + S // 2)
+
+
+def test_rates_that_turn_otherwise() -> None:
+    stamps = np.arange(0, S + 1, S // 50)
+    rates = np.tile([0.0, 0.0, 0.2], (len(stamps), 1))
+    turned = gtsam.Rot3.Expmap(np.array([0.0, 0.0, 0.2])).matrix()
+    assert not turns_otherwise(stamps, rates, turned)
+    assert not turns_otherwise(stamps, rates + [0.0, 0.0, 0.5], turned)  # a vessel in a gap may
+    assert turns_otherwise(stamps, rates + [0.0, 0.0, 0.7], turned)
+    assert turns_otherwise(stamps, rates[:, [2, 1, 0]] * 5.0, turned)
+
+
+def test_samples_that_are_left_out_are_a_gap_however_short() -> None:
+    stamps = np.arange(0, 10 * S, S // 100)
+    samples = np.tile([0.0, 0.0, 9.81, 0.0, 0.0, 0.1], (len(stamps), 1))
+    wrong = (stamps > 5 * S) & (stamps <= 5 * S + S // 4)
+    samples[wrong, 5] = 7.0
+    imu = ImuSeries(
+        sensor="imu",
+        stamps_ns=stamps,
+        accel_mps2=samples[:, :3],
+        gyro_radps=samples[:, 3:],
+        seqs=np.arange(len(stamps)),
+    )
+    links, bias = ROW.link(imu, ImuConfig(), np.eye(3), 9.81), gtsam.imuBias.ConstantBias()
+
+    def turn(from_ns: int, to_ns: int) -> tuple[float, float]:
+        pim = links.integrate(from_ns, to_ns, bias, Going(bias, np.zeros(3)))
+        return float(gtsam.Rot3.Logmap(pim.deltaRij())[2]), float(np.sqrt(pim.preintMeasCov()[2, 2]))
+
+    assert turn(5 * S, 6 * S)[0] == pytest.approx(0.1 + 6.9 * 0.25, abs=0.1)
+    links.leave_out(5 * S, 5 * S + S // 4)
+    angle, sigma = turn(5 * S, 5 * S + S // 4)
+    assert angle == pytest.approx(0.025, abs=1e-3)
+    assert sigma == pytest.approx(0.2 * 0.5, rel=0.1)  # 0.2 rad/s, white, over a quarter of a second
+    assert turn(4 * S, 5 * S)[1] < 0.01
+    assert links.gaps() == [(5 * S, 5 * S + S // 4 + S // 100)]
+    # It goes on: of the two, the longer stands; what follows is not known yet.
+    links.leave_out(5 * S, 20 * S)
+    assert links.gaps() == [(5 * S, 20 * S)]
+    assert turn(11 * S, 12 * S)[1] == pytest.approx(0.2, rel=0.1)
+    links.extend(np.array([20 * S + S // 100]), samples[:1])
+    assert links.gaps() == [(5 * S, 20 * S + S // 100)]
+    links.forget(21 * S)
+    assert links.gaps() == []
